@@ -1,0 +1,1 @@
+"""Servers on a running system: scheduling classes, threads, and the gate of the shaping node."""

@@ -1,0 +1,244 @@
+"""The gate: when may a message of the chain's output leave?
+
+A latency-shaping node receives the chain's output early, late or somewhere between, and lets it
+go only inside the publish slots of its server R_m° (paper, sections 3.2.2 and 3.3). The gate
+*is* that server: no kernel support is needed to hold back one's own publication.
+
+Slots repeat every cycle and are counted from an **anchor**, the instant at which a cycle starts:
+
+* ``stamp``: the cycle starts when the chain started, which the message itself says (its first
+  field is a ``std_msgs/Header``). Latency is constant even when the first callback's timer
+  drifts or starts late.
+* ``cycle``: cycles start at ``phase_ns`` of CLOCK_MONOTONIC and every cycle thereafter, whatever
+  the messages say. The output is strictly periodic, and messages need no stamp.
+
+A message that arrives before a slot waits for its start; one that arrives inside a slot leaves
+at once; one that missed its last slot takes the first slot of a later cycle and is counted.
+
+This module is deliberately free of any import outside the standard library: it also runs
+inside a ROS 2 node, where nothing of ours may be installed.
+"""
+
+import ctypes
+import os
+import time
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+__all__ = [
+    "ANCHORS",
+    "Gate",
+    "Release",
+    "Shaper",
+    "Waking",
+    "clock_offset",
+    "origin_of",
+    "release_of",
+    "sleep_until",
+    "wait_until",
+]
+
+ANCHORS = ("stamp", "cycle")
+
+
+@dataclass(frozen=True)
+class Gate:
+    """The publish slots of one output. All times are nanoseconds.
+
+    ``slots`` are half-open ``(start, end)`` intervals counted from the anchor, ascending, apart
+    from each other and inside ``[0, cycle_ns)``. ``phase_ns`` anchors cycles to CLOCK_MONOTONIC;
+    with the ``stamp`` anchor it is used for messages whose stamp is of no use. A stamp is of use
+    when its message is at most ``max_age_ns`` old and comes at most ``max_future_ns`` from the
+    future (clocks of different hosts disagree a little).
+    """
+
+    slots: tuple[tuple[int, int], ...]
+    cycle_ns: int
+    anchor: str = "stamp"
+    phase_ns: int = 0
+    max_age_ns: int | None = None  # None: ten cycles
+    max_future_ns: int = 1_000_000
+
+    def __post_init__(self) -> None:
+        if self.anchor not in ANCHORS:
+            raise ValueError(f"anchor {self.anchor!r}: choose one of {', '.join(ANCHORS)}")
+        if self.cycle_ns <= 0:
+            raise ValueError(f"cycle of {self.cycle_ns} ns: it must be longer than nothing")
+        if not self.slots:
+            raise ValueError("a gate without slots would never let anything through")
+        previous_end = 0
+        for start, end in self.slots:
+            if not previous_end <= start < end <= self.cycle_ns:
+                raise ValueError(
+                    f"slot [{start}, {end}) ns: slots must ascend, not overlap and lie within the "
+                    f"cycle of {self.cycle_ns} ns"
+                )
+            previous_end = end
+
+
+@dataclass(frozen=True)
+class Release:
+    """The gate's decision for one message; times are ns of CLOCK_MONOTONIC.
+
+    ``at_ns`` is when the message may leave (not after the arrival: at once), ``slot`` which of
+    the slots that is, ``cycles_waited`` how many cycles after its own (0 is the rule; more means
+    that the chain overran its last slot), ``anchor`` what the slots were counted from.
+    """
+
+    at_ns: int
+    origin_ns: int
+    slot: int
+    cycles_waited: int
+    anchor: str
+
+
+def release_of(gate: Gate, arrival_ns: int, stamp_ns: int | None) -> Release:
+    """Decide when a message that arrived at ``arrival_ns`` may leave.
+
+    ``stamp_ns`` is its origin on CLOCK_MONOTONIC (see :func:`origin_of`), None if it has none.
+
+        >>> gate = Gate(slots=((60, 61),), cycle_ns=100)
+        >>> release_of(gate, arrival_ns=1040, stamp_ns=1000).at_ns      # early: held
+        1060
+        >>> release_of(gate, arrival_ns=1070, stamp_ns=1000).at_ns      # missed: the next cycle
+        1160
+    """
+    if gate.anchor == "stamp" and stamp_ns is not None and _usable(gate, arrival_ns - stamp_ns):
+        origin, anchor = stamp_ns, "stamp"
+    else:
+        elapsed = (arrival_ns - gate.phase_ns) % gate.cycle_ns
+        origin, anchor = arrival_ns - elapsed, "cycle"
+    # A stamp slightly from the future puts the arrival before its own cycle: cycle 0 still.
+    cycle = max(0, (arrival_ns - origin) // gate.cycle_ns)
+    while True:
+        cycle_start = origin + cycle * gate.cycle_ns
+        for slot, (start, end) in enumerate(gate.slots):
+            if arrival_ns < cycle_start + end:
+                at = max(arrival_ns, cycle_start + start)
+                return Release(at, origin, slot, cycle, anchor)
+        cycle += 1
+
+
+def _usable(gate: Gate, age_ns: int) -> bool:
+    max_age = 10 * gate.cycle_ns if gate.max_age_ns is None else gate.max_age_ns
+    return -gate.max_future_ns <= age_ns <= max_age
+
+
+def origin_of(payload: bytes) -> int | None:
+    """The header stamp of a serialized message in ns of its clock, None if it is zero or short.
+
+    A message whose first field is a ``std_msgs/Header`` has its stamp (int32 seconds, uint32
+    nanoseconds) right behind the 4-byte CDR encapsulation header, whose second byte gives the
+    byte order. Nothing else of the message needs to be known.
+    """
+    if len(payload) < 12:
+        return None
+    order = "little" if payload[1] & 1 else "big"
+    seconds = int.from_bytes(payload[4:8], order, signed=True)  # type: ignore[arg-type]
+    nanoseconds = int.from_bytes(payload[8:12], order)  # type: ignore[arg-type]
+    if (seconds == 0 and nanoseconds == 0) or nanoseconds >= 1_000_000_000:
+        return None
+    return seconds * 1_000_000_000 + nanoseconds
+
+
+class Waking(NamedTuple):
+    """When a wait ended, and the longest stretch (ns) in which it could not see the clock."""
+
+    at_ns: int
+    gap_start_ns: int
+    gap_ns: int
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
+
+
+_libc = ctypes.CDLL(None, use_errno=True)
+_TIMER_ABSTIME = 1
+
+
+def sleep_until(deadline_ns: int) -> None:
+    """Sleep until an instant of CLOCK_MONOTONIC; returns at once when it has passed.
+
+    ``time.sleep`` takes a relative time, so a pre-emption between computing and sleeping would
+    be added to it. An absolute sleep cannot be late for that reason.
+    """
+    request = _Timespec(deadline_ns // 1_000_000_000, deadline_ns % 1_000_000_000)
+    while True:
+        # A signal ends the sleep early (EINTR, 4); the deadline stays the same.
+        error = _libc.clock_nanosleep(
+            time.CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(request), None
+        )
+        if error != 4:
+            break
+    if error:
+        raise OSError(error, f"clock_nanosleep: {os.strerror(error)}")
+
+
+def wait_until(deadline_ns: int, spin_ns: int = 0) -> Waking:
+    """Sleep until ``spin_ns`` before the instant, then watch the clock until it has come.
+
+    Waking from a sleep costs the kernel some tens of microseconds, and not always the same.
+    Watching the clock over the last stretch trades a little CPU time for that variation, and
+    shows when the clock jumped: a thread that does nothing else notices every interruption.
+    """
+    sleep_until(deadline_ns - spin_ns)
+    clock = time.monotonic_ns
+    now = clock()
+    if now >= deadline_ns:
+        return Waking(now, now, 0)
+    last, gap_start, gap = now, now, 0
+    while now < deadline_ns:
+        now = clock()
+        if now - last > gap:
+            gap_start, gap = last, now - last
+        last = now
+    return Waking(now, gap_start, gap)
+
+
+def clock_offset() -> int:
+    """CLOCK_REALTIME minus CLOCK_MONOTONIC in ns, to a fraction of a microsecond."""
+    best_width, best = None, 0
+    for _ in range(5):
+        before, realtime, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        width = after - before
+        if best_width is None or width < best_width:
+            best_width, best = width, realtime - (before + after) // 2
+        if width < 2_000:  # a longer bracket means that something came between
+            break
+    return best
+
+
+class Shaper:
+    """A gate at work: holds each message until its release, and minds the clocks.
+
+    Stamps are CLOCK_REALTIME, sleeping is CLOCK_MONOTONIC; the offset between the two is taken
+    anew for every message, since NTP or an operator may step the wall clock. A message under way
+    during a step has a stamp of which nobody can say to which side it belongs: it is anchored to
+    the cycle instead, at the phase that the last good stamp had.
+    """
+
+    STEP_NS = 500_000  # slewing moves the clock by at most 50 us in a cycle of 100 ms
+
+    def __init__(self, gate: Gate, spin_ns: int = 0) -> None:
+        self.gate = gate
+        self.spin_ns = spin_ns
+        self._offset = clock_offset()
+
+    def decide(self, payload: bytes, arrival_ns: int) -> Release:
+        """When the message that arrived may leave, after :func:`release_of`."""
+        offset = clock_offset()
+        stepped = abs(offset - self._offset) > self.STEP_NS
+        self._offset = offset
+        stamp = None if stepped else origin_of(payload)
+        release = release_of(self.gate, arrival_ns, None if stamp is None else stamp - offset)
+        if release.anchor == "stamp":
+            phase = release.origin_ns % self.gate.cycle_ns
+            self.gate = replace(self.gate, phase_ns=phase)
+        return release
+
+    def hold(self, payload: bytes) -> tuple[Release, int, Waking]:
+        """Wait until a message may leave: the decision, its arrival (ns) and the waking."""
+        arrival = time.monotonic_ns()
+        release = self.decide(payload, arrival)
+        return release, arrival, wait_until(release.at_ns, self.spin_ns)

@@ -1,0 +1,32 @@
+"""What can go wrong, and the exit code it ends the command line with.
+
+Every error names the thing (file, line, topic, thread), the reason and the remedy in its
+message; the command line prints that message and nothing else. Three kinds are enough, because
+a caller has three ways to react: correct the input, look at what failed, or change the machine.
+"""
+
+__all__ = ["ChainshaperError", "InputError", "OperationError", "PlatformError"]
+
+
+class ChainshaperError(Exception):
+    """Any failure that chainshaper foresaw; its message is complete for a person."""
+
+    exit_code = 1
+
+
+class OperationError(ChainshaperError):
+    """The operation failed although the request was valid: a node died, the disk is full."""
+
+    exit_code = 1
+
+
+class InputError(ChainshaperError):
+    """The request is wrong: an unknown topic, a mistake in a YAML file, an impossible value."""
+
+    exit_code = 2
+
+
+class PlatformError(ChainshaperError):
+    """This machine cannot do it: a missing core, a missing privilege, no CycloneDDS wheel."""
+
+    exit_code = 3

@@ -1,0 +1,186 @@
+"""The event tables: their names, columns and units, in one place.
+
+Everything chainshaper knows about a run it knows from these tables. They are the events of
+`ros2_tracing` (tracetools 8.x, Jazzy) under their own names and fields, whether they came from
+an LTTng trace, from eBPF, from the live workload or from the simulator, so that the analysis
+needs to know only this page.
+
+Every table has the columns of :data:`COMMON_COLUMNS` followed by the event's own fields:
+
+* ``time``: nanoseconds of CLOCK_MONOTONIC. Add the recording's ``clock_offset_ns`` for
+  wall-clock time, which is what DDS source timestamps are.
+* ``pid``, ``tid``: process and thread, as the kernel numbers them in the traced container.
+* ``cpu``: the core, null where the source does not know it.
+
+Handles (``*_handle``, ``callback``, ``message``, ``subscription``) are addresses: unique only
+within one process and only until they are freed. Tables lack columns that their source cannot
+know (``rmw_publish`` has neither handle nor timestamp before Jazzy); a table that is missing
+altogether is the same as an empty one.
+
+Upstream: `tracetools/include/tracetools/tracetools.h` of ros2_tracing, and
+`sched:sched_switch` of the Linux kernel.
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import TypeAlias
+
+import polars as pl
+
+__all__ = ["COMMON_COLUMNS", "FIELDS", "OPTIONAL_FIELDS", "EventTables", "empty", "table"]
+
+EventTables: TypeAlias = Mapping[str, pl.DataFrame]
+"""One frame per event name, each sorted by ``time``."""
+
+COMMON_COLUMNS: dict[str, pl.DataType] = {
+    "time": pl.Int64(),
+    "pid": pl.Int32(),
+    "tid": pl.Int32(),
+    "cpu": pl.Int32(),
+}
+
+_HANDLE = pl.UInt64()
+_NAME = pl.String()
+_NANOSECONDS = pl.Int64()
+
+FIELDS: dict[str, dict[str, pl.DataType]] = {
+    # Who exists: emitted once per object, in this order of dependence.
+    "rcl_init": {"context_handle": _HANDLE, "version": _NAME},
+    "rcl_node_init": {
+        "node_handle": _HANDLE,
+        "rmw_handle": _HANDLE,
+        "node_name": _NAME,
+        "namespace": _NAME,
+    },
+    "rmw_publisher_init": {"rmw_publisher_handle": _HANDLE, "gid": pl.List(pl.UInt8)},
+    "rcl_publisher_init": {
+        "publisher_handle": _HANDLE,
+        "node_handle": _HANDLE,
+        "rmw_publisher_handle": _HANDLE,
+        "topic_name": _NAME,
+        "queue_depth": pl.UInt64(),
+    },
+    "rmw_subscription_init": {"rmw_subscription_handle": _HANDLE, "gid": pl.List(pl.UInt8)},
+    "rcl_subscription_init": {
+        "subscription_handle": _HANDLE,
+        "node_handle": _HANDLE,
+        "rmw_subscription_handle": _HANDLE,
+        "topic_name": _NAME,
+        "queue_depth": pl.UInt64(),
+    },
+    "rclcpp_subscription_init": {"subscription_handle": _HANDLE, "subscription": _HANDLE},
+    "rclcpp_subscription_callback_added": {"subscription": _HANDLE, "callback": _HANDLE},
+    "rcl_service_init": {
+        "service_handle": _HANDLE,
+        "node_handle": _HANDLE,
+        "rmw_service_handle": _HANDLE,
+        "service_name": _NAME,
+    },
+    "rclcpp_service_callback_added": {"service_handle": _HANDLE, "callback": _HANDLE},
+    "rcl_client_init": {
+        "client_handle": _HANDLE,
+        "node_handle": _HANDLE,
+        "rmw_client_handle": _HANDLE,
+        "service_name": _NAME,
+    },
+    "rcl_timer_init": {"timer_handle": _HANDLE, "period": _NANOSECONDS},
+    "rclcpp_timer_callback_added": {"timer_handle": _HANDLE, "callback": _HANDLE},
+    "rclcpp_timer_link_node": {"timer_handle": _HANDLE, "node_handle": _HANDLE},
+    "rclcpp_callback_register": {"callback": _HANDLE, "symbol": _NAME},
+    # What happens, again and again.
+    "callback_start": {"callback": _HANDLE, "is_intra_process": pl.Int32()},
+    "callback_end": {"callback": _HANDLE},
+    "rclcpp_publish": {"message": _HANDLE},
+    "rclcpp_intra_publish": {"publisher_handle": _HANDLE, "message": _HANDLE},
+    "rcl_publish": {"publisher_handle": _HANDLE, "message": _HANDLE},
+    "rmw_publish": {
+        "rmw_publisher_handle": _HANDLE,
+        "message": _HANDLE,
+        "timestamp": _NANOSECONDS,  # the DDS source timestamp: CLOCK_REALTIME
+    },
+    "rmw_take": {
+        "rmw_subscription_handle": _HANDLE,
+        "message": _HANDLE,
+        "source_timestamp": _NANOSECONDS,  # CLOCK_REALTIME, as the publisher wrote it
+        "taken": pl.Int32(),
+    },
+    "rcl_take": {"message": _HANDLE},
+    "rclcpp_take": {"message": _HANDLE},
+    # CARET (before Humble) instead of rmw_publish and rmw_take: the message that was written, the
+    # DDS source timestamp it got, and the callback that the message with this stamp went to.
+    "dds_write": {"message": _HANDLE},
+    "dds_bind_addr_to_stamp": {"addr": _HANDLE, "source_stamp": _NANOSECONDS},
+    "dispatch_subscription_callback": {
+        "message": _HANDLE,
+        "callback": _HANDLE,
+        "source_stamp": _NANOSECONDS,
+    },
+    "rmw_implementation": {"rmw_impl": _NAME},
+    # Intra-process communication: messages travel through ring buffers, not through DDS.
+    "rclcpp_construct_ring_buffer": {"buffer": _HANDLE, "capacity": pl.UInt64()},
+    "rclcpp_buffer_to_ipb": {"buffer": _HANDLE, "ipb": _HANDLE},
+    "rclcpp_ipb_to_subscription": {"ipb": _HANDLE, "subscription": _HANDLE},
+    "rclcpp_ring_buffer_enqueue": {
+        "buffer": _HANDLE,
+        "index": pl.UInt64(),
+        "size": pl.UInt64(),
+        "overwritten": pl.Int32(),
+    },
+    "rclcpp_ring_buffer_dequeue": {
+        "buffer": _HANDLE,
+        "index": pl.UInt64(),
+        "size": pl.UInt64(),
+    },
+    "rclcpp_ring_buffer_clear": {"buffer": _HANDLE},
+    "rclcpp_executor_get_next_ready": {},
+    "rclcpp_executor_wait_for_work": {"timeout": _NANOSECONDS},
+    "rclcpp_executor_execute": {"handle": _HANDLE},
+    "sched_switch": {
+        "prev_comm": _NAME,
+        "prev_tid": pl.Int32(),
+        "prev_prio": pl.Int32(),
+        "prev_state": pl.Int64(),
+        "next_comm": _NAME,
+        "next_tid": pl.Int32(),
+        "next_prio": pl.Int32(),
+    },
+    # Ours: what the shaping node decided, and what the machine did to everybody.
+    "gate_release": {  # `time` is the instant at which the gate let the message go
+        "callback": _HANDLE,  # the shaping node's subscription callback
+        "source_timestamp": _NANOSECONDS,  # of the message that was held
+        "arrival": _NANOSECONDS,
+        "origin": _NANOSECONDS,  # the anchor the slots were counted from
+        "release": _NANOSECONDS,  # planned; `time` minus this is the gate's own error
+        "slot": pl.Int32(),
+        "cycles_waited": pl.Int32(),  # 0: in its own cycle; more: it missed its last slot
+        "anchor": pl.String(),  # "stamp", or "cycle" (also when a stamp was unusable)
+    },
+    "machine_stall": {  # `time` is when the sleeper should have woken, `cpu` where it sleeps
+        "duration": _NANOSECONDS,  # how late it woke
+    },
+}
+
+OPTIONAL_FIELDS: dict[str, dict[str, pl.DataType]] = {
+    # CPU time of the executing thread so far: where it is there, execution times need no
+    # sched_switch.
+    "callback_start": {"thread_time": _NANOSECONDS},
+    "callback_end": {"thread_time": _NANOSECONDS},
+}
+
+
+def empty(name: str) -> pl.DataFrame:
+    """An empty table with all columns of event ``name``."""
+    return pl.DataFrame(schema={**COMMON_COLUMNS, **FIELDS[name]})
+
+
+def table(tables: EventTables, name: str, columns: Iterable[str] = ()) -> pl.DataFrame:
+    """The table of event ``name``, empty when absent, with ``columns`` present (null if unknown).
+
+    This is how version differences are met: code asks for the columns it can use and finds
+    nulls where a distribution or a tracer did not record them.
+    """
+    frame = tables.get(name)
+    if frame is None:
+        return empty(name)
+    known = {**COMMON_COLUMNS, **FIELDS[name], **OPTIONAL_FIELDS.get(name, {})}
+    missing = [column for column in columns if column not in frame.columns]
+    return frame.with_columns(pl.lit(None, dtype=known[column]).alias(column) for column in missing)

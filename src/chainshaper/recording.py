@@ -1,0 +1,206 @@
+"""A recording on disk: a folder with one Parquet file per event table and a `recording.json`.
+
+The folder is written beside its final place and renamed when it is complete, so a recording
+that exists is whole. `recording.json` says under which conditions the events were taken, and
+what was lost on the way: figures computed from a recording are only as good as these facts.
+"""
+
+import json
+import os
+import platform
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from chainshaper import events
+from chainshaper.errors import InputError, OperationError
+
+__all__ = [
+    "Recording",
+    "RecordingInfo",
+    "StallMeterInfo",
+    "ThreadInfo",
+    "open_recording",
+    "refuse_existing",
+    "write_recording",
+]
+
+INFO_FILE = "recording.json"
+FORMAT = 1
+
+
+class ThreadInfo(BaseModel):
+    """One thread as the kernel reported it while the application ran (not as it was asked for)."""
+
+    model_config = ConfigDict(frozen=True)
+
+    tid: int
+    pid: int
+    comm: str
+    node: str
+    role: str  # executor, dds, publisher, stall-meter, unknown
+    policy: str  # SCHED_FIFO, SCHED_OTHER, ...
+    priority: int
+    cores: tuple[int, ...]
+
+
+class StallMeterInfo(BaseModel):
+    """How the machine was watched: a sleeper on every core of ``cores`` (ns throughout).
+
+    Stalls shorter than ``threshold_ns`` are not recorded. ``median_lateness_ns`` is what an
+    ordinary wake-up took on each core; ``realtime`` is false when the sleeper itself could be
+    pre-empted, so that its stalls may be ordinary scheduling.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    cores: tuple[int, ...]
+    period_ns: int
+    threshold_ns: int
+    wakeups: int
+    median_lateness_ns: tuple[int, ...]
+    realtime: bool
+
+
+class RecordingInfo(BaseModel):
+    """The facts of a recording that are not events. Times are ns of CLOCK_MONOTONIC.
+
+    ``clock_offset_ns`` is what to add to event times for CLOCK_REALTIME. ``lost`` counts events
+    that are known to be missing, by reason. ``realtime`` says whether SCHED_FIFO was in force
+    for every thread it was asked for, ``notes`` what a reader of the figures must know.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    format: int = FORMAT
+    source: str  # live, simulated, lttng, ebpf
+    host: str = Field(default_factory=platform.node)
+    kernel: str = Field(default_factory=platform.release)
+    distribution: str | None = None  # of ROS 2
+    rmw: str | None = None
+    clock_offset_ns: int
+    command: tuple[str, ...] = ()
+    processes: dict[int, str] = {}  # pid → the node or command it runs
+    threads: tuple[ThreadInfo, ...] = ()
+    realtime: bool | None = None  # None: unknown
+    notes: tuple[str, ...] = ()
+    lost: dict[str, int] = {}
+    stall_meter: StallMeterInfo | None = None
+    chain: str | None = None  # the chain the application's description names first
+    application: dict[str, Any] | None = None  # the description that ran, when we ran it
+    plan: dict[str, Any] | None = None  # the plan in force, when one was
+
+
+class Recording:
+    """An open recording: ``info`` and the event tables, read from disk when first asked for.
+
+    ``events`` behaves like a dictionary of frames, so every analysis function takes it as it is.
+    """
+
+    def __init__(self, path: Path, info: RecordingInfo) -> None:
+        self.path = path
+        self.info = info
+        self.events: events.EventTables = _TablesOnDisk(path)
+
+    def __repr__(self) -> str:
+        return f"Recording({str(self.path)!r})"
+
+
+class _TablesOnDisk(Mapping[str, pl.DataFrame]):
+    def __init__(self, path: Path) -> None:
+        self._files = {file.stem: file for file in sorted(path.glob("*.parquet"))}
+        self._read: dict[str, pl.DataFrame] = {}
+
+    def __getitem__(self, name: str) -> pl.DataFrame:
+        if name not in self._read:
+            file = self._files[name]
+            try:
+                frame = pl.read_parquet(file, glob=False)
+            except (pl.exceptions.PolarsError, OSError) as error:
+                raise InputError(
+                    f"{file}: not a readable event table ({error}); record the run again"
+                ) from error
+            if "time" not in frame.columns:
+                raise InputError(f"{file}: an event table needs a column `time`, this one has none")
+            self._read[name] = frame.sort("time", maintain_order=True)
+        return self._read[name]
+
+    def __iter__(self) -> Any:
+        return iter(self._files)
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+
+def open_recording(path: str | Path) -> Recording:
+    """Open a recording folder.
+
+    Raises:
+        InputError: no such folder, no or an unreadable `recording.json`, a newer format.
+    """
+    path = Path(path)
+    file = path / INFO_FILE
+    if not file.is_file():
+        what = "a folder without recording.json" if path.is_dir() else "no such folder"
+        raise InputError(
+            f"{path}: {what}; a recording is made with `chainshaper run APP.yaml -o {path}`"
+        )
+    try:
+        info = RecordingInfo.model_validate(json.loads(file.read_text()))
+    except (OSError, ValueError, ValidationError) as error:
+        raise InputError(f"{file}: not a recording's description: {error}") from error
+    if info.format != FORMAT:
+        raise InputError(
+            f"{file}: format {info.format}, this chainshaper reads format {FORMAT}; update it"
+        )
+    return Recording(path, info)
+
+
+def refuse_existing(path: str | Path) -> Path:
+    """The path, once it is sure that nothing of the user's is there to be overwritten.
+
+    Asked before a run begins, so that nobody loses a minute to learn it at the end.
+    """
+    path = Path(path)
+    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+        raise InputError(
+            f"{path} exists already and is not overwritten: name another, or remove it"
+        )
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{path.absolute().parent}: no such folder to write {path.name} into")
+    return path
+
+
+def write_recording(path: str | Path, tables: events.EventTables, info: RecordingInfo) -> Recording:
+    """Write a recording, whole or not at all, and open it.
+
+    Raises:
+        InputError: ``path`` exists already.
+        OperationError: it cannot be written (disk full, no permission); nothing is left behind.
+    """
+    path = refuse_existing(path)
+    partial: Path | None = None
+    try:
+        partial = Path(
+            tempfile.mkdtemp(prefix=f".{path.name}.partial-", dir=path.absolute().parent)
+        )
+        for name, frame in tables.items():
+            file = partial / f"{name}.parquet"
+            with file.open("wb") as stream:
+                frame.write_parquet(stream, compression="zstd")
+                stream.flush()
+                os.fsync(stream.fileno())
+        (partial / INFO_FILE).write_text(info.model_dump_json(indent=2) + "\n")
+        partial.chmod(0o755)
+        partial.rename(path)
+    except (OSError, pl.exceptions.PolarsError) as error:
+        raise OperationError(f"{path}: the recording cannot be written: {error}") from error
+    finally:
+        if partial is not None and partial.exists():
+            shutil.rmtree(partial, ignore_errors=True)
+    return open_recording(path)

@@ -1,0 +1,1 @@
+"""Extending an application by the latency-shaping node, without touching its code."""

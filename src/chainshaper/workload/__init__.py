@@ -1,0 +1,1 @@
+"""One application description, and the ways to run it."""

@@ -1,0 +1,198 @@
+"""DDS as ROS 2 uses it: topic names, quality of service, and messages that begin with a Header.
+
+Messages are handled in serialized form, as a generic ROS 2 subscription does: what a node
+forwards is what it received, byte for byte, and the time spent here is DDS's own.
+
+A domain of the live workload is closed: loopback only, no multicast, and a domain id that no
+other process of this machine uses, so a robot's own topics are never touched.
+"""
+
+import random
+import socket
+from dataclasses import dataclass
+from typing import Any
+
+from chainshaper.errors import OperationError, PlatformError
+
+try:
+    from cyclonedds._clayer import ddspy_take, ddspy_write_ts
+    from cyclonedds.core import (
+        GuardCondition,
+        InstanceState,
+        ReadCondition,
+        SampleState,
+        ViewState,
+        WaitSet,
+    )
+    from cyclonedds.domain import DomainParticipant
+    from cyclonedds.idl import IdlStruct
+    from cyclonedds.idl.types import int32, sequence, uint8, uint32, uint64
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.qos import Policy, Qos
+    from cyclonedds.sub import DataReader
+    from cyclonedds.topic import Topic
+except ImportError as error:  # no wheel for this Python or processor
+    raise PlatformError(
+        f"the live workload needs the `cyclonedds` package, which does not load here ({error}); "
+        "it exists for Python 3.10 to 3.13 on x86-64: use one of these"
+    ) from error
+
+__all__ = [
+    "GuardCondition",
+    "Message",
+    "Publisher",
+    "Subscription",
+    "WaitSet",
+    "closed_domain_configuration",
+    "free_domain",
+    "join_domain",
+    "message_template",
+    "stamp_message",
+]
+
+_ANY = SampleState.Any | ViewState.Any | InstanceState.Any
+
+
+@dataclass
+class Time(IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
+    sec: int32
+    nanosec: uint32
+
+
+@dataclass
+class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
+    stamp: Time
+    frame_id: str
+
+
+@dataclass
+class Stamped(IdlStruct, typename="chainshaper_msgs::msg::dds_::Stamped_"):
+    """What the live workload's topics carry: a header, a number, and as many bytes as asked for."""
+
+    header: Header
+    number: uint64
+    data: sequence[uint8]  # type: ignore[type-arg]
+
+
+@dataclass(frozen=True)
+class Message:
+    """A received message: serialized payload and the publisher's source timestamp."""
+
+    payload: bytes
+    source_timestamp: int  # ns of CLOCK_REALTIME
+
+
+def closed_domain_configuration() -> str:
+    """Cyclone DDS configuration (XML) of a domain that stays on this machine."""
+    return (
+        '<CycloneDDS><Domain Id="any"><General>'
+        '<Interfaces><NetworkInterface address="127.0.0.1" multicast="false"/></Interfaces>'
+        "<AllowMulticast>false</AllowMulticast></General>"
+        "<Discovery><ParticipantIndex>auto</ParticipantIndex>"
+        "<MaxAutoParticipantIndex>119</MaxAutoParticipantIndex>"
+        '<Peers><Peer address="127.0.0.1"/></Peers></Discovery>'
+        "</Domain></CycloneDDS>"
+    )
+
+
+def free_domain() -> int:
+    """A DDS domain id in which no process of this machine takes part.
+
+    Raises:
+        OperationError: all of them are in use.
+    """
+    candidates = list(range(20, 101))  # 0 to 19 are what people choose by hand
+    random.shuffle(candidates)
+    for domain in candidates:
+        try:
+            # The first participant's unicast discovery port (DDSI-RTPS 2.3, 9.6.1.1).
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+                probe.bind(("127.0.0.1", 7400 + 250 * domain + 10))
+            return domain
+        except OSError:
+            continue
+    raise OperationError(
+        "no DDS domain between 20 and 100 is free: end an application that uses one"
+    )
+
+
+def join_domain(domain: int) -> Any:
+    """Take part in a domain; its configuration comes from CYCLONEDDS_URI."""
+    return DomainParticipant(domain)
+
+
+def message_template(payload_bytes: int) -> bytearray:
+    """A serialized message with a zero stamp and number, to be filled by :func:`stamp_message`."""
+    message = Stamped(Header(Time(0, 0), ""), 0, [0] * payload_bytes)  # type: ignore[arg-type]
+    serialized = bytes(message.serialize())
+    return bytearray(serialized + b"\0" * (-len(serialized) % 4))
+
+
+def stamp_message(template: bytearray, stamp_ns: int) -> bytes:
+    """A message with the given header stamp (ns of CLOCK_REALTIME); see ``gate.origin_of``."""
+    order = "little" if template[1] & 1 else "big"
+    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    template[4:8] = seconds.to_bytes(4, order, signed=True)  # type: ignore[arg-type]
+    template[8:12] = nanoseconds.to_bytes(4, order)  # type: ignore[arg-type]
+    return bytes(template)
+
+
+def _qos(reliability: str, depth: int) -> Any:
+    reliable = Policy.Reliability.Reliable(max_blocking_time=100_000_000)
+    return Qos(
+        reliable if reliability == "reliable" else Policy.Reliability.BestEffort,
+        Policy.History.KeepLast(depth),
+        Policy.Durability.Volatile,
+    )
+
+
+def _topic(participant: Any, name: str) -> Any:
+    return Topic(participant, "rt" + name, Stamped)  # ROS 2's prefix of topics
+
+
+class Publisher:
+    """A writer of one topic that takes serialized messages."""
+
+    def __init__(self, participant: Any, topic: str, reliability: str, depth: int) -> None:
+        self._writer = DataWriter(
+            participant, _topic(participant, topic), qos=_qos(reliability, depth)
+        )
+        self._handle = self._writer._ref
+
+    def write(self, payload: bytes, source_timestamp: int) -> None:
+        code = ddspy_write_ts(self._handle, payload, source_timestamp)
+        if code < 0:
+            raise OperationError(f"DDS write failed with code {code}")
+
+    def matched(self) -> int:
+        """Number of subscriptions that have found this publisher."""
+        return len(self._writer.get_matched_subscriptions())
+
+
+class Subscription:
+    """A reader of one topic that gives serialized messages, oldest first."""
+
+    def __init__(self, participant: Any, topic: str, reliability: str, depth: int) -> None:
+        self._reader = DataReader(
+            participant, _topic(participant, topic), qos=_qos(reliability, depth)
+        )
+        self.condition = ReadCondition(self._reader, _ANY)
+        self._handle = self._reader._ref
+
+    def ready(self) -> bool:
+        # Cyclone counts the messages here; its own `triggered` is true for exactly one of them.
+        return int(self.condition._triggered(self.condition._ref)) > 0
+
+    def take(self) -> Message | None:
+        """The next message, None when there is none or it only reports a publisher's state."""
+        taken = ddspy_take(self._handle, _ANY, 1)
+        if isinstance(taken, int):
+            raise OperationError(f"DDS take failed with code {taken}")
+        for payload, info in taken:
+            if info.valid_data:
+                return Message(payload, info.source_timestamp)
+        return None
+
+    def matched(self) -> int:
+        """Number of publishers that have found this subscription."""
+        return len(self._reader.get_matched_publications())

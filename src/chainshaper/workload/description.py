@@ -1,0 +1,264 @@
+"""The description of an application in one YAML file: what runs, how long, where.
+
+The live workload executes it with real processes over DDS; anything that can be said about a
+run before it happens is said here, and nothing about a particular application is said in code.
+
+    name: synthetic chain
+    chain: /t1../t5
+    scheduling:
+      executors: {core: 1, priority: 80}
+      dds: {core: 0, priority: 90}
+    nodes:
+      node1:
+        callbacks:
+          - {timer: 100ms, execution: {uniform: [5ms, 15ms]}, publishes: [/t1]}
+      node2:
+        callbacks:
+          - {subscription: /t1, execution: {uniform: [5ms, 15ms]}, publishes: [/t2]}
+"""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from chainshaper.enforcement.gate import Gate
+from chainshaper.yaml_file import (
+    AS_YAML,
+    Duration,
+    FullName,
+    Part,
+    PositiveDuration,
+    read_model,
+    wrong_value,
+)
+
+__all__ = [
+    "Application",
+    "CallbackDescription",
+    "ExecutionTime",
+    "GateDescription",
+    "NodeDescription",
+    "Scheduling",
+    "TopicDescription",
+    "application_as_written",
+    "load_application",
+]
+
+_NODE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+
+
+class ExecutionTime(Part):
+    """CPU time of one callback instance: exactly one of the distributions.
+
+    ``constant``; ``uniform`` between two durations; ``normal`` with mean and standard deviation,
+    redrawn outside ``within``.
+    """
+
+    constant_ns: Duration | None = None
+    uniform_ns: tuple[Duration, Duration] | None = None
+    normal_ns: tuple[Duration, Duration] | None = None
+    within_ns: tuple[Duration, Duration] | None = None
+
+    @model_validator(mode="after")
+    def _one_distribution(self) -> "ExecutionTime":
+        given = [self.constant_ns, self.uniform_ns, self.normal_ns]
+        if sum(value is not None for value in given) != 1:
+            raise wrong_value("give exactly one of constant, uniform, normal")
+        if (self.normal_ns is None) != (self.within_ns is None):
+            raise wrong_value("`within: [low, high]` goes with `normal`, and normal needs it")
+        for key, pair in (("uniform", self.uniform_ns), ("within", self.within_ns)):
+            if pair is not None and pair[0] > pair[1]:
+                raise wrong_value("the shorter duration comes first: exchange the two", key)
+        if self.normal_ns is not None and self.within_ns is not None:
+            mean, deviation = self.normal_ns
+            if deviation == 0 or not self.within_ns[0] <= mean <= self.within_ns[1]:
+                raise wrong_value(
+                    "the mean must lie within the limits, with a deviation above 0ms", "normal"
+                )
+        return self
+
+
+class GateDescription(Part):
+    """A gate in a callback: the received message is republished inside ``slots`` only."""
+
+    slots: Annotated[tuple[tuple[Duration, Duration], ...], Field(min_length=1)]
+    cycle_ns: PositiveDuration
+    anchor: Literal["stamp", "cycle"] = "stamp"
+    spin_ns: Duration = 0
+    pause_ns: Duration = 0
+
+    @model_validator(mode="after")
+    def _gate_exists(self) -> "GateDescription":
+        try:
+            Gate(slots=self.slots, cycle_ns=self.cycle_ns, anchor=self.anchor)
+        except ValueError as error:
+            raise wrong_value(str(error), "slots") from error
+        return self
+
+
+class CallbackDescription(Part):
+    """One callback: a timer or a subscription, its execution time and the topics it publishes.
+
+    ``timer_ns`` is a timer's period and ``phase_ns`` delays its first expiry after the common
+    start. ``gate`` makes the callback a latency-shaping one: it executes nothing and forwards
+    the message it received.
+    """
+
+    timer_ns: PositiveDuration | None = None
+    phase_ns: Duration = 0
+    subscription: FullName | None = None
+    execution: ExecutionTime = ExecutionTime(constant_ns=0)
+    publishes: tuple[FullName, ...] = ()
+    gate: GateDescription | None = None
+
+    @model_validator(mode="after")
+    def _one_trigger(self) -> "CallbackDescription":
+        if (self.timer_ns is None) == (self.subscription is None):
+            raise wrong_value("give either `timer: PERIOD` or `subscription: TOPIC`")
+        if self.phase_ns and self.timer_ns is None:
+            raise wrong_value(
+                "a phase is a timer's delay after the common start: remove it", "phase"
+            )
+        if self.gate is not None and (self.subscription is None or len(self.publishes) != 1):
+            raise wrong_value("a gate forwards one subscription to exactly one topic", "gate")
+        return self
+
+
+class NodeDescription(Part):
+    """A node in a process of its own.
+
+    ``core`` and ``priority`` override ``scheduling.executors``, ``dds_priority`` overrides that
+    of ``scheduling.dds`` for the DDS threads of this node.
+    """
+
+    callbacks: tuple[CallbackDescription, ...] = Field(min_length=1)
+    core: int | None = Field(default=None, ge=0)
+    priority: int | None = Field(default=None, ge=1, le=97)
+    dds_priority: int | None = Field(default=None, ge=1, le=97)
+
+
+class TopicDescription(Part):
+    """How a topic is published, and its quality of service (keep-last ``depth``)."""
+
+    publication: Literal["synchronous", "asynchronous"] = "synchronous"
+    reliability: Literal["reliable", "best_effort"] = "reliable"
+    depth: int = Field(default=10, ge=1)
+    payload: int = Field(default=1024, ge=0, le=16_000_000)  # bytes behind the header
+
+
+class Scheduling(Part):
+    """Core and SCHED_FIFO priority of a class of threads (98 and 99 stay free for measuring)."""
+
+    core: Annotated[int, Field(ge=0)]
+    priority: Annotated[int, Field(ge=1, le=97)]
+
+
+class SchedulingOfApplication(Part):
+    executors: Scheduling
+    dds: Scheduling
+
+
+class Application(Part):
+    """A whole application. ``chain`` is the chain of interest, as ``FIRST..LAST``."""
+
+    name: str
+    chain: str
+    seed: int = Field(default=1, ge=0)
+    scheduling: SchedulingOfApplication
+    topics: dict[FullName, TopicDescription] = Field(default_factory=dict)
+    nodes: dict[str, NodeDescription] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Application":
+        publishers: dict[str, list[str]] = {}
+        for node, callback in self.callbacks():
+            for topic in callback.publishes:
+                publishers.setdefault(topic, []).append(node)
+        for name, described in self.nodes.items():
+            if not _NODE.fullmatch(name):
+                raise wrong_value("a node's name has letters, digits, _ and / only", "nodes", name)
+            for number, callback in enumerate(described.callbacks):
+                if callback.subscription is not None and callback.subscription not in publishers:
+                    raise wrong_value(
+                        f"no node publishes {callback.subscription}; published are "
+                        f"{', '.join(sorted(publishers)) or 'no topics'}",
+                        *("nodes", name, "callbacks", number, "subscription"),
+                    )
+        for topic in self.topics:
+            if topic not in publishers:
+                raise wrong_value("is published by no node: remove it", "topics", topic)
+        self._refuse_endless_cycles()
+        return self
+
+    def _refuse_endless_cycles(self) -> None:
+        """No message may circle for ever."""
+        fed: dict[str, set[str]] = {}
+        for _, callback in self.callbacks():
+            if callback.subscription is not None:
+                fed.setdefault(callback.subscription, set()).update(callback.publishes)
+        for start, nexts in fed.items():
+            path, seen = [(start, iter(sorted(nexts)))], {start}
+            while path:
+                following = next(path[-1][1], None)
+                if following is None:
+                    path.pop()
+                elif following == start:
+                    circle = " → ".join([*(topic for topic, _ in path), start])
+                    raise wrong_value(
+                        f"the topics form a cycle, in which messages would circle for ever: "
+                        f"{circle}; break it at one of these topics",
+                        "nodes",
+                    )
+                elif following not in seen:
+                    seen.add(following)
+                    path.append((following, iter(sorted(fed.get(following, ())))))
+
+    def callbacks(self) -> Iterator[tuple[str, CallbackDescription]]:
+        """Every callback with the name of its node, in the order of the file."""
+        for name, node in self.nodes.items():
+            for callback in node.callbacks:
+                yield name, callback
+
+    def topic(self, name: str) -> TopicDescription:
+        """A topic's description, the default one where the file says nothing about it."""
+        return self.topics.get(name, TopicDescription())
+
+    def scheduling_of(self, node: str) -> Scheduling:
+        """Core and priority of a node's executor."""
+        own = self.nodes[node]
+        executors = self.scheduling.executors
+        return Scheduling(
+            core=executors.core if own.core is None else own.core,
+            priority=executors.priority if own.priority is None else own.priority,
+        )
+
+    def dds_scheduling_of(self, node: str) -> Scheduling:
+        """Core and priority of a node's DDS threads."""
+        own, dds = self.nodes[node].dds_priority, self.scheduling.dds
+        return dds if own is None else Scheduling(core=dds.core, priority=own)
+
+    def cores(self) -> dict[int, str]:
+        """Every core the application uses, with who asks for it."""
+        used = {self.scheduling.dds.core: "scheduling.dds"}
+        for node in self.nodes:
+            used[self.scheduling_of(node).core] = f"node {node}"
+        return used
+
+
+def load_application(path: str | Path) -> Application:
+    """Read an application's YAML file.
+
+    Raises:
+        InputError: with file, line, key, reason and remedy of each wrong value.
+    """
+    return read_model(path, Application, made_by="like examples/synthetic_chain.yaml")
+
+
+def application_as_written(application: Application) -> dict[str, Any]:
+    """The application as its YAML file would have it, durations with units, defaults left out."""
+    return application.model_dump(
+        mode="json", by_alias=True, exclude_defaults=True, context=AS_YAML
+    )

@@ -1,0 +1,84 @@
+"""From the event logs of the live workload's processes to the event tables."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from chainshaper import events
+from chainshaper.workload.event_log import LAYOUT, WIDTH
+
+__all__ = ["ProcessLog", "event_tables", "stall_table"]
+
+
+@dataclass(frozen=True)
+class ProcessLog:
+    """What one process recorded: rows of :mod:`~chainshaper.workload.event_log`, and objects."""
+
+    pid: int
+    core: int | None  # the one its executor was pinned to
+    rows: bytes
+    objects: tuple[dict[str, Any], ...]
+
+
+def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataFrame]:
+    """The event tables of all processes, sorted by time.
+
+    Events before ``from_ns`` (the warm-up) are left out, objects are not: they exist throughout.
+    """
+    parts: dict[str, list[pl.DataFrame]] = {}
+    for log in logs:
+        rows = np.frombuffer(log.rows, dtype=np.int64).reshape(-1, WIDTH)
+        rows = rows[rows[:, 1] >= from_ns]
+        for number, (name, fields) in enumerate(LAYOUT):
+            mine = rows[rows[:, 0] == number]
+            if len(mine):
+                columns = {"time": mine[:, 1]}
+                columns |= {field: mine[:, 2 + i] for i, field in enumerate(fields)}
+                parts.setdefault(name, []).append(_typed(name, pl.DataFrame(columns), log))
+        for created in log.objects:
+            name = created["event"]
+            fields_of = {key: [value] for key, value in created.items() if key != "event"}
+            parts.setdefault(name, []).append(_typed(name, pl.DataFrame(fields_of), log))
+    return {
+        name: pl.concat(frames).sort("time", maintain_order=True)
+        for name, frames in sorted(parts.items())
+    }
+
+
+def _typed(name: str, frame: pl.DataFrame, log: ProcessLog) -> pl.DataFrame:
+    if name == "gate_release":
+        anchor = pl.when(pl.col("anchor") == 0).then(pl.lit("stamp")).otherwise(pl.lit("cycle"))
+        frame = frame.with_columns(anchor.alias("anchor"))
+    types = {**events.FIELDS[name], **events.OPTIONAL_FIELDS.get(name, {})}
+    return frame.select(
+        pl.col("time").cast(pl.Int64),
+        pl.lit(log.pid, dtype=pl.Int32).alias("pid"),
+        pl.lit(log.pid, dtype=pl.Int32).alias("tid"),  # executors run on the main thread
+        pl.lit(log.core, dtype=pl.Int32).alias("cpu"),
+        *(pl.col(field).cast(type_) for field, type_ in types.items() if field in frame.columns),
+    )
+
+
+def stall_table(
+    stalls: Sequence[tuple[int, int, bytes]], seen_by_gates: pl.DataFrame | None = None
+) -> pl.DataFrame:
+    """The `machine_stall` table from (pid, core, pairs of due time and lateness) per sleeper.
+
+    What a gate noticed while it watched the clock is added to it.
+    """
+    frames = [events.empty("machine_stall") if seen_by_gates is None else seen_by_gates]
+    for pid, core, rows in stalls:
+        pairs = np.frombuffer(rows, dtype=np.int64).reshape(-1, 2)
+        frames.append(
+            pl.DataFrame({"time": pairs[:, 0], "duration": pairs[:, 1]}).select(
+                "time",
+                pl.lit(pid, dtype=pl.Int32).alias("pid"),
+                pl.lit(pid, dtype=pl.Int32).alias("tid"),
+                pl.lit(core, dtype=pl.Int32).alias("cpu"),
+                "duration",
+            )
+        )
+    return pl.concat(frames).sort("time", maintain_order=True)

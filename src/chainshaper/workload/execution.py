@@ -1,0 +1,65 @@
+"""Execution times: drawn from a distribution, and spent as CPU time."""
+
+import time
+import zlib
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+__all__ = ["ExecutionTimes", "draw", "spend"]
+
+BLOCK = 1024
+
+
+def draw(
+    execution: dict[str, Any], count: int, random: np.random.Generator
+) -> npt.NDArray[np.int64]:
+    """``count`` execution times in ns from a described distribution (durations in ns).
+
+    ``execution`` is :class:`~chainshaper.workload.description.ExecutionTime` as a dictionary.
+    """
+    if (constant := execution.get("constant_ns")) is not None:
+        return np.full(count, constant, dtype=np.int64)
+    if (uniform := execution.get("uniform_ns")) is not None:
+        return random.integers(uniform[0], uniform[1], count, dtype=np.int64, endpoint=True)
+    mean, deviation = execution["normal_ns"]
+    low, high = execution["within_ns"]
+    drawn = random.normal(mean, deviation, count)
+    while (outside := (drawn < low) | (drawn > high)).any():
+        drawn[outside] = random.normal(mean, deviation, int(outside.sum()))
+    return drawn.astype(np.int64)
+
+
+class ExecutionTimes:
+    """The endless sequence of execution times of one callback, in ns.
+
+    Seed, node and the callback's index in its node determine the sequence, so two runs of an
+    application, or a run and its simulation, spend the same time in the same instance. Values
+    are drawn in blocks: drawing must not cost time in the callback that spends them.
+    """
+
+    def __init__(self, execution: dict[str, Any], seed: int, node: str, index: int) -> None:
+        self._execution = execution
+        self._random = np.random.default_rng([seed, zlib.crc32(node.encode()), index])
+        self._values: list[int] = []
+
+    def refill(self, count: int = BLOCK) -> None:
+        """Have at least ``count`` values ready, so that the next ones cost nothing."""
+        if len(self._values) < count:
+            drawn = draw(self._execution, BLOCK * -(-count // BLOCK), self._random)
+            self._values = [*reversed(drawn.tolist()), *self._values]
+
+    def next(self) -> int:
+        """The execution time of the next instance."""
+        if not self._values:
+            self.refill()
+        return self._values.pop()
+
+
+def spend(cpu_ns: int) -> None:
+    """Compute until this thread has used ``cpu_ns`` more CPU time: pre-emption does not count."""
+    clock = time.thread_time_ns
+    until = clock() + cpu_ns
+    while clock() < until:
+        pass

@@ -1,0 +1,119 @@
+"""Starting processes of the live workload, watching them, and leaving none behind."""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import IO, Any
+
+from chainshaper.errors import OperationError
+
+__all__ = ["Child", "end_all", "first_casualty", "start_child"]
+
+
+@dataclass(frozen=True)
+class Child:
+    """A process of ours: what it is for people, and its pipes and error output."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    errors: IO[bytes]
+
+    @property
+    def pid(self) -> int:
+        return self.process.pid
+
+    def tell(self, **fields: Any) -> None:
+        """Send a line; a process that is gone is noticed by :meth:`hear` or the watch."""
+        assert self.process.stdin is not None  # noqa: S101 - start_child opens it
+        with contextlib.suppress(BrokenPipeError):
+            self.process.stdin.write(json.dumps(fields).encode() + b"\n")
+            self.process.stdin.flush()
+
+    def hear(self) -> dict[str, Any]:
+        """Its next line.
+
+        Raises:
+            OperationError: it died instead.
+        """
+        assert self.process.stdout is not None  # noqa: S101 - start_child opens it
+        line = self.process.stdout.readline()
+        try:
+            heard: dict[str, Any] = json.loads(line)
+        except ValueError:
+            raise OperationError(self.obituary()) from None
+        return heard
+
+    def hear_bytes(self, size: int) -> bytes:
+        """The bytes that follow a line."""
+        assert self.process.stdout is not None  # noqa: S101 - start_child opens it
+        data = self.process.stdout.read(size)
+        if len(data) != size:
+            raise OperationError(self.obituary())
+        return data
+
+    def obituary(self) -> str:
+        """One sentence about how it died, with the last thing it said."""
+        try:
+            code = self.process.wait(timeout=2)
+        except subprocess.TimeoutExpired:
+            return f"{self.name} (pid {self.pid}) sends something that is not part of the protocol"
+        how = (
+            f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
+        )
+        self.errors.seek(0)
+        said = self.errors.read().decode(errors="replace").strip().splitlines()
+        last = f": {said[-1]}" if said else ""
+        return f"{self.name} (pid {self.pid}) {how} before the run was over{last}"
+
+
+def start_child(name: str, module: str, environment: dict[str, str]) -> Child:
+    """Start ``python -m module`` in a session of its own, with pipes to talk to it.
+
+    A session of its own keeps Ctrl-C for us: we end children in order, they do not die at random.
+    """
+    errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the child
+    try:
+        process = subprocess.Popen(
+            [sys.executable, "-P", "-m", module]
+            if sys.version_info >= (3, 11)
+            else [sys.executable, "-m", module],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            env={**os.environ, **environment},
+            start_new_session=True,
+        )
+    except OSError as error:
+        errors.close()
+        raise OperationError(f"{name} cannot be started: {error}") from error
+    return Child(name, process, errors)
+
+
+def first_casualty(children: Iterable[Child]) -> Child | None:
+    """A child that has ended although it should be running, if there is one."""
+    return next((child for child in children if child.process.poll() is not None), None)
+
+
+def end_all(children: Iterable[Child], patience_s: float = 2.0) -> None:
+    """End every child: ask, wait, kill; afterwards none is left, whatever happened before."""
+    children = list(children)
+    for child in children:
+        child.tell()
+    deadline = time.monotonic() + patience_s
+    for child in children:
+        try:
+            child.process.wait(timeout=max(0.0, deadline - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            child.process.kill()
+            child.process.wait()
+        for stream in (child.process.stdin, child.process.stdout, child.errors):
+            if stream is not None:
+                with contextlib.suppress(OSError):  # unsent bytes of a broken pipe
+                    stream.close()

@@ -1,0 +1,364 @@
+"""Run a described application live: real processes, real DDS topics, real scheduling.
+
+Threads are allocated as in the paper (section 2.5): executors SCHED_FIFO on their cores, DDS
+threads SCHED_FIFO on another, interference low. All of it concerns processes that we started and
+that end with the run, so nothing on the machine is different afterwards.
+"""
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from chainshaper.durations import format_duration
+from chainshaper.enforcement.gate import clock_offset
+from chainshaper.enforcement.realtime import check_cores, may_use_fifo
+from chainshaper.enforcement.threads import (
+    Scheduling,
+    Thread,
+    apply_scheduling,
+    foreign_realtime_processes,
+    list_threads,
+)
+from chainshaper.errors import InputError, OperationError
+from chainshaper.recording import (
+    Recording,
+    RecordingInfo,
+    StallMeterInfo,
+    ThreadInfo,
+    refuse_existing,
+    write_recording,
+)
+from chainshaper.workload import stall_meter
+from chainshaper.workload.description import (
+    Application,
+    CallbackDescription,
+    application_as_written,
+)
+from chainshaper.workload.event_reading import ProcessLog, event_tables, stall_table
+from chainshaper.workload.launcher import Child, end_all, first_casualty, start_child
+
+__all__ = ["Progress", "origin_timer", "run_application"]
+
+Progress = Callable[[float, str], None]
+"""Called with the share done (0 to 1) and what is being done."""
+
+WARM_UP_CYCLES = 5
+DISCOVERY_NS = 20_000_000_000
+METER_BEHIND_NS = 150_000
+NODE_MODULE = "chainshaper.workload.node_process"
+STALL_METER_MODULE = "chainshaper.workload.stall_meter"
+
+
+def run_application(
+    application: Application,
+    output: str | Path,
+    *,
+    cycles: int = 320,
+    realtime: bool | None = None,
+    plan: dict[str, Any] | None = None,
+    command: Sequence[str] = (),
+    progress: Progress | None = None,
+) -> Recording:
+    """Run an application for ``cycles`` periods of its chain and record it.
+
+    ``realtime`` None takes SCHED_FIFO where it is permitted and notes where it is not; False
+    does without. ``plan`` is stored with the recording. A few cycles before the recorded ones
+    warm the caches and are left out.
+
+    Raises:
+        InputError: ``output`` exists, or the chain has no timer to count cycles by.
+        PlatformError: a core is missing, DDS does not load.
+        OperationError: a node died, discovery failed, the recording cannot be written. In every
+            case all processes are gone and no recording is left.
+    """
+    output = refuse_existing(output)
+    if cycles < 1:
+        raise InputError(f"{cycles} cycles cannot be recorded: ask for at least 1")
+    check_cores(application.cores())
+    timer = origin_timer(application)
+    if realtime is None:
+        realtime = may_use_fifo()
+    if progress is None:
+        progress = _no_progress
+    nodes: dict[str, Child] = {}
+    meters: dict[int, Child] = {}
+    finished = False
+    try:
+        progress(0.0, "starting nodes")
+        _start(application, timer, nodes, meters)
+        memory_locked = _await_ready([*nodes.values(), *meters.values()])
+        _allocate_threads(application, nodes, meters, realtime)
+        timing = _Timing.of(application, timer, cycles)
+        offset_before = clock_offset()
+        for child in [*nodes.values(), *meters.values()]:
+            child.tell(**timing.for_processes())
+        threads = _watch(nodes, meters, timing, progress)
+        progress(1.0, "collecting events")
+        logs = [_read_log(name, child, application) for name, child in nodes.items()]
+        stalls, meter_info = _read_stalls(meters, realtime)
+        finished = True
+    finally:
+        end_all([*nodes.values(), *meters.values()], patience_s=3.0 if finished else 0.0)
+    tables = event_tables(logs, timing.record_from_ns)
+    tables["machine_stall"] = stall_table(stalls, tables.get("machine_stall"))
+    notes = _notes(realtime, memory_locked, clock_offset() - offset_before)
+    info = RecordingInfo(
+        source="live",
+        rmw="cyclonedds",
+        clock_offset_ns=offset_before,
+        command=tuple(command),
+        processes={child.pid: node_name(name) for name, child in nodes.items()},
+        threads=threads,
+        realtime=realtime,
+        notes=notes,
+        stall_meter=meter_info,
+        chain=application.chain,
+        application=application_as_written(application),
+        plan=plan,
+    )
+    return write_recording(output, tables, info)
+
+
+def _no_progress(share: float, what: str) -> None:
+    pass
+
+
+def node_name(name: str) -> str:
+    """A node's full name: with a leading slash."""
+    return "/" + name.strip("/")
+
+
+def origin_timer(application: Application) -> CallbackDescription:
+    """The timer callback that starts the application's chain.
+
+    Raises:
+        InputError: the chain's first topic or node has no timer.
+    """
+    first = application.chain.split("..")[0].strip()
+    for name, callback in application.callbacks():
+        starts_here = first in callback.publishes or first.strip("/") == name.strip("/")
+        if starts_here and callback.timer_ns is not None:
+            return callback
+    timers = [f"node {name}" for name, cb in application.callbacks() if cb.timer_ns is not None]
+    raise InputError(
+        f"chain {application.chain}: no timer callback publishes or belongs to {first!r}, so there "
+        f"is nothing to count cycles by; timers are in {', '.join(timers) or 'no node'}"
+    )
+
+
+@dataclass(frozen=True)
+class _Timing:
+    """The instants of a run (ns of CLOCK_MONOTONIC)."""
+
+    start_ns: int
+    record_from_ns: int
+    last_timer_ns: int
+    stop_ns: int
+    meter_from_ns: int
+
+    @classmethod
+    def of(cls, application: Application, timer: CallbackDescription, cycles: int) -> "_Timing":
+        period = timer.timer_ns or 0
+        start = time.monotonic_ns() + 300_000_000
+        first = start + timer.phase_ns + WARM_UP_CYCLES * period
+        end = first + cycles * period
+        gates = [cb.gate for _, cb in application.callbacks() if cb.gate is not None]
+        release = gates[0].slots[-1][0] if gates else 0
+        grid = release % stall_meter.PERIOD_NS + METER_BEHIND_NS
+        return cls(
+            start_ns=start,
+            # Just before the first recorded expiry: instances are not cut in two.
+            record_from_ns=first - min(1_000_000, period // 10),
+            last_timer_ns=end - min(1_000_000, period // 10),
+            stop_ns=end + max(2 * period, 200_000_000),  # what has begun is completed
+            # The stall meter's grid has a point shortly behind each planned release: a stall
+            # that delays a release is then seen for certain, and no wake-up comes in between.
+            meter_from_ns=start
+            + timer.phase_ns
+            + release % stall_meter.PERIOD_NS
+            + METER_BEHIND_NS,
+        )
+
+    def for_processes(self) -> dict[str, int]:
+        return {
+            "start_ns": self.start_ns,
+            "last_timer_ns": self.last_timer_ns,
+            "stop_ns": self.stop_ns,
+            "meter_from_ns": self.meter_from_ns,
+        }
+
+
+def _start(
+    application: Application,
+    timer: CallbackDescription,
+    nodes: dict[str, Child],
+    meters: dict[int, Child],
+) -> None:
+    """Start a process per node and a stall meter per core, into the given dictionaries."""
+    from chainshaper.workload.dds import closed_domain_configuration, free_domain
+
+    domain = free_domain()
+    environment = {"CYCLONEDDS_URI": closed_domain_configuration()}
+    for name in application.nodes:
+        nodes[name] = start_child(f"node {name}", NODE_MODULE, environment)
+        nodes[name].tell(**_spec(application, name, timer, domain))
+    for core in sorted(application.cores()):
+        meters[core] = start_child(f"stall meter of core {core}", STALL_METER_MODULE, {})
+        meters[core].tell(parent=os.getpid())
+
+
+def _spec(
+    application: Application, name: str, timer: CallbackDescription, domain: int
+) -> dict[str, Any]:
+    """A node's description as its process gets it: durations are ns here."""
+    writers: dict[str, int] = {}
+    readers: dict[str, int] = {}
+    for _, callback in application.callbacks():
+        for topic in callback.publishes:
+            writers[topic] = writers.get(topic, 0) + 1
+        if callback.subscription is not None:
+            topic = callback.subscription
+            readers[topic] = readers.get(topic, 0) + 1
+    return {
+        "node": node_name(name),
+        "domain": domain,
+        "seed": application.seed,
+        "parent": os.getpid(),
+        "discovery_ns": DISCOVERY_NS,
+        "origin_phase": timer.phase_ns,
+        "callbacks": [cb.model_dump() for cb in application.nodes[name].callbacks],
+        "topics": {topic: application.topic(topic).model_dump() for topic in writers},
+        "expected": {topic: (writers[topic], readers.get(topic, 0)) for topic in writers},
+    }
+
+
+def _await_ready(children: Sequence[Child]) -> bool:
+    """Wait until all have found each other; whether all of them could lock their memory."""
+    answers = [(child, child.hear()) for child in children]
+    missing = [f"{child.name}: {text}" for child, answer in answers for text in answer["missing"]]
+    if missing:
+        raise OperationError(
+            f"DDS discovery was not complete after {format_duration(DISCOVERY_NS)} "
+            f"({'; '.join(missing)}); is UDP on 127.0.0.1 permitted here?"
+        )
+    return all(answer["memory_locked"] for _, answer in answers)
+
+
+def _allocate_threads(
+    application: Application, nodes: dict[str, Child], meters: dict[int, Child], realtime: bool
+) -> None:
+    """Give every thread its core and, where permitted, its SCHED_FIFO priority."""
+    for name, child in nodes.items():
+        executor, dds = application.scheduling_of(name), application.dds_scheduling_of(name)
+        for thread in list_threads(child.pid):
+            if thread.role == "executor":
+                wanted = (executor.core, executor.priority)
+            elif thread.role == "publisher":
+                # Below the executor: it shares the writer's lock with it, and may spin on it.
+                wanted = (executor.core, max(1, executor.priority - 1))
+            else:
+                wanted = (dds.core, dds.priority)
+            apply_scheduling(
+                thread, Scheduling(wanted[1] if realtime else None, cores=(wanted[0],))
+            )
+    for core, child in meters.items():
+        for thread in list_threads(child.pid):
+            priority = stall_meter.PRIORITY if realtime else None
+            apply_scheduling(thread, Scheduling(priority, cores=(core,)))
+
+
+def _watch(
+    nodes: dict[str, Child],
+    meters: dict[int, Child],
+    timing: _Timing,
+    progress: Progress,
+) -> tuple[ThreadInfo, ...]:
+    """Wait for the end of the run; the threads as they were while it lasted.
+
+    Raises:
+        OperationError: a process ended before its time.
+    """
+    children = [*nodes.values(), *meters.values()]
+    threads: tuple[ThreadInfo, ...] = ()
+    while (now := time.monotonic_ns()) < timing.stop_ns:
+        if (casualty := first_casualty(children)) is not None:
+            raise OperationError(f"{casualty.obituary()}; the run was ended and nothing recorded")
+        if now >= timing.record_from_ns and not threads:
+            threads = _snapshot(nodes, meters)
+        share = (now - timing.start_ns) / (timing.stop_ns - timing.start_ns)
+        progress(max(0.0, share), "recording")
+        time.sleep(0.1)
+    return threads or _snapshot(nodes, meters)
+
+
+def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[ThreadInfo, ...]:
+    def info(thread: Thread, node: str, role: str) -> ThreadInfo:
+        return ThreadInfo(
+            tid=thread.tid,
+            pid=thread.pid,
+            comm=thread.comm,
+            node=node,
+            role=role,
+            policy=thread.policy,
+            priority=thread.priority,
+            cores=thread.cores,
+        )
+
+    return tuple(
+        [
+            info(thread, node_name(name), thread.role)
+            for name, child in nodes.items()
+            for thread in list_threads(child.pid)
+        ]
+        + [
+            info(thread, "", "stall-meter")
+            for child in meters.values()
+            for thread in list_threads(child.pid)
+        ]
+    )
+
+
+def _read_log(name: str, child: Child, application: Application) -> ProcessLog:
+    answer = child.hear()
+    rows = child.hear_bytes(answer["bytes"])
+    core = application.scheduling_of(name).core
+    return ProcessLog(child.pid, core, rows, tuple(answer["objects"]))
+
+
+def _read_stalls(
+    meters: dict[int, Child], realtime: bool
+) -> tuple[list[tuple[int, int, bytes]], StallMeterInfo]:
+    stalls, wakeups, lateness = [], 0, []
+    for core, child in meters.items():
+        answer = child.hear()
+        stalls.append((child.pid, core, child.hear_bytes(answer["bytes"])))
+        wakeups += answer["wakeups"]
+        lateness.append(answer["median_lateness_ns"])
+    info = StallMeterInfo(
+        cores=tuple(meters),
+        period_ns=stall_meter.PERIOD_NS,
+        threshold_ns=stall_meter.THRESHOLD_NS,
+        wakeups=wakeups,
+        median_lateness_ns=tuple(lateness),
+        realtime=realtime,
+    )
+    return stalls, info
+
+
+def _notes(realtime: bool, memory_locked: bool, clock_moved_ns: int) -> tuple[str, ...]:
+    notes = [f"the first {WARM_UP_CYCLES} cycles warmed up and were not recorded"]
+    if not realtime:
+        notes.append("taken without real-time scheduling: the process may not use SCHED_FIFO")
+    if not memory_locked:
+        notes.append("memory was not locked: page faults may have cost time")
+    if abs(clock_moved_ns) > 1_000_000:
+        notes.append(
+            f"the wall clock moved by {format_duration(clock_moved_ns)} against CLOCK_MONOTONIC"
+        )
+    others = foreign_realtime_processes()
+    if others:
+        notes.append(f"other real-time processes were running: {', '.join(others)}")
+    return tuple(notes)

@@ -1,0 +1,318 @@
+"""One node of the live workload, in a process of its own: ``python -m …node_process``.
+
+Started by :mod:`chainshaper.workload.live`, with which it talks as
+:mod:`chainshaper.workload.protocol` says. This module imports little on purpose: every page of
+it is locked into memory.
+"""
+
+import os
+import queue
+import resource
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from chainshaper.enforcement.gate import Gate, Shaper, origin_of, sleep_until
+from chainshaper.enforcement.realtime import (
+    die_with_parent,
+    lock_memory,
+    set_thread_name,
+    stop_garbage_collection,
+)
+from chainshaper.workload import dds, protocol
+from chainshaper.workload.event_log import EventLog
+from chainshaper.workload.execution import ExecutionTimes, spend
+from chainshaper.workload.executor import Executor, SubscriptionEntity, Timer
+
+__all__ = ["NodeProcess", "main"]
+
+ASYNCHRONOUS_PUBLISHER = "dds.asyn.0"  # the name that Fast DDS gives to its own
+STALL_NS = 100_000
+"""As the stall meter's threshold."""
+
+
+class Handles:
+    """Addresses for objects: like real ones, unique in this process and reused by the others."""
+
+    def __init__(self) -> None:
+        self._last = 0x55D0_0000_0000
+
+    def __call__(self) -> int:
+        self._last += 0x100
+        return self._last
+
+
+class NodeProcess:
+    """A node built from its description, ready to run."""
+
+    def __init__(self, spec: dict[str, Any]) -> None:
+        self.spec = spec
+        self.log = EventLog()
+        self.new_handle = Handles()
+        self.participant = dds.join_domain(spec["domain"])
+        self.executor = Executor(self.participant, self.log)
+        self.publishers: dict[str, dds.Publisher] = {}
+        self.shapers: list[Shaper] = []
+        self.first_due: list[tuple[Timer, int]] = []
+        self.execution_times: list[ExecutionTimes] = []
+        self._point = {
+            name: self.log.point(name)
+            for name in (
+                "callback_start",
+                "callback_end",
+                "rclcpp_publish",
+                "rcl_publish",
+                "rmw_publish",
+                "gate_release",
+                "machine_stall",
+            )
+        }
+        self.node_handle = self.new_handle()
+        self.log.init("rcl_init", context_handle=self.new_handle(), version="live workload")
+        namespace, _, name = spec["node"].rpartition("/")
+        self.log.init(
+            "rcl_node_init",
+            node_handle=self.node_handle,
+            rmw_handle=self.new_handle(),
+            node_name=name,
+            namespace="/" + namespace.strip("/"),
+        )
+        for index, callback in enumerate(spec["callbacks"]):
+            self._add_callback(index, callback)
+
+    # Building -----------------------------------------------------------------------------
+
+    def _add_callback(self, index: int, callback: dict[str, Any]) -> None:
+        handle = self.new_handle()
+        publish = [self._publisher(topic) for topic in callback["publishes"]]
+        if callback["gate"] is not None:
+            body = self._shaping_body(handle, callback["gate"], publish[0])
+        else:
+            times = ExecutionTimes(
+                callback["execution"], self.spec["seed"], self.spec["node"], index
+            )
+            self.execution_times.append(times)
+            body = self._computing_body(handle, times, publish)
+        if callback["timer_ns"] is not None:
+            self._add_timer(handle, callback, body)
+        else:
+            self._add_subscription(handle, callback["subscription"], body)
+        symbol = f"{self.spec['node']}::callback{index}"
+        self.log.init("rclcpp_callback_register", callback=handle, symbol=symbol)
+
+    def _add_timer(
+        self, handle: int, callback: dict[str, Any], body: Callable[[dds.Message | None], None]
+    ) -> None:
+        timer = Timer(self.new_handle(), callback["timer_ns"], lambda: body(None))
+        self.executor.timers.append(timer)
+        self.first_due.append((timer, callback["phase_ns"]))
+        self.log.init("rcl_timer_init", timer_handle=timer.handle, period=timer.period_ns)
+        self.log.init("rclcpp_timer_callback_added", timer_handle=timer.handle, callback=handle)
+        self.log.init(
+            "rclcpp_timer_link_node", timer_handle=timer.handle, node_handle=self.node_handle
+        )
+
+    def _add_subscription(
+        self, handle: int, topic: str, body: Callable[[dds.Message | None], None]
+    ) -> None:
+        qos = self.spec["topics"][topic]
+        entity = SubscriptionEntity(
+            handle=self.new_handle(),
+            rmw_handle=self.new_handle(),
+            subscription=dds.Subscription(
+                self.participant, topic, qos["reliability"], qos["depth"]
+            ),
+            callback=body,
+        )
+        rclcpp_handle = self.new_handle()
+        self.executor.add_subscription(entity)
+        self.log.init(
+            "rcl_subscription_init",
+            subscription_handle=entity.handle,
+            node_handle=self.node_handle,
+            rmw_subscription_handle=entity.rmw_handle,
+            topic_name=topic,
+            queue_depth=qos["depth"],
+        )
+        self.log.init(
+            "rclcpp_subscription_init",
+            subscription_handle=entity.handle,
+            subscription=rclcpp_handle,
+        )
+        self.log.init(
+            "rclcpp_subscription_callback_added", subscription=rclcpp_handle, callback=handle
+        )
+
+    def _publisher(self, topic: str) -> Callable[..., int]:
+        """A function that publishes on a topic and returns when it did (ns).
+
+        It takes the payload to forward, or None for a message of its own, the header stamp of
+        the latter, and how long to pause after writing, before anything else is done.
+        """
+        qos = self.spec["topics"][topic]
+        publisher = dds.Publisher(self.participant, topic, qos["reliability"], qos["depth"])
+        self.publishers[topic] = publisher
+        handle, rmw_handle = self.new_handle(), self.new_handle()
+        self.log.init(
+            "rcl_publisher_init",
+            publisher_handle=handle,
+            node_handle=self.node_handle,
+            rmw_publisher_handle=rmw_handle,
+            topic_name=topic,
+            queue_depth=qos["depth"],
+        )
+        write = publisher.write
+        if qos["publication"] == "asynchronous":
+            write = _hand_over_to_publisher_thread(publisher.write)
+        template = dds.message_template(qos["payload"])
+        rclcpp, rcl, rmw = (
+            self._point[name] for name in ("rclcpp_publish", "rcl_publish", "rmw_publish")
+        )
+
+        def publish(forwarded: bytes | None, stamp_ns: int, pause_ns: int = 0) -> int:
+            payload = dds.stamp_message(template, stamp_ns) if forwarded is None else forwarded
+            # As rmw_cyclonedds does: one time stamp, given to the trace point and to DDS.
+            source_timestamp, now = time.time_ns(), time.monotonic_ns()
+            write(payload, source_timestamp)
+            if pause_ns:
+                sleep_until(now + pause_ns)
+            address = id(payload)
+            rclcpp(now, address)
+            rcl(now, handle, address)
+            rmw(now, rmw_handle, address, source_timestamp)
+            return now
+
+        return publish
+
+    def _computing_body(
+        self, handle: int, times: ExecutionTimes, publish: list[Callable[..., int]]
+    ) -> Callable[[dds.Message | None], None]:
+        """An ordinary callback: compute, then publish; the origin's stamp is passed on."""
+        start, end = self._point["callback_start"], self._point["callback_end"]
+
+        def body(message: dds.Message | None) -> None:
+            now, wall = time.monotonic_ns(), time.time_ns()
+            start(now, handle, time.thread_time_ns(), 0)
+            stamp = wall if message is None else origin_of(message.payload) or 0
+            spend(times.next())
+            for publish_on in publish:
+                publish_on(None, stamp)
+            end(time.monotonic_ns(), handle, time.thread_time_ns())
+
+        return body
+
+    def _shaping_body(
+        self, handle: int, gate: dict[str, Any], publish: Callable[..., int]
+    ) -> Callable[[dds.Message | None], None]:
+        """The latency-shaping callback (paper, section 3.2.2): hold, then republish unchanged.
+
+        Between waking and writing nothing is computed, and after writing the thread pauses, so
+        that threads it outranks can deliver; only then are its events recorded. When time jumped
+        although no other thread ran on the core in between, the machine stood still, and that is
+        recorded like the stall meter's own findings.
+        """
+        start, end = self._point["callback_start"], self._point["callback_end"]
+        released, stalled = self._point["gate_release"], self._point["machine_stall"]
+        slots = tuple((begin, finish) for begin, finish in gate["slots"])
+        shaper = Shaper(Gate(slots, gate["cycle_ns"], gate["anchor"]), gate["spin_ns"])
+        self.shapers.append(shaper)
+        pause_ns = gate["pause_ns"]
+
+        def body(message: dds.Message | None) -> None:
+            assert message is not None  # noqa: S101 - a gate has a subscription, by validation
+            start(time.monotonic_ns(), handle, time.thread_time_ns(), 0)
+            switches = _involuntary_switches()
+            release, arrival, woke = shaper.hold(message.payload)
+            published = publish(message.payload, 0, pause_ns)
+            if _involuntary_switches() == switches:
+                if woke.gap_ns >= STALL_NS:
+                    stalled(woke.gap_start_ns, woke.gap_ns)
+                if published - woke.at_ns >= STALL_NS:
+                    stalled(woke.at_ns, published - woke.at_ns)
+            released(
+                woke.at_ns,
+                handle,
+                message.source_timestamp,
+                arrival,
+                release.origin_ns,
+                release.at_ns,
+                release.slot,
+                release.cycles_waited,
+                int(release.anchor == "cycle"),
+            )
+            end(time.monotonic_ns(), handle, time.thread_time_ns())
+
+        return body
+
+    # Running ------------------------------------------------------------------------------
+
+    def wait_for_counterparts(self, deadline_ns: int) -> list[str]:
+        """Wait until DDS discovery is complete; what is still missing at the deadline."""
+        expected = self.spec["expected"]
+        while True:
+            missing = [
+                f"publisher of {topic} found {publisher.matched()} of {expected[topic][1]} readers"
+                for topic, publisher in self.publishers.items()
+                if publisher.matched() < expected[topic][1]
+            ]
+            subscribed = [c["subscription"] for c in self.spec["callbacks"] if c["subscription"]]
+            missing += [
+                f"subscription to {topic} found {entity.subscription.matched()} of "
+                f"{expected[topic][0]} writers"
+                for topic, entity in zip(subscribed, self.executor.subscriptions, strict=True)
+                if entity.subscription.matched() < expected[topic][0]
+            ]
+            if not missing or time.monotonic_ns() > deadline_ns:
+                return missing
+            time.sleep(0.01)
+
+    def run(self, start_ns: int, last_timer_ns: int, stop_ns: int) -> None:
+        """Execute callbacks from the common start until the end."""
+        for timer, phase in self.first_due:
+            timer.due_ns = start_ns + phase
+        periods = [timer.period_ns for timer in self.executor.timers] or [100_000_000]
+        for times in self.execution_times:
+            times.refill(min(1 + (stop_ns - start_ns) // min(periods), 100_000))
+        for shaper in self.shapers:
+            phase = start_ns + self.spec["origin_phase"]
+            shaper.gate = Gate(shaper.gate.slots, shaper.gate.cycle_ns, shaper.gate.anchor, phase)
+        stop_garbage_collection()
+        self.executor.spin_until(stop_ns, last_timer_ns)
+
+
+def _involuntary_switches() -> int:
+    """How often another thread took this thread's core from it."""
+    return resource.getrusage(resource.RUSAGE_THREAD).ru_nivcsw
+
+
+def _hand_over_to_publisher_thread(write: Callable[[bytes, int], None]) -> Callable[..., None]:
+    """Asynchronous publication (paper, section 2.2): a thread of its own sends the messages."""
+    pending: queue.SimpleQueue[tuple[bytes, int]] = queue.SimpleQueue()
+
+    def send() -> None:
+        set_thread_name(ASYNCHRONOUS_PUBLISHER)
+        while True:
+            write(*pending.get())
+
+    threading.Thread(target=send, daemon=True).start()
+    return lambda payload, source_timestamp: pending.put((payload, source_timestamp))
+
+
+def main() -> None:
+    """Run one node as the launcher says."""
+    spec = protocol.receive()
+    die_with_parent(spec["parent"])
+    set_thread_name(spec["node"].strip("/").replace("/", "."))
+    node = NodeProcess(spec)
+    missing = node.wait_for_counterparts(time.monotonic_ns() + spec["discovery_ns"])
+    protocol.send(missing=missing, memory_locked=lock_memory())
+    times = protocol.receive()
+    node.run(times["start_ns"], times["last_timer_ns"], times["stop_ns"])
+    protocol.send_events(node.log.rows.tobytes(), objects=node.log.objects)
+    protocol.wait_for_leave()
+    os._exit(0)  # DDS teardown of a closed domain is of use to nobody, and not always quick
+
+
+if __name__ == "__main__":
+    main()

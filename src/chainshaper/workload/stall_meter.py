@@ -1,0 +1,73 @@
+"""The stall meter: a sleeper that notices when the machine itself stood still.
+
+Virtual machines and firmware stop all threads of a core for milliseconds now and then. A thread
+at the highest priority that only sleeps and looks at the clock wakes late exactly then; the
+figures of a run can only be judged beside what it saw. One process per core:
+``python -m chainshaper.workload.stall_meter`` speaks the launcher's protocol.
+"""
+
+import time
+from array import array
+
+from chainshaper.enforcement.gate import sleep_until
+from chainshaper.enforcement.realtime import (
+    die_with_parent,
+    lock_memory,
+    set_thread_name,
+    stop_garbage_collection,
+)
+from chainshaper.workload import protocol
+
+__all__ = ["PERIOD_NS", "PRIORITY", "THRESHOLD_NS", "main", "watch"]
+
+PERIOD_NS = 1_000_000
+"""A wake-up costs some 20 us on a virtual machine: more of them would disturb what they watch."""
+THRESHOLD_NS = 100_000
+"""Wake-ups later than this are recorded: what the kernel needs to wake a thread is less."""
+PRIORITY = 98
+"""Above everything it watches, so that none of it looks like a stall."""
+
+
+def watch(
+    start_ns: int, stop_ns: int, period_ns: int = PERIOD_NS, threshold_ns: int = THRESHOLD_NS
+) -> "tuple[array[int], int, int]":
+    """Sleep in steps of ``period_ns`` from ``start_ns`` until ``stop_ns`` on the calling thread.
+
+    Returns the stalls as pairs (when it should have woken, how late it was), the number of
+    wake-ups, and the median lateness of the ordinary ones (all ns).
+    """
+    stalls = array("q")
+    lateness = array("q")
+    clock = time.monotonic_ns
+    due = start_ns
+    wakeups = 0
+    while due < stop_ns:
+        sleep_until(due)
+        now = clock()
+        late = now - due
+        wakeups += 1
+        if late >= threshold_ns:
+            stalls.extend((due, late))
+            due += late // period_ns * period_ns  # stay on the grid
+        else:
+            lateness.append(late)
+        due += period_ns
+    ordinary = sorted(lateness)
+    return stalls, wakeups, ordinary[len(ordinary) // 2] if ordinary else 0
+
+
+def main() -> None:
+    """Watch the core this process is put on, as the launcher says."""
+    spec = protocol.receive()
+    die_with_parent(spec["parent"])
+    set_thread_name("stall-meter")
+    protocol.send(missing=[], memory_locked=lock_memory())
+    times = protocol.receive()
+    stop_garbage_collection()
+    stalls, wakeups, ordinary = watch(times["meter_from_ns"], times["stop_ns"])
+    protocol.send_events(stalls.tobytes(), wakeups=wakeups, median_lateness_ns=ordinary)
+    protocol.wait_for_leave()
+
+
+if __name__ == "__main__":
+    main()
