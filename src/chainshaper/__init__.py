@@ -1,0 +1,106 @@
+"""chainshaper: constant end-to-end latency for ROS 2 computation chains.
+
+Everything the command line does is one call away:
+
+    import chainshaper as cs
+
+    application = cs.load_application("examples/synthetic_chain.yaml")
+    before = cs.run_application(application, "before")
+    plan = cs.plan_recording(before)
+    after = cs.shape_application(application, plan, "after")
+    cs.compare_recordings([before, after])
+
+Names are imported when they are first used, so that importing the package costs nothing.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from chainshaper.analysis import (
+        LatencyAnalysis,
+        analyse_latency,
+        application_graph,
+        callback_statistics,
+        data_flow,
+        find_chain,
+    )
+    from chainshaper.doctor import examine_machine
+    from chainshaper.errors import ChainshaperError, InputError, OperationError, PlatformError
+    from chainshaper.planning import Plan, load_plan, plan_shaping, save_plan
+    from chainshaper.recording import Recording, open_recording
+    from chainshaper.reporting.figures import draw_distribution, draw_latency
+    from chainshaper.steps import (
+        Comparison,
+        Measurement,
+        compare_recordings,
+        measure_latency,
+        plan_recording,
+        shape_application,
+    )
+    from chainshaper.workload.description import Application, load_application
+    from chainshaper.workload.live import run_application
+
+_HOMES = {
+    "chainshaper.analysis": (
+        "LatencyAnalysis",
+        "analyse_latency",
+        "application_graph",
+        "callback_statistics",
+        "data_flow",
+        "find_chain",
+    ),
+    "chainshaper.doctor": ("examine_machine",),
+    "chainshaper.errors": ("ChainshaperError", "InputError", "OperationError", "PlatformError"),
+    "chainshaper.planning": ("Plan", "load_plan", "plan_shaping", "save_plan"),
+    "chainshaper.recording": ("Recording", "open_recording"),
+    "chainshaper.reporting.figures": ("draw_distribution", "draw_latency"),
+    "chainshaper.steps": (
+        "Comparison",
+        "Measurement",
+        "compare_recordings",
+        "measure_latency",
+        "plan_recording",
+        "shape_application",
+    ),
+    "chainshaper.workload.description": ("Application", "load_application"),
+    "chainshaper.workload.live": ("run_application",),
+}
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "Application",
+    "ChainshaperError",
+    "Comparison",
+    "InputError",
+    "LatencyAnalysis",
+    "Measurement",
+    "OperationError",
+    "Plan",
+    "PlatformError",
+    "Recording",
+    "analyse_latency",
+    "application_graph",
+    "callback_statistics",
+    "compare_recordings",
+    "data_flow",
+    "draw_distribution",
+    "draw_latency",
+    "examine_machine",
+    "find_chain",
+    "load_application",
+    "load_plan",
+    "measure_latency",
+    "open_recording",
+    "plan_recording",
+    "plan_shaping",
+    "run_application",
+    "save_plan",
+    "shape_application",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'chainshaper' has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOME_OF[name]), name)

@@ -180,7 +180,7 @@ def table(tables: EventTables, name: str, columns: Iterable[str] = ()) -> pl.Dat
     """
     frame = tables.get(name)
     if frame is None:
-        return empty(name)
+        frame = empty(name)
     known = {**COMMON_COLUMNS, **FIELDS[name], **OPTIONAL_FIELDS.get(name, {})}
     missing = [column for column in columns if column not in frame.columns]
     return frame.with_columns(pl.lit(None, dtype=known[column]).alias(column) for column in missing)

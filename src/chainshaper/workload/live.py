@@ -26,7 +26,6 @@ from chainshaper.errors import InputError, OperationError
 from chainshaper.recording import (
     Recording,
     RecordingInfo,
-    StallMeterInfo,
     ThreadInfo,
     refuse_existing,
     write_recording,
@@ -39,6 +38,7 @@ from chainshaper.workload.description import (
 )
 from chainshaper.workload.event_reading import ProcessLog, event_tables, stall_table
 from chainshaper.workload.launcher import Child, end_all, first_casualty, start_child
+from chainshaper.workload.stall_watch import promote_meters, read_meters, start_meters
 
 __all__ = ["Progress", "origin_timer", "run_application"]
 
@@ -49,7 +49,6 @@ WARM_UP_CYCLES = 5
 DISCOVERY_NS = 20_000_000_000
 METER_BEHIND_NS = 150_000
 NODE_MODULE = "chainshaper.workload.node_process"
-STALL_METER_MODULE = "chainshaper.workload.stall_meter"
 
 
 def run_application(
@@ -88,9 +87,11 @@ def run_application(
     finished = False
     try:
         progress(0.0, "starting nodes")
-        _start(application, timer, nodes, meters)
+        _start_nodes(application, timer, nodes)
+        start_meters(application.cores(), meters)
         memory_locked = _await_ready([*nodes.values(), *meters.values()])
-        _allocate_threads(application, nodes, meters, realtime)
+        _allocate_threads(application, nodes, realtime)
+        promote_meters(meters, realtime)
         timing = _Timing.of(application, timer, cycles)
         offset_before = clock_offset()
         for child in [*nodes.values(), *meters.values()]:
@@ -98,7 +99,7 @@ def run_application(
         threads = _watch(nodes, meters, timing, progress)
         progress(1.0, "collecting events")
         logs = [_read_log(name, child, application) for name, child in nodes.items()]
-        stalls, meter_info = _read_stalls(meters, realtime)
+        stalls, meter_info = read_meters(meters, realtime)
         finished = True
     finally:
         end_all([*nodes.values(), *meters.values()], patience_s=3.0 if finished else 0.0)
@@ -176,10 +177,7 @@ class _Timing:
             stop_ns=end + max(2 * period, 200_000_000),  # what has begun is completed
             # The stall meter's grid has a point shortly behind each planned release: a stall
             # that delays a release is then seen for certain, and no wake-up comes in between.
-            meter_from_ns=start
-            + timer.phase_ns
-            + release % stall_meter.PERIOD_NS
-            + METER_BEHIND_NS,
+            meter_from_ns=start + timer.phase_ns + grid,
         )
 
     def for_processes(self) -> dict[str, int]:
@@ -191,13 +189,10 @@ class _Timing:
         }
 
 
-def _start(
-    application: Application,
-    timer: CallbackDescription,
-    nodes: dict[str, Child],
-    meters: dict[int, Child],
+def _start_nodes(
+    application: Application, timer: CallbackDescription, nodes: dict[str, Child]
 ) -> None:
-    """Start a process per node and a stall meter per core, into the given dictionaries."""
+    """Start a process per node, into ``nodes``: what fails later can end those started."""
     from chainshaper.workload.dds import closed_domain_configuration, free_domain
 
     domain = free_domain()
@@ -205,9 +200,6 @@ def _start(
     for name in application.nodes:
         nodes[name] = start_child(f"node {name}", NODE_MODULE, environment)
         nodes[name].tell(**_spec(application, name, timer, domain))
-    for core in sorted(application.cores()):
-        meters[core] = start_child(f"stall meter of core {core}", STALL_METER_MODULE, {})
-        meters[core].tell(parent=os.getpid())
 
 
 def _spec(
@@ -247,9 +239,7 @@ def _await_ready(children: Sequence[Child]) -> bool:
     return all(answer["memory_locked"] for _, answer in answers)
 
 
-def _allocate_threads(
-    application: Application, nodes: dict[str, Child], meters: dict[int, Child], realtime: bool
-) -> None:
+def _allocate_threads(application: Application, nodes: dict[str, Child], realtime: bool) -> None:
     """Give every thread its core and, where permitted, its SCHED_FIFO priority."""
     for name, child in nodes.items():
         executor, dds = application.scheduling_of(name), application.dds_scheduling_of(name)
@@ -264,10 +254,6 @@ def _allocate_threads(
             apply_scheduling(
                 thread, Scheduling(wanted[1] if realtime else None, cores=(wanted[0],))
             )
-    for core, child in meters.items():
-        for thread in list_threads(child.pid):
-            priority = stall_meter.PRIORITY if realtime else None
-            apply_scheduling(thread, Scheduling(priority, cores=(core,)))
 
 
 def _watch(
@@ -326,26 +312,6 @@ def _read_log(name: str, child: Child, application: Application) -> ProcessLog:
     rows = child.hear_bytes(answer["bytes"])
     core = application.scheduling_of(name).core
     return ProcessLog(child.pid, core, rows, tuple(answer["objects"]))
-
-
-def _read_stalls(
-    meters: dict[int, Child], realtime: bool
-) -> tuple[list[tuple[int, int, bytes]], StallMeterInfo]:
-    stalls, wakeups, lateness = [], 0, []
-    for core, child in meters.items():
-        answer = child.hear()
-        stalls.append((child.pid, core, child.hear_bytes(answer["bytes"])))
-        wakeups += answer["wakeups"]
-        lateness.append(answer["median_lateness_ns"])
-    info = StallMeterInfo(
-        cores=tuple(meters),
-        period_ns=stall_meter.PERIOD_NS,
-        threshold_ns=stall_meter.THRESHOLD_NS,
-        wakeups=wakeups,
-        median_lateness_ns=tuple(lateness),
-        realtime=realtime,
-    )
-    return stalls, info
 
 
 def _notes(realtime: bool, memory_locked: bool, clock_moved_ns: int) -> tuple[str, ...]:

@@ -1,0 +1,32 @@
+# `make demo` and `make test` need nothing but Python 3.10 or newer; see scripts/setup.
+
+.PHONY: demo test lint benchmark docs clean
+
+demo: .venv/.ready
+	.venv/bin/chainshaper demo
+
+test: lint
+	.venv/bin/python -m pytest
+
+lint: .venv/.ready-dev
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/mypy
+
+# Needs a quiet machine and about three minutes; prints a table, asserts nothing.
+benchmark: .venv/.ready
+	.venv/bin/python benchmarks/shaping_jitter.py
+
+docs: .venv/.ready-dev
+	.venv/bin/mkdocs build --strict
+
+.venv/.ready: pyproject.toml scripts/setup
+	scripts/setup
+	touch $@
+
+.venv/.ready-dev: pyproject.toml scripts/setup
+	scripts/setup dev
+	touch $@ .venv/.ready
+
+clean:
+	rm -rf .venv site .mypy_cache .ruff_cache .pytest_cache

@@ -1,0 +1,58 @@
+"""Events → application graph, callback instances, end-to-end latencies, statistics.
+
+    tables ─► objects ─► instances ┐
+                      └► messages ─┴► flow ─► graph ─► chains
+                                        └──► traversals ─► disturbance ─► latency, statistics
+
+Nothing here knows where the events came from: LTTng, eBPF, the live workload and the simulator
+write the same tables (:mod:`chainshaper.events`). :func:`analyse_latency` does all of it for one
+chain; every step is a function of its own.
+"""
+
+from chainshaper.analysis.chains import (
+    ChainEnumeration,
+    enumerate_chains,
+    find_chain,
+    parse_chain,
+)
+from chainshaper.analysis.disturbance import disturbed
+from chainshaper.analysis.flow import DataFlow, data_flow
+from chainshaper.analysis.graph import application_graph, graph_of
+from chainshaper.analysis.instances import callback_instances
+from chainshaper.analysis.latency import LatencyAnalysis, analyse_latency
+from chainshaper.analysis.messages import publications, takes
+from chainshaper.analysis.named_paths import load_named_paths
+from chainshaper.analysis.objects import Objects, resolve_objects
+from chainshaper.analysis.statistics import (
+    LatencyStatistics,
+    callback_statistics,
+    latency_statistics,
+)
+from chainshaper.analysis.traversals import REASONS, Traversals, reception, traverse
+
+__all__ = [
+    "REASONS",
+    "ChainEnumeration",
+    "DataFlow",
+    "LatencyAnalysis",
+    "LatencyStatistics",
+    "Objects",
+    "Traversals",
+    "analyse_latency",
+    "application_graph",
+    "callback_instances",
+    "callback_statistics",
+    "data_flow",
+    "disturbed",
+    "enumerate_chains",
+    "find_chain",
+    "graph_of",
+    "latency_statistics",
+    "load_named_paths",
+    "parse_chain",
+    "publications",
+    "reception",
+    "resolve_objects",
+    "takes",
+    "traverse",
+]

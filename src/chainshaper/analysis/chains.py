@@ -1,0 +1,258 @@
+"""Computation chains: finding the one that a person means, and listing those there are.
+
+A chain is written ``FIRST..LAST``, with more way points where several paths match. Way points
+are topics or nodes. A chain that begins with a topic starts at the callback that publishes it,
+and every chain ends with the publication of its last topic (paper, section 2.3); a chain that
+ends with a node ends with what that node publishes, or, if it publishes nothing, with the topic
+that it subscribes to.
+"""
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from chainshaper.analysis.paths import Path, PathSearch, Stage, Vertex
+from chainshaper.app import ApplicationGraph, Callback, Chain
+from chainshaper.errors import InputError
+
+__all__ = [
+    "ChainEnumeration",
+    "enumerate_chains",
+    "find_chain",
+    "parse_chain",
+]
+
+HANDFUL = 5
+
+
+def parse_chain(text: str) -> tuple[str, ...]:
+    """The way points of a chain: ``/t1../t5`` → ``("/t1", "/t5")``.
+
+    Raises:
+        InputError: nothing between two dots, more than two dots in a row, a way point twice.
+    """
+    waypoints = tuple(part.strip() for part in text.split(".."))
+    if any(not part or part.startswith(".") or part.endswith(".") for part in waypoints):
+        raise InputError(
+            f"chain {text!r}: write way points (topics or nodes) with two dots between them, "
+            "such as /t1../t5"
+        )
+    repeated = [part for part in waypoints if waypoints.count(part) > 1]
+    if repeated:
+        raise InputError(
+            f"chain {text!r}: {repeated[0]} stands twice in it; a cyclic chain has no end-to-end "
+            "latency, name each way point once"
+        )
+    return waypoints
+
+
+def find_chain(graph: ApplicationGraph, spec: str) -> Chain:
+    """The one chain of ``graph`` that ``spec`` means.
+
+    Raises:
+        InputError: a topic or node that does not exist, no path, only a cyclic one, or several.
+    """
+    search, stages = _search(graph, spec, parse_chain(spec))
+    found, complete = search.listed(HANDFUL + 1)
+    chains = list(dict.fromkeys(_chain(spec, path) for path in found))
+    if not chains:
+        raise InputError(_no_path(graph, spec, search, stages))
+    if len(chains) > 1 or not complete:
+        raise InputError(_ambiguous(graph, spec, chains, complete))
+    return chains[0]
+
+
+@dataclass(frozen=True)
+class ChainEnumeration:
+    """The chains between two places of a graph.
+
+    ``chains`` are all of them if ``complete``, else the first ones found. ``count`` says how many
+    there are; where the graph between the two places has cycles, it is only a lower bound (not
+    ``exact``): the chains that never step back in the order of one depth-first search, or those
+    listed if they are more. ``heaviest`` has the largest sum of mean response times
+    (``heaviest_ns``) among the counted and the listed chains.
+    """
+
+    chains: tuple[Chain, ...]
+    complete: bool
+    count: int
+    exact: bool
+    heaviest: Chain | None
+    heaviest_ns: float
+
+
+def enumerate_chains(
+    graph: ApplicationGraph,
+    start: str | None = None,
+    end: str | None = None,
+    limit: int = 100,
+    response_ns: Mapping[int, float] | None = None,
+) -> ChainEnumeration:
+    """The chains from ``start`` to ``end`` (topics or nodes), at most ``limit`` of them.
+
+    Without ``start`` chains begin at callbacks that no other callback of the application
+    triggers, without ``end`` they end with topics from which no callback goes on. ``response_ns``
+    is the mean response time by callback id. Never hangs, see :mod:`~chainshaper.analysis.paths`.
+
+    Raises:
+        InputError: ``start`` or ``end`` does not exist, or nothing leads from one to the other.
+    """
+    waypoints = tuple(name for name in (start, end) if name is not None)
+    spec = f"{start or ''}..{end or ''}"
+    search, stages = _search(graph, spec, waypoints, start is None, end is None)
+    weights = response_ns or {}
+    count, heaviest_path, heaviest_ns = search.counted(weights)
+    found, complete = search.listed(limit)
+    if not found and waypoints:
+        raise InputError(_no_path(graph, spec, search, stages))
+    chains = tuple(dict.fromkeys(_chain(None, path) for path in found))
+    heaviest = _chain(None, heaviest_path) if heaviest_path else None
+    for chain in chains:
+        weight = sum(weights.get(callback, 0.0) for callback in chain.callbacks)
+        if heaviest is None or weight > heaviest_ns:
+            heaviest, heaviest_ns = chain, weight
+    return ChainEnumeration(
+        chains=chains,
+        complete=complete,
+        count=len(chains) if complete else max(count, len(chains)),
+        exact=complete or not search.cyclic,
+        heaviest=heaviest,
+        heaviest_ns=heaviest_ns,
+    )
+
+
+def _search(
+    graph: ApplicationGraph,
+    spec: str,
+    waypoints: Sequence[str],
+    any_start: bool = False,
+    any_end: bool = False,
+) -> tuple[PathSearch, tuple[Stage, ...]]:
+    stages = tuple(_stage(graph, spec, name) for name in waypoints)
+    starts = _sources(graph) if any_start else _start_callbacks(graph, spec, stages[0])
+    if any_start:  # every source is as good as a first way point
+        stages = (Stage("any source", frozenset[Vertex](starts)), *stages)
+    going_on = {
+        callback.topic
+        for callback in graph.callbacks
+        if callback.kind == "subscription" and callback.publishes
+    }
+    last = len(stages)
+    ends_with_topic = not any_end and all(isinstance(v, str) for v in stages[-1].vertices)
+
+    def accepts(state: tuple[Vertex, int], callback: Callback | None) -> bool:
+        vertex, met = state
+        if met < last:
+            return False
+        if any_end:
+            return callback is None and vertex not in going_on
+        if ends_with_topic:
+            return vertex in stages[-1].vertices
+        # The last way point is a node: its callback was met, then comes the topic it publishes.
+        return callback is None or not callback.publishes
+
+    return PathSearch(graph, frozenset(starts), stages, accepts), stages
+
+
+def _stage(graph: ApplicationGraph, spec: str, name: str) -> Stage:
+    """What a way point stands for: a topic, or all callbacks of a node."""
+    nodes: dict[str, set[int]] = {node.name: set() for node in graph.nodes}
+    topics = set(graph.topics)
+    for callback in graph.callbacks:
+        nodes.setdefault(callback.node, set()).add(callback.id)
+        topics.update(callback.publishes)
+    for candidate in (name, f"/{name}"):
+        if candidate in topics:
+            return Stage(candidate, frozenset[Vertex]((candidate,)))
+        if candidate in nodes:
+            return Stage(candidate, frozenset[Vertex](nodes[candidate]))
+    close = difflib.get_close_matches(name, sorted(topics | nodes.keys()), n=3, cutoff=0.5)
+    hint = f"did you mean {' or '.join(close)}?" if close else "`graph` shows the names there are."
+    raise InputError(f"chain {spec!r}: no topic or node is called {name}; {hint}")
+
+
+def _start_callbacks(graph: ApplicationGraph, spec: str, first: Stage) -> set[int]:
+    vertices = first.vertices
+    if not any(isinstance(vertex, str) for vertex in vertices):
+        return {vertex for vertex in vertices if isinstance(vertex, int)}
+    starts = {
+        callback.id
+        for callback in graph.callbacks
+        if vertices & (set(callback.publishes) - set(callback.passes_on))
+    }
+    if not starts:
+        writers = ", ".join(graph.publishers.get(first.name, ())) or "nobody in the recording"
+        raise InputError(
+            f"chain {spec!r}: no callback was seen to publish {first.name} (its publisher: "
+            f"{writers}); begin the chain at a topic that a callback publishes"
+        )
+    return starts
+
+
+def _sources(graph: ApplicationGraph) -> set[int]:
+    """Publishing callbacks that no callback's publication triggers."""
+    published = {topic for callback in graph.callbacks for topic in callback.publishes}
+    return {
+        callback.id
+        for callback in graph.callbacks
+        if callback.publishes
+        and not (callback.kind == "subscription" and callback.topic in published)
+    }
+
+
+def _chain(spec: str | None, path: Path) -> Chain:
+    callbacks = tuple(vertex for vertex in path if isinstance(vertex, int))
+    topics = tuple(vertex for vertex in path if isinstance(vertex, str))
+    written = spec if spec is not None else "..".join(topics)
+    return Chain(written, callbacks[: len(topics)], topics)
+
+
+def _no_path(
+    graph: ApplicationGraph, spec: str, search: PathSearch, stages: tuple[Stage, ...]
+) -> str:
+    if search.roots:
+        return (
+            f"chain {spec!r}: it can only be closed by passing the same callback or topic twice; "
+            "a cyclic chain has no end-to-end latency, give its way points in the order of the "
+            "data"
+        )
+    met = search.furthest
+    if not met:
+        return f"chain {spec!r}: no callback of {stages[0].name} publishes anything"
+    reached = sorted(vertex for vertex in search.reached if isinstance(vertex, str))
+    going_on = {c.topic for c in graph.callbacks if c.kind == "subscription" and c.publishes}
+    stops = [topic for topic in reached if topic not in going_on] or reached
+    if not stops:
+        return f"chain {spec!r}: no callback of {stages[met - 1].name} publishes anything"
+    goal = stages[min(met, len(stages) - 1)].name
+    listed = ", ".join(stops[:HANDFUL]) + (", ..." if len(stops) > HANDFUL else "")
+    return (
+        f"chain {spec!r}: no path leads from {stages[met - 1].name} to {goal}; from there the data "
+        f"gets as far as {listed}"
+    )
+
+
+def _ambiguous(graph: ApplicationGraph, spec: str, chains: Sequence[Chain], complete: bool) -> str:
+    shown = chains[:HANDFUL]
+    more = "" if complete and len(chains) <= HANDFUL else "at least "
+    lines = [f"chain {spec!r}: {more}{len(chains)} paths match; add a way point:"]
+    callbacks = {callback.id: callback for callback in graph.callbacks}
+    for chain in shown:
+        others = [other for other in shown if other is not chain]
+        telling = next(
+            (t for t in chain.topics if all(t not in other.topics for other in others)), None
+        ) or next(
+            (
+                callbacks[c].node
+                for c in chain.callbacks
+                if all(
+                    callbacks[c].node not in {callbacks[o].node for o in other.callbacks}
+                    for other in others
+                )
+            ),
+            None,
+        )
+        remedy = f"  (only this one passes {telling})" if telling else ""
+        names = [callbacks[chain.callbacks[0]].label, *chain.topics]
+        lines.append(f"  {' → '.join(names)}{remedy}")
+    return "\n".join(lines)

@@ -1,0 +1,113 @@
+"""From a recording to the end-to-end latencies of one chain: the whole analysis in one call."""
+
+from dataclasses import dataclass
+
+import polars as pl
+
+from chainshaper import events
+from chainshaper.analysis.chains import find_chain
+from chainshaper.analysis.disturbance import GUARD_NS, THRESHOLD_NS, disturbed
+from chainshaper.analysis.flow import DataFlow, data_flow
+from chainshaper.analysis.graph import graph_of
+from chainshaper.analysis.statistics import LatencyStatistics, latency_statistics
+from chainshaper.analysis.traversals import reception, traverse
+from chainshaper.app import ApplicationGraph, Chain
+from chainshaper.recording import Recording
+
+__all__ = ["LatencyAnalysis", "analyse_latency"]
+
+
+@dataclass(frozen=True)
+class LatencyAnalysis:
+    """The end-to-end latency of one chain in one recording.
+
+    ``traversals`` is the frame of :class:`~chainshaper.analysis.traversals.Traversals` with the
+    columns ``disturbed``, ``received`` and ``reception_ns`` (latency to the subscriber's
+    `callback_start`) added, ``hops`` its frame of hops. ``statistics`` are over all complete
+    traversals, ``undisturbed`` over those that the machine did not disturb; ``subscriber`` and
+    ``subscriber_undisturbed`` are the same of ``reception_ns`` (None: nobody subscribes to the
+    output in this recording). ``incomplete`` counts traversals without an end by reason,
+    ``silent`` instances of the first callback that began none.
+    """
+
+    chain: Chain
+    graph: ApplicationGraph
+    traversals: pl.DataFrame
+    hops: pl.DataFrame
+    statistics: LatencyStatistics
+    undisturbed: LatencyStatistics
+    subscriber: LatencyStatistics | None
+    subscriber_undisturbed: LatencyStatistics | None
+    incomplete: dict[str, int]
+    silent: int
+    notes: tuple[str, ...]
+
+
+def analyse_latency(
+    source: Recording | events.EventTables | DataFlow,
+    chain: str | Chain,
+    clock_offset_ns: int | None = None,
+    *,
+    threshold_ns: int = THRESHOLD_NS,
+    guard_ns: int = GUARD_NS,
+    subscriber: str | None = None,
+) -> LatencyAnalysis:
+    """Every traversal of ``chain`` in a recording, with statistics.
+
+    ``source`` is a recording, its event tables, or its data flow where several chains are
+    analysed. ``clock_offset_ns`` (event clock to CLOCK_REALTIME) is taken from a recording and
+    needed for tables from before Jazzy. ``threshold_ns`` and ``guard_ns`` decide which traversals
+    count as disturbed (:mod:`~chainshaper.analysis.disturbance`); ``subscriber`` names the node
+    whose reception is reported.
+
+    Raises:
+        InputError: the chain is not in the recording, see
+            :func:`~chainshaper.analysis.chains.find_chain`.
+    """
+    notes: tuple[str, ...] = ()
+    if isinstance(source, DataFlow):
+        flow = source
+    elif isinstance(source, Recording):
+        offset = source.info.clock_offset_ns if clock_offset_ns is None else clock_offset_ns
+        flow = data_flow(source.events, offset)
+        notes = source.info.notes
+    else:
+        flow = data_flow(source, clock_offset_ns or 0)
+    graph = graph_of(flow)
+    if isinstance(chain, str):
+        chain = find_chain(graph, chain)
+    found = traverse(flow, chain, graph)
+    mask = disturbed(flow, found, threshold_ns, guard_ns)
+    received = reception(flow, found, graph, subscriber)
+    frame = found.frame.with_columns(
+        pl.Series("disturbed", mask), received["received"], received["reception_ns"]
+    )
+    reasons = frame.drop_nulls("reason").group_by("reason").len().sort("reason")
+    return LatencyAnalysis(
+        chain=chain,
+        graph=graph,
+        traversals=frame,
+        hops=found.hops,
+        statistics=_statistics(frame, "latency_ns"),
+        undisturbed=_statistics(frame.filter(~pl.col("disturbed")), "latency_ns"),
+        subscriber=_subscriber(frame, frame),
+        subscriber_undisturbed=_subscriber(frame, frame.filter(~pl.col("disturbed"))),
+        incomplete=dict(reasons.iter_rows()),
+        silent=found.silent,
+        notes=(*notes, *flow.notes, *found.notes),
+    )
+
+
+def _statistics(frame: pl.DataFrame, column: str) -> LatencyStatistics:
+    measured = frame.drop_nulls(column)
+    return latency_statistics(
+        measured[column].to_numpy(),
+        measured["disturbed"].to_numpy(),
+        incomplete=frame.height - measured.height,
+    )
+
+
+def _subscriber(frame: pl.DataFrame, chosen: pl.DataFrame) -> LatencyStatistics | None:
+    if not frame["reception_ns"].count():
+        return None
+    return _statistics(chosen, "reception_ns")

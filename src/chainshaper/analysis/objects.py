@@ -1,0 +1,366 @@
+"""Who exists: nodes, publishers, subscriptions, timers, services and their callbacks.
+
+Events name objects by handles: addresses that are unique only within one process, and only until
+they are freed. The same number may stand for another object later, in the same process or in
+one that got the old process's number. So a handle is looked up as (process, handle, time): the
+object created there last, at or before the event.
+
+Handles that were never initialised are nobody's: `ros_discovery_info` is published and taken
+under such (Cyclone DDS), as is everything that existed before tracing began. What cannot be
+known because of that is said in words in ``notes``.
+
+Upstream: ros2_tracing, `tracetools/include/tracetools/tracetools.h`; the order of the events is
+that of rclcpp's constructors.
+"""
+
+from dataclasses import dataclass
+
+import polars as pl
+
+from chainshaper import events
+from chainshaper.analysis.matching import first_after, latest_before, nearest
+
+__all__ = ["CALLBACK_SCHEMA", "Objects", "resolve_objects"]
+
+CALLBACK_SCHEMA: dict[str, pl.DataType] = {
+    "callback_id": pl.Int64(),
+    "pid": pl.Int32(),
+    "handle": pl.UInt64(),
+    "valid_from": pl.Int64(),
+    "valid_to": pl.Int64(),
+    "kind": pl.String(),
+    "node": pl.String(),
+    "topic": pl.String(),
+    "period_ns": pl.Int64(),
+    "symbol": pl.String(),
+    "observed": pl.Boolean(),
+    "subscription": pl.Int64(),
+}
+
+
+@dataclass(frozen=True)
+class Objects:
+    """The objects of a recording, one frame per kind; times are ns of the event clock.
+
+    * ``nodes``: ``pid, handle, valid_from, node`` (name with namespace, ``/front/filter``).
+    * ``publishers``: ``publisher, pid, handle, rmw_handle, valid_from, node, topic``.
+    * ``subscriptions``: ``subscription, pid, handle, rmw_handle, valid_from, node, topic``.
+    * ``callbacks``: :data:`CALLBACK_SCHEMA`, one row per *registration*, the address
+      (``pid, handle``) under which a callback ran from ``valid_from`` until that address was
+      registered again (``valid_to``, null: never). ``callback_id`` numbers callbacks from 0; one
+      that was recreated, or that also has an intra-process twin, has several registrations.
+      ``kind`` is timer, subscription, service or unknown, ``topic`` the topic or the service's
+      name. ``observed`` is false for subscriptions whose library emits no callback events
+      (rclpy): their instances are assumed from what they take and publish.
+    * ``buffers``: ``pid, buffer, valid_from, callback_id``: intra-process ring buffers.
+    * ``notes``: what cannot be known from this recording, in plain words.
+    """
+
+    nodes: pl.DataFrame
+    publishers: pl.DataFrame
+    subscriptions: pl.DataFrame
+    callbacks: pl.DataFrame
+    buffers: pl.DataFrame
+    notes: tuple[str, ...]
+
+
+def resolve_objects(tables: events.EventTables) -> Objects:
+    """Find all objects of a recording. Cost is linear in the number of events."""
+    nodes = _nodes(tables)
+    publishers = _endpoints(tables, nodes, "publisher")
+    subscriptions = _endpoints(tables, nodes, "subscription")
+    registered = pl.concat(
+        [
+            _subscription_callbacks(tables, subscriptions),
+            _timer_callbacks(tables, nodes),
+            _service_callbacks(tables, nodes),
+        ],
+        how="diagonal_relaxed",
+    )
+    registered = _with_symbols(tables, registered)
+    strangers = _unregistered(tables, registered)
+    callbacks = pl.concat(
+        [registered, strangers, _callbackless(tables, subscriptions, registered)],
+        how="diagonal_relaxed",
+    )
+    callbacks = _numbered(tables, callbacks)
+    return Objects(
+        nodes=nodes,
+        publishers=publishers,
+        subscriptions=subscriptions,
+        callbacks=callbacks.select(pl.col(name).cast(t) for name, t in CALLBACK_SCHEMA.items()),
+        buffers=_buffers(tables, callbacks),
+        notes=_notes(tables, callbacks),
+    )
+
+
+def _nodes(tables: events.EventTables) -> pl.DataFrame:
+    namespace = pl.col("namespace").fill_null("").str.strip_chars_end("/")
+    return (
+        events.table(tables, "rcl_node_init")
+        .select(
+            "pid",
+            pl.col("node_handle").alias("handle"),
+            pl.col("time").alias("valid_from"),
+            (namespace + "/" + pl.col("node_name")).alias("node"),
+        )
+        .drop_nulls("handle")
+    )
+
+
+def _with_node(objects: pl.DataFrame, nodes: pl.DataFrame, at: str) -> pl.DataFrame:
+    """Add ``node`` from ``node_handle`` at time ``at``.
+
+    Before Iron a node's /rosout publisher is created just before `rcl_node_init`: what has no
+    node before it belongs to the next one with that handle.
+    """
+    of_node = nodes.select("pid", "node", node_handle="handle", node_from="valid_from")
+    found = latest_before(objects, of_node, ["pid", "node_handle"], at, "node_from")
+    later = first_after(
+        found.drop("node", "node_from"), of_node, ["pid", "node_handle"], at, "node_from"
+    )
+    return found.with_columns(pl.col("node").fill_null(later["node"])).drop("node_from")
+
+
+def _endpoints(tables: events.EventTables, nodes: pl.DataFrame, kind: str) -> pl.DataFrame:
+    created = (
+        events.table(tables, f"rcl_{kind}_init")
+        .select(
+            "pid",
+            "node_handle",
+            pl.col(f"{kind}_handle").alias("handle"),
+            pl.col(f"rmw_{kind}_handle").alias("rmw_handle"),
+            pl.col("time").alias("valid_from"),
+            pl.col("topic_name").alias("topic"),
+        )
+        .with_row_index(kind)
+        .with_columns(pl.col(kind).cast(pl.Int64))
+    )
+    columns = [kind, "pid", "handle", "rmw_handle", "valid_from", "node", "topic"]
+    return _with_node(created, nodes, "valid_from").select(columns)
+
+
+def _subscription_callbacks(
+    tables: events.EventTables, subscriptions: pl.DataFrame
+) -> pl.DataFrame:
+    """Callback ← rclcpp subscription object ← rcl subscription ← node and topic.
+
+    The object is matched to the nearest `rclcpp_subscription_init`: for an intra-process twin
+    that event comes just after `callback_added`, for all others just before.
+    """
+    added = events.table(tables, "rclcpp_subscription_callback_added").select(
+        "pid", "subscription", pl.col("callback").alias("handle"), valid_from="time"
+    )
+    objects = events.table(tables, "rclcpp_subscription_init").select(
+        "pid", "subscription", "subscription_handle", created="time"
+    )
+    joined = nearest(added, objects, ["pid", "subscription"], "valid_from", "created")
+    joined = joined.drop("subscription").rename({"subscription_handle": "rcl_handle"})
+    rcl = subscriptions.select(
+        "pid", "subscription", "node", "topic", rcl_handle="handle", rcl_from="valid_from"
+    )
+    # Both constructors ran after rcl_subscription_init; without `created` there is no rcl handle.
+    joined = joined.with_columns(pl.max_horizontal("created", "valid_from").alias("known"))
+    joined = latest_before(joined, rcl, ["pid", "rcl_handle"], "known", "rcl_from")
+    return joined.select(
+        "pid", "handle", "valid_from", "node", "topic", "subscription", kind=pl.lit("subscription")
+    )
+
+
+def _timer_callbacks(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
+    """Callback ← timer (its period before, its node after `rclcpp_timer_callback_added`)."""
+    added = events.table(tables, "rclcpp_timer_callback_added").select(
+        "pid", "timer_handle", pl.col("callback").alias("handle"), valid_from="time"
+    )
+    created = events.table(tables, "rcl_timer_init").select(
+        "pid", "timer_handle", pl.col("period").alias("period_ns"), created="time"
+    )
+    linked = events.table(tables, "rclcpp_timer_link_node").select(
+        "pid", "timer_handle", "node_handle", linked="time"
+    )
+    joined = latest_before(added, created, ["pid", "timer_handle"], "valid_from", "created")
+    joined = first_after(joined, linked, ["pid", "timer_handle"], "valid_from", "linked")
+    # `joined` is sorted by valid_from: a link made after the address was used again is another's.
+    next_use = pl.col("valid_from").shift(-1).over("pid", "timer_handle")
+    own = next_use.is_null() | (pl.col("linked") < next_use)
+    joined = joined.with_columns(
+        pl.when(own).then("node_handle").alias("node_handle"),
+        pl.max_horizontal("linked", "valid_from").alias("at"),
+    )
+    joined = _with_node(joined, nodes, "at")
+    return joined.select("pid", "handle", "valid_from", "node", "period_ns", kind=pl.lit("timer"))
+
+
+def _service_callbacks(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
+    added = events.table(tables, "rclcpp_service_callback_added").select(
+        "pid", "service_handle", pl.col("callback").alias("handle"), valid_from="time"
+    )
+    created = events.table(tables, "rcl_service_init").select(
+        "pid",
+        "service_handle",
+        "node_handle",
+        pl.col("service_name").alias("topic"),
+        created="time",
+    )
+    joined = latest_before(added, created, ["pid", "service_handle"], "valid_from", "created")
+    joined = _with_node(joined, nodes, "valid_from")
+    return joined.select("pid", "handle", "valid_from", "node", "topic", kind=pl.lit("service"))
+
+
+def _with_symbols(tables: events.EventTables, registered: pl.DataFrame) -> pl.DataFrame:
+    """Add ``valid_to``, ``observed`` and the ``symbol`` registered while the handle was valid."""
+    registered = registered.sort("valid_from", maintain_order=True).with_columns(
+        pl.col("valid_from").shift(-1).over("pid", "handle").alias("valid_to"),
+        observed=pl.lit(True),
+    )
+    symbols = events.table(tables, "rclcpp_callback_register").select(
+        "pid", "symbol", pl.col("callback").alias("handle"), named="time"
+    )
+    joined = first_after(registered, symbols, ["pid", "handle"], "valid_from", "named")
+    in_time = pl.col("valid_to").is_null() | (pl.col("named") < pl.col("valid_to"))
+    return joined.with_columns(pl.when(in_time).then("symbol").alias("symbol")).drop("named")
+
+
+def _unregistered(tables: events.EventTables, registered: pl.DataFrame) -> pl.DataFrame:
+    """Callbacks that ran before (or without) a registration: tracing started after them."""
+    known = registered.group_by("pid", "handle").agg(pl.col("valid_from").min().alias("known"))
+    started = (
+        events.table(tables, "callback_start")
+        .lazy()
+        .select("pid", "time", pl.col("callback").alias("handle"))
+    )
+    first = started.group_by("pid", "handle").agg(pl.col("time").min().alias("valid_from"))
+    joined = first.collect().join(known, on=["pid", "handle"], how="left")
+    early = joined.filter(pl.col("known").is_null() | (pl.col("valid_from") < pl.col("known")))
+    return early.sort("valid_from", "pid", "handle").select(
+        "pid",
+        "handle",
+        "valid_from",
+        valid_to="known",
+        kind=pl.lit("unknown"),
+        observed=pl.lit(True),
+    )
+
+
+def _callbackless(
+    tables: events.EventTables, subscriptions: pl.DataFrame, registered: pl.DataFrame
+) -> pl.DataFrame:
+    """Subscriptions that take messages but have no callback in the trace: rclpy, wait sets."""
+    bare = subscriptions.join(registered.drop_nulls("subscription"), on="subscription", how="anti")
+    takes = (
+        events.table(tables, "rmw_take")
+        .lazy()
+        .select("pid", pl.col("rmw_subscription_handle").alias("rmw_handle"))
+        .unique()
+        .collect()
+    )
+    return bare.join(takes, on=["pid", "rmw_handle"], how="semi").select(
+        "pid",
+        "handle",
+        "valid_from",
+        "node",
+        "topic",
+        "subscription",
+        valid_to=pl.lit(None, dtype=pl.Int64),
+        kind=pl.lit("subscription"),
+        observed=pl.lit(False),
+    )
+
+
+def _numbered(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFrame:
+    """Add ``callback_id``: registrations of what is the same callback to a person share one.
+
+    Two registrations are one callback when they belong to the same subscription (intra-process
+    twins), or when node, kind, topic, period and symbol agree and the first was done before the
+    second began: its address was reused, or its last instance started before.
+    """
+    missing = pl.format("unknown (process {})", "pid")
+    callbacks = callbacks.sort("valid_from", "handle", maintain_order=True).with_columns(
+        named=pl.col("node").is_not_null(), node=pl.col("node").fill_null(missing)
+    )
+    identity = ["pid", "kind", "node", "topic", "period_ns", "symbol"]
+    last_start = _last_starts(tables, callbacks, identity)
+    latest: dict[tuple[object, ...], tuple[int, int]] = {}  # identity → (id, row) seen last
+    of_subscription: dict[int, int] = {}
+    ids: list[int] = []
+    count = 0
+    columns = [*identity, "subscription", "valid_from", "valid_to", "named"]
+    for row, values in enumerate(callbacks.select(columns).iter_rows()):
+        *key, subscription, valid_from, _, named = values
+        found = of_subscription.get(subscription)
+        if found is None and named and tuple(key) in latest:
+            previous, at = latest[tuple(key)]
+            freed = callbacks["valid_to"][at]
+            ended = last_start.get(at)
+            if (freed is not None and freed <= valid_from) or (
+                ended is not None and ended < valid_from
+            ):
+                found = previous
+        number = count if found is None else found
+        count = max(count, number + 1)
+        ids.append(number)
+        latest[tuple(key)] = (number, row)
+        if subscription is not None:
+            of_subscription.setdefault(subscription, number)
+    return callbacks.drop("named").with_columns(pl.Series("callback_id", ids, dtype=pl.Int64))
+
+
+def _last_starts(
+    tables: events.EventTables, callbacks: pl.DataFrame, identity: list[str]
+) -> dict[int, int]:
+    """Row of a registration → time of its last instance, for those that look alike."""
+    alike = callbacks.with_row_index("row").filter(pl.len().over(identity) > 1)
+    if alike.is_empty():
+        return {}
+    handles = alike.select("pid", callback="handle").unique()
+    starts = events.table(tables, "callback_start").select("time", "pid", "callback")
+    starts = starts.join(handles, on=["pid", "callback"], how="semi")
+    owner = alike.select("row", "valid_from", "pid", callback="handle")
+    found = latest_before(starts, owner, ["pid", "callback"], "time", "valid_from")
+    last = found.drop_nulls("row").group_by("row").agg(pl.col("time").max())
+    return dict(last.select("row", "time").iter_rows())
+
+
+def _buffers(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFrame:
+    """Ring buffer → intra-process buffer → subscription object → callback."""
+    buffers = events.table(tables, "rclcpp_buffer_to_ipb").select(
+        "pid", "buffer", "ipb", valid_from="time"
+    )
+    owners = events.table(tables, "rclcpp_ipb_to_subscription").select(
+        "pid", "ipb", "subscription", owned="time"
+    )
+    added = events.table(tables, "rclcpp_subscription_callback_added").select(
+        "pid", "subscription", pl.col("callback").alias("handle"), added="time"
+    )
+    joined = first_after(buffers, owners, ["pid", "ipb"], "valid_from", "owned")
+    joined = nearest(
+        joined.drop_nulls("owned"), added, ["pid", "subscription"], "owned", "added"
+    ).drop_nulls("added")
+    ids = callbacks.select("pid", "handle", "callback_id", registered="valid_from")
+    joined = latest_before(joined, ids, ["pid", "handle"], "added", "registered")
+    return joined.select("pid", "buffer", "valid_from", "callback_id").sort("valid_from")
+
+
+def _notes(tables: events.EventTables, callbacks: pl.DataFrame) -> tuple[str, ...]:
+    notes: list[str] = []
+    unknown = callbacks.filter(pl.col("kind") == "unknown")
+    if len(unknown):
+        processes = ", ".join(str(pid) for pid in sorted(unknown["pid"].unique()))
+        notes.append(
+            f"{len(unknown)} callbacks (process {processes}) ran without having been registered: "
+            "tracing started after the application, or their events were lost; their node, kind "
+            "and topic cannot be known. Start tracing first to see them."
+        )
+    running = events.table(tables, "rmw_take").height + events.table(tables, "rmw_publish").height
+    if running and not events.table(tables, "rcl_node_init").height:
+        notes.append(
+            "no node was created during the recording: topics of publications and takes cannot "
+            "be known, so no chain can be followed."
+        )
+    for node, topic in callbacks.filter(~pl.col("observed")).select("node", "topic").iter_rows():
+        notes.append(
+            f"{node} takes {topic} without callback events (a Python node, or a wait set): its "
+            "response times cannot be known; what its thread publishes until its next take is "
+            "counted as its output."
+        )
+    return tuple(notes)

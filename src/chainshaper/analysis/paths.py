@@ -1,0 +1,226 @@
+"""Searching paths in the graph of callbacks and topics, without ever hanging.
+
+A path alternates between callbacks and topics and meets given way points in their order. Real
+applications have cycles and wide fan-in, so the number of simple paths grows exponentially, and
+counting them is #P-hard. Three things keep the answers quick:
+
+* only vertices that lie between a start and an end at all are looked at;
+* where these form no cycle, every step forward leads to an end, so listing needs no search;
+  where they do, one search backwards from the ends per step finds the steps that still lead
+  somewhere without meeting the path itself, so no dead end is ever entered;
+* counting and the heaviest path come from dynamic programming over the edges that agree with one
+  order of the vertices (the reverse postorder of a depth-first search): exact without cycles,
+  with cycles the paths that never step back in that order, so the count is a lower bound.
+"""
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+
+from chainshaper.analysis.graph import INTERNAL_TOPICS
+from chainshaper.app import ApplicationGraph, Callback
+
+__all__ = ["Path", "PathSearch", "Stage", "Vertex"]
+
+Vertex = int | str
+"""A callback's id, or a topic's name."""
+
+State = tuple[Vertex, int]
+"""A vertex, and how many way points have been met with it."""
+
+Path = tuple[Vertex, ...]
+
+SEARCHES = 150
+"""Backward searches that one listing may spend where there are cycles, about 1 ms each."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A way point: its name and the vertices that it stands for."""
+
+    name: str
+    vertices: frozenset[Vertex]
+
+
+@dataclass
+class PathSearch:
+    """All paths from ``starts`` through ``stages`` to a state that ``accepts``.
+
+    ``starts`` are callbacks. A path that starts before the first stage must go there at once (a
+    chain that begins with a topic starts at the callback that publishes it).
+    """
+
+    graph: ApplicationGraph
+    starts: frozenset[int]
+    stages: tuple[Stage, ...]
+    accepts: Callable[[State, Callback | None], bool]
+    successors: dict[State, tuple[State, ...]] = field(init=False)
+    ends: set[State] = field(init=False)
+    roots: tuple[State, ...] = field(init=False)
+    cyclic: bool = field(init=False)
+    furthest: int = field(init=False)
+    reached: frozenset[Vertex] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._callbacks = {callback.id: callback for callback in self.graph.callbacks}
+        named = frozenset().union(*(stage.vertices for stage in self.stages))
+        self._ignored = INTERNAL_TOPICS - named
+        self._subscribers: dict[str, list[int]] = {}
+        for callback in self.graph.callbacks:
+            if callback.topic is not None and callback.kind == "subscription":
+                self._subscribers.setdefault(callback.topic, []).append(callback.id)
+        roots = [self._enter(start, 0) for start in sorted(self.starts)]
+        self.successors = self._reachable(roots)
+        self.ends = {state for state in self.successors if self._is_end(state)}
+        useful = _distances(self.successors, self.ends)
+        self.furthest = max((met for _, met in self.successors), default=0)
+        self.reached = frozenset(v for v, met in self.successors if met == self.furthest)
+        self.successors = {
+            state: tuple(sorted((s for s in following if s in useful), key=useful.__getitem__))
+            for state, following in self.successors.items()
+            if state in useful
+        }
+        self.roots = tuple(sorted((r for r in roots if r in useful), key=useful.__getitem__))
+        self._order = self._postorder()
+        self.cyclic = any(
+            self._order[after[0]] >= self._order[state[0]]
+            for state, following in self.successors.items()
+            for after in following
+        )
+
+    def _enter(self, vertex: Vertex, met: int) -> State:
+        here = met < len(self.stages) and vertex in self.stages[met].vertices
+        return (vertex, met + 1 if here else met)
+
+    def _is_end(self, state: State) -> bool:
+        vertex = state[0]
+        return self.accepts(state, self._callbacks[vertex] if isinstance(vertex, int) else None)
+
+    def _reachable(self, roots: list[State]) -> dict[State, tuple[State, ...]]:
+        found: dict[State, tuple[State, ...]] = {}
+        waiting = list(roots)
+        while waiting:
+            state = waiting.pop()
+            if state in found:
+                continue
+            found[state] = () if self._is_end(state) else tuple(self._step(state))
+            waiting.extend(found[state])
+        return found
+
+    def _step(self, state: State) -> Iterator[State]:
+        vertex, met = state
+        if isinstance(vertex, int):
+            following: list[Vertex] = list(self._callbacks[vertex].publishes)
+        else:
+            following = list(self._subscribers.get(vertex, ()))
+        for after in following:
+            if after not in self._ignored:
+                entered = self._enter(after, met)
+                if met > 0 or entered[1] > 0:
+                    yield entered
+
+    def _postorder(self) -> dict[Vertex, int]:
+        """Vertices numbered as a depth-first search leaves them: edges lead to lower numbers."""
+        base: dict[Vertex, list[Vertex]] = {}
+        for (vertex, _), following in self.successors.items():
+            base.setdefault(vertex, []).extend(after for after, _ in following)
+        order: dict[Vertex, int] = {}
+        entered: set[Vertex] = set()
+        for root, _ in self.roots:
+            if root in entered:
+                continue
+            entered.add(root)
+            stack: list[tuple[Vertex, Iterator[Vertex]]] = [(root, iter(base[root]))]
+            while stack:
+                vertex, rest = stack[-1]
+                after = next((v for v in rest if v not in entered), None)
+                if after is None:
+                    order[vertex] = len(order)
+                    stack.pop()
+                else:
+                    entered.add(after)
+                    stack.append((after, iter(base.get(after, ()))))
+        return order
+
+    def listed(self, limit: int) -> tuple[tuple[Path, ...], bool]:
+        """Up to ``limit`` paths, short ones first where there is a choice; whether that is all."""
+        found: list[Path] = []
+        searches = 0
+        stack: list[tuple[State, Iterator[State]]] = []
+        for root in self.roots:
+            on_path: set[Vertex] = set()
+            stack = [((root[0], -1), iter((root,)))]
+            while stack:
+                state = next(stack[-1][1], None)
+                if state is None:
+                    on_path.discard(stack.pop()[0][0])
+                    continue
+                if state[0] in on_path:
+                    continue
+                if state in self.ends:
+                    if len(found) == limit:
+                        return tuple(found), False
+                    found.append((*(s[0] for s, _ in stack[1:]), state[0]))
+                    continue
+                on_path.add(state[0])
+                following = self.successors[state]
+                if self.cyclic:
+                    if searches == SEARCHES:
+                        return tuple(found), False
+                    searches += 1
+                    following = self._leading_on(state, on_path)
+                stack.append((state, iter(following)))
+        return tuple(found), True
+
+    def _leading_on(self, state: State, on_path: set[Vertex]) -> tuple[State, ...]:
+        """The successors from which an end can be reached without meeting the path again."""
+        free = {s: f for s, f in self.successors.items() if s[0] not in on_path}
+        useful = _distances(free, {end for end in self.ends if end in free})
+        following = [after for after in self.successors[state] if after in useful]
+        return tuple(sorted(following, key=useful.__getitem__))
+
+    def counted(self, weights: Mapping[int, float]) -> tuple[int, Path, float]:
+        """Number of paths, the heaviest of them, and its weight (the sum over its callbacks).
+
+        Of paths that never step back in the search's order; those are all unless ``cyclic``.
+        """
+        best: dict[State, tuple[int, float, State | None]] = {}
+        for state in sorted(self.successors, key=lambda s: (self._order[s[0]], -s[1])):
+            vertex = state[0]
+            own = weights.get(vertex, 0.0) if isinstance(vertex, int) else 0.0
+            count, weight, chosen = (1, 0.0, None) if state in self.ends else (0, -1.0, None)
+            for after in self.successors[state]:
+                if after not in best or self._order[after[0]] >= self._order[vertex]:
+                    continue
+                paths, below, _ = best[after]
+                count += paths
+                if paths and below > weight:
+                    weight, chosen = below, after
+            best[state] = (count, own + weight, chosen)
+        roots = [root for root in self.roots if best[root][0]]
+        if not roots:
+            return 0, (), 0.0
+        first = max(roots, key=lambda root: best[root][1])
+        heaviest: list[Vertex] = []
+        at: State | None = first
+        while at is not None:
+            heaviest.append(at[0])
+            at = best[at][2]
+        return sum(best[root][0] for root in roots), tuple(heaviest), best[first][1]
+
+
+def _distances(successors: Mapping[State, tuple[State, ...]], ends: set[State]) -> dict[State, int]:
+    """Steps from every state to the nearest end, for those from which one can be reached."""
+    before: dict[State, list[State]] = {}
+    for state, following in successors.items():
+        for after in following:
+            before.setdefault(after, []).append(state)
+    distance = dict.fromkeys(ends, 0)
+    waiting = deque(ends)
+    while waiting:
+        state = waiting.popleft()
+        for previous in before.get(state, ()):
+            if previous not in distance:
+                distance[previous] = distance[state] + 1
+                waiting.append(previous)
+    return distance

@@ -1,0 +1,38 @@
+"""All verbs of the command line."""
+
+from collections.abc import Callable
+
+import typer
+
+from chainshaper.cli.callbacks import callbacks
+from chainshaper.cli.compare import compare
+from chainshaper.cli.demo import demo
+from chainshaper.cli.doctor import doctor
+from chainshaper.cli.latency import latency
+from chainshaper.cli.plan import plan
+from chainshaper.cli.run import run
+from chainshaper.cli.shape import shape
+
+__all__ = ["app"]
+
+app = typer.Typer(
+    help="Constant end-to-end latency for ROS 2 computation chains, without touching their code.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+VERBS: tuple[Callable[..., None], ...] = (
+    demo,
+    run,
+    latency,
+    callbacks,
+    plan,
+    shape,
+    compare,
+    doctor,
+)
+for verb in VERBS:
+    app.command()(verb)

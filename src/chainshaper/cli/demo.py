@@ -1,0 +1,71 @@
+"""`chainshaper demo`: the whole flow on a live chain, on one command."""
+
+import sys
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from chainshaper.cli.options import CyclesOption, JsonOption, RealtimeOption
+
+__all__ = ["demo"]
+
+
+def demo(
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="DIR",
+            help="Folder for everything. Default: chainshaper-demo-DATE-TIME here.",
+            show_default=False,
+        ),
+    ] = None,
+    application: Annotated[
+        Path | None,
+        typer.Option(
+            "--application",
+            metavar="APP.yaml",
+            help="Another application than the paper's synthetic chain.",
+            show_default=False,
+        ),
+    ] = None,
+    cycles: CyclesOption = 320,
+    realtime: RealtimeOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Measure a live chain, plan, splice the shaping node, measure again, show the gain.
+
+    Runs the paper's synthetic chain as real processes over real DDS topics, for about a minute
+    and a half. Needs no ROS 2.
+    """
+    from chainshaper.cli.output import notes, print_json, progress, stdout
+    from chainshaper.demo import run_demo
+    from chainshaper.reporting.tables import (
+        callback_table,
+        comparison_json,
+        comparison_table,
+        plan_table,
+    )
+
+    folder = output or Path(f"chainshaper-demo-{datetime.now():%Y%m%d-%H%M%S}")
+    with progress("demo") as report:
+        result = run_demo(
+            folder,
+            application=application,
+            cycles=cycles,
+            realtime=realtime,
+            command=sys.argv,
+            progress=report,
+        )
+    if json:
+        print_json({**comparison_json(result.comparison), "folder": str(folder)})
+        return
+    out = stdout()
+    out.print(callback_table(result.callbacks))
+    out.print(plan_table(result.plan))
+    out.print(comparison_table(result.comparison))
+    notes(result.notes)
+    sys.stdout.write(f"{folder.absolute()}\n")

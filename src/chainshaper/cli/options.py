@@ -1,0 +1,71 @@
+"""Options that several verbs share."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from chainshaper.errors import InputError
+
+__all__ = [
+    "ApplicationArgument",
+    "ChainOption",
+    "CyclesOption",
+    "JsonOption",
+    "RealtimeOption",
+    "RecordingArgument",
+    "RecordingOutput",
+    "duration_option",
+]
+
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON (integer ns).")]
+ChainOption = Annotated[
+    str | None,
+    typer.Option(
+        "--chain",
+        metavar="FIRST..LAST",
+        help="The chain, by topics or nodes: /t1../t5. Default: the one the recording names.",
+        show_default=False,
+    ),
+]
+
+
+RecordingArgument = Annotated[
+    Path, typer.Argument(metavar="REC", help="A recording's folder.", show_default=False)
+]
+ApplicationArgument = Annotated[
+    Path,
+    typer.Argument(metavar="APP.yaml", help="The application's description.", show_default=False),
+]
+RecordingOutput = Annotated[
+    Path,
+    typer.Option(
+        "--output", "-o", metavar="REC", help="Folder to write; must not exist.", show_default=False
+    ),
+]
+CyclesOption = Annotated[int, typer.Option("--cycles", min=1, help="Cycles to record.")]
+RealtimeOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--realtime/--no-realtime",
+        help="Use SCHED_FIFO. Default: where it is permitted.",
+        show_default=False,
+    ),
+]
+
+
+def _parse(text: str) -> int:
+    from chainshaper.durations import parse_duration
+
+    try:
+        value = parse_duration(text)
+    except InputError as error:
+        raise typer.BadParameter(str(error)) from error
+    if value < 0:
+        raise typer.BadParameter(f"{text} is negative")
+    return value
+
+
+def duration_option(name: str, help_text: str) -> Any:
+    """An option that takes a duration with a unit and gives nanoseconds."""
+    return typer.Option(name, help=help_text, metavar="DURATION", parser=_parse)

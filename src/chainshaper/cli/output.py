@@ -1,0 +1,67 @@
+"""What verbs print: tables for people, JSON for machines, progress on stderr."""
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+__all__ = ["notes", "print_json", "progress", "stdout"]
+
+
+def stdout() -> "Console":
+    """Where results go; colour only on a terminal."""
+    from rich.console import Console
+
+    # A table in a file or a pipe must not be folded to the width of nothing.
+    return Console() if sys.stdout.isatty() else Console(width=120)
+
+
+def print_json(value: Any) -> None:
+    """One JSON document on stdout."""
+    sys.stdout.write(json.dumps(value, indent=2) + "\n")
+
+
+def notes(lines: Iterator[str] | tuple[str, ...] | list[str]) -> None:
+    """What a reader of the figures must know, one line each, on stderr."""
+    for line in lines:
+        sys.stderr.write(f"note: {line}\n")
+
+
+@contextmanager
+def progress(title: str) -> Iterator[Callable[[float, str], None]]:
+    """A progress bar on stderr; without a terminal one line per stage instead."""
+    if not sys.stderr.isatty():
+        yield _stage_lines(title)
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f}%"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(title, total=1.0)
+
+        def report(share: float, what: str) -> None:
+            bar.update(task, completed=min(1.0, share), description=f"{title}: {what}")
+
+        yield report
+
+
+def _stage_lines(title: str) -> Callable[[float, str], None]:
+    last = ""
+
+    def report(share: float, what: str) -> None:  # noqa: ARG001 - the signature of progress
+        nonlocal last
+        if what != last:
+            sys.stderr.write(f"{title}: {what}\n")
+            last = what
+
+    return report

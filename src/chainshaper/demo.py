@@ -1,0 +1,119 @@
+"""The demonstration: the whole flow on a live application, everything kept in one folder.
+
+DIR/application.yaml   what ran
+DIR/before             the recording of the unshaped run
+DIR/plan.yaml          what was planned from it
+DIR/after              the recording of the shaped run
+DIR/latency.png        latency of every cycle, before and after
+DIR/distribution.png   their distributions, with the publish slot
+DIR/comparison.json    every figure of the printed table
+"""
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+import polars as pl
+
+from chainshaper.analysis import callback_statistics, data_flow
+from chainshaper.errors import OperationError
+from chainshaper.planning import Plan, plan_warnings, save_plan
+from chainshaper.recording import refuse_existing
+from chainshaper.reporting.figures import draw_comparison
+from chainshaper.reporting.tables import comparison_json
+from chainshaper.steps import (
+    Comparison,
+    compare_recordings,
+    plan_recording,
+    shape_application,
+)
+from chainshaper.workload.description import load_application
+from chainshaper.workload.live import Progress, run_application
+
+__all__ = ["DemoResult", "run_demo", "synthetic_chain"]
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What the demonstration found; all of it can be recomputed from ``folder``."""
+
+    folder: Path
+    callbacks: pl.DataFrame
+    plan: Plan
+    comparison: Comparison
+    notes: tuple[str, ...]
+
+
+def synthetic_chain() -> Path:
+    """The description of the paper's synthetic chain (section 2.5)."""
+    return Path(str(resources.files("chainshaper") / "examples" / "synthetic_chain.yaml"))
+
+
+def run_demo(
+    folder: str | Path,
+    *,
+    application: str | Path | None = None,
+    cycles: int = 320,
+    realtime: bool | None = None,
+    command: Sequence[str] = (),
+    progress: Progress | None = None,
+) -> DemoResult:
+    """Run an application, plan, shape, run again and compare.
+
+    Raises:
+        InputError: ``folder`` exists and is not empty, or the application is not right.
+        PlatformError, OperationError: a step failed; recordings that are complete are kept.
+    """
+    folder = refuse_existing(folder)
+    path = synthetic_chain() if application is None else Path(application)
+    description = load_application(path)
+    try:
+        folder.mkdir(exist_ok=True)
+        shutil.copyfile(path, folder / "application.yaml")
+    except OSError as error:
+        raise OperationError(f"{folder}: cannot be written: {error}") from error
+    before = run_application(
+        description,
+        folder / "before",
+        cycles=cycles,
+        realtime=realtime,
+        command=command,
+        progress=_part(progress, 0.0, 0.48, "unshaped run"),
+    )
+    if progress is not None:
+        progress(0.48, "planning")
+    plan = plan_recording(before)
+    save_plan(plan, folder / "plan.yaml")
+    after = shape_application(
+        description,
+        plan,
+        folder / "after",
+        cycles=cycles,
+        realtime=realtime,
+        command=command,
+        progress=_part(progress, 0.5, 0.48, "shaped run"),
+    )
+    if progress is not None:
+        progress(0.98, "comparing")
+    comparison = compare_recordings([before, after])
+    draw_comparison(comparison.measurements, folder)
+    (folder / "comparison.json").write_text(
+        json.dumps(comparison_json(comparison), indent=2) + "\n"
+    )
+    return DemoResult(
+        folder=folder,
+        callbacks=callback_statistics(data_flow(before.events, before.info.clock_offset_ns)),
+        plan=plan,
+        comparison=comparison,
+        notes=tuple(dict.fromkeys([*before.info.notes, *after.info.notes, *plan_warnings(plan)])),
+    )
+
+
+def _part(progress: Progress | None, start: float, share: float, title: str) -> Progress | None:
+    """Progress of one run as a part of the whole."""
+    if progress is None:
+        return None
+    return lambda done, what: progress(start + share * done, f"{title}, {what}")

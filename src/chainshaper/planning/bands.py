@@ -1,0 +1,343 @@
+"""Where to put the publish slots of several latency bands, exactly (sections 3.3 and 4.1).
+
+With ν bands an execution publishes in the first slot that ends after it is done, so most of
+them come earlier than the longest latency. The average is eq. 5,
+
+    Σ_α (φ(x_α) − φ(x_{α−1}))·x_α,
+
+x_α the end of slot α and φ the measured distribution; the last slot stays where single-band
+shaping has it. The optimum is found on a grid of instants by dynamic programming from the last
+slot backwards: B_m(i), the least cost of the m bands behind a band that ends at x_i, is
+
+    B_m(i) = min over j of (c_j − c_i)·x_j + B_{m−1}(j),    B_1(i) = (n − c_i)·x_ν,
+
+c_i being the number of latencies ≤ x_i among n.
+
+**Why divide and conquer is exact, also under tight constraints.** For i < i' and j < j',
+
+    w(i, j') + w(i', j) − w(i, j) − w(i', j') = (c_i' − c_i)·(x_j' − x_j) ≥ 0
+
+with w(i, j) = (c_j − c_i)·x_j: the cost is Monge. Every constraint on neighbouring bands has the
+form "j not before the first allowed, not behind the last allowed", and both bounds ascend with i
+(Δ and LV bound x_j − x_i, the cap on a band's share bounds c_j − c_i). Let w be infinite where
+a constraint is broken. If the right pair, (i, j') with the widest and (i', j) with the narrowest
+distance, is allowed, then so are (i, j) and (i', j'), whose distances lie in between: the
+inequality holds with infinite costs too, because an infinity on its smaller side has one on the
+other. Adding B_{m−1}(j) to column j changes neither. So the leftmost best j never descends as i
+ascends, over all i that have an allowed j at all, which is what divide and conquer needs; the
+kernel leaves out rows and columns that have none.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chainshaper.durations import format_duration
+from chainshaper.errors import InputError, OperationError
+from chainshaper.planning.band_kernel import UNREACHABLE, cheapest_successors
+from chainshaper.planning.latency_file import check_latencies
+
+__all__ = [
+    "BandProblem",
+    "Goal",
+    "Placement",
+    "band_problem",
+    "broken_constraint",
+    "enough_bands",
+    "mean_of",
+    "place_bands",
+    "placement_curve",
+]
+
+Goal: TypeAlias = Literal["mean", "jitter", "gap"]
+
+MOST_CELLS = 120_000_000  # grid points × bands: more than a gigabyte
+
+
+@dataclass(frozen=True)
+class BandProblem:
+    """What a placement must respect; all times in nanoseconds. Made by :func:`band_problem`.
+
+    ``latencies_ns`` ascend. Slots are ``publish_slot_ns`` long (Δ), the last ends at
+    ``last_end_ns``, the others at multiples of ``grid_ns``. Neighbouring slot ends are at most
+    ``max_gap_ns`` apart (LV), a band holds at most ``max_share`` of the executions; None: no
+    such limit.
+    """
+
+    latencies_ns: NDArray[np.int64]
+    last_end_ns: int
+    publish_slot_ns: int
+    grid_ns: int
+    max_gap_ns: int | None = None
+    max_share: float | None = None
+
+    @property
+    def most_per_band(self) -> int:
+        """How many of the sample's latencies one band may hold."""
+        size = self.latencies_ns.size
+        return size if self.max_share is None else int(self.max_share * size + 1e-9)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Slot ends, ascending, and the average that eq. 5 predicts for them."""
+
+    slot_ends_ns: tuple[int, ...]
+    mean_ns: float
+
+
+def band_problem(
+    latencies_ns: NDArray[np.int64],
+    last_end_ns: int,
+    *,
+    publish_slot_ns: int = 1_000_000,
+    grid_ns: int = 1_000,
+    max_gap_ns: int | None = None,
+    max_share: float | None = None,
+) -> BandProblem:
+    """Check and sort what a placement needs.
+
+    Raises:
+        InputError: values that make no sense for any number of bands; the message names them.
+    """
+    latencies = np.sort(check_latencies(latencies_ns))
+    if publish_slot_ns <= 0 or grid_ns <= 0:
+        raise InputError("the publish slot and the grid must be longer than 0ms")
+    if last_end_ns < latencies[-1]:
+        raise InputError(
+            f"the last slot ends at {format_duration(last_end_ns)}, before the longest latency"
+            f" {format_duration(int(latencies[-1]))}: move it behind"
+        )
+    if max_gap_ns is not None and max_gap_ns <= publish_slot_ns:
+        raise InputError(
+            f"a largest gap of {format_duration(max_gap_ns)} is not longer than the publish slot"
+            f" {format_duration(publish_slot_ns)}, so no two slots could follow each other: allow"
+            " a longer gap or use a shorter slot"
+        )
+    if max_share is not None and not 0 < max_share <= 1:
+        raise InputError(f"the largest share per band must be above 0, at most 1: not {max_share}")
+    if latencies.size * last_end_ns >= 2**62:
+        raise InputError("latencies this long and this many overflow the planner: plan with fewer")
+    return BandProblem(latencies, last_end_ns, publish_slot_ns, grid_ns, max_gap_ns, max_share)
+
+
+def place_bands(
+    problem: BandProblem,
+    bands: int,
+    *,
+    minimise: Goal = "mean",
+    mean_at_most_ns: int | None = None,
+) -> Placement:
+    """The best placement of ``bands`` slots that exists on the grid.
+
+    ``minimise`` the average (eq. 5; among equals the one with the smallest jitter), or, under
+    the condition that the average stays at or below ``mean_at_most_ns``, the overall jitter
+    x_ν − (x_1 − Δ), or the largest gap between neighbouring bands.
+
+    Raises:
+        InputError: a number of bands or a goal that makes no sense.
+        OperationError: no placement exists; the message names the constraint that prevents it.
+    """
+    if bands < 1:
+        raise InputError(f"{bands} bands: plan with one band at least")
+    if minimise == "jitter" and mean_at_most_ns is None:
+        raise InputError("the smallest jitter is that of one band: say which average it may cost")
+    if minimise == "gap":
+        return _smallest_gap(problem, bands, mean_at_most_ns)
+    tables = _solve(problem, bands)
+    best = _best(tables, bands)
+    if best is None:
+        raise OperationError(_why_none(problem, bands))
+    _refuse_slower(best, mean_at_most_ns)
+    if minimise == "jitter" and bands > 1 and mean_at_most_ns is not None:
+        allowed = mean_at_most_ns * problem.latencies_ns.size
+        return _read(tables, bands, int(np.flatnonzero(tables.totals(bands) <= allowed)[-1]))
+    return best
+
+
+def placement_curve(problem: BandProblem, most_bands: int) -> list[Placement]:
+    """The best placement for each number of bands from one upwards (figure 7).
+
+    Ends early where more bands do not fit.
+
+    Raises:
+        OperationError: no number of bands up to ``most_bands`` can be placed.
+    """
+    tables = _solve(problem, most_bands)
+    curve: list[Placement] = []
+    for bands in range(1, most_bands + 1):
+        best = _best(tables, bands)
+        if best is not None:
+            curve.append(best)
+        elif curve:
+            break
+    if not curve:
+        raise OperationError(_why_none(problem, most_bands))
+    return curve
+
+
+def enough_bands(curve: list[Placement], least_gain: float = 0.02) -> Placement:
+    """The first placement of a curve behind which another band gains less than ``least_gain``.
+
+    The gain is the share of the average that one more band takes away: beyond the point that
+    this picks, figure 7 is flat.
+    """
+    for placement, following in pairwise(curve):
+        if placement.mean_ns - following.mean_ns < least_gain * placement.mean_ns:
+            return placement
+    return curve[-1]
+
+
+def mean_of(problem: BandProblem, slot_ends_ns: tuple[int, ...]) -> float:
+    """The average that eq. 5 gives for any slot ends."""
+    reached = np.searchsorted(problem.latencies_ns, slot_ends_ns, side="right")
+    return float(np.diff(reached, prepend=0) @ np.array(slot_ends_ns)) / problem.latencies_ns.size
+
+
+def broken_constraint(problem: BandProblem, slot_ends_ns: tuple[int, ...]) -> str | None:
+    """The first constraint that given slot ends break, in words; None when they keep all.
+
+    The grid is not among them: a solver may place slots anywhere.
+    """
+    ends = np.array(slot_ends_ns)
+    slot, shortest = problem.publish_slot_ns, int(problem.latencies_ns[0])
+    reached = np.searchsorted(problem.latencies_ns, ends, side="right")
+    if ends.size > 1 and ends[0] - slot <= shortest:
+        return f"the first slot must begin after the shortest latency {format_duration(shortest)}"
+    if (np.diff(ends) <= slot).any():
+        return f"slot ends must be more than the publish slot {format_duration(slot)} apart"
+    if problem.max_gap_ns is not None and (np.diff(ends) > problem.max_gap_ns).any():
+        return f"slot ends must be at most {format_duration(problem.max_gap_ns)} apart"
+    if (np.diff(reached, prepend=0) > problem.most_per_band).any():
+        return f"a band must hold at most {problem.max_share:.1%} of the executions"
+    return None
+
+
+@dataclass(frozen=True)
+class _Tables:
+    """Grid positions and, for each number of bands behind one, their cost and the next band."""
+
+    problem: BandProblem
+    ends: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    costs: list[NDArray[np.int64]]
+    successors: list[NDArray[np.int32]]  # successors[m][i]: −1 where the last band follows
+
+    def totals(self, bands: int) -> NDArray[np.int64]:
+        """The cost of all bands for every position of the first; two bands at least."""
+        behind = self.costs[bands - 2]
+        allowed = (behind != UNREACHABLE) & (self.counts <= self.problem.most_per_band)
+        return np.where(allowed, behind + self.counts * self.ends * allowed, UNREACHABLE)
+
+
+def _solve(problem: BandProblem, bands: int) -> _Tables:
+    slot, grid, last = problem.publish_slot_ns, problem.grid_ns, problem.last_end_ns
+    # Positions: multiples of the grid above L̲ + Δ (x_1 − Δ > L̲) and below x_ν − Δ.
+    first = (int(problem.latencies_ns[0]) + slot) // grid + 1
+    size = max(0, -(-(last - slot) // grid) - first) if bands > 1 else 0
+    if size * bands > MOST_CELLS:
+        raise InputError(
+            f"{size} positions for {bands} bands are too many to search: use a grid coarser than"
+            f" {format_duration(grid)}"
+        )
+    ends = (first + np.arange(size, dtype=np.int64)) * grid
+    counts = np.searchsorted(problem.latencies_ns, ends, side="right").astype(np.int64)
+    behind = problem.latencies_ns.size - counts
+    reachable = behind <= problem.most_per_band
+    nearest = np.arange(size, dtype=np.int64) + slot // grid + 1  # x_α − x_{α−1} > Δ
+    farthest = np.searchsorted(counts, counts + problem.most_per_band, side="right") - 1
+    if problem.max_gap_ns is not None:
+        reachable &= last - ends <= problem.max_gap_ns
+        farthest = np.minimum(farthest, np.arange(size) + problem.max_gap_ns // grid)
+        farthest = np.minimum(farthest, size - 1)
+    costs = [np.where(reachable, behind * last, UNREACHABLE)]
+    successors: list[NDArray[np.int32]] = [np.full(size, -1, dtype=np.int32)]
+    for _ in range(bands - 2):
+        cost, successor = cheapest_successors(counts, ends, nearest, farthest, costs[-1])
+        costs.append(cost)
+        successors.append(successor.astype(np.int32))
+    return _Tables(problem, ends, counts, costs, successors)
+
+
+def _best(tables: _Tables, bands: int) -> Placement | None:
+    problem = tables.problem
+    if bands == 1:
+        fits = problem.latencies_ns.size <= problem.most_per_band
+        return Placement((problem.last_end_ns,), float(problem.last_end_ns)) if fits else None
+    totals = tables.totals(bands)
+    if not totals.size or totals.min() == UNREACHABLE:
+        return None
+    # Of equally good placements the one that begins last: the smallest jitter.
+    return _read(tables, bands, int(np.flatnonzero(totals == totals.min())[-1]))
+
+
+def _read(tables: _Tables, bands: int, position: int) -> Placement:
+    total = int(tables.totals(bands)[position])
+    ends = [int(tables.ends[position])]
+    for behind in range(bands - 2, 0, -1):
+        position = int(tables.successors[behind][position])
+        ends.append(int(tables.ends[position]))
+    ends.append(tables.problem.last_end_ns)
+    return Placement(tuple(ends), total / tables.problem.latencies_ns.size)
+
+
+def _smallest_gap(problem: BandProblem, bands: int, mean_at_most_ns: int | None) -> Placement:
+    # A larger gap only ever allows more: the smallest one that is enough is found by halving.
+    found = place_bands(problem, bands, mean_at_most_ns=mean_at_most_ns)
+    low = problem.publish_slot_ns
+    high = max(np.diff(found.slot_ends_ns), default=low + 1)
+    while high - low > 1:
+        middle = int(low + high) // 2
+        try:
+            found = place_bands(
+                replace(problem, max_gap_ns=middle), bands, mean_at_most_ns=mean_at_most_ns
+            )
+            high = max(np.diff(found.slot_ends_ns))
+        except OperationError:
+            low = middle
+    return found
+
+
+def _refuse_slower(best: Placement, mean_at_most_ns: int | None) -> None:
+    if mean_at_most_ns is not None and best.mean_ns > mean_at_most_ns:
+        raise OperationError(
+            f"no placement of {len(best.slot_ends_ns)} bands has an average of"
+            f" {format_duration(mean_at_most_ns)} or less; the best is"
+            f" {format_duration(round(best.mean_ns))}: allow that, or more bands"
+        )
+
+
+def _why_none(problem: BandProblem, bands: int) -> str:
+    """Which constraint leaves no placement: the one without which there is one."""
+    said = f"{bands} bands cannot be placed: "
+    slot, room = problem.publish_slot_ns, problem.last_end_ns - int(problem.latencies_ns[0])
+    most = max(1, room // (slot + 1))  # x_1 ≥ L̲ + Δ + 1 ns, then steps of Δ + 1 ns at least
+    if bands > most:
+        return (
+            f"{said}between the shortest latency {format_duration(int(problem.latencies_ns[0]))}"
+            f" and the last slot's end {format_duration(problem.last_end_ns)} there is room for"
+            f" {most} publish slots of {format_duration(slot)}; use fewer bands or a shorter slot"
+        )
+    limits = []
+    if problem.max_share is not None:
+        without = replace(problem, max_share=None)
+        reason = f"no placement keeps every band at {problem.max_share:.1%} of the executions"
+        limits.append((without, f"{reason}; allow a larger share or more bands"))
+    if problem.max_gap_ns is not None:
+        without = replace(problem, max_gap_ns=None)
+        reason = f"no placement keeps neighbours within {format_duration(problem.max_gap_ns)}"
+        limits.append((without, f"{reason}; allow a larger gap"))
+    for without, reason in limits:
+        if _best(_solve(without, bands), bands) is not None:
+            return said + reason
+    if len(limits) == 2 and _best(
+        _solve(replace(problem, max_share=None, max_gap_ns=None), bands), bands
+    ):
+        return f"{said}the largest gap and the largest share exclude each other; relax one"
+    return (
+        f"{said}the grid of {format_duration(problem.grid_ns)} is too coarse for slots of"
+        f" {format_duration(slot)}; use a finer one"
+    )

@@ -1,0 +1,244 @@
+"""How far beyond the longest measured latency a slot must reach, from the tail of the sample.
+
+The longest of n measured latencies is exceeded sooner or later. Extreme value theory says how
+often: whatever the distribution, its excesses over a high threshold u follow, in the limit, a
+generalised Pareto distribution (Pickands–Balkema–de Haan), which can be fitted and read beyond
+the data. With ζ the share of latencies above u, ξ the shape and σ the scale, the latency that
+is exceeded with probability p is
+
+    x_p = u + σ/ξ · ((ζ/p)^ξ − 1),
+
+and the margin is ε = x_p − L̄, if that is positive. This holds for independent executions of an
+unchanging system and a tail that does look generalised Pareto. Each of the three is tested, and
+where one fails there is no number.
+
+The parameters are estimated by L-moments (Hosking and Wallis, *Parameter and quantile estimation
+for the generalized Pareto distribution*, Technometrics 29, 1987), which for a few hundred
+excesses err less than maximum likelihood does. The goodness of fit (Anderson–Darling) and the
+confidence interval come from one parametric bootstrap, because tables for known parameters do
+not hold for estimated ones. In simulations with normal, exponential and uniform-sum latencies the
+95 % interval held the true value in 87 to 98 of 100 samples of 5,000, and missed on the low side
+when it missed: for small samples it is somewhat optimistic.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chainshaper.durations import format_duration
+from chainshaper.errors import InputError, OperationError
+from chainshaper.planning.extras import extra_library
+from chainshaper.planning.latency_file import check_latencies
+from chainshaper.planning.plan import Margin
+
+__all__ = ["TailFit", "derive_margin", "fit_tail"]
+
+# A tail is the n^(2/3) longest of n latencies, or these parts of it: the more there are, the
+# further out it begins. A fixed share would leave large samples with a systematic error.
+TAILS = (1.0, 0.85, 0.7, 0.6, 0.5)
+FEWEST_EXCESSES = 50
+MOST_EXCESSES = 2_000
+MOST_PROBABLE = 0.001
+SIGNIFICANCE = 0.01  # below it, independence or an unchanging system is given up
+GOODNESS = 0.10  # the fit's own test must not come near rejection
+CONFIDENCE = 0.95
+BOOTSTRAPS = 999
+WIDEST_INTERVAL = 0.5  # of the latency itself; wider, the sample does not tell
+
+_Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TailFit:
+    """A generalised Pareto tail and the latency that it says is exceeded with ``probability``.
+
+    ``interval_ns`` is the 95 % confidence interval of ``latency_ns``; ``goodness`` the p-value
+    of the Anderson–Darling test of the fit.
+    """
+
+    probability: float
+    threshold_ns: int
+    excesses: int
+    shape: float
+    scale_ns: float
+    goodness: float
+    latency_ns: int
+    interval_ns: tuple[int, int]
+
+
+def derive_margin(
+    latencies_ns: NDArray[np.int64], overrun_probability: float, seed: int = 0
+) -> Margin:
+    """The margin ε with which an execution overruns its slot with the given probability.
+
+    ``latencies_ns`` are in the order in which they were measured. The result says that it was
+    derived, and keeps the probability and the confidence interval of ε; hand it to
+    :func:`chainshaper.planning.shaping.plan_shaping`.
+
+    Raises: as :func:`fit_tail`.
+    """
+    fit = fit_tail(latencies_ns, overrun_probability, seed)
+    longest = int(np.max(latencies_ns))
+    low, high = (max(0, end - longest) for end in fit.interval_ns)
+    return Margin(
+        epsilon_ns=max(0, fit.latency_ns - longest),
+        source="derived",
+        overrun_probability=overrun_probability,
+        confidence_interval_ns=(low, high),
+    )
+
+
+def fit_tail(latencies_ns: NDArray[np.int64], probability: float, seed: int = 0) -> TailFit:
+    """Fit the tail of a sample and read the latency that is exceeded with a small probability.
+
+    The threshold is the lowest of a few that leaves a tail of good fit. ``seed`` is the
+    bootstrap's.
+
+    Raises:
+        InputError: latencies that cannot be planned with, or a probability outside the tail.
+        OperationError: the data do not allow an answer: too few, not stationary, not
+            independent, no generalised Pareto tail, or an answer too vague to plan with.
+        PlatformError: SciPy is not installed.
+    """
+    latencies = check_latencies(latencies_ns)
+    if not 0 < probability < MOST_PROBABLE:
+        raise InputError(
+            f"an overrun probability of {probability} is none of the tail: give one above 0 and"
+            f" below {MOST_PROBABLE}"
+        )
+    fewest = round(FEWEST_EXCESSES**1.5)
+    if latencies.size <= fewest:
+        raise OperationError(
+            f"{latencies.size} latencies are too few to say anything about rarer ones: measure"
+            f" more than {fewest} cycles, better thousands, or give the margin yourself"
+        )
+    _refuse_not_stationary(latencies)
+    random = np.random.default_rng(seed)
+    tried = []
+    for threshold in _thresholds(latencies):
+        fit = _fit_above(latencies, threshold, probability, random)
+        tried.append(fit.goodness)
+        if fit.goodness >= GOODNESS:
+            _refuse_clusters(latencies, threshold)
+            _refuse_vague(fit, latencies.size)
+            return fit
+    raise OperationError(
+        "the longest latencies do not follow a generalised Pareto distribution above any of"
+        f" {len(tried)} thresholds (best p-value {max(tried, default=0):.3f}), so rarer ones cannot"
+        " be extrapolated: look for two modes of the application in one recording, or give the"
+        " margin yourself"
+    )
+
+
+def _thresholds(latencies: NDArray[np.int64]) -> Iterator[int]:
+    ordered = np.sort(latencies)
+    longest = min(ordered.size ** (2 / 3), MOST_EXCESSES)
+    for share in TAILS:
+        threshold = int(ordered[-round(share * longest) - 1])
+        if np.count_nonzero(latencies > threshold) >= FEWEST_EXCESSES:
+            yield threshold
+
+
+def _fit_above(
+    latencies: NDArray[np.int64], threshold: int, probability: float, random: np.random.Generator
+) -> TailFit:
+    pareto = extra_library("scipy.stats", "a margin from extreme value theory").genpareto
+    excesses = np.sort(latencies[latencies > threshold] - threshold).astype(float)[np.newaxis, :]
+    shape, scale = _l_moment_fit(excesses)
+    goodness_of_fit = _anderson_darling(pareto, excesses, shape, scale)[0]
+    share = excesses.size / latencies.size
+    quantile = float(_quantile(shape, scale, share, probability)[0])
+
+    drawn = pareto.rvs(
+        shape[0], scale=scale[0], size=(BOOTSTRAPS, excesses.size), random_state=random
+    )
+    drawn.sort(axis=1)
+    shapes, scales = _l_moment_fit(drawn)
+    statistics = _anderson_darling(pareto, drawn, shapes, scales)
+    shares = random.binomial(latencies.size, share, BOOTSTRAPS) / latencies.size
+    quantiles = _quantile(shapes, scales, shares, probability)
+    low, high = np.quantile(quantiles, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return TailFit(
+        probability=probability,
+        threshold_ns=threshold,
+        excesses=excesses.size,
+        shape=float(shape[0]),
+        scale_ns=float(scale[0]),
+        goodness=float((1 + np.sum(statistics >= goodness_of_fit)) / (1 + BOOTSTRAPS)),
+        latency_ns=threshold + round(quantile),
+        interval_ns=(threshold + round(low), threshold + round(high)),
+    )
+
+
+def _l_moment_fit(ordered: _Floats) -> tuple[_Floats, _Floats]:
+    """Shape and scale for each row of ascending excesses.
+
+    With λ₁ the mean and λ₂ half the mean difference of two, ξ = 2 − λ₁/λ₂ and σ = λ₁(1 − ξ).
+    """
+    size = ordered.shape[1]
+    first = ordered.mean(axis=1)
+    weights = (2 * np.arange(size) - (size - 1)) / (size * (size - 1))
+    second = ordered @ weights
+    shape = 2 - first / second
+    return shape, first * (1 - shape)
+
+
+def _quantile(
+    shape: _Floats, scale: _Floats, share: float | _Floats, probability: float
+) -> _Floats:
+    ratio = np.log(np.maximum(share / probability, 1.0))
+    nearly_zero = np.abs(shape) < 1e-9
+    safe = np.where(nearly_zero, 1.0, shape)
+    result: _Floats = scale * np.where(nearly_zero, ratio, np.expm1(safe * ratio) / safe)
+    return result
+
+
+def _anderson_darling(pareto: object, ordered: _Floats, shape: _Floats, scale: _Floats) -> _Floats:
+    """A² of each row; infinite where an excess lies beyond the fitted distribution's end."""
+    size = ordered.shape[1]
+    parameters = {"c": shape[:, np.newaxis], "scale": scale[:, np.newaxis]}
+    below = pareto.logcdf(ordered, **parameters)  # type: ignore[attr-defined]
+    above = pareto.logsf(ordered, **parameters)[:, ::-1]  # type: ignore[attr-defined]
+    weights = (2 * np.arange(1, size + 1) - 1) / size
+    result: _Floats = -size - ((below + above) * weights).sum(axis=1)
+    return result
+
+
+def _refuse_not_stationary(latencies: NDArray[np.int64]) -> None:
+    stats = extra_library("scipy.stats", "a margin from extreme value theory")
+    half = latencies.size // 2
+    halves = stats.ks_2samp(latencies[:half], latencies[half:], method="asymp").pvalue
+    trend = stats.kendalltau(np.arange(latencies.size), latencies).pvalue
+    if min(halves, trend) < SIGNIFICANCE / 2:
+        raise OperationError(
+            "the latencies are not stationary (two halves alike:"
+            f" p = {halves:.2g}; no trend: p = {trend:.2g}): they come from a system that changed"
+            " while it was measured, and nothing follows for later. Measure after start-up and in"
+            " one operating mode, in the order of time, or give the margin yourself"
+        )
+
+
+def _refuse_clusters(latencies: NDArray[np.int64], threshold: int) -> None:
+    stats = extra_library("scipy.stats", "a margin from extreme value theory")
+    above = latencies > threshold
+    share = float(above.mean())
+    long, followed = int(above[:-1].sum()), int(np.count_nonzero(above[:-1] & above[1:]))
+    chance = stats.binomtest(followed, long, share, alternative="greater").pvalue
+    if chance < SIGNIFICANCE:
+        raise OperationError(
+            f"long latencies come in clusters ({followed} of {long} are followed by another,"
+            f" p = {chance:.2g}): executions are not independent, as when one delays the"
+            " next. Remove the cause, or give the margin yourself"
+        )
+
+
+def _refuse_vague(fit: TailFit, samples: int) -> None:
+    low, high = fit.interval_ns
+    if not high - low <= WIDEST_INTERVAL * fit.latency_ns:
+        raise OperationError(
+            f"{samples} latencies are too few for an overrun probability of {fit.probability:g}:"
+            f" the latency it asks for lies between {format_duration(low)} and"
+            f" {format_duration(high)}. Measure more cycles, or ask for less"
+        )

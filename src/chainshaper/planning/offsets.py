@@ -1,0 +1,226 @@
+"""Several chains on shared cores: when each one's cycles start, so that no slots collide.
+
+Plans made one by one may want the same instants of the same core. Within the hyper-period of
+their cycles, chains are moved against each other until every two slots of one core and one
+priority are disjoint in all cycles (the rule that holds inside a plan, across plans; servers of
+different priority may overlap, as there). The paper leaves this open (section 3.1).
+
+Two slots [a, a + d) and [b, b + e) that repeat every T and U collide in some cycle unless the
+distance of their starts, modulo g = gcd(T, U), is in [d, g − e]: the distances that occur are
+all numbers congruent to it. So each pair of chains allows a set of differences of offsets
+modulo g, and nothing else matters.
+
+**Few chains are searched exhaustively.** From any solution, take the chains that are not linked
+to the first by a chain of tight pairs (pairs whose difference is at an end of an allowed
+interval), and start all of them earlier until some pair becomes tight. Repeated, that links
+every chain to the first without breaking a constraint: if there is a solution, there is one in
+which the tight pairs form a tree, and it is enough to try the ends of allowed intervals. Many
+chains are given to the CP-SAT solver of OR-tools, which is exact as well but may run out of time.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from itertools import combinations
+from typing import TypeAlias
+
+from chainshaper.durations import format_duration
+from chainshaper.errors import InputError, OperationError
+from chainshaper.planning.extras import extra_library
+from chainshaper.planning.plan import Plan, revised
+
+__all__ = ["with_offsets"]
+
+MOST_SEARCHED = 4  # chains; beyond, CP-SAT is faster
+TIME_LIMIT_SECONDS = 60.0
+
+_Intervals: TypeAlias = list[tuple[int, int]]  # closed, ascending
+_Allowed: TypeAlias = dict[tuple[int, int], tuple[int, _Intervals]]
+"""For chains j < k whose slots can collide: g, and what (offset k − offset j) mod g may be."""
+
+
+def with_offsets(plans: Sequence[Plan]) -> tuple[Plan, ...]:
+    """The plans of several chains with offsets that keep their slots apart.
+
+    The first chain, and any that shares no core with another, keeps the offset 0. To let two
+    chains run on one core at the same time, give their servers different priorities first.
+
+    Raises:
+        InputError: no plans.
+        OperationError: there are no such offsets, with the reason where a single pair of chains
+            or the load of a core already excludes them; or the solver ran out of time.
+        PlatformError: more than a few chains collide and OR-tools is not installed.
+    """
+    if not plans:
+        raise InputError("no plans to find offsets for: give one per chain")
+    allowed: _Allowed = {}
+    for j, k in combinations(range(len(plans)), 2):
+        found = _allowed_differences(plans[j], plans[k])
+        if found is not None:
+            allowed[j, k] = found
+            if not found[1]:
+                raise OperationError(_pair_too_long(plans[j], plans[k], found[0]))
+    _refuse_overload(plans)
+    offsets = [0] * len(plans)
+    for group in _groups(len(plans), allowed):
+        if len(group) <= MOST_SEARCHED:
+            solution = _search(plans, allowed, group, {group[0]: 0})
+        else:
+            solution = _solve(plans, allowed, group)
+        if solution is None:
+            raise OperationError(
+                f"there are no offsets at which {', '.join(_name(plans[k]) for k in group)} keep"
+                " their slots apart, although any two of them could: move one to another core,"
+                " give servers different priorities, or shorten slots"
+            )
+        for k, offset in solution.items():
+            offsets[k] = offset
+    return tuple(
+        revised(plan, offset_ns=offset) for plan, offset in zip(plans, offsets, strict=True)
+    )
+
+
+def _allowed_differences(one: Plan, two: Plan) -> tuple[int, _Intervals] | None:
+    common = math.gcd(one.cycle_ns, two.cycle_ns)
+    forbidden: _Intervals = []
+    for place in _places(one) & _places(two):
+        for start_one, end_one in _slots(one, place):
+            for start_two, end_two in _slots(two, place):
+                # They collide if `two` starts later by more than this and less than that.
+                first, last = start_one - end_two + 1, end_one - start_two - 1
+                if last - first + 1 >= common:
+                    return common, []
+                first, last = first % common, last % common
+                forbidden += [(first, last)] if first <= last else [(0, last), (first, common - 1)]
+    if not forbidden:
+        return None
+    allowed, free = [], 0
+    for first, last in sorted(forbidden):
+        if first > free:
+            allowed.append((free, first - 1))
+        free = max(free, last + 1)
+    if free < common:
+        allowed.append((free, common - 1))
+    return common, allowed
+
+
+def _places(plan: Plan) -> set[tuple[int, int]]:
+    return {(server.core, server.priority) for server in plan.servers}
+
+
+def _slots(plan: Plan, place: tuple[int, int]) -> Iterator[tuple[int, int]]:
+    for server in plan.servers:
+        if (server.core, server.priority) == place:
+            yield from server.slots
+
+
+def _groups(count: int, allowed: _Allowed) -> list[list[int]]:
+    """Chains that can collide with each other, directly or through others."""
+    groups = [{k} for k in range(count)]
+    for j, k in allowed:
+        merged = set().union(*(group for group in groups if j in group or k in group))
+        groups = [group for group in groups if not group & merged] + [merged]
+    return [sorted(group) for group in groups if len(group) > 1]
+
+
+def _differences(allowed: _Allowed, j: int, k: int) -> tuple[int, _Intervals] | None:
+    """What (offset k − offset j) mod g may be, whichever of the two comes first."""
+    if (j, k) in allowed:
+        return allowed[j, k]
+    if (k, j) in allowed:
+        common, intervals = allowed[k, j]
+        return common, [(-last % common, -first % common) for first, last in intervals]
+    return None
+
+
+def _search(
+    plans: Sequence[Plan], allowed: _Allowed, group: list[int], placed: dict[int, int]
+) -> dict[int, int] | None:
+    if len(placed) == len(group):
+        return placed
+    tried = set()
+    for k in (k for k in group if k not in placed):
+        for offset in _tight_offsets(plans[k].cycle_ns, allowed, k, placed):
+            if (k, offset) not in tried and _fits(allowed, k, offset, placed):
+                tried.add((k, offset))
+                found = _search(plans, allowed, group, {**placed, k: offset})
+                if found is not None:
+                    return found
+    return None
+
+
+def _tight_offsets(cycle: int, allowed: _Allowed, k: int, placed: dict[int, int]) -> Iterator[int]:
+    for j, base in placed.items():
+        difference = _differences(allowed, j, k)
+        if difference is not None:
+            common, intervals = difference
+            for end in {end for interval in intervals for end in interval}:
+                yield from range((base + end) % common, cycle, common)
+
+
+def _fits(allowed: _Allowed, k: int, offset: int, placed: dict[int, int]) -> bool:
+    for j, base in placed.items():
+        difference = _differences(allowed, j, k)
+        if difference is not None:
+            common, intervals = difference
+            distance = (offset - base) % common
+            if not any(
+                first <= distance <= last or (first > last and not last < distance < first)
+                for first, last in intervals
+            ):
+                return False
+    return True
+
+
+def _solve(plans: Sequence[Plan], allowed: _Allowed, group: list[int]) -> dict[int, int] | None:
+    cp_model = extra_library("ortools.sat.python.cp_model", "offsets for this many chains")
+    model = cp_model.CpModel()
+    offsets = {k: model.new_int_var(0, plans[k].cycle_ns - 1, f"offset{k}") for k in group}
+    model.add(offsets[group[0]] == 0)
+    for (j, k), (common, intervals) in allowed.items():
+        if j in offsets and k in offsets:
+            cycles = model.new_int_var(
+                -(plans[j].cycle_ns // common) - 1, plans[k].cycle_ns // common + 1, f"n{j}_{k}"
+            )
+            model.add_linear_expression_in_domain(
+                offsets[k] - offsets[j] - common * cycles,
+                cp_model.Domain.from_intervals([list(interval) for interval in intervals]),
+            )
+    solver = cp_model.CpSolver()
+    solver.parameters.max_time_in_seconds = TIME_LIMIT_SECONDS
+    solver.parameters.num_workers = 1  # the same plans give the same offsets
+    status = solver.solve(model)
+    if status == cp_model.INFEASIBLE:
+        return None
+    if status not in (cp_model.OPTIMAL, cp_model.FEASIBLE):
+        raise OperationError(
+            f"no offsets for {len(group)} chains were found within {TIME_LIMIT_SECONDS:.0f} s,"
+            " nor a proof that there are none: put fewer chains on a core"
+        )
+    return {k: int(solver.value(offset)) for k, offset in offsets.items()}
+
+
+def _refuse_overload(plans: Sequence[Plan]) -> None:
+    for place in sorted(set().union(*(_places(plan) for plan in plans))):
+        load = sum(
+            (end - start) / plan.cycle_ns for plan in plans for start, end in _slots(plan, place)
+        )
+        if load > 1 + 1e-9:
+            raise OperationError(
+                f"the slots of all chains on core {place[0]} at priority {place[1]} fill"
+                f" {load:.1%} of its time: move a chain to another core, or give servers different"
+                " priorities"
+            )
+
+
+def _pair_too_long(one: Plan, two: Plan, common: int) -> str:
+    return (
+        f"the slots of {_name(one)} and {_name(two)} collide at every offset: with cycles of"
+        f" {format_duration(one.cycle_ns)} and {format_duration(two.cycle_ns)} they meet in every"
+        f" distance modulo {format_duration(common)}, which leaves no room for both. Move one to"
+        " another core, give their servers different priorities, or use periods with a larger"
+        " common divisor"
+    )
+
+
+def _name(plan: Plan) -> str:
+    return plan.chain.spec or plan.chain.output or "a chain without a name"

@@ -1,0 +1,158 @@
+"""Several latency bands, or one long slot, in place of a shaped plan's single publish slot.
+
+Single-band shaping gives every execution the latency of the slowest. These steps take a plan of
+:func:`chainshaper.planning.shaping.plan_shaping` and trade some of its constancy for a better
+average (sections 3.3 and 4.1), without touching the longest latency.
+"""
+
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chainshaper.durations import format_duration
+from chainshaper.errors import InputError
+from chainshaper.planning.bands import (
+    Goal,
+    Placement,
+    band_problem,
+    enough_bands,
+    place_bands,
+    placement_curve,
+)
+from chainshaper.planning.latency_file import check_latencies
+from chainshaper.planning.plan import (
+    Plan,
+    Prediction,
+    Slot,
+    output_server,
+    publish_slots,
+    revised,
+)
+from chainshaper.planning.shaping import predict_bands
+from chainshaper.planning.swarm import place_by_swarm, place_randomly
+
+__all__ = ["Solver", "figure7_curve", "with_bands", "with_long_slot"]
+
+Solver: TypeAlias = Literal["exact", "pso", "random"]
+
+MOST_BANDS = 12  # as far as `auto` looks; figure 7 is flat from the fourth on
+
+
+def with_bands(
+    plan: Plan,
+    latencies_ns: NDArray[np.int64],
+    bands: int | Literal["auto"],
+    *,
+    solver: Solver = "exact",
+    grid_ns: int = 1_000,
+    max_gap_ns: int | None = None,
+    max_share: float | None = None,
+    minimise: Goal = "mean",
+    mean_at_most_ns: int | None = None,
+    least_gain: float = 0.02,
+    seed: int | None = None,
+) -> Plan:
+    """A shaped plan with ``bands`` publish slots; the last stays where the plan has it.
+
+    The slots are as long as the plan's own (Δ). ``exact`` finds the best placement on the grid;
+    ``pso`` and ``random`` are for comparison and take a ``seed``. ``auto`` takes as many bands
+    as each lower the average by ``least_gain`` of it at least. ``max_gap_ns`` is LV, the longest
+    distance of neighbouring bands; ``max_share`` the largest share of executions in one band;
+    with ``mean_at_most_ns`` the exact solver can ``minimise`` the ``jitter`` or the largest
+    ``gap`` instead of the average.
+
+    Raises:
+        InputError: a plan without a publish slot, or values that make no sense together.
+        OperationError: no such placement exists; the message names the binding constraint.
+    """
+    start, end = _last_publish_slot(plan)
+    latencies = check_latencies(latencies_ns)
+    problem = band_problem(
+        latencies,
+        end,
+        publish_slot_ns=end - start,
+        grid_ns=grid_ns,
+        max_gap_ns=max_gap_ns,
+        max_share=max_share,
+    )
+    if (bands == "auto" or solver != "exact") and (minimise != "mean" or mean_at_most_ns):
+        raise InputError("another goal than the average needs the exact solver and fixed bands")
+    if bands == "auto":
+        if solver != "exact":
+            raise InputError("only the exact solver chooses the number of bands by itself")
+        placement = enough_bands(placement_curve(problem, MOST_BANDS), least_gain)
+    elif solver == "pso":
+        placement = place_by_swarm(problem, bands, seed)
+    elif solver == "random":
+        placement = place_randomly(problem, bands, seed)
+    else:
+        placement = place_bands(problem, bands, minimise=minimise, mean_at_most_ns=mean_at_most_ns)
+    slots = tuple((x - (end - start), x) for x in placement.slot_ends_ns)
+    predicted = predict_bands(latencies, placement.slot_ends_ns, end - start)
+    return _with_publish_slots(plan, slots, predicted)
+
+
+def figure7_curve(
+    plan: Plan,
+    latencies_ns: NDArray[np.int64],
+    most_bands: int = MOST_BANDS,
+    *,
+    grid_ns: int = 1_000,
+    max_gap_ns: int | None = None,
+) -> list[Placement]:
+    """The best placement for 1, 2, … bands: average over number of bands is figure 7.
+
+    Raises:
+        InputError: a plan without a publish slot.
+        OperationError: no number of bands can be placed.
+    """
+    start, end = _last_publish_slot(plan)
+    problem = band_problem(
+        latencies_ns, end, publish_slot_ns=end - start, grid_ns=grid_ns, max_gap_ns=max_gap_ns
+    )
+    return placement_curve(problem, most_bands)
+
+
+def with_long_slot(plan: Plan, latencies_ns: NDArray[np.int64], slot_start_ns: int) -> Plan:
+    """A shaped plan with one long publish slot, from ``slot_start_ns`` to where it ended before.
+
+    An execution that is done earlier waits for the slot, any other publishes at once: the
+    average falls and the jitter grows as the start moves towards the shortest latency (end of
+    section 4.1; the paper's example is [62, 87] ms).
+
+    Raises:
+        InputError: a start that is not before the plan's own publish slot, or negative.
+    """
+    start, end = _last_publish_slot(plan)
+    if not 0 <= slot_start_ns <= start:
+        raise InputError(
+            f"a long publish slot may start from 0ms to {format_duration(start)}, where the plan's"
+            f" own does; {format_duration(slot_start_ns)} does not"
+        )
+    published = np.maximum(check_latencies(latencies_ns), slot_start_ns)
+    # Published at once, the output is late by the publication itself, which the slot's end bounds.
+    predicted = Prediction(
+        mean_ns=round(int(published.sum()) / published.size),
+        max_ns=end,
+        jitter_ns=end - slot_start_ns,
+        shares=(1.0,),
+    )
+    slots = ((slot_start_ns, end),)
+    return revised(_with_publish_slots(plan, slots, predicted), policy="one-long-slot")
+
+
+def _last_publish_slot(plan: Plan) -> Slot:
+    slots = publish_slots(plan)
+    if not slots:
+        raise InputError(f"a plan of policy {plan.policy} has no publish slot: plan shaping first")
+    return slots[-1]
+
+
+def _with_publish_slots(plan: Plan, slots: tuple[Slot, ...], predicted: Prediction) -> Plan:
+    publishing = output_server(plan)
+    servers = tuple(
+        server.model_copy(update={"slots": slots}) if server is publishing else server
+        for server in plan.servers
+    )
+    return revised(plan, servers=servers, predicted=predicted)

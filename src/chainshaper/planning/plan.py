@@ -1,0 +1,374 @@
+"""The plan: which reservation servers, slots, threads and shaping nodes make a latency constant.
+
+A plan is a value. It is computed from measured latencies (:mod:`chainshaper.planning.shaping`),
+written as YAML that people edit (:mod:`chainshaper.planning.plan_file`), and carried out by
+:mod:`chainshaper.enforcement`. Whoever holds a :class:`Plan` may rely on every rule checked
+here, whichever way it came about.
+
+Durations are integer nanoseconds, in fields that end in ``_ns``; in YAML the same keys stand
+without the suffix and their values carry a unit (``period: 100ms``). Slots are half-open
+intervals ``(start, end)`` in nanoseconds after the start of a cycle.
+"""
+
+import re
+from collections.abc import Iterator
+from itertools import combinations, pairwise
+from typing import Annotated, Any, Literal, TypeAlias
+
+from pydantic import AfterValidator, Field, model_validator
+
+from chainshaper.durations import format_duration
+from chainshaper.yaml_file import Duration, FullName, Part, PositiveDuration, wrong_value
+
+__all__ = [
+    "Anchor",
+    "ChainOfPlan",
+    "Evidence",
+    "Margin",
+    "Plan",
+    "Policy",
+    "Prediction",
+    "Server",
+    "ShapingNode",
+    "Slot",
+    "Thread",
+    "output_server",
+    "publish_slots",
+    "revised",
+    "server_of",
+]
+
+
+def _node_name(value: str) -> str:
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", value):
+        raise ValueError(
+            f"{value!r} is not a node's name: write letters, digits and underscores, no slash, no"
+            " digit first"
+        )
+    return value
+
+
+Slot: TypeAlias = tuple[Duration, Duration]
+"""A time slot [start, end) of a cycle."""
+
+Policy: TypeAlias = Literal[
+    "shaped",
+    "one-long-slot",
+    "server-per-callback",
+    "server-per-chain",
+    "let-per-callback",
+    "let-per-chain",
+]
+Anchor: TypeAlias = Literal["stamp", "cycle"]
+
+
+class ChainOfPlan(Part):
+    """The chain that is planned for, as far as it is known.
+
+    ``publisher`` is the node that publishes ``output``, the chain's last topic. A plan computed
+    from bare latencies knows only the period; it can be studied but not carried out.
+    """
+
+    spec: str | None = None
+    output: FullName | None = None
+    publisher: FullName | None = None
+    period_ns: PositiveDuration
+
+
+class Evidence(Part):
+    """The measurements that the plan rests on: end-to-end latencies under high SCHED_FIFO.
+
+    ``incomplete`` counts traversals without an end, ``disturbed`` those that a stall of the
+    machine hit, ``utilisation`` is the share of its core that the chain's execution takes.
+    ``None`` is: not known.
+    """
+
+    recording: str | None = None
+    samples: Annotated[int, Field(ge=1)]
+    min_latency_ns: Duration
+    mean_latency_ns: Duration
+    max_latency_ns: PositiveDuration
+    incomplete: Annotated[int, Field(ge=0)] = 0
+    disturbed: Annotated[int, Field(ge=0)] = 0
+    realtime: bool | None = None
+    longest_stall_ns: Duration | None = None
+    utilisation: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "Evidence":
+        if not self.min_latency_ns <= self.mean_latency_ns <= self.max_latency_ns:
+            raise wrong_value("min, mean and max latency must ascend: correct them", "mean_latency")
+        return self
+
+
+class Margin(Part):
+    """How far the chain's slot reaches beyond the longest latency measured (ε of eq. 1).
+
+    ``given`` by a person, or ``derived`` from the tail of the measured latencies: then the plan
+    keeps the probability of an overrun per cycle that it was derived for, and the confidence
+    interval of the margin.
+    """
+
+    epsilon_ns: Duration
+    source: Literal["given", "derived"] = "given"
+    overrun_probability: Annotated[float, Field(gt=0, lt=1)] | None = None
+    confidence_interval_ns: tuple[Duration, Duration] | None = None
+
+
+class Thread(Part):
+    """A thread of a node that runs inside a server: its executor, or its asynchronous publisher.
+
+    DDS threads other than the publisher's are never gated (section 3.1), so they have no role.
+    """
+
+    node: FullName
+    role: Literal["executor", "publisher"] = "executor"
+
+
+class Server(Part):
+    """A table-driven reservation server (section 2.2.1): its threads run in its slots only.
+
+    A smaller ``priority`` is better, which is LITMUS^RT's order.
+    """
+
+    name: Annotated[str, Field(min_length=1)]
+    core: Annotated[int, Field(ge=0)]
+    priority: Annotated[int, Field(ge=1)]
+    slots: Annotated[tuple[Slot, ...], Field(min_length=1)]
+    threads: tuple[Thread, ...] = ()
+
+    @model_validator(mode="after")
+    def _slots_ascend(self) -> "Server":
+        for number, (start, end) in enumerate(self.slots):
+            if end <= start:
+                raise wrong_value(
+                    f"the slot {_slot_text((start, end))} is empty: its end must come after its"
+                    " start",
+                    "slots",
+                    number,
+                )
+        for number, (before, after) in enumerate(pairwise(self.slots), start=1):
+            if after[0] < before[1]:
+                raise wrong_value(
+                    f"the slot {_slot_text(after)} begins before {_slot_text(before)} ends: write"
+                    " a server's slots in ascending order, without overlap",
+                    "slots",
+                    number,
+                )
+        return self
+
+
+class ShapingNode(Part):
+    """The node that takes the chain's output from ``input`` and republishes it on ``output``.
+
+    It publishes in the slots of the server that holds its thread. ``core`` and ``fifo_priority``
+    are those of its executor; it sleeps until ``spin_ns`` before the slot and spins from there,
+    and pauses for ``pause_ns`` after a publication so that delivery is not delayed by it.
+    """
+
+    name: Annotated[str, AfterValidator(_node_name)]
+    input: FullName
+    output: FullName
+    core: Annotated[int, Field(ge=0)]
+    fifo_priority: Annotated[int, Field(ge=1, le=98)]
+    spin_ns: Duration
+    pause_ns: Duration
+
+    @property
+    def thread(self) -> Thread:
+        """The node's executor, as servers name it."""
+        return Thread(node=f"/{self.name}")
+
+    @model_validator(mode="after")
+    def _two_topics(self) -> "ShapingNode":
+        if self.input == self.output:
+            raise wrong_value(
+                f"the shaping node would feed itself: input and output are both {self.input};"
+                f" let the chain publish on another topic, such as {self.output}_tmp",
+                "input",
+            )
+        return self
+
+
+class Prediction(Part):
+    """What the plan promises: end-to-end latency, and the share of cycles per latency band.
+
+    A band is represented by the end of its slot (section 4.1). The jitter is the widest
+    distance of two outputs, from the start of the first slot to the end of the last.
+    """
+
+    mean_ns: Duration
+    max_ns: Duration
+    jitter_ns: Duration
+    shares: tuple[Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)], ...] = ()
+
+
+class Plan(Part):
+    """Servers and shaping nodes for one chain, with the evidence and the prediction.
+
+    ``cycle_ns`` is the servers' cycle time: the chain's period, or a whole multiple of it. Where
+    several chains share cores, this chain's cycles start ``offset_ns`` after the instant from
+    which all of them count; slots count from the start of the chain's own cycle nevertheless.
+    ``anchor`` says what starts a cycle for the shaping node: the stamp that each message carries
+    from the chain's first callback, or the servers' own cycle. ``shaping_node`` serves the
+    chain's output; it is absent when the publisher's own thread is gated (asynchronous
+    publication) or nothing is. ``further_shaping_nodes`` serve other sinks, or the topics inside
+    a chain whose callbacks follow LET one by one.
+    """
+
+    format: Literal[1] = 1
+    chain: ChainOfPlan
+    evidence: Evidence
+    margin: Margin
+    policy: Policy
+    cycle_ns: PositiveDuration
+    offset_ns: Duration = 0
+    anchor: Anchor = "stamp"
+    servers: Annotated[tuple[Server, ...], Field(min_length=1)]
+    shaping_node: ShapingNode | None = None
+    further_shaping_nodes: tuple[ShapingNode, ...] = ()
+    predicted: Prediction
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Plan":
+        _check_cycle(self)
+        _check_servers(self)
+        _check_overlaps(self)
+        for where, node in _shaping_nodes(self):
+            _check_shaping_node(self, node, where)
+        return self
+
+
+def server_of(plan: Plan, thread: Thread) -> Server | None:
+    """The server that a thread is assigned to, or None when it runs outside all servers."""
+    return next((server for server in plan.servers if thread in server.threads), None)
+
+
+def output_server(plan: Plan) -> Server | None:
+    """The server in whose slots the chain's output is published; None without shaping.
+
+    It is the one of the shaping node or, where the publisher is asynchronous, of the
+    publisher's thread. A plan from bare latencies names no threads; its server ``output`` is
+    the one meant.
+    """
+    server = None
+    if plan.shaping_node is not None:
+        server = server_of(plan, plan.shaping_node.thread)
+    elif plan.chain.publisher is not None:
+        server = server_of(plan, Thread(node=plan.chain.publisher, role="publisher"))
+    if server is None:
+        server = next((server for server in plan.servers if server.name == "output"), None)
+    return server
+
+
+def publish_slots(plan: Plan) -> tuple[Slot, ...]:
+    """The slots of :func:`output_server`, ascending; none without shaping."""
+    server = output_server(plan)
+    return server.slots if server is not None else ()
+
+
+def revised(plan: Plan, **changes: object) -> Plan:
+    """A copy of a plan with some fields replaced, checked like any other plan."""
+    values = {name: getattr(plan, name) for name in Plan.model_fields}
+    return Plan.model_validate({**values, **changes})
+
+
+def _slot_text(slot: tuple[int, int]) -> str:
+    return f"[{format_duration(slot[0])}, {format_duration(slot[1])})"
+
+
+def _shaping_nodes(plan: Plan) -> Iterator[tuple[tuple[str | int, ...], ShapingNode]]:
+    if plan.shaping_node is not None:
+        yield ("shaping_node",), plan.shaping_node
+    for number, node in enumerate(plan.further_shaping_nodes):
+        yield ("further_shaping_nodes", number), node
+
+
+def _check_cycle(plan: Plan) -> None:
+    cycle, period, longest = plan.cycle_ns, plan.chain.period_ns, plan.evidence.max_latency_ns
+    if cycle % period:
+        raise wrong_value(
+            f"the cycle {format_duration(cycle)} is no multiple of the chain's period"
+            f" {format_duration(period)}: make it the period, or a whole multiple",
+            "cycle",
+        )
+    if cycle <= longest:
+        raise wrong_value(
+            f"the cycle {format_duration(cycle)} is not longer than the longest latency measured,"
+            f" {format_duration(longest)}: plan with a longer period or a shorter chain",
+            "cycle",
+        )
+
+
+def _check_servers(plan: Plan) -> None:
+    names: set[str] = set()
+    homes: dict[Thread, str] = {}
+    for number, server in enumerate(plan.servers):
+        if server.name in names:
+            raise wrong_value(
+                f"two servers are named {server.name!r}: rename one", "servers", number, "name"
+            )
+        names.add(server.name)
+        for slot_number, slot in enumerate(server.slots):
+            if slot[1] > plan.cycle_ns:
+                raise wrong_value(
+                    f"the slot {_slot_text(slot)} ends after the cycle"
+                    f" {format_duration(plan.cycle_ns)}: move it, or split it in two slots",
+                    *("servers", number, "slots", slot_number),
+                )
+        for thread_number, thread in enumerate(server.threads):
+            if thread in homes:
+                raise wrong_value(
+                    f"the {thread.role} of {thread.node} is already in server {homes[thread]!r}:"
+                    " a thread belongs to one server, remove it from the other",
+                    *("servers", number, "threads", thread_number),
+                )
+            homes[thread] = server.name
+
+
+def _check_overlaps(plan: Plan) -> None:
+    # Two servers of one core may overlap only when a priority says who runs.
+    for (_, one), (number, two) in combinations(enumerate(plan.servers), 2):
+        if (one.core, one.priority) != (two.core, two.priority):
+            continue
+        for slot_number, slot in enumerate(two.slots):
+            for other in one.slots:
+                if slot[0] < other[1] and other[0] < slot[1]:
+                    raise wrong_value(
+                        f"the slot {_slot_text(slot)} overlaps {_slot_text(other)} of server"
+                        f" {one.name!r} on core {one.core} at the same priority {one.priority}:"
+                        " move one of them, or give one server another priority",
+                        *("servers", number, "slots", slot_number),
+                    )
+
+
+def _check_shaping_node(plan: Plan, node: ShapingNode, where: tuple[Any, ...]) -> None:
+    others = [other for place, other in _shaping_nodes(plan) if place != where]
+    if any(node.name == other.name or node.output == other.output for other in others):
+        raise wrong_value(
+            f"another shaping node has the name {node.name} or the output {node.output} too:"
+            " both must be its own",
+            *where,
+        )
+    if where == ("shaping_node",) and plan.chain.output not in (None, node.output):
+        raise wrong_value(
+            f"publishes {node.output}, but the chain's output is {plan.chain.output}: make them"
+            " the same",
+            *where,
+            "output",
+        )
+    server = server_of(plan, node.thread)
+    if server is None:
+        raise wrong_value(
+            f"no server holds the shaping node's thread: add {{node: {node.thread.node}}} to the"
+            " threads of the server whose slots it publishes in",
+            *where,
+            "name",
+        )
+    if server.core != node.core:
+        raise wrong_value(
+            f"core {node.core}, but its server {server.name!r} is on core {server.core}: make them"
+            " the same",
+            *where,
+            "core",
+        )

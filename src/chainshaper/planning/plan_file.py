@@ -1,0 +1,148 @@
+"""A plan on disk: YAML that a person reads, edits and compares, checked again when it is read.
+
+:func:`load_plan` tolerates whatever a person does to the layout (comments, order of keys, flow
+or block style) and refuses whatever would not run: each wrong value is named with its file,
+line, key, the reason and what to write instead.
+"""
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+
+from chainshaper.errors import InputError, OperationError
+from chainshaper.planning.plan import Plan, publish_slots
+from chainshaper.yaml_file import AS_YAML, explanations, key_text, read_model
+
+__all__ = ["Plan", "dump_plan", "load_plan", "plan_json", "save_plan", "wrong_values_refused"]
+
+_HEADER = """\
+# A chainshaper plan: the reservation servers that give a ROS 2 chain a constant latency.
+# Edit it as you like; it is checked when it is used. Durations carry units (59ms, 250us);
+# slots are half-open, [start, end), and count from the start of a cycle.
+"""
+
+_SECTION_COMMENTS = {
+    "evidence": "the measurements behind the plan",
+    "margin": "epsilon: how far the chain's slot reaches beyond the longest latency measured",
+    "offset": "this chain's cycles start so much after the instant that all chains count from",
+    "anchor": "what starts a cycle: the message's origin stamp (stamp), or the servers (cycle)",
+    "servers": "a thread runs only in its server's slots; a smaller priority is better",
+    "shaping_node": "republishes the chain's output in the slots of its server",
+    "predicted": "for the slots as planned; not updated when they are edited",
+}
+
+
+def load_plan(path: str | Path) -> Plan:
+    """Read a plan.
+
+    Raises:
+        InputError: no such file, not YAML, or wrong values; each is named with its line, key,
+            reason and remedy.
+    """
+    return read_model(path, Plan, made_by="written by `chainshaper plan`")
+
+
+def dump_plan(plan: Plan) -> str:
+    """The YAML text of a plan; reading it gives an equal plan."""
+    values = plan.model_dump(mode="json", by_alias=True, exclude_none=True, context=AS_YAML)
+    for server in values["servers"]:
+        server["slots"] = _Inline(server["slots"])
+        server["threads"] = [_InlineMapping(thread) for thread in server["threads"]]
+    if plan.offset_ns == 0:
+        del values["offset"]
+    if not values["further_shaping_nodes"]:
+        del values["further_shaping_nodes"]
+    values["predicted"]["shares"] = _Inline(values["predicted"]["shares"])
+    if "confidence_interval" in values["margin"]:
+        values["margin"]["confidence_interval"] = _Inline(values["margin"]["confidence_interval"])
+
+    text = _HEADER
+    for key, value in values.items():
+        if key in _SECTION_COMMENTS:
+            text += f"# {_SECTION_COMMENTS[key]}\n"
+        text += yaml.dump({key: value}, Dumper=_Dumper, sort_keys=False, width=100)
+    return text
+
+
+def save_plan(plan: Plan, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write a plan, whole or not at all.
+
+    Raises:
+        InputError: ``path`` exists (and ``overwrite`` is not set), or its folder does not.
+        OperationError: it cannot be written; nothing is left behind, an existing file stays.
+    """
+    path = Path(path)
+    if path.exists() and (path.is_dir() or not overwrite):
+        raise InputError(
+            f"{path} exists already and is not overwritten: name another, or remove it"
+        )
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder to write {path.name} into")
+    text = dump_plan(plan)
+    partial: Path | None = None
+    try:
+        descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.partial-", dir=folder)
+        partial = Path(name)
+        with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        partial.chmod(0o644)
+        partial.replace(path)
+    except OSError as error:
+        raise OperationError(f"{path}: the plan cannot be written: {error}") from error
+    finally:
+        if partial is not None:
+            partial.unlink(missing_ok=True)
+
+
+def plan_json(plan: Plan) -> dict[str, Any]:
+    """The plan as plain data for ``--json``: integer nanoseconds, keys ending in ``_ns``.
+
+    ``bands_ns`` are the ends of the publish slots, ascending; the slots themselves are pairs of
+    nanoseconds in ``servers``.
+    """
+    bands = [end for _, end in publish_slots(plan)]
+    return {**plan.model_dump(mode="json"), "bands_ns": bands}
+
+
+@contextmanager
+def wrong_values_refused() -> Iterator[None]:
+    """Inside, a value that no plan may have ends in an InputError that names it.
+
+    For code that builds plans from what a caller gave.
+    """
+    try:
+        yield
+    except ValidationError as error:
+        problems = [f"{key_text(where)}: {reason}" for where, reason in explanations(error, Plan)]
+        raise InputError("; ".join(problems)) from error
+
+
+class _Inline(list[Any]):
+    """A sequence that is written on one line."""
+
+
+class _InlineMapping(dict[str, Any]):
+    """A mapping that is written on one line."""
+
+
+class _Dumper(yaml.SafeDumper):
+    pass
+
+
+_Dumper.add_representer(
+    _Inline,
+    lambda dumper, data: dumper.represent_sequence("tag:yaml.org,2002:seq", data, flow_style=True),
+)
+_Dumper.add_representer(
+    _InlineMapping,
+    lambda dumper, data: dumper.represent_mapping("tag:yaml.org,2002:map", data, flow_style=True),
+)

@@ -1,0 +1,137 @@
+"""Figures: end-to-end latency per cycle, and its distribution with the publish slots drawn in.
+
+Both are drawn from recordings alone, so they can be made again at any time. The colours stay
+apart for colour-blind readers and in grey print.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import polars as pl
+
+from chainshaper.errors import OperationError
+from chainshaper.planning import publish_slots
+from chainshaper.steps import Measurement
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["draw_comparison", "draw_distribution", "draw_latency"]
+
+COLOURS = ("#d95f02", "#1b6ca8", "#4d9221", "#7b3294")
+SIZE_INCHES = (9.0, 4.2)
+
+
+def draw_comparison(measurements: Sequence[Measurement], folder: str | Path) -> tuple[Path, Path]:
+    """Both figures, as `latency.png` and `distribution.png` in a folder that is made if needed."""
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OperationError(f"{folder}: the folder cannot be made: {error}") from error
+    return (
+        draw_latency(measurements, folder / "latency.png"),
+        draw_distribution(measurements, folder / "distribution.png"),
+    )
+
+
+def draw_latency(measurements: Sequence[Measurement], path: str | Path) -> Path:
+    """End-to-end latency of every cycle, all recordings in one picture (paper, figure 6).
+
+    Crosses mark cycles that the machine disturbed. The picture ends a little above the highest
+    undisturbed cycle.
+    """
+    figure, axes = _figure()
+    for index, measurement in enumerate(measurements):
+        frame = measurement.analysis.traversals.filter("complete")
+        cycles = np.arange(len(frame))
+        latency = frame["latency_ns"].to_numpy() / 1e6
+        disturbed = frame["disturbed"].to_numpy()
+        colour = COLOURS[index % len(COLOURS)]
+        name = measurement.recording.path.name
+        jitter = measurement.analysis.undisturbed.jitter_ns
+        label = name if jitter is None else f"{name}: jitter {jitter / 1e6:.3f} ms"
+        axes.plot(
+            cycles[~disturbed],
+            latency[~disturbed],
+            ".",
+            markersize=4,
+            color=colour,
+            label=label,
+        )
+        axes.plot(cycles[disturbed], latency[disturbed], "x", markersize=5, color=colour, alpha=0.7)
+    _limit_to_cycle(axes, measurements)
+    axes.set_xlabel("cycle (crosses: disturbed by the machine)")
+    axes.set_ylabel("end-to-end latency [ms]")
+    axes.set_title(f"Chain {measurements[0].analysis.chain.spec}", loc="left")
+    axes.legend(loc="lower right")
+    return _save(figure, path)
+
+
+def draw_distribution(measurements: Sequence[Measurement], path: str | Path) -> Path:
+    """Cumulative distribution of the latency over undisturbed cycles, publish slots shaded."""
+    figure, axes = _figure()
+    for index, measurement in enumerate(measurements):
+        frame = measurement.analysis.traversals.filter(pl.col("complete") & ~pl.col("disturbed"))
+        latency = np.sort(frame["latency_ns"].to_numpy()) / 1e6
+        share = np.arange(1, len(latency) + 1) / max(1, len(latency))
+        axes.step(
+            latency,
+            share,
+            where="post",
+            color=COLOURS[index % len(COLOURS)],
+            label=f"{measurement.recording.path.name} ({len(latency)} cycles)",
+        )
+        if measurement.plan is not None:
+            for number, (start, end) in enumerate(publish_slots(measurement.plan)):
+                axes.axvspan(
+                    start / 1e6,
+                    end / 1e6,
+                    color="0.8",
+                    zorder=0,
+                    label="publish slot" if number == 0 else None,
+                )
+    _limit_to_cycle(axes, measurements, vertical=False)
+    axes.set_xlabel("end-to-end latency [ms]")
+    axes.set_ylabel("share of cycles")
+    axes.set_title(f"Chain {measurements[0].analysis.chain.spec}", loc="left")
+    axes.legend(loc="upper left")
+    return _save(figure, path)
+
+
+def _figure() -> tuple[Any, "Axes"]:
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(figsize=SIZE_INCHES, layout="constrained")
+    axes.grid(alpha=0.3)
+    return figure, axes
+
+
+def _limit_to_cycle(
+    axes: "Axes", measurements: Sequence[Measurement], *, vertical: bool = True
+) -> None:
+    """Let single cycles that waited for another slot not squeeze all others into a line."""
+    highest = 0.0
+    for measurement in measurements:
+        maximum = measurement.analysis.undisturbed.max_ns
+        highest = max(highest, (maximum or 0) / 1e6)
+    if highest:
+        (axes.set_ylim if vertical else axes.set_xlim)(0, highest * 1.15)
+
+
+def _save(figure: Any, path: str | Path) -> Path:
+    from matplotlib import pyplot as plt
+
+    path = Path(path)
+    try:
+        figure.savefig(path, dpi=130)
+    except OSError as error:
+        raise OperationError(f"{path}: the figure cannot be written: {error}") from error
+    finally:
+        plt.close(figure)
+    return path

@@ -1,0 +1,242 @@
+"""Tables for the terminal, and the same figures as plain data for ``--json``."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import polars as pl
+from rich.table import Table
+
+from chainshaper.analysis import LatencyAnalysis, LatencyStatistics
+from chainshaper.durations import milliseconds
+from chainshaper.planning import Plan, publish_slots
+from chainshaper.steps import Comparison, Measurement
+
+__all__ = [
+    "callback_rows",
+    "callback_table",
+    "comparison_json",
+    "comparison_table",
+    "latency_json",
+    "latency_table",
+    "plan_table",
+    "statistics_json",
+]
+
+ABSENT = "–"
+
+
+def statistics_json(statistics: LatencyStatistics) -> dict[str, Any]:
+    """Statistics as DESIGN's contract has them: integers in nanoseconds."""
+    return {
+        "count": statistics.count,
+        "incomplete": statistics.incomplete,
+        "disturbed": statistics.disturbed,
+        "min_ns": statistics.min_ns,
+        "mean_ns": statistics.mean_ns,
+        "max_ns": statistics.max_ns,
+        "jitter_ns": statistics.jitter_ns,
+        "spread_ns": statistics.spread_ns,
+        "percentiles_ns": statistics.percentiles_ns,
+    }
+
+
+def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[str, Any]:
+    """One chain's latency as plain data; ``instances`` adds every complete traversal.
+
+    Instances have their start and end in ns of the trace clock (wall clock).
+    """
+    analysis = measurement.analysis
+    result = {
+        "chain": analysis.chain.spec,
+        **statistics_json(analysis.statistics),
+        "undisturbed": statistics_json(analysis.undisturbed),
+        "subscriber": _optional(analysis.subscriber),
+        "subscriber_undisturbed": _optional(analysis.subscriber_undisturbed),
+        "incomplete_by_reason": analysis.incomplete,
+        "silent": analysis.silent,
+        "overruns": measurement.overruns,
+        "longest_stall_ns": measurement.longest_stall_ns,
+        "realtime": measurement.recording.info.realtime,
+        "lost": measurement.recording.info.lost,
+        "notes": list(analysis.notes),
+    }
+    if instances:
+        offset = measurement.recording.info.clock_offset_ns
+        complete = analysis.traversals.filter("complete")
+        result["instances"] = complete.select(
+            (pl.col("start") + offset).alias("start_ns"),
+            (pl.col("end") + offset).alias("end_ns"),
+            "latency_ns",
+            "disturbed",
+        ).to_dicts()
+    return result
+
+
+def _optional(statistics: LatencyStatistics | None) -> dict[str, Any] | None:
+    return None if statistics is None else statistics_json(statistics)
+
+
+def comparison_json(comparison: Comparison) -> dict[str, Any]:
+    """A comparison as plain data, one entry per recording."""
+    entries = []
+    for measurement in comparison.measurements:
+        entry = {"recording": str(measurement.recording.path), **latency_json(measurement)}
+        if measurement.plan is not None:
+            entry["predicted"] = measurement.plan.predicted.model_dump(mode="json")
+        entries.append(entry)
+    return {"chain": comparison.chain, "recordings": entries}
+
+
+def latency_table(analysis: LatencyAnalysis) -> Table:
+    """End-to-end latency: at publication and at the subscriber, all cycles and undisturbed ones."""
+    table = Table(title=f"End-to-end latency of {analysis.chain.spec} [ms]", title_justify="left")
+    table.add_column("")
+    columns: list[tuple[str, LatencyStatistics | None]] = [
+        ("all cycles", analysis.statistics),
+        ("undisturbed", analysis.undisturbed),
+        ("at the subscriber", analysis.subscriber),
+        ("…undisturbed", analysis.subscriber_undisturbed),
+    ]
+    for name, _ in columns:
+        table.add_column(name, justify="right")
+    for title, field in _FIGURES:
+        table.add_row(title, *(_figure(statistics, field) for _, statistics in columns))
+    table.add_row("cycles", *(ABSENT if s is None else str(s.count) for _, s in columns))
+    return table
+
+
+_FIGURES = (
+    ("average", "mean_ns"),
+    ("minimum", "min_ns"),
+    ("maximum", "max_ns"),
+    ("jitter (max − min)", "jitter_ns"),
+    ("spread p0.5–p99.5", "spread_ns"),
+)
+
+
+def _figure(statistics: LatencyStatistics | None, field: str) -> str:
+    value = None if statistics is None else getattr(statistics, field)
+    return ABSENT if value is None else milliseconds(value)
+
+
+def comparison_table(comparison: Comparison) -> Table:
+    """Before and after in one table: what this project is for."""
+    table = Table(
+        title=f"End-to-end latency of {comparison.chain} [ms]",
+        title_justify="left",
+    )
+    table.add_column("")
+    for measurement in comparison.measurements:
+        table.add_column(measurement.recording.path.name, justify="right")
+    analyses = [measurement.analysis for measurement in comparison.measurements]
+    _add_section(table, "at publication", [a.undisturbed for a in analyses])
+    _add_section(
+        table, "at the subscriber's callback", [a.subscriber_undisturbed for a in analyses]
+    )
+    table.add_row("[bold]including disturbed cycles[/]", *[""] * len(analyses))
+    table.add_row("  maximum", *(_figure(a.statistics, "max_ns") for a in analyses))
+    table.add_row("  jitter (max − min)", *(_figure(a.statistics, "jitter_ns") for a in analyses))
+    table.add_section()
+    table.add_row("cycles", *(str(a.statistics.count) for a in analyses))
+    table.add_row("  disturbed by the machine", *(str(a.statistics.disturbed) for a in analyses))
+    table.add_row("  incomplete", *(str(a.statistics.incomplete) for a in analyses))
+    table.add_row(
+        "  too late for their slot",
+        *(ABSENT if m.overruns is None else str(m.overruns) for m in comparison.measurements),
+    )
+    table.add_row(
+        "longest stall of the machine",
+        *(
+            ABSENT if m.longest_stall_ns is None else milliseconds(m.longest_stall_ns)
+            for m in comparison.measurements
+        ),
+    )
+    for measurement in comparison.measurements:
+        if measurement.plan is not None:
+            predicted = measurement.plan.predicted
+            table.caption = (
+                f"planned: slots {slots_text(measurement.plan)}, "
+                f"predicted maximum {milliseconds(predicted.max_ns)}, "
+                f"jitter at most {milliseconds(predicted.jitter_ns)}"
+            )
+    return table
+
+
+def _add_section(table: Table, title: str, columns: Sequence[LatencyStatistics | None]) -> None:
+    table.add_row(f"[bold]{title}[/]", *[""] * len(columns))
+    for name, field in _FIGURES:
+        if field != "min_ns":
+            table.add_row(f"  {name}", *(_figure(statistics, field) for statistics in columns))
+    table.add_section()
+
+
+def slots_text(plan: Plan) -> str:
+    """The publish slots: ``[64.213, 65.213)``."""
+    return " ".join(
+        f"[{milliseconds(start)}, {milliseconds(end)})" for start, end in publish_slots(plan)
+    )
+
+
+def plan_table(plan: Plan) -> Table:
+    """Servers and slots of a plan."""
+    table = Table(title=f"Plan for {plan.chain.spec or 'a chain'} [ms]", title_justify="left")
+    for name in ("server", "core", "priority", "slots", "threads"):
+        table.add_column(name, justify="right" if name in ("core", "priority") else "left")
+    for server in plan.servers:
+        slots = " ".join(f"[{milliseconds(a)}, {milliseconds(b)})" for a, b in server.slots)
+        threads = ", ".join(thread.node for thread in server.threads)
+        # Brackets of half-open intervals are not Rich's markup.
+        table.add_row(
+            server.name,
+            str(server.core),
+            str(server.priority),
+            slots.replace("[", "\\["),
+            threads,
+        )
+    predicted = plan.predicted
+    table.caption = (
+        f"cycle {milliseconds(plan.cycle_ns)}; "
+        f"predicted average {milliseconds(predicted.mean_ns)}, "
+        f"maximum {milliseconds(predicted.max_ns)}, jitter at most "
+        f"{milliseconds(predicted.jitter_ns)}"
+    )
+    return table
+
+
+def callback_rows(statistics: pl.DataFrame) -> list[dict[str, Any]]:
+    """Callback statistics as plain data: response and execution times in ns."""
+    rows = []
+    for row in statistics.to_dicts():
+        rows.append(
+            {
+                key: row[key]
+                for key in ("node", "kind", "topic", "period_ns", "pid", "tids", "count")
+            }
+            | {"response_ns": row["response_ns"], "execution_ns": row["execution_ns"]}
+        )
+    return rows
+
+
+def callback_table(statistics: pl.DataFrame) -> Table:
+    """Every callback: how often it ran, and its execution and response times."""
+    table = Table(title="Callbacks [ms]", title_justify="left")
+    for name in ("node", "callback", "count"):
+        table.add_column(name, justify="right" if name == "count" else "left")
+    for name in ("execution", "response"):
+        for figure in ("min", "mean", "max"):
+            table.add_column(f"{name} {figure}", justify="right")
+    for row in statistics.iter_rows(named=True):
+        trigger = (
+            f"every {milliseconds(row['period_ns'], 0)}" if row["kind"] == "timer" else row["topic"]
+        )
+        table.add_row(
+            row["node"],
+            f"{row['kind']} {trigger or ''}",
+            str(row["count"]),
+            *(
+                ABSENT if row[field] is None else milliseconds(row[field][figure])
+                for field in ("execution_ns", "response_ns")
+                for figure in ("min", "mean", "max")
+            ),
+        )
+    return table

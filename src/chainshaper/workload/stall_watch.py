@@ -1,0 +1,83 @@
+"""Watching the machine's own stalls from outside: one stall meter process per core.
+
+Beside a run the launcher starts, times and ends the meters with everything else; on its own,
+:func:`measure_stalls` answers "how badly does this machine stall?".
+"""
+
+import os
+import time
+from collections.abc import Iterable, Mapping
+
+import polars as pl
+
+from chainshaper.enforcement.threads import Scheduling, apply_scheduling, list_threads
+from chainshaper.recording import StallMeterInfo
+from chainshaper.workload import stall_meter
+from chainshaper.workload.event_reading import stall_table
+from chainshaper.workload.launcher import Child, end_all, start_child
+
+__all__ = ["measure_stalls", "promote_meters", "read_meters", "start_meters"]
+
+MODULE = "chainshaper.workload.stall_meter"
+
+
+def start_meters(cores: Iterable[int], meters: dict[int, Child]) -> None:
+    """Start a meter per core into ``meters``, so that those started can be ended whatever fails."""
+    for core in sorted(cores):
+        meters[core] = start_child(f"stall meter of core {core}", MODULE, {})
+        meters[core].tell(parent=os.getpid())
+
+
+def promote_meters(meters: Mapping[int, Child], realtime: bool) -> None:
+    """Put each meter on its core, above everything else there if that is permitted."""
+    for core, child in meters.items():
+        for thread in list_threads(child.pid):
+            priority = stall_meter.PRIORITY if realtime else None
+            apply_scheduling(thread, Scheduling(priority, cores=(core,)))
+
+
+def read_meters(
+    meters: Mapping[int, Child], realtime: bool
+) -> tuple[list[tuple[int, int, bytes]], StallMeterInfo]:
+    """What the meters saw: (pid, core, pairs of due time and lateness), and how they watched."""
+    stalls, wakeups, lateness = [], 0, []
+    for core, child in meters.items():
+        answer = child.hear()
+        stalls.append((child.pid, core, child.hear_bytes(answer["bytes"])))
+        wakeups += answer["wakeups"]
+        lateness.append(answer["median_lateness_ns"])
+    info = StallMeterInfo(
+        cores=tuple(meters),
+        period_ns=stall_meter.PERIOD_NS,
+        threshold_ns=stall_meter.THRESHOLD_NS,
+        wakeups=wakeups,
+        median_lateness_ns=tuple(lateness),
+        realtime=realtime,
+    )
+    return stalls, info
+
+
+def measure_stalls(
+    cores: Iterable[int], duration_ns: int, realtime: bool
+) -> tuple[pl.DataFrame, StallMeterInfo]:
+    """Watch cores for a while: the `machine_stall` table, and how it was taken.
+
+    Raises:
+        OperationError: a meter died.
+    """
+    meters: dict[int, Child] = {}
+    finished = False
+    try:
+        start_meters(cores, meters)
+        for child in meters.values():
+            child.hear()
+        promote_meters(meters, realtime)
+        start = time.monotonic_ns() + 50_000_000
+        times = {"start_ns": start, "meter_from_ns": start, "stop_ns": start + duration_ns}
+        for child in meters.values():
+            child.tell(**times)
+        stalls, info = read_meters(meters, realtime)
+        finished = True
+    finally:
+        end_all(meters.values(), patience_s=2.0 if finished else 0.0)
+    return stall_table(stalls), info

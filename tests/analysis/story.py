@@ -1,0 +1,223 @@
+"""A builder of event tables, so that a test reads like the story of a run.
+
+Times are small integers (ns). A message's source timestamp is its publication time plus
+:data:`OFFSET`, unless the test says otherwise.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import polars as pl
+
+from chainshaper import events
+
+__all__ = ["OFFSET", "Callback", "Node", "Publisher", "Story"]
+
+OFFSET = 1_000_000
+"""CLOCK_REALTIME minus the event clock."""
+
+
+@dataclass(frozen=True)
+class Node:
+    pid: int
+    handle: int
+
+
+@dataclass(frozen=True)
+class Callback:
+    pid: int
+    handle: int
+    rmw_subscription: int = 0
+
+
+@dataclass(frozen=True)
+class Publisher:
+    pid: int
+    handle: int
+    rmw_handle: int
+
+
+@dataclass
+class Story:
+    rows: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
+    next_handle: int = 0x1000
+
+    def event(self, name: str, time: int, pid: int, tid: int | None = None, **fields: Any) -> None:
+        row = {"time": time, "pid": pid, "tid": pid if tid is None else tid, **fields}
+        self.rows.setdefault(name, []).append(row)
+
+    def handle(self) -> int:
+        self.next_handle += 8
+        return self.next_handle
+
+    def node(self, name: str, pid: int, time: int = 0, handle: int | None = None) -> Node:
+        node = Node(pid, handle or self.handle())
+        namespace, _, short = name.rpartition("/")
+        self.event(
+            "rcl_node_init",
+            time,
+            pid,
+            node_handle=node.handle,
+            rmw_handle=self.handle(),
+            node_name=short,
+            namespace=namespace or "/",
+        )
+        return node
+
+    def publisher(self, node: Node, topic: str, time: int = 0) -> Publisher:
+        publisher = Publisher(node.pid, self.handle(), self.handle())
+        self.event(
+            "rcl_publisher_init",
+            time,
+            node.pid,
+            publisher_handle=publisher.handle,
+            node_handle=node.handle,
+            rmw_publisher_handle=publisher.rmw_handle,
+            topic_name=topic,
+            queue_depth=10,
+        )
+        return publisher
+
+    def timer(
+        self,
+        node: Node,
+        period: int = 100,
+        time: int = 0,
+        handle: int | None = None,
+        symbol: str | None = None,
+    ) -> Callback:
+        timer, callback = self.handle(), Callback(node.pid, handle or self.handle())
+        pid = node.pid
+        self.event("rcl_timer_init", time, pid, timer_handle=timer, period=period)
+        self.event(
+            "rclcpp_timer_callback_added",
+            time,
+            pid,
+            timer_handle=timer,
+            callback=callback.handle,
+        )
+        if symbol:
+            self.event(
+                "rclcpp_callback_register", time, pid, callback=callback.handle, symbol=symbol
+            )
+        self.event("rclcpp_timer_link_node", time, pid, timer_handle=timer, node_handle=node.handle)
+        return callback
+
+    def subscription(
+        self,
+        node: Node,
+        topic: str,
+        time: int = 0,
+        *,
+        handle: int | None = None,
+        symbol: str | None = None,
+        callbackless: bool = False,
+    ) -> Callback:
+        rcl, rmw, rclcpp = self.handle(), self.handle(), self.handle()
+        callback = Callback(node.pid, handle or self.handle(), rmw)
+        pid = node.pid
+        self.event(
+            "rcl_subscription_init",
+            time,
+            pid,
+            subscription_handle=rcl,
+            node_handle=node.handle,
+            rmw_subscription_handle=rmw,
+            topic_name=topic,
+            queue_depth=10,
+        )
+        if callbackless:
+            return callback
+        self.event(
+            "rclcpp_subscription_init", time, pid, subscription_handle=rcl, subscription=rclcpp
+        )
+        self.event(
+            "rclcpp_subscription_callback_added",
+            time,
+            pid,
+            subscription=rclcpp,
+            callback=callback.handle,
+        )
+        if symbol:
+            self.event(
+                "rclcpp_callback_register", time, pid, callback=callback.handle, symbol=symbol
+            )
+        return callback
+
+    def start(self, callback: Callback, time: int, tid: int | None = None, intra: int = 0) -> None:
+        self.event(
+            "callback_start",
+            time,
+            callback.pid,
+            tid,
+            callback=callback.handle,
+            is_intra_process=intra,
+        )
+
+    def end(self, callback: Callback, time: int, tid: int | None = None) -> None:
+        self.event("callback_end", time, callback.pid, tid, callback=callback.handle)
+
+    def take(
+        self,
+        callback: Callback,
+        time: int,
+        sent: int,
+        tid: int | None = None,
+        taken: int = 1,
+    ) -> None:
+        """Take the message that was published at ``sent``."""
+        self.event(
+            "rmw_take",
+            time,
+            callback.pid,
+            tid,
+            rmw_subscription_handle=callback.rmw_subscription,
+            message=1,
+            source_timestamp=sent + OFFSET,
+            taken=taken,
+        )
+
+    def publish(self, publisher: Publisher, time: int, tid: int | None = None) -> None:
+        self.event(
+            "rmw_publish",
+            time,
+            publisher.pid,
+            tid,
+            rmw_publisher_handle=publisher.rmw_handle,
+            message=1,
+            timestamp=time + OFFSET,
+        )
+
+    def runs(
+        self,
+        callback: Callback,
+        start: int,
+        end: int | None,
+        *,
+        reads: int | None = None,
+        writes: tuple[tuple[Publisher, int], ...] = (),
+        tid: int | None = None,
+    ) -> None:
+        """One instance, which took the message sent at ``reads`` just before it started."""
+        if reads is not None:
+            self.take(callback, start - 1, reads, tid)
+        self.start(callback, start, tid)
+        for publisher, time in writes:
+            self.publish(publisher, time, tid)
+        if end is not None:
+            self.end(callback, end, tid)
+
+    def tables(self) -> dict[str, pl.DataFrame]:
+        """The event tables, each sorted by time; events at one time keep the order of telling."""
+        return {
+            name: pl.DataFrame(
+                rows,
+                schema_overrides={
+                    **events.COMMON_COLUMNS,
+                    **events.FIELDS[name],
+                    **events.OPTIONAL_FIELDS.get(name, {}),
+                },
+                infer_schema_length=None,
+            ).sort("time", maintain_order=True)
+            for name, rows in self.rows.items()
+        }

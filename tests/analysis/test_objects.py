@@ -1,0 +1,164 @@
+"""Who exists: handles reused, recreated, shared, missing."""
+
+import polars as pl
+from story import Story
+
+from chainshaper.analysis import application_graph, callback_instances, resolve_objects
+
+
+def labels(story: Story) -> list[str]:
+    return [callback.label for callback in application_graph(story.tables()).callbacks]
+
+
+def instances_by_callback(story: Story) -> dict[int, list[int]]:
+    tables = story.tables()
+    objects = resolve_objects(tables)
+    instances = callback_instances(tables, objects.callbacks)
+    grouped = instances.group_by("callback_id", maintain_order=True).agg("start")
+    return dict(grouped.iter_rows())
+
+
+def test_names_kinds_and_topics() -> None:
+    story = Story()
+    node = story.node("/front/filter", pid=7)
+    story.timer(node, period=250_000_000)
+    story.subscription(node, "/points", symbol="Filter::on_points(Cloud)")
+    graph = application_graph(story.tables())
+    timer, subscription = graph.callbacks
+    assert (timer.kind, timer.node, timer.pid) == ("timer", "/front/filter", 7)
+    assert timer.label == "/front/filter every 250ms"
+    assert (subscription.kind, subscription.topic) == ("subscription", "/points")
+    assert subscription.symbol == "Filter::on_points(Cloud)"
+    assert graph.subscribers == {"/points": ("/front/filter",)}
+    assert [node.name for node in graph.nodes] == ["/front/filter"]
+
+
+def test_the_same_handle_in_two_processes() -> None:
+    story = Story()
+    story.subscription(story.node("/a", pid=1), "/x", handle=0xBEEF)
+    story.subscription(story.node("/b", pid=2), "/y", handle=0xBEEF)
+    assert labels(story) == ["/a ← /x", "/b ← /y"]
+
+
+def test_a_handle_reused_in_time_by_another_object() -> None:
+    story = Story()
+    node = story.node("/a", pid=1)
+    first = story.subscription(node, "/x", time=10, handle=0xBEEF)
+    story.runs(first, 20, 30)
+    second = story.timer(node, time=40, handle=0xBEEF)
+    story.runs(second, 50, 60)
+    assert labels(story) == ["/a ← /x", "/a every 100ns"]
+    assert instances_by_callback(story) == {0: [20], 1: [50]}
+
+
+def test_a_process_number_reused_by_a_second_process() -> None:
+    # The second process has the same number, node handle and callback handle.
+    story = Story()
+    first = story.subscription(story.node("/a", 1, time=0, handle=8), "/x", 1, handle=0xBEEF)
+    story.runs(first, 20, 30)
+    again = story.subscription(story.node("/b", 1, time=40, handle=8), "/x", 41, handle=0xBEEF)
+    story.runs(again, 50, 60)
+    assert labels(story) == ["/a ← /x", "/b ← /x"]
+    assert instances_by_callback(story) == {0: [20], 1: [50]}
+
+
+def test_a_subscription_recreated_at_another_address_is_one_callback() -> None:
+    story = Story()
+    node = story.node("/a", pid=1)
+    story.runs(story.subscription(node, "/x", time=10), 20, 30)
+    story.runs(story.subscription(node, "/x", time=40), 50, 60)
+    assert labels(story) == ["/a ← /x"]
+    assert instances_by_callback(story) == {0: [20, 50]}
+
+
+def test_two_timers_with_one_period_stay_two() -> None:
+    # Both are in use at the same time, though node, period and even symbol agree.
+    story = Story()
+    node = story.node("/a", pid=1)
+    one, two = (story.timer(node, time=10, symbol="A::tick()") for _ in range(2))
+    for start in (100, 200):
+        story.runs(one, start, start + 5)
+        story.runs(two, start + 10, start + 15)
+    assert instances_by_callback(story) == {0: [100, 200], 1: [110, 210]}
+
+
+def test_symbol_of_a_later_user_of_the_address_is_not_taken() -> None:
+    story = Story()
+    node = story.node("/a", pid=1)
+    story.subscription(node, "/x", time=10, handle=0xBEEF)
+    story.subscription(node, "/y", time=40, handle=0xBEEF, symbol="second()")
+    graph = application_graph(story.tables())
+    assert [callback.symbol for callback in graph.callbacks] == [None, "second()"]
+
+
+def test_tracing_started_late_leaves_callbacks_unknown_and_says_so() -> None:
+    story = Story()
+    story.event("callback_start", 5, 9, callback=0xABC, is_intra_process=0)
+    story.event("callback_end", 8, 9, callback=0xABC)
+    graph = application_graph(story.tables())
+    (callback,) = graph.callbacks
+    assert (callback.kind, callback.handle, callback.topic) == ("unknown", 0xABC, None)
+    assert callback.label == "unknown (process 9) callback 0xabc"
+    (note,) = resolve_objects(story.tables()).notes
+    assert "tracing started after the application" in note
+
+
+def test_a_handle_used_before_it_is_registered_is_somebody_elses() -> None:
+    story = Story()
+    story.event("callback_start", 5, 1, callback=0xBEEF, is_intra_process=0)
+    story.event("callback_end", 8, 1, callback=0xBEEF)
+    later = story.subscription(story.node("/a", pid=1, time=10), "/x", 20, handle=0xBEEF)
+    story.runs(later, 30, 40)
+    assert labels(story) == ["unknown (process 1) callback 0xbeef", "/a ← /x"]
+    assert instances_by_callback(story) == {0: [5], 1: [30]}
+
+
+def test_lost_init_events_leave_what_is_known() -> None:
+    # The node's and the rcl subscription's events are missing: topic and node stay unknown.
+    story = Story()
+    story.event("rclcpp_subscription_init", 1, 1, subscription_handle=5, subscription=6)
+    story.event("rclcpp_subscription_callback_added", 2, 1, subscription=6, callback=7)
+    story.event("callback_start", 3, 1, callback=7, is_intra_process=0)
+    (callback,) = application_graph(story.tables()).callbacks
+    assert (callback.kind, callback.topic, callback.node) == (
+        "subscription",
+        None,
+        "unknown (process 1)",
+    )
+
+
+def test_publisher_created_before_its_node_as_rosout_is() -> None:
+    story = Story()
+    story.event(
+        "rcl_publisher_init",
+        5,
+        1,
+        publisher_handle=1,
+        node_handle=8,
+        rmw_publisher_handle=2,
+        topic_name="/rosout",
+        queue_depth=1,
+    )
+    story.node("/a", pid=1, time=6, handle=8)
+    assert application_graph(story.tables()).publishers == {"/rosout": ("/a",)}
+
+
+def test_python_nodes_have_assumed_instances() -> None:
+    # /py takes at 20 and 60 and publishes at 30 and 70; there are no callback events.
+    story = Story()
+    python = story.node("/py", pid=1)
+    taker = story.subscription(python, "/x", callbackless=True)
+    out = story.publisher(python, "/y")
+    for took in (20, 60):
+        story.take(taker, took, sent=took - 5)
+        story.publish(out, took + 10)
+    tables = story.tables()
+    (callback,) = application_graph(tables).callbacks
+    assert (callback.kind, callback.topic, callback.publishes) == ("subscription", "/x", ("/y",))
+    assert "without callback events" in resolve_objects(tables).notes[0]
+
+
+def test_empty_tables_are_an_empty_application() -> None:
+    graph = application_graph({})
+    assert (graph.nodes, graph.callbacks, graph.topics) == ((), (), ())
+    assert isinstance(callback_instances({}, resolve_objects({}).callbacks), pl.DataFrame)

@@ -1,0 +1,99 @@
+"""Real traces of ROS 2 applications, against ground truth computed independently."""
+
+import polars as pl
+import pytest
+from reference_traces import TRACES, reference_trace
+
+from chainshaper.analysis import (
+    analyse_latency,
+    application_graph,
+    callback_statistics,
+    data_flow,
+)
+
+
+@pytest.mark.parametrize("name", TRACES)
+def test_callbacks_counts_and_response_times(name: str) -> None:
+    trace = reference_trace(name)
+    found = callback_statistics(data_flow(trace.tables, trace.clock_offset_ns))
+    keys = ["kind", "node", "topic", "period_ns", "pid", "tids", "count"]
+    measured = []
+    for row in found.iter_rows(named=True):
+        response = {**row["response_ns"], "mean": round(row["response_ns"]["mean"], 1)}
+        measured.append({**{key: row[key] for key in keys}, "response_ns": response})
+    expected = [
+        {key: row[key] for key in (*keys, "response_ns")} for row in trace.truth["callbacks"]
+    ]
+    for row in (*measured, *expected):
+        row["response_ns"] = sorted(row["response_ns"].items())
+    assert sorted(measured, key=repr) == sorted(expected, key=repr)
+    assert found["unfinished"].sum() == 0
+
+
+@pytest.mark.parametrize("name", TRACES)
+def test_publications_and_their_takes(name: str) -> None:
+    trace = reference_trace(name)
+    flow = data_flow(trace.tables, trace.clock_offset_ns)
+    read = flow.takes.drop_nulls("publication").select("publication").unique()
+    counted = {
+        topic: [
+            published.height,
+            published.join(read, on="publication", how="semi").height,
+        ]
+        for topic in trace.truth["published_and_taken"]
+        for published in [flow.publications.filter(topic=topic).drop_nulls("source_timestamp")]
+    }
+    assert counted == trace.truth["published_and_taken"]
+
+
+@pytest.mark.parametrize(
+    ("name", "spec"),
+    [
+        ("jazzy_chain_cyclonedds", "/t1../t5"),
+        ("jazzy_chain_fastrtps_async", "/t1../t5"),
+        ("jazzy_avp_cyclonedds", "/lidar_rear/points_raw../points_fused../localization/ndt_pose"),
+    ],
+)
+def test_every_traversal_to_the_nanosecond(name: str, spec: str) -> None:
+    trace = reference_trace(name)
+    truth = trace.truth["chain"]
+    found = analyse_latency(trace.tables, spec, trace.clock_offset_ns)
+    complete = found.traversals.filter(pl.col("complete"))
+    spans = complete.select(pl.col("start", "end") + trace.clock_offset_ns).rows()
+    assert [list(span) for span in spans] == truth["start_and_end_ns"]
+    assert found.statistics.count == truth["complete"]
+    assert found.statistics.incomplete == truth["incomplete"]
+    assert found.statistics.min_ns == truth["latency_ns"]["min"]
+    assert found.statistics.max_ns == truth["latency_ns"]["max"]
+
+
+def test_a_synchroniser_that_holds_messages_back_is_noticed() -> None:
+    trace = reference_trace("jazzy_avp_cyclonedds")
+    found = analyse_latency(trace.tables, "/lidar_rear/points_raw../localization/ndt_pose")
+    assert any("lower bounds" in note for note in found.notes)
+
+
+def test_humble_takes_are_linked_without_timestamps() -> None:
+    # 40 messages of /topic_b were taken whose publication is not in the trace: the events of
+    # that process end 200 ms early. All others have theirs, in order, none twice.
+    trace = reference_trace("humble_sync")
+    flow = data_flow(trace.tables, trace.clock_offset_ns)
+    linked = flow.takes.drop_nulls("publication")
+    for topic, unknown in (("/topic_a", 0), ("/topic_b", 40)):
+        taken = flow.takes.filter(topic=topic)
+        assert taken["publication"].null_count() == unknown
+        order = linked.filter(topic=topic)["publication"].to_list()
+        assert order == sorted(set(order))
+    found = analyse_latency(trace.tables, "/topic_a../topic_b", trace.clock_offset_ns)
+    assert found.statistics.count == 1986
+    assert found.incomplete == {"lost": 5, "not taken": 40}
+
+
+def test_caret_traces_have_chains_through_stored_messages() -> None:
+    trace = reference_trace("galactic_caret_end_to_end")
+    graph = application_graph(trace.tables)
+    timer_driven = next(c for c in graph.callbacks if c.topic == "/topic3")
+    assert timer_driven.passes_on == ("/topic4",)
+    found = analyse_latency(trace.tables, "/topic1../actuator_dummy_node")
+    assert found.chain.topics == ("/topic1", "/topic2", "/topic3", "/topic4")
+    assert found.statistics.count + found.statistics.incomplete == 75

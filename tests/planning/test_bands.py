@@ -1,0 +1,249 @@
+"""Exact band placement, proven against trying out every placement."""
+
+import itertools
+import math
+import random
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from chainshaper.errors import InputError, OperationError
+from chainshaper.planning.bands import (
+    BandProblem,
+    Goal,
+    band_problem,
+    broken_constraint,
+    enough_bands,
+    mean_of,
+    place_bands,
+    placement_curve,
+)
+
+pytest.importorskip("numba")
+
+MS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Tried:
+    """One placement that keeps every constraint, judged without the code under test."""
+
+    ends: tuple[int, ...]
+    total: int
+    jitter: int
+    gap: int
+
+
+def every_placement(problem: BandProblem, bands: int) -> list[Tried]:
+    """All placements on the grid, straight from the text of sections 3.3 and 4.1."""
+    sample = problem.latencies_ns.tolist()
+    grid, slot, last = problem.grid_ns, problem.publish_slot_ns, problem.last_end_ns
+    instants = range(0, last, grid)
+    found = []
+    for first_ends in itertools.combinations(instants, bands - 1):
+        ends = (*first_ends, last)
+        if bands > 1 and not ends[0] - slot > min(sample):
+            continue
+        gaps = [after - before for before, after in itertools.pairwise(ends)]
+        if any(not gap > slot for gap in gaps):
+            continue
+        if problem.max_gap_ns is not None and any(gap > problem.max_gap_ns for gap in gaps):
+            continue
+        published = [min(end for end in ends if latency <= end) for latency in sample]
+        shares = [published.count(end) / len(sample) for end in ends]
+        if problem.max_share is not None and max(shares) > problem.max_share + 1e-12:
+            continue
+        jitter = last - (ends[0] - slot)
+        found.append(Tried(ends, sum(published), jitter, max(gaps, default=0)))
+    return found
+
+
+def random_problem(random: random.Random) -> tuple[BandProblem, int]:
+    """A small problem; slots, gaps and caps are tight as often as not."""
+    span = random.randint(2, 18)
+    low = random.randint(0, 6)
+    size = random.randint(2, 10)
+    sample = [low + random.randint(0, span) for _ in range(size)]
+    if random.random() < 0.3:  # few distinct values: plateaus and jumps of the distribution
+        sample = [low + random.choice([0, span // 2, span]) for _ in range(size)]
+    slot = random.choice([1, 1, 2, 3, random.randint(1, 8)])
+    last = max(sample) + random.randint(0, 3) + slot
+    max_gap = None
+    if random.random() < 0.6:
+        max_gap = slot + random.choice([1, 1, 2, 3, random.randint(1, 12)])
+    max_share = None
+    if random.random() < 0.4:
+        max_share = random.choice([0.2, 0.25, 1 / 3, 0.5, 0.6, 0.75, random.uniform(0.1, 1)])
+    problem = band_problem(
+        np.array(sample),
+        last,
+        publish_slot_ns=slot,
+        grid_ns=random.choice([1, 1, 1, 2, 3]),
+        max_gap_ns=max_gap,
+        max_share=max_share,
+    )
+    return problem, random.randint(1, 5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_optimum_is_that_of_trying_everything(seed: int) -> None:
+    generator = random.Random(seed)
+    feasible = tight = 0
+    for _ in range(1000):
+        problem, bands = random_problem(generator)
+        tried = every_placement(problem, bands)
+        size = problem.latencies_ns.size
+        if not tried:
+            with pytest.raises(OperationError):
+                place_bands(problem, bands)
+            continue
+        feasible += 1
+        tight += len(tried) < 4
+        placement = place_bands(problem, bands)
+        least = min(one.total for one in tried)
+        assert placement.mean_ns == least / size
+        assert placement.slot_ends_ns in {one.ends for one in tried}
+        assert broken_constraint(problem, placement.slot_ends_ns) is None
+        assert mean_of(problem, placement.slot_ends_ns) == placement.mean_ns
+        best_jitter = min(one.jitter for one in tried if one.total == least)
+        found = next(one for one in tried if one.ends == placement.slot_ends_ns)
+        assert found.jitter == best_jitter
+    assert feasible > 350
+    assert tight > 50
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_other_goals_are_reached_as_well_as_by_trying_everything(seed: int) -> None:
+    generator = random.Random(100 + seed)
+    compared = 0
+    while compared < 300:
+        problem, bands = random_problem(generator)
+        tried = every_placement(problem, bands)
+        if not tried:
+            continue
+        size = problem.latencies_ns.size
+        least = math.ceil(min(one.total for one in tried) / size)
+        mean = least + generator.choice([0, 1, 1, 2, 5])
+        allowed = [one for one in tried if one.total <= mean * size]
+        placement = place_bands(problem, bands, minimise="jitter", mean_at_most_ns=mean)
+        found = next(one for one in allowed if one.ends == placement.slot_ends_ns)
+        assert found.jitter == min(one.jitter for one in allowed)
+        placement = place_bands(problem, bands, minimise="gap", mean_at_most_ns=mean)
+        found = next(one for one in allowed if one.ends == placement.slot_ends_ns)
+        assert found.gap == min(one.gap for one in allowed)
+        compared += 1
+
+
+def test_the_curve_is_every_number_of_bands_at_once() -> None:
+    generator = random.Random(7)
+    for _ in range(200):
+        problem, _ = random_problem(generator)
+        alone = []
+        for bands in range(1, 6):
+            try:
+                alone.append(place_bands(problem, bands))
+            except OperationError:
+                if alone:
+                    break
+        if alone:
+            assert placement_curve(problem, 5) == alone
+        else:
+            with pytest.raises(OperationError):
+                placement_curve(problem, 5)
+
+
+def test_a_placement_worked_out_by_hand() -> None:
+    # Half of the executions take 10 ms, half 50 ms. With Δ = 1 ms the first slot is best right
+    # behind the shorter ones: it must begin after 10 ms, so it ends 1 µs after 11 ms.
+    latencies = np.array([10, 10, 50, 50]) * MS
+    placement = place_bands(band_problem(latencies, 52 * MS), 2)
+    assert placement.slot_ends_ns == (11_001_000, 52 * MS)
+    assert placement.mean_ns == (11_001_000 + 52 * MS) / 2
+    # With neighbours at most 30 ms apart the first moves to 22 ms, far from any sample; a third
+    # one lies between them, as early as the gap of the last allows.
+    close = band_problem(latencies, 52 * MS, max_gap_ns=30 * MS)
+    assert place_bands(close, 2).slot_ends_ns == (22 * MS, 52 * MS)
+    assert place_bands(close, 3).slot_ends_ns[0] == 11_001_000
+
+
+def test_a_cap_on_the_share_moves_bands_together() -> None:
+    latencies = np.arange(1, 101) * MS
+    placement = place_bands(band_problem(latencies, 101 * MS, grid_ns=MS, max_share=0.4), 3)
+    shares = np.diff(np.searchsorted(latencies, placement.slot_ends_ns, side="right"), prepend=0)
+    assert max(shares) <= 40
+
+
+def test_equal_latencies_leave_no_earlier_slot() -> None:
+    problem = band_problem(np.array([50, 50]) * MS, 52 * MS)
+    assert place_bands(problem, 1).slot_ends_ns == (52 * MS,)
+    with pytest.raises(OperationError, match="room for 1 publish slots of 1ms"):
+        place_bands(problem, 3)
+
+
+@pytest.mark.parametrize(
+    ("limits", "bands", "words"),
+    [
+        ({}, 60, "room for 41 publish slots"),
+        ({"grid_ns": 30 * MS}, 4, "grid of 30ms is too coarse"),
+        ({"max_gap_ns": 1_000_001}, 3, "within 1.000001ms"),
+        ({"max_share": 0.1}, 3, r"10\.0% of the executions"),
+        ({"max_share": 0.5}, 1, r"50\.0% of the executions"),
+        ({"max_share": 0.34, "max_gap_ns": 5 * MS}, 3, "exclude each other|34.0%"),
+    ],
+)
+def test_the_binding_constraint_is_named(limits: dict[str, Any], bands: int, words: str) -> None:
+    latencies = np.linspace(10 * MS, 50 * MS, 100).astype(np.int64)
+    problem = replace(band_problem(latencies, 52 * MS), **limits)
+    with pytest.raises(OperationError, match=words):
+        place_bands(problem, bands)
+
+
+def test_an_average_out_of_reach_is_said() -> None:
+    problem = band_problem(np.array([10, 20, 30]) * MS, 32 * MS, grid_ns=MS)
+    goals: list[Goal] = ["mean", "jitter", "gap"]
+    for goal in goals:
+        with pytest.raises(OperationError, match="the best is 24ms"):
+            place_bands(problem, 2, minimise=goal, mean_at_most_ns=20 * MS)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"publish_slot_ns": 0}, "longer than 0ms"),
+        ({"grid_ns": 0}, "longer than 0ms"),
+        ({"max_gap_ns": MS}, "not longer than the publish slot"),
+        ({"max_share": 0.0}, "above 0"),
+        ({"max_share": float("nan")}, "above 0"),
+        ({"last_end_ns": 29 * MS}, "before the longest latency"),
+        ({"last_end_ns": 2**61}, "overflow"),
+    ],
+)
+def test_senseless_problems_are_refused(wrong: dict[str, Any], words: str) -> None:
+    values = {"last_end_ns": 32 * MS, **wrong}
+    with pytest.raises(InputError, match=words):
+        band_problem(np.array([10, 20, 30]) * MS, **values)
+
+
+def test_senseless_requests_are_refused() -> None:
+    problem = band_problem(np.array([10, 20, 30]) * MS, 32 * MS)
+    with pytest.raises(InputError, match="one band at least"):
+        place_bands(problem, 0)
+    with pytest.raises(InputError, match="which average"):
+        place_bands(problem, 2, minimise="jitter")
+    with pytest.raises(InputError, match="coarser than 1ns"):
+        place_bands(replace(problem, grid_ns=1, last_end_ns=2000 * MS), 2)
+
+
+def test_bands_are_enough_when_another_gains_little() -> None:
+    latencies = np.linspace(30 * MS, 60 * MS, 301).astype(np.int64)
+    curve = placement_curve(band_problem(latencies, 62 * MS), 12)
+    means = [placement.mean_ns for placement in curve]
+    assert means == sorted(means, reverse=True)
+    chosen = enough_bands(curve, least_gain=0.02)
+    bands = len(chosen.slot_ends_ns)
+    gains = [(before - after) / before for before, after in itertools.pairwise(means)]
+    assert all(gain >= 0.02 for gain in gains[: bands - 1])
+    assert gains[bands - 1] < 0.02
+    assert enough_bands(curve, least_gain=0) == curve[-1]

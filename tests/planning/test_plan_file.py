@@ -1,0 +1,327 @@
+"""The plan file: what is written is read back equal, and what would not run is refused."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from chainshaper.errors import InputError, OperationError
+from chainshaper.planning import (
+    ChainOfPlan,
+    Evidence,
+    Margin,
+    Plan,
+    Prediction,
+    Server,
+    ShapingNode,
+    Thread,
+    dump_plan,
+    load_plan,
+    plan_json,
+    publish_slots,
+    save_plan,
+    server_of,
+)
+
+GOOD = """\
+# edited by hand: keys in another order, flow style, comments
+servers:
+  - {name: chain, core: 1, priority: 2, slots: [[0, 64ms]], threads: [{node: /n1, role: executor}]}
+  - name: output      # the gate
+    priority: 1
+    core: 0
+    slots:
+      - [64000us, 0.065s]
+    threads:
+      - {node: /chainshaper_t5}
+cycle: 100ms
+policy: shaped
+chain: {spec: "/t1../t5", output: /t5, publisher: /ns/n5, period: 100ms}
+evidence:
+  recording: null
+  samples: 320
+  min_latency: 30ms
+  mean_latency: 48.123456ms
+  max_latency: 63ms
+  realtime: yes
+margin: {epsilon: 1ms, source: given}
+anchor: stamp
+shaping_node: {name: chainshaper_t5, input: /t5_tmp, output: /t5, core: 0, fifo_priority: 84,
+               spin: 300us, pause: 500us}
+predicted: {mean: 65ms, max: 65ms, jitter: 1ms, shares: [1]}
+format: 1
+"""
+
+
+def test_a_hand_edited_plan_is_read(tmp_path: Path) -> None:
+    plan = _load(tmp_path, GOOD)
+    assert plan.cycle_ns == 100_000_000
+    assert plan.evidence.mean_latency_ns == 48_123_456
+    assert plan.evidence.realtime is True
+    assert plan.servers[1].slots == ((64_000_000, 65_000_000),)
+    assert publish_slots(plan) == ((64_000_000, 65_000_000),)
+    assert server_of(plan, Thread(node="/n1")) == plan.servers[0]
+    assert server_of(plan, Thread(node="/n9")) is None
+
+
+def test_the_json_form_has_integer_nanoseconds(tmp_path: Path) -> None:
+    values = plan_json(_load(tmp_path, GOOD))
+    assert values["bands_ns"] == [65_000_000]
+    assert values["predicted"] == {
+        "mean_ns": 65_000_000,
+        "max_ns": 65_000_000,
+        "jitter_ns": 1_000_000,
+        "shares": [1.0],
+    }
+    assert values["servers"][0]["slots"] == [[0, 64_000_000]]
+    assert values["cycle_ns"] == 100_000_000
+    assert values["chain"]["period_ns"] == 100_000_000
+
+
+WRONG_VALUES = [
+    # what to replace, by what, line, key, and words of the reason
+    ("cycle: 100ms", "cycle: 100", 11, "cycle", "unit"),
+    ("cycle: 100ms", "cycle: .nan", 11, "cycle", "unit"),
+    ("cycle: 100ms", "cycle: -1ms", 11, "cycle", "negative"),
+    ("cycle: 100ms", "cycle: 0", 11, "cycle", "zero"),
+    ("cycle: 100ms", "cycle: [100ms]", 11, "cycle", "unit"),
+    ("cycle: 100ms", "cycle: 1000000000000s", 11, "cycle", "292 years"),
+    ("cycle: 100ms", "cycle: 150ms", 11, "cycle", "multiple"),
+    ("cycle: 100ms", "cycel: 100ms", 11, "cycel", "did you mean 'cycle'"),
+    ("cycle: 100ms", "cycle: 100ms\ncycle: 200ms", 12, "cycle", "second time"),
+    ("cycle: 100ms", "cycle_ns: 100000000", 11, "cycle_ns", "write 'cycle'"),
+    ("cycle: 100ms\n", "", 2, "cycle", "missing"),
+    ("cycle: 100ms", "cycle: 100ms\ncolour: red", 12, "colour", "unknown key: remove it"),
+    ("max_latency: 63ms", "max_latency: 100ms", 11, "cycle", "not longer than"),
+    ("max_latency: 63ms", "max_latency: 40ms", 18, "evidence.mean_latency", "ascend"),
+    ("samples: 320", "samples: 0", 16, "evidence.samples", "greater than or equal to 1"),
+    ("samples: 320", "samples: many", 16, "evidence.samples", "'many' is not a whole number"),
+    ("realtime: yes", "realtime: 1", 20, "evidence.realtime", "not true or false"),
+    ("[[0, 64ms]]", "[[0, 64]]", 3, "servers[0].slots[0][1]", "unit"),
+    ("[[0, 64ms]]", "[[-1ms, 64ms]]", 3, "servers[0].slots[0][0]", "negative"),
+    ("[[0, 64ms]]", "[[64ms, 64ms]]", 3, "servers[0].slots[0]", "empty"),
+    ("[[0, 64ms]]", "[[64ms, 3ms]]", 3, "servers[0].slots[0]", "empty"),
+    ("[[0, 64ms]]", "[[0, 64ms], [99ms, 101ms]]", 3, "servers[0].slots[1]", "after the cycle"),
+    ("[[0, 64ms]]", "[[5ms, 9ms], [0ms, 4ms]]", 3, "servers[0].slots[1]", "ascending"),
+    ("[[0, 64ms]]", "[[5ms, 9ms], [8ms, 12ms]]", 3, "servers[0].slots[1]", "overlap"),
+    ("[[0, 64ms]]", "[[0ms]]", 3, "servers[0].slots[0][1]", "missing"),
+    ("[[0, 64ms]]", "64ms", 3, "servers[0].slots", "not a list"),
+    ("[[0, 64ms]]", "[]", 3, "servers[0].slots", "too short"),
+    ("name: output ", "name: chain ", 4, "servers[1].name", "two servers"),
+    ("priority: 1", "priority: 0", 5, "servers[1].priority", "greater than or equal to 1"),
+    ("priority: 1", "priority: 1.5", 5, "servers[1].priority", "not a whole number"),
+    ("core: 0\n", "core: -1\n", 6, "servers[1].core", "greater than or equal to 0"),
+    ("core: 0\n", "core: 3\n", 23, "shaping_node.core", "make them the same"),
+    ("{node: /n1, role: executor}", "/n1", 3, "servers[0].threads[0]", "not a mapping"),
+    ("{node: /n1, role: executor}", "{node: n1}", 3, "servers[0].threads[0].node", "full ROS"),
+    ("role: executor", "role: dds", 3, "servers[0].threads[0].role", "'executor' or 'publisher'"),
+    ("{node: /n1", "{node: /chainshaper_t5", 10, "servers[1].threads[0]", "already in"),
+    ("{node: /chainshaper_t5}", "{node: /other}", 23, "shaping_node.name", "no server holds"),
+    ("input: /t5_tmp", "input: /t5", 23, "shaping_node.input", "feed itself"),
+    ("input: /t5_tmp", "input: t5_tmp", 23, "shaping_node.input", "full ROS"),
+    ("input: /t5_tmp", "input: /t5//tmp", 23, "shaping_node.input", "full ROS"),
+    ("input: /t5_tmp", "input: /5", 23, "shaping_node.input", "full ROS"),
+    ("output: /t5, core", "output: /t6, core", 23, "shaping_node.output", "make them the same"),
+    ("fifo_priority: 84", "fifo_priority: 99", 23, "shaping_node.fifo_priority", "equal to 98"),
+    ("fifo_priority: 84", "fifo_priority: 0", 23, "shaping_node.fifo_priority", "equal to 1"),
+    ("{name: chainshaper_t5,", "{name: /x,", 23, "shaping_node.name", "not a node's name"),
+    ("spin: 300us", "spin: 0.1ns", 24, "shaping_node.spin", "finer"),
+    ("shares: [1]", "shares: [.nan]", 25, "predicted.shares[0]", "finite"),
+    ("shares: [1]", "shares: [1.5]", 25, "predicted.shares[0]", "equal to 1"),
+    ("shares: [1]", "shares: 1", 25, "predicted.shares", "not a list"),
+    ("policy: shaped", "policy: fast", 12, "policy", "'shaped'"),
+    ("anchor: stamp", "anchor: sea", 22, "anchor", "'stamp' or 'cycle'"),
+    ("format: 1", "format: 2", 26, "format", "should be 1"),
+    ('spec: "/t1../t5"', "spec: 7", 13, "chain.spec", "7 is not a text"),
+    ("samples: 320", "samples: 2001-99-99", 16, "evidence.samples", "whole number"),
+]
+
+
+@pytest.mark.parametrize("case", WRONG_VALUES, ids=lambda case: case[1].strip())
+def test_a_wrong_value_is_named(tmp_path: Path, case: tuple[str, str, int, str, str]) -> None:
+    old, new, line, key, words = case
+    assert GOOD.count(old) >= 1
+    with pytest.raises(InputError) as caught:
+        _load(tmp_path, GOOD.replace(old, new, 1))
+    problem = str(caught.value).splitlines()[-1]
+    assert problem.startswith(f"{tmp_path / 'plan.yaml'}:{line}: {key}: ")
+    assert words in problem
+
+
+def test_every_wrong_value_is_named_once(tmp_path: Path) -> None:
+    text = GOOD.replace("cycle: 100ms", "cycel: 100ms").replace("[[0, 64ms]]", "[[0, 64]]")
+    with pytest.raises(InputError) as caught:
+        _load(tmp_path, text)
+    assert [line.split(": ")[1] for line in str(caught.value).splitlines()] == [
+        "cycle",
+        "servers[0].slots[0][1]",
+        "cycel",
+    ]
+
+
+def test_overlap_is_judged_per_core_and_priority(tmp_path: Path) -> None:
+    inside = GOOD.replace("[64000us, 0.065s]", "[30ms, 31ms]")
+    assert publish_slots(_load(tmp_path, inside)) == ((30_000_000, 31_000_000),)
+    same_core = inside.replace("core: 0", "core: 1")
+    _load(tmp_path, same_core)  # the better priority pre-empts
+    with pytest.raises(InputError, match=r":8: servers\[1\]\.slots\[0\]: .* overlaps .*'chain'"):
+        _load(tmp_path, same_core.replace("priority: 1", "priority: 2"))
+    touching = GOOD.replace("core: 0", "core: 1").replace("priority: 1", "priority: 2")
+    _load(tmp_path, touching)  # half-open: [0, 64) and [64, 65) do not overlap
+
+
+def test_two_shaping_nodes_may_not_share_name_or_output(tmp_path: Path) -> None:
+    second = (
+        "further_shaping_nodes:\n  - {name: other, input: /a, output: /t5, core: 0,"
+        " fifo_priority: 84, spin: 0, pause: 0}\n"
+    )
+    with pytest.raises(InputError, match="both must be its own"):
+        _load(tmp_path, GOOD + second)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", ":1: the file is empty"),
+        ("- 1\n- 2\n", ":1: expected a YAML mapping"),
+        ("chain: {period: 1ms\n", ":2: not YAML"),
+        ("chain: 1\n---\nchain: 2\n", ":2: not YAML"),
+        ("a: &x [1]\nb: *x\n", "alias"),
+        ("a: &x [*x]\n", "alias"),
+        ("chain: \x00\n", "not a YAML text"),
+        ("[" * 5000, "not a YAML text"),
+    ],
+)
+def test_what_is_no_plan_at_all_is_refused(tmp_path: Path, text: str, words: str) -> None:
+    with pytest.raises(InputError) as caught:
+        _load(tmp_path, text)
+    assert words in str(caught.value)
+
+
+def test_unreadable_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        load_plan(tmp_path / "absent.yaml")
+    with pytest.raises(InputError, match="cannot be read"):
+        load_plan(tmp_path)
+    (tmp_path / "latin").write_bytes(b"chain: \xff\xfe")
+    with pytest.raises(InputError, match="not a YAML text"):
+        load_plan(tmp_path / "latin")
+
+
+def test_nothing_is_overwritten_unless_told(tmp_path: Path) -> None:
+    plan = _load(tmp_path, GOOD)
+    target = tmp_path / "out.yaml"
+    save_plan(plan, target)
+    with pytest.raises(InputError, match="not overwritten"):
+        save_plan(plan, target)
+    save_plan(plan, target, overwrite=True)
+    assert load_plan(target) == plan
+    with pytest.raises(InputError, match="no such folder"):
+        save_plan(plan, tmp_path / "absent" / "plan.yaml")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["out.yaml", "plan.yaml"]
+
+
+def test_a_failed_write_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = _load(tmp_path, GOOD)
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OperationError, match="No space left"):
+        save_plan(plan, tmp_path / "out.yaml")
+    assert [file.name for file in tmp_path.iterdir()] == ["plan.yaml"]
+
+
+NAMES = st.from_regex(r"(/[A-Za-z_][A-Za-z0-9_]{0,5}){1,3}", fullmatch=True)
+SHARES = st.lists(st.floats(0, 1), max_size=4).map(tuple)
+
+
+@st.composite
+def plans(draw: st.DrawFn) -> Plan:
+    """Any plan the rules allow: times anywhere in 64 bits, names as ROS 2 permits them."""
+    period = draw(st.integers(8, 2**62))
+    low, mean, high = sorted(draw(st.lists(st.integers(1, period - 1), min_size=3, max_size=3)))
+    bounds = sorted(draw(st.sets(st.integers(0, period), min_size=4, max_size=8)))
+    slots = tuple(zip(bounds[::2], bounds[1::2], strict=False))
+    output = draw(NAMES)
+    node = ShapingNode(
+        name="gate",
+        input=output + "_tmp",
+        output=output,
+        core=0,
+        fifo_priority=draw(st.integers(1, 98)),
+        spin_ns=draw(st.integers(0, 10**9)),
+        pause_ns=draw(st.integers(0, 10**9)),
+    )
+    others = draw(st.sets(NAMES.filter(lambda name: name != "/gate"), max_size=3))
+    return Plan(
+        chain=ChainOfPlan(
+            spec=draw(st.none() | st.text()),
+            output=output,
+            publisher=draw(st.none() | NAMES),
+            period_ns=period,
+        ),
+        evidence=Evidence(
+            recording=draw(st.none() | st.text()),
+            samples=draw(st.integers(1, 10**12)),
+            min_latency_ns=low,
+            mean_latency_ns=mean,
+            max_latency_ns=high,
+            realtime=draw(st.none() | st.booleans()),
+            longest_stall_ns=draw(st.none() | st.integers(0, 10**12)),
+            utilisation=draw(st.none() | st.floats(0, 2)),
+        ),
+        margin=draw(
+            st.integers(0, 10**9).map(lambda margin: Margin(epsilon_ns=margin))
+            | st.just(
+                Margin(
+                    epsilon_ns=7,
+                    source="derived",
+                    overrun_probability=1e-6,
+                    confidence_interval_ns=(3, 123_456_789),
+                )
+            )
+        ),
+        policy="shaped",
+        cycle_ns=period,
+        offset_ns=draw(st.integers(0, 3)),
+        anchor=draw(st.sampled_from(["stamp", "cycle"])),
+        servers=(
+            Server(
+                name="chain",
+                core=1,
+                priority=2,
+                slots=((0, period),),
+                threads=tuple(Thread(node=name, role="publisher") for name in sorted(others)),
+            ),
+            Server(
+                name=draw(st.text(min_size=1).filter(lambda name: name != "chain")),
+                core=0,
+                priority=1,
+                slots=slots,
+                threads=(node.thread,),
+            ),
+        ),
+        shaping_node=node,
+        predicted=Prediction(mean_ns=1, max_ns=high, jitter_ns=0, shares=draw(SHARES)),
+    )
+
+
+@given(plans())
+def test_what_is_dumped_is_loaded_equal(plan: Plan) -> None:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "plan.yaml"
+        save_plan(plan, file)
+        again = load_plan(file)
+        assert again == plan
+        assert dump_plan(again) == dump_plan(plan)
+
+
+def _load(folder: Path, text: str) -> Plan:
+    file = folder / "plan.yaml"
+    file.write_text(text, encoding="utf-8")
+    return load_plan(file)
