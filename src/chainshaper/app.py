@@ -13,7 +13,8 @@ from chainshaper.durations import format_duration
 __all__ = ["ApplicationGraph", "Callback", "CallbackKind", "Chain", "Node"]
 
 CallbackKind: TypeAlias = Literal["timer", "subscription", "service", "client", "unknown"]
-"""``unknown``: it was seen to run, but not to be created (tracing started after it)."""
+"""``unknown``: it was seen to run, but not to be created (tracing started after it), or only its
+publications were seen (``handle`` 0: a thread of the node's own)."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,8 @@ class Callback:
         """A short text that tells callbacks apart: ``/node2 ← /t1`` or ``/node1 every 100ms``."""
         if self.kind == "timer":
             return f"{self.node} every {format_duration(self.period_ns or 0)}"
+        if self.kind == "unknown" and not self.handle:
+            return f"{self.node} outside callbacks"
         if self.kind == "unknown":
             return f"{self.node} callback {self.handle:#x}"
         return f"{self.node} ← {self.topic}"

@@ -11,7 +11,8 @@ DIR/comparison.json    every figure of the printed table
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -65,24 +66,21 @@ def run_demo(
 
     Raises:
         InputError: ``folder`` exists and is not empty, or the application is not right.
-        PlatformError, OperationError: a step failed; recordings that are complete are kept.
+        PlatformError, OperationError: a step failed; recordings that are complete are kept. If
+            there is none, nothing is left.
     """
     folder = refuse_existing(folder)
     path = synthetic_chain() if application is None else Path(application)
     description = load_application(path)
-    try:
-        folder.mkdir(exist_ok=True)
-        shutil.copyfile(path, folder / "application.yaml")
-    except OSError as error:
-        raise OperationError(f"{folder}: cannot be written: {error}") from error
-    before = run_application(
-        description,
-        folder / "before",
-        cycles=cycles,
-        realtime=realtime,
-        command=command,
-        progress=_part(progress, 0.0, 0.48, "unshaped run"),
-    )
+    with _prepared(folder, path):
+        before = run_application(
+            description,
+            folder / "before",
+            cycles=cycles,
+            realtime=realtime,
+            command=command,
+            progress=_part(progress, 0.0, 0.48, "unshaped run"),
+        )
     if progress is not None:
         progress(0.48, "planning")
     plan = plan_recording(before)
@@ -100,9 +98,7 @@ def run_demo(
         progress(0.98, "comparing")
     comparison = compare_recordings([before, after])
     draw_comparison(comparison.measurements, folder)
-    (folder / "comparison.json").write_text(
-        json.dumps(comparison_json(comparison), indent=2) + "\n"
-    )
+    _write_figures(comparison, folder / "comparison.json")
     return DemoResult(
         folder=folder,
         callbacks=callback_statistics(data_flow(before.events, before.info.clock_offset_ns)),
@@ -110,6 +106,32 @@ def run_demo(
         comparison=comparison,
         notes=tuple(dict.fromkeys([*before.info.notes, *after.info.notes, *plan_warnings(plan)])),
     )
+
+
+@contextmanager
+def _prepared(folder: Path, application: Path) -> Iterator[None]:
+    """The folder with the application in it; gone again when nothing comes to stand beside it."""
+    made = not folder.exists()
+    copy = folder / "application.yaml"
+    try:
+        folder.mkdir(exist_ok=True)
+        shutil.copyfile(application, copy)
+        yield
+    except OSError as error:
+        raise OperationError(f"{folder}: cannot be written: {error}") from error
+    finally:
+        if not (folder / "before").exists():
+            copy.unlink(missing_ok=True)
+            if made and folder.exists():
+                folder.rmdir()
+
+
+def _write_figures(comparison: Comparison, path: Path) -> None:
+    text = json.dumps(comparison_json(comparison), indent=2) + "\n"
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OperationError(f"{path}: cannot be written: {error}") from error
 
 
 def _part(progress: Progress | None, start: float, share: float, title: str) -> Progress | None:

@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from chainshaper import events
 from chainshaper.errors import InputError, OperationError
+from chainshaper.yaml_file import explanations, key_text
 
 __all__ = [
     "Recording",
@@ -150,15 +151,27 @@ def open_recording(path: str | Path) -> Recording:
         raise InputError(
             f"{path}: {what}; a recording is made with `chainshaper run APP.yaml -o {path}`"
         )
+    return Recording(path, _read_info(file))
+
+
+def _read_info(file: Path) -> RecordingInfo:
     try:
-        info = RecordingInfo.model_validate(json.loads(file.read_text()))
-    except (OSError, ValueError, ValidationError) as error:
-        raise InputError(f"{file}: not a recording's description: {error}") from error
-    if info.format != FORMAT:
+        values = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{file}: not readable as JSON ({error}); record the run again") from error
+    # The format first: what else a newer one holds is not ours to judge.
+    format_ = values.get("format", FORMAT) if isinstance(values, dict) else FORMAT
+    if format_ != FORMAT:
         raise InputError(
-            f"{file}: format {info.format}, this chainshaper reads format {FORMAT}; update it"
+            f"{file}: format {format_}, this chainshaper reads format {FORMAT}; update it"
         )
-    return Recording(path, info)
+    try:
+        return RecordingInfo.model_validate(values)
+    except ValidationError as error:
+        problems = [
+            f"{key_text(where)}: {reason}" for where, reason in explanations(error, RecordingInfo)
+        ]
+        raise InputError(f"{file}: not a recording's description: {'; '.join(problems)}") from error
 
 
 def refuse_existing(path: str | Path) -> Path:
@@ -171,8 +184,13 @@ def refuse_existing(path: str | Path) -> Path:
         raise InputError(
             f"{path} exists already and is not overwritten: name another, or remove it"
         )
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"{path.absolute().parent}: no such folder to write {path.name} into")
+    if os.path.ismount(path) or (path.exists() and path.samefile(".")):
+        raise InputError(f"{path} cannot be replaced by a new folder: name one inside it")
+    parent = path.absolute().parent
+    if not parent.is_dir():
+        raise InputError(f"{parent}: no such folder to write {path.name} into")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise InputError(f"{parent}: no permission to write {path.name} into it: name another")
     return path
 
 

@@ -15,12 +15,13 @@ import polars as pl
 from chainshaper import events
 from chainshaper.analysis import LatencyAnalysis, analyse_latency
 from chainshaper.app import ApplicationGraph, Chain
+from chainshaper.durations import format_duration
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning import Plan, plan_shaping
 from chainshaper.recording import Recording, open_recording
 from chainshaper.splicing.application import splice_application
 from chainshaper.workload.description import Application
-from chainshaper.workload.live import Progress, run_application
+from chainshaper.workload.live import Progress, origin_timer, run_application
 
 __all__ = [
     "Comparison",
@@ -83,8 +84,7 @@ def measure_latency(recording: Recording | str | Path, chain: str | None = None)
         longest = int(stalls["duration"].max() or 0)  # type: ignore[arg-type]
     overruns = None
     if "gate_release" in recording.events:
-        late = (pl.col("cycles_waited") > 0) | (pl.col("arrival") > pl.col("release"))
-        overruns = recording.events["gate_release"].filter(late).height
+        overruns = recording.events["gate_release"].filter(pl.col("cycles_waited") > 0).height
     plan = recording.info.plan
     return Measurement(
         recording=recording,
@@ -184,6 +184,13 @@ def shape_application(
         InputError: the plan does not fit the application; and what
             :func:`~chainshaper.workload.live.run_application` raises.
     """
+    period = origin_timer(application).timer_ns
+    if period != plan.chain.period_ns:
+        raise InputError(
+            f"the plan is for a chain with the period {format_duration(plan.chain.period_ns)}, but "
+            f"{application.chain} of {application.name!r} has {format_duration(period or 0)}: plan "
+            "again from a recording of this application"
+        )
     return run_application(
         splice_application(application, plan),
         output,

@@ -161,7 +161,8 @@ def _compose(path: Path, made_by: str) -> yaml.Node:
             f"{path}:{line}: not YAML: {error.problem or error.context}; correct the line"
         ) from error
     except (UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
-        raise InputError(f"{path}: not a YAML text ({error}); such a file is {made_by}") from error
+        reason = " ".join(str(error).split())  # PyYAML writes some over several lines
+        raise InputError(f"{path}: not a YAML text ({reason}); such a file is {made_by}") from error
     except OSError as error:
         raise InputError(
             f"{path}: cannot be read ({error.strerror}); such a file is {made_by}"

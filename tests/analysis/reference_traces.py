@@ -61,6 +61,7 @@ class ReferenceTrace:
     tables: events.EventTables
     clock_offset_ns: int
     truth: dict[str, Any]
+    others: dict[str, list[dict[str, Any]]]  # events that are not ROS 2's, row by row
 
 
 @cache
@@ -86,7 +87,8 @@ def reference_trace(name: str) -> ReferenceTrace:
         partial.write_bytes(dump.stdout)
         partial.rename(cache_file)
     dumped = json.loads(cache_file.read_text())
-    tables = {}
+    tables: dict[str, pl.DataFrame] = {}
+    others: dict[str, list[dict[str, Any]]] = {}
     for full_name, columns in dumped["tables"].items():
         provider, event = full_name.split(":")
         if provider.startswith("ros2") and event in events.FIELDS:
@@ -97,5 +99,8 @@ def reference_trace(name: str) -> ReferenceTrace:
                 schema_overrides={column: types[column] for column in columns if column in types},
             )
             tables[event] = frame.sort("time", maintain_order=True)
+        elif not provider.startswith("ros2"):
+            rows = zip(*columns.values(), strict=True)
+            others[full_name] = [dict(zip(columns, row, strict=True)) for row in rows]
     truth = json.loads((folder / "truth.json").read_text())
-    return ReferenceTrace(tables, dumped["offset"], truth)
+    return ReferenceTrace(tables, dumped["offset"], truth, others)

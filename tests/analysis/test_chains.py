@@ -135,6 +135,7 @@ def test_way_points_tell_paths_apart() -> None:
         (LINE, "/sink../t1", "no callback of /sink publishes anything"),
         (DIAMOND, "/raw../fused", "2 paths match; add a way point"),
         (DIAMOND, "/raw../fused", "only this one passes /left"),
+        (graph(idle=[(None, ())]), "/a../b", "tracing has to start before the application"),
         (LINE, "/parameter_events../t2", "no callback was seen to publish /parameter_events"),
     ],
 )
@@ -295,6 +296,11 @@ named_paths:
   - node_name: /node3
     publish_topic_name: UNDEFINED
     subscribe_topic_name: /t2
+nodes:
+- node_name: /node1
+  callbacks:
+  - callback_name: timer_callback_0
+    period_ns: 100000000
 executors: []
 """
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from story import OFFSET, Story
 
 from chainshaper.analysis import data_flow, disturbed, find_chain, graph_of, traverse
-from chainshaper.analysis.disturbance import overlapping
+from chainshaper.analysis.disturbance import overlapping, stalled_within
 
 
 def one_traversal(
@@ -16,7 +16,10 @@ def one_traversal(
     cycles_waited: int = 0,
     arrival: int = 2_000,
 ) -> bool:
-    """A traversal from 1,000 to 10,000, whose last hop may be a gate; guard 500, threshold 50."""
+    """A traversal from 1,000 to 10,000, whose last hop may be a gate with origin 1,300.
+
+    Single stalls count from 50, those of a computing traversal from 200 in all.
+    """
     story = Story()
     source, gate = story.node("/source", 1), story.node("/gate", 2)
     timer, t1 = story.timer(source), story.publisher(source, "/tmp")
@@ -31,7 +34,7 @@ def one_traversal(
             callback=hold.handle,
             source_timestamp=1_100 + OFFSET,
             arrival=arrival,
-            origin=1_000,
+            origin=1_300,
             release=release,
             slot=0,
             cycles_waited=cycles_waited,
@@ -42,44 +45,71 @@ def one_traversal(
     flow = data_flow(story.tables())
     graph = graph_of(flow)
     found = traverse(flow, find_chain(graph, "/tmp../t1"), graph)
-    (mask,) = disturbed(flow, found, threshold_ns=50, guard_ns=500)
+    (mask,) = disturbed(flow, found, threshold_ns=50, computing_threshold_ns=200)
     return bool(mask)
 
 
 @pytest.mark.parametrize(
-    ("stall", "hit"),
+    ("stalls", "hit"),
     [
-        ((5_000, 100), True),
-        ((5_000, 49), False),  # below the threshold
-        ((900, 100), False),  # over just as the traversal starts: [900, 1000)
-        ((900, 101), True),
-        ((10_000, 50), True),  # begins in its last nanosecond
-        ((10_001, 50), False),
-        ((0, 50_000), True),  # longer than the traversal
+        ([(5_000, 200)], True),
+        ([(5_000, 199)], False),
+        ([(2_000, 100), (5_000, 100)], True),  # they add up
+        ([(2_000, 49), (3_000, 49), (4_000, 49), (5_000, 49), (6_000, 49)], False),  # too short
+        ([(800, 400)], True),  # 200 of it inside
+        ([(800, 399)], False),
+        ([(9_800, 5_000)], True),  # 200 of it inside
+        ([(9_801, 5_000)], False),
+        ([(0, 50_000)], True),  # longer than the traversal
     ],
 )
-def test_unshaped_traversals_count_every_stall(stall: tuple[int, int], hit: bool) -> None:
-    assert one_traversal([stall]) is hit
+def test_stalls_of_a_computing_traversal_add_up(stalls: list[tuple[int, int]], hit: bool) -> None:
+    assert one_traversal(stalls) is hit
 
 
 @pytest.mark.parametrize(
     ("stall", "hit"),
     [
-        ((5_000, 100), False),  # absorbed by the wait
-        ((9_300, 100), False),  # over before the guard begins: 9,900 - 500
-        ((9_350, 100), True),  # reaches into it
+        ((5_000, 3_000), False),  # absorbed by the wait
+        ((9_000, 900), False),  # over at the release, 9,900
+        ((9_000, 901), True),  # reaches into it
         ((9_950, 60), True),
+        ((9_950, 49), False),
+        ((10_001, 60), False),  # the output is out
         ((1_200, 100), True),  # while the origin is stamped
-        ((1_600, 100), False),
+        ((1_301, 100), False),
+        ((900, 100), False),  # over before the start
     ],
 )
 def test_a_gate_absorbs_stalls_before_its_release(stall: tuple[int, int], hit: bool) -> None:
     assert one_traversal([stall], release=9_900) is hit
 
 
-def test_a_message_that_missed_its_slot_absorbed_nothing() -> None:
-    assert one_traversal([(5_000, 100)], release=9_900, cycles_waited=1)
-    assert one_traversal([(5_000, 100)], release=9_900, arrival=9_950)
+def test_a_message_that_was_not_held_absorbed_nothing() -> None:
+    assert one_traversal([(5_000, 200)], release=9_900, cycles_waited=1)
+    assert one_traversal([(5_000, 200)], release=9_900, arrival=9_900)  # inside its slot
+    assert one_traversal([(5_000, 200)], release=9_900, arrival=9_950)
+    assert not one_traversal([(5_000, 199)], release=9_900, arrival=9_950)
+    assert one_traversal([(9_950, 60)], release=9_900, arrival=9_900)  # between release and output
+
+
+def two_traversals(first_end: int) -> list[bool]:
+    """Two traversals of 100 and 150 that start at 1,000 and 2,000; a stall hits only the first."""
+    story = Story()
+    source = story.node("/source", 1)
+    timer, t1 = story.timer(source), story.publisher(source, "/t1")
+    story.runs(timer, 1_000, first_end, writes=((t1, first_end),), tid=1)
+    story.runs(timer, 2_000, 2_150, writes=((t1, 2_150),), tid=2)
+    story.event("machine_stall", 1_200, 9, duration=300)
+    flow = data_flow(story.tables())
+    graph = graph_of(flow)
+    found = traverse(flow, find_chain(graph, "/source../t1"), graph)
+    return list(disturbed(flow, found, threshold_ns=50, computing_threshold_ns=200))
+
+
+def test_who_queued_behind_a_disturbed_traversal_is_disturbed_with_it() -> None:
+    assert two_traversals(first_end=2_100) == [True, True]
+    assert two_traversals(first_end=1_900) == [True, False]
 
 
 def test_without_stalls_nothing_is_disturbed() -> None:
@@ -102,3 +132,28 @@ def test_overlaps_agree_with_comparing_all_pairs(
         for a, b in zip(start, end, strict=True)
     ]
     assert overlapping(start, end, began, ended).tolist() == expected
+
+
+@given(SPANS, st.lists(st.tuples(st.integers(0, 5), st.integers(1, 5), st.integers(0, 1))))
+def test_time_lost_agrees_with_counting_nanoseconds(
+    windows: list[tuple[int, int]], gaps_and_stalls: list[tuple[int, int, int]]
+) -> None:
+    start = np.array([a for a, _ in windows], dtype=np.int64)
+    end = np.array([a + d for a, d in windows], dtype=np.int64)
+    stalls, clock = [], [0, 0]
+    for gap, duration, core in gaps_and_stalls:  # one after the other on each core
+        began = clock[core] + gap
+        clock[core] = began + duration
+        stalls.append((began, clock[core], core))
+    expected = [
+        max(
+            (
+                sum(begun <= t < ended for t in range(a, b) for begun, ended, c in stalls if c == k)
+                for k in (0, 1)
+            ),
+            default=0,
+        )
+        for a, b in zip(start, end, strict=True)
+    ]
+    columns = np.array(stalls, dtype=np.int64).reshape(-1, 3).T
+    assert stalled_within(start, end, *columns).tolist() == expected

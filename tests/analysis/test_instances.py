@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from story import Callback, Story
 
-from chainshaper.analysis import callback_instances, resolve_objects
+from chainshaper.analysis import callback_instances, data_flow, resolve_objects
 from chainshaper.analysis.instances import cpu_time
 
 
@@ -134,6 +134,7 @@ def test_execution_time_unknown_without_an_end_or_switches() -> None:
     assert instances(story)["execution_ns"].to_list() == [None, None]
     switch(story, 0, 0, 77)
     assert instances(story)["execution_ns"].to_list() == [None, None]
+    assert "execution times cannot be known" in data_flow(story.tables()).notes[0]
 
 
 KEY = st.tuples(st.integers(1, 2), st.integers(1, 2), st.integers(0, 1))

@@ -10,6 +10,7 @@ from chainshaper.analysis import (
     callback_statistics,
     data_flow,
 )
+from chainshaper.analysis.matching import first_after
 
 
 @pytest.mark.parametrize("name", TRACES)
@@ -87,6 +88,21 @@ def test_humble_takes_are_linked_without_timestamps() -> None:
     found = analyse_latency(trace.tables, "/topic_a../topic_b", trace.clock_offset_ns)
     assert found.statistics.count == 1986
     assert found.incomplete == {"lost": 5, "not taken": 40}
+
+
+def test_humble_takes_are_linked_to_what_dds_says_it_wrote() -> None:
+    # This trace also has DDS's own write events, which carry the source timestamp: the first on
+    # a publication's thread is its own. They are not used by the analysis.
+    trace = reference_trace("humble_sync")
+    flow = data_flow(trace.tables, trace.clock_offset_ns)
+    writes = pl.DataFrame(trace.others["dds:write"]).select(
+        pl.col("tid").cast(pl.Int32), "timestamp", written="time"
+    )
+    stamped = first_after(flow.publications, writes, ["tid"], "time", "written")
+    stamped = stamped.select("publication", "timestamp")
+    linked = flow.takes.drop_nulls("publication").join(stamped, on="publication", how="left")
+    assert linked.height == 3994
+    assert (linked["timestamp"] == linked["source_timestamp"]).all()
 
 
 def test_caret_traces_have_chains_through_stored_messages() -> None:

@@ -191,6 +191,23 @@ def test_a_python_node_in_the_chain() -> None:
     assert found.hops.filter(hop=1)["start"].to_list() == [19, 119]
 
 
+def test_a_driver_that_publishes_from_a_thread_of_its_own() -> None:
+    # No callback of /driver publishes /t1: the chain is measured from the publications.
+    story = Story()
+    driver, relay = story.node("/driver", 1), story.node("/relay", 2)
+    t1, t2 = story.publisher(driver, "/t1"), story.publisher(relay, "/t2")
+    forward = story.subscription(relay, "/t1")
+    for cycle in (0, 100):
+        story.publish(t1, cycle + 12, tid=77)
+        story.runs(forward, cycle + 20, cycle + 31, reads=cycle + 12, writes=((t2, cycle + 30),))
+    found = analyse_latency(story.tables(), "/t1../t2")
+    assert found.traversals.select("start", "end").rows() == [(12, 30), (112, 130)]
+    assert found.silent == 0
+    assert "outside its callbacks" in found.notes[0]
+    labels = [callback.label for callback in found.graph.callbacks]
+    assert labels == ["/relay ← /t1", "/driver outside callbacks"]
+
+
 def test_intra_process_hops_and_overwritten_messages() -> None:
     # A buffer of one place: the message of 22 overwrites that of 12 before it was read.
     story = Story()

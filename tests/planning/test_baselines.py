@@ -9,12 +9,13 @@ from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.baselines import (
     CallbackTimes,
     let_per_callback,
+    let_per_callback_asynchronous,
     let_per_chain,
     server_per_callback,
     server_per_chain,
 )
 from chainshaper.planning.graphs import over_cores, with_first_node_apart, with_sink
-from chainshaper.planning.plan import Plan, publish_slots, server_of
+from chainshaper.planning.plan import Plan, Thread, publish_slots, server_of
 from chainshaper.planning.plan_file import dump_plan
 from chainshaper.planning.shaping import plan_shaping
 
@@ -170,6 +171,31 @@ def test_let_per_callback_takes_as_many_periods_as_callbacks() -> None:
         let_per_callback(_avp(), ["/t1", "/t1", "/pose"])
     with pytest.raises(OperationError, match="101 publish slots"):
         let_per_callback(_avp(), [f"/t{number}" for number in range(100)] + ["/pose"])
+
+
+def test_let_per_callback_of_asynchronous_publishers_adds_no_nodes() -> None:
+    latencies = np.array([30, 60]) * MS
+    shaped = plan_shaping(
+        latencies, 100 * MS, output="/t5", publisher="/n2", publication="asynchronous"
+    )
+    plan = let_per_callback_asynchronous(shaped, ["/n1", "/n2"])
+    assert plan.shaping_node is None
+    assert plan.further_shaping_nodes == ()
+    publishers = [Thread(node=name, role="publisher") for name in ("/n1", "/n2")]
+    servers = [server_of(plan, thread) for thread in publishers]
+    assert [server.slots for server in servers if server] == [((MS, 2 * MS),), ((0, MS),)]
+    assert publish_slots(plan) == ((0, MS),)
+    assert plan.predicted.max_ns == 201 * MS
+    for wrong in ([], ["/n2", "/n1"]):
+        with pytest.raises(InputError, match="publishes its output last"):
+            let_per_callback_asynchronous(shaped, wrong)
+    with pytest.raises(InputError, match="plan for asynchronous publication"):
+        let_per_callback_asynchronous(_avp(), ["/localizer"])
+
+
+def test_a_first_node_apart_has_no_place_in_let() -> None:
+    with pytest.raises(InputError, match="overlaps"):
+        let_per_chain(with_first_node_apart(_avp(), "/throttler", 2 * MS))
 
 
 def test_a_graph_on_two_cores_has_two_servers_and_one_output() -> None:

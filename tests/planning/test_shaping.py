@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chainshaper.errors import InputError, OperationError
@@ -111,6 +111,7 @@ def test_prediction_refuses_slots_that_leave_latencies_out(ends: list[int]) -> N
         predict_bands(np.array([3, 10]), ends, 1)
 
 
+@settings(deadline=None)
 @given(
     st.lists(st.integers(0, 10**8), min_size=1, max_size=50),
     st.lists(st.integers(1, 10**8), max_size=5),

@@ -28,7 +28,8 @@ from chainshaper.analysis.statistics import (
     callback_statistics,
     latency_statistics,
 )
-from chainshaper.analysis.traversals import REASONS, Traversals, reception, traverse
+from chainshaper.analysis.subscriber import reception
+from chainshaper.analysis.traversals import REASONS, Traversals, traverse
 
 __all__ = [
     "REASONS",

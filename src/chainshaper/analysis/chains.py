@@ -8,7 +8,7 @@ that it subscribes to.
 """
 
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from chainshaper.analysis.paths import Path, PathSearch, Stage, Vertex
@@ -68,7 +68,7 @@ class ChainEnumeration:
 
     ``chains`` are all of them if ``complete``, else the first ones found. ``count`` says how many
     there are; where the graph between the two places has cycles, it is only a lower bound (not
-    ``exact``): the chains that never step back in the order of one depth-first search, or those
+    ``exact``): the chains that never step back in one order of callbacks and topics, or those
     listed if they are more. ``heaviest`` has the largest sum of mean response times
     (``heaviest_ns``) among the counted and the listed chains.
     """
@@ -166,9 +166,22 @@ def _stage(graph: ApplicationGraph, spec: str, name: str) -> Stage:
             return Stage(candidate, frozenset[Vertex]((candidate,)))
         if candidate in nodes:
             return Stage(candidate, frozenset[Vertex](nodes[candidate]))
+    if not topics:
+        raise InputError(
+            f"chain {spec!r}: the recording shows no topics at all; tracing has to start before "
+            "the application does"
+        )
     close = difflib.get_close_matches(name, sorted(topics | nodes.keys()), n=3, cutoff=0.5)
-    hint = f"did you mean {' or '.join(close)}?" if close else "`graph` shows the names there are."
+    hint = (
+        f"did you mean {' or '.join(close)}?" if close else "the names there are: " + _some(topics)
+    )
     raise InputError(f"chain {spec!r}: no topic or node is called {name}; {hint}")
+
+
+def _some(names: Iterable[str]) -> str:
+    """A handful of names for a message."""
+    listed = sorted(names)
+    return ", ".join(listed[:HANDFUL]) + (", ..." if len(listed) > HANDFUL else "")
 
 
 def _start_callbacks(graph: ApplicationGraph, spec: str, first: Stage) -> set[int]:
@@ -225,10 +238,9 @@ def _no_path(
     if not stops:
         return f"chain {spec!r}: no callback of {stages[met - 1].name} publishes anything"
     goal = stages[min(met, len(stages) - 1)].name
-    listed = ", ".join(stops[:HANDFUL]) + (", ..." if len(stops) > HANDFUL else "")
     return (
         f"chain {spec!r}: no path leads from {stages[met - 1].name} to {goal}; from there the data "
-        f"gets as far as {listed}"
+        f"gets as far as {_some(stops)}"
     )
 
 

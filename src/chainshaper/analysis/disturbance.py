@@ -5,13 +5,18 @@ sleeper at the highest priority, run beside the application, sees it: a row of `
 says that on core ``cpu`` nobody ran from ``time`` for ``duration``. A latency measured across a
 stall says something about the machine, not about the application.
 
-* A traversal is disturbed when a stall overlaps it: [start, end].
-* A traversal that a gate released (`gate_release`) waited for its slot; a stall before the
-  release only shortened the wait. Stalls count when they overlap [start, start + guard], where
-  the cycle's anchor is taken, or [release − guard, end], where the gate must be awake. If the
-  message missed its slot and waited for a later cycle, or a stall made it arrive after the
-  planned release, nothing was absorbed and the whole of [start, end] counts.
+What a stall does to a traversal depends on whether a gate held its output (`gate_release`):
+
+* **A gate** makes two instants decide the latency: when the origin was taken (between the
+  traversal's start and the anchor's origin), and from the planned release to the publication.
+  Any stall at one of them disturbs. While the message was held, a stall only shortened the wait.
+* **Not held**: no gate, or the message came in or behind its slot. Stalls while it was computed
+  add up, and disturb it from ``COMPUTING_THRESHOLD_NS`` in all: on one core, within [start, end].
+  A traversal that began before its disturbed predecessor had ended may have queued behind it,
+  and counts as disturbed with it.
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -21,40 +26,112 @@ from chainshaper import events
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.traversals import Traversals
 
-__all__ = ["GUARD_NS", "THRESHOLD_NS", "disturbed", "overlapping"]
+__all__ = [
+    "COMPUTING_THRESHOLD_NS",
+    "THRESHOLD_NS",
+    "disturbed",
+    "overlapping",
+    "stalled_after",
+    "stalled_within",
+]
 
 THRESHOLD_NS = 100_000
 """Stalls shorter than this are what an ordinary wake-up takes."""
 
-GUARD_NS = 500_000
-"""Before a release the gate wakes and may spin (300 µs); after the start it stamps the origin."""
+COMPUTING_THRESHOLD_NS = 1_000_000
+"""A chain that computes for tens of milliseconds is hardly changed by less than this."""
 
 Times = npt.NDArray[np.int64]
+Mask = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class _Stalls:
+    """Stalls as intervals [began, ended) on cores."""
+
+    began: Times
+    ended: Times
+    core: Times
+
+    @classmethod
+    def of(cls, flow: DataFlow, threshold_ns: int) -> "_Stalls":
+        table = events.table(flow.events, "machine_stall", ["cpu"]).filter(
+            pl.col("duration") >= threshold_ns
+        )
+        began = table["time"].to_numpy()
+        core = table["cpu"].fill_null(-1).cast(pl.Int64).to_numpy()
+        return cls(began, began + table["duration"].to_numpy(), core)
 
 
 def disturbed(
     flow: DataFlow,
     traversals: Traversals,
     threshold_ns: int = THRESHOLD_NS,
-    guard_ns: int = GUARD_NS,
-) -> npt.NDArray[np.bool_]:
+    computing_threshold_ns: int = COMPUTING_THRESHOLD_NS,
+) -> Mask:
     """A mask over the rows of ``traversals.frame``; incomplete traversals are never marked."""
-    stalls = events.table(flow.events, "machine_stall").filter(pl.col("duration") >= threshold_ns)
-    began = stalls["time"].to_numpy()
-    ended = (stalls["time"] + stalls["duration"]).to_numpy()
+    stalls = _Stalls.of(flow, threshold_ns)
     frame = traversals.frame.join(
         _releases(flow, traversals), on="traversal", how="left", maintain_order="left"
     )
     complete = frame["complete"].to_numpy()
-    start = frame["start"].to_numpy()
-    end = frame["end"].fill_null(0).to_numpy()
-    absorbed = frame["release"].is_not_null().to_numpy()
-    release = frame["release"].fill_null(0).to_numpy()
-    anywhere = overlapping(start, end, began, ended)
-    at_start = overlapping(start, np.minimum(start + guard_ns, end), began, ended)
-    at_release = overlapping(np.maximum(release - guard_ns, start), end, began, ended)
-    hit = np.where(absorbed, at_start | at_release, anywhere)
-    return np.asarray(hit & complete, dtype=np.bool_)
+    start, end = frame["start"].to_numpy(), frame["end"].fill_null(0).to_numpy()
+    gated, held = (
+        frame["release"].is_not_null().to_numpy(),
+        frame["held"].fill_null(False).to_numpy(),
+    )
+    release, origin = (frame[name].fill_null(0).to_numpy() for name in ("release", "origin"))
+    first, last = np.minimum(start, origin), np.maximum(start, origin)
+    at_instants = overlapping(first, last, stalls.began, stalls.ended)
+    at_instants |= overlapping(release, end, stalls.began, stalls.ended)
+    lost = stalled_within(start, end, stalls.began, stalls.ended, stalls.core)
+    hit = complete & ((gated & at_instants) | (~held & (lost >= computing_threshold_ns)))
+    return complete & (hit | _queued_behind(hit, start, end, ~held & complete))
+
+
+def stalled_after(
+    flow: DataFlow, start: Times, end: Times, threshold_ns: int = THRESHOLD_NS
+) -> Mask:
+    """Which windows [start, end] any stall meets: a delivery that the machine disturbed."""
+    stalls = _Stalls.of(flow, threshold_ns)
+    return overlapping(start, end, stalls.began, stalls.ended)
+
+
+def _queued_behind(hit: Mask, start: Times, end: Times, may_queue: Mask) -> Mask:
+    """Traversals, in order of start, linked to a disturbed one by predecessors still under way."""
+    if not len(start):
+        return hit
+    linked = np.zeros(len(start), dtype=np.bool_)
+    linked[1:] = may_queue[1:] & (start[1:] < np.maximum.accumulate(end)[:-1])
+    position = np.arange(len(start))
+    run_start = np.maximum.accumulate(np.where(linked, 0, position))
+    last_hit = np.maximum.accumulate(np.where(hit, position, -1))
+    return np.asarray(last_hit >= run_start, dtype=np.bool_)
+
+
+def stalled_within(start: Times, end: Times, began: Times, ended: Times, core: Times) -> Times:
+    """Per window [start, end] the time lost in it to stalls of one core, the worst one (ns).
+
+    Stalls of one core do not overlap, so what they took up to an instant is a running sum plus
+    the part of the stall that the instant lies in; a window's share is a difference of two.
+    """
+    worst = np.zeros(len(start), dtype=np.int64)
+    for one in np.unique(core):
+        mine = core == one
+        order = np.argsort(began[mine], kind="stable")
+        first, length = began[mine][order], (ended - began)[mine][order]
+        total = np.concatenate(([0], np.cumsum(length)))
+
+        def lost_until(
+            instant: Times, first: Times = first, length: Times = length, total: Times = total
+        ) -> Times:
+            index = np.searchsorted(first, instant, side="right")
+            before = np.maximum(index - 1, 0)
+            part = np.minimum(instant - first[before], length[before])
+            return np.asarray(total[before] + np.where(index > 0, part, 0), dtype=np.int64)
+
+        worst = np.maximum(worst, lost_until(end) - lost_until(start))
+    return worst
 
 
 def overlapping(start: Times, end: Times, began: Times, ended: Times) -> npt.NDArray[np.bool_]:
@@ -69,27 +146,24 @@ def overlapping(start: Times, end: Times, began: Times, ended: Times) -> npt.NDA
 
 
 def _releases(flow: DataFlow, traversals: Traversals) -> pl.DataFrame:
-    """``traversal, release``: the planned release of those whose last hop was a gate.
+    """``traversal, release, origin, held`` of those whose last hop was a gate.
 
-    The gate's row is found by its callback and the source timestamp of the message it held.
-    Messages that were not released as planned have none.
+    The gate's row is found by its callback and the source timestamp of the message. ``held`` are
+    messages that came before their slot in their own cycle.
     """
     last = len(traversals.chain.callbacks) - 1
-    held = traversals.hops.filter(pl.col("hop") == last).select(
+    arrived = traversals.hops.filter(pl.col("hop") == last).select(
         "traversal", "callback_id", "source_timestamp"
     )
     gates = flow.objects.callbacks.select("pid", "callback_id", callback="handle").unique()
-    on_time = (pl.col("cycles_waited").fill_null(0) == 0) & (
-        pl.col("arrival").fill_null(pl.col("release")) <= pl.col("release")
-    )
+    in_time = (pl.col("cycles_waited") == 0) & (pl.col("arrival") < pl.col("release"))
     released = (
         events.table(flow.events, "gate_release")
-        .filter(on_time)
-        .select("pid", "callback", "source_timestamp", "release")
+        .select("pid", "callback", "source_timestamp", "release", "origin", held=in_time)
         .join(gates, on=["pid", "callback"], how="inner")
         .unique(["callback_id", "source_timestamp"], keep="last", maintain_order=True)
-        .select("callback_id", "source_timestamp", "release")
+        .drop("pid", "callback")
     )
-    return held.join(released, on=["callback_id", "source_timestamp"], how="inner").select(
-        "traversal", "release"
+    return arrived.join(released, on=["callback_id", "source_timestamp"], how="inner").select(
+        "traversal", "release", "origin", "held"
     )

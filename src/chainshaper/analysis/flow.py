@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import polars as pl
 
 from chainshaper import events
+from chainshaper.analysis.assumed import with_assumed_readers, with_assumed_writers
 from chainshaper.analysis.instances import callback_instances
-from chainshaper.analysis.matching import latest_before
+from chainshaper.analysis.matching import by_number, latest_before
 from chainshaper.analysis.messages import link_takes, publications, takes
 from chainshaper.analysis.objects import Objects, resolve_objects
 
@@ -23,9 +24,9 @@ class DataFlow:
     """A recording, resolved.
 
     * ``objects``: who exists, see :class:`~chainshaper.analysis.objects.Objects`.
-    * ``instances``: see :func:`~chainshaper.analysis.instances.callback_instances`. Instances of
-      subscriptions without callback events (rclpy) are added with ``assumed`` true: each begins
-      at a take; its end is not known.
+    * ``instances``: see :func:`~chainshaper.analysis.instances.callback_instances`, with those
+      that no event shows added (:mod:`~chainshaper.analysis.assumed`). An instance's number is
+      its row.
     * ``publications``: see :func:`~chainshaper.analysis.messages.publications`, with the
       ``instance`` in which each was published and its ``callback_id`` (null: outside callbacks).
     * ``takes``: see :func:`~chainshaper.analysis.messages.takes`, with the ``publication`` that
@@ -53,38 +54,21 @@ def data_flow(tables: events.EventTables, clock_offset_ns: int = 0) -> DataFlow:
     taken = takes(tables, objects)
     published = publications(tables, objects)
     taken = link_takes(tables, taken, published, clock_offset_ns)
-    instances, taken = _with_assumed(instances, taken, objects)
+    instances, taken = with_assumed_readers(instances, taken, objects)
     taken = _consumed(taken, instances)
     published = _published_in(published, instances, objects)
-    return DataFlow(objects, instances, published, taken, tables, objects.notes)
+    objects, instances, published = with_assumed_writers(objects, instances, published)
+    notes = (*objects.notes, *_about_execution_times(tables, instances))
+    return DataFlow(objects, instances, published, taken, tables, notes)
 
 
-def _with_assumed(
-    instances: pl.DataFrame, taken: pl.DataFrame, objects: Objects
-) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Add an instance for every take of a subscription that has no callback events.
-
-    Returns the instances, renumbered in order of start, and the takes with ``assumed_instance``.
-    """
-    silent = objects.callbacks.filter(~pl.col("observed")).select("callback_id").unique()
-    assumed = taken.join(silent, on="callback_id", how="semi").select(
-        "callback_id",
-        "pid",
-        "tid",
-        "take",
-        pl.col("time").alias("start"),
-        "intra_process",
-        pl.lit(True).alias("assumed"),
+def _about_execution_times(tables: events.EventTables, instances: pl.DataFrame) -> tuple[str, ...]:
+    if "sched_switch" not in tables or instances["execution_ns"].count() or not instances.height:
+        return ()
+    return (
+        "sched_switch was recorded, but shows none of the application's threads (inside a "
+        "container threads have other numbers): execution times cannot be known.",
     )
-    if assumed.is_empty():
-        none = pl.lit(None, dtype=pl.Int64).alias("assumed_instance")
-        return instances, taken.with_columns(none)
-    every = pl.concat([instances.drop("instance"), assumed], how="diagonal_relaxed")
-    every = every.sort("start", maintain_order=True).with_row_index("instance")
-    every = every.with_columns(pl.col("instance").cast(pl.Int64))
-    of_take = every.drop_nulls("take").select("take", assumed_instance="instance")
-    taken = taken.join(of_take, on="take", how="left", maintain_order="left")
-    return every.drop("take").select(instances.columns), taken
 
 
 def _consumed(taken: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
@@ -93,14 +77,24 @@ def _consumed(taken: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
     Only when it comes before the thread's next take for that callback: an instance reads the
     latest message taken for it, and a message is read by one instance.
     """
-    key = ["pid", "tid", "callback_id", "intra_process"]
-    began = instances.filter(~pl.col("assumed")).select(*key, "instance", "start")
-    read = latest_before(
-        began, taken.select(*key, "take", took="time"), key, "start", "took"
-    ).drop_nulls("take")
-    first = read.group_by("take").agg(pl.col("instance").min())
-    joined = taken.join(first, on="take", how="left", maintain_order="left")
-    return joined.with_columns(pl.coalesce("instance", "assumed_instance")).drop("assumed_instance")
+    key = ["tid", "callback_id"]
+    read = []
+    for through_buffer in (False, True):
+        same = pl.col("intra_process") == through_buffer
+        began = instances.filter(same & ~pl.col("assumed")).select(*key, "instance", "start")
+        got = taken.filter(same).select(*key, "take", took="time")
+        if began.height and got.height:
+            read.append(latest_before(began, got, key, "start", "took").select("take", "instance"))
+    if not read:
+        return taken.rename({"assumed_instance": "instance"})
+    first = pl.concat(read).filter(pl.col("take").is_not_null())
+    # `first` is in order of start: of several instances after one take the first had it.
+    first = first.unique("take", keep="first", maintain_order=True)
+    return taken.with_columns(
+        pl.coalesce("assumed_instance", by_number(first, "take", "instance", taken.height)).alias(
+            "instance"
+        )
+    ).drop("assumed_instance")
 
 
 def _published_in(
@@ -115,19 +109,26 @@ def _published_in(
     others, once per level of nesting.
     """
     nodes = objects.callbacks.unique("callback_id", maintain_order=True)
-    nodes = nodes.select("callback_id", owner="node")
+    nodes = nodes.select("callback_id", owner=pl.col("node").cast(published.schema["node"]))
     running = instances.join(nodes, on="callback_id", how="left", maintain_order="left").select(
         "pid", "tid", "instance", "callback_id", "start", "end", "assumed", "owner"
     )
-    found = [_within(published, running, strictly=True)]
-    rest = published.join(found[0], on="publication", how="anti")
+    rest = published.select("publication", "time", "pid", "tid", "node")
+    found = [_within(rest, running, strictly=True)]
+    rest = rest.join(found[0], on="publication", how="anti")
     while running.height and rest.height:
         found.append(_within(rest, running, strictly=False))
         rest = rest.join(found[-1], on="publication", how="anti")
         running = running.sort("start", maintain_order=True)
-        next_start = pl.col("start").shift(-1).over("pid", "tid")
-        running = running.filter((next_start < pl.col("end")).fill_null(False))
-    return published.join(pl.concat(found), on="publication", how="left", maintain_order="left")
+        inner_start = pl.col("start").shift(-1).over("pid", "tid")
+        inner_end = pl.col("end").shift(-1).over("pid", "tid")
+        contains = (inner_start < pl.col("end")) & (inner_end <= pl.col("end")).fill_null(True)
+        running = running.filter(contains.fill_null(False))
+    inside = pl.concat(found)
+    return published.with_columns(
+        by_number(inside, "publication", column, published.height)
+        for column in ("instance", "callback_id")
+    )
 
 
 def _within(published: pl.DataFrame, running: pl.DataFrame, *, strictly: bool) -> pl.DataFrame:

@@ -20,6 +20,7 @@ import polars as pl
 
 from chainshaper import events
 from chainshaper.analysis.flow import DataFlow, data_flow
+from chainshaper.analysis.objects import INTERNAL_TOPICS
 from chainshaper.app import ApplicationGraph, Callback, Node
 
 __all__ = [
@@ -29,9 +30,6 @@ __all__ = [
     "goes_on_elsewhere",
     "graph_of",
 ]
-
-INTERNAL_TOPICS = frozenset(("/parameter_events", "/rosout", "/clock"))
-"""Topics that every node has for itself: they connect no computation."""
 
 MESSAGE_FILTER = "message_filters::"
 """What the symbols of callbacks that message_filters registered contain."""

@@ -36,51 +36,54 @@ def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> p
         "callback_id", "pid", callback="handle", registered="valid_from"
     )
     owned = latest_before(paired, owners, ["pid", "callback"], "start", "registered")
-    by_thread_time = pl.col("end_thread_time") - pl.col("thread_time")
-    frame = owned.drop_nulls("callback_id").select(
+    frame = owned.filter(pl.col("callback_id").is_not_null()).select(
         "callback_id",
         "pid",
         "tid",
         "start",
         "end",
-        pl.when(by_thread_time >= 0).then(by_thread_time).alias("execution_ns"),
-        pl.col("is_intra_process").fill_null(0).ne(0).alias("intra_process"),
+        pl.when(pl.col("used") >= 0).then("used").alias("execution_ns"),
+        "intra_process",
         pl.lit(False).alias("assumed"),
     )
     if frame["execution_ns"].null_count() == frame.height and "sched_switch" in tables:
         frame = frame.with_columns(cpu_time(tables, frame).alias("execution_ns"))
-    return frame.with_row_index("instance").with_columns(pl.col("instance").cast(pl.Int64))
+    return frame.with_row_index("instance")
 
 
 def _paired(tables: events.EventTables) -> pl.DataFrame:
-    """Starts with the end that follows them in their (process, thread, callback)."""
+    """Starts with the end that follows them in their (process, thread, callback).
+
+    Columns: ``pid, tid, callback, start, end, used, intra_process``; ``used`` is the thread's
+    CPU time between start and end where the source tells it.
+    """
     starts = events.table(tables, "callback_start", ["is_intra_process", "thread_time"])
     ends = events.table(tables, "callback_end", ["thread_time"])
+    clock = ["thread_time"] if starts["thread_time"].count() else []  # a column less to sort
+    intra = pl.col("is_intra_process").fill_null(0).ne(0).alias("intra_process")
+    never = pl.lit(False).alias("intra_process")
     both = pl.concat(
         [
-            starts.select(
-                "time", *_THREAD, "thread_time", "is_intra_process", is_end=pl.lit(False)
-            ),
-            ends.select(
-                "time",
-                *_THREAD,
-                "thread_time",
-                pl.lit(None, dtype=pl.Int32).alias("is_intra_process"),
-                is_end=pl.lit(True),
-            ),
+            starts.select(*_THREAD, "time", *clock, intra, is_end=pl.lit(False)),
+            ends.select(*_THREAD, "time", *clock, never, is_end=pl.lit(True)),
         ]
     ).sort(*_THREAD, "time", "is_end", maintain_order=True)
     both = _simultaneous_in_order(both)
-    same = pl.all_horizontal(pl.col(key).eq_missing(pl.col(key).shift(-1)) for key in _THREAD)
-    ended = same & pl.col("is_end").shift(-1)
-    return (
-        both.with_columns(
-            pl.when(ended).then(pl.col("time").shift(-1)).alias("end"),
-            pl.when(ended).then(pl.col("thread_time").shift(-1)).alias("end_thread_time"),
-        )
-        .filter(~pl.col("is_end"))
-        .rename({"time": "start"})
-    )
+    ended = ~_differs(_THREAD, -1) & pl.col("is_end").shift(-1, fill_value=False)
+    used = pl.col("thread_time").shift(-1) - pl.col("thread_time")
+    return both.select(
+        *_THREAD,
+        pl.col("time").alias("start"),
+        pl.when(ended).then(pl.col("time").shift(-1)).alias("end"),
+        pl.when(ended).then(used if clock else pl.lit(None, pl.Int64)).alias("used"),
+        "intra_process",
+        "is_end",
+    ).filter(~pl.col("is_end"))
+
+
+def _differs(keys: list[str], shift: int) -> pl.Expr:
+    """Whether a row has another key than the one before (``shift`` 1) or after it (−1)."""
+    return pl.any_horizontal(pl.col(key).ne_missing(pl.col(key).shift(shift)) for key in keys)
 
 
 def _simultaneous_in_order(both: pl.DataFrame) -> pl.DataFrame:
@@ -92,21 +95,21 @@ def _simultaneous_in_order(both: pl.DataFrame) -> pl.DataFrame:
     """
     if both.is_empty():
         return both
-    keys = pl.struct(*_THREAD, "time")
-    moment = both.select(keys.ne_missing(keys.shift(1)).fill_null(True)).to_series().to_numpy()
-    first = np.flatnonzero(moment)
+    new_moment, new_thread = both.select(
+        _differs([*_THREAD, "time"], 1).alias("moment"), _differs(_THREAD, 1).alias("thread")
+    )
+    first = np.flatnonzero(new_moment.to_numpy())
     if len(first) == len(both):
         return both
-    thread = both.select(pl.struct(_THREAD).ne_missing(pl.struct(_THREAD).shift(1))).to_series()
-    step = np.where(both["is_end"].to_numpy(), -1, 1)
+    is_end = both["is_end"].to_numpy()
+    step = np.where(is_end, -1, 1)
     opened = np.cumsum(step) - step  # starts minus ends of all rows before this one
-    thread_first = np.flatnonzero(thread.fill_null(True).to_numpy())
+    thread_first = np.flatnonzero(new_thread.to_numpy())
     length = np.diff(np.append(thread_first, len(both)))
     opened -= np.repeat(opened[thread_first], length)  # counted within the thread and callback
     open_before = np.repeat(opened[first] > 0, np.diff(np.append(first, len(both))))
-    rank = both["is_end"].to_numpy() ^ open_before
     return (
-        both.with_columns(pl.Series("rank", rank))
+        both.with_columns(pl.Series("rank", is_end ^ open_before))
         .sort(*_THREAD, "time", "rank", maintain_order=True)
         .drop("rank")
     )

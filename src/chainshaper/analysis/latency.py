@@ -6,11 +6,12 @@ import polars as pl
 
 from chainshaper import events
 from chainshaper.analysis.chains import find_chain
-from chainshaper.analysis.disturbance import GUARD_NS, THRESHOLD_NS, disturbed
+from chainshaper.analysis.disturbance import disturbed, stalled_after
 from chainshaper.analysis.flow import DataFlow, data_flow
 from chainshaper.analysis.graph import graph_of
 from chainshaper.analysis.statistics import LatencyStatistics, latency_statistics
-from chainshaper.analysis.traversals import reception, traverse
+from chainshaper.analysis.subscriber import reception
+from chainshaper.analysis.traversals import traverse
 from chainshaper.app import ApplicationGraph, Chain
 from chainshaper.recording import Recording
 
@@ -22,8 +23,9 @@ class LatencyAnalysis:
     """The end-to-end latency of one chain in one recording.
 
     ``traversals`` is the frame of :class:`~chainshaper.analysis.traversals.Traversals` with the
-    columns ``disturbed``, ``received`` and ``reception_ns`` (latency to the subscriber's
-    `callback_start`) added, ``hops`` its frame of hops. ``statistics`` are over all complete
+    columns ``disturbed``, ``received``, ``reception_ns`` (latency to the subscriber's
+    `callback_start`) and ``reception_disturbed`` (also by a stall between the two) added,
+    ``hops`` its frame of hops. ``statistics`` are over all complete
     traversals, ``undisturbed`` over those that the machine did not disturb; ``subscriber`` and
     ``subscriber_undisturbed`` are the same of ``reception_ns`` (None: nobody subscribes to the
     output in this recording). ``incomplete`` counts traversals without an end by reason,
@@ -48,17 +50,14 @@ def analyse_latency(
     chain: str | Chain,
     clock_offset_ns: int | None = None,
     *,
-    threshold_ns: int = THRESHOLD_NS,
-    guard_ns: int = GUARD_NS,
     subscriber: str | None = None,
 ) -> LatencyAnalysis:
     """Every traversal of ``chain`` in a recording, with statistics.
 
     ``source`` is a recording, its event tables, or its data flow where several chains are
     analysed. ``clock_offset_ns`` (event clock to CLOCK_REALTIME) is taken from a recording and
-    needed for tables from before Jazzy. ``threshold_ns`` and ``guard_ns`` decide which traversals
-    count as disturbed (:mod:`~chainshaper.analysis.disturbance`); ``subscriber`` names the node
-    whose reception is reported.
+    needed for tables from before Jazzy. ``subscriber`` names the node whose reception is
+    reported.
 
     Raises:
         InputError: the chain is not in the recording, see
@@ -77,11 +76,16 @@ def analyse_latency(
     if isinstance(chain, str):
         chain = find_chain(graph, chain)
     found = traverse(flow, chain, graph)
-    mask = disturbed(flow, found, threshold_ns, guard_ns)
     received = reception(flow, found, graph, subscriber)
     frame = found.frame.with_columns(
-        pl.Series("disturbed", mask), received["received"], received["reception_ns"]
+        received["received"],
+        received["reception_ns"],
+        disturbed=disturbed(flow, found),
     )
+    on_its_way = stalled_after(
+        flow, frame["end"].fill_null(0).to_numpy(), frame["received"].fill_null(-1).to_numpy()
+    )
+    frame = frame.with_columns(reception_disturbed=pl.col("disturbed") | pl.Series(on_its_way))
     reasons = frame.drop_nulls("reason").group_by("reason").len().sort("reason")
     return LatencyAnalysis(
         chain=chain,
@@ -91,18 +95,20 @@ def analyse_latency(
         statistics=_statistics(frame, "latency_ns"),
         undisturbed=_statistics(frame.filter(~pl.col("disturbed")), "latency_ns"),
         subscriber=_subscriber(frame, frame),
-        subscriber_undisturbed=_subscriber(frame, frame.filter(~pl.col("disturbed"))),
+        subscriber_undisturbed=_subscriber(frame, frame.filter(~pl.col("reception_disturbed"))),
         incomplete=dict(reasons.iter_rows()),
         silent=found.silent,
         notes=(*notes, *flow.notes, *found.notes),
     )
 
 
-def _statistics(frame: pl.DataFrame, column: str) -> LatencyStatistics:
+def _statistics(
+    frame: pl.DataFrame, column: str, disturbed_by: str = "disturbed"
+) -> LatencyStatistics:
     measured = frame.drop_nulls(column)
     return latency_statistics(
         measured[column].to_numpy(),
-        measured["disturbed"].to_numpy(),
+        measured[disturbed_by].to_numpy(),
         incomplete=frame.height - measured.height,
     )
 
@@ -110,4 +116,4 @@ def _statistics(frame: pl.DataFrame, column: str) -> LatencyStatistics:
 def _subscriber(frame: pl.DataFrame, chosen: pl.DataFrame) -> LatencyStatistics | None:
     if not frame["reception_ns"].count():
         return None
-    return _statistics(chosen, "reception_ns")
+    return _statistics(chosen, "reception_ns", "reception_disturbed")

@@ -10,7 +10,7 @@ from typing import Literal
 
 import polars as pl
 
-__all__ = ["first_after", "latest_before", "nearest"]
+__all__ = ["by_number", "first_after", "latest_before", "nearest"]
 
 
 def latest_before(
@@ -65,13 +65,41 @@ def _asof(
     strategy: Literal["backward", "forward", "nearest"],
     strictly: bool,
 ) -> pl.DataFrame:
-    return left.sort(left_on, maintain_order=True).join_asof(
-        right.drop_nulls([*by, right_on]).sort(right_on, maintain_order=True),
+    right = right.drop_nulls([*by, right_on])
+    packed = len(by) == 2 and all(left.schema[key] in _HALF for key in by)
+    if packed:
+        left, right = (frame.with_columns(_pack(*by).alias("key")) for frame in (left, right))
+        right = right.drop(by)
+    joined = _in_order(left, left_on).join_asof(
+        _in_order(right, right_on),
         left_on=left_on,
         right_on=right_on,
-        by=by or None,
+        by="key" if packed else by or None,
         strategy=strategy,
         allow_exact_matches=not strictly,
         coalesce=False,
-        check_sortedness=False,  # both were sorted above; Polars cannot check it within groups
+        check_sortedness=False,  # both are sorted; Polars cannot check it within groups
     )
+    return joined.drop("key") if packed else joined
+
+
+_HALF = (pl.Int32(), pl.UInt32())
+
+
+def _pack(first: str, second: str) -> pl.Expr:
+    """Two 32-bit keys as one of 64 bits, with which Polars groups in a fraction of the memory."""
+    return (pl.col(first).cast(pl.Int64) * 2**32) + pl.col(second).cast(pl.Int64)
+
+
+def _in_order(frame: pl.DataFrame, time: str) -> pl.DataFrame:
+    # Events come sorted, and looking costs far less time and memory than sorting again.
+    return frame if frame[time].is_sorted() else frame.sort(time, maintain_order=True)
+
+
+def by_number(rows: pl.DataFrame, number: str, column: str, height: int) -> pl.Series:
+    """``column`` of ``rows`` laid out by their ``number``: a series of ``height``, null elsewhere.
+
+    What a left join on a frame's own row numbers gives, without copying the frame.
+    """
+    values = pl.repeat(None, height, dtype=rows.schema[column], eager=True).alias(column)
+    return values.scatter(rows[number], rows[column])

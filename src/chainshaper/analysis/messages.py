@@ -22,7 +22,7 @@ Publications and takes under handles that nobody initialised are left out
 import polars as pl
 
 from chainshaper import events
-from chainshaper.analysis.matching import first_after, latest_before
+from chainshaper.analysis.matching import by_number, first_after, latest_before
 from chainshaper.analysis.objects import Objects
 
 __all__ = ["link_takes", "overwritten_in", "publications", "takes"]
@@ -55,8 +55,7 @@ def publications(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
         time=pl.col("intra_time"), source_timestamp=pl.lit(None, dtype=pl.Int64)
     )
     every = pl.concat([merged.select(columns), alone.select(columns)])
-    every = every.sort("time", "pid", "tid", maintain_order=True).with_row_index("publication")
-    return every.with_columns(pl.col("publication").cast(pl.Int64))
+    return every.sort("time", "pid", "tid", maintain_order=True).with_row_index("publication")
 
 
 def _written(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
@@ -179,13 +178,11 @@ def takes(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
         ]
     )
     every = every.sort("time", "pid", "tid", maintain_order=True).with_row_index("take")
-    return every.with_columns(
-        pl.col("take").cast(pl.Int64), pl.col("buffer").is_not_null().alias("intra_process")
-    )
+    return every.with_columns(pl.col("buffer").is_not_null().alias("intra_process"))
 
 
 def _dispatched(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
-    owners = objects.callbacks.select(
+    owners = _with_enums(objects.callbacks, objects).select(
         "pid", "callback_id", "node", "topic", callback="handle", created="valid_from"
     )
     dispatched = events.table(tables, "dispatch_subscription_callback").rename(
@@ -195,9 +192,14 @@ def _dispatched(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     return found.drop_nulls("topic")
 
 
+def _with_enums(callbacks: pl.DataFrame, objects: Objects) -> pl.DataFrame:
+    types = objects.subscriptions.schema
+    return callbacks.with_columns(pl.col(name).cast(types[name]) for name in ("node", "topic"))
+
+
 def _dequeued(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     owner = objects.callbacks.unique("callback_id", maintain_order=True)
-    owner = owner.select("callback_id", "node", "topic")
+    owner = _with_enums(owner, objects).select("callback_id", "node", "topic")
     buffers = objects.buffers.rename({"valid_from": "created"})
     dequeued = events.table(tables, "rclcpp_ring_buffer_dequeue")
     found = latest_before(dequeued, buffers, ["pid", "buffer"], "time", "created")
@@ -218,17 +220,12 @@ def link_takes(
     ``clock_offset_ns`` is what to add to event times for CLOCK_REALTIME, the clock of source
     timestamps; it is used only where publications carry no source timestamp.
     """
-    stamped = published.drop_nulls("source_timestamp").select(
-        "topic", "source_timestamp", "publication"
-    )
-    stamped = stamped.unique(["topic", "source_timestamp"], keep="first")
-    linked = taken.join(
-        stamped, on=["topic", "source_timestamp"], how="left", maintain_order="left"
-    )
+    found = _with_same_stamp(taken, published)
+    linked = taken.with_columns(by_number(found, "take", "publication", taken.height))
     stampless = published.filter(
-        pl.col("source_timestamp").is_null() & pl.col("time").is_not_null()
-    ).filter(pl.col("intra_time").is_null() | (pl.col("time") > pl.col("intra_time")))
-    stampless = stampless.select("topic", guess="publication", published="time")
+        pl.col("source_timestamp").is_null()
+        & (pl.col("intra_time").is_null() | (pl.col("time") > pl.col("intra_time")))
+    ).select("topic", guess="publication", published="time")
     if stampless.height:
         rows = linked.with_columns(sent=pl.col("source_timestamp") - clock_offset_ns)
         rows = latest_before(rows, stampless, ["topic"], "sent", "published")
@@ -238,6 +235,23 @@ def link_takes(
         linked = rows.with_columns(pl.coalesce("publication", guess)).sort("take")
         linked = linked.select([*taken.columns, "publication"])
     return _link_through_buffers(tables, linked, published)
+
+
+def _with_same_stamp(taken: pl.DataFrame, published: pl.DataFrame) -> pl.DataFrame:
+    """``take, publication`` that agree in topic and source timestamp.
+
+    An asof join that insists on equality: unlike a hash join it stays linear in time and memory
+    whatever the stamps are. Should two publications of a topic share one, the first is taken.
+    """
+    stamp = "source_timestamp"
+    wanted = taken.select("topic", stamp, "take").filter(pl.col(stamp).is_not_null())
+    stamped = (
+        published.select("topic", "publication", stamped=stamp)
+        .filter(pl.col("stamped").is_not_null())
+        .sort("stamped", "publication", descending=[False, True])
+    )
+    found = latest_before(wanted.sort(stamp), stamped, ["topic"], stamp, "stamped")
+    return found.filter(pl.col(stamp) == pl.col("stamped")).select("take", "publication")
 
 
 def _link_through_buffers(

@@ -20,10 +20,13 @@ import polars as pl
 from chainshaper import events
 from chainshaper.analysis.matching import first_after, latest_before, nearest
 
-__all__ = ["CALLBACK_SCHEMA", "Objects", "resolve_objects"]
+__all__ = ["CALLBACK_SCHEMA", "INTERNAL_TOPICS", "Objects", "resolve_objects"]
+
+INTERNAL_TOPICS = frozenset(("/parameter_events", "/rosout", "/clock"))
+"""Topics that every node has for itself: they connect no computation."""
 
 CALLBACK_SCHEMA: dict[str, pl.DataType] = {
-    "callback_id": pl.Int64(),
+    "callback_id": pl.UInt32(),
     "pid": pl.Int32(),
     "handle": pl.UInt64(),
     "valid_from": pl.Int64(),
@@ -34,7 +37,7 @@ CALLBACK_SCHEMA: dict[str, pl.DataType] = {
     "period_ns": pl.Int64(),
     "symbol": pl.String(),
     "observed": pl.Boolean(),
-    "subscription": pl.Int64(),
+    "subscription": pl.UInt32(),
 }
 
 
@@ -45,6 +48,7 @@ class Objects:
     * ``nodes``: ``pid, handle, valid_from, node`` (name with namespace, ``/front/filter``).
     * ``publishers``: ``publisher, pid, handle, rmw_handle, valid_from, node, topic``.
     * ``subscriptions``: ``subscription, pid, handle, rmw_handle, valid_from, node, topic``.
+      In these two, and in everything joined from them, names are of type ``Enum``.
     * ``callbacks``: :data:`CALLBACK_SCHEMA`, one row per *registration*, the address
       (``pid, handle``) under which a callback ran from ``valid_from`` until that address was
       registered again (``valid_to``, null: never). ``callback_id`` numbers callbacks from 0; one
@@ -84,14 +88,24 @@ def resolve_objects(tables: events.EventTables) -> Objects:
         how="diagonal_relaxed",
     )
     callbacks = _numbered(tables, callbacks)
+    names = _name_types(publishers, subscriptions, callbacks)
     return Objects(
         nodes=nodes,
-        publishers=publishers,
-        subscriptions=subscriptions,
+        publishers=publishers.with_columns(names),
+        subscriptions=subscriptions.with_columns(names),
         callbacks=callbacks.select(pl.col(name).cast(t) for name, t in CALLBACK_SCHEMA.items()),
         buffers=_buffers(tables, callbacks),
         notes=_notes(tables, callbacks),
     )
+
+
+def _name_types(*owners: pl.DataFrame) -> list[pl.Expr]:
+    """Casts of node and topic to ``Enum``: millions of rows carry them as numbers, not as text."""
+    casts = []
+    for column in ("node", "topic"):
+        names = pl.concat([owner[column].cast(pl.String) for owner in owners])
+        casts.append(pl.col(column).cast(pl.Enum(names.drop_nulls().unique().sort())))
+    return casts
 
 
 def _nodes(tables: events.EventTables) -> pl.DataFrame:
@@ -134,7 +148,6 @@ def _endpoints(tables: events.EventTables, nodes: pl.DataFrame, kind: str) -> pl
             pl.col("topic_name").alias("topic"),
         )
         .with_row_index(kind)
-        .with_columns(pl.col(kind).cast(pl.Int64))
     )
     columns = [kind, "pid", "handle", "rmw_handle", "valid_from", "node", "topic"]
     return _with_node(created, nodes, "valid_from").select(columns)
@@ -302,7 +315,7 @@ def _numbered(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFra
         latest[tuple(key)] = (number, row)
         if subscription is not None:
             of_subscription.setdefault(subscription, number)
-    return callbacks.drop("named").with_columns(pl.Series("callback_id", ids, dtype=pl.Int64))
+    return callbacks.drop("named").with_columns(pl.Series("callback_id", ids, dtype=pl.UInt32))
 
 
 def _last_starts(
@@ -341,6 +354,9 @@ def _buffers(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFram
     return joined.select("pid", "buffer", "valid_from", "callback_id").sort("valid_from")
 
 
+_CREATION = ("rcl_node_init", "rcl_publisher_init", "rcl_subscription_init")
+
+
 def _notes(tables: events.EventTables, callbacks: pl.DataFrame) -> tuple[str, ...]:
     notes: list[str] = []
     unknown = callbacks.filter(pl.col("kind") == "unknown")
@@ -351,12 +367,15 @@ def _notes(tables: events.EventTables, callbacks: pl.DataFrame) -> tuple[str, ..
             "tracing started after the application, or their events were lost; their node, kind "
             "and topic cannot be known. Start tracing first to see them."
         )
+    created = {name: events.table(tables, name).height for name in _CREATION}
     running = events.table(tables, "rmw_take").height + events.table(tables, "rmw_publish").height
-    if running and not events.table(tables, "rcl_node_init").height:
+    if running and not (created["rcl_publisher_init"] or created["rcl_subscription_init"]):
         notes.append(
-            "no node was created during the recording: topics of publications and takes cannot "
-            "be known, so no chain can be followed."
+            "no publisher or subscription was created during the recording: the topics of "
+            "messages cannot be known, so no chain can be followed."
         )
+    elif running and not created["rcl_node_init"]:
+        notes.append("no node was created during the recording: names of nodes cannot be known.")
     for node, topic in callbacks.filter(~pl.col("observed")).select("node", "topic").iter_rows():
         notes.append(
             f"{node} takes {topic} without callback events (a Python node, or a wait set): its "

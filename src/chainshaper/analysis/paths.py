@@ -9,15 +9,16 @@ counting them is #P-hard. Three things keep the answers quick:
   where they do, one search backwards from the ends per step finds the steps that still lead
   somewhere without meeting the path itself, so no dead end is ever entered;
 * counting and the heaviest path come from dynamic programming over the edges that agree with one
-  order of the vertices (the reverse postorder of a depth-first search): exact without cycles,
-  with cycles the paths that never step back in that order, so the count is a lower bound.
+  order of the vertices (:mod:`~chainshaper.analysis.ordering`): exact without cycles, with cycles
+  the paths that never step back in that order, so the count is a lower bound.
 """
 
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
-from chainshaper.analysis.graph import INTERNAL_TOPICS
+from chainshaper.analysis.objects import INTERNAL_TOPICS
+from chainshaper.analysis.ordering import depth_first_order, greedy_order
 from chainshaper.app import ApplicationGraph, Callback
 
 __all__ = ["Path", "PathSearch", "Stage", "Vertex"]
@@ -81,11 +82,14 @@ class PathSearch:
             if state in useful
         }
         self.roots = tuple(sorted((r for r in roots if r in useful), key=useful.__getitem__))
-        self._order = self._postorder()
+        self._edges: dict[Vertex, list[Vertex]] = {}
+        for (vertex, _), following in self.successors.items():
+            self._edges.setdefault(vertex, []).extend(after for after, _ in following)
+        self._order = depth_first_order(self._edges, [vertex for vertex, _ in self.roots])
         self.cyclic = any(
-            self._order[after[0]] >= self._order[state[0]]
-            for state, following in self.successors.items()
-            for after in following
+            self._order[after] >= self._order[vertex]
+            for vertex, onward in self._edges.items()
+            for after in onward
         )
 
     def _enter(self, vertex: Vertex, met: int) -> State:
@@ -118,29 +122,6 @@ class PathSearch:
                 entered = self._enter(after, met)
                 if met > 0 or entered[1] > 0:
                     yield entered
-
-    def _postorder(self) -> dict[Vertex, int]:
-        """Vertices numbered as a depth-first search leaves them: edges lead to lower numbers."""
-        base: dict[Vertex, list[Vertex]] = {}
-        for (vertex, _), following in self.successors.items():
-            base.setdefault(vertex, []).extend(after for after, _ in following)
-        order: dict[Vertex, int] = {}
-        entered: set[Vertex] = set()
-        for root, _ in self.roots:
-            if root in entered:
-                continue
-            entered.add(root)
-            stack: list[tuple[Vertex, Iterator[Vertex]]] = [(root, iter(base[root]))]
-            while stack:
-                vertex, rest = stack[-1]
-                after = next((v for v in rest if v not in entered), None)
-                if after is None:
-                    order[vertex] = len(order)
-                    stack.pop()
-                else:
-                    entered.add(after)
-                    stack.append((after, iter(base.get(after, ()))))
-        return order
 
     def listed(self, limit: int) -> tuple[tuple[Path, ...], bool]:
         """Up to ``limit`` paths, short ones first where there is a choice; whether that is all."""
@@ -182,15 +163,46 @@ class PathSearch:
     def counted(self, weights: Mapping[int, float]) -> tuple[int, Path, float]:
         """Number of paths, the heaviest of them, and its weight (the sum over its callbacks).
 
-        Of paths that never step back in the search's order; those are all unless ``cyclic``.
+        All paths are counted unless ``cyclic``. Else those are that never step back in one order
+        of the vertices: the depth-first one, or the greedy one if more paths agree with it.
         """
+        orders = [self._order] + ([self._greedy()] if self.cyclic else [])
+        results = [self._counted_in(order, weights) for order in orders]
+        heaviest = max(results, key=lambda result: result[2])
+        return max(result[0] for result in results), heaviest[1], heaviest[2]
+
+    def _greedy(self) -> dict[Vertex, int]:
+        """The greedy order of topics, every callback just after the topic it subscribes to.
+
+        Callbacks have one edge in and thus no choice: ordered by themselves they would all come
+        before their topics. Roots are first, no path comes back to them.
+        """
+        roots = [vertex for vertex, _ in self.roots]
+        between: dict[str, list[str]] = {}
+        for vertex, onward in self._edges.items():
+            topic = self._callbacks[vertex].topic if isinstance(vertex, int) else None
+            if topic is not None and vertex not in roots:
+                between.setdefault(topic, []).extend(str(after) for after in onward)
+        rank: dict[Vertex, int] = {}
+        for topic, place in greedy_order(between).items():
+            rank[topic] = 2 * place
+            for callback in self._subscribers.get(topic, ()):
+                rank[callback] = 2 * place - 1
+        last = min(rank.values(), default=0)
+        for vertex in self._edges:
+            rank.setdefault(vertex, last - 1)  # topics that only a root publishes, and that end
+        return rank | dict.fromkeys(roots, max(rank.values(), default=0) + 1)
+
+    def _counted_in(
+        self, order: Mapping[Vertex, int], weights: Mapping[int, float]
+    ) -> tuple[int, Path, float]:
         best: dict[State, tuple[int, float, State | None]] = {}
-        for state in sorted(self.successors, key=lambda s: (self._order[s[0]], -s[1])):
+        for state in sorted(self.successors, key=lambda s: (order[s[0]], -s[1])):
             vertex = state[0]
             own = weights.get(vertex, 0.0) if isinstance(vertex, int) else 0.0
             count, weight, chosen = (1, 0.0, None) if state in self.ends else (0, -1.0, None)
             for after in self.successors[state]:
-                if after not in best or self._order[after[0]] >= self._order[vertex]:
+                if after not in best or order[after[0]] >= order[vertex]:
                     continue
                 paths, below, _ = best[after]
                 count += paths

@@ -65,7 +65,7 @@ def latency_statistics(
 
 
 def callback_statistics(flow: DataFlow) -> pl.DataFrame:
-    """Count, response and execution times of every callback that ran, one row each.
+    """Count, response and execution times of every callback that was seen to run, one row each.
 
     Columns: ``callback_id, node, kind, topic, period_ns, symbol, pid, tids, count, unfinished,
     response_ns, execution_ns``. The last two are structs ``{min, mean, max}`` in ns (means as
@@ -73,7 +73,8 @@ def callback_statistics(flow: DataFlow) -> pl.DataFrame:
     """
     about = flow.objects.callbacks.unique("callback_id", maintain_order=True)
     response = pl.col("end") - pl.col("start")
-    figures = flow.instances.group_by("callback_id").agg(
+    seen = flow.instances.filter(~pl.col("assumed"))
+    figures = seen.group_by("callback_id").agg(
         pl.col("tid").unique().sort().alias("tids"),
         pl.len().alias("count"),
         pl.col("end").null_count().alias("unfinished"),

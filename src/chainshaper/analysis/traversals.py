@@ -32,7 +32,7 @@ from chainshaper.analysis.matching import first_after
 from chainshaper.analysis.messages import overwritten_in
 from chainshaper.app import ApplicationGraph, Callback, Chain
 
-__all__ = ["REASONS", "Traversals", "reception", "traverse"]
+__all__ = ["REASONS", "Traversals", "traverse"]
 
 REASONS: dict[str, str] = {
     "lost": "published, but never taken, though a later message of the topic was",
@@ -45,6 +45,9 @@ REASONS: dict[str, str] = {
 }
 """Why a traversal is incomplete."""
 
+_REASON = pl.Enum(list(REASONS))
+_VIA = pl.Enum(["instance", "sibling"])
+
 
 @dataclass(frozen=True)
 class Traversals:
@@ -55,13 +58,13 @@ class Traversals:
     output's number in the data flow), ``broken_hop`` and ``broken_at`` (place in the chain and
     topic where an incomplete one stopped) and ``reason`` (a key of :data:`REASONS`).
 
-    ``hops`` has one row per traversal and callback reached: ``traversal``, ``hop`` (from 0),
-    ``callback_id``, ``topic`` (that it publishes), ``instance``, ``take`` (time), ``start``,
-    ``publish`` (time), ``end`` (of the instance), ``source_timestamp`` (of the message it took),
-    ``communication_ns`` (previous publication to start: waiting and transport),
+    ``hops`` has one row per traversal and callback reached, sorted by hop: ``traversal``,
+    ``hop`` (from 0), ``callback_id``, ``topic`` (that it publishes), ``instance``, ``take``
+    (time), ``start``, ``publish`` (time), ``end`` (of the instance), ``source_timestamp`` (of the
+    message it took), ``communication_ns`` (previous publication to start: transport and waiting),
     ``computation_ns`` (start to publication), and ``via``: ``instance`` when the instance itself
-    published, ``sibling`` when another callback of its node did. Over a complete traversal
-    communication and computation add up to the latency.
+    published, ``sibling`` when another callback of its node did, null when nobody did. Over a
+    complete traversal communication and computation add up to the latency.
 
     ``silent`` counts instances of the first callback that published nothing. ``notes`` says what
     the events leave open.
@@ -82,42 +85,43 @@ def traverse(flow: DataFlow, chain: Chain, graph: ApplicationGraph | None = None
     graph = graph or graph_of(flow)
     callbacks = {callback.id: callback for callback in graph.callbacks}
     path = [callbacks[number] for number in chain.callbacks]
-    state = (
-        flow.instances.filter(pl.col("callback_id") == path[0].id)
-        .select(instance_0="instance", start_0="start", end_0="end")
-        .with_columns(
-            pl.lit(None, dtype=pl.Int64).alias("broken_hop"),
-            pl.lit(None, dtype=pl.String).alias("broken_at"),
-            pl.lit(None, dtype=pl.String).alias("reason"),
-        )
-    )
-    state = _with_first_take(flow, state)
+    state = _begun(flow, path[0])
     silent = 0
     notes: list[str] = []
     for hop, (callback, topic) in enumerate(zip(path, chain.topics, strict=True)):
         if hop:
-            state = _take(flow, state, hop, callback, chain.topics[hop - 1])
+            state = _take(flow, state, hop, callback)
         state = _publish(flow, state, hop, callback, topic)
         if topic in callback.passes_on or (hop and goes_on_elsewhere(graph, callback, topic)):
             here = _published_by_node(flow, callback, topic)
-            state = _publish_by_sibling(state, here, hop)
+            state = _publish_by_sibling(flow, state, hop, here)
             notes += _held_back(state, here, hop, callback, topic)
-        state = _unless_published(state, hop, topic)
+        state = _unless_published(flow, state, hop)
         if hop == 0:
             quiet = (pl.col("reason") == "not published").fill_null(False)
             silent = int(state.select(quiet.sum()).item())
             state = state.filter(~quiet)
-    frame, hops = _finished(chain, state)
+    frame, hops = _described(flow, chain, state)
     return Traversals(chain, frame, hops, silent, tuple(notes))
 
 
-def _with_first_take(flow: DataFlow, state: pl.DataFrame) -> pl.DataFrame:
-    """What the first callback's instances took, when it is a subscription."""
-    taken = flow.takes.drop_nulls("instance").select(
-        instance_0="instance", take_0="time", stamp_0="source_timestamp"
+# While it is followed, a traversal is a row of numbers: for every hop h the `instance_h`, the
+# `take_h` it read, the `publication_h` it went into and whether that was a `sibling_h`'s. Numbers
+# are the row numbers of the data flow's frames, so times are looked up when they are needed.
+
+
+def _begun(flow: DataFlow, first: Callback) -> pl.DataFrame:
+    """One row per instance of the first callback, with what it took if it is a subscription."""
+    begun = flow.instances.filter(pl.col("callback_id") == first.id).select(instance_0="instance")
+    taken = (
+        flow.takes.filter((pl.col("callback_id") == first.id) & pl.col("instance").is_not_null())
+        .select(instance_0="instance", take_0="take")
+        .unique("instance_0", keep="last", maintain_order=True)
     )
-    taken = taken.unique("instance_0", keep="last", maintain_order=True)
-    return state.join(taken, on="instance_0", how="left", maintain_order="left")
+    return begun.join(taken, on="instance_0", how="left", maintain_order="left").with_columns(
+        pl.lit(None, dtype=pl.UInt8).alias("broken_hop"),
+        pl.lit(None, dtype=_REASON).alias("reason"),
+    )
 
 
 def _publish(
@@ -125,15 +129,13 @@ def _publish(
 ) -> pl.DataFrame:
     """Add the publications of the hop's topic inside each traversal's instance."""
     own = flow.publications.filter(
-        (pl.col("topic") == topic) & (pl.col("callback_id") == callback.id)
+        (pl.col("callback_id") == callback.id) & (pl.col("topic") == topic)
     ).select(
         pl.col("instance").alias(f"instance_{hop}"),
         pl.col("publication").alias(f"publication_{hop}"),
-        pl.col("time").alias(f"publish_{hop}"),
-        pl.col("intra_time").alias(f"intra_{hop}"),
-        pl.lit("instance").alias(f"via_{hop}"),
     )
-    return state.join(own, on=f"instance_{hop}", how="left", maintain_order="left")
+    joined = state.join(own, on=f"instance_{hop}", how="left", maintain_order="left")
+    return joined.with_columns(pl.lit(False).alias(f"sibling_{hop}"))
 
 
 def _published_by_node(flow: DataFlow, callback: Callback, topic: str) -> pl.DataFrame:
@@ -141,23 +143,23 @@ def _published_by_node(flow: DataFlow, callback: Callback, topic: str) -> pl.Dat
         (pl.col("topic") == topic)
         & (pl.col("pid") == callback.pid)
         & (pl.col("node") == callback.node)
-    ).select(sibling="publication", sibling_time="time", sibling_intra="intra_time")
+    ).select(later="publication", sent="time")
 
 
-def _publish_by_sibling(state: pl.DataFrame, here: pl.DataFrame, hop: int) -> pl.DataFrame:
+def _publish_by_sibling(
+    flow: DataFlow, state: pl.DataFrame, hop: int, here: pl.DataFrame
+) -> pl.DataFrame:
     """Fill in the first publication by the node after the instance's start."""
-    rows = state.with_row_index("row")
-    rows = first_after(rows, here, [], f"start_{hop}", "sibling_time", strictly=True).sort("row")
-    found = pl.col(f"publication_{hop}").is_null() & pl.col("sibling").is_not_null()
-    filled = {
-        f"publication_{hop}": pl.col("sibling"),
-        f"publish_{hop}": pl.col("sibling_time"),
-        f"intra_{hop}": pl.col("sibling_intra"),
-        f"via_{hop}": pl.lit("sibling"),
-    }
-    return rows.with_columns(
-        pl.when(found).then(value).otherwise(name).alias(name) for name, value in filled.items()
-    ).select(state.columns)
+    waiting = pl.col(f"publication_{hop}").is_null() & pl.col(f"instance_{hop}").is_not_null()
+    rows = state.with_row_index("row").filter(waiting)
+    start = _looked_up(flow.instances, "start", f"instance_{hop}").alias("start")
+    found = first_after(rows.select("row", start), here, [], "start", "sent", strictly=True)
+    later = found.select("row", "later").drop_nulls()
+    joined = state.with_row_index("row").join(later, on="row", how="left", maintain_order="left")
+    return joined.with_columns(
+        pl.coalesce(f"publication_{hop}", "later"),
+        (pl.col(f"sibling_{hop}") | pl.col("later").is_not_null()).alias(f"sibling_{hop}"),
+    ).drop("row", "later")
 
 
 def _held_back(
@@ -167,153 +169,139 @@ def _held_back(
     if callback.symbol is not None and MESSAGE_FILTER not in callback.symbol:
         return []  # a callback that stores its latest message: old values are its purpose
     reached = state[f"publication_{hop}"].drop_nulls()
-    between = here.filter(pl.col("sibling").is_between(reached.min(), reached.max()))
+    between = here.filter(pl.col("later").is_between(reached.min(), reached.max()))
     missed = between.height - reached.n_unique()
     if missed <= 0:
         return []
     return [
         f"{missed} of {between.height} publications on {topic} came without a new message on "
-        f"{callback.topic}: {callback.node} holds messages back before it publishes them, for how "
+        f"{callback.topic}: {callback.node} holds messages back or uses old ones again, for how "
         "long the events do not show; latencies through it are lower bounds."
     ]
 
 
-def _unless_published(state: pl.DataFrame, hop: int, topic: str) -> pl.DataFrame:
-    stuck = (
-        pl.col("reason").is_null()
-        & pl.col(f"instance_{hop}").is_not_null()
-        & pl.col(f"publication_{hop}").is_null()
-    )
-    ended = pl.col(f"end_{hop}").is_not_null()
+def _unless_published(flow: DataFlow, state: pl.DataFrame, hop: int) -> pl.DataFrame:
+    instance, publication = pl.col(f"instance_{hop}"), pl.col(f"publication_{hop}")
+    stuck = pl.col("reason").is_null() & instance.is_not_null() & publication.is_null()
+    ended = _looked_up(flow.instances, "end", f"instance_{hop}").is_not_null()
     why = pl.when(ended).then(pl.lit("not published")).otherwise(pl.lit("still running"))
-    return _broken(state, stuck, hop, topic, why)
+    return _broken(state, stuck, hop, why)
 
 
-def _take(
-    flow: DataFlow, state: pl.DataFrame, hop: int, callback: Callback, topic: str
-) -> pl.DataFrame:
+def _take(flow: DataFlow, state: pl.DataFrame, hop: int, callback: Callback) -> pl.DataFrame:
     """Add the instance of ``callback`` that took each traversal's latest publication."""
-    last = hop - 1
-    mine = flow.takes.filter(pl.col("callback_id") == callback.id).drop_nulls("publication")
-    times = flow.instances.filter(pl.col("callback_id") == callback.id)
-    times = times.select("instance", start="start", end="end")
+    taken = flow.takes.filter(
+        (pl.col("callback_id") == callback.id) & pl.col("publication").is_not_null()
+    ).select("publication", "take", "instance")
     # Should a message have been taken twice, the take that led to an execution is followed.
-    mine = mine.sort(pl.col("instance").is_null(), "time", maintain_order=True)
-    mine = mine.unique("publication", keep="first", maintain_order=True)
-    mine = mine.join(times, on="instance", how="left").select(
-        pl.col("publication").alias(f"publication_{last}"),
-        pl.col("instance").alias(f"instance_{hop}"),
-        pl.col("time").alias(f"take_{hop}"),
-        pl.col("source_timestamp").alias(f"stamp_{hop}"),
-        pl.col("start").alias(f"start_{hop}"),
-        pl.col("end").alias(f"end_{hop}"),
-        pl.col("intra_process").alias("through_buffer"),
+    taken = taken.sort(pl.col("instance").is_null(), "take", maintain_order=True)
+    taken = taken.unique("publication", keep="first", maintain_order=True)
+    named = taken.rename(
+        {
+            "publication": f"publication_{hop - 1}",
+            "take": f"take_{hop}",
+            "instance": f"instance_{hop}",
+        }
     )
-    state = state.join(mine, on=f"publication_{last}", how="left", maintain_order="left")
-    # A message that went through a ring buffer left when it was put there, not when DDS got it.
-    left = pl.when("through_buffer").then(f"intra_{last}").otherwise(f"publish_{last}")
-    state = state.with_columns(left.alias(f"publish_{last}")).drop("through_buffer")
+    state = state.join(named, on=f"publication_{hop - 1}", how="left", maintain_order="left")
     untaken = pl.col("reason").is_null() & pl.col(f"take_{hop}").is_null()
-    state = _broken(state, untaken, hop, topic, _why_not_taken(flow, mine, callback, last))
+    why = _why_not_taken(flow, taken, callback, pl.col(f"publication_{hop - 1}"))
+    state = _broken(state, untaken, hop, why)
     unread = pl.col("reason").is_null() & pl.col(f"instance_{hop}").is_null()
-    return _broken(state, unread, hop, topic, pl.lit("not executed"))
+    return _broken(state, unread, hop, pl.lit("not executed"))
 
 
-def _why_not_taken(flow: DataFlow, taken: pl.DataFrame, callback: Callback, last: int) -> pl.Expr:
+def _why_not_taken(
+    flow: DataFlow, taken: pl.DataFrame, callback: Callback, publication: pl.Expr
+) -> pl.Expr:
     """The reason why a publication that ``callback`` never took broke its traversal."""
-    publication = pl.col(f"publication_{last}")
-    latest = taken[f"publication_{last}"].max()
-    later = publication < pl.lit(latest, dtype=pl.Int64)  # numbered in order of time
-    reason = pl.when(later.fill_null(False)).then(pl.lit("lost")).otherwise(pl.lit("not taken"))
+    latest = pl.lit(taken["publication"].max(), dtype=pl.UInt32)
+    later = (publication < latest).fill_null(False)  # they are numbered in order of time
+    reason = pl.when(later).then(pl.lit("lost")).otherwise(pl.lit("not taken"))
     if not flow.publications["intra_time"].count():
         return reason
     overwritten = overwritten_in(flow.events, flow.publications, flow.objects.buffers, callback.id)
-    return (
-        pl.when(publication.is_in(overwritten.implode()))
-        .then(pl.lit("overwritten"))
-        .otherwise(reason)
-    )
+    gone = publication.is_in(overwritten.implode())
+    return pl.when(gone).then(pl.lit("overwritten")).otherwise(reason)
 
 
-def _broken(
-    state: pl.DataFrame, where: pl.Expr, hop: int, topic: str, reason: pl.Expr
-) -> pl.DataFrame:
+def _broken(state: pl.DataFrame, where: pl.Expr, hop: int, reason: pl.Expr) -> pl.DataFrame:
     """Mark the traversals that stop at ``hop``; those that stopped earlier keep their mark."""
-    at = pl.lit(hop, dtype=pl.Int64)
+    at = pl.lit(hop, dtype=pl.UInt8)
     return state.with_columns(
         pl.when(where).then(at).otherwise("broken_hop").alias("broken_hop"),
-        pl.when(where).then(pl.lit(topic)).otherwise("broken_at").alias("broken_at"),
-        pl.when(where).then(reason).otherwise("reason").alias("reason"),
+        pl.when(where).then(reason.cast(_REASON)).otherwise("reason").alias("reason"),
     )
 
 
-def _finished(chain: Chain, state: pl.DataFrame) -> tuple[pl.DataFrame, pl.DataFrame]:
+def _looked_up(frame: pl.DataFrame, column: str, numbers: str) -> pl.Expr:
+    """``column`` of the rows of ``frame`` that the state's column ``numbers`` names."""
+    return pl.lit(frame[column]).gather(pl.col(numbers))
+
+
+def _described(
+    flow: DataFlow, chain: Chain, state: pl.DataFrame
+) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """The frames of :class:`Traversals` from the rows of numbers."""
     last = len(chain.callbacks) - 1
-    state = state.sort("start_0", f"publish_{last}", maintain_order=True)
-    state = state.with_row_index("traversal").with_columns(pl.col("traversal").cast(pl.Int64))
-    frame = state.select(
+    frame = state.with_columns(
+        start=_looked_up(flow.instances, "start", "instance_0"),
+        end=_looked_up(flow.publications, "time", f"publication_{last}"),
+    ).sort("start", "end", f"publication_{last}", nulls_last=True, maintain_order=True)
+    frame = frame.with_row_index("traversal")
+    # A message that was not taken broke its chain on the topic before the hop it did not reach.
+    on_the_way = pl.col("reason").is_in(["not published", "still running"]).not_()
+    place = pl.col("broken_hop").cast(pl.Int64) - on_the_way.cast(pl.Int64)
+    summary = frame.select(
         "traversal",
-        start="start_0",
-        end=f"publish_{last}",
-        latency_ns=pl.col(f"publish_{last}") - pl.col("start_0"),
-        complete=pl.col(f"publish_{last}").is_not_null(),
-        publication=f"publication_{last}",
-        broken_hop="broken_hop",
-        broken_at="broken_at",
-        reason="reason",
+        "start",
+        "end",
+        (pl.col("end") - pl.col("start")).alias("latency_ns"),
+        pl.col("end").is_not_null().alias("complete"),
+        pl.col(f"publication_{last}").alias("publication"),
+        "broken_hop",
+        pl.lit(pl.Series(chain.topics)).gather(place).alias("broken_at"),
+        "reason",
     )
-    return frame, _hops(chain, state)
+    hops = [_hop(flow, chain, frame, hop) for hop in range(last + 1)]
+    return summary, pl.concat(hops)
 
 
-def _hops(chain: Chain, state: pl.DataFrame) -> pl.DataFrame:
-    parts = []
-    for hop, (callback_id, topic) in enumerate(zip(chain.callbacks, chain.topics, strict=True)):
-        previous = pl.col(f"publish_{hop - 1}") if hop else pl.lit(None, dtype=pl.Int64)
-        parts.append(
-            state.filter(pl.col(f"instance_{hop}").is_not_null()).select(
-                "traversal",
-                hop=pl.lit(hop, dtype=pl.Int64),
-                callback_id=pl.lit(callback_id, dtype=pl.Int64),
-                topic=pl.lit(topic),
-                instance=f"instance_{hop}",
-                take=f"take_{hop}",
-                start=f"start_{hop}",
-                publish=f"publish_{hop}",
-                end=f"end_{hop}",
-                source_timestamp=f"stamp_{hop}",
-                communication_ns=pl.col(f"start_{hop}") - previous,
-                computation_ns=pl.col(f"publish_{hop}") - pl.col(f"start_{hop}"),
-                via=f"via_{hop}",
-            )
+def _hop(flow: DataFlow, chain: Chain, frame: pl.DataFrame, hop: int) -> pl.DataFrame:
+    previous, publish = pl.lit(None, dtype=pl.Int64), _published_at(flow, hop, chain)
+    if hop:
+        previous = _published_at(flow, hop - 1, chain)
+    sibling = pl.when(f"sibling_{hop}").then(pl.lit("sibling")).otherwise(pl.lit("instance"))
+    published = pl.col("publish").is_not_null()
+    return (
+        frame.filter(pl.col(f"instance_{hop}").is_not_null())
+        .select(
+            "traversal",
+            pl.lit(hop, dtype=pl.UInt8).alias("hop"),
+            pl.lit(chain.callbacks[hop], dtype=pl.UInt32).alias("callback_id"),
+            pl.lit(chain.topics[hop], dtype=pl.Enum(list(chain.topics))).alias("topic"),
+            pl.col(f"instance_{hop}").alias("instance"),
+            _looked_up(flow.takes, "time", f"take_{hop}").alias("take"),
+            _looked_up(flow.instances, "start", f"instance_{hop}").alias("start"),
+            publish.alias("publish"),
+            _looked_up(flow.instances, "end", f"instance_{hop}").alias("end"),
+            _looked_up(flow.takes, "source_timestamp", f"take_{hop}").alias("source_timestamp"),
+            previous.alias("communication_ns"),
+            sibling.cast(_VIA).alias("via"),
         )
-    return pl.concat(parts).sort("traversal", "hop", maintain_order=True)
-
-
-def reception(
-    flow: DataFlow, traversals: Traversals, graph: ApplicationGraph, node: str | None = None
-) -> pl.DataFrame:
-    """What the subscriber of the chain's output sees: the latency to its `callback_start`.
-
-    The paper's latency ends at the publication; an actuator's node gets the message later. One
-    row per traversal, in order: ``traversal``, ``received`` (start of the callback instance that
-    took the output, null if there is none) and ``reception_ns`` (from the traversal's start).
-    The subscriber is that of ``node``, by default the first subscription callback of the last
-    topic that took anything at all.
-    """
-    topic = traversals.chain.topics[-1]
-    candidates = [
-        callback.id
-        for callback in graph.callbacks
-        if callback.kind == "subscription"
-        and callback.topic == topic
-        and node in {None, callback.node}
-    ]
-    taken = flow.takes.drop_nulls(["publication", "instance"]).filter(
-        pl.col("callback_id").is_in(candidates)
+        .with_columns(
+            (pl.col("start") - pl.col("communication_ns")).alias("communication_ns"),
+            (pl.col("publish") - pl.col("start")).alias("computation_ns"),
+            pl.when(published).then("via").alias("via"),
+        )
     )
-    taken = taken.filter(pl.col("callback_id") == pl.col("callback_id").min())
-    started = flow.instances.select("instance", received="start")
-    taken = taken.join(started, on="instance", how="left").sort("received")
-    taken = taken.unique("publication", keep="first").select("publication", "received")
-    rows = traversals.frame.join(taken, on="publication", how="left", maintain_order="left")
-    return rows.select("traversal", "received", reception_ns=pl.col("received") - pl.col("start"))
+
+
+def _published_at(flow: DataFlow, hop: int, chain: Chain) -> pl.Expr:
+    """When the hop's message left: for a ring buffer when it was put there, else with DDS."""
+    time = _looked_up(flow.publications, "time", f"publication_{hop}")
+    if hop == len(chain.callbacks) - 1 or not flow.takes["intra_process"].any():
+        return time
+    put = _looked_up(flow.publications, "intra_time", f"publication_{hop}")
+    through_buffer = _looked_up(flow.takes, "intra_process", f"take_{hop + 1}")
+    return pl.when(through_buffer).then(put).otherwise(time)

@@ -4,7 +4,6 @@ Results go to stdout, errors and progress to stderr. Exit codes: 0 done, 1 the o
 2 wrong use or bad input, 3 the platform cannot do it.
 """
 
-import os
 import signal
 import sys
 from types import FrameType
@@ -17,18 +16,16 @@ def main() -> None:
     from chainshaper.cli.app import app
     from chainshaper.errors import ChainshaperError
 
-    signal.signal(signal.SIGTERM, _end_in_order)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) == signal.SIG_DFL:  # under nohup it stays ignored
+            signal.signal(number, _end_in_order)
     try:
         app(prog_name="chainshaper")
     except ChainshaperError as error:
         print(f"error: {error}", file=sys.stderr)  # noqa: T201 - the last line of a failed command
         sys.exit(error.exit_code)
-    except BrokenPipeError:
-        # `chainshaper … | head`: not an error, and nothing more can be written.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
 
 
 def _end_in_order(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - a signal handler
-    """SIGTERM ends us as Ctrl-C does: through every `finally` on the way out."""
+    """SIGTERM, or a lost terminal, ends us as Ctrl-C does: through every `finally`."""
     raise KeyboardInterrupt

@@ -8,7 +8,7 @@ __all__ = ["callbacks"]
 def callbacks(recording: RecordingArgument, json: JsonOption = False) -> None:
     """Show every callback of a recording: kind, count, execution time, response time."""
     from chainshaper.analysis import callback_statistics, data_flow
-    from chainshaper.cli.output import notes, print_json, stdout
+    from chainshaper.cli.output import notes, print_json, show
     from chainshaper.recording import open_recording
     from chainshaper.reporting.tables import callback_rows, callback_table
 
@@ -18,5 +18,5 @@ def callbacks(recording: RecordingArgument, json: JsonOption = False) -> None:
     if json:
         print_json(callback_rows(statistics))
         return
-    stdout().print(callback_table(statistics))
+    show(callback_table(statistics))
     notes((*opened.info.notes, *flow.notes))

@@ -28,7 +28,7 @@ def compare(
     json: JsonOption = False,
 ) -> None:
     """Show the same chain in several recordings side by side, usually before and after shaping."""
-    from chainshaper.cli.output import print_json, stdout
+    from chainshaper.cli.output import print_json, show
     from chainshaper.reporting.tables import comparison_json, comparison_table
     from chainshaper.steps import compare_recordings
 
@@ -40,4 +40,4 @@ def compare(
     if json:
         print_json(comparison_json(comparison))
         return
-    stdout().print(comparison_table(comparison))
+    show(comparison_table(comparison))

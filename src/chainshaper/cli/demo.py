@@ -41,7 +41,7 @@ def demo(
     Runs the paper's synthetic chain as real processes over real DDS topics, for about a minute
     and a half. Needs no ROS 2.
     """
-    from chainshaper.cli.output import notes, print_json, progress, stdout
+    from chainshaper.cli.output import notes, print_json, progress, show, show_line
     from chainshaper.demo import run_demo
     from chainshaper.reporting.tables import (
         callback_table,
@@ -63,9 +63,10 @@ def demo(
     if json:
         print_json({**comparison_json(result.comparison), "folder": str(folder)})
         return
-    out = stdout()
-    out.print(callback_table(result.callbacks))
-    out.print(plan_table(result.plan))
-    out.print(comparison_table(result.comparison))
+    show(
+        callback_table(result.callbacks),
+        plan_table(result.plan),
+        comparison_table(result.comparison),
+    )
     notes(result.notes)
-    sys.stdout.write(f"{folder.absolute()}\n")
+    show_line(str(folder.absolute()))

@@ -14,7 +14,7 @@ def doctor(
     json: JsonOption = False,
 ) -> None:
     """Examine this machine: scheduling, privileges, tracing, DDS, and its own stalls."""
-    from chainshaper.cli.output import print_json, progress, stdout
+    from chainshaper.cli.output import print_json, progress, show
     from chainshaper.doctor import examine_machine
     from chainshaper.reporting.machine import machine_json, machine_tables
 
@@ -24,5 +24,4 @@ def doctor(
     if json:
         print_json(machine_json(found))
         return
-    for table in machine_tables(found):
-        stdout().print(table)
+    show(*machine_tables(found))

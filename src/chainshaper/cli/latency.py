@@ -5,6 +5,7 @@ from typing import Annotated
 import typer
 
 from chainshaper.cli.options import ChainOption, JsonOption, RecordingArgument
+from chainshaper.errors import InputError
 
 __all__ = ["latency"]
 
@@ -22,21 +23,23 @@ def latency(
     Each traversal is followed from the start of the first callback to the publication of the
     last topic, message by message.
     """
-    from chainshaper.cli.output import notes, print_json, stdout
+    from chainshaper.cli.output import notes, print_json, show, show_line
     from chainshaper.reporting.tables import latency_json, latency_table
     from chainshaper.steps import measure_latency
 
+    if instances and not json:
+        raise InputError("--instances goes with --json: add it")
     measurement = measure_latency(recording, chain)
     if json:
         print_json(latency_json(measurement, instances=instances))
         return
     analysis = measurement.analysis
-    stdout().print(latency_table(analysis))
+    show(latency_table(analysis))
     counts = f"{analysis.statistics.disturbed} cycles disturbed by the machine"
     if analysis.incomplete:
         reasons = ", ".join(f"{count} {reason}" for reason, count in analysis.incomplete.items())
         counts += f"; incomplete: {reasons}"
     if measurement.overruns:
         counts += f"; {measurement.overruns} outputs were too late for their slot"
-    stdout().print(counts)
+    show_line(counts)
     notes(analysis.notes)

@@ -1,28 +1,56 @@
 """What verbs print: tables for people, JSON for machines, progress on stderr."""
 
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from chainshaper.errors import OperationError
+
 if TYPE_CHECKING:
-    from rich.console import Console
+    from rich.console import RenderableType
 
-__all__ = ["notes", "print_json", "progress", "stdout"]
+__all__ = ["notes", "print_json", "progress", "show", "show_line"]
 
 
-def stdout() -> "Console":
-    """Where results go; colour only on a terminal."""
+def show(*tables: "RenderableType") -> None:
+    """Tables on stdout; colour only on a terminal."""
     from rich.console import Console
 
     # A table in a file or a pipe must not be folded to the width of nothing.
-    return Console() if sys.stdout.isatty() else Console(width=120)
+    console = Console() if sys.stdout.isatty() else Console(width=120)
+    with _written():
+        for table in tables:
+            console.print(table)
+
+
+def show_line(text: str) -> None:
+    """One line on stdout as it is: a path must not be folded."""
+    with _written():
+        sys.stdout.write(text + "\n")
 
 
 def print_json(value: Any) -> None:
     """One JSON document on stdout."""
-    sys.stdout.write(json.dumps(value, indent=2) + "\n")
+    show_line(json.dumps(value, indent=2))
+
+
+@contextmanager
+def _written() -> Iterator[None]:
+    """What is printed inside is out, or the command fails: a redirection to a full disk."""
+    try:
+        yield
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise  # `chainshaper … | head`: Typer ends us quietly
+    except OSError as error:
+        # What could not be written would be tried again, and complained about, at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise OperationError(
+            f"standard output cannot be written ({error.strerror}): send it somewhere else"
+        ) from error
 
 
 def notes(lines: Iterator[str] | tuple[str, ...] | list[str]) -> None:

@@ -67,7 +67,7 @@ def plan(
 
     From a recording, or from bare latencies with their period.
     """
-    from chainshaper.cli.output import notes, print_json, stdout
+    from chainshaper.cli.output import notes, print_json, show, show_line
     from chainshaper.planning import plan_json, plan_warnings, save_plan
     from chainshaper.reporting.tables import plan_table
     from chainshaper.steps import plan_recording
@@ -87,25 +87,35 @@ def plan(
             pause_ns=pause,
         )
     else:
-        planned = _plan_latencies(latencies, period, epsilon, publish_slot)
+        planned = _plan_latencies(latencies, period, chain, epsilon, publish_slot, anchor)
     if output is not None:
         save_plan(planned, output)
     if json:
         print_json(plan_json(planned))
         return
-    stdout().print(plan_table(planned))
+    show(plan_table(planned))
     notes(plan_warnings(planned))
     if output is not None:
-        stdout().print(str(output))
+        show_line(str(output))
 
 
 def _plan_latencies(
-    latencies: Path | None, period: int | None, epsilon: int, publish_slot: int
+    latencies: Path | None,
+    period: int | None,
+    chain: str | None,
+    epsilon: int,
+    publish_slot: int,
+    anchor: Anchor,
 ) -> "Plan":
     from chainshaper.planning import plan_shaping, read_latencies
 
     if latencies is None or period is None:
         raise InputError("--latencies needs the chain's period: add --period, such as 100ms")
     return plan_shaping(
-        read_latencies(latencies), period, epsilon_ns=epsilon, publish_slot_ns=publish_slot
+        read_latencies(latencies),
+        period,
+        spec=chain,
+        epsilon_ns=epsilon,
+        publish_slot_ns=publish_slot,
+        anchor=anchor.value,
     )

@@ -23,7 +23,7 @@ def run(
     Every node is a process of its own, scheduled as the description says (SCHED_FIFO where it is
     permitted). The recording is a folder of Parquet tables.
     """
-    from chainshaper.cli.output import notes, progress
+    from chainshaper.cli.output import notes, progress, show_line
     from chainshaper.workload.description import load_application
     from chainshaper.workload.live import run_application
 
@@ -38,4 +38,4 @@ def run(
             progress=report,
         )
     notes(recording.info.notes)
-    sys.stdout.write(f"{recording.path}\n")
+    show_line(str(recording.path))

@@ -29,7 +29,7 @@ def shape(
 
     The publisher's output topic is remapped, and the shaping node republishes it in its slots.
     """
-    from chainshaper.cli.output import notes, progress
+    from chainshaper.cli.output import notes, progress, show_line
     from chainshaper.planning import load_plan
     from chainshaper.steps import shape_application
     from chainshaper.workload.description import load_application
@@ -46,4 +46,4 @@ def shape(
             progress=report,
         )
     notes(recording.info.notes)
-    sys.stdout.write(f"{recording.path}\n")
+    show_line(str(recording.path))

@@ -163,7 +163,7 @@ def sleep_until(deadline_ns: int) -> None:
     ``time.sleep`` takes a relative time, so a pre-emption between computing and sleeping would
     be added to it. An absolute sleep cannot be late for that reason.
     """
-    request = _Timespec(deadline_ns // 1_000_000_000, deadline_ns % 1_000_000_000)
+    request = _Timespec(*divmod(max(0, deadline_ns), 1_000_000_000))
     while True:
         # A signal ends the sleep early (EINTR, 4); the deadline stays the same.
         error = _libc.clock_nanosleep(

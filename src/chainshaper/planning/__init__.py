@@ -1,6 +1,21 @@
-"""From measured latencies to servers and slots: dimensioning, prediction, the plan file."""
+"""From measured latencies to servers and slots: dimensioning, prediction, the plan file.
 
+Everything starts with :func:`plan_shaping`; each further step takes a plan and returns a plan.
+"""
+
+from chainshaper.planning.baselines import (
+    CallbackTimes,
+    let_per_callback,
+    let_per_callback_asynchronous,
+    let_per_chain,
+    server_per_callback,
+    server_per_chain,
+)
+from chainshaper.planning.graphs import over_cores, with_first_node_apart, with_sink
 from chainshaper.planning.latency_file import check_latencies, read_latencies
+from chainshaper.planning.margins import derive_margin
+from chainshaper.planning.offsets import with_offsets
+from chainshaper.planning.placement import figure7_curve, with_bands, with_long_slot
 from chainshaper.planning.plan import (
     ChainOfPlan,
     Evidence,
@@ -11,6 +26,7 @@ from chainshaper.planning.plan import (
     ShapingNode,
     Slot,
     Thread,
+    output_server,
     publish_slots,
     server_of,
 )
@@ -18,6 +34,7 @@ from chainshaper.planning.plan_file import dump_plan, load_plan, plan_json, save
 from chainshaper.planning.shaping import plan_shaping, plan_warnings, predict_bands
 
 __all__ = [
+    "CallbackTimes",
     "ChainOfPlan",
     "Evidence",
     "Margin",
@@ -28,8 +45,15 @@ __all__ = [
     "Slot",
     "Thread",
     "check_latencies",
+    "derive_margin",
     "dump_plan",
+    "figure7_curve",
+    "let_per_callback",
+    "let_per_callback_asynchronous",
+    "let_per_chain",
     "load_plan",
+    "output_server",
+    "over_cores",
     "plan_json",
     "plan_shaping",
     "plan_warnings",
@@ -38,4 +62,11 @@ __all__ = [
     "read_latencies",
     "save_plan",
     "server_of",
+    "server_per_callback",
+    "server_per_chain",
+    "with_bands",
+    "with_first_node_apart",
+    "with_long_slot",
+    "with_offsets",
+    "with_sink",
 ]

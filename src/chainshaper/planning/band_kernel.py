@@ -1,113 +1,148 @@
-"""The inner loop of exact band placement, compiled by Numba when it is first used.
+"""The inner loops of exact band placement, compiled by Numba.
 
-Everything here is about positions on a grid: position k is the instant ``ends[k]``, and
-``counts[k]`` latencies are not longer. The equations and the proof are in
-:mod:`chainshaper.planning.bands`.
+Importing this module needs Numba; :mod:`chainshaper.planning.bands`, where the equations and the
+proof are, does so when it first places bands. Everything here is about positions on a grid:
+position k is the instant ``ends[k]``, and ``counts[k]`` latencies are not longer.
 """
 
-import functools
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from chainshaper.planning.bands import UNREACHABLE
 from chainshaper.planning.extras import extra_library
 
-__all__ = ["UNREACHABLE", "cheapest_successors"]
-
-UNREACHABLE = np.iinfo(np.int64).max
+__all__ = ["costs_behind"]
 
 _Ints = NDArray[np.int64]
 
 
-def cheapest_successors(
-    counts: _Ints, ends: _Ints, nearest: _Ints, farthest: _Ints, costs: _Ints
-) -> tuple[_Ints, _Ints]:
-    """For every position, the best next band and the cost of all bands behind the position.
-
-    Row i may be followed by the columns j from ``nearest[i]`` to ``farthest[i]``; both bounds
-    ascend with i. ``costs[j]`` is the cost of the bands behind j, :data:`UNREACHABLE` where
-    there is no way to place them. The result holds, per row, the smallest
-    ``costs[j] + (counts[j] − counts[i])·ends[j]`` and the j it comes from (−1: none).
-    """
-    return _compiled()(counts, ends, nearest, farthest, costs)
-
-
-@functools.cache
-def _compiled() -> Callable[..., tuple[_Ints, _Ints]]:
+def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     numba = extra_library("numba", "exact placement of latency bands")
     try:
-        compiled = numba.njit(cache=True)(_cheapest_successors)
+        return numba.njit(cache=True)(function)  # type: ignore[no-any-return]
     except RuntimeError:  # no folder to keep the machine code in: compile in every process
-        compiled = numba.njit(_cheapest_successors)
-    return compiled  # type: ignore[no-any-return]
+        return numba.njit(function)  # type: ignore[no-any-return]
 
 
-def _cheapest_successors(  # noqa: PLR0915 - one kernel: calls would cost what it saves
-    counts: _Ints, ends: _Ints, nearest: _Ints, farthest: _Ints, costs: _Ints
-) -> tuple[_Ints, _Ints]:
-    unreachable = np.iinfo(np.int64).max
-    size = counts.size
-    best_costs = np.full(size, unreachable)
-    successors = np.full(size, -1)
+def _compress(grid: _Ints, windows: _Ints, costs: _Ints, work: _Ints) -> tuple[int, int]:
+    """Columns from which the bands behind can be placed, and rows that have such a column.
 
-    # Columns that cannot be reached are left out, so that a row's columns are one run of
-    # `columns` and each of them counts. `rank[k]`: how many columns lie before position k.
-    columns = np.empty(size, np.int64)
-    base = np.empty(size, np.int64)
-    slope = np.empty(size, np.int64)
-    rank = np.empty(size + 1, np.int64)
+    Only these are left, so that a row's columns are one run of those that remain and each of
+    them counts. ``work`` holds, per remaining column, its position, intercept and slope, and
+    per remaining row its position, count, first and last column; the result says how many.
+    """
+    counts, ends = grid[0], grid[1]
+    nearest, farthest = windows[0], windows[1]
     width = 0
-    for k in range(size):
-        rank[k] = width
-        if costs[k] != unreachable:
-            columns[width] = k
-            base[width] = costs[k] + counts[k] * ends[k]
-            slope[width] = ends[k]
+    for k in range(costs.size):
+        work[7, k] = width  # remaining columns before position k
+        if costs[k] != UNREACHABLE:
+            work[0, width] = k
+            work[1, width] = costs[k] + counts[k] * ends[k]
+            work[2, width] = ends[k]
             width += 1
-    rank[size] = width
-
-    rows = np.empty(size, np.int64)
-    low = np.empty(size, np.int64)
-    high = np.empty(size, np.int64)
+    work[7, costs.size] = width
     height = 0
-    for i in range(size):
-        if nearest[i] < size and nearest[i] <= farthest[i]:
-            low[height] = rank[nearest[i]]
-            high[height] = rank[farthest[i] + 1] - 1
-            if low[height] <= high[height]:
-                rows[height] = i
+    for i in range(costs.size):
+        if nearest[i] <= farthest[i]:
+            low, high = work[7, nearest[i]], work[7, farthest[i] + 1] - 1
+            if low <= high:
+                work[3, height], work[4, height] = i, counts[i]
+                work[5, height], work[6, height] = low, high
                 height += 1
+    return width, height
 
-    # Divide and conquer: the best column of the middle row bounds those of the rows on either
-    # side. Each entry of the stack is (first row, last row, first column, last column).
-    stack = np.empty((128, 4), np.int64)
-    depth = 0
-    if height:
-        stack[0, 0], stack[0, 1], stack[0, 2], stack[0, 3] = 0, height - 1, 0, width - 1
-        depth = 1
-    while depth:
-        depth -= 1
-        first, last = stack[depth, 0], stack[depth, 1]
-        left, right = stack[depth, 2], stack[depth, 3]
-        middle = (first + last) // 2
-        count = counts[rows[middle]]
-        start = max(left, low[middle])
-        best = start
-        least = base[start] - count * slope[start]
-        for column in range(start + 1, min(right, high[middle]) + 1):
-            cost = base[column] - count * slope[column]
-            if cost < least:
-                least = cost
-                best = column
-        best_costs[rows[middle]] = least
-        successors[rows[middle]] = columns[best]
-        if first < middle:
-            stack[depth, 0], stack[depth, 1] = first, middle - 1
-            stack[depth, 2], stack[depth, 3] = left, best
-            depth += 1
-        if middle < last:
-            stack[depth, 0], stack[depth, 1] = middle + 1, last
-            stack[depth, 2], stack[depth, 3] = best, right
-            depth += 1
-    return best_costs, successors
+
+def _least_lines(lines: _Ints, rows: _Ints, least: _Ints, best: _Ints) -> None:
+    """Per row r, the least ``base[q] − count[r]·slope[q]`` for q in ``low[r] … high[r]``, and q.
+
+    ``lines`` are base and slope, which ascends strictly; ``rows`` are count, low and high, which
+    ascend, and no row's run of q is empty.
+
+    The least of lines is found on their lower envelope, in constant time per row and line as
+    long as lines are only added. Windows that move lose lines too, so rows are taken in blocks
+    whose windows share a column, the pivot: left of it windows only grow from the last row to
+    the first, right of it they only grow from the first to the last.
+    """
+    base, slope = lines[0], lines[1]
+    counts, low, high = rows[0], rows[1], rows[2]
+    least[:] = UNREACHABLE
+    envelope = np.empty(base.size, np.int64)
+    takes_over = np.empty(base.size, np.int64)  # the count from which a line beats its forerunner
+    block = 0
+    while block < counts.size:
+        pivot, stop = high[block], block
+        while stop < counts.size and low[stop] <= pivot:
+            stop += 1
+        for step in (-1, 1):
+            left = step < 0
+            row, end, column = (stop - 1, block - 1, pivot) if left else (block, stop, pivot + 1)
+            front = size = 0
+            while row != end:
+                bound = low[row] if left else high[row]
+                while (bound - column) * step >= 0:
+                    limit = 0
+                    while size > front:
+                        top = envelope[size - 1]
+                        # Counts come in the order −step: negated, they descend in both passes.
+                        limit = (base[top] - base[column]) // (step * (slope[column] - slope[top]))
+                        if size - 1 == front or limit < takes_over[size - 1]:
+                            break
+                        size -= 1
+                    envelope[size] = column
+                    takes_over[size] = limit
+                    size += 1
+                    column += step
+                while front + 1 < size and -step * counts[row] <= takes_over[front + 1]:
+                    front += 1
+                if front < size:
+                    cost = base[envelope[front]] - counts[row] * slope[envelope[front]]
+                    if cost < least[row]:
+                        least[row] = cost
+                        best[row] = envelope[front]
+                row += step
+        block = stop
+
+
+_compress_fast = _compiled(_compress)
+_least_lines_fast = _compiled(_least_lines)
+
+
+def _costs_behind(
+    grid: _Ints, windows: _Ints, last: _Ints, layers: int
+) -> tuple[_Ints, NDArray[np.int32]]:
+    positions = last.size
+    costs = np.full((layers, positions), UNREACHABLE)
+    successors = np.full((layers, positions), -1, np.int32)
+    costs[0] = last
+    work = np.empty((8, positions + 1), np.int64)
+    least = np.empty(positions, np.int64)
+    best = np.zeros(positions, np.int64)
+    for layer in range(1, layers):
+        width, height = _compress_fast(grid, windows, costs[layer - 1], work)
+        _least_lines_fast(work[1:3, :width], work[4:7, :height], least[:height], best[:height])
+        for r in range(height):
+            costs[layer, work[3, r]] = least[r]
+            successors[layer, work[3, r]] = work[0, best[r]]
+    return costs, successors
+
+
+_costs_behind_fast = _compiled(_costs_behind)
+
+
+def costs_behind(
+    grid: _Ints, windows: _Ints, last: _Ints, layers: int
+) -> tuple[_Ints, NDArray[np.int32]]:
+    """For every position, the cost of 1, 2, … ``layers`` bands behind it, and the next of them.
+
+    ``grid`` are two rows, counts and ends. ``windows`` are two rows that ascend: a band at i may
+    be followed by one at j from ``windows[0, i]`` (at most the number of positions) to
+    ``windows[1, i]``. ``last[i]`` is the cost when only the last band is behind position i,
+    ``UNREACHABLE`` where it cannot be. Row m of the result holds the smallest
+    ``(counts[j] − counts[i])·ends[j]`` plus row m − 1 at j, and that j (−1: none).
+    """
+    result: tuple[_Ints, NDArray[np.int32]] = _costs_behind_fast(grid, windows, last, layers)
+    return result

@@ -13,19 +13,15 @@ slot backwards: B_m(i), the least cost of the m bands behind a band that ends at
 
 c_i being the number of latencies ≤ x_i among n.
 
-**Why divide and conquer is exact, also under tight constraints.** For i < i' and j < j',
-
-    w(i, j') + w(i', j) − w(i, j) − w(i', j') = (c_i' − c_i)·(x_j' − x_j) ≥ 0
-
-with w(i, j) = (c_j − c_i)·x_j: the cost is Monge. Every constraint on neighbouring bands has the
-form "j not before the first allowed, not behind the last allowed", and both bounds ascend with i
-(Δ and LV bound x_j − x_i, the cap on a band's share bounds c_j − c_i). Let w be infinite where
-a constraint is broken. If the right pair, (i, j') with the widest and (i', j) with the narrowest
-distance, is allowed, then so are (i, j) and (i', j'), whose distances lie in between: the
-inequality holds with infinite costs too, because an infinity on its smaller side has one on the
-other. Adding B_{m−1}(j) to column j changes neither. So the leftmost best j never descends as i
-ascends, over all i that have an allowed j at all, which is what divide and conquer needs; the
-kernel leaves out rows and columns that have none.
+**Why this is exact, also under tight constraints.** For row i, column j costs the value of the
+line with intercept c_j·x_j + B_{m−1}(j) and slope −x_j at c_i. Every constraint on neighbouring
+bands says that j lies in a window whose both ends ascend with i: Δ and LV bound x_j − x_i, the cap
+on a band's share bounds c_j − c_i, and x and c ascend. So B_m(i) is the least of the lines of a
+moving window at c_i, and all the c_i ascend too. The kernel keeps the lower envelope of the
+lines, in an order of rows in which windows only grow, so that no line is lost that a later row
+may need, and positions from which no placement leads on are left out. Each layer is linear in
+the number of grid points. (The cost is Monge as well, w(i, j) + w(i', j') ≤ w(i, j') + w(i', j) for
+i < i', j < j', which is why the average gains less with every further band.)
 """
 
 from dataclasses import dataclass, replace
@@ -37,7 +33,6 @@ from numpy.typing import NDArray
 
 from chainshaper.durations import format_duration
 from chainshaper.errors import InputError, OperationError
-from chainshaper.planning.band_kernel import UNREACHABLE, cheapest_successors
 from chainshaper.planning.latency_file import check_latencies
 
 __all__ = [
@@ -54,6 +49,7 @@ __all__ = [
 
 Goal: TypeAlias = Literal["mean", "jitter", "gap"]
 
+UNREACHABLE = 2**63 - 1  # the cost of what cannot be placed
 MOST_CELLS = 120_000_000  # grid points × bands: more than a gigabyte
 
 
@@ -223,8 +219,8 @@ class _Tables:
     problem: BandProblem
     ends: NDArray[np.int64]
     counts: NDArray[np.int64]
-    costs: list[NDArray[np.int64]]
-    successors: list[NDArray[np.int32]]  # successors[m][i]: −1 where the last band follows
+    costs: NDArray[np.int64]  # row m: m + 1 bands behind the position, UNREACHABLE if impossible
+    successors: NDArray[np.int32]  # position of the next band; −1 where the last one follows
 
     def totals(self, bands: int) -> NDArray[np.int64]:
         """The cost of all bands for every position of the first; two bands at least."""
@@ -238,27 +234,33 @@ def _solve(problem: BandProblem, bands: int) -> _Tables:
     # Positions: multiples of the grid above L̲ + Δ (x_1 − Δ > L̲) and below x_ν − Δ.
     first = (int(problem.latencies_ns[0]) + slot) // grid + 1
     size = max(0, -(-(last - slot) // grid) - first) if bands > 1 else 0
-    if size * bands > MOST_CELLS:
+    layers = min(bands, size + 1)
+    if size * layers > MOST_CELLS:
         raise InputError(
-            f"{size} positions for {bands} bands are too many to search: use a grid coarser than"
+            f"{size} positions for {layers} bands are too many to search: use a grid coarser than"
             f" {format_duration(grid)}"
         )
     ends = (first + np.arange(size, dtype=np.int64)) * grid
     counts = np.searchsorted(problem.latencies_ns, ends, side="right").astype(np.int64)
     behind = problem.latencies_ns.size - counts
     reachable = behind <= problem.most_per_band
-    nearest = np.arange(size, dtype=np.int64) + slot // grid + 1  # x_α − x_{α−1} > Δ
-    farthest = np.searchsorted(counts, counts + problem.most_per_band, side="right") - 1
+    # x_α − x_{α−1} > Δ, at most LV, and no more latencies in between than a band may hold.
+    positions = np.arange(size, dtype=np.int64)
+    nearest = np.minimum(positions + slot // grid + 1, size)
+    farthest = np.full(size, size - 1)
+    if problem.max_share is not None:
+        farthest = np.searchsorted(counts, counts + problem.most_per_band, side="right") - 1
     if problem.max_gap_ns is not None:
         reachable &= last - ends <= problem.max_gap_ns
-        farthest = np.minimum(farthest, np.arange(size) + problem.max_gap_ns // grid)
-        farthest = np.minimum(farthest, size - 1)
-    costs = [np.where(reachable, behind * last, UNREACHABLE)]
-    successors: list[NDArray[np.int32]] = [np.full(size, -1, dtype=np.int32)]
-    for _ in range(bands - 2):
-        cost, successor = cheapest_successors(counts, ends, nearest, farthest, costs[-1])
-        costs.append(cost)
-        successors.append(successor.astype(np.int32))
+        farthest = np.minimum(farthest, positions + problem.max_gap_ns // grid)
+    costs = np.where(reachable, behind * last, UNREACHABLE)[np.newaxis, :]
+    successors = np.full((1, size), -1, dtype=np.int32)
+    if layers > 2:
+        # Numba takes a moment to import, and two bands do without it.
+        from chainshaper.planning.band_kernel import costs_behind
+
+        grid_rows, windows = np.stack([counts, ends]), np.stack([nearest, farthest])
+        costs, successors = costs_behind(grid_rows, windows, costs[0], layers - 1)
     return _Tables(problem, ends, counts, costs, successors)
 
 
@@ -267,8 +269,10 @@ def _best(tables: _Tables, bands: int) -> Placement | None:
     if bands == 1:
         fits = problem.latencies_ns.size <= problem.most_per_band
         return Placement((problem.last_end_ns,), float(problem.last_end_ns)) if fits else None
+    if bands - 1 > tables.ends.size:
+        return None
     totals = tables.totals(bands)
-    if not totals.size or totals.min() == UNREACHABLE:
+    if totals.min() == UNREACHABLE:
         return None
     # Of equally good placements the one that begins last: the smallest jitter.
     return _read(tables, bands, int(np.flatnonzero(totals == totals.min())[-1]))
@@ -278,7 +282,7 @@ def _read(tables: _Tables, bands: int, position: int) -> Placement:
     total = int(tables.totals(bands)[position])
     ends = [int(tables.ends[position])]
     for behind in range(bands - 2, 0, -1):
-        position = int(tables.successors[behind][position])
+        position = int(tables.successors[behind, position])
         ends.append(int(tables.ends[position]))
     ends.append(tables.problem.last_end_ns)
     return Placement(tuple(ends), total / tables.problem.latencies_ns.size)

@@ -19,13 +19,14 @@ from chainshaper.planning.plan import (
     output_server,
     publish_slots,
     revised,
+    wrong_values_refused,
 )
-from chainshaper.planning.plan_file import wrong_values_refused
-from chainshaper.planning.shaping import CHAIN_PRIORITY, OUTPUT_PRIORITY, shaping_node_like
+from chainshaper.planning.shaping import OUTPUT_PRIORITY, shaping_node_like
 
 __all__ = [
     "CallbackTimes",
     "let_per_callback",
+    "let_per_callback_asynchronous",
     "let_per_chain",
     "server_per_callback",
     "server_per_chain",
@@ -155,53 +156,79 @@ def let_per_callback(plan: Plan, topics: Sequence[str]) -> Plan:
 
     ``topics`` are the outputs of the chain's callbacks in order, the chain's own last. Behind
     each a shaping node republishes at the beginning of the next cycle, so the latency is as
-    many periods as there are callbacks (section 5.3, table 5). The slots of the nodes lie in
-    reverse order of the chain: whatever a fast callback does with the data of one slot, the slot
-    of its own output is over.
+    many periods as there are callbacks (section 5.3, table 5).
 
     Raises:
         InputError: a plan without a shaping node, topics that do not end with the chain's
             output, or repeat one.
         OperationError: the slots do not fit into the cycle.
     """
-    start, end = _one_slot(plan)
-    length, last = end - start, plan.shaping_node
+    last = plan.shaping_node
     if last is None or not topics or topics[-1] != last.output:
         raise InputError(
             "LET per callback needs a plan with a shaping node and all topics of the chain, its"
             " output last"
         )
-    if length * len(topics) > plan.cycle_ns:
+    with wrong_values_refused():
+        inside = tuple(shaping_node_like(last, topic) for topic in topics[:-1])
+        threads = [node.thread for node in (*inside, last)]
+        return revised(_let_per_thread(plan, threads), further_shaping_nodes=inside)
+
+
+def let_per_callback_asynchronous(plan: Plan, publishers: Sequence[str]) -> Plan:
+    """:func:`let_per_callback` for callbacks that publish asynchronously: no nodes are added.
+
+    ``publishers`` are the nodes of the chain's callbacks in order; their own publisher threads
+    run in the slots.
+
+    Raises:
+        InputError: a plan that does not gate the publisher's thread, or nodes that do not end
+            with it, or repeat one.
+        OperationError: the slots do not fit into the cycle.
+    """
+    if plan.shaping_node is not None or not publishers or publishers[-1] != plan.chain.publisher:
+        raise InputError(
+            "asynchronous LET per callback needs a plan for asynchronous publication and the"
+            " nodes of the chain, the one that publishes its output last"
+        )
+    with wrong_values_refused():
+        threads = [Thread(node=name, role="publisher") for name in publishers]
+        return _let_per_thread(plan, threads)
+
+
+def _let_per_thread(plan: Plan, threads: list[Thread]) -> Plan:
+    """Publishing threads in slots at the beginning of the cycle, in reverse order of the chain.
+
+    Whatever a fast callback makes of the data of one slot, the slot of its own output is over.
+    """
+    start, end = _one_slot(plan)
+    length, publishing = end - start, output_server(plan)
+    if length * len(threads) > plan.cycle_ns:
         raise OperationError(
-            f"{len(topics)} publish slots of {format_duration(length)} do not fit into the cycle"
+            f"{len(threads)} publish slots of {format_duration(length)} do not fit into the cycle"
             f" {format_duration(plan.cycle_ns)}: use shorter slots"
         )
-    publishing = output_server(plan)
-    with wrong_values_refused():
-        nodes = [shaping_node_like(last, topic) for topic in topics]
-        relays = [
-            Server(
-                name="output" if node.output == last.output else f"output_{node.name}",
-                core=last.core,
-                priority=OUTPUT_PRIORITY,
-                slots=((number * length, (number + 1) * length),),
-                threads=(node.thread,),
-            )
-            for number, node in enumerate(reversed(nodes))
-        ]
-        chain = [
-            server.model_copy(update={"slots": ((0, plan.cycle_ns),), "priority": CHAIN_PRIORITY})
-            for server in plan.servers
-            if server is not publishing
-        ]
-        return revised(
-            plan,
-            policy="let-per-callback",
-            servers=(*chain, *relays),
-            shaping_node=nodes[-1],
-            further_shaping_nodes=tuple(nodes[:-1]),
-            predicted=_after_periods(plan, len(topics), length),
+    gates = [
+        Server(
+            name="output" if number == 0 else f"output_{thread.node.strip('/')}",
+            core=publishing.core if publishing is not None else 0,
+            priority=OUTPUT_PRIORITY,
+            slots=((number * length, (number + 1) * length),),
+            threads=(thread,),
         )
+        for number, thread in enumerate(reversed(threads))
+    ]
+    chain = [
+        server.model_copy(update={"slots": ((0, plan.cycle_ns),)})
+        for server in plan.servers
+        if server is not publishing
+    ]
+    return revised(
+        plan,
+        policy="let-per-callback",
+        servers=(*chain, *gates),
+        predicted=_after_periods(plan, len(threads), length),
+    )
 
 
 def _slots_in_sequence(

@@ -13,8 +13,15 @@ from numpy.typing import NDArray
 from chainshaper.durations import format_duration
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.latency_file import check_latencies
-from chainshaper.planning.plan import Plan, Server, Thread, output_server, publish_slots, revised
-from chainshaper.planning.plan_file import wrong_values_refused
+from chainshaper.planning.plan import (
+    Plan,
+    Server,
+    Thread,
+    output_server,
+    publish_slots,
+    revised,
+    wrong_values_refused,
+)
 from chainshaper.planning.shaping import OUTPUT_PRIORITY, shaping_node_like
 
 __all__ = ["over_cores", "with_first_node_apart", "with_sink"]

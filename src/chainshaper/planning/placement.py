@@ -76,7 +76,9 @@ def with_bands(
         max_gap_ns=max_gap_ns,
         max_share=max_share,
     )
-    if (bands == "auto" or solver != "exact") and (minimise != "mean" or mean_at_most_ns):
+    if (bands == "auto" or solver != "exact") and (
+        minimise != "mean" or mean_at_most_ns is not None
+    ):
         raise InputError("another goal than the average needs the exact solver and fixed bands")
     if bands == "auto":
         if solver != "exact":

@@ -12,13 +12,23 @@ intervals ``(start, end)`` in nanoseconds after the start of a cycle.
 
 import re
 from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import combinations, pairwise
 from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from chainshaper.durations import format_duration
-from chainshaper.yaml_file import Duration, FullName, Part, PositiveDuration, wrong_value
+from chainshaper.errors import InputError
+from chainshaper.yaml_file import (
+    Duration,
+    FullName,
+    Part,
+    PositiveDuration,
+    explanations,
+    key_text,
+    wrong_value,
+)
 
 __all__ = [
     "Anchor",
@@ -36,6 +46,7 @@ __all__ = [
     "publish_slots",
     "revised",
     "server_of",
+    "wrong_values_refused",
 ]
 
 
@@ -256,21 +267,36 @@ def output_server(plan: Plan) -> Server | None:
         server = server_of(plan, plan.shaping_node.thread)
     elif plan.chain.publisher is not None:
         server = server_of(plan, Thread(node=plan.chain.publisher, role="publisher"))
-    if server is None:
-        server = next((server for server in plan.servers if server.name == "output"), None)
-    return server
+    return server or next((other for other in plan.servers if other.name == "output"), None)
 
 
 def publish_slots(plan: Plan) -> tuple[Slot, ...]:
     """The slots of :func:`output_server`, ascending; none without shaping."""
-    server = output_server(plan)
-    return server.slots if server is not None else ()
+    return server.slots if (server := output_server(plan)) else ()
 
 
 def revised(plan: Plan, **changes: object) -> Plan:
-    """A copy of a plan with some fields replaced, checked like any other plan."""
+    """A copy of a plan with some fields replaced, checked like any other plan.
+
+    Raises:
+        InputError: the fields make no plan together.
+    """
     values = {name: getattr(plan, name) for name in Plan.model_fields}
-    return Plan.model_validate({**values, **changes})
+    with wrong_values_refused():
+        return Plan.model_validate({**values, **changes})
+
+
+@contextmanager
+def wrong_values_refused() -> Iterator[None]:
+    """Inside, a value that no plan may have ends in an InputError that names it.
+
+    For code that builds plans from what a caller gave.
+    """
+    try:
+        yield
+    except ValidationError as error:
+        problems = [f"{key_text(where)}: {reason}" for where, reason in explanations(error, Plan)]
+        raise InputError("; ".join(problems)) from error
 
 
 def _slot_text(slot: tuple[int, int]) -> str:

@@ -7,19 +7,16 @@ line, key, the reason and what to write instead.
 
 import os
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import ValidationError
 
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.plan import Plan, publish_slots
-from chainshaper.yaml_file import AS_YAML, explanations, key_text, read_model
+from chainshaper.yaml_file import AS_YAML, read_model
 
-__all__ = ["Plan", "dump_plan", "load_plan", "plan_json", "save_plan", "wrong_values_refused"]
+__all__ = ["Plan", "dump_plan", "load_plan", "plan_json", "save_plan"]
 
 _HEADER = """\
 # A chainshaper plan: the reservation servers that give a ROS 2 chain a constant latency.
@@ -111,19 +108,6 @@ def plan_json(plan: Plan) -> dict[str, Any]:
     """
     bands = [end for _, end in publish_slots(plan)]
     return {**plan.model_dump(mode="json"), "bands_ns": bands}
-
-
-@contextmanager
-def wrong_values_refused() -> Iterator[None]:
-    """Inside, a value that no plan may have ends in an InputError that names it.
-
-    For code that builds plans from what a caller gave.
-    """
-    try:
-        yield
-    except ValidationError as error:
-        problems = [f"{key_text(where)}: {reason}" for where, reason in explanations(error, Plan)]
-        raise InputError("; ".join(problems)) from error
 
 
 class _Inline(list[Any]):

@@ -26,8 +26,8 @@ from chainshaper.planning.plan import (
     ShapingNode,
     Thread,
     publish_slots,
+    wrong_values_refused,
 )
-from chainshaper.planning.plan_file import wrong_values_refused
 
 __all__ = ["evidence_of", "plan_shaping", "plan_warnings", "predict_bands", "shaping_node_like"]
 

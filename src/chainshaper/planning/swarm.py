@@ -38,8 +38,9 @@ def place_by_swarm(problem: BandProblem, bands: int, seed: int | None = None) ->
         OperationError: the swarm ended at a placement that breaks a constraint.
         PlatformError: PySwarms is not installed.
     """
-    if _only_the_last(problem, bands):
-        return Placement((problem.last_end_ns,), float(problem.last_end_ns))
+    _refuse_none(bands)
+    if bands == 1:
+        return _checked(problem, (problem.last_end_ns,), "the single band")
     lowest = float(problem.latencies_ns[0] + problem.publish_slot_ns)
     highest = float(problem.last_end_ns - problem.publish_slot_ns)
     if lowest >= highest:
@@ -63,8 +64,9 @@ def place_randomly(problem: BandProblem, bands: int, seed: int | None = None) ->
         InputError: fewer than one band.
         OperationError: no draw out of ten thousand keeps all constraints.
     """
-    if _only_the_last(problem, bands):
-        return Placement((problem.last_end_ns,), float(problem.last_end_ns))
+    _refuse_none(bands)
+    if bands == 1:
+        return _checked(problem, (problem.last_end_ns,), "the single band")
     grid, slot = problem.grid_ns, problem.publish_slot_ns
     first = (int(problem.latencies_ns[0]) + slot) // grid + 1
     size = -(-(problem.last_end_ns - slot) // grid) - first
@@ -83,10 +85,9 @@ def place_randomly(problem: BandProblem, bands: int, seed: int | None = None) ->
     return _checked(problem, placed, "the last random draw")
 
 
-def _only_the_last(problem: BandProblem, bands: int) -> bool:
+def _refuse_none(bands: int) -> None:
     if bands < 1:
         raise InputError(f"{bands} bands: plan with one band at least")
-    return bands == 1 and _checked(problem, (problem.last_end_ns,), "the single band") is not None
 
 
 def _checked(problem: BandProblem, ends: tuple[int, ...], what: str) -> Placement:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import polars as pl
 
-from chainshaper.errors import OperationError
+from chainshaper.errors import InputError, OperationError
 from chainshaper.planning import publish_slots
 from chainshaper.steps import Measurement
 
@@ -25,16 +25,21 @@ SIZE_INCHES = (9.0, 4.2)
 
 
 def draw_comparison(measurements: Sequence[Measurement], folder: str | Path) -> tuple[Path, Path]:
-    """Both figures, as `latency.png` and `distribution.png` in a folder that is made if needed."""
-    folder = Path(folder)
+    """Both figures, as `latency.png` and `distribution.png` in a folder that is made if needed.
+
+    Raises:
+        InputError: one of them exists already.
+        OperationError: they cannot be written.
+    """
+    latency, distribution = Path(folder) / "latency.png", Path(folder) / "distribution.png"
+    for path in (latency, distribution):
+        if path.exists():
+            raise InputError(f"{path} exists already and is not overwritten: name another folder")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        Path(folder).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OperationError(f"{folder}: the folder cannot be made: {error}") from error
-    return (
-        draw_latency(measurements, folder / "latency.png"),
-        draw_distribution(measurements, folder / "distribution.png"),
-    )
+    return draw_latency(measurements, latency), draw_distribution(measurements, distribution)
 
 
 def draw_latency(measurements: Sequence[Measurement], path: str | Path) -> Path:
@@ -131,6 +136,7 @@ def _save(figure: Any, path: str | Path) -> Path:
     try:
         figure.savefig(path, dpi=130)
     except OSError as error:
+        path.unlink(missing_ok=True)  # half a picture
         raise OperationError(f"{path}: the figure cannot be written: {error}") from error
     finally:
         plt.close(figure)

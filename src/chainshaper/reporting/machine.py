@@ -3,6 +3,7 @@
 from typing import Any
 
 import polars as pl
+from rich.markup import escape
 from rich.table import Table
 
 from chainshaper.doctor import MachineReport
@@ -48,10 +49,12 @@ def machine_tables(report: MachineReport) -> tuple[Table, Table]:
         abilities.add_column(name, overflow="fold")
     for check in report.checks:
         colour = COLOURS[check.state]
-        abilities.add_row(check.name, f"[{colour}]{check.found}[/]", check.needed_for, check.remedy)
+        found = f"[{colour}]{escape(check.found)}[/]"
+        abilities.add_row(check.name, found, check.needed_for, escape(check.remedy))
     watched = format_duration(report.watched_ns)
     threshold = format_duration(report.stall_meter.threshold_ns)
-    stalls = Table(title=f"Stalls longer than {threshold} in {watched} [ms]", title_justify="left")
+    title = escape(f"Stalls longer than {threshold} in {watched} [ms]")
+    stalls = Table(title=title, title_justify="left")
     for name in ("core", "stalls", "longest", "total", "median wake-up"):
         stalls.add_column(name, justify="right")
     for row in stall_rows(report):

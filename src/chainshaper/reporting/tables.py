@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import polars as pl
+from rich.markup import escape
 from rich.table import Table
 
 from chainshaper.analysis import LatencyAnalysis, LatencyStatistics
@@ -87,9 +88,14 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
     return {"chain": comparison.chain, "recordings": entries}
 
 
+def _titled(title: str) -> Table:
+    # Units in brackets are not Rich's markup.
+    return Table(title=escape(title), title_justify="left")
+
+
 def latency_table(analysis: LatencyAnalysis) -> Table:
     """End-to-end latency: at publication and at the subscriber, all cycles and undisturbed ones."""
-    table = Table(title=f"End-to-end latency of {analysis.chain.spec} [ms]", title_justify="left")
+    table = _titled(f"End-to-end latency of {analysis.chain.spec} [ms]")
     table.add_column("")
     columns: list[tuple[str, LatencyStatistics | None]] = [
         ("all cycles", analysis.statistics),
@@ -121,13 +127,10 @@ def _figure(statistics: LatencyStatistics | None, field: str) -> str:
 
 def comparison_table(comparison: Comparison) -> Table:
     """Before and after in one table: what this project is for."""
-    table = Table(
-        title=f"End-to-end latency of {comparison.chain} [ms]",
-        title_justify="left",
-    )
+    table = _titled(f"End-to-end latency of {comparison.chain} [ms]")
     table.add_column("")
     for measurement in comparison.measurements:
-        table.add_column(measurement.recording.path.name, justify="right")
+        table.add_column(escape(measurement.recording.path.name), justify="right")
     analyses = [measurement.analysis for measurement in comparison.measurements]
     _add_section(table, "at publication", [a.undisturbed for a in analyses])
     _add_section(
@@ -179,7 +182,7 @@ def slots_text(plan: Plan) -> str:
 
 def plan_table(plan: Plan) -> Table:
     """Servers and slots of a plan."""
-    table = Table(title=f"Plan for {plan.chain.spec or 'a chain'} [ms]", title_justify="left")
+    table = _titled(f"Plan for {plan.chain.spec or 'a chain'} [ms]")
     for name in ("server", "core", "priority", "slots", "threads"):
         table.add_column(name, justify="right" if name in ("core", "priority") else "left")
     for server in plan.servers:
@@ -219,7 +222,7 @@ def callback_rows(statistics: pl.DataFrame) -> list[dict[str, Any]]:
 
 def callback_table(statistics: pl.DataFrame) -> Table:
     """Every callback: how often it ran, and its execution and response times."""
-    table = Table(title="Callbacks [ms]", title_justify="left")
+    table = _titled("Callbacks [ms]")
     for name in ("node", "callback", "count"):
         table.add_column(name, justify="right" if name == "count" else "left")
     for name in ("execution", "response"):

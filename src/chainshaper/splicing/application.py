@@ -5,14 +5,17 @@ workload: the publisher's output topic is remapped to ``…_tmp``, and a node th
 that topic and republishes on the original one is added. Subscribers notice nothing.
 """
 
+from pydantic import ValidationError
+
 from chainshaper.errors import InputError
-from chainshaper.planning.plan import Plan, publish_slots
+from chainshaper.planning.plan import Plan, ShapingNode, publish_slots
 from chainshaper.workload.description import (
     Application,
     CallbackDescription,
     GateDescription,
     NodeDescription,
 )
+from chainshaper.yaml_file import explanations, key_text
 
 __all__ = ["splice_application"]
 
@@ -28,6 +31,11 @@ def splice_application(application: Application, plan: Plan) -> Application:
         raise InputError(
             "the plan has no `shaping_node`, so there is nothing to splice: plan again with "
             "`chainshaper plan REC --chain FIRST..LAST -o plan.yaml`"
+        )
+    if plan.further_shaping_nodes:
+        raise InputError(
+            "the plan has `further_shaping_nodes`, but one can be spliced into a live workload: "
+            "remove them from the plan"
         )
     if shaping.name in {name.strip("/") for name in application.nodes}:
         raise InputError(
@@ -50,27 +58,37 @@ def splice_application(application: Application, plan: Plan) -> Application:
         name: _remapped(node, shaping.output, shaping.input) if name == publishers[0] else node
         for name, node in application.nodes.items()
     }
-    nodes[shaping.name] = NodeDescription(
-        core=shaping.core,
-        priority=shaping.fifo_priority,
-        callbacks=(
-            CallbackDescription(
-                subscription=shaping.input,
-                publishes=(shaping.output,),
-                gate=GateDescription(
-                    slots=publish_slots(plan),
-                    cycle_ns=plan.cycle_ns,
-                    anchor=plan.anchor,
-                    spin_ns=shaping.spin_ns,
-                    pause_ns=shaping.pause_ns,
-                ),
-            ),
-        ),
-    )
+    nodes[shaping.name] = _described(plan, shaping)
     topics = dict(application.topics)
     if shaping.output in topics:
         topics[shaping.input] = topics[shaping.output]  # the same quality of service
     return application.model_copy(update={"nodes": nodes, "topics": topics})
+
+
+def _described(plan: Plan, shaping: ShapingNode) -> NodeDescription:
+    try:
+        return NodeDescription(
+            core=shaping.core,
+            priority=shaping.fifo_priority,
+            callbacks=(
+                CallbackDescription(
+                    subscription=shaping.input,
+                    publishes=(shaping.output,),
+                    gate=GateDescription(
+                        slots=publish_slots(plan),
+                        cycle_ns=plan.cycle_ns,
+                        anchor=plan.anchor,
+                        spin_ns=shaping.spin_ns,
+                        pause_ns=shaping.pause_ns,
+                    ),
+                ),
+            ),
+        )
+    except ValidationError as error:
+        problems = [
+            f"{key_text(where)}: {reason}" for where, reason in explanations(error, NodeDescription)
+        ]
+        raise InputError(f"the plan's shaping node cannot be run: {'; '.join(problems)}") from error
 
 
 def _remapped(node: NodeDescription, old: str, new: str) -> NodeDescription:

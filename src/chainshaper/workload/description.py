@@ -18,7 +18,7 @@ run before it happens is said here, and nothing about a particular application i
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -78,6 +78,11 @@ class ExecutionTime(Part):
                 raise wrong_value(
                     "the mean must lie within the limits, with a deviation above 0ms", "normal"
                 )
+            if self.within_ns[1] - self.within_ns[0] < deviation:
+                # Nearly every value would be drawn again, for ever if the limits are equal.
+                raise wrong_value(
+                    "the limits are closer together than one deviation: write `uniform`", "within"
+                )
         return self
 
 
@@ -96,6 +101,9 @@ class GateDescription(Part):
             Gate(slots=self.slots, cycle_ns=self.cycle_ns, anchor=self.anchor)
         except ValueError as error:
             raise wrong_value(str(error), "slots") from error
+        for key, rest in (("spin", self.spin_ns), ("pause", self.pause_ns)):
+            if rest >= self.cycle_ns:
+                raise wrong_value("must be shorter than the cycle: shorten it", key)
         return self
 
 
@@ -190,8 +198,29 @@ class Application(Part):
         for topic in self.topics:
             if topic not in publishers:
                 raise wrong_value("is published by no node: remove it", "topics", topic)
+        self._refuse_equal_names()
+        self._refuse_unknown_way_points(publishers.keys())
         self._refuse_endless_cycles()
         return self
+
+    def _refuse_equal_names(self) -> None:
+        """A leading slash does not make another name."""
+        seen: dict[str, str] = {}
+        for name in self.nodes:
+            other = seen.setdefault(name.strip("/"), name)
+            if other != name:
+                raise wrong_value(f"is the same name as {other!r}: rename one", "nodes", name)
+
+    def _refuse_unknown_way_points(self, topics: Collection[str]) -> None:
+        """A run takes its time: a chain that cannot be found in it is refused before."""
+        known = {*topics, *("/" + name.strip("/") for name in self.nodes)}
+        for way_point in self.chain.split(".."):
+            if "/" + way_point.strip().removeprefix("/") not in known:
+                raise wrong_value(
+                    f"no topic or node is called {way_point.strip()!r}: write way points of "
+                    f"{', '.join(sorted(known))}, such as FIRST..LAST",
+                    "chain",
+                )
 
     def _refuse_endless_cycles(self) -> None:
         """No message may circle for ever."""

@@ -46,8 +46,10 @@ class ExecutionTimes:
 
     def refill(self, count: int = BLOCK) -> None:
         """Have at least ``count`` values ready, so that the next ones cost nothing."""
-        if len(self._values) < count:
-            drawn = draw(self._execution, BLOCK * -(-count // BLOCK), self._random)
+        # Block by block: values redrawn outside their limits would otherwise make the sequence
+        # depend on how many were asked for at once.
+        while len(self._values) < count:
+            drawn = draw(self._execution, BLOCK, self._random)
             self._values = [*reversed(drawn.tolist()), *self._values]
 
     def next(self) -> int:

@@ -64,13 +64,18 @@ class Child:
             code = self.process.wait(timeout=2)
         except subprocess.TimeoutExpired:
             return f"{self.name} (pid {self.pid}) sends something that is not part of the protocol"
-        how = (
-            f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
-        )
+        how = f"was killed by {_signal_name(-code)}" if code < 0 else f"ended with code {code}"
         self.errors.seek(0)
         said = self.errors.read().decode(errors="replace").strip().splitlines()
         last = f": {said[-1]}" if said else ""
         return f"{self.name} (pid {self.pid}) {how} before the run was over{last}"
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:  # most real-time signals have no name of their own
+        return f"signal {number}"
 
 
 def start_child(name: str, module: str, environment: dict[str, str]) -> Child:

@@ -22,7 +22,7 @@ from chainshaper.enforcement.threads import (
     foreign_realtime_processes,
     list_threads,
 )
-from chainshaper.errors import InputError, OperationError
+from chainshaper.errors import InputError, OperationError, PlatformError
 from chainshaper.recording import (
     Recording,
     RecordingInfo,
@@ -47,7 +47,7 @@ Progress = Callable[[float, str], None]
 
 WARM_UP_CYCLES = 5
 DISCOVERY_NS = 20_000_000_000
-METER_BEHIND_NS = 150_000
+METER_BEHIND_NS = 500_000
 NODE_MODULE = "chainshaper.workload.node_process"
 
 
@@ -78,8 +78,14 @@ def run_application(
         raise InputError(f"{cycles} cycles cannot be recorded: ask for at least 1")
     check_cores(application.cores())
     timer = origin_timer(application)
-    if realtime is None:
-        realtime = may_use_fifo()
+    permitted = may_use_fifo()
+    if realtime and not permitted:
+        raise PlatformError(
+            "real-time scheduling was asked for, but this process may not use SCHED_FIFO: run as "
+            "root, give your user an rtprio limit of 98 in /etc/security/limits.conf, or do without"
+        )
+    reason = "the process may not use SCHED_FIFO" if not permitted else "SCHED_FIFO was declined"
+    realtime = permitted if realtime is None else realtime
     if progress is None:
         progress = _no_progress
     nodes: dict[str, Child] = {}
@@ -105,7 +111,7 @@ def run_application(
         end_all([*nodes.values(), *meters.values()], patience_s=3.0 if finished else 0.0)
     tables = event_tables(logs, timing.record_from_ns)
     tables["machine_stall"] = stall_table(stalls, tables.get("machine_stall"))
-    notes = _notes(realtime, memory_locked, clock_offset() - offset_before)
+    notes = _notes(None if realtime else reason, memory_locked, clock_offset() - offset_before)
     info = RecordingInfo(
         source="live",
         rmw="cyclonedds",
@@ -175,8 +181,8 @@ class _Timing:
             record_from_ns=first - min(1_000_000, period // 10),
             last_timer_ns=end - min(1_000_000, period // 10),
             stop_ns=end + max(2 * period, 200_000_000),  # what has begun is completed
-            # The stall meter's grid has a point shortly behind each planned release: a stall
-            # that delays a release is then seen for certain, and no wake-up comes in between.
+            # The stall meter's grid keeps away from the planned releases: what happens there the
+            # gate sees more exactly, as long as no other thread's wake-up comes in between.
             meter_from_ns=start + timer.phase_ns + grid,
         )
 
@@ -314,10 +320,12 @@ def _read_log(name: str, child: Child, application: Application) -> ProcessLog:
     return ProcessLog(child.pid, core, rows, tuple(answer["objects"]))
 
 
-def _notes(realtime: bool, memory_locked: bool, clock_moved_ns: int) -> tuple[str, ...]:
+def _notes(
+    no_realtime_because: str | None, memory_locked: bool, clock_moved_ns: int
+) -> tuple[str, ...]:
     notes = [f"the first {WARM_UP_CYCLES} cycles warmed up and were not recorded"]
-    if not realtime:
-        notes.append("taken without real-time scheduling: the process may not use SCHED_FIFO")
+    if no_realtime_because is not None:
+        notes.append(f"taken without real-time scheduling: {no_realtime_because}")
     if not memory_locked:
         notes.append("memory was not locked: page faults may have cost time")
     if abs(clock_moved_ns) > 1_000_000:

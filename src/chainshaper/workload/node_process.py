@@ -11,6 +11,7 @@ import resource
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from chainshaper.enforcement.gate import Gate, Shaper, origin_of, sleep_until
@@ -41,6 +42,33 @@ class Handles:
     def __call__(self) -> int:
         self._last += 0x100
         return self._last
+
+
+@dataclass(frozen=True)
+class TracedPublisher:
+    """A publisher with its trace points, which are recorded apart from sending."""
+
+    write: Callable[[bytes, int], None]
+    template: bytearray
+    handle: int
+    rmw_handle: int
+    point: dict[str, Callable[..., None]]
+
+    def send(self, payload: bytes) -> tuple[int, int]:
+        """Publish; the time of publication (ns) and the source timestamp.
+
+        As rmw_cyclonedds does: one time stamp, given to the trace point and to DDS.
+        """
+        source_timestamp, now = time.time_ns(), time.monotonic_ns()
+        self.write(payload, source_timestamp)
+        return now, source_timestamp
+
+    def record(self, payload: bytes, now: int, source_timestamp: int) -> None:
+        """Record what :meth:`send` did."""
+        address = id(payload)
+        self.point["rclcpp_publish"](now, address)
+        self.point["rcl_publish"](now, self.handle, address)
+        self.point["rmw_publish"](now, self.rmw_handle, address, source_timestamp)
 
 
 class NodeProcess:
@@ -85,19 +113,25 @@ class NodeProcess:
 
     def _add_callback(self, index: int, callback: dict[str, Any]) -> None:
         handle = self.new_handle()
-        publish = [self._publisher(topic) for topic in callback["publishes"]]
-        if callback["gate"] is not None:
-            body = self._shaping_body(handle, callback["gate"], publish[0])
+        publishers = [self._publisher(topic) for topic in callback["publishes"]]
+        subscription = None
+        if callback["subscription"] is not None:
+            qos = self.spec["topics"][callback["subscription"]]
+            subscription = dds.Subscription(
+                self.participant, callback["subscription"], qos["reliability"], qos["depth"]
+            )
+        if callback["gate"] is not None and subscription is not None:
+            body = self._shaping_body(handle, callback["gate"], publishers[0], subscription)
         else:
             times = ExecutionTimes(
                 callback["execution"], self.spec["seed"], self.spec["node"], index
             )
             self.execution_times.append(times)
-            body = self._computing_body(handle, times, publish)
-        if callback["timer_ns"] is not None:
+            body = self._computing_body(handle, times, publishers)
+        if subscription is None:
             self._add_timer(handle, callback, body)
         else:
-            self._add_subscription(handle, callback["subscription"], body)
+            self._add_subscription(handle, callback["subscription"], subscription, body)
         symbol = f"{self.spec['node']}::callback{index}"
         self.log.init("rclcpp_callback_register", callback=handle, symbol=symbol)
 
@@ -114,15 +148,16 @@ class NodeProcess:
         )
 
     def _add_subscription(
-        self, handle: int, topic: str, body: Callable[[dds.Message | None], None]
+        self,
+        handle: int,
+        topic: str,
+        subscription: dds.Subscription,
+        body: Callable[[dds.Message | None], None],
     ) -> None:
-        qos = self.spec["topics"][topic]
         entity = SubscriptionEntity(
             handle=self.new_handle(),
             rmw_handle=self.new_handle(),
-            subscription=dds.Subscription(
-                self.participant, topic, qos["reliability"], qos["depth"]
-            ),
+            subscription=subscription,
             callback=body,
         )
         rclcpp_handle = self.new_handle()
@@ -133,7 +168,7 @@ class NodeProcess:
             node_handle=self.node_handle,
             rmw_subscription_handle=entity.rmw_handle,
             topic_name=topic,
-            queue_depth=qos["depth"],
+            queue_depth=self.spec["topics"][topic]["depth"],
         )
         self.log.init(
             "rclcpp_subscription_init",
@@ -144,12 +179,7 @@ class NodeProcess:
             "rclcpp_subscription_callback_added", subscription=rclcpp_handle, callback=handle
         )
 
-    def _publisher(self, topic: str) -> Callable[..., int]:
-        """A function that publishes on a topic and returns when it did (ns).
-
-        It takes the payload to forward, or None for a message of its own, the header stamp of
-        the latter, and how long to pause after writing, before anything else is done.
-        """
+    def _publisher(self, topic: str) -> "TracedPublisher":
         qos = self.spec["topics"][topic]
         publisher = dds.Publisher(self.participant, topic, qos["reliability"], qos["depth"])
         self.publishers[topic] = publisher
@@ -162,31 +192,20 @@ class NodeProcess:
             topic_name=topic,
             queue_depth=qos["depth"],
         )
-        write = publisher.write
-        if qos["publication"] == "asynchronous":
-            write = _hand_over_to_publisher_thread(publisher.write)
-        template = dds.message_template(qos["payload"])
-        rclcpp, rcl, rmw = (
-            self._point[name] for name in ("rclcpp_publish", "rcl_publish", "rmw_publish")
+        return TracedPublisher(
+            write=(
+                _hand_over_to_publisher_thread(publisher.write)
+                if qos["publication"] == "asynchronous"
+                else publisher.write
+            ),
+            template=dds.message_template(qos["payload"]),
+            handle=handle,
+            rmw_handle=rmw_handle,
+            point=self._point,
         )
 
-        def publish(forwarded: bytes | None, stamp_ns: int, pause_ns: int = 0) -> int:
-            payload = dds.stamp_message(template, stamp_ns) if forwarded is None else forwarded
-            # As rmw_cyclonedds does: one time stamp, given to the trace point and to DDS.
-            source_timestamp, now = time.time_ns(), time.monotonic_ns()
-            write(payload, source_timestamp)
-            if pause_ns:
-                sleep_until(now + pause_ns)
-            address = id(payload)
-            rclcpp(now, address)
-            rcl(now, handle, address)
-            rmw(now, rmw_handle, address, source_timestamp)
-            return now
-
-        return publish
-
     def _computing_body(
-        self, handle: int, times: ExecutionTimes, publish: list[Callable[..., int]]
+        self, handle: int, times: ExecutionTimes, publishers: list["TracedPublisher"]
     ) -> Callable[[dds.Message | None], None]:
         """An ordinary callback: compute, then publish; the origin's stamp is passed on."""
         start, end = self._point["callback_start"], self._point["callback_end"]
@@ -196,21 +215,29 @@ class NodeProcess:
             start(now, handle, time.thread_time_ns(), 0)
             stamp = wall if message is None else origin_of(message.payload) or 0
             spend(times.next())
-            for publish_on in publish:
-                publish_on(None, stamp)
+            for publisher in publishers:
+                payload = dds.stamp_message(publisher.template, stamp)
+                publisher.record(payload, *publisher.send(payload))
             end(time.monotonic_ns(), handle, time.thread_time_ns())
 
         return body
 
     def _shaping_body(
-        self, handle: int, gate: dict[str, Any], publish: Callable[..., int]
+        self,
+        handle: int,
+        gate: dict[str, Any],
+        publisher: "TracedPublisher",
+        subscription: dds.Subscription,
     ) -> Callable[[dds.Message | None], None]:
         """The latency-shaping callback (paper, section 3.2.2): hold, then republish unchanged.
 
         Between waking and writing nothing is computed, and after writing the thread pauses, so
-        that threads it outranks can deliver; only then are its events recorded. When time jumped
-        although no other thread ran on the core in between, the machine stood still, and that is
-        recorded like the stall meter's own findings.
+        that threads it outranks can deliver; only then are its events recorded. It does not
+        pause when another message waits already: one that missed its slot leaves together with
+        the next, and must not make that one late as well.
+
+        When time jumped although no other thread ran on the core in between, the machine stood
+        still, and that is recorded like the stall meter's own findings.
         """
         start, end = self._point["callback_start"], self._point["callback_end"]
         released, stalled = self._point["gate_release"], self._point["machine_stall"]
@@ -224,12 +251,15 @@ class NodeProcess:
             start(time.monotonic_ns(), handle, time.thread_time_ns(), 0)
             switches = _involuntary_switches()
             release, arrival, woke = shaper.hold(message.payload)
-            published = publish(message.payload, 0, pause_ns)
-            if _involuntary_switches() == switches:
-                if woke.gap_ns >= STALL_NS:
-                    stalled(woke.gap_start_ns, woke.gap_ns)
-                if published - woke.at_ns >= STALL_NS:
-                    stalled(woke.at_ns, published - woke.at_ns)
+            published, source_timestamp = publisher.send(message.payload)
+            alone = _involuntary_switches() == switches
+            if not subscription.ready():
+                sleep_until(published + pause_ns)
+            publisher.record(message.payload, published, source_timestamp)
+            if alone and woke.gap_ns >= STALL_NS:
+                stalled(woke.gap_start_ns, woke.gap_ns)
+            if alone and published - woke.at_ns >= STALL_NS:
+                stalled(woke.at_ns, published - woke.at_ns)
             released(
                 woke.at_ns,
                 handle,

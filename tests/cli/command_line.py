@@ -1,0 +1,97 @@
+"""The real command line in a process of its own, as a person or a script runs it."""
+
+import json
+import os
+import subprocess
+import sys
+import uuid
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from processes import marked_processes, wait_for
+
+__all__ = ["Running", "chainshaper", "json_of", "refused"]
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What a command left: its exit code and what it printed."""
+
+    code: int
+    out: str
+    err: str
+
+
+def chainshaper(*arguments: str | Path, prefix: tuple[str, ...] = ()) -> Finished:
+    """Run a command to its end; ``prefix`` is a program that runs it, such as `setpriv`."""
+    run = subprocess.run(
+        [*prefix, *_command(arguments)], capture_output=True, text=True, check=False, timeout=100
+    )
+    return Finished(run.returncode, run.stdout, run.stderr)
+
+
+def refused(code: int, *arguments: str | Path) -> str:
+    """The message of a command that must fail with this exit code.
+
+    One clear message, and nothing else: no traceback, and no result that a script could take.
+    """
+    finished = chainshaper(*arguments)
+    assert finished.code == code, finished
+    assert finished.out == ""
+    assert "Traceback" not in finished.err
+    assert finished.err.count("error: ") == 1, finished.err
+    return finished.err[finished.err.index("error: ") :]
+
+
+def json_of(*arguments: str | Path) -> Any:
+    """The one JSON document that a successful command prints."""
+    finished = chainshaper(*arguments, "--json")
+    assert finished.code == 0, finished
+    return json.loads(finished.out)
+
+
+@dataclass
+class Running:
+    """A command under way, known by a mark in the environment of all its descendants."""
+
+    process: "subprocess.Popen[str]"
+    mark: str
+    said: list[str] = field(default_factory=list)
+
+    @classmethod
+    def start(cls, *arguments: str | Path) -> "Running":
+        mark = f"MARK_{uuid.uuid4().hex}=1"
+        name, _, value = mark.partition("=")
+        process = subprocess.Popen(
+            _command(arguments),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, name: value},
+        )
+        return cls(process, mark)
+
+    def wait_until_it_says(self, words: str) -> None:
+        """Read its messages until one has these words."""
+        assert self.process.stderr is not None
+        for line in self.process.stderr:
+            self.said.append(line)
+            if words in line:
+                return
+        raise AssertionError(f"it ended without saying {words!r}: {self.said}")
+
+    def nodes(self) -> dict[str, int]:
+        """Its living descendants, by name."""
+        found = marked_processes(self.mark)
+        return {name: pid for pid, name in found.items() if pid != self.process.pid}
+
+    def end(self) -> Finished:
+        """Wait for its end, and for that of its descendants."""
+        out, err = self.process.communicate(timeout=60)
+        wait_for(lambda: not self.nodes(), f"the end of its processes {self.nodes()}")
+        return Finished(self.process.returncode, out, "".join(self.said) + err)
+
+
+def _command(arguments: tuple[str | Path, ...]) -> list[str]:
+    return [sys.executable, "-m", "chainshaper", *map(str, arguments)]

@@ -1,0 +1,71 @@
+"""What several rooms' tests stand on: a real recording, and a disk that is full."""
+
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain, small_chain_text
+
+from chainshaper import run_application, shape_application
+from chainshaper.planning import Plan, plan_shaping
+from chainshaper.recording import Recording
+
+CYCLES = 12
+
+
+@pytest.fixture
+def application_file(tmp_path: Path) -> Path:
+    """The small chain as a person would have it on disk."""
+    path = tmp_path / "application.yaml"
+    path.write_text(small_chain_text())
+    return path
+
+
+@pytest.fixture(scope="session")
+def plan() -> Plan:
+    """Single-band shaping of the small chain: publish slot [21 ms, 22 ms)."""
+    return plan_shaping(
+        np.array([5_000_000, 20_000_000]),
+        PERIOD_NS,
+        spec="/t1../t3",
+        output="/t3",
+        publisher="/third",
+        nodes=("/first", "/second", "/third"),
+        core=EXECUTOR_CORE,
+    )
+
+
+@pytest.fixture(scope="session")
+def unshaped(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """A live run of the small chain, with real-time scheduling where it is permitted."""
+    folder = tmp_path_factory.mktemp("unshaped")
+    return run_application(small_chain(folder), folder / "before", cycles=CYCLES)
+
+
+@pytest.fixture(scope="session")
+def shaped(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> Recording:
+    """The same with the shaping node, anchored to the messages' stamps."""
+    folder = tmp_path_factory.mktemp("shaped")
+    return shape_application(small_chain(folder), plan, folder / "after", cycles=CYCLES)
+
+
+@pytest.fixture
+def full_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of its own on which not one byte more can be written."""
+    if os.geteuid() != 0:
+        pytest.skip("mounting a small file system needs root")
+    mount = tmp_path / "full"
+    mount.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", str(mount)]
+    mounted = subprocess.run(command, capture_output=True, text=True, check=False)
+    if mounted.returncode:
+        pytest.skip(f"a tmpfs cannot be mounted here: {mounted.stderr.strip()}")
+    try:
+        with pytest.raises(OSError, match="No space left"):
+            (mount / "filling").write_bytes(bytes(1_000_000))
+        yield mount
+    finally:
+        subprocess.run(["umount", str(mount)], check=True)

@@ -1,0 +1,53 @@
+"""What /proc says about the processes that a test started, directly or through others."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from chainshaper.enforcement.threads import list_threads
+
+__all__ = ["children_of", "marked_processes", "real_time_threads", "wait_for"]
+
+
+def children_of(pid: int) -> list[int]:
+    """Processes whose parent is ``pid``, dead ones that nobody has waited for included."""
+    return [child for child in _pids() if _parent(child) == pid]
+
+
+def marked_processes(marker: str) -> dict[int, str]:
+    """Living processes that inherited an environment with ``marker`` in it, with their names.
+
+    Orphans are found as well: an environment stays when the parent is gone.
+    """
+    found = {}
+    for pid in _pids():
+        try:
+            if marker.encode() in Path(f"/proc/{pid}/environ").read_bytes():
+                found[pid] = Path(f"/proc/{pid}/comm").read_text().strip()
+        except OSError:  # it ended meanwhile, or belongs to somebody else
+            continue
+    return found
+
+
+def real_time_threads(pids: list[int]) -> list[str]:
+    """Names of the threads of these processes that run under SCHED_FIFO."""
+    return [t.comm for pid in pids for t in list_threads(pid) if t.policy == "SCHED_FIFO"]
+
+
+def wait_for(condition: Callable[[], bool], what: str, seconds: float = 20.0) -> None:
+    """Wait until something has happened; a test that waits in vain fails, and says for what."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, f"waited {seconds} s in vain for {what}"
+        time.sleep(0.02)
+
+
+def _pids() -> list[int]:
+    return [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdigit()]
+
+
+def _parent(pid: int) -> int:
+    try:
+        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+    except OSError:
+        return -1

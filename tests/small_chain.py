@@ -1,0 +1,51 @@
+"""A chain of three short nodes and an actuator, described for the cores of this machine."""
+
+from pathlib import Path
+
+from chainshaper.enforcement.realtime import available_cores
+from chainshaper.workload.description import Application, load_application
+
+__all__ = ["DDS_CORE", "EXECUTOR_CORE", "NODES", "PERIOD_NS", "small_chain", "small_chain_text"]
+
+DDS_CORE = available_cores()[0]
+EXECUTOR_CORE = available_cores()[-1]
+PERIOD_NS = 50_000_000
+NODES = ("first", "second", "third", "actuator")
+
+_TEXT = """\
+name: small chain
+chain: /t1../t3
+seed: 7
+scheduling:
+  executors: {{core: {executor_core}, priority: 80}}
+  dds: {{core: {dds_core}, priority: 90}}
+nodes:
+  first:
+    callbacks:
+      - {{timer: 50ms, execution: {{uniform: [1ms, 4ms]}}, publishes: [/t1]}}
+  second:
+    callbacks:
+      - {{subscription: /t1, execution: {{uniform: [1ms, 4ms]}}, publishes: [/t2]}}
+  third:
+    callbacks:
+      - {{subscription: /t2, execution: {{uniform: [1ms, 4ms]}}, publishes: [/t3]}}
+  actuator:
+    callbacks:
+      - {{subscription: /t3, execution: {{constant: 100us}}}}
+topics:
+  /t3: {{publication: {publication}}}
+"""
+
+
+def small_chain_text(
+    *, publication: str = "synchronous", executor_core: int = EXECUTOR_CORE
+) -> str:
+    """The YAML text of the application; node `third` publishes its output, /t3."""
+    return _TEXT.format(publication=publication, executor_core=executor_core, dds_core=DDS_CORE)
+
+
+def small_chain(folder: Path, *, publication: str = "synchronous") -> Application:
+    """The application, by way of a file in ``folder``."""
+    path = folder / "small_chain.yaml"
+    path.write_text(small_chain_text(publication=publication))
+    return load_application(path)

@@ -1,0 +1,113 @@
+"""Splicing the shaping node into a description: one publisher remapped, one node added."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_chain import EXECUTOR_CORE, small_chain
+
+from chainshaper import shape_application
+from chainshaper.errors import InputError
+from chainshaper.planning import Plan, plan_shaping, publish_slots
+from chainshaper.planning.plan import revised
+from chainshaper.splicing.application import splice_application
+from chainshaper.workload.description import Application, TopicDescription
+
+
+@pytest.fixture
+def application(tmp_path: Path) -> Application:
+    return small_chain(tmp_path, publication="asynchronous")
+
+
+def test_the_publisher_is_remapped_and_the_shaping_node_takes_its_place(
+    application: Application, plan: Plan
+) -> None:
+    spliced = splice_application(application, plan)
+
+    assert spliced.nodes["third"].callbacks[0].publishes == ("/t3_tmp",)
+    shaping = spliced.nodes["chainshaper_t3"]
+    (callback,) = shaping.callbacks
+    assert (callback.subscription, callback.publishes) == ("/t3_tmp", ("/t3",))
+    assert (shaping.core, shaping.priority) == (EXECUTOR_CORE, 84)
+    assert callback.gate is not None
+    assert callback.gate.slots == publish_slots(plan)
+    assert (callback.gate.cycle_ns, callback.gate.anchor) == (50_000_000, "stamp")
+    assert (callback.gate.spin_ns, callback.gate.pause_ns) == (300_000, 500_000)
+
+
+def test_nothing_else_changes(application: Application, plan: Plan) -> None:
+    before = application.model_dump_json()
+    spliced = splice_application(application, plan)
+    assert application.model_dump_json() == before, "the given one is left as it is"
+    for name in ("first", "second", "actuator"):
+        assert spliced.nodes[name] == application.nodes[name]
+    assert (spliced.chain, spliced.seed) == (application.chain, application.seed)
+
+
+def test_the_new_topic_has_the_outputs_quality_of_service(
+    application: Application, plan: Plan
+) -> None:
+    spliced = splice_application(application, plan)
+    asynchronous = TopicDescription(publication="asynchronous")
+    assert spliced.topic("/t3_tmp") == spliced.topic("/t3") == asynchronous
+
+
+def test_the_spliced_application_is_a_right_one(application: Application, plan: Plan) -> None:
+    spliced = splice_application(application, plan)
+    assert Application.model_validate(spliced.model_dump()) == spliced
+
+
+def _changed(plan: Plan, **changes: object) -> Plan:
+    assert plan.shaping_node is not None
+    return plan.model_copy(update={"shaping_node": plan.shaping_node.model_copy(update=changes)})
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"output": "/t9"}, "/t9, which no node of the application publishes; exactly one"),
+        ({"name": "second"}, "has a node 'second' already.*change it in the plan"),
+        ({"input": "/t1"}, "publishes /t1 already.*change `shaping_node.input` in the plan"),
+        ({"fifo_priority": 98}, "cannot be run: priority: 98 should be less than or equal to 97"),
+        ({"pause_ns": 50_000_000}, "cannot be run: pause: must be shorter than the cycle"),
+        ({"spin_ns": 60_000_000}, "cannot be run: spin: must be shorter than the cycle"),
+    ],
+)
+def test_a_plan_that_does_not_fit_is_refused(
+    application: Application, plan: Plan, changes: dict[str, object], said: str
+) -> None:
+    with pytest.raises(InputError, match=said):
+        splice_application(application, _changed(plan, **changes))
+
+
+def test_a_plan_without_a_shaping_node_is_refused(application: Application, plan: Plan) -> None:
+    bare = plan_shaping(np.array([5_000_000, 20_000_000]), plan.cycle_ns)
+    with pytest.raises(InputError, match="no `shaping_node`, so there is nothing to splice"):
+        splice_application(application, bare)
+
+
+def test_a_plan_with_more_shaping_nodes_than_can_run_is_refused(
+    application: Application, plan: Plan
+) -> None:
+    assert plan.shaping_node is not None
+    more = plan.model_copy(update={"further_shaping_nodes": (plan.shaping_node,)})
+    with pytest.raises(InputError, match="remove them from the plan"):
+        splice_application(application, more)
+
+
+def test_an_output_that_two_nodes_publish_is_refused(application: Application, plan: Plan) -> None:
+    nodes = {**application.nodes, "fourth": application.nodes["third"]}
+    both = application.model_copy(update={"nodes": nodes})
+    with pytest.raises(InputError, match="which third, fourth of the application publishes"):
+        splice_application(both, plan)
+
+
+def test_a_plan_for_another_period_is_refused_before_anything_starts(
+    application: Application, plan: Plan, tmp_path: Path
+) -> None:
+    slower = revised(
+        plan, chain=plan.chain.model_copy(update={"period_ns": 60_000_000}), cycle_ns=60_000_000
+    )
+    with pytest.raises(InputError, match=r"period 60ms, but /t1../t3 of 'small chain' has 50ms"):
+        shape_application(application, slower, tmp_path / "rec")
+    assert not (tmp_path / "rec").exists()

@@ -1,0 +1,53 @@
+"""The public names: all there, and free of charge until they are used."""
+
+import subprocess
+import sys
+
+import pytest
+
+import chainshaper
+from chainshaper.enforcement import gate
+
+HEAVY = ("polars", "matplotlib", "pydantic", "cyclonedds", "numpy", "yaml")
+
+
+def _modules_after(statement: str) -> set[str]:
+    """Modules that are loaded after a statement in a fresh interpreter."""
+    program = f"{statement}\nimport sys\nprint(*sys.modules)"
+    run = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    return {name.split(".")[0] for name in run.stdout.split()}
+
+
+@pytest.mark.parametrize("name", chainshaper.__all__)
+def test_every_public_name_resolves(name: str) -> None:
+    value = getattr(chainshaper, name)
+    assert value.__doc__, f"{name} has no docstring"
+    assert value.__module__.startswith("chainshaper.")
+
+
+def test_names_that_do_not_exist_are_said_not_to() -> None:
+    with pytest.raises(AttributeError, match="'chainshaper' has no attribute 'shape_it'"):
+        _ = chainshaper.shape_it
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    assert _modules_after("import chainshaper").isdisjoint(HEAVY)
+
+
+def test_importing_the_command_line_loads_nothing_heavy() -> None:
+    assert _modules_after("import chainshaper.cli.app").isdisjoint(HEAVY)
+
+
+def test_the_gate_needs_the_standard_library_only() -> None:
+    # It also runs inside a ROS 2 node, where nothing of ours may be installed.
+    statement = (
+        "import importlib.util, sys\n"
+        f"spec = importlib.util.spec_from_file_location('gate', {gate.__file__!r})\n"
+        "module = importlib.util.module_from_spec(spec)\n"
+        "sys.modules['gate'] = module\n"
+        "spec.loader.exec_module(module)"
+    )
+    loaded = _modules_after(statement) - _modules_after("pass") - {"gate"}
+    assert loaded <= sys.stdlib_module_names

@@ -1,0 +1,186 @@
+"""The description of an application: what is right is kept, what is wrong is said where."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+from description_mistakes import MISTAKES, RIGHT
+from hypothesis import given
+from hypothesis import strategies as st
+from small_chain import NODES, small_chain, small_chain_text
+
+from chainshaper.demo import synthetic_chain
+from chainshaper.errors import InputError
+from chainshaper.workload.description import (
+    Application,
+    TopicDescription,
+    application_as_written,
+    load_application,
+)
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_named_once_with_line_key_reason_and_remedy(
+    mistake: str, tmp_path: Path
+) -> None:
+    right, wrong, line, key, reason, remedy = MISTAKES[mistake]
+    assert RIGHT.count(right) == 1, "the test itself is wrong"
+    path = tmp_path / "robot.yaml"
+    path.write_text(RIGHT.replace(right, wrong))
+
+    with pytest.raises(InputError) as refused:
+        load_application(path)
+    said = str(refused.value)
+    named = [each for each in said.splitlines() if f"{key}: " in each]
+    assert len(named) == 1, said
+    assert named[0].startswith(f"{path}:{line}: {key}: ")
+    assert reason in named[0]
+    assert remedy in named[0]
+
+
+def _refusal(path: Path) -> str:
+    with pytest.raises(InputError) as refused:
+        load_application(path)
+    return str(refused.value)
+
+
+def test_every_mistake_is_said_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_text(RIGHT.replace("50ms", "50").replace("core: 1,", "core: x,"))
+    places = [line.split(": ")[0] for line in _refusal(path).splitlines()]
+    assert places == [f"{path}:4", f"{path}:9"]
+
+
+def test_topics_in_a_circle_are_shown(tmp_path: Path) -> None:
+    path = tmp_path / "robot.yaml"
+    circle = "  back:\n    callbacks:\n      - {subscription: /command, publishes: [/scan]}\n"
+    path.write_text(RIGHT.replace("topics:\n", circle + "topics:\n"))
+    said = _refusal(path)
+    assert said.startswith(f"{path}:6: nodes: the topics form a cycle")
+    assert "/command → /scan → /command" in said or "/scan → /command → /scan" in said
+    assert "break it at one of these topics" in said
+
+
+def test_a_node_that_hears_itself_is_a_circle(tmp_path: Path) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_text(RIGHT.replace("publishes: [/command]", "publishes: [/command, /scan]"))
+    assert "/scan → /scan" in _refusal(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", ":1: the file is empty"),
+        (b"# only a comment\n", ":1: the file is empty"),
+        (b"- a\n- list\n", ":1: expected a YAML mapping"),
+        (b"just text", ":1: expected a YAML mapping"),
+        (b"name: x\nnodes: [1, 2\n", ": not YAML: "),
+        (b"name: x\n\tchain: y\n", ":2: not YAML: "),
+        (b"name: 'x\n", ": not YAML: "),
+        (b"a: 1\n---\nb: 2\n", ":2: not YAML: but found another document"),
+        (bytes(range(256)), ": not a YAML text"),
+        (b"\x7fELF\x02\x01\x01\x00\x00", ": not a YAML text"),
+        (b"name: \xe9\n", ": not a YAML text"),  # Latin-1
+        (b"a: &loop [*loop]\n", ":1: a[0]: refers to this by a YAML alias"),
+        (b"[" * 5000, ": not a YAML text"),
+    ],
+)
+def test_files_that_are_no_descriptions(content: bytes, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_bytes(content)
+    text = _refusal(path)
+    assert text.startswith(f"{path}")
+    assert said in text
+    assert "\n" not in text, "one message"
+
+
+def test_paths_that_are_no_files(tmp_path: Path) -> None:
+    missing = _refusal(tmp_path / "missing.yaml")
+    assert missing.startswith(f"{tmp_path / 'missing.yaml'}: cannot be read (No such file")
+    assert "synthetic_chain.yaml" in missing, "where to find a description to begin with"
+    assert f"{tmp_path}: cannot be read (Is a directory)" in _refusal(tmp_path)
+
+
+def test_the_right_one_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_text(RIGHT)
+    application = load_application(path)
+    assert application.seed == 1
+    assert application.topic("/command") == TopicDescription(depth=3)
+    assert application.topic("/scan") == TopicDescription()
+    planner = application.nodes["planner"]
+    assert planner.callbacks[0].execution.within_ns == (4_000_000, 14_000_000)
+    assert application.scheduling_of("planner").core == 0
+    assert application.scheduling_of("planner").priority == 80
+    assert application.dds_scheduling_of("lidar").priority == 90
+    assert application.cores() == {0: "node planner", 1: "node lidar"}
+
+
+def test_the_examples_are_right(tmp_path: Path) -> None:
+    assert load_application(synthetic_chain()).chain == "/t1../t5"
+    assert tuple(small_chain(tmp_path).nodes) == NODES
+    assert "asynchronous" in small_chain_text(publication="asynchronous")
+
+
+@pytest.mark.parametrize("text", [RIGHT, small_chain_text(), synthetic_chain().read_text()])
+def test_an_application_written_to_yaml_is_read_back_equal(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_text(text)
+    application = load_application(path)
+    path.write_text(yaml.safe_dump(application_as_written(application), sort_keys=False))
+    assert load_application(path) == application
+
+
+_durations = st.integers(0, 10**12)
+_pairs = st.tuples(_durations, _durations).map(sorted).map(tuple)
+_executions = st.one_of(
+    _durations.map(lambda value: {"constant_ns": value}),
+    _pairs.map(lambda pair: {"uniform_ns": pair}),
+    _pairs.filter(lambda pair: pair[1] > pair[0]).map(
+        lambda pair: {"normal_ns": (pair[0], pair[1] - pair[0]), "within_ns": pair}
+    ),
+)
+_topics = st.fixed_dictionaries(
+    {},
+    optional={
+        "publication": st.sampled_from(["synchronous", "asynchronous"]),
+        "reliability": st.sampled_from(["reliable", "best_effort"]),
+        "depth": st.integers(1, 1000),
+        "payload": st.integers(0, 16_000_000),
+    },
+)
+
+
+_sources = st.fixed_dictionaries(
+    {
+        "timer_ns": st.integers(1, 10**12),
+        "phase_ns": _durations,
+        "execution": _executions,
+        "publishes": st.just(("/out",)),
+    }
+)
+
+
+@given(_sources, _topics, st.integers(0, 2**64))
+def test_whatever_is_described_survives_its_file(
+    tmp_path_factory: pytest.TempPathFactory,
+    source: dict[str, object],
+    topic: dict[str, object],
+    seed: int,
+) -> None:
+    application = Application.model_validate(
+        {
+            "name": "any: [application]",
+            "chain": "/out",
+            "seed": seed,
+            "scheduling": {
+                "executors": {"core": 0, "priority": 1},
+                "dds": {"core": 3, "priority": 97},
+            },
+            "topics": {"/out": topic},
+            "nodes": {"ns/source": {"callbacks": (source,), "dds_priority": 5}},
+        }
+    )
+    path = tmp_path_factory.mktemp("any") / "robot.yaml"
+    path.write_text(yaml.safe_dump(application_as_written(application)))
+    assert load_application(path) == application

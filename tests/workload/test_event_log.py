@@ -1,0 +1,95 @@
+"""The event log: what a process records is what the tables hold."""
+
+from typing import Any
+
+import polars as pl
+import pytest
+
+from chainshaper import events
+from chainshaper.workload.event_log import LAYOUT, WIDTH, EventLog
+from chainshaper.workload.event_reading import ProcessLog, event_tables, stall_table
+
+
+def _process(log: EventLog, pid: int = 100, core: int | None = 1) -> ProcessLog:
+    return ProcessLog(pid, core, log.rows.tobytes(), tuple(log.objects))
+
+
+def _types(name: str, fields: tuple[str, ...]) -> dict[str, pl.DataType]:
+    known = {**events.FIELDS[name], **events.OPTIONAL_FIELDS.get(name, {})}
+    return {**events.COMMON_COLUMNS, **{field: known[field] for field in known if field in fields}}
+
+
+@pytest.mark.parametrize(("name", "fields"), LAYOUT)
+def test_every_event_is_read_back_as_it_was_recorded(name: str, fields: tuple[str, ...]) -> None:
+    log = EventLog()
+    values = dict(zip(fields, range(1, len(fields) + 1), strict=True))
+    log.point(name)(5000, *values.values())
+    tables = event_tables([_process(log)], from_ns=0)
+
+    assert list(tables) == [name]
+    assert dict(tables[name].schema) == _types(name, fields)
+    expected: dict[str, Any] = {"time": 5000, "pid": 100, "tid": 100, "cpu": 1, **values}
+    if name == "gate_release":
+        expected["anchor"] = "cycle"
+    assert tables[name].to_dicts() == [expected]
+
+
+def test_the_layout_says_what_the_event_tables_say() -> None:
+    for name, fields in LAYOUT:
+        known = {**events.FIELDS[name], **events.OPTIONAL_FIELDS.get(name, {})}
+        assert set(events.FIELDS[name]) <= set(fields) <= set(known), name
+        assert 2 + len(fields) <= WIDTH, name
+
+
+def test_the_largest_numbers_fit() -> None:
+    log = EventLog()
+    log.point("rmw_take")(2**62, 0x55D0_0000_0100, 2**47, 2**62, 1)
+    (row,) = event_tables([_process(log)], from_ns=0)["rmw_take"].to_dicts()
+    assert row["time"] == row["source_timestamp"] == 2**62
+    assert row["message"] == 2**47
+
+
+def test_the_warm_up_is_cut_and_objects_are_kept() -> None:
+    log = EventLog()
+    log.init("rcl_timer_init", timer_handle=7, period=100)
+    created = log.objects[0]["time"]
+    start = log.point("callback_start")
+    for time in (created + 10, created + 19, created + 20, created + 30):
+        start(time, 1, 0, 0)
+    tables = event_tables([_process(log)], from_ns=created + 20)
+    assert tables["callback_start"]["time"].to_list() == [created + 20, created + 30]
+    assert tables["rcl_timer_init"].select("time", "timer_handle", "period").rows() == [
+        (created, 7, 100)
+    ]
+
+
+def test_several_processes_are_merged_by_time() -> None:
+    logs = []
+    for pid, times in ((1, (10, 40)), (2, (20, 30))):
+        log = EventLog()
+        for time in times:
+            log.point("callback_end")(time, 5, 0)
+        logs.append(_process(log, pid=pid, core=pid))
+    table = event_tables(logs, from_ns=0)["callback_end"]
+    assert table.select("time", "pid", "cpu").rows() == [
+        (10, 1, 1),
+        (20, 2, 2),
+        (30, 2, 2),
+        (40, 1, 1),
+    ]
+
+
+def test_a_process_that_recorded_nothing_is_no_problem() -> None:
+    assert event_tables([_process(EventLog())], from_ns=0) == {}
+    assert event_tables([], from_ns=0) == {}
+
+
+def test_stalls_come_from_meters_and_gates() -> None:
+    log = EventLog()
+    log.point("machine_stall")(150, 9)
+    seen = event_tables([_process(log)], from_ns=0)["machine_stall"]
+    meters = EventLog()
+    meters.rows.extend((100, 7, 200, 8))
+    table = stall_table([(11, 0, meters.rows.tobytes()), (12, 1, b"")], seen)
+    assert table.select("time", "cpu", "duration").rows() == [(100, 0, 7), (150, 1, 9), (200, 0, 8)]
+    assert stall_table([]).schema == events.empty("machine_stall").schema

@@ -1,0 +1,225 @@
+"""The executor runs callbacks in ROS 2's order, on real DDS topics of a closed domain."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from chainshaper.workload import dds
+from chainshaper.workload.event_log import LAYOUT, WIDTH, EventLog
+from chainshaper.workload.executor import Executor, SubscriptionEntity, Timer
+
+MS = 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("called_at", "due_next"),
+    [
+        (100, 110),  # on time
+        (109, 110),  # late, within its period
+        (110, 110),  # the next expiry is now: it runs again at once
+        (111, 120),  # one period missed, and not made up for
+        (120, 120),
+        (135, 140),
+        (1004, 1010),
+    ],
+)
+def test_a_timer_that_missed_periods_keeps_its_phase(called_at: int, due_next: int) -> None:
+    timer = Timer(handle=1, period_ns=10, callback=lambda: None, due_ns=100)
+    timer.call(called_at)
+    assert timer.due_ns == due_next
+
+
+@given(st.integers(0, 10**6), st.integers(1, 10**4), st.integers(0, 10**6))
+def test_whatever_a_timer_missed_its_next_expiry_is_the_first_one_left(
+    due: int, period: int, late: int
+) -> None:
+    timer = Timer(handle=1, period_ns=period, callback=lambda: None, due_ns=due)
+    timer.call(due + late)
+    assert (timer.due_ns - due) % period == 0, "the phase"
+    assert timer.due_ns > due
+    assert timer.due_ns >= due + late, "not in the past"
+    assert timer.due_ns - (due + late) <= period, "none skipped that can still be met"
+
+
+@dataclass
+class Bench:
+    """An executor with its participant, and a diary of what ran."""
+
+    participant: Any
+    log: EventLog
+    executor: Executor
+    diary: list[str] = field(default_factory=list)
+    handles: int = 0
+
+    def topic(self, name: str, depth: int = 10) -> tuple[dds.Publisher, dds.Subscription]:
+        subscription = dds.Subscription(self.participant, name, "reliable", depth)
+        publisher = dds.Publisher(self.participant, name, "reliable", depth)
+        deadline = time.monotonic() + 10
+        while not (publisher.matched() and subscription.matched()):
+            assert time.monotonic() < deadline, f"{name}: writer and reader did not meet"
+            time.sleep(0.001)
+        return publisher, subscription
+
+    def subscribe(
+        self, name: str, depth: int = 10, then: Callable[[], None] = lambda: None
+    ) -> dds.Publisher:
+        """A subscription that writes its name into the diary; the publisher of its topic."""
+        publisher, subscription = self.topic(f"/{name}", depth)
+
+        def callback(message: dds.Message) -> None:
+            self.diary.append(name)
+            then()
+
+        self.handles += 2
+        self.executor.add_subscription(
+            SubscriptionEntity(self.handles, self.handles + 1, subscription, callback)
+        )
+        return publisher
+
+    def timer(
+        self, name: str, due_ns: int, period_ns: int, then: Callable[[], None] = lambda: None
+    ) -> Timer:
+        def callback() -> None:
+            self.diary.append(name)
+            then()
+
+        self.handles += 2
+        timer = Timer(self.handles, period_ns, callback, due_ns)
+        self.executor.timers.append(timer)
+        return timer
+
+    def spin(self, for_ns: int = 30 * MS) -> None:
+        now = time.monotonic_ns()
+        self.executor.spin_until(now + for_ns, now + for_ns)
+
+    def recorded(self, event: str) -> list[list[int]]:
+        """Rows of one event: time, then its fields."""
+        number = [name for name, _ in LAYOUT].index(event)
+        rows = self.log.rows.tolist()
+        all_rows = [rows[i : i + WIDTH] for i in range(0, len(rows), WIDTH)]
+        return [row[1:] for row in all_rows if row[0] == number]
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
+    monkeypatch.setenv("CYCLONEDDS_URI", dds.closed_domain_configuration())
+    log = EventLog()
+    participant = dds.join_domain(dds.free_domain())
+    return Bench(participant, log, Executor(participant, log))
+
+
+def _send(publisher: dds.Publisher, stamp_ns: int = 1) -> None:
+    publisher.write(dds.stamp_message(dds.message_template(8), stamp_ns), time.time_ns())
+
+
+def test_timers_run_before_subscriptions_each_in_order_of_registration(bench: Bench) -> None:
+    second = bench.subscribe("subscription1")
+    bench.timer("timer1", due_ns=time.monotonic_ns(), period_ns=10_000 * MS)
+    first = bench.subscribe("subscription2")
+    bench.timer("timer2", due_ns=time.monotonic_ns() - 5 * MS, period_ns=10_000 * MS)
+    _send(first)  # neither the order of arrival nor of expiry decides
+    _send(second)
+    bench.spin()
+    assert bench.diary == ["timer1", "timer2", "subscription1", "subscription2"]
+
+
+def test_what_becomes_ready_meanwhile_waits_for_the_next_snapshot(bench: Bench) -> None:
+    """`late` is registered between the two others, but was not ready with them."""
+    starts = bench.subscribe("early", then=lambda: _send(late))
+    late = bench.subscribe("late")
+    last = bench.subscribe("last")
+    _send(starts)
+    _send(last)
+    bench.spin()
+    assert bench.diary == ["early", "last", "late"]
+
+
+def test_a_timer_that_expires_meanwhile_waits_for_the_next_snapshot(bench: Bench) -> None:
+    timer = bench.timer("timer", due_ns=time.monotonic_ns() + 3600_000 * MS, period_ns=10_000 * MS)
+
+    def expire() -> None:
+        timer.due_ns = time.monotonic_ns()
+
+    one, two = bench.subscribe("one", then=expire), bench.subscribe("two")
+    _send(one)
+    _send(two)
+    bench.spin()
+    assert bench.diary == ["one", "two", "timer"]
+
+
+def test_each_runs_at_most_once_per_snapshot(bench: Bench) -> None:
+    one, two = bench.subscribe("one"), bench.subscribe("two")
+    for _ in range(3):
+        _send(one)
+    for _ in range(2):
+        _send(two)
+    bench.spin()
+    assert bench.diary == ["one", "two", "one", "two", "one"]
+
+
+def test_a_timer_that_missed_periods_fires_once(bench: Bench) -> None:
+    start = time.monotonic_ns()
+    instants: list[int] = []
+
+    def body() -> None:
+        instants.append(time.monotonic_ns())
+        if len(instants) == 1:
+            time.sleep(0.045)  # over the expiries at 10, 20, 30 and 40 ms
+
+    timer = bench.timer("timer", due_ns=start, period_ns=10 * MS, then=body)
+    bench.executor.spin_until(start + 100 * MS, start + 95 * MS)
+    assert len(instants) <= 7, "missed expiries were made up for"
+    assert (timer.due_ns - start) % (10 * MS) == 0
+    assert all(instant >= start for instant in instants)
+    assert timer.due_ns > start + 95 * MS
+
+
+def test_no_timer_expires_after_the_last_moment_but_messages_are_still_taken(bench: Bench) -> None:
+    now = time.monotonic_ns()
+    publisher = bench.subscribe("subscription")
+    bench.timer("timer", due_ns=now + 20 * MS, period_ns=10 * MS, then=lambda: _send(publisher))
+    bench.executor.spin_until(now + 80 * MS, last_timer_ns=now + 25 * MS)
+    assert bench.diary == ["timer", "subscription"]
+
+
+def test_an_idle_executor_waits_until_the_end_and_not_less(bench: Bench) -> None:
+    stop = time.monotonic_ns() + 20 * MS
+    bench.executor.spin_until(stop, stop)
+    assert time.monotonic_ns() >= stop
+    assert len(bench.recorded("rclcpp_executor_wait_for_work")) < 10, "it spun instead of waiting"
+
+
+def test_a_slow_reader_keeps_the_last_messages_of_its_depth(bench: Bench) -> None:
+    publisher, subscription = bench.topic("/numbers", depth=2)
+    template = dds.message_template(8)
+    for number in range(1, 6):
+        publisher.write(dds.stamp_message(template, number), source_timestamp=1000 + number)
+    taken = [subscription.take() for _ in range(3)]
+    assert [m and m.source_timestamp for m in taken] == [1004, 1005, None]
+    assert not subscription.ready()
+
+
+def test_takes_are_recorded_with_the_source_timestamp(bench: Bench) -> None:
+    publisher = bench.subscribe("one")
+    payload = dds.stamp_message(dds.message_template(8), 5)
+    publisher.write(payload, source_timestamp=123_456_789)
+    bench.spin()
+    (take,) = bench.recorded("rmw_take")
+    handle = bench.executor.subscriptions[0].rmw_handle
+    assert (take[1], take[3], take[4]) == (handle, 123_456_789, 1)
+    (execute,) = bench.recorded("rclcpp_executor_execute")
+    assert execute[1] == bench.executor.subscriptions[0].handle
+
+
+def test_messages_travel_byte_for_byte(bench: Bench) -> None:
+    publisher, subscription = bench.topic("/bytes")
+    payload = dds.stamp_message(dds.message_template(1000), 1_700_000_000_123_456_789)
+    publisher.write(payload, source_timestamp=7)
+    message = subscription.take()
+    assert message is not None
+    assert message.payload[4:] == payload[4:], "all behind the encapsulation header"

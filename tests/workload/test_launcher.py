@@ -1,0 +1,184 @@
+"""The launcher: what dies says how, and nothing is left behind."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from processes import children_of, wait_for
+
+from chainshaper.errors import OperationError
+from chainshaper.workload.launcher import Child, end_all, first_casualty, start_child
+
+BODIES = {
+    "polite": "input()\ninput()",
+    "fails": "import sys\nsys.exit('earlier line\\ndisk on fire')",
+    "exits": "import sys\nsys.exit(3)",
+    "raises": "raise RuntimeError('no sensor')",
+    "crashes": "import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)",
+    "real_time_signal": "import os\nos.kill(os.getpid(), 40)",
+    "babbles": "print('hello', flush=True)\ninput()\ninput()",
+    "cut_off": "import json\nprint(json.dumps({'bytes': 100}), flush=True)\nprint('short')",
+    "says_its_pid": "import json, os\nprint(json.dumps({'pid': os.getpid()}), flush=True)\ninput()",
+    "stubborn": (
+        "import signal, time\n"
+        "for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):\n"
+        "    signal.signal(number, signal.SIG_IGN)\n"
+        "print('{}', flush=True)\n"
+        "while True:\n"
+        "    time.sleep(600)"
+    ),
+    "bound": (
+        "import json, time\n"
+        "from chainshaper.enforcement.realtime import die_with_parent\n"
+        "die_with_parent(json.loads(input())['parent'])\n"
+        "print('{}', flush=True)\n"
+        "while True:\n"
+        "    time.sleep(600)"  # it would never notice that the pipe is closed
+    ),
+}
+
+
+class Nursery:
+    """Starts children with given bodies; whatever a test does, they are gone after it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.children: list[Child] = []
+
+    def start(self, body: str) -> Child:
+        (self.folder / f"{body}.py").write_text(BODIES[body])
+        child = start_child(f"node {body}", body, {"PYTHONPATH": str(self.folder)})
+        self.children.append(child)
+        return child
+
+
+@pytest.fixture
+def nursery(tmp_path: Path) -> Iterator[Nursery]:
+    nursery = Nursery(tmp_path)
+    yield nursery
+    for child in nursery.children:
+        with contextlib.suppress(ProcessLookupError):
+            child.process.kill()
+        child.process.wait()
+
+
+@pytest.mark.parametrize(
+    ("body", "how"),
+    [
+        ("fails", "ended with code 1 before the run was over: disk on fire"),
+        ("exits", "ended with code 3 before the run was over"),
+        ("raises", "ended with code 1 before the run was over: RuntimeError: no sensor"),
+        ("crashes", "was killed by SIGSEGV before the run was over"),
+        ("real_time_signal", "was killed by signal 40 before the run was over"),
+    ],
+)
+def test_the_obituary_says_how_it_died_and_what_it_said_last(
+    nursery: Nursery, body: str, how: str
+) -> None:
+    child = nursery.start(body)
+    with pytest.raises(OperationError) as died:
+        child.hear()
+    assert str(died.value) == f"node {body} (pid {child.pid}) {how}"
+    assert first_casualty([child]) is child
+
+
+def test_a_child_killed_from_outside_is_a_casualty(nursery: Nursery) -> None:
+    healthy, victim = nursery.start("polite"), nursery.start("polite")
+    assert first_casualty([healthy, victim]) is None
+    os.kill(victim.pid, signal.SIGKILL)
+    wait_for(lambda: first_casualty([healthy, victim]) is victim, "the casualty to be noticed")
+    assert "was killed by SIGKILL" in victim.obituary()
+
+
+def test_a_child_that_babbles_is_not_taken_for_dead(nursery: Nursery) -> None:
+    child = nursery.start("babbles")
+    with pytest.raises(OperationError, match="sends something that is not part of the protocol"):
+        child.hear()
+    assert first_casualty([child]) is None
+
+
+def test_events_that_are_cut_off_are_not_taken_for_whole(nursery: Nursery) -> None:
+    child = nursery.start("cut_off")
+    with pytest.raises(OperationError, match="ended with code 0 before the run was over"):
+        child.hear_bytes(child.hear()["bytes"])
+
+
+def test_talking_to_a_dead_child_is_no_error_of_its_own(nursery: Nursery) -> None:
+    child = nursery.start("exits")
+    child.process.wait()
+    for _ in range(3):
+        child.tell(anything="x" * 100_000)
+
+
+def test_a_program_that_does_not_exist_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", "/no/python")
+    with pytest.raises(OperationError, match=r"node x cannot be started: .*/no/python"):
+        start_child("node x", "anything", {})
+
+
+def test_the_end_leaves_none_whatever_they_do(nursery: Nursery) -> None:
+    polite, stubborn = nursery.start("polite"), nursery.start("stubborn")
+    stopped, dead = nursery.start("says_its_pid"), nursery.start("exits")
+    stubborn.hear()
+    assert stopped.hear() == {"pid": stopped.pid}
+    os.kill(stopped.pid, signal.SIGSTOP)
+    dead.process.wait()
+
+    end_all([polite, stubborn, stopped, dead], patience_s=0.3)
+
+    for child in nursery.children:
+        assert child.process.returncode is not None
+        assert not Path(f"/proc/{child.pid}").exists(), f"{child.name} is still there"
+    assert polite.pid not in children_of(os.getpid())
+
+
+def test_a_polite_child_is_asked_before_it_is_killed(nursery: Nursery) -> None:
+    polite = nursery.start("says_its_pid")
+    polite.hear()
+    end_all([polite], patience_s=20)
+    assert polite.process.returncode == 0
+
+
+def test_children_are_out_of_reach_of_ctrl_c(nursery: Nursery) -> None:
+    child = nursery.start("polite")
+    assert os.getsid(child.pid) == child.pid != os.getsid(0)
+
+
+def test_children_die_when_their_launcher_is_killed(tmp_path: Path) -> None:
+    """SIGKILL leaves the launcher no time for anything: the kernel has to do it."""
+    (tmp_path / "bound.py").write_text(BODIES["bound"])
+    program = (
+        "import os, time\n"
+        "from chainshaper.workload.launcher import start_child\n"
+        f"environment = {{'PYTHONPATH': {str(tmp_path)!r}}}\n"
+        "children = [start_child(f'node {i}', 'bound', environment) for i in range(2)]\n"
+        "for child in children:\n"
+        "    child.tell(parent=os.getpid())\n"
+        "    child.hear()\n"
+        "print(*[child.pid for child in children], flush=True)\n"
+        "time.sleep(600)\n"
+    )
+    launcher = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    try:
+        assert launcher.stdout is not None
+        pids = [int(pid) for pid in launcher.stdout.readline().split()]
+        assert len(pids) == 2
+        assert all(Path(f"/proc/{pid}").exists() for pid in pids)
+    finally:
+        launcher.kill()
+        launcher.communicate()
+    wait_for(lambda: not any(_alive(pid) for pid in pids), "the kernel to end the children")
+
+
+def _alive(pid: int) -> bool:
+    """Whether a process runs; one that is dead but not yet waited for does not."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state not in ("Z", "X")

@@ -1,0 +1,275 @@
+"""The real thing: processes, DDS topics, threads as the description allocates them."""
+
+import gc
+import os
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from numpy.typing import NDArray
+from processes import children_of, real_time_threads
+from small_chain import DDS_CORE, EXECUTOR_CORE, NODES, PERIOD_NS, small_chain, small_chain_text
+
+from chainshaper import measure_latency, run_application, shape_application
+from chainshaper.enforcement.realtime import may_use_fifo
+from chainshaper.errors import InputError, OperationError, PlatformError
+from chainshaper.planning import Plan, publish_slots
+from chainshaper.planning.plan import revised
+from chainshaper.recording import Recording, ThreadInfo
+from chainshaper.workload import live
+from chainshaper.workload.description import Application, load_application
+from chainshaper.workload.execution import ExecutionTimes
+
+CYCLES = 12
+
+needs_fifo = pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here")
+
+
+@pytest.fixture(scope="module")
+def ordinary(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """A run without any privilege."""
+    folder = tmp_path_factory.mktemp("ordinary")
+    before = _own_state()
+    recording = run_application(small_chain(folder), folder / "rec", cycles=CYCLES, realtime=False)
+    assert _own_state() == before, "the caller is not as it was"
+    return recording
+
+
+@pytest.fixture(scope="module")
+def privileged(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """A run with real-time scheduling."""
+    if not may_use_fifo():
+        pytest.skip("SCHED_FIFO is not permitted here")
+    folder = tmp_path_factory.mktemp("privileged")
+    before = _own_state()
+    recording = run_application(small_chain(folder), folder / "rec", cycles=CYCLES, realtime=True)
+    assert _own_state() == before, "the caller is not as it was"
+    return recording
+
+
+def _own_state() -> tuple[object, ...]:
+    """What a run might change in the process that calls it."""
+    return (
+        os.sched_getscheduler(0),
+        os.sched_getparam(0).sched_priority,
+        os.sched_getaffinity(0),
+        gc.isenabled(),
+        gc.get_freeze_count(),
+        os.environ.get("CYCLONEDDS_URI"),
+        children_of(os.getpid()),
+        real_time_threads([os.getpid()]),
+    )
+
+
+def _count_of(recording: Recording, event: str) -> dict[str, int]:
+    """How often each node recorded an event."""
+    names = recording.info.processes
+    counted = recording.events[event].group_by("pid").len().rows()
+    return {names[pid]: count for pid, count in counted}
+
+
+@needs_fifo
+def test_every_cycle_is_recorded_once_in_every_node(privileged: Recording) -> None:
+    everywhere = dict.fromkeys((f"/{name}" for name in NODES), CYCLES)
+    assert _count_of(privileged, "callback_start") == everywhere
+    assert _count_of(privileged, "callback_end") == everywhere
+    del everywhere["/actuator"]
+    for event in ("rclcpp_publish", "rcl_publish", "rmw_publish"):
+        assert _count_of(privileged, event) == everywhere
+    takes = privileged.events["rmw_take"]
+    assert takes["taken"].to_list() == [1] * (3 * CYCLES)
+
+
+def test_without_privileges_every_message_arrives_as_well(ordinary: Recording) -> None:
+    counts = _count_of(ordinary, "callback_start")
+    # Without real-time scheduling a busy machine may make the timer miss whole periods.
+    assert 1 <= counts["/first"] <= CYCLES
+    assert counts == dict.fromkeys((f"/{name}" for name in NODES), counts["/first"])
+
+
+@pytest.mark.parametrize("run", ["ordinary", "privileged"])
+def test_every_traversal_is_complete(run: str, request: pytest.FixtureRequest) -> None:
+    recording: Recording = request.getfixturevalue(run)
+    statistics = measure_latency(recording).analysis.statistics
+    assert statistics.incomplete == 0
+    assert statistics.count == _count_of(recording, "callback_start")["/first"]
+    assert statistics.min_ns is not None
+    assert statistics.min_ns >= 3_000_000, "three callbacks of 1 ms and more"
+
+
+def _threads(recording: Recording, role: str) -> list[ThreadInfo]:
+    return [thread for thread in recording.info.threads if thread.role == role]
+
+
+@needs_fifo
+def test_threads_are_allocated_as_described(privileged: Recording) -> None:
+    executors = {thread.node: thread for thread in _threads(privileged, "executor")}
+    assert set(executors) == {f"/{name}" for name in NODES}
+    for thread in executors.values():
+        assert thread.comm == thread.node.strip("/")
+        assert (thread.policy, thread.priority) == ("SCHED_FIFO", 80)
+        assert thread.cores == (EXECUTOR_CORE,)
+    dds_threads = _threads(privileged, "dds")
+    assert {thread.node for thread in dds_threads} == set(executors)
+    for thread in dds_threads:
+        assert (thread.policy, thread.priority) == ("SCHED_FIFO", 90)
+        assert thread.cores == (DDS_CORE,)
+    meters = _threads(privileged, "stall-meter")
+    assert {thread.cores for thread in meters} == {(DDS_CORE,), (EXECUTOR_CORE,)}
+    assert {(thread.policy, thread.priority) for thread in meters} == {("SCHED_FIFO", 98)}
+    assert privileged.info.realtime is True
+
+
+def test_without_privileges_threads_have_their_cores_and_the_recording_says_so(
+    ordinary: Recording,
+) -> None:
+    assert {thread.policy for thread in ordinary.info.threads} == {"SCHED_OTHER"}
+    assert {t.cores for t in _threads(ordinary, "executor")} == {(EXECUTOR_CORE,)}
+    assert {t.cores for t in _threads(ordinary, "dds")} == {(DDS_CORE,)}
+    assert ordinary.info.realtime is False
+    assert any("without real-time scheduling" in note for note in ordinary.info.notes)
+
+
+@pytest.mark.parametrize("run", ["ordinary", "privileged"])
+def test_no_process_is_left(run: str, request: pytest.FixtureRequest) -> None:
+    recording: Recording = request.getfixturevalue(run)
+    for pid in {thread.pid for thread in recording.info.threads}:
+        assert not Path(f"/proc/{pid}").exists()
+    assert children_of(os.getpid()) == []
+
+
+def test_the_recording_says_what_ran(ordinary: Recording, tmp_path: Path) -> None:
+    info = ordinary.info
+    assert (info.source, info.rmw, info.chain) == ("live", "cyclonedds", "/t1../t3")
+    assert set(info.processes.values()) == {f"/{name}" for name in NODES}
+    assert info.application is not None
+    assert info.application["nodes"]["first"]["callbacks"][0]["timer"] == "50ms"
+    assert info.stall_meter is not None
+    assert info.stall_meter.cores == tuple(sorted({DDS_CORE, EXECUTOR_CORE}))
+    assert info.stall_meter.wakeups > CYCLES
+    topics = ordinary.events["rcl_publisher_init"]["topic_name"]
+    assert set(topics) == {"/t1", "/t2", "/t3"}
+
+
+@needs_fifo
+def test_the_seed_determines_the_execution_times(privileged: Recording) -> None:
+    """Each instance spends what its place in the sequence says, and little more."""
+    for index, node in enumerate(("/first", "/second", "/third")):
+        (pid,) = (pid for pid, name in privileged.info.processes.items() if name == node)
+        drawn = ExecutionTimes({"uniform_ns": (1_000_000, 4_000_000)}, 7, node, 0)
+        expected = np.array([drawn.next() for _ in range(live.WARM_UP_CYCLES + CYCLES)])
+        spent = _cpu_time(privileged, pid)
+        excess = spent - expected[live.WARM_UP_CYCLES :]
+        assert (excess >= 0).all(), f"node {index} computed for less than was drawn"
+        assert np.median(excess) < 500_000, "that is not the drawn sequence"
+
+
+@needs_fifo
+def test_a_shaped_run_spends_the_same_times(privileged: Recording, shaped: Recording) -> None:
+    for node in ("/first", "/second", "/third"):
+        spent = []
+        for recording in (privileged, shaped):
+            (pid,) = (pid for pid, name in recording.info.processes.items() if name == node)
+            spent.append(_cpu_time(recording, pid))
+        assert np.median(np.abs(spent[0] - spent[1])) < 500_000
+
+
+def _cpu_time(recording: Recording, pid: int) -> NDArray[np.int64]:
+    start, end = (
+        recording.events[name].filter(pl.col("pid") == pid)["thread_time"]
+        for name in ("callback_start", "callback_end")
+    )
+    return (end - start).to_numpy().astype(np.int64)
+
+
+def _check_releases(recording: Recording, plan: Plan) -> pl.DataFrame:
+    """Every message left inside a slot or later, and never before it arrived."""
+    releases = recording.events["gate_release"]
+    assert releases.height >= 1
+    ((start, end),) = publish_slots(plan)
+    since_start = (releases["release"] - releases["origin"]) % plan.cycle_ns
+    assert since_start.is_between(start, end - 1).all()
+    assert (releases["release"] >= releases["arrival"]).all()
+    assert (releases["time"] >= releases["release"]).all(), "it left before its release"
+    waited = (releases["release"] - releases["origin"]) // plan.cycle_ns
+    assert releases["cycles_waited"].to_list() == waited.to_list()
+    overruns = measure_latency(recording).overruns
+    assert overruns == (releases["cycles_waited"] > 0).sum()
+    return releases
+
+
+def test_shaped_outputs_leave_in_their_slot_or_are_counted(shaped: Recording, plan: Plan) -> None:
+    releases = _check_releases(shaped, plan)
+    assert set(releases["anchor"]) == {"stamp"}
+    assert releases.height == _count_of(shaped, "callback_start")["/first"]
+    measured = measure_latency(shaped)
+    assert measured.plan == plan
+    assert measured.analysis.statistics.incomplete == 0
+    assert measured.analysis.chain.topics == ("/t1", "/t2", "/t3_tmp", "/t3")
+    if measured.overruns == 0:
+        assert measured.analysis.statistics.min_ns is not None
+        # The stamp is read a moment before the callback's start is; 0.1 ms is far above that.
+        assert measured.analysis.statistics.min_ns >= publish_slots(plan)[0][0] - 100_000
+
+
+def test_anchored_to_the_cycle_the_output_is_strictly_periodic(tmp_path: Path, plan: Plan) -> None:
+    plan = revised(plan, anchor="cycle")
+    recording = shape_application(small_chain(tmp_path), plan, tmp_path / "rec", cycles=CYCLES)
+    releases = _check_releases(recording, plan)
+    assert set(releases["anchor"]) == {"cycle"}
+    held = releases.filter(pl.col("release") > pl.col("arrival"))["release"]
+    assert held.len() > 0
+    assert set((held - held[0]) % PERIOD_NS) == {0}
+
+
+def test_asynchronous_publication_has_a_thread_of_its_own(tmp_path: Path) -> None:
+    application = small_chain(tmp_path, publication="asynchronous")
+    recording = run_application(application, tmp_path / "rec", cycles=CYCLES)
+    (publisher,) = _threads(recording, "publisher")
+    assert (publisher.node, publisher.comm) == ("/third", "dds.asyn.0")
+    assert publisher.cores == (EXECUTOR_CORE,)
+    if recording.info.realtime:
+        assert (publisher.policy, publisher.priority) == ("SCHED_FIFO", 79), "below its executor"
+    statistics = measure_latency(recording).analysis.statistics
+    assert statistics.incomplete == 0
+    assert statistics.count == _count_of(recording, "callback_start")["/first"]
+
+
+def test_what_cannot_run_is_refused_before_anything_starts(tmp_path: Path) -> None:
+    application = small_chain(tmp_path)
+    started: list[float] = []
+
+    def report(share: float, what: str) -> None:
+        started.append(share)
+
+    with pytest.raises(InputError, match="0 cycles cannot be recorded"):
+        run_application(application, tmp_path / "rec", cycles=0, progress=report)
+    with pytest.raises(InputError, match="exists already"):
+        run_application(application, tmp_path, progress=report)
+    with pytest.raises(PlatformError, match="core 1023, which node first asks for"):
+        run_application(_elsewhere(tmp_path), tmp_path / "rec", progress=report)
+    with pytest.raises(InputError, match="no timer callback publishes or belongs to '/t2'"):
+        run_application(
+            application.model_copy(update={"chain": "/t2../t3"}), tmp_path / "rec", progress=report
+        )
+    assert started == []
+    assert not (tmp_path / "rec").exists()
+
+
+def _elsewhere(folder: Path) -> Application:
+    path = folder / "elsewhere.yaml"
+    text = small_chain_text().replace("  first:\n", "  first:\n    core: 1023\n")
+    path.write_text(text)
+    return load_application(path)
+
+
+def test_a_caller_that_gives_up_leaves_nothing(tmp_path: Path) -> None:
+    def give_up(share: float, what: str) -> None:
+        if what == "recording":
+            raise OperationError("enough")
+
+    with pytest.raises(OperationError, match="enough"):
+        run_application(small_chain(tmp_path), tmp_path / "rec", progress=give_up)
+    assert children_of(os.getpid()) == []
+    assert [entry.name for entry in tmp_path.iterdir()] == ["small_chain.yaml"]
