@@ -5,6 +5,7 @@ that exists is whole. `recording.json` says under which conditions the events we
 what was lost on the way: figures computed from a recording are only as good as these facts.
 """
 
+import io
 import json
 import os
 import platform
@@ -208,9 +209,12 @@ def write_recording(path: str | Path, tables: events.EventTables, info: Recordin
             tempfile.mkdtemp(prefix=f".{path.name}.partial-", dir=path.absolute().parent)
         )
         for name, frame in tables.items():
-            file = partial / f"{name}.parquet"
-            with file.open("wb") as stream:
-                frame.write_parquet(stream, compression="zstd")
+            # By way of memory: writing to a file itself, Polars reports a full disk as a file
+            # that is out of specification.
+            content = io.BytesIO()
+            frame.write_parquet(content, compression="zstd")
+            with (partial / f"{name}.parquet").open("wb") as stream:
+                stream.write(content.getbuffer())
                 stream.flush()
                 os.fsync(stream.fileno())
         (partial / INFO_FILE).write_text(info.model_dump_json(indent=2) + "\n")

@@ -40,8 +40,9 @@ def refused(code: int, *arguments: str | Path) -> str:
     assert finished.code == code, finished
     assert finished.out == ""
     assert "Traceback" not in finished.err
-    assert finished.err.count("error: ") == 1, finished.err
-    return finished.err[finished.err.index("error: ") :]
+    messages = [line for line in finished.err.splitlines() if line.startswith("error: ")]
+    assert len(messages) == 1, finished.err
+    return finished.err[finished.err.index(messages[0]) :]
 
 
 def json_of(*arguments: str | Path) -> Any:

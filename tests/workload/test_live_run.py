@@ -180,7 +180,7 @@ def _cpu_time(recording: Recording, pid: int) -> NDArray[np.int64]:
         recording.events[name].filter(pl.col("pid") == pid)["thread_time"]
         for name in ("callback_start", "callback_end")
     )
-    return (end - start).to_numpy().astype(np.int64)
+    return np.array((end - start).to_list(), dtype=np.int64)
 
 
 def _check_releases(recording: Recording, plan: Plan) -> pl.DataFrame:

@@ -53,12 +53,12 @@ def find_chain(graph: ApplicationGraph, spec: str) -> Chain:
         InputError: a topic or node that does not exist, no path, only a cyclic one, or several.
     """
     search, stages = _search(graph, spec, parse_chain(spec))
-    found, complete = search.listed(HANDFUL + 1)
-    chains = list(dict.fromkeys(_chain(spec, path) for path in found))
+    listing = search.listed(HANDFUL + 1)
+    chains = list(dict.fromkeys(_chain(spec, path) for path in listing.paths))
     if not chains:
         raise InputError(_no_path(graph, spec, search, stages))
-    if len(chains) > 1 or not complete:
-        raise InputError(_ambiguous(graph, spec, chains, complete))
+    if len(chains) > 1 or not listing.complete:
+        raise InputError(_ambiguous(graph, spec, chains, listing.complete))
     return chains[0]
 
 
@@ -69,8 +69,8 @@ class ChainEnumeration:
     ``chains`` are all of them if ``complete``, else the first ones found. ``count`` says how many
     there are; where the graph between the two places has cycles, it is only a lower bound (not
     ``exact``): the chains that never step back in one order of callbacks and topics, or those
-    listed if they are more. ``heaviest`` has the largest sum of mean response times
-    (``heaviest_ns``) among the counted and the listed chains.
+    met while listing if they are more. ``heaviest`` has the largest sum of mean response times
+    (``heaviest_ns``) among the counted and the listed chains; None without response times.
     """
 
     chains: tuple[Chain, ...]
@@ -78,7 +78,7 @@ class ChainEnumeration:
     count: int
     exact: bool
     heaviest: Chain | None
-    heaviest_ns: float
+    heaviest_ns: float | None
 
 
 def enumerate_chains(
@@ -102,22 +102,22 @@ def enumerate_chains(
     search, stages = _search(graph, spec, waypoints, start is None, end is None)
     weights = response_ns or {}
     count, heaviest_path, heaviest_ns = search.counted(weights)
-    found, complete = search.listed(limit)
-    if not found and waypoints:
+    listing = search.listed(limit)
+    if not listing.paths and waypoints:
         raise InputError(_no_path(graph, spec, search, stages))
-    chains = tuple(dict.fromkeys(_chain(None, path) for path in found))
-    heaviest = _chain(None, heaviest_path) if heaviest_path else None
-    for chain in chains:
+    chains = tuple(dict.fromkeys(_chain(None, path) for path in listing.paths))
+    heaviest = _chain(None, heaviest_path) if heaviest_path and weights else None
+    for chain in chains if weights else ():
         weight = sum(weights.get(callback, 0.0) for callback in chain.callbacks)
         if heaviest is None or weight > heaviest_ns:
             heaviest, heaviest_ns = chain, weight
     return ChainEnumeration(
         chains=chains,
-        complete=complete,
-        count=len(chains) if complete else max(count, len(chains)),
-        exact=complete or not search.cyclic,
+        complete=listing.complete,
+        count=len(chains) if listing.complete else max(count, listing.count),
+        exact=listing.complete or not search.cyclic,
         heaviest=heaviest,
-        heaviest_ns=heaviest_ns,
+        heaviest_ns=heaviest_ns if heaviest else None,
     )
 
 

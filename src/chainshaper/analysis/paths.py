@@ -2,12 +2,13 @@
 
 A path alternates between callbacks and topics and meets given way points in their order. Real
 applications have cycles and wide fan-in, so the number of simple paths grows exponentially, and
-counting them is #P-hard. Three things keep the answers quick:
+counting them is #P-hard. Four things keep the answers quick:
 
 * only vertices that lie between a start and an end at all are looked at;
 * where these form no cycle, every step forward leads to an end, so listing needs no search;
-  where they do, one search backwards from the ends per step finds the steps that still lead
-  somewhere without meeting the path itself, so no dead end is ever entered;
+* where they do, paths are listed by length; if short ones are few, one search backwards from the
+  ends per step finds the steps that still lead somewhere without meeting the path itself, so
+  that no dead end is ever entered; both have a budget;
 * counting and the heaviest path come from dynamic programming over the edges that agree with one
   order of the vertices (:mod:`~chainshaper.analysis.ordering`): exact without cycles, with cycles
   the paths that never step back in that order, so the count is a lower bound.
@@ -21,7 +22,7 @@ from chainshaper.analysis.objects import INTERNAL_TOPICS
 from chainshaper.analysis.ordering import depth_first_order, greedy_order
 from chainshaper.app import ApplicationGraph, Callback
 
-__all__ = ["Path", "PathSearch", "Stage", "Vertex"]
+__all__ = ["Listing", "Path", "PathSearch", "Stage", "Vertex"]
 
 Vertex = int | str
 """A callback's id, or a topic's name."""
@@ -31,8 +32,11 @@ State = tuple[Vertex, int]
 
 Path = tuple[Vertex, ...]
 
-SEARCHES = 150
-"""Backward searches that one listing may spend where there are cycles, about 1 ms each."""
+STEPS = 100_000
+"""Steps that looking for short paths may take where there are cycles, about 1 µs each."""
+
+SEARCHES = 100
+"""Backward searches that looking for all paths may take then, about 1 ms each."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,15 @@ class Stage:
 
     name: str
     vertices: frozenset[Vertex]
+
+
+@dataclass(frozen=True)
+class Listing:
+    """``paths`` that were found, whether they are all, and how many were met on the way."""
+
+    paths: tuple[Path, ...]
+    complete: bool
+    count: int
 
 
 @dataclass
@@ -57,6 +70,7 @@ class PathSearch:
     accepts: Callable[[State, Callback | None], bool]
     successors: dict[State, tuple[State, ...]] = field(init=False)
     ends: set[State] = field(init=False)
+    distance: dict[State, int] = field(init=False)
     roots: tuple[State, ...] = field(init=False)
     cyclic: bool = field(init=False)
     furthest: int = field(init=False)
@@ -73,7 +87,7 @@ class PathSearch:
         roots = [self._enter(start, 0) for start in sorted(self.starts)]
         self.successors = self._reachable(roots)
         self.ends = {state for state in self.successors if self._is_end(state)}
-        useful = _distances(self.successors, self.ends)
+        useful = self.distance = _distances(self.successors, self.ends)
         self.furthest = max((met for _, met in self.successors), default=0)
         self.reached = frozenset(v for v, met in self.successors if met == self.furthest)
         self.successors = {
@@ -123,14 +137,25 @@ class PathSearch:
                 if met > 0 or entered[1] > 0:
                     yield entered
 
-    def listed(self, limit: int) -> tuple[tuple[Path, ...], bool]:
-        """Up to ``limit`` paths, short ones first where there is a choice; whether that is all."""
+    def listed(self, limit: int) -> "Listing":
+        """Up to ``limit`` paths. Where there are cycles, the shortest ones first."""
+        if not self.cyclic:
+            paths, complete = self._one_after_another(limit)
+            return Listing(paths, complete, len(paths))
+        shortest, count, complete = self._by_length(limit)
+        if complete or len(shortest) == limit:
+            return Listing(shortest, complete and count == len(shortest), count)
+        others, complete = self._one_after_another(limit)
+        paths = tuple(dict.fromkeys((*shortest, *others)))
+        return Listing(paths[:limit], complete, max(count, len(paths)))
+
+    def _one_after_another(self, limit: int) -> tuple[tuple[Path, ...], bool]:
+        """Up to ``limit`` paths without entering a dead end, and whether that is all."""
         found: list[Path] = []
         searches = 0
-        stack: list[tuple[State, Iterator[State]]] = []
         for root in self.roots:
             on_path: set[Vertex] = set()
-            stack = [((root[0], -1), iter((root,)))]
+            stack: list[tuple[State, Iterator[State]]] = [((root[0], -1), iter((root,)))]
             while stack:
                 state = next(stack[-1][1], None)
                 if state is None:
@@ -152,6 +177,45 @@ class PathSearch:
                     following = self._leading_on(state, on_path)
                 stack.append((state, iter(following)))
         return tuple(found), True
+
+    def _by_length(self, limit: int) -> tuple[tuple[Path, ...], int, bool]:
+        """The shortest paths: up to ``limit`` of them, how many were met, whether that is all.
+
+        Iterative deepening: no step is taken from which the nearest end is too far for the bound,
+        which keeps dead ends few while the bound is near the shortest length.
+        """
+        found: list[Path] = []
+        count, steps = 0, STEPS
+        before, bound = 0, min((self.distance[root] for root in self.roots), default=0)
+        while True:
+            beyond = False
+            for root in self.roots:
+                on_path: set[Vertex] = set()
+                stack: list[tuple[State, Iterator[State]]] = [((root[0], -1), iter((root,)))]
+                while stack:
+                    state = next(stack[-1][1], None)
+                    if state is None:
+                        on_path.discard(stack.pop()[0][0])
+                        continue
+                    steps -= 1
+                    if steps == 0:
+                        return tuple(found), count, False
+                    length = len(stack) - 1
+                    if state[0] in on_path:
+                        continue
+                    if length + self.distance[state] > bound:
+                        beyond = True
+                    elif state in self.ends:
+                        if length > before:
+                            count += 1
+                            if len(found) < limit:
+                                found.append((*(s[0] for s, _ in stack[1:]), state[0]))
+                    else:
+                        on_path.add(state[0])
+                        stack.append((state, iter(self.successors[state])))
+            if not beyond:
+                return tuple(found), count, True
+            before, bound = bound, bound + 2  # a hop is a callback and a topic
 
     def _leading_on(self, state: State, on_path: set[Vertex]) -> tuple[State, ...]:
         """The successors from which an end can be reached without meeting the path again."""
