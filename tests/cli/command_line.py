@@ -1,17 +1,29 @@
-"""The real command line in a process of its own, as a person or a script runs it."""
+"""The command line as a person or a script runs it.
 
+Starting an interpreter and loading what a verb needs takes a second. What is about processes
+(exit codes, pipes, signals) runs in a process of its own; what is about one verb's words and
+figures calls the same entry point here.
+"""
+
+import contextlib
+import io
 import json
 import os
+import signal
 import subprocess
 import sys
 import uuid
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 from processes import marked_processes, wait_for
 
-__all__ = ["Running", "chainshaper", "json_of", "refused"]
+from chainshaper.cli import main
+
+__all__ = ["Finished", "Running", "called", "chainshaper", "json_of", "message_of", "refused"]
 
 
 @dataclass(frozen=True)
@@ -31,12 +43,39 @@ def chainshaper(*arguments: str | Path, prefix: tuple[str, ...] = ()) -> Finishe
     return Finished(run.returncode, run.stdout, run.stderr)
 
 
-def refused(code: int, *arguments: str | Path) -> str:
-    """The message of a command that must fail with this exit code.
+def called(*arguments: str | Path) -> Finished:
+    """The same, by a call of the entry point in this process."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        mock.patch.object(sys, "argv", ["chainshaper", *map(str, arguments)]),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        _signal_handlers_kept(),
+    ):
+        code = 0
+        try:
+            main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return Finished(code, out.getvalue(), err.getvalue())
+
+
+@contextlib.contextmanager
+def _signal_handlers_kept() -> Iterator[None]:
+    numbers = (signal.SIGTERM, signal.SIGHUP)
+    before = [signal.getsignal(number) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+def message_of(finished: Finished, code: int) -> str:
+    """The message of a command that had to fail with this exit code.
 
     One clear message, and nothing else: no traceback, and no result that a script could take.
     """
-    finished = chainshaper(*arguments)
     assert finished.code == code, finished
     assert finished.out == ""
     assert "Traceback" not in finished.err
@@ -45,9 +84,14 @@ def refused(code: int, *arguments: str | Path) -> str:
     return finished.err[finished.err.index(messages[0]) :]
 
 
+def refused(code: int, *arguments: str | Path) -> str:
+    """The message of a command that must fail with this exit code."""
+    return message_of(called(*arguments), code)
+
+
 def json_of(*arguments: str | Path) -> Any:
     """The one JSON document that a successful command prints."""
-    finished = chainshaper(*arguments, "--json")
+    finished = called(*arguments, "--json")
     assert finished.code == 0, finished
     return json.loads(finished.out)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import chainshaper, refused
+from command_line import called, chainshaper, message_of, refused
 from small_chain import small_chain_text
 
 from chainshaper.planning import Plan, save_plan
@@ -20,32 +20,32 @@ from chainshaper.recording import Recording
         ("/t3../t1", "/t3../t1"),  # against the flow
         ("/t1../t2../t1", "stands twice"),  # cyclic
         ("/t1..", "way points"),
-        ("", "names no chain"),
     ],
 )
 @pytest.mark.parametrize("verb", ["latency", "plan"])
 def test_a_chain_that_does_not_exist(verb: str, chain: str, said: str, unshaped: Recording) -> None:
-    if chain == "":
-        pytest.skip("an empty --chain means the recording's own")
     assert said in refused(2, verb, unshaped.path, "--chain", chain)
 
 
 @pytest.mark.parametrize("verb", ["run", "shape"])
 @pytest.mark.parametrize(
-    ("right", "wrong", "said"),
+    ("change", "said"),
     [
-        ("subscription: /t2", "subscription: /t9", "subscription: no node publishes /t9"),
-        ("chain: /t1../t3", "chain: /t1../brake", ":2: chain: no topic or node is called '/brake'"),
-        ("chain: /t1../t3", "chain: /t2../t3", "no timer callback publishes or belongs to '/t2'"),
-        ("timer: 50ms", "timer: 50", "50 is not a duration: write a number and a unit"),
-        ("publishes: [/t3]", "publishes: [/t3, /t1]", "the topics form a cycle"),
-        ("nodes:", "nodes: [", "not YAML"),
+        (("subscription: /t2", "subscription: /t9"), "subscription: no node publishes /t9"),
+        (
+            ("chain: /t1../t3", "chain: /t1../brake"),
+            ":2: chain: no topic or node is called '/brake'",
+        ),
+        (("chain: /t1../t3", "chain: /t2../t3"), "no timer callback publishes or belongs to '/t2'"),
+        (("timer: 50ms", "timer: 50"), "50 is not a duration: write a number and a unit"),
+        (("publishes: [/t3]", "publishes: [/t3, /t1]"), "the topics form a cycle"),
+        (("nodes:", "nodes: ["), "not YAML"),
     ],
 )
 def test_a_mistake_in_the_application(
-    verb: str, right: str, wrong: str, said: str, application_file: Path, plan: Plan
+    verb: str, change: tuple[str, str], said: str, application_file: Path, plan: Plan
 ) -> None:
-    application_file.write_text(small_chain_text().replace(right, wrong))
+    application_file.write_text(small_chain_text().replace(*change))
     output = application_file.parent / "recording"
     arguments: list[str | Path] = [application_file]
     if verb == "shape":
@@ -228,8 +228,30 @@ def test_options_that_do_not_go_together(tmp_path: Path, unshaped: Recording) ->
     ],
 )
 def test_wrong_use_ends_with_2_and_a_hint(arguments: tuple[str, ...]) -> None:
-    finished = chainshaper(*arguments)
+    finished = called(*arguments)
     assert finished.code == 2
     assert finished.out == ""
     assert "Usage: chainshaper" in finished.err
     assert "Traceback" not in finished.err
+
+
+def test_the_exit_code_of_the_process_tells_the_kinds_of_failure_apart(
+    application_file: Path, unshaped: Recording
+) -> None:
+    folder = application_file.parent
+    latencies = folder / "latencies.txt"
+    latencies.write_text("30ms\n120ms\n")
+    elsewhere = folder / "elsewhere.yaml"
+    elsewhere.write_text(small_chain_text(executor_core=1023))
+    for code, arguments in (
+        (0, ("callbacks", unshaped.path)),
+        (1, ("plan", "--latencies", latencies, "--period", "100ms")),
+        (2, ("latency", unshaped.path, "--chain", "/t1../t9")),
+        (2, ("run", latencies, "-o", folder / "recording")),
+        (3, ("run", elsewhere, "-o", folder / "recording")),
+    ):
+        finished = chainshaper(*arguments)
+        if code == 0:
+            assert finished.code == 0
+        else:
+            message_of(finished, code)

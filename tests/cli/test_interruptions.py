@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from command_line import Running, chainshaper, refused
+from command_line import Running, chainshaper, message_of
 from processes import wait_for
 from small_chain import NODES
 
@@ -91,7 +91,8 @@ def test_a_full_disk_is_named_and_nothing_stays_on_it(
     application_file: Path, full_disk: Path
 ) -> None:
     path = full_disk / "recording"
-    said = refused(1, "run", application_file, "-o", path, "--cycles", "2")
+    finished = chainshaper("run", application_file, "-o", path, "--cycles", "2")
+    said = message_of(finished, 1)
     assert f"{path}: the recording cannot be written" in said
     assert "No space left on device" in said
     assert [entry.name for entry in full_disk.iterdir()] == ["filling"]

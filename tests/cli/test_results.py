@@ -1,10 +1,11 @@
 """What verbs print when all is well: for people on stdout, for scripts as JSON."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import chainshaper, json_of
+from command_line import called, chainshaper, json_of
 from small_chain import DDS_CORE, EXECUTOR_CORE, small_chain_text
 
 from chainshaper import load_plan, measure_latency, open_recording
@@ -21,7 +22,7 @@ STATISTICS = {
 @pytest.mark.parametrize("verb", VERBS)
 def test_every_verb_explains_itself(verb: str) -> None:
     for option in ("--help", "-h"):
-        finished = chainshaper(verb, option)
+        finished = called(verb, option)
         assert finished.code == 0
         assert f"Usage: chainshaper {verb}" in finished.out
         assert finished.err == ""
@@ -42,6 +43,12 @@ def test_latency_as_json_is_what_the_library_finds(unshaped: Recording) -> None:
     assert (values["min_ns"], values["max_ns"]) == (found.min_ns, found.max_ns)
     assert values["jitter_ns"] == values["max_ns"] - values["min_ns"]
     assert all(isinstance(values[key], int) for key in ("min_ns", "mean_ns", "max_ns", "spread_ns"))
+
+
+def test_a_process_prints_its_document_and_nothing_else(unshaped: Recording) -> None:
+    finished = chainshaper("latency", unshaped.path, "--json")
+    assert (finished.code, finished.err) == (0, "")
+    assert json.loads(finished.out) == json_of("latency", unshaped.path)
 
 
 def test_instances_are_in_wall_clock_time(unshaped: Recording) -> None:
@@ -114,7 +121,7 @@ def test_compare_as_json_and_with_figures(
     assert before["count"] == after["count"] or not unshaped.info.realtime
     for name in ("latency.png", "distribution.png"):
         assert (figures / name).read_bytes().startswith(b"\x89PNG")
-    again = chainshaper("compare", unshaped.path, shaped.path, "--figures", figures)
+    again = called("compare", unshaped.path, shaped.path, "--figures", figures)
     assert again.code == 2
     assert "exists already and is not overwritten" in again.err
 
@@ -151,17 +158,17 @@ def test_demo_keeps_everything_in_one_folder(application_file: Path) -> None:
 
 
 def test_tables_are_for_people(unshaped: Recording, shaped: Recording) -> None:
-    latency = chainshaper("latency", unshaped.path).out
+    latency = called("latency", unshaped.path).out
     assert "End-to-end latency of /t1../t3 [ms]" in latency, "figures without a unit"
     assert "cycles disturbed by the machine" in latency
-    callbacks = chainshaper("callbacks", unshaped.path).out
+    callbacks = called("callbacks", unshaped.path).out
     assert "Callbacks [ms]" in callbacks
     assert "/actuator" in callbacks
-    compared = chainshaper("compare", unshaped.path, shaped.path)
+    compared = called("compare", unshaped.path, shaped.path)
     assert "before" in compared.out
     assert "after" in compared.out
     assert "slots [21.000, 22.000)" in compared.out
-    plan = chainshaper("plan", unshaped.path)
+    plan = called("plan", unshaped.path)
     assert "Plan for /t1../t3 [ms]" in plan.out
     assert "note: the sample is small" in plan.err
 

@@ -154,4 +154,5 @@ def _running_time(tables: events.EventTables) -> pl.DataFrame:
     changes = pl.concat([ran_from_start, changes]).sort("tid", "switched", maintain_order=True)
     elapsed = (pl.col("switched") - pl.col("switched").shift(1)).over("tid")
     ran = pl.when(pl.col("running").shift(1).over("tid")).then(elapsed).otherwise(0)
-    return changes.with_columns(ran.fill_null(0).cum_sum().over("tid").alias("used"))
+    changes = changes.with_columns(ran.fill_null(0).alias("used"))
+    return changes.with_columns(pl.col("used").cum_sum().over("tid"))

@@ -28,7 +28,7 @@ import polars as pl
 
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.graph import MESSAGE_FILTER, goes_on_elsewhere, graph_of
-from chainshaper.analysis.matching import first_after
+from chainshaper.analysis.matching import by_number, first_after
 from chainshaper.analysis.messages import overwritten_in
 from chainshaper.app import ApplicationGraph, Callback, Chain
 
@@ -221,8 +221,9 @@ def _why_not_taken(
     if not flow.publications["intra_time"].count():
         return reason
     overwritten = overwritten_in(flow.events, flow.publications, flow.objects.buffers, callback.id)
-    gone = publication.is_in(overwritten.implode())
-    return pl.when(gone).then(pl.lit("overwritten")).otherwise(reason)
+    marks = pl.DataFrame({"publication": overwritten}).with_columns(gone=True)
+    gone = by_number(marks, "publication", "gone", flow.publications.height)
+    return pl.when(pl.lit(gone).gather(publication)).then(pl.lit("overwritten")).otherwise(reason)
 
 
 def _broken(state: pl.DataFrame, where: pl.Expr, hop: int, reason: pl.Expr) -> pl.DataFrame:

@@ -154,6 +154,10 @@ def comparison_table(comparison: Comparison) -> Table:
             for m in comparison.measurements
         ),
     )
+    realtime = [measurement.recording.info.realtime for measurement in comparison.measurements]
+    table.add_row(
+        "real-time scheduling", *({True: "yes", False: "no", None: ABSENT}[r] for r in realtime)
+    )
     for measurement in comparison.measurements:
         if measurement.plan is not None:
             predicted = measurement.plan.predicted

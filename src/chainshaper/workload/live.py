@@ -94,7 +94,8 @@ def run_application(
     try:
         progress(0.0, "starting nodes")
         _start_nodes(application, timer, nodes)
-        start_meters(application.cores(), meters)
+        if realtime:  # what can be pre-empted itself cannot tell a stall from ordinary scheduling
+            start_meters(application.cores(), meters)
         memory_locked = _await_ready([*nodes.values(), *meters.values()])
         _allocate_threads(application, nodes, realtime)
         promote_meters(meters, realtime)
@@ -105,7 +106,7 @@ def run_application(
         threads = _watch(nodes, meters, timing, progress)
         progress(1.0, "collecting events")
         logs = [_read_log(name, child, application) for name, child in nodes.items()]
-        stalls, meter_info = read_meters(meters, realtime)
+        stalls, meter_info = read_meters(meters, realtime) if meters else ([], None)
         finished = True
     finally:
         end_all([*nodes.values(), *meters.values()], patience_s=3.0 if finished else 0.0)
@@ -325,7 +326,10 @@ def _notes(
 ) -> tuple[str, ...]:
     notes = [f"the first {WARM_UP_CYCLES} cycles warmed up and were not recorded"]
     if no_realtime_because is not None:
-        notes.append(f"taken without real-time scheduling: {no_realtime_because}")
+        notes.append(
+            f"taken without real-time scheduling ({no_realtime_because}), and without watching for "
+            "stalls of the machine"
+        )
     if not memory_locked:
         notes.append("memory was not locked: page faults may have cost time")
     if abs(clock_moved_ns) > 1_000_000:
