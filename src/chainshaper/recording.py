@@ -12,6 +12,7 @@ import platform
 import shutil
 import tempfile
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -98,19 +99,18 @@ class RecordingInfo(BaseModel):
     plan: dict[str, Any] | None = None  # the plan in force, when one was
 
 
+@dataclass(frozen=True)
 class Recording:
     """An open recording: ``info`` and the event tables, read from disk when first asked for.
 
     ``events`` behaves like a dictionary of frames, so every analysis function takes it as it is.
+    A trace that another tracer wrote is opened as a recording too
+    (:func:`chainshaper.sources.open_source`): what follows does not care.
     """
 
-    def __init__(self, path: Path, info: RecordingInfo) -> None:
-        self.path = path
-        self.info = info
-        self.events: events.EventTables = _TablesOnDisk(path)
-
-    def __repr__(self) -> str:
-        return f"Recording({str(self.path)!r})"
+    path: Path
+    info: RecordingInfo
+    events: events.EventTables = field(repr=False)
 
 
 class _TablesOnDisk(Mapping[str, pl.DataFrame]):
@@ -152,7 +152,7 @@ def open_recording(path: str | Path) -> Recording:
         raise InputError(
             f"{path}: {what}; a recording is made with `chainshaper run APP.yaml -o {path}`"
         )
-    return Recording(path, _read_info(file))
+    return Recording(path, _read_info(file), _TablesOnDisk(path))
 
 
 def _read_info(file: Path) -> RecordingInfo:

@@ -18,7 +18,8 @@ from chainshaper.app import ApplicationGraph, Chain
 from chainshaper.durations import format_duration
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning import Plan, plan_shaping
-from chainshaper.recording import Recording, open_recording
+from chainshaper.recording import Recording
+from chainshaper.sources import open_source
 from chainshaper.splicing.application import splice_application
 from chainshaper.workload.description import Application
 from chainshaper.workload.live import Progress, origin_timer, run_application
@@ -76,7 +77,7 @@ def chain_of(recording: Recording, chain: str | None) -> str:
 def measure_latency(recording: Recording | str | Path, chain: str | None = None) -> Measurement:
     """Analyse the end-to-end latency of one chain in a recording."""
     if not isinstance(recording, Recording):
-        recording = open_recording(recording)
+        recording = open_source(recording)
     analysis = analyse_latency(recording, chain_of(recording, chain))
     stalls = events.table(recording.events, "machine_stall")
     longest = None
