@@ -19,8 +19,8 @@ from typing import Any
 import polars as pl
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from chainshaper import events
 from chainshaper.errors import InputError, OperationError
+from chainshaper.events import EventTables
 from chainshaper.yaml_file import explanations, key_text
 
 __all__ = [
@@ -110,7 +110,7 @@ class Recording:
 
     path: Path
     info: RecordingInfo
-    events: events.EventTables = field(repr=False)
+    events: EventTables = field(repr=False)
 
 
 class _TablesOnDisk(Mapping[str, pl.DataFrame]):
@@ -195,7 +195,7 @@ def refuse_existing(path: str | Path) -> Path:
     return path
 
 
-def write_recording(path: str | Path, tables: events.EventTables, info: RecordingInfo) -> Recording:
+def write_recording(path: str | Path, tables: EventTables, info: RecordingInfo) -> Recording:
     """Write a recording, whole or not at all, and open it.
 
     Raises:
