@@ -149,6 +149,8 @@ def open_recording(path: str | Path) -> Recording:
     file = path / INFO_FILE
     if not file.is_file():
         what = "a folder without recording.json" if path.is_dir() else "no such folder"
+        if path.is_file():
+            what = "a file, where the folder of a recording is wanted"
         raise InputError(
             f"{path}: {what}; a recording is made with `chainshaper run APP.yaml -o {path}`"
         )

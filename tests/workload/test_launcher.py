@@ -95,6 +95,12 @@ def test_a_child_killed_from_outside_is_a_casualty(nursery: Nursery) -> None:
     assert "was killed by SIGKILL" in victim.obituary()
 
 
+def test_a_child_that_keeps_silent_is_not_waited_for_for_ever(nursery: Nursery) -> None:
+    child = nursery.start("polite")
+    with pytest.raises(OperationError, match=r"has not answered for 0.2 s: it hangs, or somebody"):
+        child.hear(within_s=0.2)
+
+
 def test_a_child_that_babbles_is_not_taken_for_dead(nursery: Nursery) -> None:
     child = nursery.start("babbles")
     with pytest.raises(OperationError, match="sends something that is not part of the protocol"):

@@ -139,17 +139,26 @@ def test_no_process_is_left(run: str, request: pytest.FixtureRequest) -> None:
     assert children_of(os.getpid()) == []
 
 
-def test_the_recording_says_what_ran(ordinary: Recording, tmp_path: Path) -> None:
+def test_the_recording_says_what_ran(ordinary: Recording) -> None:
     info = ordinary.info
     assert (info.source, info.rmw, info.chain) == ("live", "cyclonedds", "/t1../t3")
     assert set(info.processes.values()) == {f"/{name}" for name in NODES}
     assert info.application is not None
     assert info.application["nodes"]["first"]["callbacks"][0]["timer"] == "50ms"
-    assert info.stall_meter is not None
-    assert info.stall_meter.cores == tuple(sorted({DDS_CORE, EXECUTOR_CORE}))
-    assert info.stall_meter.wakeups > CYCLES
     topics = ordinary.events["rcl_publisher_init"]["topic_name"]
     assert set(topics) == {"/t1", "/t2", "/t3"}
+
+
+@needs_fifo
+def test_the_machine_is_watched_by_sleepers_that_nothing_pre_empts(
+    privileged: Recording, ordinary: Recording
+) -> None:
+    meter = privileged.info.stall_meter
+    assert meter is not None
+    assert meter.cores == tuple(sorted({DDS_CORE, EXECUTOR_CORE}))
+    assert meter.wakeups > CYCLES
+    assert meter.realtime
+    assert ordinary.info.stall_meter is None, "ordinary scheduling would look like stalls"
 
 
 @needs_fifo

@@ -4,6 +4,7 @@ Results go to stdout, errors and progress to stderr. Exit codes: 0 done, 1 the o
 2 wrong use or bad input, 3 the platform cannot do it.
 """
 
+import io
 import signal
 import sys
 from types import FrameType
@@ -19,6 +20,8 @@ def main() -> None:
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) == signal.SIG_DFL:  # under nohup it stays ignored
             signal.signal(number, _end_in_order)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # an ASCII terminal gets "?" for µ
     try:
         app(prog_name="chainshaper")
     except ChainshaperError as error:

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -36,13 +37,18 @@ class Child:
             self.process.stdin.write(json.dumps(fields).encode() + b"\n")
             self.process.stdin.flush()
 
-    def hear(self) -> dict[str, Any]:
-        """Its next line.
+    def hear(self, within_s: float | None = None) -> dict[str, Any]:
+        """Its next line, waited for as long as it takes or ``within_s``.
 
         Raises:
-            OperationError: it died instead.
+            OperationError: it died instead, or kept silent.
         """
         assert self.process.stdout is not None  # noqa: S101 - start_child opens it
+        if not select.select([self.process.stdout], [], [], within_s)[0]:
+            raise OperationError(
+                f"{self.name} (pid {self.pid}) has not answered for {within_s:g} s: it hangs, or "
+                "somebody stopped it"
+            )
         line = self.process.stdout.readline()
         try:
             heard: dict[str, Any] = json.loads(line)

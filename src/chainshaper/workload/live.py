@@ -47,6 +47,8 @@ Progress = Callable[[float, str], None]
 
 WARM_UP_CYCLES = 5
 DISCOVERY_NS = 20_000_000_000
+ANSWER_S = 60.0
+"""A process that is silent for longer, discovery included, hangs."""
 METER_BEHIND_NS = 500_000
 NODE_MODULE = "chainshaper.workload.node_process"
 
@@ -236,7 +238,7 @@ def _spec(
 
 def _await_ready(children: Sequence[Child]) -> bool:
     """Wait until all have found each other; whether all of them could lock their memory."""
-    answers = [(child, child.hear()) for child in children]
+    answers = [(child, child.hear(ANSWER_S)) for child in children]
     missing = [f"{child.name}: {text}" for child, answer in answers for text in answer["missing"]]
     if missing:
         raise OperationError(
@@ -315,7 +317,7 @@ def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[Thread
 
 
 def _read_log(name: str, child: Child, application: Application) -> ProcessLog:
-    answer = child.hear()
+    answer = child.hear(ANSWER_S)
     rows = child.hear_bytes(answer["bytes"])
     core = application.scheduling_of(name).core
     return ProcessLog(child.pid, core, rows, tuple(answer["objects"]))

@@ -1,0 +1,213 @@
+"""How fast the CTF decoder is against babeltrace2's C counter, in one run on one trace.
+
+    python benchmarks/ctf_decode.py [--events 2000000] [--trace FOLDER] [--out FOLDER]
+
+Scales a trace (a real one, or one that the writer makes) to the number of events asked for and
+prints a table: seconds and processor seconds of each way of reading, events per second, its
+ratio to babeltrace2 by either (medians over interleaved runs), and peak memory of a process that
+does only that.  babeltrace2 runs as
+``babeltrace2 FOLDER --component sink.utils.counter`` where it is installed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from chainshaper.sources.ctf import count_events, open_trace, read_events
+from chainshaper.sources.ctf.lttng_text import lttng_metadata
+from chainshaper.sources.ctf.metadata import read_metadata_text
+from chainshaper.sources.ctf.tsdl import parse_tsdl
+from chainshaper.sources.ctf.writer import (
+    EncodedPacket,
+    EventRecord,
+    encode_packet,
+    repeat_packets,
+    write_trace,
+)
+
+EVENTS = {
+    "ros2:rclcpp_publish": {"message": "x64"},
+    "ros2:rcl_publish": {"publisher_handle": "x64", "message": "x64"},
+    "ros2:rmw_publish": {"rmw_publisher_handle": "x64", "message": "x64", "timestamp": "s64"},
+    "ros2:rmw_take": {
+        "rmw_subscription_handle": "x64", "message": "x64",
+        "source_timestamp": "s64", "taken": "s32",
+    },
+    "ros2:callback_start": {"callback": "x64", "is_intra_process": "s32"},
+    "ros2:callback_end": {"callback": "x64"},
+    "ros2:rclcpp_executor_get_next_ready": {},
+    "ros2:rclcpp_executor_wait_for_work": {"timeout": "s64"},
+}  # fmt: skip
+CONTEXT = {"vpid": "s32", "vtid": "s32", "procname": "char[17]"}
+ONE_NAME = "ros2:callback_start"
+_RUN = """
+import re, sys, time
+sys.path[:0] = sys.argv[3].split(":")
+from chainshaper.sources.ctf import count_events, open_trace, read_events
+trace = open_trace(sys.argv[1])
+started = time.monotonic()
+if sys.argv[2] == "count":
+    total = sum(count_events(trace).values())
+else:
+    names = None if sys.argv[2] == "all" else {sys.argv[2]}
+    total = sum(len(frame) for frame in read_events(trace, names).values())
+elapsed = time.monotonic() - started
+status = open("/proc/self/status").read()
+print(total, elapsed, int(re.search(r"VmHWM:\\s*(\\d+)", status)[1]) // 1024)
+"""
+
+
+def made_base() -> tuple[str, dict[str, list[EncodedPacket]]]:
+    """Metadata and packets of a made-up system: 8 cores, some 40,000 events."""
+    text = lttng_metadata(EVENTS, CONTEXT)
+    declared = parse_tsdl(text)
+    streams: dict[str, list[EncodedPacket]] = {}
+    for cpu in range(8):
+        chance, now = random.Random(cpu), (1 << 42) + cpu
+        packets = []
+        for number in range(10):
+            records = []
+            for _ in range(500):
+                now += chance.randrange(2_000, 900_000)
+                name = chance.choice(list(EVENTS))
+                payload = {n: chance.randrange(1 << 31) for n in EVENTS[name]}
+                process = chance.randrange(5)
+                context = {"vpid": 9 + process, "vtid": 9 + process, "procname": f"node_{process}"}
+                records.append(EventRecord(name, now, payload, context))
+            about = {"cpu_id": cpu, "packet_seq_num": number, "events_discarded": 0}
+            packets.append(encode_packet(declared, records, about, instance=cpu))
+        streams[f"channel_{cpu}"] = packets
+    return text, streams
+
+
+def read_base(folder: Path) -> tuple[str, dict[str, list[EncodedPacket]]]:
+    """A real trace of one stream class, written again by our writer."""
+    trace = open_trace(folder)
+    text, _ = read_metadata_text(trace.folders[0].path / "metadata")
+    declared = parse_tsdl(text)
+    names = {"pid": "vpid", "tid": "vtid"}
+    records: dict[int, list[EventRecord]] = {}
+    for name, frame in read_events(trace, context=True).items():
+        for row in frame.iter_rows(named=True):
+            context = {
+                names.get(column, column.removeprefix("context.")): row.pop(column)
+                for column in list(row)
+                if column in ("pid", "tid", "procname") or column.startswith("context.")
+            }
+            now, cpu = row.pop("time"), row.pop("cpu")
+            payload = {column.removeprefix("payload."): value for column, value in row.items()}
+            records.setdefault(cpu, []).append(EventRecord(name, now, payload, context))
+    streams = {}
+    for cpu, found in sorted(records.items()):
+        found.sort(key=lambda record: record.time)
+        streams[f"channel_{cpu}"] = [
+            encode_packet(
+                declared,
+                found[start : start + 2000],
+                {"cpu_id": cpu, "packet_seq_num": start // 2000, "events_discarded": 0},
+                instance=cpu,
+            )
+            for start in range(0, len(found), 2000)
+        ]
+    return text, streams
+
+
+def scaled(folder: Path, base: tuple[str, dict[str, list[EncodedPacket]]], events: int) -> int:
+    """Write ``base`` as often as ``events`` asks for; returns the number of events written."""
+    text, streams = base
+    once = folder / "once"
+    write_trace(once, text, streams)
+    trace = open_trace(once)
+    count = sum(count_events(trace).values())
+    begin = min(s.begin_ns or 0 for s in trace.streams)
+    end = max(s.end_ns or 0 for s in trace.streams)
+    period = -(-(end - begin + 1) // (1 << 32)) * (1 << 32)
+    turns = max(1, events // count)
+    repeated = {n: repeat_packets(packets, turns, period) for n, packets in streams.items()}
+    write_trace(folder / "scaled", text, repeated)
+    return count * turns
+
+
+def timed(action: Callable[[], object]) -> tuple[float, float]:
+    """Seconds and processor seconds (children's included) that ``action`` takes."""
+    started, before = time.monotonic(), sum(os.times()[:4])
+    action()
+    return time.monotonic() - started, sum(os.times()[:4]) - before
+
+
+def peak_memory(folder: Path, what: str) -> int:
+    """Peak resident MiB of a fresh process that reads ``what``."""
+    paths = ":".join(path for path in sys.path if path)
+    command = [sys.executable, "-c", _RUN, str(folder), what, paths]
+    out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return int(out.split()[2])
+
+
+def main() -> None:
+    """Parse arguments, scale, measure, print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--events", type=int, default=2_000_000)
+    parser.add_argument("--trace", type=Path, help="a real trace to scale")
+    parser.add_argument("--out", type=Path, help="keep the scaled trace in this new folder")
+    parser.add_argument("--runs", type=int, default=3)
+    options = parser.parse_args()
+    folder = options.out or Path(tempfile.mkdtemp(prefix="ctf_decode_"))
+    try:
+        base = read_base(options.trace) if options.trace else made_base()
+        events = scaled(folder, base, options.events)
+        measure(folder / "scaled", events, options.runs)
+    finally:
+        if options.out is None:
+            shutil.rmtree(folder)
+
+
+def measure(folder: Path, events: int, runs: int) -> None:
+    """Time all ways of reading in turns and print the table."""
+    size = sum(path.stat().st_size for path in folder.iterdir()) / 2**20
+    print(f"{events:,} events, {size:,.0f} MiB, {len(list(folder.iterdir())) - 1} streams")
+    trace = open_trace(folder)
+    counter = ["babeltrace2", str(folder), "--component", "sink.utils.counter"]
+    ways: dict[str, Callable[[], object]] = {
+        "open": lambda: open_trace(folder),
+        "count": lambda: count_events(trace),
+        "one event": lambda: read_events(trace, {ONE_NAME}),
+        "all fields": lambda: read_events(trace),
+        "all fields, 1 thread": lambda: read_events(trace, threads=1),
+    }
+    if shutil.which("babeltrace2"):
+        ways["babeltrace2 counter"] = lambda: subprocess.run(
+            counter, stdout=subprocess.DEVNULL, check=True
+        )
+    taken: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
+    for _ in range(runs):
+        for name, action in ways.items():
+            taken[name].append(timed(action))
+    medians = {
+        name: [statistics.median(values) for values in zip(*runs_of, strict=True)]
+        for name, runs_of in taken.items()
+    }
+    reference = medians.get("babeltrace2 counter", [float("nan")] * 2)
+    memory = {
+        "count": peak_memory(folder, "count"),
+        "one event": peak_memory(folder, ONE_NAME),
+        "all fields": peak_memory(folder, "all"),
+    }
+    print(f"{'':22}{'s':>8}{'cpu s':>8}{'M/s':>8}{'ratio':>8}{'cpu ratio':>11}{'peak MiB':>10}")
+    for name, (wall, cpu) in medians.items():
+        rate, ratio = events / wall / 1e6, reference[0] / wall
+        row = f"{name:22}{wall:8.3f}{cpu:8.3f}{rate:8.1f}{ratio:8.1f}"
+        print(f"{row}{reference[1] / max(cpu, 0.01):11.1f}{memory.get(name, ''):>10}")
+
+
+if __name__ == "__main__":
+    main()

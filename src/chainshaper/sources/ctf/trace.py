@@ -1,0 +1,188 @@
+"""Opening CTF traces: what was recorded, where, by which clock, and what was lost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from chainshaper.sources.ctf.errors import CtfError
+from chainshaper.sources.ctf.metadata import read_metadata
+from chainshaper.sources.ctf.types import Clock, TraceClass
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+__all__ = ["CtfFolder", "CtfStream", "CtfTrace", "open_trace"]
+
+
+@dataclass(frozen=True)
+class CtfFolder:
+    """One folder with a ``metadata`` file: what it declares."""
+
+    path: Path
+    declared: TraceClass = field(repr=False)
+
+    @property
+    def clock(self) -> Clock:
+        """The folder's clock; one of 1 GHz without offset where the metadata has none."""
+        return next(iter(self.declared.clocks.values()), Clock("none"))
+
+
+@dataclass(frozen=True)
+class CtfStream:
+    """One stream file.
+
+    ``begin_ns`` and ``end_ns`` are those of its packets on the raw trace clock, None where
+    unknown.  ``discarded_events`` and ``lost_packets`` are counted over the whole stream that
+    the file belongs to, and reported with its first file.
+    """
+
+    path: Path
+    folder: int
+    class_id: int
+    instance: int | None
+    packets: int
+    begin_ns: int | None
+    end_ns: int | None
+    discarded_events: int
+    lost_packets: int
+    table: NDArray[np.int64] = field(repr=False, compare=False)
+
+
+@dataclass(frozen=True)
+class CtfTrace:
+    """Traces opened together.
+
+    ``env`` is the first folder's environment (``hostname``, ``domain``, ``tracer_name``, …) and
+    the clock its clock: ``clock_offset_ns`` added to an event's time gives ns since the Epoch.
+    ``discarded_events`` and ``lost_packets`` are what the tracer says that it dropped.
+    """
+
+    folders: tuple[CtfFolder, ...]
+    streams: tuple[CtfStream, ...]
+    event_names: tuple[str, ...]
+    env: Mapping[str, str | int]
+    clock_name: str
+    clock_frequency: int
+    clock_offset_ns: int
+    packets: int
+    discarded_events: int
+    lost_packets: int
+    warnings: tuple[str, ...]
+
+
+def open_trace(*paths: Path | str) -> CtfTrace:
+    """Find and open every CTF trace in ``paths``, folders searched recursively.
+
+    Reads metadata and packet headers only.  Raises `CtfError` where a path holds no trace or
+    metadata cannot be understood; stream files with damage give ``warnings`` instead.
+    """
+    # Numba is slow to import: only who opens a trace pays for it.
+    from chainshaper.sources.ctf.assembly import assemble
+    from chainshaper.sources.ctf.streams import packet_table, stream_paths
+
+    folders = [CtfFolder(path, read_metadata(path / "metadata")) for path in _find(paths)]
+    assembly = assemble([(f.path, f.declared) for f in folders], lambda _: False)
+    warnings = _clock_warnings(folders)
+    streams: list[CtfStream] = []
+    for number, folder in enumerate(folders):
+        tables: list[tuple[Path, NDArray[np.int64]]] = []
+        for path in stream_paths(folder.path):
+            table, found = packet_table(path, assembly, number)
+            warnings += found
+            if len(table):
+                tables.append((path, table))
+        identifiers = [row[0] for row in assembly.stream_rows]
+        rates = [row[16] for row in assembly.stream_rows]
+        streams += _streams(number, tables, identifiers, rates, warnings)
+    clock = folders[0].clock
+    names = {
+        e.name for f in folders for s in f.declared.streams.values() for e in s.events.values()
+    }
+    return CtfTrace(
+        folders=tuple(folders),
+        streams=tuple(streams),
+        event_names=tuple(sorted(names)),
+        env=folders[0].declared.env,
+        clock_name=clock.name,
+        clock_frequency=clock.frequency,
+        clock_offset_ns=clock.offset_ns,
+        packets=sum(stream.packets for stream in streams),
+        discarded_events=sum(stream.discarded_events for stream in streams),
+        lost_packets=sum(stream.lost_packets for stream in streams),
+        warnings=tuple(warnings),
+    )
+
+
+def _find(paths: Iterable[Path | str]) -> list[Path]:
+    found: dict[Path, Path] = {}
+    for path in map(Path, paths):
+        if not path.exists():
+            raise CtfError(path, None, "no such file or folder")
+        here = sorted(p.parent for p in path.rglob("metadata") if p.is_file())
+        if not here:
+            raise CtfError(
+                path, None, "no CTF trace: no file named metadata in it", "give a trace's folder"
+            )
+        for folder in here:
+            found.setdefault(folder.resolve(), folder)
+    if not found:
+        raise CtfError(".", None, "no trace given")
+    return list(found.values())
+
+
+def _clock_warnings(folders: list[CtfFolder]) -> list[str]:
+    first = folders[0].clock
+    return [
+        f"{folder.path}: clock {folder.clock.name!r} is not the clock of {folders[0].path};"
+        " times of the two cannot be compared"
+        for folder in folders[1:]
+        if (folder.clock.name, folder.clock.uuid) != (first.name, first.uuid)
+    ]
+
+
+def _streams(
+    folder: int,
+    tables: list[tuple[Path, NDArray[np.int64]]],
+    identifiers: list[int],
+    rates: list[int],
+    warnings: list[str],
+) -> list[CtfStream]:
+    """The streams of a folder's files, with what was lost counted per stream."""
+    from chainshaper.sources.ctf.losses import count_losses
+    from chainshaper.sources.ctf.tables import PacketColumn
+
+    groups: dict[Any, list[int]] = {}
+    for index, (path, table) in enumerate(tables):
+        first = table[0]
+        instance = int(first[PacketColumn.INSTANCE])
+        own = path if instance < 0 else instance
+        groups.setdefault((int(first[PacketColumn.STREAM]), own), []).append(index)
+    losses = {
+        group[0]: count_losses([tables[i] for i in group], warnings) for group in groups.values()
+    }
+    found = []
+    for index, (path, table) in enumerate(tables):
+        stream = int(table[0, PacketColumn.STREAM])
+        begin, end = int(table[0, PacketColumn.BEGIN]), int(table[-1, PacketColumn.LAST])
+        instance = int(table[0, PacketColumn.INSTANCE])
+        discarded, lost = losses.get(index, (0, 0))
+        rate = rates[stream]
+        found.append(
+            CtfStream(
+                path=path,
+                folder=folder,
+                class_id=identifiers[stream],
+                instance=None if instance < 0 else instance,
+                packets=len(table),
+                begin_ns=begin * 1_000_000_000 // rate if begin >= 0 else None,
+                end_ns=end * 1_000_000_000 // rate if end >= 0 else None,
+                discarded_events=discarded,
+                lost_packets=lost,
+                table=table,
+            )
+        )
+    return found

@@ -1,0 +1,203 @@
+"""What a trace's metadata says: field types, event, stream and trace classes (CTF 1.8).
+
+All of it is immutable plain data.  Names are kept as TSDL writes them, with LTTng's leading
+underscore; `field_name` gives the name that users see.  Sizes and alignments are in bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+__all__ = [
+    "ArrayType",
+    "ByteOrder",
+    "Clock",
+    "EnumMapping",
+    "EnumType",
+    "EventClass",
+    "Field",
+    "FloatType",
+    "IntegerType",
+    "SequenceType",
+    "StreamClass",
+    "StringType",
+    "StructType",
+    "TraceClass",
+    "Type",
+    "VariantType",
+    "alignment",
+    "field_name",
+]
+
+ByteOrder = Literal["native", "le", "be"]
+
+
+@dataclass(frozen=True, slots=True)
+class IntegerType:
+    """``integer { … }`` (section 4.1.5); ``clock`` is the name of the clock it is mapped to."""
+
+    size: int
+    align: int
+    signed: bool = False
+    byte_order: ByteOrder = "native"
+    base: int = 10
+    encoding: Literal["none", "utf8", "ascii"] = "none"
+    clock: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FloatType:
+    """``floating_point { … }`` (section 4.1.7), IEEE 754 of 32 or 64 bits."""
+
+    size: int
+    align: int
+    byte_order: ByteOrder = "native"
+
+
+@dataclass(frozen=True, slots=True)
+class EnumMapping:
+    """One label of an enumeration and the closed range of values that carry it."""
+
+    label: str
+    low: int
+    high: int
+
+
+@dataclass(frozen=True, slots=True)
+class EnumType:
+    """``enum : container { … }`` (section 4.1.8); ranges may overlap."""
+
+    container: IntegerType
+    mappings: tuple[EnumMapping, ...]
+
+    def labels(self, value: int) -> tuple[str, ...]:
+        """Every label whose range holds ``value``, in order of declaration."""
+        return tuple(m.label for m in self.mappings if m.low <= value <= m.high)
+
+
+@dataclass(frozen=True, slots=True)
+class StringType:
+    """``string`` (section 4.2.5): bytes up to and including the first NUL."""
+
+    encoding: Literal["none", "utf8", "ascii"] = "utf8"
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayType:
+    """``T name[length]`` (section 4.2.3)."""
+
+    element: Type
+    length: int
+
+
+@dataclass(frozen=True, slots=True)
+class SequenceType:
+    """``T name[path]`` (section 4.2.4); ``length`` is the path as written, ``a.b.c``."""
+
+    element: Type
+    length: str
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A named member of a structure or option of a variant, named as TSDL writes it."""
+
+    name: str
+    type: Type
+
+
+@dataclass(frozen=True, slots=True)
+class StructType:
+    """``struct { … } align(n)`` (section 4.2.1)."""
+
+    fields: tuple[Field, ...] = ()
+    align: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class VariantType:
+    """``variant <tag> { … }`` (section 4.2.2); ``tag`` is the path as written or ``None``."""
+
+    tag: str | None
+    options: tuple[Field, ...]
+
+
+Type = (
+    IntegerType
+    | FloatType
+    | EnumType
+    | StringType
+    | ArrayType
+    | SequenceType
+    | StructType
+    | VariantType
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """``clock { … }`` (section 8): ``frequency`` in Hz, ``offset_ns`` from the Epoch, exact."""
+
+    name: str
+    frequency: int = 1_000_000_000
+    offset_ns: int = 0
+    uuid: str | None = None
+    description: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class EventClass:
+    """``event { … }`` (section 7.2)."""
+
+    id: int
+    name: str
+    stream_id: int
+    context: StructType | None = None
+    fields: StructType | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StreamClass:
+    """``stream { … }`` (section 7.2) with its event classes by id."""
+
+    id: int
+    packet_context: StructType | None = None
+    event_header: StructType | None = None
+    event_context: StructType | None = None
+    events: Mapping[int, EventClass] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class TraceClass:
+    """Everything one ``metadata`` file declares."""
+
+    byte_order: Literal["le", "be"]
+    uuid: str | None
+    packet_header: StructType | None
+    env: Mapping[str, str | int]
+    clocks: Mapping[str, Clock]
+    streams: Mapping[int, StreamClass]
+
+
+def field_name(name: str) -> str:
+    """The name users see: TSDL's without one leading underscore, as babeltrace2 shows it."""
+    return name[1:] if name.startswith("_") and len(name) > 1 else name
+
+
+def alignment(kind: Type) -> int:
+    """The alignment of a type in bits (section 4.1.2, 4.2); a variant has none of its own."""
+    match kind:
+        case IntegerType(align=align) | FloatType(align=align):
+            return align
+        case EnumType(container=container):
+            return container.align
+        case StringType():
+            return 8
+        case ArrayType(element=element) | SequenceType(element=element):
+            return alignment(element)
+        case StructType(fields=fields, align=align):
+            return max([align, *(alignment(f.type) for f in fields)])
+        case VariantType():
+            return 1

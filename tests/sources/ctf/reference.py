@@ -1,0 +1,104 @@
+"""What babeltrace2 says, and the comparison of our frames with it, field by field."""
+
+import functools
+import pickle
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from chainshaper.sources.ctf import open_trace, read_events
+
+DUMP = Path(__file__).with_name("babeltrace_dump.py")
+SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
+REAL_TRACES = (
+    "galactic_caret_end_to_end",
+    "humble_sync",
+    "jazzy_avp_cyclonedds",
+    "jazzy_chain_cyclonedds",
+    "jazzy_chain_fastrtps_async",
+)
+
+
+def real_trace(name: Any) -> Any:
+    folder = SHARED / name / "trace"
+    if not folder.is_dir():
+        pytest.skip(f"no real traces: {folder} is absent")
+    return folder
+
+
+@functools.cache
+def interpreter() -> Any:
+    """An interpreter that can import bt2, or None."""
+    for candidate in (sys.executable, "/usr/bin/python3", shutil.which("python3")):
+        if candidate and Path(candidate).exists():
+            run = subprocess.run([candidate, "-c", "import bt2"], capture_output=True, check=False)
+            if run.returncode == 0:
+                return candidate
+    return None
+
+
+def babeltrace(*folders: Any) -> Any:
+    """The reference's events and losses; skips without it, fails where it cannot read."""
+    if interpreter() is None:
+        pytest.skip("no reference: python3-bt2 (babeltrace2) is not installed")
+    command = [interpreter(), str(DUMP), *map(str, folders)]
+    run = subprocess.run(command, capture_output=True, check=False, timeout=120)
+    assert run.returncode == 0, run.stderr.decode()
+    return pickle.loads(run.stdout)  # noqa: S301 - from our own script
+
+
+def lean(value: Any) -> Any:
+    """Without options not chosen and empty structures, which only one of the two shows.
+
+    Names in order of the alphabet, so that texts can be compared.
+    """
+    if isinstance(value, dict):
+        inner = {name: lean(value[name]) for name in sorted(value) if value[name] is not None}
+        return {name: part for name, part in inner.items() if part != {}}
+    return [lean(item) for item in value] if isinstance(value, list) else value
+
+
+def expected_rows(reference: Any, kernel: Any = False) -> Any:
+    rows: dict[str, list[Any]] = {}
+    first = ("pid", "vpid") if kernel else ("vpid", "pid")
+    for name, time, packet, recorded, payload in reference["events"]:
+        context = dict(recorded)
+        standard = {"time": time, "cpu": packet.get("cpu_id")}
+        for column in ("pid", "tid"):
+            order = first if column == "pid" else tuple(n.replace("pid", "tid") for n in first)
+            found = next((n for n in order if n in context), None)
+            standard[column] = context.pop(found) if found else None
+        if "procname" in context:
+            standard["procname"] = context.pop("procname")
+        standard |= {f"context.{n}": v for n, v in context.items()}
+        shown = {(f"payload.{n}" if n in standard else n): v for n, v in payload.items()}
+        rows.setdefault(name, []).append(lean(standard | shown))
+    return rows
+
+
+def actual_rows(frames: Any) -> Any:
+    return {
+        name: [lean(row) for row in frame.rows(named=True)]
+        for name, frame in frames.items()
+        if len(frame)
+    }
+
+
+def assert_equal_to_babeltrace(*folders: Any, kernel: Any = False) -> Any:
+    reference = babeltrace(*folders)
+    trace = open_trace(*folders)
+    frames = read_events(trace, context=True)
+    expected, actual = expected_rows(reference, kernel), actual_rows(frames)
+    assert expected.keys() == actual.keys()
+    for name, rows in expected.items():
+        assert [r["time"] for r in actual[name]] == [r["time"] for r in rows], name
+        # Equal times may stand in another order.
+        assert sorted(map(repr, actual[name])) == sorted(map(repr, rows)), name
+    assert trace.discarded_events == reference["discarded"]
+    assert trace.lost_packets == reference["lost"]
+    assert frames.warnings == ()
+    return trace, frames

@@ -1,0 +1,306 @@
+"""Traces assembled byte by byte, so that neither our writer nor our types are trusted."""
+
+# ruff: noqa: PLR0917
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import pytest
+from reference import assert_equal_to_babeltrace
+
+from chainshaper.sources.ctf import open_trace, read_events
+
+PLAIN = """/* CTF 1.8 */
+typealias integer {{ size = 8; align = 8; }} := u8;
+typealias integer {{ size = 32; align = 8; }} := u32;
+clock {{ name = c; freq = 1000000000; offset = 5; }};
+typealias integer {{ size = 64; align = 8; map = clock.c.value; }} := stamp;
+trace {{ major = 1; minor = 8; byte_order = {order}; packet.header := struct {{ u32 magic; }}; }};
+stream {{
+    event.header := struct {{ u8 id; stamp timestamp; }};
+    packet.context := struct {{ u32 content_size; u32 packet_size; }};
+}};
+event {{ name = "e"; id = 0; fields := {fields}; }};
+"""
+
+
+def one_event(folder: Any, fields: Any, payload: Any, order: Any = "le", bits: Any = None) -> Any:
+    """A trace of one packet with one event at time 1000."""
+    mark = "<" if order == "le" else ">"
+    content = 8 * (12 + 9) + (8 * len(payload) if bits is None else bits)
+    folder.mkdir(exist_ok=True)
+    (folder / "metadata").write_text(PLAIN.format(order=order, fields=fields))
+    head = struct.pack(mark + "III", 0xC1FC1FC1, content, 8 * (21 + len(payload)))
+    (folder / "stream").write_bytes(head + struct.pack(mark + "BQ", 0, 1000) + payload)
+    return read_events(open_trace(folder))["e"].drop("cpu", "pid", "tid").to_dicts()
+
+
+def check(
+    folder: Any,
+    fields: Any,
+    payload: Any,
+    expected: Any,
+    order: Any = "le",
+    bits: Any = None,
+    reference: Any = True,
+) -> None:
+    assert one_event(folder, fields, payload, order, bits) == [{"time": 1000, **expected}]
+    if reference:
+        assert_equal_to_babeltrace(folder)
+
+
+def test_bits_are_packed_from_the_low_end_in_little_endian(tmp_path: Path) -> None:
+    fields = """struct {
+        integer { size = 3; align = 1; } a;
+        integer { size = 7; align = 1; signed = true; } b;
+        integer { size = 14; align = 1; } c;
+        integer { size = 8; } d; }"""
+    word = 5 | (-3 & 0x7F) << 3 | 0x2BCD << 10
+    payload = word.to_bytes(3, "little") + b"\x7e"
+    check(tmp_path, fields, payload, {"a": 5, "b": -3, "c": 0x2BCD, "d": 0x7E})
+
+
+def test_bits_are_packed_from_the_high_end_in_big_endian(tmp_path: Path) -> None:
+    fields = """struct {
+        integer { size = 3; align = 1; } a;
+        integer { size = 7; align = 1; signed = true; } b;
+        integer { size = 14; align = 1; } c;
+        integer { size = 16; align = 8; } d; }"""
+    word = 5 << 21 | (-3 & 0x7F) << 14 | 0x2BCD
+    payload = word.to_bytes(3, "big") + b"\x12\x34"
+    check(tmp_path, fields, payload, {"a": 5, "b": -3, "c": 0x2BCD, "d": 0x1234}, order="be")
+
+
+@pytest.mark.parametrize("order", ["le", "be"])
+def test_a_64_bit_number_across_nine_bytes(tmp_path: Path, order: Any) -> None:
+    fields = """struct {
+        integer { size = 5; align = 1; } a;
+        integer { size = 64; align = 1; signed = true; } b;
+        integer { size = 3; align = 1; } c; }"""
+    number = -0x123456789ABCDEF
+    wide = number & (1 << 64) - 1
+    if order == "le":
+        payload = (21 | wide << 5 | 6 << 69).to_bytes(9, "little")
+    else:
+        payload = (21 << 67 | wide << 3 | 6).to_bytes(9, "big")
+    check(tmp_path, fields, payload, {"a": 21, "b": number, "c": 6}, order=order)
+
+
+def test_alignment_counts_from_the_packet(tmp_path: Path) -> None:
+    fields = """struct {
+        integer { size = 8; } a;
+        integer { size = 32; align = 32; } b;
+        struct { integer { size = 8; } x; } align(64) s;
+        struct { } align(32) padding;
+        integer { size = 8; } c; }"""
+    # The event header ends at byte 21; s aligns the payload to 24: a there, b at 28, s at 32.
+    gap = b"\xff" * 3
+    payload = gap + b"\x01" + gap + b"\x02\0\0\0" + b"\x03" + gap + b"\x04"
+    check(tmp_path, fields, payload, {"a": 1, "b": 2, "s": {"x": 3}, "c": 4})
+
+
+def test_floats_and_their_byte_orders(tmp_path: Path) -> None:
+    fields = """struct {
+        floating_point { exp_dig = 8; mant_dig = 24; align = 8; } f;
+        floating_point { exp_dig = 11; mant_dig = 53; align = 8; byte_order = be; } d; }"""
+    payload = struct.pack("<f", 1.5) + struct.pack(">d", -2.25e100)
+    check(tmp_path, fields, payload, {"f": 1.5, "d": -2.25e100})
+
+
+def test_text_ends_at_its_nul(tmp_path: Path) -> None:
+    fields = """struct {
+        string s;
+        integer { size = 8; encoding = UTF8; } t[6];
+        integer { size = 8; } n;
+        integer { size = 8; encoding = ASCII; } q[n];
+        string { encoding = ASCII; } empty; }"""
+    payload = "caf\u00e9\0".encode() + b"ab\0xyz" + b"\x03" + b"full"[:3] + b"\0"
+    expected = {"s": "caf\u00e9", "t": "ab", "n": 3, "q": "ful", "empty": ""}
+    check(tmp_path, fields, payload, expected)
+
+
+def test_empty_texts_are_empty(tmp_path: Path) -> None:
+    fields = "struct { string a; string b; integer { size = 8; encoding = UTF8; } c[2]; }"
+    check(tmp_path, fields, b"x\0\0\0\0", {"a": "x", "b": "", "c": ""}, reference=False)
+
+
+def test_bytes_that_are_no_utf8_are_shown(tmp_path: Path) -> None:
+    expected = {"s": "a\\xffb"}
+    check(tmp_path, "struct { string s; }", b"a\xffb\0", expected, reference=False)
+
+
+def test_arrays_sequences_and_structures_nest(tmp_path: Path) -> None:
+    fields = """struct {
+        struct { u8 x; u8 n; } pair[2];
+        u8 n;
+        u8 grid[2][3];
+        struct { u8 m; u32 v[m]; string s; } list[n];
+        u8 none[0];
+        struct { u8 n; u8 v[n]; } ragged[2]; }"""
+    payload = bytes([1, 2, 3, 4, 2]) + bytes(range(6))
+    payload += b"\x01" + struct.pack("<I", 70000) + b"one\0" + b"\x00" + b"none\0"
+    payload += bytes([0, 2, 7, 8])
+    expected = {
+        "pair": [{"x": 1, "n": 2}, {"x": 3, "n": 4}],
+        "n": 2,
+        "grid": [[0, 1, 2], [3, 4, 5]],
+        "list": [{"m": 1, "v": [70000], "s": "one"}, {"m": 0, "v": [], "s": "none"}],
+        "none": [],
+        "ragged": [{"n": 0, "v": []}, {"n": 2, "v": [7, 8]}],
+    }
+    check(tmp_path, fields, payload, expected)
+
+
+@pytest.mark.parametrize(("tag", "body", "chosen"), [
+    (0, b"\x2a", {"number": 42, "text": None, "many": None}),
+    (7, b"hello\0", {"number": None, "text": "hello", "many": None}),
+    (200, bytes([2, 8, 9]), {"number": None, "text": None, "many": {"n": 2, "v": [8, 9]}}),
+])  # fmt: skip
+def test_variants_follow_their_tag(tmp_path: Path, tag: Any, body: Any, chosen: Any) -> None:
+    fields = """struct {
+        enum : u8 { number = 0, text = 5 ... 9, many = 128 ... 255 } tag;
+        variant <tag> { u8 number; string text; struct { u8 n; u8 v[n]; } many; } v;
+        u8 after; }"""
+    check(tmp_path, fields, bytes([tag]) + body + b"\x09", {"tag": tag, "v": chosen, "after": 9})
+
+
+def test_negative_tags_and_values_of_enumerations(tmp_path: Path) -> None:
+    fields = """struct {
+        enum : integer { size = 8; signed = true; } { low = -5 ... -1, "high" = 3 } tag;
+        variant <tag> { u8 low; u32 high; } v; }"""
+    check(tmp_path, fields, b"\xfd\x11", {"tag": -3, "v": {"low": 17, "high": None}})
+
+
+HEADER_27 = """/* CTF 1.8 */
+typealias integer {{ size = 8; align = 8; }} := uint8_t;
+typealias integer {{ size = 16; align = 8; }} := uint16_t;
+typealias integer {{ size = 32; align = 8; }} := uint32_t;
+typealias integer {{ size = 64; align = 8; }} := uint64_t;
+typealias integer {{ size = 5; align = 1; }} := uint5_t;
+clock {{ name = c; freq = 1000000000; }};
+typealias integer {{ size = {bits}; align = {align}; map = clock.c.value; }} := low_t;
+typealias integer {{ size = 64; align = 8; map = clock.c.value; }} := stamp_t;
+trace {{ major = 1; minor = 8; byte_order = le; packet.header := struct {{ uint32_t magic; }}; }};
+stream {{
+    event.header := struct {{
+        enum : {container} {{ compact = 0 ... {last}, extended = {all} }} id;
+        variant <id> {{
+            struct {{ low_t timestamp; }} compact;
+            struct {{ uint32_t id; stamp_t timestamp; }} extended;
+        }} v;
+    }} align(8);
+    packet.context := struct {{
+        stamp_t timestamp_begin; stamp_t timestamp_end;
+        uint32_t content_size; uint32_t packet_size;
+    }};
+}};
+event {{ name = "e"; id = 1; fields := struct {{ uint8_t n; }}; }};
+event {{ name = "far"; id = 70000; fields := struct {{ uint8_t n; }}; }};
+"""
+SMALL = {"bits": 27, "align": 1, "container": "uint5_t", "last": 30, "all": 31}
+LARGE = {"bits": 32, "align": 8, "container": "uint16_t", "last": 65534, "all": 65535}
+
+
+def packet(kind: Any, begin: Any, end: Any, events: Any) -> Any:
+    """A packet; events are (low bits of the stamp, n) or (stamp, n, id) for extended ones."""
+    body = b""
+    for low, number, *identifier in events:
+        if identifier:
+            all_ones = b"\x1f" if kind is SMALL else b"\xff\xff"
+            body += all_ones + struct.pack("<IQ", identifier[0], low)
+        elif kind is SMALL:
+            body += struct.pack("<I", 1 | low << 5)
+        else:
+            body += struct.pack("<HI", 1, low)
+        body += bytes([number])
+    size = 28 + len(body)
+    return struct.pack("<IQQII", 0xC1FC1FC1, begin, end, 8 * size, 8 * size + 24) + body + b"pad"
+
+
+@pytest.mark.parametrize("kind", [SMALL, LARGE], ids=["27 bits", "32 bits"])
+def test_time_stamps_wrap_and_follow_packets(tmp_path: Path, kind: Any) -> None:
+    turn = 1 << kind["bits"]
+    begin = 7 * turn + turn - 10
+    data = packet(kind, begin, 10 * turn, [(turn - 10, 0), (turn - 1, 1), (0, 2), (5, 3), (4, 4)])
+    later = [(100, 5), (33 * turn, 6, 1), (40 * turn + 9, 7, 70000)]
+    data += packet(kind, 20 * turn + 100, 41 * turn, later)
+    (tmp_path / "metadata").write_text(HEADER_27.format(**kind))
+    (tmp_path / "stream").write_bytes(data)
+    frames = read_events(open_trace(tmp_path))
+    expected = [begin, begin + 9, 8 * turn, 8 * turn + 5, 9 * turn + 4, 20 * turn + 100, 33 * turn]
+    assert frames["e"]["time"].to_list() == expected
+    assert frames["e"]["n"].to_list() == list(range(7))
+    assert frames["far"].select("time", "n").rows() == [(40 * turn + 9, 7)]
+    assert_equal_to_babeltrace(tmp_path)
+
+
+def test_lengths_and_tags_from_every_scope(tmp_path: Path) -> None:
+    (tmp_path / "metadata").write_text("""/* CTF 1.8 */
+        typealias integer { size = 8; align = 8; } := u8;
+        typealias integer { size = 32; align = 8; } := u32;
+        clock { name = c; };
+        typealias integer { size = 64; align = 8; map = clock.c.value; } := stamp;
+        trace { major = 1; minor = 8; byte_order = le;
+            packet.header := struct { u32 magic; u8 of_header; }; };
+        stream {
+            packet.context := struct { u32 content_size; u32 packet_size;
+                u8 of_packet; u8 cpu_id; };
+            event.header := struct { u8 id; stamp timestamp; };
+            event.context := struct { u8 shared; u8 own; };
+        };
+        event { name = "e"; id = 0;
+            context := struct { u8 own; enum : u8 { x = 1, y = 2 } tag; };
+            fields := struct {
+                u8 own;
+                u8 a[trace.packet.header.of_header];
+                u8 b[stream.packet.context.of_packet];
+                u8 c[stream.event.context.shared];
+                u8 d[event.context.own];
+                u8 e[own];
+                u8 f[shared];
+                u8 g[stream.event.context.own];
+                struct { u8 own; u8 h[own]; u8 i[event.fields.own]; } inner;
+                variant <event.context.tag> { u8 x; u32 y; } v;
+            }; };
+    """)
+    body = b"\0" + struct.pack("<Q", 77) + bytes([2, 3]) + bytes([1, 2]) + bytes([1])
+    for count in (1, 2, 2, 1, 1, 2, 3):
+        body += bytes(range(10, 10 + count))
+    body += bytes([2, 50, 51, 60]) + struct.pack("<I", 99)
+    size = 8 * (15 + len(body))
+    head = struct.pack("<IBIIBB", 0xC1FC1FC1, 1, size, size, 2, 3)
+    (tmp_path / "stream").write_bytes(head + body)
+    row = read_events(open_trace(tmp_path), context=True)["e"].to_dicts()[0]
+    counts = {name: len(row[name]) for name in "abcdefg"}
+    assert counts == {"a": 1, "b": 2, "c": 2, "d": 1, "e": 1, "f": 2, "g": 3}
+    assert row["inner"] == {"own": 2, "h": [50, 51], "i": [60]}
+    assert row["v"] == {"x": None, "y": 99}
+    assert (row["cpu"], row["context.shared"]) == (3, 2)
+
+
+def test_clock_frequency_and_offset_are_exact(tmp_path: Path) -> None:
+    text = PLAIN.format(order="le", fields="struct { u8 n; }")
+    text = text.replace("freq = 1000000000; offset = 5;", "freq = 3; offset_s = 7; offset = 4;")
+    (tmp_path / "metadata").write_text(text)
+    head = struct.pack("<III", 0xC1FC1FC1, 8 * 22, 8 * 22)
+    (tmp_path / "stream").write_bytes(head + struct.pack("<BQB", 0, 10, 1))
+    trace = open_trace(tmp_path)
+    assert trace.clock_offset_ns == 8_333_333_333
+    assert read_events(trace)["e"]["time"].to_list() == [3_333_333_333]
+
+
+def test_a_trace_without_headers_is_one_packet_of_one_event_class(tmp_path: Path) -> None:
+    (tmp_path / "metadata").write_text("""
+        trace { major = 1; minor = 8; byte_order = le; };
+        event { name = "only"; fields := struct { integer { size = 16; } n; }; };
+    """)
+    (tmp_path / "stream").write_bytes(struct.pack("<HHH", 1, 2, 3))
+    assert read_events(open_trace(tmp_path))["only"]["n"].to_list() == [1, 2, 3]
+
+
+def test_alike_names_are_told_apart(tmp_path: Path) -> None:
+    fields = "struct { u8 time; u8 tid; u8 _x; struct { u8 _a; u8 a; } x2; }"
+    row = one_event(tmp_path, fields, bytes([1, 2, 3, 4, 5]))[0]
+    assert (row["time"], row["payload.time"], row["payload.tid"], row["x"]) == (1000, 1, 2, 3)
+    assert row["x2"] == {"a": 4, "_a": 5}

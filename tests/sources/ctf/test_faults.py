@@ -1,0 +1,277 @@
+"""Damage gives an error that names the file, or a warning and everything readable."""
+
+# ruff: noqa: PLR0917
+
+import random
+import shutil
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from made import make_trace
+from test_bytes import PLAIN
+
+from chainshaper.sources.ctf import CtfError, count_events, open_trace, read_events
+from chainshaper.sources.ctf.lttng_text import lttng_metadata
+from chainshaper.sources.ctf.metadata import read_metadata
+from chainshaper.sources.ctf.writer import metadata_packets
+
+UUID = "2a6422d0-6cee-11e0-8c08-cb07d7b3a564"
+
+
+def rows_of(folder: Any) -> Any:
+    """All rows as texts, and all warnings."""
+    trace = open_trace(folder)
+    frames = read_events(trace)
+    rows = [repr((name, row)) for name, frame in frames.items() for row in frame.rows()]
+    assert sum(count_events(trace).values()) == len(rows)
+    return rows, [*trace.warnings, *frames.warnings]
+
+
+def test_no_trace_there(tmp_path: Path) -> None:
+    with pytest.raises(CtfError, match="no such file") as caught:
+        open_trace(tmp_path / "absent")
+    assert caught.value.path == tmp_path / "absent"
+    with pytest.raises(CtfError, match="no file named metadata"):
+        open_trace(tmp_path)
+    with pytest.raises(CtfError, match="no trace given"):
+        open_trace()
+
+
+@pytest.mark.parametrize(("text", "place", "reason"), [
+    ("trace { major = 1; };", 0, "byte_order"),
+    ("/* CTF 1.8 */ trace { byte_order = le; ", 39, "expected"),
+    ("nonsense;", 0, "unknown block"),
+    ("typealias wrong := x;", 10, "unknown type 'wrong'"),
+    ("typealias integer { size = 65; } := x;", 10, "65 bits"),
+    ("typealias integer { size = 8; align = 3; } := x;", 10, "power of two"),
+    ("trace { byte_order = le; }; event { name = a; id = 0; }; event { name = b; id = 0; };",
+     57, "declared twice"),
+    ("trace { byte_order = le; }; event { name = \"a", 43, "unterminated string"),
+    ("/* no end", 0, "unterminated comment"),
+    ("struct { " * 60, 297, "nested"),
+    ("", 0, "no trace block"),
+])  # fmt: skip
+@pytest.mark.parametrize("packetized", [False, True])
+def test_metadata_faults_name_the_byte(
+    tmp_path: Path, text: Any, place: Any, reason: Any, packetized: Any
+) -> None:
+    path = tmp_path / "metadata"
+    path.write_bytes(metadata_packets(text, UUID) if packetized else text.encode())
+    with pytest.raises(CtfError, match=reason) as caught:
+        open_trace(tmp_path)
+    assert caught.value.path == path
+    assert caught.value.offset == place + 37 * packetized
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(("place", "value", "reason"), [
+    (24, 8 * 5000, "content"), (24, 8, "content"), (28, 0, "content"), (32, 1, "compressed"),
+])  # fmt: skip
+def test_lying_metadata_packets(tmp_path: Path, place: Any, value: Any, reason: Any) -> None:
+    data = bytearray(metadata_packets(lttng_metadata({"e": {}}), UUID, size=1024))
+    data[1024 + place : 1024 + place + 4] = struct.pack("<I", value)
+    (tmp_path / "metadata").write_bytes(data)
+    with pytest.raises(CtfError, match=reason) as caught:
+        open_trace(tmp_path)
+    assert caught.value.offset == 1024
+
+
+def test_unresolved_lengths_and_tags_are_errors(tmp_path: Path) -> None:
+    for fields, reason in (
+        ("struct { u8 a[missing]; }", "missing"),
+        ("struct { variant <tag> { u8 x; } v; }", "tag"),
+        ("struct { variant { u8 x; } v; }", "no tag"),
+    ):
+        (tmp_path / "metadata").write_text(PLAIN.format(order="le", fields=fields))
+        with pytest.raises(CtfError, match=reason):
+            open_trace(tmp_path)
+
+
+def test_files_cut_short_keep_their_first_events(tmp_path: Path) -> None:
+    make_trace(tmp_path / "whole", streams=1)
+    whole, _ = rows_of(tmp_path / "whole")
+    data = (tmp_path / "whole/channel_0").read_bytes()
+    kept = []
+    for number, cut in enumerate(range(0, len(data), 97)):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        shutil.copy(tmp_path / "whole/metadata", folder)
+        (folder / "channel_0").write_bytes(data[:cut])
+        rows, warnings = rows_of(folder)
+        assert set(rows) <= set(whole)
+        assert all(str(folder / "channel_0") in warning for warning in warnings)
+        kept.append(len(rows))
+    assert kept == sorted(kept)
+    assert kept[-1] >= len(whole) - 2
+
+
+def damaged(
+    folder: Any,
+    place: Any,
+    data: Any,
+    fields: Any = "struct { string s; }",
+    payload: Any = b"text\0",
+) -> Any:
+    """Two packets of one event each, with ``data`` over the bytes at ``place`` of the first."""
+    folder.mkdir(exist_ok=True)
+    (folder / "metadata").write_text(PLAIN.format(order="le", fields=fields))
+    packets = bytearray()
+    for stamp in (1000, 2000):
+        body = struct.pack("<BQ", 0, stamp) + payload
+        size = 8 * (12 + len(body))
+        packets += struct.pack("<III", 0xC1FC1FC1, size, size) + body
+    packets[place : place + len(data)] = data
+    (folder / "stream").write_bytes(packets)
+    trace = open_trace(folder)
+    frames = read_events(trace)
+    times = frames["e"]["time"].to_list()
+    assert sum(count_events(trace).values()) == len(times)
+    return times, [*trace.warnings, *frames.warnings]
+
+
+@pytest.mark.parametrize(("place", "data", "times", "byte", "reason"), [
+    (0, b"\0", [], 0, "magic"),
+    (4, struct.pack("<I", 8), [], 0, "impossible"),
+    (4, struct.pack("<I", 1 << 31), [], 0, "impossible"),
+    (8, struct.pack("<I", 0), [], 0, "impossible"),
+    (8, struct.pack("<I", 8 * 26 + 3), [], 0, "impossible"),
+    (12, b"\x01", [2000], 12, "event id"),
+    (25, b"!", [2000], 12, "string"),
+    (26, b"?", [1000], 26, "magic"),
+    (8, struct.pack("<I", 8 * 60000), [1000], 0, "cut short"),
+])  # fmt: skip
+def test_each_damage_names_its_byte(
+    tmp_path: Path, place: Any, data: Any, times: Any, byte: Any, reason: Any
+) -> None:
+    found, warnings = damaged(tmp_path, place, data)
+    assert found == times
+    assert len(warnings) == 1
+    assert f"{tmp_path / 'stream'}, byte {byte}: " in warnings[0]
+    assert reason in warnings[0]
+
+
+@pytest.mark.parametrize(("fields", "payload", "reason"), [
+    ("struct { u32 n; u8 a[n]; }", struct.pack("<I", 1 << 31), "longer"),
+    ("struct { integer { size = 32; signed = true; } n; u32 a[n]; }",
+     struct.pack("<i", -1), "longer"),
+    ("struct { u32 n; integer { size = 8; encoding = UTF8; } a[n]; }",
+     struct.pack("<I", 99), "longer"),
+    ("struct { enum : u8 { x = 1 } t; variant <t> { u8 x; } v; }", b"\x02\x01", "tag"),
+    ("struct { u32 n; u32 b; }", b"\1\2\3\4\5\6", "past the end"),
+    ("struct { u8 a[2147483647][2147483647][2147483647]; }", b"abc", "longer"),
+])  # fmt: skip
+def test_payloads_that_lie(tmp_path: Path, fields: Any, payload: Any, reason: Any) -> None:
+    times, warnings = damaged(tmp_path, 0, b"", fields, payload)
+    assert times == []
+    assert len(warnings) == 2
+    assert reason in warnings[0]
+
+
+def test_sequences_of_nothing_do_not_hang(tmp_path: Path) -> None:
+    fields = """struct { u32 n; enum : u8 { none = 0 } t;
+        struct { variant <t> { struct { } none; } v[n]; } v[n]; }"""
+    started = time.monotonic()
+    times, warnings = damaged(tmp_path, 0, b"", fields, struct.pack("<IB", 1 << 31, 0))
+    assert (times, len(warnings)) == ([], 2)
+    times, _ = damaged(tmp_path, 0, b"", fields, struct.pack("<IB", 4, 0))
+    assert time.monotonic() - started < 60
+    assert len(times) == 2 or times == []
+
+
+def test_other_traces_packets_and_stray_files_are_named(tmp_path: Path) -> None:
+    make_trace(tmp_path, streams=1)
+    count = len(rows_of(tmp_path)[0])
+    (tmp_path / "notes.txt").write_text("not a stream at all, but long enough to be read as one")
+    data = bytearray((tmp_path / "channel_0").read_bytes())
+    data[4] ^= 1
+    (tmp_path / "channel_1").write_bytes(data)
+    (tmp_path / "channel_2").write_bytes(b"")
+    (tmp_path / ".hidden").write_bytes(b"x")
+    rows, warnings = rows_of(tmp_path)
+    assert len(rows) == count
+    assert [("uuid" in w, "magic" in w) for w in warnings] == [(True, False), (False, True)]
+
+
+def test_numba_is_imported_only_to_decode() -> None:
+    code = "import sys, chainshaper.sources.ctf; sys.exit('numba' in sys.modules)"
+    environment = {"PYTHONPATH": ":".join(sys.path)}
+    assert (
+        subprocess.run([sys.executable, "-c", code], env=environment, check=False).returncode == 0
+    )
+
+
+def test_kernels_compile_without_a_folder_for_their_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    from numba.core.dispatcher import Dispatcher
+
+    from chainshaper.sources.ctf import memory
+
+    def refuse(_: Any) -> Any:
+        raise RuntimeError("cannot cache function: no locator available")
+
+    def twice(number: Any) -> Any:
+        return 2 * number
+
+    monkeypatch.setattr(Dispatcher, "enable_caching", refuse)
+    assert memory.compiled("int64(int64)")(twice)(21) == 42
+
+
+SECONDS = 7
+
+
+def test_random_damage_to_streams(tmp_path: Path) -> None:
+    """Packets before the damage are intact; nothing hangs, crashes or appears from nowhere."""
+    make_trace(tmp_path / "whole", streams=1, packets=4, events=15)
+    whole = (tmp_path / "whole/channel_0").read_bytes()
+    table = open_trace(tmp_path / "whole").streams[0].table
+    starts = [int(byte) for byte in table[:, 0]]
+    folder = tmp_path / "damaged"
+    folder.mkdir()
+    shutil.copy(tmp_path / "whole/metadata", folder)
+    good = rows_of(tmp_path / "whole")[0]
+    chance, deadline = random.Random(8), time.monotonic() + SECONDS
+    for _ in range(400):
+        data = bytearray(whole)
+        first = len(data)
+        for _ in range(chance.choice([1, 1, 2, 8])):
+            place = chance.randrange(len(data))
+            data[place] = chance.choice([0, 255, data[place] ^ (1 << chance.randrange(8))])
+            first = min(first, place)
+        if chance.random() < 0.2:
+            del data[chance.randrange(len(data)) :]
+            first = min(first, len(data))
+        (folder / "channel_0").write_bytes(data)
+        rows, _ = rows_of(folder)
+        intact = 15 * sum(start <= first for start in starts[1:])
+        assert len(set(rows) & set(good)) >= len(set(good)) - (60 - intact)
+        assert len(rows) <= len(data)
+        if time.monotonic() > deadline:
+            break
+
+
+def test_random_damage_to_metadata(tmp_path: Path) -> None:
+    make_trace(tmp_path, streams=1, packets=1, events=10)
+    path = tmp_path / "metadata"
+    text = lttng_metadata({"e": {"a": "u8[]", "s": "string"}}, {"vtid": "s32"})
+    words = ["{", "}", ";", "struct", "variant", "enum", "[", "]", "9", "0", "<id>", "string", "-"]
+    chance, deadline = random.Random(9), time.monotonic() + SECONDS
+    refused = 0
+    for _ in range(300):
+        pieces = text.split(" ")
+        for _ in range(chance.choice([1, 2, 5])):
+            place = chance.randrange(len(pieces))
+            pieces[place] = chance.choice([*words, chance.choice(pieces), ""])
+        path.write_text(" ".join(pieces))
+        try:
+            read_metadata(path)
+            rows_of(tmp_path)
+        except CtfError as error:
+            assert error.path == path
+            refused += 1
+        if time.monotonic() > deadline:
+            break
+    assert refused > 0

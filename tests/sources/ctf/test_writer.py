@@ -1,0 +1,176 @@
+"""What the writer writes comes back, from us and from babeltrace2."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from made import START, USER_CONTEXT, USER_EVENTS, make_trace, records
+from reference import actual_rows, assert_equal_to_babeltrace, lean
+
+from chainshaper.sources.ctf import count_events, open_trace, read_events
+from chainshaper.sources.ctf.lttng_text import lttng_metadata
+from chainshaper.sources.ctf.tsdl import parse_tsdl
+from chainshaper.sources.ctf.writer import (
+    EventRecord,
+    encode_packet,
+    repeat_packets,
+    write_trace,
+)
+
+
+def expected(made: Any) -> Any:
+    rows: dict[str, list[Any]] = {}
+    for event in made:
+        context = dict(event.context)
+        row = {"time": event.time, "pid": context.get("vpid"), "tid": context.get("vtid")}
+        rows.setdefault(event.name, []).append(lean(row | dict(event.payload)))
+    return {name: sorted(map(repr, found)) for name, found in rows.items()}
+
+
+@pytest.mark.parametrize("options", [
+    {}, {"header": "compact"}, {"big": True}, {"big": True, "header": "compact"},
+    {"aligned": True}, {"aligned": True, "header": "compact", "big": True},
+], ids=str)  # fmt: skip
+def test_round_trip(tmp_path: Path, options: Any) -> None:
+    made = make_trace(tmp_path, **options)
+    frames = read_events(open_trace(tmp_path))
+    dropped = ("cpu", "procname")
+    rows = actual_rows({n: f.drop(dropped) for n, f in frames.items()})
+    assert {n: sorted(map(repr, found)) for n, found in rows.items()} == expected(made)
+    assert_equal_to_babeltrace(tmp_path)
+
+
+@pytest.mark.parametrize("header", ["compact", "large"])
+@pytest.mark.parametrize("aligned", [False, True])
+def test_kernel_traces(tmp_path: Path, header: Any, aligned: Any) -> None:
+    make_trace(tmp_path / "kernel", kernel=True, header=header, aligned=aligned)
+    trace, frames = assert_equal_to_babeltrace(tmp_path, kernel=True)
+    assert trace.env["domain"] == "kernel"
+    switches = frames["sched_switch"]
+    assert {"prev_comm", "prev_tid", "next_tid", "pid", "tid", "cpu"} <= set(switches.columns)
+    assert "payload.tid" in frames["sched_wakeup"].columns
+
+
+def test_kernel_beside_user_space_and_per_process_folders(tmp_path: Path) -> None:
+    """One frame per event over all folders, by time, with null where a trace has no column."""
+    make_trace(tmp_path / "kernel", kernel=True, seed=1)
+    make_trace(tmp_path / "ust/pid/first-1-20260101/64-bit", seed=2)
+    make_trace(tmp_path / "ust/pid/second-2-20260101/64-bit", seed=3, header="compact")
+    trace = open_trace(tmp_path)
+    assert len(trace.folders) == 3
+    assert len(trace.streams) == 9
+    frames = read_events(trace)
+    assert sum(count_events(trace).values()) == 3 * 3 * 4 * 20
+    assert all(frame["time"].is_sorted() for frame in frames.values())
+    alone = read_events(open_trace(tmp_path / "ust/pid/first-1-20260101"))
+    for name, frame in alone.items():
+        assert set(frame["time"]) <= set(frames[name]["time"])
+    # Naming a folder twice does not read it twice.
+    assert open_trace(tmp_path, tmp_path / "kernel").packets == trace.packets
+
+
+def test_metadata_as_plain_text(tmp_path: Path) -> None:
+    made = records(5, 30)
+    text = lttng_metadata(USER_EVENTS, USER_CONTEXT)
+    packet = encode_packet(
+        parse_tsdl(text), made, {"cpu_id": 0, "packet_seq_num": 0, "events_discarded": 0}
+    )
+    write_trace(tmp_path, text, {"a": [packet]}, packetized=False)
+    assert_equal_to_babeltrace(tmp_path)
+    with pytest.raises(FileExistsError):
+        write_trace(tmp_path, text, {})
+
+
+@pytest.mark.parametrize("files", [1, 2], ids=["one file", "rotated files"])
+def test_losses_are_counted(tmp_path: Path, files: Any) -> None:
+    text = lttng_metadata(USER_EVENTS, USER_CONTEXT)
+    declared = parse_tsdl(text)
+    packets, start = [], START
+    for number, (sequence, discarded) in enumerate([(3, 2), (4, 2), (9, 12), (10, 13)]):
+        part = records(number, 10, start=start)
+        start = part[-1].time + 1
+        about = {"cpu_id": 0, "packet_seq_num": sequence, "events_discarded": discarded}
+        packets.append(encode_packet(declared, part, about))
+    if files == 1:
+        write_trace(tmp_path, text, {"a": packets})
+    else:
+        write_trace(tmp_path, text, {"a_1": packets[:2], "a_0": packets[2:]})
+    trace, _ = assert_equal_to_babeltrace(tmp_path)
+    assert (trace.discarded_events, trace.lost_packets) == (11, 4)
+    assert len(trace.warnings) == 2
+    assert "11 events" in trace.warnings[0]
+
+
+def test_losses_before_the_first_packet_of_a_stream_count(tmp_path: Path) -> None:
+    """babeltrace2 does not count these, though the tracer says that they happened."""
+    text = lttng_metadata({"e": {}})
+    declared = parse_tsdl(text)
+    packets = [
+        encode_packet(
+            declared,
+            [EventRecord("e", START + number)],
+            {"cpu_id": 0, "packet_seq_num": number, "events_discarded": discarded},
+        )
+        for number, discarded in enumerate([(1 << 32) - 2, 3])
+    ]
+    write_trace(tmp_path, text, {"a": packets})
+    assert open_trace(tmp_path).discarded_events == (1 << 32) + 3
+
+
+def test_repeated_packets_go_on_in_time(tmp_path: Path) -> None:
+    text = lttng_metadata(USER_EVENTS, USER_CONTEXT)
+    packet = encode_packet(
+        parse_tsdl(text), records(1, 50), {"cpu_id": 0, "packet_seq_num": 0, "events_discarded": 0}
+    )
+    period = 1 << 42
+    write_trace(tmp_path, text, {"a": repeat_packets([packet], 5, period)})
+    trace, frames = assert_equal_to_babeltrace(tmp_path)
+    assert trace.lost_packets == 0
+    times = frames["ros2:callback_end"]["time"].to_list()
+    count = len(times) // 5
+    assert times[count:] == [time + period for time in times[:-count]]
+
+
+def test_equal_times_stand_in_order_of_the_files(tmp_path: Path) -> None:
+    text = lttng_metadata({"e": {"n": "u32"}})
+    declared = parse_tsdl(text)
+    files = {}
+    for cpu in (2, 0, 1):
+        same = [EventRecord("e", START, {"n": 10 * cpu + i}) for i in range(2)]
+        about = {"cpu_id": cpu, "packet_seq_num": 0, "events_discarded": 0}
+        files[f"channel_{cpu}"] = [encode_packet(declared, same, about, instance=cpu)]
+    write_trace(tmp_path, text, files)
+    assert read_events(open_trace(tmp_path))["e"]["n"].to_list() == [0, 1, 10, 11, 20, 21]
+
+
+def test_many_spans_and_threads_give_the_same_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from chainshaper.sources.ctf import decode
+
+    make_trace(tmp_path, streams=4, packets=10, events=60)
+    trace = open_trace(tmp_path)
+    whole = read_events(trace)
+    monkeypatch.setattr(decode, "_SMALL_BYTES", 0)
+    monkeypatch.setattr(decode, "_CHUNK_BYTES", 4096)
+    for threads in (1, 3):
+        cut = read_events(trace, threads=threads)
+        assert cut.keys() == whole.keys()
+        assert all(cut[name].to_dicts() == whole[name].to_dicts() for name in whole)
+
+
+def test_many_different_strings(tmp_path: Path) -> None:
+    """The dictionary grows while columns are being filled."""
+    text = lttng_metadata({"e": {"s": "string", "t": "char[24]", "n": "u8[]"}})
+    declared = parse_tsdl(text)
+    made = [
+        EventRecord("e", START + i, {"s": f"{i:x}" * (i % 4), "t": f"text {i}", "_n_length": i % 3,
+                                     "n": [i & 255] * (i % 3)})
+        for i in range(4000)
+    ]  # fmt: skip
+    about = {"cpu_id": 0, "packet_seq_num": 0, "events_discarded": 0}
+    write_trace(tmp_path, text, {"a": [encode_packet(declared, made, about)]})
+    frame = read_events(open_trace(tmp_path))["e"]
+    assert frame["s"].to_list() == [event.payload["s"] for event in made]
+    assert frame["t"].to_list() == [event.payload["t"] for event in made]
+    assert frame["n"].to_list() == [event.payload["n"] for event in made]
