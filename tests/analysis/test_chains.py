@@ -9,8 +9,15 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from story import Story
 
-from chainshaper.analysis import enumerate_chains, find_chain, load_named_paths, parse_chain
+from chainshaper.analysis import (
+    application_graph,
+    enumerate_chains,
+    find_chain,
+    load_named_paths,
+    parse_chain,
+)
 from chainshaper.app import ApplicationGraph, Callback, Node
 from chainshaper.errors import InputError
 
@@ -336,3 +343,19 @@ def test_files_that_are_no_caret_architecture(tmp_path: Path, text: str) -> None
     file.write_text(text)
     with pytest.raises(InputError, match=r"architecture\.yaml"):
         load_named_paths(file)
+
+
+def test_two_callbacks_on_one_topic_do_not_synchronise_it_with_itself() -> None:
+    """Of two subscriptions of a node to one topic only one publishes: there is one path."""
+    story = Story()
+    source, worker = story.node("/source", 1), story.node("/worker", 2)
+    timer, big = story.timer(source), story.publisher(source, "/big")
+    works, logs = story.subscription(worker, "/big"), story.subscription(worker, "/big")
+    out = story.publisher(worker, "/out")
+    story.runs(timer, 1_000, 1_200, writes=((big, 1_100),))
+    story.runs(works, 2_000, 2_200, reads=1_100, writes=((out, 2_100),))
+    story.runs(logs, 3_000, 3_200, reads=1_100)
+    graph = application_graph(story.tables())
+    chain = find_chain(graph, "/big../out")
+    assert chain.topics == ("/big", "/out")
+    assert graph.callbacks[chain.callbacks[1]].publishes == ("/out",)

@@ -6,8 +6,8 @@ in one callback and published in another of the same node:
 * **Synchronising callbacks** (message_filters) read in one instance and publish in that of the
   input which completes the set. The library emits no events of its own. A subscription callback
   is taken to be such an input of topic X when another subscription callback of its node publishes
-  X and it either is registered by message_filters (its symbol says so) or publishes nothing
-  itself.
+  X, subscribes to another topic, and it either is registered by message_filters (its symbol says
+  so) or publishes nothing itself.
 * **Stored messages**: a subscription callback that publishes nothing, in a node whose
   subscription callbacks publish nothing at all, but whose timers do, is taken to store the
   message for the timers.
@@ -15,6 +15,8 @@ in one callback and published in another of the same node:
 Both are inferences, so they are kept apart: such topics stand in ``Callback.publishes`` (the
 chain goes on there) and also in ``Callback.passes_on``.
 """
+
+from typing import Any
 
 import polars as pl
 
@@ -116,10 +118,18 @@ def _passed_on(callbacks: pl.DataFrame, writes: dict[int, set[str]]) -> dict[int
             own = outputs["subscription"][row["callback_id"]]
             filtered = MESSAGE_FILTER in (row["symbol"] or "")
             if by_inputs and (filtered or not own):
-                passed[row["callback_id"]] = by_inputs - own
+                passed[row["callback_id"]] = _of_other_topics(row, rows, outputs) - own
             elif not by_inputs:
                 passed[row["callback_id"]] = by_timers
     return passed
+
+
+def _of_other_topics(
+    row: dict[str, Any], rows: list[dict[str, Any]], outputs: dict[str, dict[int, set[str]]]
+) -> set[str]:
+    """What subscriptions to other topics publish: nobody synchronises a topic with itself."""
+    siblings = [other for other in rows if other["topic"] != row["topic"]]
+    return set().union(*(outputs["subscription"].get(o["callback_id"], ()) for o in siblings))
 
 
 def _by_topic(endpoints: pl.DataFrame) -> dict[str, tuple[str, ...]]:
