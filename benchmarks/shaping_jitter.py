@@ -1,11 +1,13 @@
 """Jitter before and after shaping, live, with a compile running beside it.
 
-    python benchmarks/shaping_jitter.py [CYCLES] [RUNS]
+    python benchmarks/shaping_jitter.py [--cycles N] [--runs N] [--keep DIR]
 
-Prints one row per run. All figures are of one machine in one session: compare columns, not
+Prints one column per run; with --keep the recordings stay, to look into them.
+All figures are of one machine in one session: compare columns, not
 machines. Nothing is asserted; the figures to reach stand in the last column.
 """
 
+import argparse
 import contextlib
 import os
 import shutil
@@ -55,16 +57,23 @@ def compile_beside(folder: Path) -> Iterator[str]:
 
 
 def main() -> None:
-    cycles = int(sys.argv[1]) if len(sys.argv) > 1 else 320
-    runs = int(sys.argv[2]) if len(sys.argv) > 2 else 2
+    parser = argparse.ArgumentParser(description="Jitter before and after shaping.")
+    parser.add_argument("--cycles", type=int, default=320)
+    parser.add_argument("--runs", type=int, default=2)
+    parser.add_argument("--keep", type=Path, help="folder for the recordings, made if needed")
+    options = parser.parse_args()
     results: list[tuple[str, Measurement, Measurement]] = []
     with tempfile.TemporaryDirectory(prefix="chainshaper-benchmark-") as name:
-        for run in range(runs):
+        folder = options.keep or Path(name)
+        folder.mkdir(parents=True, exist_ok=True)
+        for run in range(1, options.runs + 1):
             with compile_beside(Path(name)) as load:
-                print(f"run {run + 1} of {runs}: {cycles} cycles each, beside: {load}", flush=True)
-                result = run_demo(Path(name) / f"run{run}", cycles=cycles)
+                print(f"run {run}: {options.cycles} cycles each, beside: {load}", flush=True)
+                result = run_demo(folder / f"run{run}", cycles=options.cycles)
+            for note in result.notes:
+                print(f"  note: {note}")
             before, after = result.comparison.measurements
-            results.append((f"run {run + 1}", before, after))
+            results.append((f"run {run}", before, after))
     Console(width=120).print(table_of(results))
 
 

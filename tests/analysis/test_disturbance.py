@@ -45,7 +45,7 @@ def one_traversal(
     flow = data_flow(story.tables())
     graph = graph_of(flow)
     found = traverse(flow, find_chain(graph, "/tmp../t1"), graph)
-    (mask,) = disturbed(flow, found, threshold_ns=50, computing_threshold_ns=200)
+    (mask,) = disturbed(flow, found, threshold_ns=50, computing_threshold_ns=200, waking_ns=100)
     return bool(mask)
 
 
@@ -71,8 +71,8 @@ def test_stalls_of_a_computing_traversal_add_up(stalls: list[tuple[int, int]], h
     ("stall", "hit"),
     [
         ((5_000, 3_000), False),  # absorbed by the wait
-        ((9_000, 900), False),  # over at the release, 9,900
-        ((9_000, 901), True),  # reaches into it
+        ((9_000, 800), False),  # over 100 before the release, 9,900
+        ((9_000, 801), True),  # leaves too little time to wake up
         ((9_950, 60), True),
         ((9_950, 49), False),
         ((10_001, 60), False),  # the output is out

@@ -1,12 +1,15 @@
 """Waiting for an instant: never early, whatever interrupts the sleep."""
 
+import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 
 import pytest
 
-from chainshaper.enforcement.gate import Gate, Shaper, clock_offset, sleep_until, wait_until
+from chainshaper.enforcement.gate import Gate, Shaper, clock_offset, sleep_until, watch_until
 
 MS = 1_000_000
 
@@ -61,21 +64,50 @@ def test_an_exception_from_a_signal_handler_ends_the_sleep() -> None:
         signal.signal(signal.SIGUSR1, previous)
 
 
-@pytest.mark.parametrize("spin", [0, 300_000, 5 * MS])
-def test_wait_until_is_never_early_and_reports_its_waking(spin: int) -> None:
-    deadline = time.monotonic_ns() + 2 * MS  # the last spin begins before now
-    woke = wait_until(deadline, spin)
-    assert deadline <= woke.at_ns <= time.monotonic_ns()
-    assert woke.gap_ns >= 0
-    assert woke.gap_start_ns + woke.gap_ns <= woke.at_ns
+def test_watching_the_clock_is_never_early() -> None:
+    deadline = time.monotonic_ns() + 2 * MS
+    assert deadline <= watch_until(deadline) <= time.monotonic_ns()
+    assert watch_until(deadline) >= deadline, "an instant that has passed"
 
 
-def test_a_held_message_leaves_inside_its_slot_or_later() -> None:
-    shaper = Shaper(Gate(slots=((4 * MS, 5 * MS),), cycle_ns=10 * MS, anchor="cycle"), spin_ns=MS)
+@pytest.mark.parametrize("spin", [0, 300_000, 5 * MS])  # the last begins before the message comes
+def test_a_held_message_leaves_inside_its_slot_or_later(spin: int) -> None:
+    gate = Gate(slots=((4 * MS, 5 * MS),), cycle_ns=10 * MS, anchor="cycle")
+    shaper = Shaper(gate, spin_ns=spin)
     for _ in range(5):
         release, arrival, woke = shaper.hold(b"no header")
-        assert arrival <= release.at_ns <= woke.at_ns
+        assert arrival <= release.at_ns <= woke
         assert 4 * MS <= release.at_ns % (10 * MS) < 5 * MS
+
+
+def test_time_that_others_ran_is_not_the_machines() -> None:
+    """A delay is the machine's only as far as the kernel counts no other thread for it."""
+    shaper = Shaper(Gate(slots=((4 * MS, 5 * MS),), cycle_ns=10 * MS, anchor="cycle"))
+    release, _, woke = shaper.hold(b"no header")
+    lost = shaper.time_lost(release, woke)
+    assert 0 <= lost <= woke - release.at_ns
+
+
+def test_time_spent_behind_a_competitor_is_told_from_time_that_nobody_had() -> None:
+    """Two processes on one core: each waits for about half of the time, by the kernel's account."""
+    shaper = Shaper(Gate(slots=((4 * MS, 5 * MS),), cycle_ns=10 * MS, anchor="cycle"))
+    core = min(os.sched_getaffinity(0))
+    mine = os.sched_getaffinity(0)
+    busy = [sys.executable, "-c", f"import os; os.sched_setaffinity(0, [{core}])\nwhile True: pass"]
+    competitor = subprocess.Popen(busy)
+    try:
+        os.sched_setaffinity(0, {core})
+        time.sleep(0.2)  # let it start
+        release, _, _ = shaper.hold(b"no header")
+        until = release.at_ns + 100 * MS
+        while time.monotonic_ns() < until:
+            pass
+        late = time.monotonic_ns() - release.at_ns
+        assert shaper.time_lost(release, release.at_ns + late) < 0.8 * late
+    finally:
+        competitor.kill()
+        competitor.wait()
+        os.sched_setaffinity(0, mine)
 
 
 def test_the_clock_offset_turns_monotonic_time_into_wall_clock_time() -> None:

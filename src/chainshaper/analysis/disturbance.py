@@ -8,8 +8,9 @@ stall says something about the machine, not about the application.
 What a stall does to a traversal depends on whether a gate held its output (`gate_release`):
 
 * **A gate** makes two instants decide the latency: when the origin was taken (between the
-  traversal's start and the anchor's origin), and from the planned release to the publication.
-  Any stall at one of them disturbs. While the message was held, a stall only shortened the wait.
+  traversal's start and the anchor's origin), and from shortly before the planned release to the
+  publication. Any stall at one of them disturbs. While the message was held, a stall only
+  shortened the wait.
 * **Not held**: no gate, or the message came in or behind its slot. Stalls while it was computed
   add up, and disturb it from ``COMPUTING_THRESHOLD_NS`` in all: on one core, within [start, end].
   A traversal that began before its disturbed predecessor had ended may have queued behind it,
@@ -37,6 +38,9 @@ __all__ = [
 
 THRESHOLD_NS = 100_000
 """Stalls shorter than this are what an ordinary wake-up takes."""
+
+WAKING_NS = 200_000
+"""A stall that ends this shortly before a release leaves the gate no time to wake up for it."""
 
 COMPUTING_THRESHOLD_NS = 1_000_000
 """A chain that computes for tens of milliseconds is hardly changed by less than this."""
@@ -68,6 +72,7 @@ def disturbed(
     traversals: Traversals,
     threshold_ns: int = THRESHOLD_NS,
     computing_threshold_ns: int = COMPUTING_THRESHOLD_NS,
+    waking_ns: int = WAKING_NS,
 ) -> Mask:
     """A mask over the rows of ``traversals.frame``; incomplete traversals are never marked."""
     stalls = _Stalls.of(flow, threshold_ns)
@@ -83,7 +88,7 @@ def disturbed(
     release, origin = (frame[name].fill_null(0).to_numpy() for name in ("release", "origin"))
     first, last = np.minimum(start, origin), np.maximum(start, origin)
     at_instants = overlapping(first, last, stalls.began, stalls.ended)
-    at_instants |= overlapping(release, end, stalls.began, stalls.ended)
+    at_instants |= overlapping(release - waking_ns, end, stalls.began, stalls.ended)
     lost = stalled_within(start, end, stalls.began, stalls.ended, stalls.core)
     hit = complete & ((gated & at_instants) | (~held & (lost >= computing_threshold_ns)))
     return complete & (hit | _queued_behind(hit, start, end, ~held & complete))

@@ -21,21 +21,20 @@ inside a ROS 2 node, where nothing of ours may be installed.
 
 import ctypes
 import os
+import threading
 import time
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 __all__ = [
     "ANCHORS",
     "Gate",
     "Release",
     "Shaper",
-    "Waking",
     "clock_offset",
     "origin_of",
     "release_of",
     "sleep_until",
-    "wait_until",
+    "watch_until",
 ]
 
 ANCHORS = ("stamp", "cycle")
@@ -141,14 +140,6 @@ def origin_of(payload: bytes) -> int | None:
     return seconds * 1_000_000_000 + nanoseconds
 
 
-class Waking(NamedTuple):
-    """When a wait ended, and the longest stretch (ns) in which it could not see the clock."""
-
-    at_ns: int
-    gap_start_ns: int
-    gap_ns: int
-
-
 class _Timespec(ctypes.Structure):
     _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
 
@@ -175,25 +166,17 @@ def sleep_until(deadline_ns: int) -> None:
         raise OSError(error, f"clock_nanosleep: {os.strerror(error)}")
 
 
-def wait_until(deadline_ns: int, spin_ns: int = 0) -> Waking:
-    """Sleep until ``spin_ns`` before the instant, then watch the clock until it has come.
+def watch_until(deadline_ns: int) -> int:
+    """Watch the clock until an instant of CLOCK_MONOTONIC has come; returns the time then.
 
     Waking from a sleep costs the kernel some tens of microseconds, and not always the same.
-    Watching the clock over the last stretch trades a little CPU time for that variation, and
-    shows when the clock jumped: a thread that does nothing else notices every interruption.
+    Watching the clock over the last stretch trades a little CPU time for that variation.
     """
-    sleep_until(deadline_ns - spin_ns)
     clock = time.monotonic_ns
     now = clock()
-    if now >= deadline_ns:
-        return Waking(now, now, 0)
-    last, gap_start, gap = now, now, 0
     while now < deadline_ns:
         now = clock()
-        if now - last > gap:
-            gap_start, gap = last, now - last
-        last = now
-    return Waking(now, gap_start, gap)
+    return now
 
 
 def clock_offset() -> int:
@@ -216,6 +199,9 @@ class Shaper:
     anew for every message, since NTP or an operator may step the wall clock. A message under way
     during a step has a stamp of which nobody can say to which side it belongs: it is anchored to
     the cycle instead, at the phase that the last good stamp had.
+
+    One shaper belongs to one thread, which does nothing else at the time of a release. That makes
+    it a witness of the machine's own stalls (:meth:`time_lost`).
     """
 
     STEP_NS = 500_000  # slewing moves the clock by at most 50 us in a cycle of 100 ms
@@ -224,6 +210,8 @@ class Shaper:
         self.gate = gate
         self.spin_ns = spin_ns
         self._offset = clock_offset()
+        self._waiting = _WaitingTime()
+        self._waited = 0
 
     def decide(self, payload: bytes, arrival_ns: int) -> Release:
         """When the message that arrived may leave, after :func:`release_of`."""
@@ -237,8 +225,45 @@ class Shaper:
             self.gate = replace(self.gate, phase_ns=phase)
         return release
 
-    def hold(self, payload: bytes) -> tuple[Release, int, Waking]:
-        """Wait until a message may leave: the decision, its arrival (ns) and the waking."""
+    def hold(self, payload: bytes) -> tuple[Release, int, int]:
+        """Wait until a message may leave: the decision, its arrival and the time then (ns)."""
         arrival = time.monotonic_ns()
         release = self.decide(payload, arrival)
-        return release, arrival, wait_until(release.at_ns, self.spin_ns)
+        self._waited = self._waiting.so_far()
+        sleep_until(release.at_ns - self.spin_ns)
+        if time.monotonic_ns() < release.at_ns:
+            # Awake in time: what other threads took before is of no consequence.
+            self._waited = self._waiting.so_far()
+        return release, arrival, watch_until(release.at_ns)
+
+    def time_lost(self, release: Release, published_ns: int) -> int:
+        """How much of the delay between a release and its publication the machine itself took (ns).
+
+        The kernel counts for how long a thread was ready but others ran. What is left of the
+        delay, besides the microseconds that publishing takes, nobody used: interrupts, or a core
+        that was taken away from the whole system. To be called right after publishing.
+        """
+        return max(0, published_ns - release.at_ns - (self._waiting.so_far() - self._waited))
+
+
+class _WaitingTime:
+    """For how long the calling thread has been ready while others ran, by the kernel's account.
+
+    The second number of `/proc/thread-self/schedstat` (Documentation/scheduler/sched-stats.rst).
+    Where the kernel has none, all delay is taken to be other threads', and none the machine's.
+    """
+
+    def __init__(self) -> None:
+        self._file: int | None = None
+        self._thread: int | None = None
+
+    def so_far(self) -> int:
+        if self._thread != threading.get_ident():  # the file is bound to who opened it
+            self._thread = threading.get_ident()
+            try:
+                self._file = os.open("/proc/thread-self/schedstat", os.O_RDONLY)
+            except OSError:
+                self._file = None
+        if self._file is None:
+            return time.monotonic_ns()
+        return int(os.pread(self._file, 128, 0).split()[1])

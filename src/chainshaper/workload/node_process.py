@@ -7,7 +7,6 @@ it is locked into memory.
 
 import os
 import queue
-import resource
 import threading
 import time
 from collections.abc import Callable
@@ -236,8 +235,7 @@ class NodeProcess:
         pause when another message waits already: one that missed its slot leaves together with
         the next, and must not make that one late as well.
 
-        When time jumped although no other thread ran on the core in between, the machine stood
-        still, and that is recorded like the stall meter's own findings.
+        Delay that no other thread caused is recorded like the stall meter's own findings.
         """
         start, end = self._point["callback_start"], self._point["callback_end"]
         released, stalled = self._point["gate_release"], self._point["machine_stall"]
@@ -249,19 +247,16 @@ class NodeProcess:
         def body(message: dds.Message | None) -> None:
             assert message is not None  # noqa: S101 - a gate has a subscription, by validation
             start(time.monotonic_ns(), handle, time.thread_time_ns(), 0)
-            switches = _involuntary_switches()
-            release, arrival, woke = shaper.hold(message.payload)
+            release, arrival, woke_ns = shaper.hold(message.payload)
             published, source_timestamp = publisher.send(message.payload)
-            alone = _involuntary_switches() == switches
+            lost = shaper.time_lost(release, published)
             if not subscription.ready():
                 sleep_until(published + pause_ns)
             publisher.record(message.payload, published, source_timestamp)
-            if alone and woke.gap_ns >= STALL_NS:
-                stalled(woke.gap_start_ns, woke.gap_ns)
-            if alone and published - woke.at_ns >= STALL_NS:
-                stalled(woke.at_ns, published - woke.at_ns)
+            if lost >= STALL_NS:
+                stalled(release.at_ns, lost)
             released(
-                woke.at_ns,
+                woke_ns,
                 handle,
                 message.source_timestamp,
                 arrival,
@@ -309,11 +304,6 @@ class NodeProcess:
             shaper.gate = Gate(shaper.gate.slots, shaper.gate.cycle_ns, shaper.gate.anchor, phase)
         stop_garbage_collection()
         self.executor.spin_until(stop_ns, last_timer_ns)
-
-
-def _involuntary_switches() -> int:
-    """How often another thread took this thread's core from it."""
-    return resource.getrusage(resource.RUSAGE_THREAD).ru_nivcsw
 
 
 def _hand_over_to_publisher_thread(write: Callable[[bytes, int], None]) -> Callable[..., None]:
