@@ -13,9 +13,12 @@ lint: .venv/.ready-dev
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 
-# Needs a quiet machine and about three minutes; prints a table, asserts nothing.
-benchmark: .venv/.ready
+# Needs a quiet machine and about four minutes; prints tables, asserts nothing.
+benchmark: .venv/.ready-dev
 	.venv/bin/python benchmarks/shaping_jitter.py
+	.venv/bin/python benchmarks/band_placement.py
+	.venv/bin/python benchmarks/ctf_decode.py
+	.venv/bin/python benchmarks/trace_to_latency.py
 
 docs: .venv/.ready-dev
 	.venv/bin/mkdocs build --strict

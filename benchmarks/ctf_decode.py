@@ -20,7 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from chainshaper.sources.ctf import count_events, open_trace, read_events
@@ -49,6 +49,8 @@ EVENTS = {
     "ros2:rclcpp_executor_wait_for_work": {"timeout": "s64"},
 }  # fmt: skip
 CONTEXT = {"vpid": "s32", "vtid": "s32", "procname": "char[17]"}
+CREATION = ("_init", "_added", "_register", "_link_node")
+STAMPS = ("timestamp", "source_timestamp")
 ONE_NAME = "ros2:callback_start"
 _RUN = """
 import re, sys, time
@@ -67,34 +69,26 @@ print(total, elapsed, int(re.search(r"VmHWM:\\s*(\\d+)", status)[1]) // 1024)
 """
 
 
-def made_base() -> tuple[str, dict[str, list[EncodedPacket]]]:
-    """Metadata and packets of a made-up system: 8 cores, some 40,000 events."""
-    text = lttng_metadata(EVENTS, CONTEXT)
-    declared = parse_tsdl(text)
-    streams: dict[str, list[EncodedPacket]] = {}
+def made_records() -> tuple[str, dict[int, list[EventRecord]]]:
+    """Metadata and records per core of a made-up system: 8 cores, 40,000 events."""
+    records: dict[int, list[EventRecord]] = {}
     for cpu in range(8):
         chance, now = random.Random(cpu), (1 << 42) + cpu
-        packets = []
-        for number in range(10):
-            records = []
-            for _ in range(500):
-                now += chance.randrange(2_000, 900_000)
-                name = chance.choice(list(EVENTS))
-                payload = {n: chance.randrange(1 << 31) for n in EVENTS[name]}
-                process = chance.randrange(5)
-                context = {"vpid": 9 + process, "vtid": 9 + process, "procname": f"node_{process}"}
-                records.append(EventRecord(name, now, payload, context))
-            about = {"cpu_id": cpu, "packet_seq_num": number, "events_discarded": 0}
-            packets.append(encode_packet(declared, records, about, instance=cpu))
-        streams[f"channel_{cpu}"] = packets
-    return text, streams
+        own = records[cpu] = []
+        for _ in range(5000):
+            now += chance.randrange(2_000, 900_000)
+            name = chance.choice(list(EVENTS))
+            payload = {n: chance.randrange(1 << 31) for n in EVENTS[name]}
+            process = chance.randrange(5)
+            context = {"vpid": 9 + process, "vtid": 9 + process, "procname": f"node_{process}"}
+            own.append(EventRecord(name, now, payload, context))
+    return lttng_metadata(EVENTS, CONTEXT), records
 
 
-def read_base(folder: Path) -> tuple[str, dict[str, list[EncodedPacket]]]:
-    """A real trace of one stream class, written again by our writer."""
+def read_records(folder: Path) -> tuple[str, dict[int, list[EventRecord]]]:
+    """Metadata and records per core of a real trace of one folder and one stream class."""
     trace = open_trace(folder)
     text, _ = read_metadata_text(trace.folders[0].path / "metadata")
-    declared = parse_tsdl(text)
     names = {"pid": "vpid", "tid": "vtid"}
     records: dict[int, list[EventRecord]] = {}
     for name, frame in read_events(trace, context=True).items():
@@ -107,35 +101,49 @@ def read_base(folder: Path) -> tuple[str, dict[str, list[EncodedPacket]]]:
             now, cpu = row.pop("time"), row.pop("cpu")
             payload = {column.removeprefix("payload."): value for column, value in row.items()}
             records.setdefault(cpu, []).append(EventRecord(name, now, payload, context))
-    streams = {}
-    for cpu, found in sorted(records.items()):
+    for found in records.values():
         found.sort(key=lambda record: record.time)
-        streams[f"channel_{cpu}"] = [
+    return text, records
+
+
+def scaled(folder: Path, base: tuple[str, dict[int, list[EventRecord]]], events: int) -> int:
+    """Write ``base``, then its course again and again, until there are ``events`` of them.
+
+    Objects are created in the first round only; source time stamps move with the events, so
+    that every round is as good a recording as the first. Returns the number of events written.
+    """
+    text, records = base
+    declared = parse_tsdl(text)
+    course = {
+        cpu: [r for r in found if not r.name.endswith(CREATION)] for cpu, found in records.items()
+    }
+    once = sum(map(len, records.values()))
+    again = sum(map(len, course.values()))
+    turns = max(0, (events - once) // again)
+    span = max(r[-1].time for r in records.values()) - min(r[0].time for r in records.values())
+    period = -(-(span + 1) // (1 << 32)) * (1 << 32)
+
+    def packets(cpu: int, found: list[EventRecord], first: int) -> list[EncodedPacket]:
+        return [
             encode_packet(
                 declared,
                 found[start : start + 2000],
-                {"cpu_id": cpu, "packet_seq_num": start // 2000, "events_discarded": 0},
+                {"cpu_id": cpu, "packet_seq_num": first + place, "events_discarded": 0},
                 instance=cpu,
+                stamps=STAMPS,
             )
-            for start in range(0, len(found), 2000)
+            for place, start in enumerate(range(0, len(found), 2000))
         ]
-    return text, streams
 
+    def stream(cpu: int) -> Iterator[EncodedPacket | bytes]:
+        whole = packets(cpu, records[cpu], 0)
+        yield from whole
+        repeated = -(-len(course[cpu]) // 2000)
+        rest = packets(cpu, course[cpu], len(whole) - repeated)
+        yield from repeat_packets(rest, turns, period, first=1)
 
-def scaled(folder: Path, base: tuple[str, dict[str, list[EncodedPacket]]], events: int) -> int:
-    """Write ``base`` as often as ``events`` asks for; returns the number of events written."""
-    text, streams = base
-    once = folder / "once"
-    write_trace(once, text, streams)
-    trace = open_trace(once)
-    count = sum(count_events(trace).values())
-    begin = min(s.begin_ns or 0 for s in trace.streams)
-    end = max(s.end_ns or 0 for s in trace.streams)
-    period = -(-(end - begin + 1) // (1 << 32)) * (1 << 32)
-    turns = max(1, events // count)
-    repeated = {n: repeat_packets(packets, turns, period) for n, packets in streams.items()}
-    write_trace(folder / "scaled", text, repeated)
-    return count * turns
+    write_trace(folder / "scaled", text, {f"channel_{cpu}": stream(cpu) for cpu in sorted(records)})
+    return once + again * turns
 
 
 def timed(action: Callable[[], object]) -> tuple[float, float]:
@@ -163,7 +171,7 @@ def main() -> None:
     options = parser.parse_args()
     folder = options.out or Path(tempfile.mkdtemp(prefix="ctf_decode_"))
     try:
-        base = read_base(options.trace) if options.trace else made_base()
+        base = read_records(options.trace) if options.trace else made_records()
         events = scaled(folder, base, options.events)
         measure(folder / "scaled", events, options.runs)
     finally:

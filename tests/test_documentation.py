@@ -87,6 +87,25 @@ def test_the_python_example_of_the_readme_runs(tmp_path: Path, reader: dict[str,
     assert (tmp_path / "after" / "recording.json").is_file()
 
 
+def test_the_python_example_about_traces_runs(tmp_path: Path, reader: dict[str, str]) -> None:
+    (example,) = PYTHON.findall((ROOT / "docs" / "traces.md").read_text())
+    write = (
+        "import sys, runpy; sys.argv[1:] = ['my_trace']; "
+        "runpy.run_path('examples/write_trace.py', run_name='__main__')"
+    )
+    for program in (write, example):
+        run = subprocess.run(
+            [sys.executable, "-c", program],
+            cwd=tmp_path,
+            env=reader,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert run.returncode == 0, run.stderr
+    assert "jazzy rmw_cyclonedds_cpp" in run.stdout
+
+
 def test_links_between_pages_lead_somewhere() -> None:
     for page in [*PAGES, ROOT / "CONTRIBUTING.md"]:
         for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text()):

@@ -24,18 +24,39 @@ if TYPE_CHECKING:
         callback_statistics,
         data_flow,
         find_chain,
+        load_named_paths,
     )
     from chainshaper.doctor import examine_machine
     from chainshaper.errors import ChainshaperError, InputError, OperationError, PlatformError
-    from chainshaper.planning import Plan, load_plan, plan_shaping, save_plan
+    from chainshaper.exploration import (
+        ApplicationDescription,
+        convert_recording,
+        describe_application,
+        event_counts,
+        list_chains,
+    )
+    from chainshaper.planning import (
+        Plan,
+        PlanRequest,
+        Profile,
+        load_plan,
+        place_chains,
+        plan_chain,
+        plan_shaping,
+        save_plan,
+    )
     from chainshaper.recording import Recording, open_recording
+    from chainshaper.reporting.application_graph import write_picture
+    from chainshaper.reporting.breakdown import hop_breakdown
     from chainshaper.reporting.figures import draw_distribution, draw_latency
+    from chainshaper.sources import open_source
     from chainshaper.steps import (
         Comparison,
         Measurement,
         compare_recordings,
         measure_latency,
         plan_recording,
+        profile_chains,
         shape_application,
     )
     from chainshaper.workload.description import Application, load_application
@@ -49,18 +70,39 @@ _HOMES = {
         "callback_statistics",
         "data_flow",
         "find_chain",
+        "load_named_paths",
     ),
     "chainshaper.doctor": ("examine_machine",),
     "chainshaper.errors": ("ChainshaperError", "InputError", "OperationError", "PlatformError"),
-    "chainshaper.planning": ("Plan", "load_plan", "plan_shaping", "save_plan"),
+    "chainshaper.exploration": (
+        "ApplicationDescription",
+        "convert_recording",
+        "describe_application",
+        "event_counts",
+        "list_chains",
+    ),
+    "chainshaper.planning": (
+        "Plan",
+        "PlanRequest",
+        "Profile",
+        "load_plan",
+        "place_chains",
+        "plan_chain",
+        "plan_shaping",
+        "save_plan",
+    ),
     "chainshaper.recording": ("Recording", "open_recording"),
+    "chainshaper.reporting.application_graph": ("write_picture",),
+    "chainshaper.reporting.breakdown": ("hop_breakdown",),
     "chainshaper.reporting.figures": ("draw_distribution", "draw_latency"),
+    "chainshaper.sources": ("open_source",),
     "chainshaper.steps": (
         "Comparison",
         "Measurement",
         "compare_recordings",
         "measure_latency",
         "plan_recording",
+        "profile_chains",
         "shape_application",
     ),
     "chainshaper.workload.description": ("Application", "load_application"),
@@ -70,6 +112,7 @@ _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "Application",
+    "ApplicationDescription",
     "ChainshaperError",
     "Comparison",
     "InputError",
@@ -77,26 +120,39 @@ __all__ = [
     "Measurement",
     "OperationError",
     "Plan",
+    "PlanRequest",
     "PlatformError",
+    "Profile",
     "Recording",
     "analyse_latency",
     "application_graph",
     "callback_statistics",
     "compare_recordings",
+    "convert_recording",
     "data_flow",
+    "describe_application",
     "draw_distribution",
     "draw_latency",
+    "event_counts",
     "examine_machine",
     "find_chain",
+    "hop_breakdown",
+    "list_chains",
     "load_application",
+    "load_named_paths",
     "load_plan",
     "measure_latency",
     "open_recording",
+    "open_source",
+    "place_chains",
+    "plan_chain",
     "plan_recording",
     "plan_shaping",
+    "profile_chains",
     "run_application",
     "save_plan",
     "shape_application",
+    "write_picture",
 ]
 
 

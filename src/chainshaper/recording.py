@@ -152,7 +152,8 @@ def open_recording(path: str | Path) -> Recording:
         if path.is_file():
             what = "a file, where the folder of a recording is wanted"
         raise InputError(
-            f"{path}: {what}; a recording is made with `chainshaper run APP.yaml -o {path}`"
+            f"{path}: {what}; a recording is made with `chainshaper run APP.yaml -o {path}`, a "
+            "trace, which is accepted as well, with `ros2 trace`"
         )
     return Recording(path, _read_info(file), _TablesOnDisk(path))
 

@@ -9,15 +9,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import polars as pl
 
 from chainshaper import events
-from chainshaper.analysis import LatencyAnalysis, analyse_latency
-from chainshaper.app import ApplicationGraph, Chain
+from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
 from chainshaper.durations import format_duration
-from chainshaper.errors import InputError, OperationError
-from chainshaper.planning import Plan, plan_shaping
+from chainshaper.errors import InputError
+from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain
+from chainshaper.predictions import PredictionHeld, cycles_until_output, hold_prediction
+from chainshaper.profiles import profile_of
 from chainshaper.recording import Recording
 from chainshaper.sources import open_source
 from chainshaper.splicing.application import splice_application
@@ -31,8 +31,11 @@ __all__ = [
     "compare_recordings",
     "measure_latency",
     "plan_recording",
+    "profile_chains",
     "shape_application",
 ]
+
+_STANDARD = PlanRequest()
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class Measurement:
 
     ``longest_stall_ns`` is the machine's own during the recording (None: nobody watched it),
     ``overruns`` counts messages that came too late for their publish slot (None: no gate ran),
-    ``plan`` is the plan in force.
+    ``plan`` is the plan in force, and ``held`` its prediction beside this measurement.
     """
 
     recording: Recording
@@ -49,6 +52,7 @@ class Measurement:
     longest_stall_ns: int | None
     overruns: int | None
     plan: Plan | None
+    held: PredictionHeld | None
 
 
 @dataclass(frozen=True)
@@ -74,99 +78,89 @@ def chain_of(recording: Recording, chain: str | None) -> str:
     return named
 
 
-def measure_latency(recording: Recording | str | Path, chain: str | None = None) -> Measurement:
-    """Analyse the end-to-end latency of one chain in a recording."""
+def measure_latency(
+    recording: Recording | str | Path, chain: str | None = None, plan: Plan | None = None
+) -> Measurement:
+    """Analyse the end-to-end latency of one chain in a recording.
+
+    ``plan`` is the plan in force, for recordings that do not know it themselves.
+    """
     if not isinstance(recording, Recording):
         recording = open_source(recording)
     analysis = analyse_latency(recording, chain_of(recording, chain))
-    stalls = events.table(recording.events, "machine_stall")
-    longest = None
-    if recording.info.stall_meter is not None:
-        longest = int(stalls["duration"].max() or 0)  # type: ignore[arg-type]
+    if plan is None and recording.info.plan is not None:
+        plan = Plan.model_validate(recording.info.plan, strict=False)
     overruns = None
     if "gate_release" in recording.events:
-        overruns = recording.events["gate_release"].filter(pl.col("cycles_waited") > 0).height
-    plan = recording.info.plan
+        expected = 0 if plan is None else cycles_until_output(plan)
+        late = pl.col("cycles_waited") > expected
+        overruns = recording.events["gate_release"].filter(late).height
+    planned_for = plan is not None and plan.chain.output in (None, analysis.chain.topics[-1])
     return Measurement(
         recording=recording,
         analysis=analysis,
-        longest_stall_ns=longest,
+        longest_stall_ns=_longest_stall(recording),
         overruns=overruns,
-        plan=None if plan is None else Plan.model_validate(plan, strict=False),
+        plan=plan,
+        held=hold_prediction(plan, recording, analysis) if plan and planned_for else None,
+    )
+
+
+def _longest_stall(recording: Recording) -> int | None:
+    if recording.info.stall_meter is None:
+        return None
+    stalls = events.table(recording.events, "machine_stall")
+    return int(stalls["duration"].max() or 0)  # type: ignore[arg-type]
+
+
+def profile_chains(
+    recording: Recording | str | Path,
+    chains: Sequence[str | None] = (None,),
+    *,
+    period_ns: int | None = None,
+) -> tuple[Profile, ...]:
+    """What the planner needs of recorded chains: see :func:`chainshaper.planning.plan_chain`.
+
+    Period, cores and priorities are those of the recording; ``period_ns`` is for chains that no
+    timer starts. None stands for the chain that the recording names.
+
+    Raises:
+        InputError: no such chain, or no period.
+        OperationError: a chain without a complete undisturbed traversal.
+    """
+    if not isinstance(recording, Recording):
+        recording = open_source(recording)
+    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    stall = _longest_stall(recording)
+    return tuple(
+        profile_of(
+            recording,
+            flow,
+            analyse_latency(flow, chain_of(recording, chain)),
+            period_ns=period_ns,
+            longest_stall_ns=stall,
+        )
+        for chain in chains
     )
 
 
 def plan_recording(
     recording: Recording | str | Path,
     chain: str | None = None,
+    request: PlanRequest = _STANDARD,
     *,
-    epsilon_ns: int = 1_000_000,
-    publish_slot_ns: int = 1_000_000,
-    anchor: str = "stamp",
-    spin_ns: int = 300_000,
-    pause_ns: int = 500_000,
+    period_ns: int | None = None,
+    sinks: Sequence[str] = (),
 ) -> Plan:
-    """Plan single-band shaping of a recorded chain (eq. 1, 4).
+    """Plan a recorded chain: single-band shaping (eq. 1, 4) unless ``request`` says otherwise.
 
     L̄ is the maximum over the cycles that the machine did not disturb: a stall of the machine is
-    not part of the chain's latency. Period, cores and priorities are those of the recording.
+    not part of the chain's latency. ``sinks`` are chains to further outputs of the same graph.
 
-    Raises:
-        InputError: no chain, or a chain that no timer starts.
-        OperationError: no complete undisturbed traversal, or L̄ does not fit into the period.
+    Raises: as :func:`profile_chains` and :func:`chainshaper.planning.plan_chain`.
     """
-    measurement = measure_latency(recording, chain)
-    recording, analysis = measurement.recording, measurement.analysis
-    complete = analysis.traversals.filter(pl.col("complete") & ~pl.col("disturbed"))
-    if complete.height == 0:
-        raise OperationError(
-            f"{recording.path}: of {analysis.traversals.height} traversals of "
-            f"{analysis.chain.spec} none is complete and undisturbed by the machine, so there is "
-            "nothing to plan from: see `chainshaper latency`, and record again"
-        )
-    graph, found = analysis.graph, analysis.chain
-    first = graph.callbacks[found.callbacks[0]]
-    if first.period_ns is None:
-        raise InputError(
-            f"chain {found.spec} starts at {first.label}, which is no timer, so its period is not "
-            "known: begin the chain at the timer callback that starts it"
-        )
-    executors = _executors(recording, graph, found)
-    return plan_shaping(
-        complete["latency_ns"].to_numpy().astype(np.int64),
-        first.period_ns,
-        spec=found.spec,
-        output=found.topics[-1],
-        publisher=graph.callbacks[found.callbacks[-1]].node,
-        nodes=tuple(dict.fromkeys(graph.callbacks[i].node for i in found.callbacks)),
-        epsilon_ns=epsilon_ns,
-        publish_slot_ns=publish_slot_ns,
-        recording=str(recording.path),
-        incomplete=analysis.statistics.incomplete,
-        disturbed=analysis.statistics.disturbed,
-        realtime=recording.info.realtime,
-        longest_stall_ns=measurement.longest_stall_ns,
-        core=executors.core,
-        anchor=anchor,  # type: ignore[arg-type]
-        fifo_priority=min(97, executors.priority + 5),
-        spin_ns=spin_ns,
-        pause_ns=pause_ns,
-    )
-
-
-@dataclass(frozen=True)
-class _Executors:
-    core: int
-    priority: int
-
-
-def _executors(recording: Recording, graph: ApplicationGraph, chain: Chain) -> _Executors:
-    """Core and priority of the chain's last executor, which R_m° shares (eq. 3)."""
-    last = graph.callbacks[chain.callbacks[-1]]
-    for thread in recording.info.threads:
-        if thread.pid == last.pid and thread.role == "executor":
-            return _Executors(thread.cores[0], thread.priority or 80)
-    return _Executors(core=1, priority=80)
+    profile, *further = profile_chains(recording, (chain, *sinks), period_ns=period_ns)
+    return plan_chain(profile, request, further)
 
 
 def shape_application(
@@ -204,14 +198,22 @@ def shape_application(
 
 
 def compare_recordings(
-    recordings: Sequence[Recording | str | Path], chain: str | None = None
+    recordings: Sequence[Recording | str | Path],
+    chain: str | None = None,
+    plan: Plan | None = None,
 ) -> Comparison:
     """Measure the same chain in several recordings.
+
+    ``plan`` was in force in the last of them, should that not say so itself.
 
     Raises:
         InputError: fewer than two recordings, or a chain that one of them does not have.
     """
     if len(recordings) < 2:
         raise InputError("a comparison needs two recordings, such as `compare before after`")
-    measurements = [measure_latency(recording, chain) for recording in recordings]
+    *first, last = recordings
+    measurements = [
+        *(measure_latency(recording, chain) for recording in first),
+        measure_latency(last, chain, plan),
+    ]
     return Comparison(measurements[0].analysis.chain.spec, tuple(measurements))

@@ -11,7 +11,20 @@ from small_chain import DDS_CORE, EXECUTOR_CORE, small_chain_text
 from chainshaper import load_plan, measure_latency, open_recording
 from chainshaper.recording import Recording
 
-VERBS = ("demo", "run", "latency", "callbacks", "plan", "shape", "compare", "doctor")
+VERBS = (
+    "demo",
+    "run",
+    "latency",
+    "info",
+    "graph",
+    "callbacks",
+    "chains",
+    "convert",
+    "plan",
+    "shape",
+    "compare",
+    "doctor",
+)
 
 STATISTICS = {
     *("count", "incomplete", "disturbed", "min_ns", "mean_ns", "max_ns", "jitter_ns"),

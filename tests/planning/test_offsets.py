@@ -10,7 +10,7 @@ import pytest
 
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning import offsets
-from chainshaper.planning.offsets import with_offsets
+from chainshaper.planning.offsets import place_chains, with_offsets
 from chainshaper.planning.plan import (
     ChainOfPlan,
     Evidence,
@@ -139,6 +139,67 @@ def test_many_chains_are_solved() -> None:
             if a[0] == b[0]:
                 assert not (a[1] < b[2] and b[1] < a[2])
     assert with_offsets(chains) == found
+
+
+def _loaded(periods: list[int], load: float) -> list[Plan]:
+    """Thirty chains of different lengths that fill this share of one core."""
+    generator = random.Random(3)
+    cycles = [generator.choice(periods) * MS for _ in range(30)]
+    weights = [generator.uniform(0.5, 1.5) for _ in range(30)]
+    lengths = [
+        int(cycle * load * weight / sum(weights))
+        for cycle, weight in zip(cycles, weights, strict=True)
+    ]
+    return [
+        _plan(f"c{number}", cycle, (1, 2, [(0, length)]))
+        for number, (cycle, length) in enumerate(zip(cycles, lengths, strict=True))
+    ]
+
+
+def test_thirty_chains_that_nearly_fill_a_core_are_fitted() -> None:
+    found = with_offsets(_loaded([50, 100, 200], 0.87))
+    busy = sorted(
+        (start, end)
+        for plan in found
+        for cycle in range(0, 200 * MS, plan.cycle_ns)
+        for start, end in [_wrapped(plan.offset_ns + cycle, plan.servers[0].slots[0][1])]
+    )
+    for (_, end), (start, _) in itertools.pairwise([*busy, (busy[0][0] + 200 * MS, 0)]):
+        assert end <= start
+    assert found[0].offset_ns == 0
+
+
+def _wrapped(start: int, length: int) -> tuple[int, int]:
+    start %= 200 * MS
+    return start, start + length
+
+
+def test_what_is_not_known_is_said_not_to_be_known() -> None:
+    if find_spec("ortools") is None:
+        pytest.skip("ortools is not installed")
+    with pytest.raises(OperationError, match=r"undecided: within 0.3 s .* fill 87.0% of core 1"):
+        with_offsets(_loaded([40, 50, 100, 200], 0.87), time_limit_s=0.3)
+
+
+def test_chains_that_cannot_take_turns_run_at_priorities_of_their_own() -> None:
+    chains = [_shaped("a", 100, 60), _shaped("b", 50, 30)]
+    with pytest.raises(OperationError, match="collide at every offset"):
+        with_offsets(chains)
+    placed, remarks = place_chains(chains)
+    assert [[server.priority for server in plan.servers] for plan in placed] == [[3, 1], [2, 1]]
+    assert ["only their publish slots are kept apart" in remark for remark in remarks] == [True]
+    slots = [plan.offset_ns + plan.servers[1].slots[0][0] for plan in placed]
+    assert (slots[1] - slots[0]) % (50 * MS) in range(MS, 49 * MS + 1)
+    turns, none = place_chains([_shaped("a", 100, 40), _shaped("b", 100, 40)])
+    assert none == []
+    assert [plan.servers[0].priority for plan in turns] == [2, 2]
+
+
+def _shaped(name: str, cycle_ms: int, latency_ms: int) -> Plan:
+    busy = latency_ms * MS
+    plan = _plan(name, cycle_ms * MS, (1, 2, [(0, busy)]), (1, 1, [(busy, busy + MS)]))
+    named = plan.servers[1].model_copy(update={"name": "output"})
+    return revised(plan, servers=(plan.servers[0], named))
 
 
 def _absolute(plan: Plan) -> list[tuple[str, tuple[int, int, int]]]:

@@ -138,6 +138,7 @@ def test_a_sound_plan_has_no_warnings() -> None:
         ({"incomplete": 2}, "2 executions"),
         ({"period_ns": 63 * MS}, "fills 98.4% of the cycle 63ms"),
         ({"period_ns": 63 * MS}, "throttles"),
+        ({"utilisation": 0.97}, "takes 97.0% of its core"),
     ],
 )
 def test_doubts_are_said(doubtful: dict[str, Any], words: str) -> None:

@@ -88,8 +88,8 @@ def _consumed(taken: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
     if not read:
         return taken.rename({"assumed_instance": "instance"})
     first = pl.concat(read).filter(pl.col("take").is_not_null())
-    # `first` is in order of start: of several instances after one take the first had it.
-    first = first.unique("take", keep="first", maintain_order=True)
+    # In order of start: of several instances after one take the first had it, so it comes last.
+    first = first.reverse()
     return taken.with_columns(
         pl.coalesce("assumed_instance", by_number(first, "take", "instance", taken.height)).alias(
             "instance"
@@ -115,10 +115,10 @@ def _published_in(
     )
     rest = published.select("publication", "time", "pid", "tid", "node")
     found = [_within(rest, running, strictly=True)]
-    rest = rest.join(found[0], on="publication", how="anti")
+    rest = _without(rest, found[0], published.height)
     while running.height and rest.height:
         found.append(_within(rest, running, strictly=False))
-        rest = rest.join(found[-1], on="publication", how="anti")
+        rest = _without(rest, found[-1], published.height)
         running = running.sort("start", maintain_order=True)
         inner_start = pl.col("start").shift(-1).over("pid", "tid")
         inner_end = pl.col("end").shift(-1).over("pid", "tid")
@@ -129,6 +129,12 @@ def _published_in(
         by_number(inside, "publication", column, published.height)
         for column in ("instance", "callback_id")
     )
+
+
+def _without(rest: pl.DataFrame, found: pl.DataFrame, height: int) -> pl.DataFrame:
+    """The publications of ``rest`` that are not among ``found``; both in their numbers."""
+    hit = by_number(found.select("publication", hit=pl.lit(True)), "publication", "hit", height)
+    return rest.filter(hit.gather(rest["publication"]).is_null())
 
 
 def _within(published: pl.DataFrame, running: pl.DataFrame, *, strictly: bool) -> pl.DataFrame:

@@ -4,7 +4,8 @@ An instance runs from `callback_start` to `callback_end` of the same callback on
 (paper, section 2.4). Instances of different processes and threads overlap freely.
 """
 
-import numpy as np
+from typing import Any
+
 import polars as pl
 
 from chainshaper import events
@@ -57,61 +58,30 @@ def _paired(tables: events.EventTables) -> pl.DataFrame:
     Columns: ``pid, tid, callback, start, end, used, intra_process``; ``used`` is the thread's
     CPU time between start and end where the source tells it.
     """
+    # Numba takes a moment to import: only who asks for instances pays for it.
+    from chainshaper.analysis.pairing import ends_of_starts
+
     starts = events.table(tables, "callback_start", ["is_intra_process", "thread_time"])
     ends = events.table(tables, "callback_end", ["thread_time"])
-    clock = ["thread_time"] if starts["thread_time"].count() else []  # a column less to sort
-    intra = pl.col("is_intra_process").fill_null(0).ne(0).alias("intra_process")
-    never = pl.lit(False).alias("intra_process")
-    both = pl.concat(
-        [
-            starts.select(*_THREAD, "time", *clock, intra, is_end=pl.lit(False)),
-            ends.select(*_THREAD, "time", *clock, never, is_end=pl.lit(True)),
-        ]
-    ).sort(*_THREAD, "time", "is_end", maintain_order=True)
-    both = _simultaneous_in_order(both)
-    ended = ~_differs(_THREAD, -1) & pl.col("is_end").shift(-1, fill_value=False)
-    used = pl.col("thread_time").shift(-1) - pl.col("thread_time")
-    return both.select(
+    found = ends_of_starts(_keyed(starts), _keyed(ends))
+    row = pl.Series(found, dtype=pl.Int64)
+    row = row.set(row < 0, None) if (found < 0).any() else row
+    return starts.select(
         *_THREAD,
         pl.col("time").alias("start"),
-        pl.when(ended).then(pl.col("time").shift(-1)).alias("end"),
-        pl.when(ended).then(used if clock else pl.lit(None, pl.Int64)).alias("used"),
-        "intra_process",
-        "is_end",
-    ).filter(~pl.col("is_end"))
-
-
-def _differs(keys: list[str], shift: int) -> pl.Expr:
-    """Whether a row has another key than the one before (``shift`` 1) or after it (−1)."""
-    return pl.any_horizontal(pl.col(key).ne_missing(pl.col(key).shift(shift)) for key in keys)
-
-
-def _simultaneous_in_order(both: pl.DataFrame) -> pl.DataFrame:
-    """Order starts and ends that share one time stamp and one key.
-
-    Clocks tick coarsely and simulators exactly, so an instance may begin in the very
-    nanosecond in which the one before ended (end first), or last no time at all (start first).
-    It is the former when an instance was open before that nanosecond.
-    """
-    if both.is_empty():
-        return both
-    new_moment, new_thread = both.select(
-        _differs([*_THREAD, "time"], 1).alias("moment"), _differs(_THREAD, 1).alias("thread")
+        ends["time"].gather(row).alias("end"),
+        (ends["thread_time"].gather(row) - starts["thread_time"]).alias("used"),
+        pl.col("is_intra_process").fill_null(0).ne(0).alias("intra_process"),
     )
-    first = np.flatnonzero(new_moment.to_numpy())
-    if len(first) == len(both):
-        return both
-    is_end = both["is_end"].to_numpy()
-    step = np.where(is_end, -1, 1)
-    opened = np.cumsum(step) - step  # starts minus ends of all rows before this one
-    thread_first = np.flatnonzero(new_thread.to_numpy())
-    length = np.diff(np.append(thread_first, len(both)))
-    opened -= np.repeat(opened[thread_first], length)  # counted within the thread and callback
-    open_before = np.repeat(opened[first] > 0, np.diff(np.append(first, len(both))))
+
+
+def _keyed(table: pl.DataFrame) -> tuple[Any, Any, Any]:
+    """Thread, callback and time of a table's rows as arrays; both pid and tid in one number."""
+    thread = pl.col("pid").fill_null(-1).cast(pl.Int64) * 2**32 + pl.col("tid").fill_null(-1)
     return (
-        both.with_columns(pl.Series("rank", is_end ^ open_before))
-        .sort(*_THREAD, "time", "rank", maintain_order=True)
-        .drop("rank")
+        table.select(thread).to_series().to_numpy(),
+        table["callback"].fill_null(0).to_numpy(),
+        table["time"].to_numpy(),
     )
 
 

@@ -10,7 +10,7 @@ from typing import Literal
 
 import polars as pl
 
-__all__ = ["by_number", "first_after", "latest_before", "nearest"]
+__all__ = ["by_number", "first_after", "in_order", "latest_before", "nearest"]
 
 
 def latest_before(
@@ -96,10 +96,21 @@ def _in_order(frame: pl.DataFrame, time: str) -> pl.DataFrame:
     return frame if frame[time].is_sorted() else frame.sort(time, maintain_order=True)
 
 
+def in_order(frame: pl.DataFrame, time: str, *ties: str) -> pl.DataFrame:
+    """``frame`` sorted by ``time`` and, where times are equal, by ``ties``; else as it was.
+
+    Looking whether all times grow costs a fraction of what sorting by several columns does.
+    """
+    if bool((frame[time].diff().drop_nulls() > 0).all()):
+        return frame
+    return frame.sort(time, *ties, maintain_order=True)
+
+
 def by_number(rows: pl.DataFrame, number: str, column: str, height: int) -> pl.Series:
     """``column`` of ``rows`` laid out by their ``number``: a series of ``height``, null elsewhere.
 
-    What a left join on a frame's own row numbers gives, without copying the frame.
+    What a left join on a frame's own row numbers gives, without copying the frame. Of several rows
+    with one number the last counts.
     """
     values = pl.repeat(None, height, dtype=rows.schema[column], eager=True).alias(column)
     return values.scatter(rows[number], rows[column])

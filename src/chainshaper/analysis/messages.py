@@ -22,7 +22,7 @@ Publications and takes under handles that nobody initialised are left out
 import polars as pl
 
 from chainshaper import events
-from chainshaper.analysis.matching import by_number, first_after, latest_before
+from chainshaper.analysis.matching import by_number, first_after, in_order, latest_before
 from chainshaper.analysis.objects import Objects
 
 __all__ = ["link_takes", "overwritten_in", "publications", "takes"]
@@ -55,7 +55,7 @@ def publications(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
         time=pl.col("intra_time"), source_timestamp=pl.lit(None, dtype=pl.Int64)
     )
     every = pl.concat([merged.select(columns), alone.select(columns)])
-    return every.sort("time", "pid", "tid", maintain_order=True).with_row_index("publication")
+    return in_order(every, "time", "pid", "tid").with_row_index("publication")
 
 
 def _written(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
@@ -69,11 +69,12 @@ def _written(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     )
     named = writes.filter(pl.col("rmw_publisher_handle").is_not_null())
     nameless = writes.filter(pl.col("rmw_publisher_handle").is_null())
-    nameless = _with_rcl_publisher(tables, nameless)
-    found = [
-        latest_before(named, by_rmw, ["pid", "rmw_publisher_handle"], "time", "created"),
-        latest_before(nameless, by_rcl, ["pid", "publisher_handle"], "time", "created"),
-    ]
+    found = [latest_before(named, by_rmw, ["pid", "rmw_publisher_handle"], "time", "created")]
+    if nameless.height:
+        nameless = _with_rcl_publisher(tables, nameless)
+        found.append(
+            latest_before(nameless, by_rcl, ["pid", "publisher_handle"], "time", "created")
+        )
     columns = ["time", "pid", "tid", *_PUBLISHER, "source_timestamp"]
     return pl.concat([frame.select(columns) for frame in found]).drop_nulls("publisher")
 
@@ -177,7 +178,7 @@ def takes(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
             for part in parts
         ]
     )
-    every = every.sort("time", "pid", "tid", maintain_order=True).with_row_index("take")
+    every = in_order(every, "time", "pid", "tid").with_row_index("take")
     return every.with_columns(pl.col("buffer").is_not_null().alias("intra_process"))
 
 

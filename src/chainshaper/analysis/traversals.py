@@ -193,17 +193,18 @@ def _take(flow: DataFlow, state: pl.DataFrame, hop: int, callback: Callback) -> 
     taken = flow.takes.filter(
         (pl.col("callback_id") == callback.id) & pl.col("publication").is_not_null()
     ).select("publication", "take", "instance")
-    # Should a message have been taken twice, the take that led to an execution is followed.
-    taken = taken.sort(pl.col("instance").is_null(), "take", maintain_order=True)
-    taken = taken.unique("publication", keep="first", maintain_order=True)
-    named = taken.rename(
-        {
-            "publication": f"publication_{hop - 1}",
-            "take": f"take_{hop}",
-            "instance": f"instance_{hop}",
-        }
+    # Should a message have been taken twice, the take that led to an execution is followed, of
+    # several the first: what is laid out last stays.
+    executed = pl.col("instance").is_not_null()
+    taken = pl.concat([taken.filter(~executed).reverse(), taken.filter(executed).reverse()])
+    height = flow.publications.height
+    before = pl.col(f"publication_{hop - 1}")
+    state = state.with_columns(
+        pl.lit(by_number(taken, "publication", column, height))
+        .gather(before)
+        .alias(f"{column}_{hop}")
+        for column in ("take", "instance")
     )
-    state = state.join(named, on=f"publication_{hop - 1}", how="left", maintain_order="left")
     untaken = pl.col("reason").is_null() & pl.col(f"take_{hop}").is_null()
     why = _why_not_taken(flow, taken, callback, pl.col(f"publication_{hop - 1}"))
     state = _broken(state, untaken, hop, why)

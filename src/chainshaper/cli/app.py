@@ -5,10 +5,15 @@ from collections.abc import Callable
 import typer
 
 from chainshaper.cli.callbacks import callbacks
+from chainshaper.cli.chains import chains
 from chainshaper.cli.compare import compare
+from chainshaper.cli.convert import convert
 from chainshaper.cli.demo import demo
 from chainshaper.cli.doctor import doctor
+from chainshaper.cli.graph import graph
+from chainshaper.cli.info import info
 from chainshaper.cli.latency import latency
+from chainshaper.cli.offsets import offsets
 from chainshaper.cli.plan import plan
 from chainshaper.cli.run import run
 from chainshaper.cli.shape import shape
@@ -27,9 +32,14 @@ app = typer.Typer(
 VERBS: tuple[Callable[..., None], ...] = (
     demo,
     run,
-    latency,
+    info,
+    graph,
     callbacks,
+    chains,
+    latency,
+    convert,
     plan,
+    offsets,
     shape,
     compare,
     doctor,

@@ -25,14 +25,29 @@ def compare(
             show_default=False,
         ),
     ] = None,
+    plan: Annotated[
+        Path | None,
+        typer.Option(
+            "--plan",
+            metavar="plan.yaml",
+            help="The plan that the last recording was made with, where it does not say so.",
+            show_default=False,
+        ),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Show the same chain in several recordings side by side, usually before and after shaping."""
+    """Show the same chain in several recordings side by side, usually before and after shaping.
+
+    Where a plan was in force, its prediction is held against the measurement, band by band.
+    """
     from chainshaper.cli.output import print_json, show
+    from chainshaper.planning import load_plan
+    from chainshaper.reporting.predictions import prediction_table
     from chainshaper.reporting.tables import comparison_json, comparison_table
     from chainshaper.steps import compare_recordings
 
-    comparison = compare_recordings(recordings, chain)
+    in_force = None if plan is None else load_plan(plan)
+    comparison = compare_recordings(recordings, chain, in_force)
     if figures is not None:
         from chainshaper.reporting.figures import draw_comparison
 
@@ -40,4 +55,5 @@ def compare(
     if json:
         print_json(comparison_json(comparison))
         return
-    show(comparison_table(comparison))
+    held = [measurement.held for measurement in comparison.measurements]
+    show(comparison_table(comparison), *(prediction_table(one) for one in held if one is not None))

@@ -1,18 +1,28 @@
-"""`chainshaper latency`: the end-to-end latency of a chain in a recording."""
+"""`chainshaper latency`: the end-to-end latency of a chain in a recording or a trace."""
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from chainshaper.cli.options import ChainOption, JsonOption, RecordingArgument
+from chainshaper.cli.options import ChainOption, JsonOption, TraceArgument
 from chainshaper.errors import InputError
 
 __all__ = ["latency"]
 
 
 def latency(
-    recording: RecordingArgument,
+    trace: TraceArgument,
     chain: ChainOption = None,
+    chains: Annotated[
+        Path | None,
+        typer.Option(
+            "--chains",
+            metavar="FILE",
+            help="A CARET architecture file: --chain then names one of its named_paths.",
+            show_default=False,
+        ),
+    ] = None,
     json: JsonOption = False,
     instances: Annotated[
         bool, typer.Option("--instances", help="With --json: every traversal, one by one.")
@@ -21,25 +31,33 @@ def latency(
     """Show the end-to-end latency of a chain: average, maximum, jitter, percentiles.
 
     Each traversal is followed from the start of the first callback to the publication of the
-    last topic, message by message.
+    last topic, message by message. A second table shows in which hop the time went.
     """
-    from chainshaper.cli.output import notes, print_json, show, show_line
+    from chainshaper.cli.output import late_progress, notes, print_json, show, show_line
+    from chainshaper.exploration import lost_events, named_chain
+    from chainshaper.reporting.breakdown import breakdown_json, breakdown_table
     from chainshaper.reporting.tables import latency_json, latency_table
+    from chainshaper.sources import open_source
     from chainshaper.steps import measure_latency
 
     if instances and not json:
         raise InputError("--instances goes with --json: add it")
-    measurement = measure_latency(recording, chain)
-    if json:
-        print_json(latency_json(measurement, instances=instances))
-        return
+    if chains is not None:
+        chain = named_chain(chains, chain)
+    with late_progress("latency") as report:
+        opened = open_source(*trace, progress=report)
+        measurement = measure_latency(opened, chain)
     analysis = measurement.analysis
-    show(latency_table(analysis))
+    if json:
+        found = latency_json(measurement, instances=instances)
+        print_json({**found, **breakdown_json(analysis)})
+        return
+    show(latency_table(analysis), breakdown_table(analysis))
     counts = f"{analysis.statistics.disturbed} cycles disturbed by the machine"
     if analysis.incomplete:
         reasons = ", ".join(f"{count} {reason}" for reason, count in analysis.incomplete.items())
         counts += f"; incomplete: {reasons}"
     if measurement.overruns:
         counts += f"; {measurement.overruns} outputs were too late for their slot"
-    show_line(counts)
+    show_line(f"{counts}; {lost_events(opened.info)}")
     notes(analysis.notes)

@@ -15,6 +15,7 @@ __all__ = [
     "RealtimeOption",
     "RecordingArgument",
     "RecordingOutput",
+    "TraceArgument",
     "duration_option",
 ]
 
@@ -32,6 +33,15 @@ ChainOption = Annotated[
 
 RecordingArgument = Annotated[
     Path, typer.Argument(metavar="REC", help="A recording's folder.", show_default=False)
+]
+TraceArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="TRACE...",
+        help="An LTTng trace's folder (several of one trace: kernel and user space), or a "
+        "recording's.",
+        show_default=False,
+    ),
 ]
 ApplicationArgument = Annotated[
     Path,
@@ -66,6 +76,8 @@ def _parse(text: str) -> int:
     return value
 
 
-def duration_option(name: str, help_text: str) -> Any:
+def duration_option(name: str, help_text: str, panel: str | None = None) -> Any:
     """An option that takes a duration with a unit and gives nanoseconds."""
-    return typer.Option(name, help=help_text, metavar="DURATION", parser=_parse)
+    return typer.Option(
+        name, help=help_text, metavar="DURATION", parser=_parse, rich_help_panel=panel
+    )

@@ -3,8 +3,9 @@
 import json
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
 from chainshaper.errors import OperationError
@@ -12,7 +13,10 @@ from chainshaper.errors import OperationError
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-__all__ = ["notes", "print_json", "progress", "show", "show_line"]
+__all__ = ["late_progress", "notes", "print_json", "progress", "show", "show_line"]
+
+PATIENCE_S = 2.0
+"""What takes longer than this shows its progress."""
 
 
 def show(*tables: "RenderableType") -> None:
@@ -81,6 +85,40 @@ def progress(title: str) -> Iterator[Callable[[float, str], None]]:
             bar.update(task, completed=min(1.0, share), description=f"{title}: {what}")
 
         yield report
+
+
+@contextmanager
+def late_progress(title: str) -> Iterator[Callable[[float, str], None]]:
+    """As :func:`progress`, but nothing is shown of what is over in two seconds."""
+    with ExitStack() as shown:
+        lock = threading.Lock()
+        latest = (0.0, "working")
+        bar: Callable[[float, str], None] | None = None
+        over = False
+
+        def begin() -> None:
+            nonlocal bar
+            with lock:
+                if not over:
+                    bar = shown.enter_context(progress(title))
+                    bar(*latest)
+
+        def report(share: float, what: str) -> None:
+            nonlocal latest
+            with lock:
+                latest = (share, what)
+                if bar is not None:
+                    bar(share, what)
+
+        timer = threading.Timer(PATIENCE_S, begin)
+        timer.daemon = True
+        timer.start()
+        try:
+            yield report
+        finally:
+            timer.cancel()
+            with lock:
+                over = True
 
 
 def _stage_lines(title: str) -> Callable[[float, str], None]:

@@ -1,60 +1,64 @@
 """`chainshaper plan`: from measured latencies to reservation servers and slots."""
 
-from enum import Enum
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from chainshaper.cli.options import ChainOption, JsonOption, duration_option
+from chainshaper.cli import plan_options as options
+from chainshaper.cli.options import JsonOption, duration_option
 from chainshaper.errors import InputError
 
 if TYPE_CHECKING:
-    from chainshaper.planning import Plan
+    from chainshaper.planning import Plan, PlanRequest, Profile
 
 __all__ = ["plan"]
-
-
-class Anchor(str, Enum):
-    """What starts a cycle for the shaping node."""
-
-    STAMP = "stamp"
-    CYCLE = "cycle"
 
 
 def plan(
     recording: Annotated[
         Path | None,
-        typer.Argument(metavar="[REC]", help="A recording's folder.", show_default=False),
-    ] = None,
-    chain: ChainOption = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "--output", "-o", metavar="plan.yaml", help="File to write.", show_default=False
+        typer.Argument(
+            metavar="[REC]", help="A recording's or a trace's folder.", show_default=False
         ),
     ] = None,
-    latencies: Annotated[
-        Path | None,
-        typer.Option(
-            "--latencies",
-            metavar="FILE",
-            help="Instead of a recording: a duration a line, or .npy in ns.",
-            show_default=False,
-        ),
-    ] = None,
-    period: Annotated[
-        int | None, duration_option("--period", "Period of the chain, with --latencies.")
-    ] = None,
-    epsilon: Annotated[
-        int, duration_option("--epsilon", "Margin behind the longest latency.")
-    ] = "1ms",  # type: ignore[assignment]
+    chain: options.ChainsOption = None,
+    output: options.PlanOutput = None,
+    latencies: options.LatenciesOption = None,
+    period: options.PeriodOption = None,
+    policy: Annotated[options.Policy, typer.Option(help="How it is scheduled.")] = (
+        options.Policy.SHAPED
+    ),
+    publication: Annotated[
+        options.Publication, typer.Option(help="By a shaping node, or the publisher's own thread.")
+    ] = options.Publication.SYNCHRONOUS,
     publish_slot: Annotated[
         int, duration_option("--publish-slot", "Length of the publish slot.")
     ] = "1ms",  # type: ignore[assignment]
+    slot_start: options.SlotStartOption = None,
+    epsilon: options.EpsilonOption = None,
+    overrun_probability: options.ProbabilityOption = None,
+    bands: options.BandsOption = "1",
+    solver: Annotated[
+        options.Solver, typer.Option(help="What places bands.", rich_help_panel="Latency bands")
+    ] = options.Solver.EXACT,
+    grid: options.GridOption = "1us",  # type: ignore[assignment]
+    max_gap: options.MaxGapOption = None,
+    max_share: options.MaxShareOption = None,
+    minimise: Annotated[
+        options.Minimise, typer.Option(help="What to make small.", rich_help_panel="Latency bands")
+    ] = options.Minimise.MEAN,
+    mean_at_most: options.MeanAtMostOption = None,
+    least_gain: options.LeastGainOption = "2%",  # type: ignore[assignment]
+    curve: options.CurveOption = None,
+    seed: options.SeedOption = 0,
+    first_slot: options.FirstSlotOption = None,
+    sink: options.SinksOption = None,
     anchor: Annotated[
-        Anchor, typer.Option(help="What slots count from: the message's stamp, or the cycle.")
-    ] = Anchor.STAMP,
+        options.Anchor,
+        typer.Option(help="What slots count from: the message's stamp, or the cycle."),
+    ] = options.Anchor.STAMP,
     spin: Annotated[
         int, duration_option("--spin", "How long the gate watches the clock before its slot.")
     ] = "300us",  # type: ignore[assignment]
@@ -63,59 +67,109 @@ def plan(
     ] = "500us",  # type: ignore[assignment]
     json: JsonOption = False,
 ) -> None:
-    """Plan single-band latency shaping: one publish slot behind the longest latency.
+    """Plan the reservation servers of a chain: by default one publish slot behind its longest
+    latency, or several latency bands, or one of the schedules that shaping is compared with.
 
     From a recording, or from bare latencies with their period.
     """
-    from chainshaper.cli.output import notes, print_json, show, show_line
-    from chainshaper.planning import plan_json, plan_warnings, save_plan
-    from chainshaper.reporting.tables import plan_table
-    from chainshaper.steps import plan_recording
+    from chainshaper.planning import PlanRequest, plan_chain
 
     if (recording is None) == (latencies is None):
         raise InputError("give either a recording or --latencies FILE --period DURATION")
-    if recording is not None:
-        if period is not None:
-            raise InputError("--period goes with --latencies: a recording knows its chain's period")
-        planned = plan_recording(
-            recording,
-            chain,
-            epsilon_ns=epsilon,
-            publish_slot_ns=publish_slot,
-            anchor=anchor.value,
-            spin_ns=spin,
-            pause_ns=pause,
-        )
-    else:
-        planned = _plan_latencies(latencies, period, chain, epsilon, publish_slot, anchor)
-    if output is not None:
-        save_plan(planned, output)
-    if json:
-        print_json(plan_json(planned))
+    if curve is not None and bands != "auto":
+        raise InputError("--curve draws what --bands auto looked at: add --bands auto")
+    request = PlanRequest(
+        policy=policy.value,
+        publication=publication.value,
+        epsilon_ns=epsilon,
+        overrun_probability=overrun_probability,
+        publish_slot_ns=publish_slot,
+        bands="auto" if bands == "auto" else int(bands),
+        solver=solver.value,
+        grid_ns=grid,
+        max_gap_ns=max_gap,
+        max_share=max_share,
+        minimise=minimise.value,
+        mean_at_most_ns=mean_at_most,
+        least_gain=least_gain,
+        seed=seed,
+        slot_start_ns=slot_start,
+        first_slot_ns=first_slot,
+        anchor=anchor.value,
+        spin_ns=spin,
+        pause_ns=pause,
+    )
+    wanted: list[str | None] = [*chain] if chain else [None]
+    profiles = _profiles(recording, latencies, period, [*wanted, *(sink or [])])
+    chains, sinks = profiles[: len(wanted)], profiles[len(wanted) :]
+    if len(chains) > 1:
+        _several(chains, sinks, request, output, curve, json)
         return
-    show(plan_table(planned))
-    notes(plan_warnings(planned))
-    if output is not None:
-        show_line(str(output))
+    planned = plan_chain(chains[0], request, sinks)
+    _print_one(planned, chains[0], request, output, curve, json)
 
 
-def _plan_latencies(
+def _profiles(
+    recording: Path | None,
     latencies: Path | None,
     period: int | None,
-    chain: str | None,
-    epsilon: int,
-    publish_slot: int,
-    anchor: Anchor,
-) -> "Plan":
-    from chainshaper.planning import plan_shaping, read_latencies
+    chains: Sequence[str | None],
+) -> "tuple[Profile, ...]":
+    from chainshaper.planning import Profile, read_latencies
+    from chainshaper.steps import profile_chains
 
+    if recording is not None:
+        return profile_chains(recording, chains, period_ns=period)
     if latencies is None or period is None:
         raise InputError("--latencies needs the chain's period: add --period, such as 100ms")
-    return plan_shaping(
-        read_latencies(latencies),
-        period,
-        spec=chain,
-        epsilon_ns=epsilon,
-        publish_slot_ns=publish_slot,
-        anchor=anchor.value,
-    )
+    if len(chains) > 1:
+        raise InputError("--latencies are those of one chain: give a recording for several")
+    return (Profile(read_latencies(latencies), period, spec=chains[0]),)
+
+
+def _print_one(
+    planned: "Plan",
+    profile: "Profile",
+    request: "PlanRequest",
+    output: Path | None,
+    curve: Path | None,
+    json: bool,
+) -> None:
+    from chainshaper.cli.output import notes, print_json, show, show_line
+    from chainshaper.planning import band_choice, plan_json, plan_warnings, save_plan
+    from chainshaper.reporting.predictions import choice_json, choice_table
+    from chainshaper.reporting.tables import plan_table
+
+    choice = band_choice(planned, profile, request) if request.bands == "auto" else None
+    if output is not None:
+        save_plan(planned, output)
+    if curve is not None and choice is not None:
+        from chainshaper.reporting.figures import draw_curve
+
+        draw_curve(choice, curve)
+    if json:
+        values: dict[str, Any] = {**plan_json(planned), "warnings": plan_warnings(planned)}
+        print_json(values if choice is None else {**values, "choice": choice_json(choice)})
+        return
+    show(plan_table(planned), *([] if choice is None else [choice_table(choice)]))
+    notes(plan_warnings(planned))
+    for path in (curve, output):
+        if path is not None:
+            show_line(str(path))
+
+
+def _several(
+    profiles: "Sequence[Profile]",
+    sinks: "Sequence[Profile]",
+    request: "PlanRequest",
+    output: Path | None,
+    curve: Path | None,
+    json: bool,
+) -> None:
+    from chainshaper.cli.offsets import place_and_print
+    from chainshaper.planning import plan_chain
+
+    if sinks or curve is not None:
+        raise InputError("--sink and --curve go with one chain: plan chains one by one")
+    plans = [plan_chain(profile, request) for profile in profiles]
+    place_and_print(plans, output, json)

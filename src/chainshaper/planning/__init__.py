@@ -1,6 +1,7 @@
 """From measured latencies to servers and slots: dimensioning, prediction, the plan file.
 
 Everything starts with :func:`plan_shaping`; each further step takes a plan and returns a plan.
+:func:`plan_chain` takes all of them that a :class:`PlanRequest` asks for.
 """
 
 from chainshaper.planning.baselines import (
@@ -14,8 +15,14 @@ from chainshaper.planning.baselines import (
 from chainshaper.planning.graphs import over_cores, with_first_node_apart, with_sink
 from chainshaper.planning.latency_file import check_latencies, read_latencies
 from chainshaper.planning.margins import derive_margin
-from chainshaper.planning.offsets import with_offsets
-from chainshaper.planning.placement import figure7_curve, with_bands, with_long_slot
+from chainshaper.planning.offsets import place_chains, with_offsets
+from chainshaper.planning.placement import (
+    BandChoice,
+    choose_bands,
+    figure7_curve,
+    with_bands,
+    with_long_slot,
+)
 from chainshaper.planning.plan import (
     ChainOfPlan,
     Evidence,
@@ -30,21 +37,27 @@ from chainshaper.planning.plan import (
     publish_slots,
     server_of,
 )
-from chainshaper.planning.plan_file import dump_plan, load_plan, plan_json, save_plan
+from chainshaper.planning.plan_file import dump_plan, load_plan, plan_json, save_plan, save_plans
+from chainshaper.planning.request import PlanRequest, Profile, band_choice, plan_chain
 from chainshaper.planning.shaping import plan_shaping, plan_warnings, predict_bands
 
 __all__ = [
+    "BandChoice",
     "CallbackTimes",
     "ChainOfPlan",
     "Evidence",
     "Margin",
     "Plan",
+    "PlanRequest",
     "Prediction",
+    "Profile",
     "Server",
     "ShapingNode",
     "Slot",
     "Thread",
+    "band_choice",
     "check_latencies",
+    "choose_bands",
     "derive_margin",
     "dump_plan",
     "figure7_curve",
@@ -54,6 +67,8 @@ __all__ = [
     "load_plan",
     "output_server",
     "over_cores",
+    "place_chains",
+    "plan_chain",
     "plan_json",
     "plan_shaping",
     "plan_warnings",
@@ -61,6 +76,7 @@ __all__ = [
     "publish_slots",
     "read_latencies",
     "save_plan",
+    "save_plans",
     "server_of",
     "server_per_callback",
     "server_per_chain",

@@ -15,10 +15,12 @@ to the first by a chain of tight pairs (pairs whose difference is at an end of a
 interval), and start all of them earlier until some pair becomes tight. Repeated, that links
 every chain to the first without breaking a constraint: if there is a solution, there is one in
 which the tight pairs form a tree, and it is enough to try the ends of allowed intervals. Many
-chains are given to the CP-SAT solver of OR-tools, which is exact as well but may run out of time.
+chains are first fitted in one after the other, which is quick and mostly enough; where it is not,
+the CP-SAT solver of OR-tools decides, which is exact as well but may run out of time.
 """
 
 import math
+import random
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 from typing import TypeAlias
@@ -26,28 +28,79 @@ from typing import TypeAlias
 from chainshaper.durations import format_duration
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.extras import extra_library
-from chainshaper.planning.plan import Plan, revised
+from chainshaper.planning.plan import Plan, output_server, revised
+from chainshaper.planning.shaping import OUTPUT_PRIORITY
 
-__all__ = ["with_offsets"]
+__all__ = ["place_chains", "with_offsets"]
 
 MOST_SEARCHED = 4  # chains; beyond, CP-SAT is faster
 TIME_LIMIT_SECONDS = 60.0
+FITTING_ORDERS = 20  # in which chains are fitted in one by one, before the solver is asked
 
 _Intervals: TypeAlias = list[tuple[int, int]]  # closed, ascending
 _Allowed: TypeAlias = dict[tuple[int, int], tuple[int, _Intervals]]
 """For chains j < k whose slots can collide: g, and what (offset k − offset j) mod g may be."""
 
 
-def with_offsets(plans: Sequence[Plan]) -> tuple[Plan, ...]:
+def place_chains(
+    plans: Sequence[Plan], *, time_limit_s: float = TIME_LIMIT_SECONDS
+) -> tuple[tuple[Plan, ...], list[str]]:
+    """Offsets for chains that share cores, and what is to be known about them.
+
+    The chains take turns where they can (:func:`with_offsets`). Where they cannot, they run at
+    the same time, the chain with the shorter period at the better priority, and only their
+    publish slots, which make the latency constant, are kept apart.
+
+    Raises: as :func:`with_offsets`.
+    """
+    try:
+        return with_offsets(plans, time_limit_s=time_limit_s), []
+    except OperationError as error:
+        ranked = _with_own_priorities(plans)
+        if [plan.servers for plan in ranked] == [plan.servers for plan in plans]:
+            raise
+        remark = (
+            f"{error} Instead, the chains run at the same time at priorities of their own, and"
+            " only their publish slots are kept apart: their latencies must have been measured"
+            " while all of them ran like this."
+        )
+        return with_offsets(ranked, time_limit_s=time_limit_s), [remark]
+
+
+def _with_own_priorities(plans: Sequence[Plan]) -> list[Plan]:
+    """Servers that do not publish get priorities behind those that do, by period."""
+    order = sorted(range(len(plans)), key=lambda k: (plans[k].cycle_ns, k))
+    rank = {k: place for place, k in enumerate(order)}
+    ranked = []
+    for k, plan in enumerate(plans):
+        nodes = (plan.shaping_node, *plan.further_shaping_nodes)
+        threads = {node.thread for node in nodes if node is not None}
+        publishing = output_server(plan)
+        servers = tuple(
+            server
+            if server is publishing or threads & set(server.threads)
+            else server.model_copy(update={"priority": OUTPUT_PRIORITY + 1 + rank[k]})
+            for server in plan.servers
+        )
+        ranked.append(revised(plan, servers=servers))
+    return ranked
+
+
+def with_offsets(
+    plans: Sequence[Plan], *, time_limit_s: float = TIME_LIMIT_SECONDS
+) -> tuple[Plan, ...]:
     """The plans of several chains with offsets that keep their slots apart.
 
     The first chain, and any that shares no core with another, keeps the offset 0. To let two
     chains run on one core at the same time, give their servers different priorities first.
 
+    ``time_limit_s`` bounds the search among chains that can collide with each other.
+
     Raises:
         InputError: no plans.
         OperationError: there are no such offsets, with the reason where a single pair of chains
-            or the load of a core already excludes them; or the solver ran out of time.
+            or the load of a core already excludes them; or it is not known whether there are,
+            because the time was up.
         PlatformError: more than a few chains collide and OR-tools is not installed.
     """
     if not plans:
@@ -65,7 +118,7 @@ def with_offsets(plans: Sequence[Plan]) -> tuple[Plan, ...]:
         if len(group) <= MOST_SEARCHED:
             solution = _search(plans, allowed, group, {group[0]: 0})
         else:
-            solution = _solve(plans, allowed, group)
+            solution = _fitted(plans, allowed, group) or _solve(plans, allowed, group, time_limit_s)
         if solution is None:
             raise OperationError(
                 f"there are no offsets at which {', '.join(_name(plans[k]) for k in group)} keep"
@@ -171,7 +224,36 @@ def _fits(allowed: _Allowed, k: int, offset: int, placed: dict[int, int]) -> boo
     return True
 
 
-def _solve(plans: Sequence[Plan], allowed: _Allowed, group: list[int]) -> dict[int, int] | None:
+def _fitted(plans: Sequence[Plan], allowed: _Allowed, group: list[int]) -> dict[int, int] | None:
+    """Chains placed one after the other where they first fit, in a few orders; None says nothing.
+
+    The first order is by period, the longest busy first among equals; the others are random.
+    """
+    order = sorted(group, key=lambda k: (plans[k].cycle_ns, -_busy(plans[k])))
+    generator = random.Random(0)  # noqa: S311 - no secrets here; the same plans, the same offsets
+    for _ in range(FITTING_ORDERS):
+        placed: dict[int, int] = {}
+        for k in order:
+            candidates = sorted({0, *_tight_offsets(plans[k].cycle_ns, allowed, k, placed)})
+            fitting = (offset for offset in candidates if _fits(allowed, k, offset, placed))
+            offset = next(fitting, None)
+            if offset is None:
+                break
+            placed[k] = offset
+        else:
+            first = placed[group[0]]
+            return {k: (offset - first) % plans[k].cycle_ns for k, offset in placed.items()}
+        generator.shuffle(order)
+    return None
+
+
+def _busy(plan: Plan) -> int:
+    return sum(end - start for server in plan.servers for start, end in server.slots)
+
+
+def _solve(
+    plans: Sequence[Plan], allowed: _Allowed, group: list[int], time_limit_s: float
+) -> dict[int, int] | None:
     cp_model = extra_library("ortools.sat.python.cp_model", "offsets for this many chains")
     model = cp_model.CpModel()
     offsets = {k: model.new_int_var(0, plans[k].cycle_ns - 1, f"offset{k}") for k in group}
@@ -186,24 +268,40 @@ def _solve(plans: Sequence[Plan], allowed: _Allowed, group: list[int]) -> dict[i
                 cp_model.Domain.from_intervals([list(interval) for interval in intervals]),
             )
     solver = cp_model.CpSolver()
-    solver.parameters.max_time_in_seconds = TIME_LIMIT_SECONDS
+    solver.parameters.max_time_in_seconds = time_limit_s
     solver.parameters.num_workers = 1  # the same plans give the same offsets
     status = solver.solve(model)
     if status == cp_model.INFEASIBLE:
         return None
     if status not in (cp_model.OPTIMAL, cp_model.FEASIBLE):
         raise OperationError(
-            f"no offsets for {len(group)} chains were found within {TIME_LIMIT_SECONDS:.0f} s,"
-            " nor a proof that there are none: put fewer chains on a core"
+            f"undecided: within {time_limit_s:g} s neither offsets for {len(group)} chains that"
+            f" share cores were found nor a proof that there are none. {_fullest(plans, group)} Put"
+            " fewer chains on it, shorten slots, use periods with a large common divisor, or allow"
+            " more time"
         )
     return {k: int(solver.value(offset)) for k, offset in offsets.items()}
 
 
-def _refuse_overload(plans: Sequence[Plan]) -> None:
-    for place in sorted(set().union(*(_places(plan) for plan in plans))):
-        load = sum(
+def _loads(plans: Sequence[Plan]) -> dict[tuple[int, int], float]:
+    """The share of time that slots take, per core and priority."""
+    return {
+        place: sum(
             (end - start) / plan.cycle_ns for plan in plans for start, end in _slots(plan, place)
         )
+        for place in sorted(set().union(*(_places(plan) for plan in plans)))
+    }
+
+
+def _fullest(plans: Sequence[Plan], group: list[int]) -> str:
+    load, (core, priority) = max(
+        (load, place) for place, load in _loads([plans[k] for k in group]).items()
+    )
+    return f"Their slots fill {load:.1%} of core {core} at priority {priority}."
+
+
+def _refuse_overload(plans: Sequence[Plan]) -> None:
+    for place, load in _loads(plans).items():
         if load > 1 + 1e-9:
             raise OperationError(
                 f"the slots of all chains on core {place[0]} at priority {place[1]} fill"

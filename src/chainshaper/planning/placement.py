@@ -5,6 +5,7 @@ Single-band shaping gives every execution the latency of the slowest. These step
 average (sections 3.3 and 4.1), without touching the longest latency.
 """
 
+from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -32,7 +33,7 @@ from chainshaper.planning.plan import (
 from chainshaper.planning.shaping import predict_bands
 from chainshaper.planning.swarm import place_by_swarm, place_randomly
 
-__all__ = ["Solver", "figure7_curve", "with_bands", "with_long_slot"]
+__all__ = ["BandChoice", "Solver", "choose_bands", "figure7_curve", "with_bands", "with_long_slot"]
 
 Solver: TypeAlias = Literal["exact", "pso", "random"]
 
@@ -83,7 +84,14 @@ def with_bands(
     if bands == "auto":
         if solver != "exact":
             raise InputError("only the exact solver chooses the number of bands by itself")
-        placement = enough_bands(placement_curve(problem, MOST_BANDS), least_gain)
+        placement = choose_bands(
+            plan,
+            latencies,
+            grid_ns=grid_ns,
+            max_gap_ns=max_gap_ns,
+            max_share=max_share,
+            least_gain=least_gain,
+        ).chosen
     elif solver == "pso":
         placement = place_by_swarm(problem, bands, seed)
     elif solver == "random":
@@ -102,6 +110,7 @@ def figure7_curve(
     *,
     grid_ns: int = 1_000,
     max_gap_ns: int | None = None,
+    max_share: float | None = None,
 ) -> list[Placement]:
     """The best placement for 1, 2, … bands: average over number of bands is figure 7.
 
@@ -111,9 +120,62 @@ def figure7_curve(
     """
     start, end = _last_publish_slot(plan)
     problem = band_problem(
-        latencies_ns, end, publish_slot_ns=end - start, grid_ns=grid_ns, max_gap_ns=max_gap_ns
+        latencies_ns,
+        end,
+        publish_slot_ns=end - start,
+        grid_ns=grid_ns,
+        max_gap_ns=max_gap_ns,
+        max_share=max_share,
     )
     return placement_curve(problem, most_bands)
+
+
+@dataclass(frozen=True)
+class BandChoice:
+    """A curve of figure 7, the placement that ``auto`` takes from it, and why it stops there."""
+
+    curve: tuple[Placement, ...]
+    chosen: Placement
+    reason: str
+
+
+def choose_bands(
+    plan: Plan,
+    latencies_ns: NDArray[np.int64],
+    *,
+    grid_ns: int = 1_000,
+    max_gap_ns: int | None = None,
+    max_share: float | None = None,
+    least_gain: float = 0.02,
+) -> BandChoice:
+    """What :func:`with_bands` takes for ``auto``, with its grounds.
+
+    ``plan`` may have any publish slots, of which the last counts.
+
+    Raises:
+        InputError: a plan without a publish slot, or a least gain that is no share.
+        OperationError: no number of bands can be placed.
+    """
+    if not 0 < least_gain < 1:
+        raise InputError(
+            f"the least gain is a share of the average, such as 0.02: not {least_gain}"
+        )
+    curve = figure7_curve(
+        plan, latencies_ns, grid_ns=grid_ns, max_gap_ns=max_gap_ns, max_share=max_share
+    )
+    chosen = enough_bands(curve, least_gain)
+    bands, longest = len(chosen.slot_ends_ns), len(curve[-1].slot_ends_ns)
+    if chosen is not curve[-1]:
+        gain = 1 - curve[curve.index(chosen) + 1].mean_ns / chosen.mean_ns
+        reason = (
+            f"stopped at {bands}: another band would lower the average by {gain:.2%}, less than"
+            f" {least_gain:.2%}"
+        )
+    elif longest < MOST_BANDS:
+        reason = f"stopped at {bands}: no more bands can be placed"
+    else:
+        reason = f"stopped at {bands}: more bands are not tried"
+    return BandChoice(tuple(curve), chosen, reason)
 
 
 def with_long_slot(plan: Plan, latencies_ns: NDArray[np.int64], slot_start_ns: int) -> Plan:

@@ -31,6 +31,7 @@ from chainshaper.yaml_file import (
 )
 
 __all__ = [
+    "PER_CALLBACK",
     "Anchor",
     "ChainOfPlan",
     "Evidence",
@@ -70,6 +71,9 @@ Policy: TypeAlias = Literal[
     "let-per-callback",
     "let-per-chain",
 ]
+PER_CALLBACK = ("server-per-callback", "let-per-callback")
+"""Policies whose slots follow from the callbacks, so that an execution may span cycles."""
+
 Anchor: TypeAlias = Literal["stamp", "cycle"]
 
 
@@ -318,7 +322,7 @@ def _check_cycle(plan: Plan) -> None:
             f" {format_duration(period)}: make it the period, or a whole multiple",
             "cycle",
         )
-    if cycle <= longest:
+    if cycle <= longest and plan.policy not in PER_CALLBACK:
         raise wrong_value(
             f"the cycle {format_duration(cycle)} is not longer than the longest latency measured,"
             f" {format_duration(longest)}: plan with a longer period or a shorter chain",

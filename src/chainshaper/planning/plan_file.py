@@ -7,6 +7,7 @@ line, key, the reason and what to write instead.
 
 import os
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.plan import Plan, publish_slots
 from chainshaper.yaml_file import AS_YAML, read_model
 
-__all__ = ["Plan", "dump_plan", "load_plan", "plan_json", "save_plan"]
+__all__ = ["Plan", "dump_plan", "load_plan", "plan_json", "save_plan", "save_plans"]
 
 _HEADER = """\
 # A chainshaper plan: the reservation servers that give a ROS 2 chain a constant latency.
@@ -98,6 +99,36 @@ def save_plan(plan: Plan, path: str | Path, *, overwrite: bool = False) -> None:
     finally:
         if partial is not None:
             partial.unlink(missing_ok=True)
+
+
+def save_plans(plans: Sequence[Plan], folder: str | Path) -> list[Path]:
+    """Write the plans of several chains into a new folder, each named after its output.
+
+    Raises:
+        InputError: ``folder`` exists, or what it stands in does not.
+        OperationError: they cannot be written; nothing is left behind.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir()
+    except FileExistsError as error:
+        raise InputError(f"{folder} exists already and is not overwritten: name another") from error
+    except FileNotFoundError as error:
+        raise InputError(f"{folder.parent}: no such folder to make {folder.name} in") from error
+    except OSError as error:
+        raise OperationError(f"{folder}: the folder cannot be made: {error}") from error
+    written: list[Path] = []
+    try:
+        for number, plan in enumerate(plans, start=1):
+            name = (plan.chain.output or "plan").strip("/").replace("/", "_")
+            written.append(folder / f"{number}_{name}.yaml")
+            save_plan(plan, written[-1])
+    except OperationError:
+        for path in written:
+            path.unlink(missing_ok=True)
+        folder.rmdir()
+        raise
+    return written
 
 
 def plan_json(plan: Plan) -> dict[str, Any]:

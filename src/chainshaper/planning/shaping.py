@@ -244,8 +244,8 @@ def plan_warnings(plan: Plan) -> list[str]:
         stalled = evidence.longest_stall_ns
         longest = "" if stalled is None else f" (longest {format_duration(stalled)})"
         warnings.append(
-            f"the machine stalled while {evidence.disturbed} cycles were measured{longest}: the"
-            " longest latency may be the machine's, not the chain's."
+            f"the machine stalled while {evidence.disturbed} cycles were measured{longest}; they"
+            " are left out, and how long the chain itself would have taken in them is not known."
         )
     if evidence.incomplete:
         warnings.append(
@@ -259,12 +259,18 @@ def plan_warnings(plan: Plan) -> list[str]:
             f" confidence it lies between {low} and {high}."
         )
     last = max((end for _, end in publish_slots(plan)), default=evidence.max_latency_ns)
-    if last > NEARLY_FULL * cycle:
+    if NEARLY_FULL * cycle < last <= cycle:
         warnings.append(
             f"the plan fills {last / cycle:.1%} of the cycle {format_duration(cycle)}: an"
             " execution a little longer than any measured delays the next one."
         )
-    if evidence.max_latency_ns > NEARLY_FULL * cycle:
+    if evidence.max_latency_ns >= cycle:
+        warnings.append(
+            f"the longest latency {format_duration(evidence.max_latency_ns)} is not shorter than"
+            f" the cycle {format_duration(cycle)}: executions of the chain overlapped while they"
+            " were measured, and response times have each other's interference in them."
+        )
+    elif evidence.max_latency_ns > NEARLY_FULL * cycle:
         warnings.append(
             "a cycle as long as the longest measured keeps its core busy for more than"
             f" {NEARLY_FULL:.0%}, where the kernel throttles real-time threads"

@@ -12,13 +12,13 @@ import numpy as np
 import polars as pl
 
 from chainshaper.errors import InputError, OperationError
-from chainshaper.planning import publish_slots
+from chainshaper.planning import BandChoice, publish_slots
 from chainshaper.steps import Measurement
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["draw_comparison", "draw_distribution", "draw_latency"]
+__all__ = ["draw_comparison", "draw_curve", "draw_distribution", "draw_latency"]
 
 COLOURS = ("#d95f02", "#1b6ca8", "#4d9221", "#7b3294")
 SIZE_INCHES = (9.0, 4.2)
@@ -103,6 +103,36 @@ def draw_distribution(measurements: Sequence[Measurement], path: str | Path) -> 
     axes.set_ylabel("share of cycles")
     axes.set_title(f"Chain {measurements[0].analysis.chain.spec}", loc="left")
     axes.legend(loc="upper left")
+    return _save(figure, path)
+
+
+def draw_curve(choice: BandChoice, path: str | Path) -> Path:
+    """The average latency over the number of bands (paper, figure 7), the chosen number marked.
+
+    Raises:
+        InputError: the file exists already.
+        OperationError: it cannot be written.
+    """
+    path = Path(path)
+    if path.exists():
+        raise InputError(f"{path} exists already and is not overwritten: name another file")
+    figure, axes = _figure()
+    bands = [len(placement.slot_ends_ns) for placement in choice.curve]
+    means = [placement.mean_ns / 1e6 for placement in choice.curve]
+    axes.plot(bands, means, "o-", color=COLOURS[1], label="best placement")
+    axes.plot(
+        len(choice.chosen.slot_ends_ns),
+        choice.chosen.mean_ns / 1e6,
+        "o",
+        markersize=12,
+        fillstyle="none",
+        color=COLOURS[0],
+        label=choice.reason,
+    )
+    axes.set_xticks(bands)
+    axes.set_xlabel("number of latency bands")
+    axes.set_ylabel("average latency, eq. 5 [ms]")
+    axes.legend(loc="upper right")
     return _save(figure, path)
 
 

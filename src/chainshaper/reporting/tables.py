@@ -8,8 +8,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from chainshaper.analysis import LatencyAnalysis, LatencyStatistics
-from chainshaper.durations import milliseconds
+from chainshaper.durations import format_duration, milliseconds
 from chainshaper.planning import Plan, publish_slots
+from chainshaper.reporting.predictions import prediction_json
 from chainshaper.steps import Comparison, Measurement
 
 __all__ = [
@@ -84,6 +85,8 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
         entry = {"recording": str(measurement.recording.path), **latency_json(measurement)}
         if measurement.plan is not None:
             entry["predicted"] = measurement.plan.predicted.model_dump(mode="json")
+        if measurement.held is not None:
+            entry["prediction"] = prediction_json(measurement.held)
         entries.append(entry)
     return {"chain": comparison.chain, "recordings": entries}
 
@@ -154,6 +157,8 @@ def comparison_table(comparison: Comparison) -> Table:
             for m in comparison.measurements
         ),
     )
+    lost = [sum(m.recording.info.lost.values()) for m in comparison.measurements]
+    table.add_row("lost while recording", *map(str, lost))
     realtime = [measurement.recording.info.realtime for measurement in comparison.measurements]
     table.add_row(
         "real-time scheduling", *({True: "yes", False: "no", None: ABSENT}[r] for r in realtime)
@@ -225,20 +230,22 @@ def callback_rows(statistics: pl.DataFrame) -> list[dict[str, Any]]:
 
 
 def callback_table(statistics: pl.DataFrame) -> Table:
-    """Every callback: how often it ran, and its execution and response times."""
+    """Every callback: its thread, how often it ran, and its execution and response times."""
     table = _titled("Callbacks [ms]")
-    for name in ("node", "callback", "count"):
-        table.add_column(name, justify="right" if name == "count" else "left")
+    for name in ("node", "callback", "thread", "count"):
+        right = name in {"thread", "count"}
+        table.add_column(name, justify="right" if right else "left", overflow="fold")
     for name in ("execution", "response"):
         for figure in ("min", "mean", "max"):
-            table.add_column(f"{name} {figure}", justify="right")
+            table.add_column(f"{name}\n{figure}", justify="right", no_wrap=True)
     for row in statistics.iter_rows(named=True):
-        trigger = (
-            f"every {milliseconds(row['period_ns'], 0)}" if row["kind"] == "timer" else row["topic"]
-        )
+        period = row["period_ns"]
+        trigger = row["topic"] if period is None else f"every {format_duration(period)}"
+        tids = row["tids"]
         table.add_row(
             row["node"],
             f"{row['kind']} {trigger or ''}",
+            str(tids[0]) if len(tids) == 1 else f"{len(tids)} threads",
             str(row["count"]),
             *(
                 ABSENT if row[field] is None else milliseconds(row[field][figure])

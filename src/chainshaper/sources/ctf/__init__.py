@@ -10,7 +10,7 @@ imported when the first trace is opened, not with this package.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING
 
 from chainshaper.sources.ctf.errors import CtfError
@@ -46,6 +46,7 @@ def read_events(
     *,
     context: bool = False,
     threads: int | None = None,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> Events:
     """Read events into one frame per name, ordered by name of event.
 
@@ -65,8 +66,9 @@ def read_events(
     * with ``context``, the other context fields as ``context.<name>``.
 
     Events that cannot be read end their packet; the result's ``warnings`` say which and why.
+    ``progress`` is told the share that is done, from 0 to 1.
     Raises `CtfError` where a file is gone or changes while it is read.
     """
     from chainshaper.sources.ctf.read import read
 
-    return read(trace, names, context, threads)
+    return read(trace, names, context, threads, progress)

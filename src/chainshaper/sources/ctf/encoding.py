@@ -32,8 +32,9 @@ __all__ = ["Bits", "encode"]
 class Bits:
     """Bytes being filled bit by bit; ``position`` in bits, ``big`` the trace's byte order.
 
-    ``clocks`` and ``names`` note the bit positions of 64-bit clock values and of the integer
-    members of the outermost structures.
+    ``clocks`` and ``names`` note the bit positions of 64-bit clock values (members of the
+    outermost structures that ``stamps`` names count as such) and of the integer members of the
+    outermost structures.
     """
 
     big: bool
@@ -41,6 +42,7 @@ class Bits:
     position: int = 0
     clocks: list[int] = field(default_factory=list)
     names: dict[str, int] = field(default_factory=dict)
+    stamps: frozenset[str] = frozenset()
 
     def align(self, bits: int) -> None:
         """Advance to a multiple of ``bits``."""
@@ -110,7 +112,8 @@ def _integer(bits: Bits, kind: IntegerType | EnumType, value: Any, name: str, de
     if isinstance(kind, EnumType) and isinstance(value, str):
         value = next(m.low for m in kind.mappings if m.label == value)
     bits.align(number.align)
-    if number.clock is not None and number.size == 64:
+    is_stamp = depth == 1 and name in bits.stamps
+    if (number.clock is not None or is_stamp) and number.size == 64:
         bits.clocks.append(bits.position)
     if depth == 1:
         bits.names[name] = bits.position

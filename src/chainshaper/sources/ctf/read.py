@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
@@ -35,21 +35,23 @@ _NULL_COLUMNS = {"cpu": pl.Int32, "pid": pl.Int32, "tid": pl.Int32}
 
 
 class Events(dict[str, pl.DataFrame]):
-    """Frames by event name, with the ``warnings`` that reading them gave."""
+    """Frames by event name.
+
+    ``warnings`` say what could not be read, ``counts`` how often each event happened in the
+    streams that were read, also those that were not asked for; ``unread`` are the other streams.
+    """
 
     warnings: tuple[str, ...] = ()
+    counts: dict[str, int]
+    unread: tuple[CtfStream, ...] = ()
 
 
 def count(trace: CtfTrace, threads: int | None = None) -> tuple[dict[str, int], tuple[str, ...]]:
     """Events per name in order of the names, zeros included, and warnings."""
     assembly = _assembly(trace, frozenset(), context=False)
-    counts = dict.fromkeys(trace.event_names, 0)
     with _mapped(trace.streams) as streams:
         walks = _walks(streams, assembly, np.zeros(0, np.int64), threads)
-    for found in walks:
-        for name, number in zip(assembly.event_names, found.counts.tolist(), strict=False):
-            counts[name] += number
-    return counts, tuple(w for found in walks for w in found.warnings)
+    return _counts(trace, assembly, walks), tuple(w for found in walks for w in found.warnings)
 
 
 def read(
@@ -57,6 +59,7 @@ def read(
     names: Collection[str] | None,
     context: bool,
     threads: int | None,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> Events:
     """See `chainshaper.sources.ctf.read_events`."""
     wanted = frozenset(trace.event_names if names is None else names)
@@ -65,14 +68,33 @@ def read(
     used = [s for s in trace.streams if not rows.isdisjoint(s.table[:, 2].tolist())]
     borders = span_borders(used, threads or default_threads())
     with _mapped(used) as streams:
-        walks = _walks(streams, assembly, borders, threads)
+        walks = _walks(streams, assembly, borders, threads, lambda share: progress(share / 3))
         total = sum((w.reached[-1] for w in walks), np.zeros(max(assembly.counters, 1), np.int64))
         storage = [_allocate(assembly, number, total) for number in range(len(assembly.tables))]
-        texts = _fill(streams, walks, assembly, storage, len(borders) + 1, threads)
+        texts = _fill(
+            streams,
+            walks,
+            assembly,
+            storage,
+            len(borders) + 1,
+            threads,
+            lambda share: progress((1 + 2 * share) / 3),
+        )
     unsorted = not all(w.sorted for w in walks)
     events = Events(_frames(assembly, storage, total, texts, unsorted))
     events.warnings = tuple(w for found in walks for w in found.warnings)
+    events.counts = _counts(trace, assembly, walks)
+    read_paths = {stream.path for stream in used}
+    events.unread = tuple(s for s in trace.streams if s.path not in read_paths)
     return events
+
+
+def _counts(trace: CtfTrace, assembly: Assembly, walks: list[Walk]) -> dict[str, int]:
+    counts = dict.fromkeys(trace.event_names, 0)
+    for found in walks:
+        for name, number in zip(assembly.event_names, found.counts.tolist(), strict=False):
+            counts[name] += number
+    return counts
 
 
 def _assembly(trace: CtfTrace, wanted: frozenset[str], context: bool) -> Assembly:
@@ -93,12 +115,23 @@ def _mapped(streams: Sequence[CtfStream]) -> Iterator[list[Stream]]:
 
 
 def _walks(
-    streams: list[Stream], assembly: Assembly, borders: NDArray[np.int64], threads: int | None
+    streams: list[Stream],
+    assembly: Assembly,
+    borders: NDArray[np.int64],
+    threads: int | None,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> list[Walk]:
+    size = sum(stream.file.size for stream in streams)
+    # Read twice, a trace that fits into memory had better stay there in between.
+    lean = size > LARGE_BYTES
+    walks, done = [], 0
     with ThreadPoolExecutor(threads or default_threads()) as pool:
-        # Read twice, a trace that fits into memory had better stay there in between.
-        lean = sum(stream.file.size for stream in streams) > LARGE_BYTES
-        return list(pool.map(lambda stream: walk(stream, assembly, borders, lean), streams))
+        found = pool.map(lambda stream: walk(stream, assembly, borders, lean), streams)
+        for stream, one in zip(streams, found, strict=True):
+            walks.append(one)
+            done += stream.file.size
+            progress(done / max(size, 1))
+    return walks
 
 
 class _Arrays:
@@ -152,6 +185,7 @@ def _fill(
     storage: list[_Arrays],
     spans: int,
     threads: int | None,
+    progress: Callable[[float], None],
 ) -> list[str]:
     """Pass 2 over all spans; returns the strings that text slots then hold codes of."""
     if not streams:
@@ -164,6 +198,7 @@ def _fill(
             own = [codes.setdefault(string, len(codes)) for string in strings]
             if own != list(range(len(own))):
                 _recode(span, walks, assembly, storage, np.array(own, np.uint32))
+            progress((span + 1) / spans)
     return [string.decode(errors="backslashreplace") for string in codes]
 
 

@@ -6,7 +6,7 @@ Any metadata text can be given; `lttng_text` makes LTTng's own.  babeltrace2 rea
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -68,11 +68,13 @@ def encode_packet(
     stream_id: int = 0,
     instance: int = 0,
     padding: int = 0,
+    stamps: Collection[str] = (),
 ) -> EncodedPacket:
     """One packet of ``events``, which are in order of time.
 
     ``context`` gives the packet context's fields that cannot be told from the events
     (``cpu_id``, ``packet_seq_num``, ``events_discarded``); ``padding`` bytes follow the content.
+    ``stamps`` names 64-bit fields of payloads that hold times: `repeat_packets` moves them too.
     """
     stream = declared.streams[stream_id]
     begin = events[0].time if events else 0
@@ -85,7 +87,7 @@ def encode_packet(
         "stream_instance_id": instance,
     }
     values = times | sizes | dict(context)
-    bits = Bits(declared.byte_order == "be")
+    bits = Bits(declared.byte_order == "be", stamps=frozenset(stamps))
     _head(bits, declared, stream, header, values)
     clock = int(values["timestamp_begin"])
     by_name = {event.name: event for event in stream.events.values()}
@@ -177,15 +179,17 @@ def metadata_packets(text: str, uuid: str, *, big: bool = False, size: int = 409
     return b"".join(packets)
 
 
-def repeat_packets(packets: Sequence[EncodedPacket], times: int, period: int) -> Iterable[bytes]:
+def repeat_packets(
+    packets: Sequence[EncodedPacket], times: int, period: int, first: int = 0
+) -> Iterable[bytes]:
     """The bytes of ``packets`` over and over, each round ``period`` cycles later.
 
-    ``period`` must be a multiple of 2**32, so that time stamps of fewer bits stay as they are;
-    sequence numbers go on counting.
+    The ``first`` round may be a later one. ``period`` must be a multiple of 2**32, so that time
+    stamps of fewer bits stay as they are; sequence numbers go on counting.
     """
     if period % (1 << 32):
         raise ValueError("the period must be a multiple of 2**32 cycles")
-    for turn in range(times):
+    for turn in range(first, first + times):
         for packet in packets:
             order: Literal["big", "little"] = "big" if packet.big else "little"
             data = bytearray(packet.data)

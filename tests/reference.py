@@ -13,7 +13,7 @@ import pytest
 from chainshaper.sources.ctf import open_trace, read_events
 
 DUMP = Path(__file__).with_name("babeltrace_dump.py")
-SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
+SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
 REAL_TRACES = (
     "galactic_caret_end_to_end",
     "humble_sync",

@@ -1,0 +1,217 @@
+"""The options of `chainshaper plan`, and what they are worth in Python."""
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from chainshaper.cli.options import duration_option
+
+__all__ = [
+    "Anchor",
+    "BandsOption",
+    "ChainsOption",
+    "CurveOption",
+    "EpsilonOption",
+    "FirstSlotOption",
+    "GridOption",
+    "LatenciesOption",
+    "LeastGainOption",
+    "MaxGapOption",
+    "MaxShareOption",
+    "MeanAtMostOption",
+    "Minimise",
+    "PeriodOption",
+    "PlanOutput",
+    "Policy",
+    "ProbabilityOption",
+    "Publication",
+    "SeedOption",
+    "SinksOption",
+    "SlotStartOption",
+    "Solver",
+]
+
+
+class Anchor(str, Enum):
+    """What starts a cycle for the shaping node."""
+
+    STAMP = "stamp"
+    CYCLE = "cycle"
+
+
+class Policy(str, Enum):
+    """How the chain is scheduled."""
+
+    SHAPED = "shaped"
+    ONE_LONG_SLOT = "one-long-slot"
+    SERVER_PER_CALLBACK = "server-per-callback"
+    SERVER_PER_CHAIN = "server-per-chain"
+    LET_PER_CALLBACK = "let-per-callback"
+    LET_PER_CHAIN = "let-per-chain"
+
+
+class Publication(str, Enum):
+    """Who publishes the chain's output."""
+
+    SYNCHRONOUS = "synchronous"
+    ASYNCHRONOUS = "asynchronous"
+
+
+class Solver(str, Enum):
+    """What places latency bands."""
+
+    EXACT = "exact"
+    PSO = "pso"
+    RANDOM = "random"
+
+
+class Minimise(str, Enum):
+    """What the placement of bands makes small."""
+
+    MEAN = "mean"
+    JITTER = "jitter"
+    GAP = "gap"
+
+
+def _bands(text: str) -> str:
+    if text != "auto" and not (text.isdecimal() and int(text) > 0):
+        raise typer.BadParameter(f"{text!r} is neither a number of bands from 1 on nor auto")
+    return text
+
+
+def _share(text: str) -> float:
+    try:
+        value = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+    except ValueError as error:
+        raise typer.BadParameter(f"{text!r} is no share: write 0.4 or 40%") from error
+    if not 0 < value <= 1:
+        raise typer.BadParameter(f"{text} is no share: write more than 0, at most 1 or 100%")
+    return value
+
+
+_BANDS, _MARGIN, _MORE = "Latency bands", "Margin", "More of the graph"
+
+ChainsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--chain",
+        metavar="FIRST..LAST",
+        help="The chain, by topics or nodes: /t1../t5. Default: the one the recording names."
+        " Give several to plan chains that share cores: their offsets are found.",
+        show_default=False,
+    ),
+]
+PlanOutput = Annotated[
+    Path | None,
+    typer.Option(
+        "--output",
+        "-o",
+        metavar="plan.yaml",
+        help="File to write; for several chains a folder, which must not exist.",
+        show_default=False,
+    ),
+]
+LatenciesOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--latencies",
+        metavar="FILE",
+        help="Instead of a recording: a duration a line, or .npy in ns.",
+        show_default=False,
+    ),
+]
+PeriodOption = Annotated[
+    int | None,
+    duration_option("--period", "Period, with --latencies or a chain that no timer starts."),
+]
+EpsilonOption = Annotated[
+    int | None,
+    duration_option("--epsilon", "Margin behind the longest latency. Default: 1ms.", panel=_MARGIN),
+]
+ProbabilityOption = Annotated[
+    float | None,
+    typer.Option(
+        "--overrun-probability",
+        metavar="P",
+        help="Derive the margin instead: from the tail of the latencies, so that a cycle overruns"
+        " with this probability, such as 1e-6.",
+        rich_help_panel=_MARGIN,
+        show_default=False,
+    ),
+]
+BandsOption = Annotated[
+    str,
+    typer.Option(
+        "--bands",
+        metavar="N|auto",
+        parser=_bands,
+        help="Number of bands; auto: as many as are worth it.",
+        rich_help_panel=_BANDS,
+    ),
+]
+MaxGapOption = Annotated[
+    int | None,
+    duration_option("--max-gap", "Longest distance of neighbouring bands (LV).", panel=_BANDS),
+]
+MaxShareOption = Annotated[
+    float | None,
+    typer.Option(
+        "--max-share",
+        metavar="SHARE",
+        parser=_share,
+        help="Most cycles in one band: 0.4 or 40%.",
+        rich_help_panel=_BANDS,
+        show_default=False,
+    ),
+]
+GridOption = Annotated[
+    int, duration_option("--grid", "Slots end at multiples of this.", panel=_BANDS)
+]
+MeanAtMostOption = Annotated[
+    int | None,
+    duration_option("--mean-at-most", "The average that --minimise may cost.", panel=_BANDS),
+]
+LeastGainOption = Annotated[
+    float,
+    typer.Option(
+        "--least-gain",
+        metavar="SHARE",
+        parser=_share,
+        help="With --bands auto: what another band must take off the average.",
+        rich_help_panel=_BANDS,
+    ),
+]
+CurveOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--curve",
+        metavar="FILE.png",
+        help="With --bands auto: draw the average over the number of bands.",
+        rich_help_panel=_BANDS,
+        show_default=False,
+    ),
+]
+SeedOption = Annotated[
+    int, typer.Option("--seed", min=0, help="For pso, random and the derived margin.")
+]
+SlotStartOption = Annotated[
+    int | None, duration_option("--slot-start", "Where the slot of one-long-slot starts.")
+]
+FirstSlotOption = Annotated[
+    int | None,
+    duration_option(
+        "--first-slot", "A server of its own for the chain's first node, this long.", panel=_MORE
+    ),
+]
+SinksOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--sink",
+        metavar="FIRST..LAST",
+        help="A chain to a further output of the same graph, to be shaped too.",
+        rich_help_panel=_MORE,
+        show_default=False,
+    ),
+]

@@ -1,0 +1,151 @@
+"""Looking into a recording or a trace: what is in it, which services, which chains.
+
+The functions behind `chainshaper info`, `graph`, `chains` and `convert`. All of them take whatever
+:func:`chainshaper.sources.open_source` opened.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import polars as pl
+
+from chainshaper import events
+from chainshaper.analysis import (
+    ChainEnumeration,
+    DataFlow,
+    callback_statistics,
+    data_flow,
+    enumerate_chains,
+    graph_of,
+    load_named_paths,
+)
+from chainshaper.analysis.matching import latest_before
+from chainshaper.app import ApplicationGraph
+from chainshaper.errors import InputError
+from chainshaper.recording import Recording, RecordingInfo, write_recording
+from chainshaper.sources import open_source
+
+__all__ = [
+    "ApplicationDescription",
+    "convert_recording",
+    "describe_application",
+    "event_counts",
+    "list_chains",
+    "lost_events",
+    "named_chain",
+    "services",
+]
+
+
+def event_counts(recording: Recording) -> pl.DataFrame:
+    """How often each event happened: ``event, count``, ordered by event.
+
+    Names are the tracer's own, with the provider (``ros2:callback_start``), also of events that the
+    analysis makes no use of; in a recording of ours they are the names of its tables.
+    """
+    counts = getattr(recording.events, "counts", None)
+    if counts is None:
+        counts = {name: frame.height for name, frame in recording.events.items()}
+    rows = sorted((name, count) for name, count in counts.items() if count)
+    return pl.DataFrame(rows, schema={"event": pl.String, "count": pl.Int64}, orient="row")
+
+
+def lost_events(info: RecordingInfo) -> str:
+    """What was lost while recording, in words for below a table; "nothing" is said as well."""
+    lost = [f"{count} {what.replace('_', ' ')}" for what, count in info.lost.items() if count]
+    return f"lost while recording: {', '.join(lost) or 'nothing'}"
+
+
+def services(tables: events.EventTables) -> pl.DataFrame:
+    """All services: ``service, role, node, pid``, one row per server and client."""
+    nodes = events.table(tables, "rcl_node_init").select(
+        "pid",
+        "node_handle",
+        created="time",
+        node=pl.col("namespace").fill_null("").str.strip_chars_end("/") + "/" + pl.col("node_name"),
+    )
+    found = []
+    for role, name in (("server", "rcl_service_init"), ("client", "rcl_client_init")):
+        ends = events.table(tables, name).select(
+            "time", "pid", "node_handle", service="service_name", role=pl.lit(role)
+        )
+        joined = latest_before(ends, nodes, ["pid", "node_handle"], "time", "created")
+        found.append(joined.select("service", "role", "node", "pid"))
+    return pl.concat(found).unique().sort("service", "role", "node", "pid")
+
+
+def list_chains(
+    source: Recording | DataFlow,
+    start: str | None = None,
+    end: str | None = None,
+    limit: int = 100,
+) -> ChainEnumeration:
+    """The computation chains of a recording, the heaviest by mean response times among them.
+
+    See :func:`~chainshaper.analysis.chains.enumerate_chains`.
+    """
+    if isinstance(source, Recording):
+        source = data_flow(source.events, source.info.clock_offset_ns)
+    statistics = callback_statistics(source).drop_nulls("response_ns")
+    mean = statistics["response_ns"].struct.field("mean")
+    weights = dict(zip(statistics["callback_id"], mean, strict=True))
+    return enumerate_chains(graph_of(source), start, end, limit, weights)
+
+
+def named_chain(file: str | Path, name: str | None = None) -> str:
+    """The chain that a CARET architecture file calls ``name``, as we write it.
+
+    Raises:
+        InputError: no such path in the file, or several and no ``name``.
+    """
+    paths = load_named_paths(file)
+    if name is None and len(paths) == 1:
+        return next(iter(paths.values()))
+    known = ", ".join(paths) or "none"
+    if name is None:
+        raise InputError(f"{file}: choose one of its named_paths with --chain: {known}")
+    if name not in paths:
+        raise InputError(f"{file}: no path is named {name!r}; its named_paths: {known}")
+    return paths[name]
+
+
+def convert_recording(recording: Recording | str | Path, output: str | Path) -> Recording:
+    """Write an open trace as a recording of ours: Parquet tables that are read in no time.
+
+    All events that the analysis knows are kept, so every figure stays the same to the nanosecond.
+
+    Raises:
+        InputError: ``output`` exists already.
+    """
+    if not isinstance(recording, Recording):
+        recording = open_source(recording)
+    if not len(recording.events):
+        raise InputError(f"{recording.path}: no event in it is one that chainshaper knows")
+    return write_recording(output, recording.events, recording.info)
+
+
+@dataclass(frozen=True)
+class ApplicationDescription:
+    """Everything that a picture of an application shows.
+
+    ``services`` is the frame of :func:`services`; ``lost`` and ``notes`` are what a reader must
+    know about how complete it is.
+    """
+
+    graph: ApplicationGraph
+    services: pl.DataFrame
+    lost: dict[str, int]
+    notes: tuple[str, ...]
+
+
+def describe_application(recording: Recording | str | Path) -> ApplicationDescription:
+    """The application that a recording or trace shows: its graph and its services."""
+    if not isinstance(recording, Recording):
+        recording = open_source(recording)
+    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    return ApplicationDescription(
+        graph=graph_of(flow),
+        services=services(recording.events),
+        lost=recording.info.lost,
+        notes=(*recording.info.notes, *flow.notes),
+    )

@@ -1,0 +1,277 @@
+"""What is asked of a plan, and what was measured of a chain: together they make the plan.
+
+:class:`Profile` holds the measurements, :class:`PlanRequest` the wishes, and :func:`plan_chain`
+turns one of each into a plan of any policy. A profile may come from a recording or consist of
+bare latencies and a period; a policy that needs more says so.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain as joined
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chainshaper.errors import InputError
+from chainshaper.planning.bands import Goal
+from chainshaper.planning.baselines import (
+    CallbackTimes,
+    let_per_callback,
+    let_per_callback_asynchronous,
+    let_per_chain,
+    server_per_callback,
+    server_per_chain,
+)
+from chainshaper.planning.graphs import over_cores, with_first_node_apart, with_sink
+from chainshaper.planning.latency_file import check_latencies
+from chainshaper.planning.margins import derive_margin
+from chainshaper.planning.placement import (
+    BandChoice,
+    Solver,
+    choose_bands,
+    with_bands,
+    with_long_slot,
+)
+from chainshaper.planning.plan import (
+    PER_CALLBACK,
+    Anchor,
+    Evidence,
+    Margin,
+    Plan,
+    Policy,
+    revised,
+)
+from chainshaper.planning.shaping import evidence_of, plan_shaping
+
+__all__ = ["PlanRequest", "Profile", "band_choice", "plan_chain"]
+
+Publication: TypeAlias = Literal["synchronous", "asynchronous"]
+
+DEFAULT_EPSILON_NS = 1_000_000
+DEFAULT_CORE = 1
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What was measured of one chain, under a high SCHED_FIFO priority. Times in nanoseconds.
+
+    ``latencies_ns`` are in the order of time. ``nodes`` are those of the chain's callbacks, one
+    per callback, ``topics`` what each of these publishes for the chain. ``core_of`` names the
+    core of every node whose executor takes part, also on branches that the chain waits for.
+    ``callbacks`` are those of the chain and its branches, see
+    :func:`~chainshaper.planning.baselines.server_per_callback`. The rest is evidence.
+    """
+
+    latencies_ns: NDArray[np.int64]
+    period_ns: int
+    spec: str | None = None
+    nodes: tuple[str, ...] = ()
+    topics: tuple[str, ...] = ()
+    core_of: Mapping[str, int] = field(default_factory=dict)
+    callbacks: tuple[CallbackTimes, ...] = ()
+    fifo_priority: int = 84
+    recording: str | None = None
+    incomplete: int = 0
+    disturbed: int = 0
+    realtime: bool | None = None
+    longest_stall_ns: int | None = None
+    utilisation: float | None = None
+
+
+@dataclass(frozen=True)
+class PlanRequest:
+    """The wishes for a plan; every field has the default that the command line has.
+
+    ``epsilon_ns`` is given (None: 1 ms), or derived for ``overrun_probability``. ``bands`` to
+    ``seed`` are those of :func:`~chainshaper.planning.placement.with_bands` and go with the
+    policy ``shaped``, ``slot_start_ns`` goes with ``one-long-slot``. ``first_slot_ns`` puts the
+    chain's first node into a server of its own that ends there.
+    """
+
+    policy: Policy = "shaped"
+    publication: Publication = "synchronous"
+    epsilon_ns: int | None = None
+    overrun_probability: float | None = None
+    publish_slot_ns: int = 1_000_000
+    bands: int | Literal["auto"] = 1
+    solver: Solver = "exact"
+    grid_ns: int = 1_000
+    max_gap_ns: int | None = None
+    max_share: float | None = None
+    minimise: Goal = "mean"
+    mean_at_most_ns: int | None = None
+    least_gain: float = 0.02
+    seed: int = 0
+    slot_start_ns: int | None = None
+    first_slot_ns: int | None = None
+    anchor: Anchor = "stamp"
+    spin_ns: int = 300_000
+    pause_ns: int = 500_000
+
+
+_STANDARD = PlanRequest()
+
+
+def plan_chain(
+    profile: Profile, request: PlanRequest = _STANDARD, sinks: Sequence[Profile] = ()
+) -> Plan:
+    """The plan of the requested policy for a measured chain.
+
+    ``sinks`` are profiles of further outputs of the same graph, which get a shaping node each.
+
+    Raises:
+        InputError: wishes that exclude each other, or a policy that needs more than the profile
+            has.
+        OperationError: no such plan exists; the message names what prevents it.
+        PlatformError: a library that only this request needs is not installed.
+    """
+    _refuse_contradictions(request, bool(sinks))
+    margin = _margin(profile, request)
+    if request.policy in PER_CALLBACK:
+        plan = _with_policy(
+            _shaped(_shortened(profile, request, margin), request, margin, sinks), profile, request
+        )
+        plan = revised(plan, evidence=_measured(plan.evidence, profile.latencies_ns))
+    else:
+        plan = _with_policy(_shaped(profile, request, margin, sinks), profile, request)
+    for sink in sinks:
+        plan = with_sink(plan, sink.latencies_ns, _output(sink))
+    return plan
+
+
+def band_choice(plan: Plan, profile: Profile, request: PlanRequest) -> BandChoice:
+    """The curve of figure 7 for a plan, and the number of bands that ``auto`` takes from it."""
+    return choose_bands(
+        plan,
+        profile.latencies_ns,
+        grid_ns=request.grid_ns,
+        max_gap_ns=request.max_gap_ns,
+        max_share=request.max_share,
+        least_gain=request.least_gain,
+    )
+
+
+def _shortened(profile: Profile, request: PlanRequest, margin: Margin) -> Profile:
+    """The profile with no latency beyond what shaping could hold in a cycle.
+
+    Where each callback has slots of its own, shaping is only the start of the plan.
+    """
+    longest = profile.period_ns - margin.epsilon_ns - request.publish_slot_ns
+    latencies = check_latencies(profile.latencies_ns)
+    return replace(profile, latencies_ns=np.minimum(latencies, max(1, longest)))
+
+
+def _measured(evidence: Evidence, latencies_ns: NDArray[np.int64]) -> Evidence:
+    figures = evidence_of(latencies_ns)
+    names = ("min_latency_ns", "mean_latency_ns", "max_latency_ns")
+    return evidence.model_copy(update={name: getattr(figures, name) for name in names})
+
+
+def _shaped(
+    profile: Profile, request: PlanRequest, margin: Margin, sinks: Sequence[Profile]
+) -> Plan:
+    last = profile.nodes[-1] if profile.nodes else None
+    plan = plan_shaping(
+        profile.latencies_ns,
+        profile.period_ns,
+        spec=profile.spec,
+        output=profile.topics[-1] if profile.topics else None,
+        publisher=last,
+        nodes=tuple(dict.fromkeys(profile.nodes)),
+        margin=margin,
+        publish_slot_ns=request.publish_slot_ns,
+        publication=request.publication,
+        recording=profile.recording,
+        incomplete=profile.incomplete,
+        disturbed=profile.disturbed,
+        realtime=profile.realtime,
+        longest_stall_ns=profile.longest_stall_ns,
+        utilisation=profile.utilisation,
+        core=profile.core_of.get(last or "", DEFAULT_CORE),
+        anchor=request.anchor,
+        fifo_priority=profile.fifo_priority,
+        spin_ns=request.spin_ns,
+        pause_ns=request.pause_ns,
+    )
+    core_of = dict(joined.from_iterable(one.core_of.items() for one in (profile, *sinks)))
+    if request.first_slot_ns is not None:
+        if not profile.nodes:
+            raise InputError("a slot for the first node needs the chain's nodes: give a recording")
+        plan = with_first_node_apart(plan, profile.nodes[0], request.first_slot_ns)
+        core_of.pop(profile.nodes[0], None)
+    return over_cores(plan, core_of) if core_of else plan
+
+
+def _margin(profile: Profile, request: PlanRequest) -> Margin:
+    if request.overrun_probability is not None:
+        return derive_margin(profile.latencies_ns, request.overrun_probability, request.seed)
+    epsilon = DEFAULT_EPSILON_NS if request.epsilon_ns is None else request.epsilon_ns
+    if epsilon < 0:
+        raise InputError("epsilon must be 0ms or more")
+    return Margin(epsilon_ns=epsilon)
+
+
+def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
+    if request.policy == "shaped":
+        return with_bands(
+            plan,
+            profile.latencies_ns,
+            request.bands,
+            solver=request.solver,
+            grid_ns=request.grid_ns,
+            max_gap_ns=request.max_gap_ns,
+            max_share=request.max_share,
+            minimise=request.minimise,
+            mean_at_most_ns=request.mean_at_most_ns,
+            least_gain=request.least_gain,
+            seed=request.seed,
+        )
+    if request.policy == "one-long-slot":
+        if request.slot_start_ns is None:
+            raise InputError("one long slot needs its start: add --slot-start, such as 62ms")
+        return with_long_slot(plan, profile.latencies_ns, request.slot_start_ns)
+    if request.policy == "server-per-chain":
+        return server_per_chain(plan)
+    if request.policy == "let-per-chain":
+        return let_per_chain(plan)
+    return _per_callback(plan, profile, request)
+
+
+def _per_callback(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
+    if not profile.callbacks or not profile.topics:
+        raise InputError(
+            f"the policy {request.policy} needs the chain's callbacks, which latencies do not tell:"
+            " plan from a recording"
+        )
+    if request.policy == "server-per-callback":
+        return server_per_callback(plan, profile.callbacks)
+    if request.publication == "asynchronous":
+        return let_per_callback_asynchronous(plan, profile.nodes)
+    return let_per_callback(plan, profile.topics)
+
+
+def _refuse_contradictions(request: PlanRequest, sinks: bool) -> None:
+    if request.epsilon_ns is not None and request.overrun_probability is not None:
+        raise InputError(
+            "the margin is either given or derived: leave out --epsilon or the overrun probability"
+        )
+    if request.policy != "one-long-slot" and request.slot_start_ns is not None:
+        raise InputError("a slot's start goes with the policy one-long-slot: add it")
+    if request.policy == "shaped":
+        return
+    for name in ("bands", "solver", "max_gap_ns", "max_share", "minimise", "mean_at_most_ns"):
+        if getattr(request, name) != getattr(_STANDARD, name):
+            option = name.removesuffix("_ns").replace("_", "-")
+            raise InputError(
+                f"--{option} places latency bands, which the policy {request.policy} has not:"
+                " leave it out, or plan with the policy shaped"
+            )
+    if sinks:
+        raise InputError(f"further sinks are shaped, not planned as {request.policy}")
+
+
+def _output(profile: Profile) -> str:
+    if not profile.topics:
+        raise InputError("a sink needs the topic it is published on: plan from a recording")
+    return profile.topics[-1]

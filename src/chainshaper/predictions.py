@@ -1,0 +1,184 @@
+"""Holding a plan's prediction against what was measured.
+
+**The convention.** Eq. 5 represents a latency band by the end of its slot, x_α. A gate lets a
+message that waits go when its slot starts, at x_α − Δ; only one that arrives inside the slot
+leaves later. So every figure is predicted twice: as if each output left at the start of its
+slot, and at its end. A measurement should lie between the two, near the first.
+"""
+
+from dataclasses import dataclass
+
+import polars as pl
+
+from chainshaper.analysis import LatencyAnalysis
+from chainshaper.planning import Plan, publish_slots
+from chainshaper.recording import Recording
+
+__all__ = ["BandHeld", "FigureHeld", "PredictionHeld", "cycles_until_output", "hold_prediction"]
+
+STANDARD_ERRORS = 3  # beyond so many, an average is not what was predicted
+
+
+@dataclass(frozen=True)
+class FigureHeld:
+    """One figure: predicted with outputs at slot starts and at slot ends, and measured (ns).
+
+    ``holds``: the measured figure lies between the two (None: nothing was measured).
+    """
+
+    at_start_ns: int
+    at_end_ns: int
+    measured_ns: int | None
+    holds: bool | None
+
+
+@dataclass(frozen=True)
+class BandHeld:
+    """One latency band, over undisturbed cycles whose output came in the cycle it was due.
+
+    ``inside`` counts outputs that left while the slot was open.
+    """
+
+    slot_start_ns: int
+    slot_end_ns: int
+    predicted_share: float | None
+    count: int
+    share: float | None
+    inside: int
+    min_ns: int | None
+    mean_ns: int | None
+    max_ns: int | None
+    jitter_ns: int | None
+
+
+@dataclass(frozen=True)
+class PredictionHeld:
+    """A plan's prediction beside the measurement, over undisturbed cycles.
+
+    ``late`` counts outputs that missed their last slot and came in a later cycle; they are in
+    the figures, not in the bands. ``bands`` is empty for policies without publish slots.
+    """
+
+    mean: FigureHeld
+    max: FigureHeld
+    jitter: FigureHeld
+    bands: tuple[BandHeld, ...]
+    late: int
+
+
+def cycles_until_output(plan: Plan) -> int:
+    """How many cycles after its own an output is due: 0, and more under LET."""
+    return (plan.predicted.max_ns - 1) // plan.cycle_ns
+
+
+def hold_prediction(plan: Plan, recording: Recording, analysis: LatencyAnalysis) -> PredictionHeld:
+    """Hold the prediction of the plan in force against a recording's analysis."""
+    delay = cycles_until_output(plan) * plan.cycle_ns
+    slots = [(start + delay, end + delay) for start, end in publish_slots(plan)]
+    outputs = _outputs(plan, slots, recording, analysis)
+    in_time = outputs.filter(pl.col("in_time"))
+    predicted, measured = plan.predicted, analysis.undisturbed
+    shares = predicted.shares if len(predicted.shares) == len(slots) else [None] * len(slots)
+    bands = tuple(
+        _band(slot, share, in_time.filter(pl.col("slot") == number), in_time.height)
+        for number, (slot, share) in enumerate(zip(slots, shares, strict=True))
+    )
+    mean, longest, jitter = predicted.mean_ns, predicted.max_ns, predicted.jitter_ns
+    if _represented_by_slot_ends(plan):
+        mean = round(sum((band.predicted_share or 0) * band.slot_start_ns for band in bands))
+        longest, jitter = slots[-1][0], slots[-1][0] - slots[0][0]
+    elif slots:
+        longest, jitter = min(longest, slots[-1][0]), 0
+    slack = STANDARD_ERRORS * _standard_error(plan, slots, analysis)
+    return PredictionHeld(
+        mean=_figure(mean, predicted.mean_ns, measured.mean_ns, slack),
+        max=_figure(longest, predicted.max_ns, measured.max_ns),
+        jitter=_figure(jitter, predicted.jitter_ns, measured.jitter_ns),
+        bands=bands,
+        late=outputs.height - in_time.height,
+    )
+
+
+def _figure(at_start: int, at_end: int, measured: int | None, slack: float = 0.0) -> FigureHeld:
+    holds = None if measured is None else at_start - slack <= measured <= at_end + slack
+    return FigureHeld(at_start, at_end, measured, holds)
+
+
+def _standard_error(plan: Plan, slots: list[tuple[int, int]], analysis: LatencyAnalysis) -> float:
+    """How far the average may be off because both samples, before and after, are finite.
+
+    Where outputs do not come in bands, their variance is not in the plan; between two limits it
+    is at most (max − mean)·(mean − min).
+    """
+    if not analysis.undisturbed.count:
+        return 0.0
+    predicted = plan.predicted
+    if _represented_by_slot_ends(plan):
+        ends = [end for _, end in slots]
+        mean = sum(share * end for share, end in zip(predicted.shares, ends, strict=True))
+        variance = sum(
+            share * (end - mean) ** 2 for share, end in zip(predicted.shares, ends, strict=True)
+        )
+    else:
+        shortest = predicted.max_ns - predicted.jitter_ns
+        above, below = predicted.max_ns - predicted.mean_ns, predicted.mean_ns - shortest
+        variance = float(max(0, above) * max(0, below))
+    samples = 1 / plan.evidence.samples + 1 / analysis.undisturbed.count
+    return float((variance * samples) ** 0.5)
+
+
+def _represented_by_slot_ends(plan: Plan) -> bool:
+    """Whether a slot's end stands for the outputs in it, as in eq. 5."""
+    slots = publish_slots(plan)
+    return plan.policy != "one-long-slot" and 0 < len(slots) == len(plan.predicted.shares)
+
+
+def _outputs(
+    plan: Plan, slots: list[tuple[int, int]], recording: Recording, analysis: LatencyAnalysis
+) -> pl.DataFrame:
+    """Undisturbed complete traversals: ``latency_ns``, ``slot`` and ``in_time``.
+
+    The slot is the one that the gate says it released the message in. Without a gate's events it
+    is the last that had started when the output came.
+    """
+    chosen = analysis.traversals.filter(pl.col("complete") & ~pl.col("disturbed"))
+    last = len(analysis.chain.callbacks) - 1
+    taken = analysis.hops.filter(pl.col("hop") == last).select("traversal", "source_timestamp")
+    if "gate_release" in recording.events:
+        released = (
+            recording.events["gate_release"]
+            .select("source_timestamp", "slot", "cycles_waited")
+            .unique("source_timestamp", keep="first")
+        )
+        joined = chosen.join(taken, on="traversal", how="left").join(
+            released, on="source_timestamp", how="left"
+        )
+        if joined["slot"].count():
+            in_time = pl.col("cycles_waited") <= cycles_until_output(plan)
+            return joined.select("latency_ns", "slot", in_time=in_time.fill_null(False))
+    starts = [start for start, _ in slots]
+    return chosen.select(
+        "latency_ns",
+        slot=sum((pl.col("latency_ns") >= start).cast(pl.Int32) for start in starts)
+        + pl.lit(-1, dtype=pl.Int32),
+        in_time=pl.col("latency_ns") < (cycles_until_output(plan) + 1) * plan.cycle_ns,
+    )
+
+
+def _band(
+    slot: tuple[int, int], predicted: float | None, own: pl.DataFrame, total: int
+) -> BandHeld:
+    latency = own["latency_ns"].to_numpy()
+    low, high = (int(latency.min()), int(latency.max())) if latency.size else (None, None)
+    return BandHeld(
+        slot_start_ns=slot[0],
+        slot_end_ns=slot[1],
+        predicted_share=predicted,
+        count=latency.size,
+        share=latency.size / total if total else None,
+        inside=int(((latency >= slot[0]) & (latency < slot[1])).sum()),
+        min_ns=low,
+        mean_ns=round(float(latency.mean())) if latency.size else None,
+        max_ns=high,
+        jitter_ns=None if low is None or high is None else high - low,
+    )

@@ -1,0 +1,49 @@
+"""What is in a recording: events, losses, clock, system; as tables and as plain data."""
+
+from typing import Any
+
+from rich.markup import escape
+from rich.table import Table
+
+from chainshaper.exploration import event_counts
+from chainshaper.recording import Recording
+
+__all__ = ["contents_json", "contents_table"]
+
+
+def contents_json(recording: Recording) -> dict[str, Any]:
+    """Counts per event, what was lost, the clock, and the system that was recorded."""
+    info = recording.info
+    return {
+        "source": info.source,
+        "events": dict(event_counts(recording).iter_rows()),
+        "lost": info.lost,
+        "clock_offset_ns": info.clock_offset_ns,
+        "distribution": info.distribution,
+        "rmw": info.rmw,
+        "hosts": [host for host in info.host.split(", ") if host],
+        "kernel": info.kernel,
+        "processes": {str(pid): name for pid, name in info.processes.items()},
+        "notes": list(info.notes),
+    }
+
+
+def contents_table(recording: Recording) -> tuple[Table, Table]:
+    """The system that was recorded, and how often each event happened."""
+    contents = contents_json(recording)
+    system = Table(title=escape(str(recording.path)), title_justify="left", show_header=False)
+    system.add_column("")
+    system.add_column("", overflow="fold")
+    system.add_row("source", contents["source"])
+    system.add_row("distribution", contents["distribution"] or "unknown")
+    system.add_row("RMW", contents["rmw"] or "unknown")
+    system.add_row("hosts", escape(", ".join(contents["hosts"])) or "unknown")
+    system.add_row("clock offset", f"{contents['clock_offset_ns']} ns to CLOCK_REALTIME")
+    for pid, name in contents["processes"].items():
+        system.add_row(f"process {pid}", escape(name))
+    counts = Table(title="Events", title_justify="left", show_footer=True)
+    counts.add_column("event", "together")
+    counts.add_column("count", f"{sum(contents['events'].values()):,}", justify="right")
+    for name, count in contents["events"].items():
+        counts.add_row(escape(name), f"{count:,}")
+    return system, counts

@@ -1,0 +1,111 @@
+"""What the events of a trace tell about the system it was taken on: distribution, RMW, processes.
+
+No event names the distribution. Three kinds of evidence do:
+
+* CARET's `caret_init` says it in so many words;
+* `rcl_init` carries the version of tracetools, and every distribution released another one;
+* without it (tracing began later) the fields of the events do: `rmw_publish` has a source
+  timestamp since Jazzy, a gid 16 bytes instead of 24 since Kilted, intra-process events came with
+  Iron. Declared fields prove presence; what a session did not enable proves nothing.
+
+The RMW is known from CARET's `rmw_implementation`, from the gids of publishers and subscriptions,
+which begin with the DDS vendor's number (RTPS 2.5, section 9.3.1.5: guidPrefix[0:2] = vendorId), or
+from the names of threads.
+
+Upstream: changelogs of tracetools; https://www.dds-foundation.org/dds-rtps-vendor-and-product-ids/.
+"""
+
+import re
+from collections.abc import Iterable, Mapping
+
+import polars as pl
+
+from chainshaper.events import EventTables
+
+__all__ = ["distribution_of", "processes_of", "rmw_of_gids", "rmw_of_threads"]
+
+_RELEASES: tuple[tuple[tuple[int, int], str], ...] = (
+    # Versions of tracetools below the first column's belong to the distribution beside it.
+    ((1, 0), "eloquent"),
+    ((2, 0), "foxy"),
+    ((3, 0), "galactic"),
+    ((5, 0), "humble"),
+    ((7, 0), "iron"),
+    ((8, 3), "jazzy"),
+    ((8, 7), "kilted"),
+)
+_LATER = "rolling"
+
+_VENDORS = {
+    (0x01, 0x01): "rmw_connextdds",
+    (0x01, 0x0F): "rmw_fastrtps_cpp",
+    (0x01, 0x10): "rmw_cyclonedds_cpp",
+    (0x01, 0x16): "rmw_gurumdds_cpp",
+}
+_THREADS = (
+    (re.compile(r"recvUC|recvMC|dq\.builtins|dq\.user|xmit\.user"), "rmw_cyclonedds_cpp"),
+    (re.compile(r"dds\.(asyn|ev|udp|shm|tcp)"), "rmw_fastrtps_cpp"),
+)
+
+
+def distribution_of(tables: EventTables, fields: Mapping[str, Mapping[str, int]]) -> str | None:
+    """The ROS 2 distribution as `ROS_DISTRO` has it (``jazzy``), None if nothing tells.
+
+    ``tables`` are those of the objects' creation; ``fields`` the declared events' fields, with
+    the length of those that are arrays (0: no array).
+    """
+    if "caret_init" in tables and tables["caret_init"].height:
+        return str(tables["caret_init"]["distribution"][0])
+    if "rcl_init" in tables and tables["rcl_init"].height:
+        found = re.match(r"(\d+)\.(\d+)", str(tables["rcl_init"]["version"][0]))
+        if found is not None:
+            version = int(found[1]), int(found[2])
+            return next((name for below, name in _RELEASES if version < below), _LATER)
+    publish = fields.get("rmw_publish")
+    if publish is None:
+        return None
+    if "timestamp" in publish:
+        length = fields.get("rmw_publisher_init", {}).get("gid", 0)
+        return {24: "jazzy", 16: "kilted"}.get(length)
+    if "rclcpp_intra_publish" in fields and "rclcpp_ring_buffer_enqueue" in fields:
+        return "iron"
+    return "humble" if "rclcpp_executor_execute" in fields else None
+
+
+def rmw_of_gids(tables: EventTables) -> str | None:
+    """The RMW from CARET's event, or from the vendor in the endpoints' gids."""
+    named = tables.get("rmw_implementation")
+    if named is not None and named.height:
+        return str(named["rmw_impl"][0])
+    for event in ("rmw_publisher_init", "rmw_subscription_init"):
+        endpoints = tables.get(event)
+        if endpoints is None or not endpoints.height or "gid" not in endpoints.columns:
+            continue
+        vendors = {tuple(gid[:2]) for gid in endpoints["gid"].head(1000).to_list()}
+        names = {_VENDORS.get(vendor) for vendor in vendors}
+        if len(names) == 1:
+            return names.pop()
+    return None
+
+
+def rmw_of_threads(names: Iterable[str]) -> str | None:
+    """The RMW from the names of threads; Fast DDS names its own from 2.13 on."""
+    known = list(names)
+    for pattern, rmw in _THREADS:
+        if any(pattern.match(name) for name in known):
+            return rmw
+    return None
+
+
+def processes_of(tables: EventTables, commands: Mapping[int, str]) -> dict[int, str]:
+    """Process → the nodes it created, else its ``commands`` entry (what the tracer calls it)."""
+    processes = dict(commands)
+    nodes = tables.get("rcl_node_init")
+    if nodes is not None and nodes.height:
+        namespace = pl.col("namespace").fill_null("").str.strip_chars_end("/")
+        named = nodes.select("pid", node=namespace + "/" + pl.col("node_name")).drop_nulls()
+        grouped = named.group_by("pid", maintain_order=True).agg(
+            pl.col("node").unique(maintain_order=True)
+        )
+        processes |= {pid: ", ".join(names) for pid, names in grouped.iter_rows()}
+    return dict(sorted(processes.items()))

@@ -1,0 +1,100 @@
+"""Plans of recordings: policies, and several chains with their offsets."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import called, json_of, refused
+
+from chainshaper import load_plan, plan_shaping, save_plan
+from chainshaper.recording import Recording
+
+MS = 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("policy", "servers"),
+    [
+        ("shaped", ["chain", "output"]),
+        ("server-per-chain", ["chain"]),
+        ("server-per-callback", ["first", "second", "third"]),
+        ("let-per-chain", ["chain", "output"]),
+        ("let-per-callback", ["chain", "output", "output_chainshaper_t2", "output_chainshaper_t1"]),
+    ],
+)
+def test_every_policy_is_planned_from_a_recording(
+    policy: str, servers: list[str], tmp_path: Path, unshaped: Recording
+) -> None:
+    file = tmp_path / "plan.yaml"
+    values = json_of("plan", unshaped.path, "--policy", policy, "-o", file)
+    assert values["policy"] == load_plan(file).policy == policy
+    assert [server["name"] for server in values["servers"]] == servers
+    assert values["evidence"]["utilisation"] > 0
+
+
+def _saved(folder: Path, name: str, longest_ms: int, period_ms: int = 100) -> Path:
+    planned = plan_shaping(
+        np.array([longest_ms // 2, longest_ms]) * MS,
+        period_ms * MS,
+        spec=name,
+        output=f"/{name}",
+        publisher="/p",
+        nodes=[f"/{name}_node"],
+    )
+    save_plan(planned, folder / f"{name}.yaml")
+    return folder / f"{name}.yaml"
+
+
+def test_chains_take_turns_where_they_can(tmp_path: Path) -> None:
+    files = [_saved(tmp_path, "a", 40), _saved(tmp_path, "b", 50)]
+    values = json_of("offsets", *files, "-o", tmp_path / "placed")
+    first, second = values["plans"]
+    assert (first["offset_ns"], second["offset_ns"]) == (0, 41 * MS)
+    assert [Path(file).name for file in values["files"]] == ["1_a.yaml", "2_b.yaml"]
+    assert load_plan(tmp_path / "placed" / "2_b.yaml").offset_ns == 41 * MS
+    again = refused(2, "offsets", *files, "-o", tmp_path / "placed")
+    assert "exists already and is not overwritten" in again
+
+
+def test_chains_that_overlap_keep_their_publish_slots_apart(tmp_path: Path) -> None:
+    # [61, 62) and [71, 72) of one cycle are apart as they are; two equal chains are not.
+    files = [_saved(tmp_path, name, 60) for name in ("a", "b")]
+    values = json_of("offsets", *files)
+    first, second = values["plans"]
+    assert second["offset_ns"] % (100 * MS) in range(MS, 99 * MS + 1)
+    assert [plan["servers"][0]["priority"] for plan in (first, second)] == [2, 3]
+    assert any("only their publish slots are kept apart" in text for text in values["warnings"])
+    assert "only their publish slots" in called("offsets", *files).err
+
+
+def test_impossible_offsets_are_explained(tmp_path: Path) -> None:
+    files = [_saved(tmp_path, "a", 6, 20), _saved(tmp_path, "b", 7, 21)]
+    assert "collide at every offset" in refused(1, "offsets", *files)
+
+
+def test_several_chains_of_a_recording(tmp_path: Path, unshaped: Recording) -> None:
+    folder = tmp_path / "plans"
+    chains = ("--chain", "/t1../t3", "--chain", "/t1../t2")
+    values = json_of("plan", unshaped.path, *chains, "-o", folder, "--publish-slot", "100us")
+    assert [plan["chain"]["spec"] for plan in values["plans"]] == ["/t1../t3", "/t1../t2"]
+    assert sorted(path.name for path in folder.iterdir()) == ["1_t3.yaml", "2_t2.yaml"]
+    assert "one by one" in refused(2, "plan", unshaped.path, *chains, "--sink", "/t1../t2")
+
+
+def test_a_further_sink(unshaped: Recording) -> None:
+    values = json_of("plan", unshaped.path, "--sink", "/t1../t2", "--publish-slot", "100us")
+    assert [node["output"] for node in values["further_shaping_nodes"]] == ["/t2"]
+
+
+def test_compare_shows_prediction_beside_measurement(
+    unshaped: Recording, shaped: Recording
+) -> None:
+    prediction = json_of("compare", unshaped.path, shaped.path)["recordings"][1]["prediction"]
+    assert prediction["max_ns"]["at_start"] == 21 * MS
+    assert prediction["max_ns"]["at_end"] == 22 * MS
+    (band,) = prediction["bands"]
+    assert (band["slot_start_ns"], band["slot_end_ns"]) == (21 * MS, 22 * MS)
+    assert band["predicted_share"] == 1.0
+    shown = called("compare", unshaped.path, shaped.path).out
+    assert "Prediction and measurement [ms]" in shown
+    assert "[21.000, 22.000)" in shown
