@@ -1,0 +1,87 @@
+"""Reservation servers as the back ends see them, and what every back end can do.
+
+A plan says which *nodes* run in which server; by the time it is carried out, nodes have become
+threads. What is left is a **table**: servers with slots that repeat every cycle (paper, section
+2.2.1), and thread ids assigned to them. A back end keeps each assigned thread inside the slots of
+its server, one way or another (DESIGN section 6):
+
+* between slots its threads do not run at all (``fifo`` excepted, which isolates only);
+* where servers overlap on a core, the better priority runs; a smaller number is better;
+* threads of one server take turns;
+* threads of no server run when no server's thread wants to.
+
+Whatever a back end changes it changes back in :meth:`BackEnd.release`, and a crash of ours must
+not leave an application stopped.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+__all__ = ["BackEnd", "ReservationServer", "ServerCounters", "ServerTable"]
+
+
+@dataclass(frozen=True)
+class ReservationServer:
+    """One server: half-open slots in ns after the start of a cycle, ascending, on one core."""
+
+    name: str
+    core: int
+    priority: int
+    slots: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True)
+class ServerTable:
+    """All servers that are in force together, and the cycle time that they share (ns)."""
+
+    cycle_ns: int
+    servers: tuple[ReservationServer, ...]
+
+
+@dataclass(frozen=True)
+class ServerCounters:
+    """What a server has done since it was armed.
+
+    ``slots`` counts the slots that were opened, ``late_entries`` those of them that opened more
+    than 100 us after their start, ``longest_lateness_ns`` the worst of these; ``overruns`` counts
+    the slots at whose end a thread of the server still wanted to run. None: the back end cannot
+    know.
+    """
+
+    slots: int | None
+    late_entries: int | None
+    longest_lateness_ns: int | None
+    overruns: int | None
+
+
+class BackEnd(Protocol):
+    """A table of servers in force on this machine.
+
+    Made by the ``create(table)`` of a back end's module, which changes nothing yet that an
+    application could notice. Then ``assign`` and ``arm`` in any order and number; ``release``
+    ends it.
+    """
+
+    name: str
+
+    def assign(self, tid: int, server: str) -> None:
+        """Put a thread into a server; before ``arm`` it goes on running freely.
+
+        Raises:
+            OperationError: the kernel refuses.
+        """
+
+    def arm(self, anchor_ns: int) -> None:
+        """Enforce the slots from now on; cycles start at ``anchor_ns`` (CLOCK_MONOTONIC) + k * CT.
+
+        Once more with another anchor, it moves the cycles without letting threads slip between.
+        """
+
+    def counters(self) -> dict[str, ServerCounters]:
+        """Per server's name, since the first ``arm``."""
+
+    def failure(self) -> str | None:
+        """Why the servers are no longer enforced, None while they are."""
+
+    def release(self) -> None:
+        """Everything as it was before; harmless when repeated."""
