@@ -92,6 +92,32 @@ def test_unresolved_lengths_and_tags_are_errors(tmp_path: Path) -> None:
             open_trace(tmp_path)
 
 
+def test_metadata_of_ctf_2_is_named_with_its_remedy(tmp_path: Path) -> None:
+    (tmp_path / "metadata").write_bytes(b'\x1e{"type": "preamble", "version": 2}\n')
+    with pytest.raises(CtfError, match=r"CTF 2 .* --trace-format=ctf-1\.8"):
+        open_trace(tmp_path)
+
+
+@pytest.mark.parametrize("body", [
+    # Sixty structures of two of the one before: 2^60 fields in a few lines.
+    "".join(f"struct s{i + 1} {{ {f'struct s{i}' if i else 'u8'} a, b; }};\n" for i in range(60)),
+    "".join(f"struct s{i + 1} {{ {f'struct s{i}' if i else 'u8'} a[99]; }};\n" for i in range(60)),
+])  # fmt: skip
+def test_structures_that_multiply_are_refused_at_once(tmp_path: Path, body: str) -> None:
+    text = PLAIN.format(order="le", fields="struct { struct s60 x; }")
+    (tmp_path / "metadata").write_text(text.replace("event {", body + "event {"))
+    started = time.monotonic()
+    with pytest.raises(CtfError, match="nested too deeply"):
+        open_trace(tmp_path)
+    assert time.monotonic() - started < 60
+
+
+def test_words_repeated_without_end_are_read(tmp_path: Path) -> None:
+    text = PLAIN.format(order="le", fields="struct { " + "const " * 50_000 + "u8 x; }")
+    (tmp_path / "metadata").write_text(text)
+    assert open_trace(tmp_path).event_names == ("e",)
+
+
 def test_files_cut_short_keep_their_first_events(tmp_path: Path) -> None:
     make_trace(tmp_path / "whole", streams=1)
     whole, _ = rows_of(tmp_path / "whole")

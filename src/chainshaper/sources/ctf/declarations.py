@@ -4,8 +4,6 @@
 declarators.  The blocks around them (``trace``, ``stream``, ``event``, …) are read by `tsdl`.
 """
 
-# ruff: noqa: PLR0911 - one branch per kind of type
-
 from __future__ import annotations
 
 from collections.abc import Iterator
@@ -13,17 +11,23 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import NoReturn
 
+from chainshaper.sources.ctf.attributes import (
+    Attributes,
+    TsdlError,
+    Value,
+    checked_alignment,
+    float_type,
+    integer_type,
+    string_type,
+)
 from chainshaper.sources.ctf.tokens import Token
 from chainshaper.sources.ctf.types import (
     ArrayType,
-    ByteOrder,
     EnumMapping,
     EnumType,
     Field,
-    FloatType,
     IntegerType,
     SequenceType,
-    StringType,
     StructType,
     Type,
     VariantType,
@@ -32,20 +36,7 @@ from chainshaper.sources.ctf.types import (
 
 __all__ = ["Parser", "Scope", "TsdlError", "Value"]
 
-Value = int | str
 _DEEPEST = 32
-_BYTE_ORDERS: dict[str, ByteOrder] = {
-    "le": "le",
-    "be": "be",
-    "network": "be",
-    "native": "native",
-}
-_BASES = {"decimal": 10, "dec": 10, "d": 10, "i": 10, "u": 10, "hexadecimal": 16, "hex": 16}
-_BASES |= {"x": 16, "X": 16, "p": 16, "octal": 8, "oct": 8, "o": 8, "binary": 2, "b": 2}
-
-
-class TsdlError(ValueError):
-    """Metadata that is no TSDL; ``args`` are the character offset and the reason."""
 
 
 @dataclass
@@ -151,9 +142,9 @@ class Parser:
             return self.path()
         return self.integer()
 
-    def attributes(self) -> dict[str, tuple[Value, int]]:
+    def attributes(self) -> Attributes:
         """``{ name = value; … }`` as a mapping to values and their character offsets."""
-        found: dict[str, tuple[Value, int]] = {}
+        found: Attributes = {}
         with self.block():
             while not self.at("}"):
                 name = self.path()
@@ -167,8 +158,8 @@ class Parser:
 
     def type(self, *, declares: bool) -> Type:
         """A type specifier; ``declares`` says that a declarator's name follows it."""
-        if self.accept("const"):
-            return self.type(declares=declares)
+        while self.accept("const"):
+            pass
         if self.token.kind != "word":
             self.fail(f"expected a type, found {self.token.text!r}")
         word, following = self.token.text, self.tokens[self.position + 1].text
@@ -179,11 +170,13 @@ class Parser:
         if word == "enum":
             return self._enum()
         if word == "string":
-            return self._string()
-        if following == "{" and word == "integer":
-            return self._integer()
-        if following == "{" and word == "floating_point":
-            return self._float()
+            self.position += 1
+            return string_type(self.attributes() if self.at("{") else {})
+        if following == "{" and word in ("integer", "floating_point"):
+            offset = self.token.offset
+            self.position += 1
+            build = integer_type if word == "integer" else float_type
+            return build(self.attributes(), offset)
         return self._alias(declares)
 
     def _alias(self, declares: bool) -> Type:
@@ -201,81 +194,6 @@ class Parser:
             self.position = start
             self.fail(f"unknown type {name!r}")
         return found
-
-    def _attribute(self, found: dict[str, tuple[Value, int]], name: str, default: int) -> int:
-        value, offset = found.get(name, (default, 0))
-        if not isinstance(value, int):
-            raise TsdlError(offset, f"{name} must be an integer, not {value!r}")
-        return value
-
-    def _align(self, found: dict[str, tuple[Value, int]], default: int, offset: int) -> int:
-        align = self._attribute(found, "align", default)
-        if not 0 < align <= 1 << 20 or align & (align - 1):
-            raise TsdlError(offset, f"alignment {align} is not a power of two")
-        return align
-
-    def _byte_order(self, found: dict[str, tuple[Value, int]]) -> ByteOrder:
-        value, offset = found.get("byte_order", ("native", 0))
-        if value not in _BYTE_ORDERS:
-            raise TsdlError(offset, f"unknown byte order {value!r}")
-        return _BYTE_ORDERS[str(value)]
-
-    def _encoding(self, found: dict[str, tuple[Value, int]]) -> str:
-        value, offset = found.get("encoding", ("none", 0))
-        encoding = str(value).lower().replace("-", "").replace("_", "")
-        if encoding not in ("none", "utf8", "ascii"):
-            raise TsdlError(offset, f"unknown encoding {value!r}")
-        return encoding
-
-    def _integer(self) -> IntegerType:
-        offset = self.token.offset
-        self.expect("integer")
-        found = self.attributes()
-        size = self._attribute(found, "size", 0)
-        if not 0 < size <= 64:
-            raise TsdlError(offset, f"integer of {size} bits; 1 to 64 are supported")
-        signed, signed_at = found.get("signed", (0, 0))
-        if signed not in (0, 1, "true", "false", "TRUE", "FALSE"):
-            raise TsdlError(signed_at, f"signed must be true or false, not {signed!r}")
-        base, base_at = found.get("base", (10, 0))
-        base = _BASES.get(base, base) if isinstance(base, str) else base
-        if base not in (2, 8, 10, 16):
-            raise TsdlError(base_at, f"unknown base {base!r}")
-        clock = None
-        if "map" in found:
-            target, target_at = found["map"]
-            parts = str(target).split(".")
-            if len(parts) != 3 or parts[0] != "clock" or parts[2] != "value":
-                raise TsdlError(target_at, f"map must be clock.NAME.value, not {target!r}")
-            clock = parts[1]
-        return IntegerType(
-            size=size,
-            align=self._align(found, 1 if size % 8 else 8, offset),
-            signed=signed in (1, "true", "TRUE"),
-            byte_order=self._byte_order(found),
-            base=int(base),
-            encoding=self._encoding(found),  # type: ignore[arg-type]
-            clock=clock,
-        )
-
-    def _float(self) -> FloatType:
-        offset = self.token.offset
-        self.expect("floating_point")
-        found = self.attributes()
-        exponent = self._attribute(found, "exp_dig", 0)
-        mantissa = self._attribute(found, "mant_dig", 0)
-        if (exponent, mantissa) not in ((8, 24), (11, 53)):
-            raise TsdlError(
-                offset, f"floating point of {exponent} + {mantissa} bits; IEEE 32 or 64 supported"
-            )
-        size = exponent + mantissa
-        return FloatType(size, self._align(found, 8, offset), self._byte_order(found))
-
-    def _string(self) -> StringType:
-        self.expect("string")
-        found = self.attributes() if self.at("{") else {}
-        encoding = self._encoding(found) if "encoding" in found else "utf8"
-        return StringType(encoding)  # type: ignore[arg-type]
 
     def _named(self, keyword: str) -> str:
         """The optional name behind ``struct``, ``variant`` or ``enum``."""
@@ -300,14 +218,12 @@ class Parser:
         align = 1
         if self.accept("align"):
             self.expect("(")
-            align = self.integer()
-            if not 0 < align <= 1 << 20 or align & (align - 1):
-                self.fail(f"alignment {align} is not a power of two")
+            align = checked_alignment(self.integer(), self.token.offset)
             self.expect(")")
-        kind = StructType(tuple(fields), align)
+        kind = StructType(tuple(fields), max([align, *(alignment(f.type) for f in fields)]))
         if name:
             self.scope.names[name] = kind
-        return replace(kind, align=alignment(kind))
+        return kind
 
     def _variant(self) -> Type:
         name = self._named("variant")

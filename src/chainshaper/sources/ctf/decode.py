@@ -21,9 +21,9 @@ from chainshaper.sources.ctf.assembly import Assembly
 from chainshaper.sources.ctf.errors import CtfError
 from chainshaper.sources.ctf.filling import fill_columns
 from chainshaper.sources.ctf.kernels import walk_events
-from chainshaper.sources.ctf.machine import Failure, State
+from chainshaper.sources.ctf.machine import AHEAD, NEVER, Failure, State
 from chainshaper.sources.ctf.streams import MappedFile, Scratch
-from chainshaper.sources.ctf.tables import Cursor, FileColumn, PacketColumn
+from chainshaper.sources.ctf.tables import AheadColumn, Cursor, FileColumn, PacketColumn
 from chainshaper.sources.ctf.trace import CtfStream
 
 __all__ = ["LARGE_BYTES", "Stream", "Walk", "default_threads", "fill", "span_borders", "walk"]
@@ -154,15 +154,18 @@ def fill(
     before = sum(w.reached[span - 1] for w in walks) if span else walks[0].reached[0] * 0
     count = len(streams)
     scratch = Scratch(assembly, count)
-    scratch.state[State.HEAP] = -1
     scratch.rows[:] = before
     scratch.caps[:] = sum(w.reached[span] for w in walks)
-    cursors, heap = np.zeros((count, len(Cursor)), np.int64), np.zeros((count, 2), np.int64)
+    cursors = np.zeros((count, len(Cursor)), np.int64)
+    ahead = np.zeros((count * AHEAD, len(AheadColumn)), np.int64)
+    leaves = 1 << (count - 1).bit_length()
+    tree = np.full((2 * leaves, 2), NEVER, np.int64)
+    tree[0] = 0
     while True:
         status = fill_columns(
-            scratch.address, files.ctypes.data, count, cursors.ctypes.data, heap.ctypes.data,
-            packets.ctypes.data, scratch.registers.ctypes.data, assembly.registers,
-            len(assembly.event_rows),
+            scratch.address, files.ctypes.data, count, cursors.ctypes.data, ahead.ctypes.data,
+            tree.ctypes.data, leaves, packets.ctypes.data, scratch.registers.ctypes.data,
+            assembly.registers, len(assembly.event_rows),
         )  # fmt: skip
         if status != Failure.FULL_DICTIONARY:
             break

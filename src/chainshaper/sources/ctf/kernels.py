@@ -93,7 +93,7 @@ __all__ = [
     "walk_events",
 ]
 
-CLOCK, HEAP = int(State.CLOCK), int(State.HEAP)
+CLOCK = int(State.CLOCK)
 UNSORTED, LATEST = int(State.UNSORTED), int(State.LATEST)
 M_STREAMS, M_EVENTS, M_IDS, M_COUNTERS, M_BATCHES = (
     int(Machine.STREAMS),

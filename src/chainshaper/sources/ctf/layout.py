@@ -15,6 +15,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
+from chainshaper.sources.ctf.shapes import (
+    ListShape,
+    OptionShape,
+    RecordShape,
+    ScalarShape,
+    Shape,
+    Slot,
+    TextShape,
+)
 from chainshaper.sources.ctf.types import (
     ArrayType,
     EnumMapping,
@@ -147,55 +156,6 @@ class Choice:
 Step = Align | Number | Text | Characters | Repeat | Choice
 
 
-@dataclass(frozen=True, slots=True)
-class Slot:
-    """A flat array: its level, its NumPy type code and whether rows may stay unwritten."""
-
-    level: int
-    dtype: str
-    sparse: bool
-
-
-@dataclass(frozen=True, slots=True)
-class ScalarShape:
-    """A column of numbers."""
-
-    slot: int
-
-
-@dataclass(frozen=True, slots=True)
-class TextShape:
-    """A column of strings; its slot holds dictionary codes."""
-
-    slot: int
-
-
-@dataclass(frozen=True, slots=True)
-class ListShape:
-    """A column of lists; ``slot`` holds lengths, or is -1 for arrays of ``count``."""
-
-    slot: int
-    level: int
-    count: int
-    element: Shape
-
-
-@dataclass(frozen=True, slots=True)
-class RecordShape:
-    """A column of structures."""
-
-    fields: tuple[tuple[str, Shape], ...]
-
-
-@dataclass(frozen=True, slots=True)
-class OptionShape:
-    """A column of variants: ``slot`` holds 1 + the index of the option that is present."""
-
-    slot: int
-    options: tuple[tuple[str, Shape | None], ...]
-
-
-Shape = ScalarShape | TextShape | ListShape | RecordShape | OptionShape
 Frame = dict[str, "Number | Frame | None"]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from chainshaper.sources.ctf.program import ROW, Code, Op
 
-__all__ = ["BATCH", "STATE_SIZE", "Failure", "Machine", "State"]
+__all__ = ["AHEAD", "BATCH", "NEVER", "STATE_SIZE", "Failure", "Machine", "State"]
 
 
 class Failure(IntEnum):
@@ -28,9 +28,8 @@ class State(IntEnum):
 
     CLOCK = 0
     STRINGS = 1
-    HEAP = 2
-    UNSORTED = 3
-    LATEST = 4
+    UNSORTED = 2
+    LATEST = 3
     STACK = 8
 
 
@@ -60,6 +59,8 @@ class Machine(IntEnum):
 
 _DEEPEST = 16
 BATCH = 128
+AHEAD = 64
+NEVER = (1 << 63) - 2  # later than all times; one more is still a number
 STATE_SIZE = State.STACK + _DEEPEST
 
 # The same as plain numbers, which is what compiled code can use.

@@ -13,7 +13,8 @@ __all__ = ["METADATA_MAGIC", "read_metadata", "read_metadata_text"]
 
 METADATA_MAGIC = 0x75D11D57
 _HEADER = "I16sIIIBBBBB"
-_LARGEST = 256 << 20
+_LARGEST = 64 << 20
+_RECORD_SEPARATOR = b"\x1e"  # begins every fragment of CTF 2's JSON text sequence
 
 
 def read_metadata(path: Path) -> TraceClass:
@@ -45,6 +46,13 @@ def read_metadata_text(path: Path) -> tuple[str, list[tuple[int, int]]]:
         data = path.read_bytes()
     except OSError as error:
         raise CtfError(path, None, f"cannot read metadata: {error.strerror}") from error
+    if data[:1] == _RECORD_SEPARATOR:
+        raise CtfError(
+            path,
+            0,
+            "CTF 2 metadata; CTF 1.8 is supported",
+            "LTTng 2.15 and later: record with `lttng create --trace-format=ctf-1.8`",
+        )
     for order in "<>":
         if data[:4] == struct.pack(order + "I", METADATA_MAGIC):
             return _packets(path, data, order)

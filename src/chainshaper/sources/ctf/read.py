@@ -31,6 +31,7 @@ from chainshaper.sources.ctf.trace import CtfStream, CtfTrace
 
 __all__ = ["Events", "count", "read"]
 
+_HUGE_PAGE = 2 << 20
 _NULL_COLUMNS = {"cpu": pl.Int32, "pid": pl.Int32, "tid": pl.Int32}
 
 
@@ -151,7 +152,7 @@ class _Arrays:
         # Columns side by side must not begin alike in their pages, or they would compete for
         # the same few lines of the processor's cache.
         sizes = [-(-rows * kind.itemsize // 4096) * 4096 + 320 for rows, kind in wanted]
-        memory = np.empty(sum(sizes), np.uint8)
+        memory = _memory(sum(sizes))
         arrays: list[NDArray[Any]] = []
         start = 0
         for (rows, kind), size in zip(wanted, sizes, strict=True):
@@ -163,6 +164,19 @@ class _Arrays:
         for slot, array in zip(table.slots, self.slots, strict=True):
             if slot.sparse:
                 array[:] = 0
+
+
+def _memory(size: int) -> NDArray[np.uint8]:
+    """Bytes that hold anything; many of them fill huge pages from the first to the last.
+
+    NumPy asks for huge pages where it can; what lies before the first and behind the last whole
+    one would come in hundreds of small pages, each at the cost of a fault.
+    """
+    if size < 2 * _HUGE_PAGE:
+        return np.empty(size, np.uint8)
+    memory = np.empty((size // _HUGE_PAGE + 2) * _HUGE_PAGE, np.uint8)
+    first = -memory.ctypes.data % _HUGE_PAGE
+    return memory[first : first + size]
 
 
 def _allocate(assembly: Assembly, number: int, total: NDArray[np.int64]) -> _Arrays:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 
 __all__ = [
+    "AheadColumn",
     "Cursor",
     "EventColumn",
     "FileColumn",
@@ -91,9 +92,17 @@ class Cursor(IntEnum):
     POSITION = 1
     END = 2
     CLOCK = 3
-    EVENT = 4
-    TIME = 5
-    STREAM = 6
+    PLACE = 4  # of the next event among those that were read ahead
+    COUNT = 5  # events that were read ahead
+    CPU = 6  # of the packet
+
+
+class AheadColumn(IntEnum):
+    """Columns of the table of events that were read ahead, `machine.AHEAD` rows per file."""
+
+    TIME = 0
+    EVENT = 1
+    ADDRESS = 2  # of what follows the header; 0 where the length is not known before
 
 
 class ScanStatus(IntEnum):
@@ -121,7 +130,8 @@ S_UUID_LOW, S_UUID_HIGH = 18, 19
 E_WALK, E_WALK_STOP, E_ALIGN, E_SIZE, E_FILL, E_FILL_STOP = 0, 1, 2, 3, 4, 5
 E_COUNTER, E_LEVELS, E_TIME, E_CPU, E_CONSTANT = 6, 7, 8, 9, 10
 F_BASE, F_SIZE, F_PACKET, F_POSITION, F_CLOCK, F_LAST_PACKET, F_LAST_POSITION = range(7)
-C_PACKET, C_POSITION, C_END, C_CLOCK, C_EVENT, C_TIME, C_STREAM = range(7)
+C_PACKET, C_POSITION, C_END, C_CLOCK, C_PLACE, C_COUNT, C_CPU = range(7)
+A_TIME, A_EVENT, A_ADDRESS = range(3)
 DONE, FULL, BAD_MAGIC, BAD_UUID = 0, 1, 2, 3
 BAD_STREAM, BAD_SIZE, BAD_HEADER, CUT = 4, 5, 6, 7
 # Registers, in the order of `layout.REGISTERS`.
@@ -130,4 +140,4 @@ R_CONTENT, R_PACKET, R_SEQUENCE, R_DISCARDED, R_CPU, R_UUID_LOW, R_UUID_HIGH = r
 MAGIC = 0xC1FC1FC1
 BILLION = 1_000_000_000
 # Bytes per row.
-P_ROW, S_ROW, E_ROW, F_ROW, C_ROW = 8 * 12, 8 * 20, 8 * 11, 8 * 7, 8 * 7
+P_ROW, S_ROW, E_ROW, F_ROW, C_ROW, A_ROW = 8 * 12, 8 * 20, 8 * 11, 8 * 7, 8 * 7, 8 * 3

@@ -31,6 +31,8 @@ _TOKEN = re.compile(
     """,
     re.VERBOSE | re.DOTALL,
 )
+_MOST = 4_000_000
+"""Tokens that fit into memory; a kernel trace with all its events has some 100,000."""
 _ESCAPE = re.compile(r"\\(x[0-9a-fA-F]{1,2}|[0-7]{1,3}|.)", re.DOTALL)
 _ESCAPES = {"n": "\n", "t": "\t", "r": "\r", "a": "\a", "b": "\b", "f": "\f", "v": "\v"}
 
@@ -43,6 +45,8 @@ def tokenize(text: str) -> list[Token]:
     tokens: list[Token] = []
     position = 0
     while position < len(text):
+        if len(tokens) > _MOST:
+            raise TokenError(position, f"more than {_MOST} tokens")
         match = _TOKEN.match(text, position)
         if match is None:
             rest = text[position : position + 2]

@@ -151,14 +151,14 @@ class _Blocks:
             raise TsdlError(0, f"trace byte_order must be le or be, not {byte_order!r}")
         streams = self.streams or {0: StreamClass(0)}
         only = next(iter(streams)) if len(streams) == 1 else 0
+        events: dict[int, dict[int, EventClass]] = {identifier: {} for identifier in streams}
         for (stream_id, _), (event, offset) in self.events.items():
             target = only if stream_id is None else stream_id
             if target not in streams:
                 raise TsdlError(offset, f"event {event.name!r} of undeclared stream {target}")
-            if event.id in streams[target].events:
+            if event.id in events[target]:
                 raise TsdlError(offset, f"event {event.name!r}: id {event.id} declared twice")
-            known = {**streams[target].events, event.id: replace(event, stream_id=target)}
-            streams[target] = replace(streams[target], events=known)
+            events[target][event.id] = replace(event, stream_id=target)
         uuid = self.trace.get("uuid")
         return TraceClass(
             byte_order="le" if byte_order == "le" else "be",
@@ -166,7 +166,7 @@ class _Blocks:
             packet_header=_struct(self.trace, "packet.header", 0),
             env=self.env,
             clocks=self.clocks,
-            streams=streams,
+            streams={i: replace(stream, events=events[i]) for i, stream in streams.items()},
         )
 
 

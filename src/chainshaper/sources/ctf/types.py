@@ -110,7 +110,10 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class StructType:
-    """``struct { … } align(n)`` (section 4.2.1)."""
+    """``struct { … } align(n)`` (section 4.2.1).
+
+    ``align`` is that of the whole: at least ``n``, and at least each field's.
+    """
 
     fields: tuple[Field, ...] = ()
     align: int = 1
@@ -189,7 +192,7 @@ def field_name(name: str) -> str:
 def alignment(kind: Type) -> int:
     """The alignment of a type in bits (section 4.1.2, 4.2); a variant has none of its own."""
     match kind:
-        case IntegerType(align=align) | FloatType(align=align):
+        case IntegerType(align=align) | FloatType(align=align) | StructType(align=align):
             return align
         case EnumType(container=container):
             return container.align
@@ -197,7 +200,5 @@ def alignment(kind: Type) -> int:
             return 8
         case ArrayType(element=element) | SequenceType(element=element):
             return alignment(element)
-        case StructType(fields=fields, align=align):
-            return max([align, *(alignment(f.type) for f in fields)])
         case VariantType():
             return 1
