@@ -143,16 +143,26 @@ FIELDS: dict[str, dict[str, pl.DataType]] = {
         "next_tid": pl.Int32(),
         "next_prio": pl.Int32(),
     },
-    # Ours: what the shaping node decided, and what the machine did to everybody.
+    # Ours: what the shaping node decided, when a message of an asynchronous publisher really
+    # left, and what the machine did to everybody.
     "gate_release": {  # `time` is the instant at which the gate let the message go
         "callback": _HANDLE,  # the shaping node's subscription callback
         "source_timestamp": _NANOSECONDS,  # of the message that was held
         "arrival": _NANOSECONDS,
         "origin": _NANOSECONDS,  # the anchor the slots were counted from
-        "release": _NANOSECONDS,  # planned; `time` minus this is the gate's own error
-        "slot": pl.Int32(),
-        "cycles_waited": pl.Int32(),  # 0: in its own cycle; more: it missed its last slot
+        # Planned; `time` minus this is the gate's own error. Null: it was never let go.
+        "release": _NANOSECONDS,
+        "slot": pl.Int32(),  # null: in none
+        "cycles_waited": pl.Int32(),  # 0: in its own cycle
         "anchor": pl.String(),  # "stamp", or "cycle" (also when a stamp was unusable)
+    },
+    "asynchronous_send": {  # `time` is when the publisher thread had the message in its hands
+        "rmw_publisher_handle": _HANDLE,
+        "timestamp": _NANOSECONDS,  # the DDS source timestamp of its `rmw_publish`
+        # "sent"; "expired": older than its topic's lifespan; "overwritten": newer messages
+        # had filled the history. The last two were never sent.
+        "outcome": pl.String(),
+        "duration": _NANOSECONDS,  # of sending
     },
     "machine_stall": {  # `time` is when the sleeper should have woken, `cpu` where it sleeps
         "duration": _NANOSECONDS,  # how late it woke
@@ -164,6 +174,11 @@ OPTIONAL_FIELDS: dict[str, dict[str, pl.DataType]] = {
     # sched_switch.
     "callback_start": {"thread_time": _NANOSECONDS},
     "callback_end": {"thread_time": _NANOSECONDS},
+    # Not 0: a thread of its own sends what this publisher is given (`asynchronous_send`).
+    "rcl_publisher_init": {"asynchronous": pl.Int32()},
+    # Null: the message came in time; otherwise what was done about the overrun, "wait",
+    # "discard" or "publish". Recordings from before there was a choice lack it.
+    "gate_release": {"overrun": pl.String()},
 }
 
 

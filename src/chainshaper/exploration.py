@@ -4,6 +4,7 @@ The functions behind `chainshaper info`, `graph`, `chains` and `convert`. All of
 :func:`chainshaper.sources.open_source` opened.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,11 +20,13 @@ from chainshaper.analysis import (
     graph_of,
     load_named_paths,
 )
+from chainshaper.analysis.close_names import close_names
 from chainshaper.analysis.matching import latest_before
 from chainshaper.app import ApplicationGraph
 from chainshaper.errors import InputError
 from chainshaper.recording import Recording, RecordingInfo, write_recording
 from chainshaper.sources import open_source
+from chainshaper.sources.event_fields import table_name
 
 __all__ = [
     "ApplicationDescription",
@@ -32,6 +35,7 @@ __all__ = [
     "event_counts",
     "list_chains",
     "lost_events",
+    "lost_text",
     "named_chain",
     "services",
 ]
@@ -41,10 +45,11 @@ def event_counts(recording: Recording) -> pl.DataFrame:
     """How often each event happened: ``event, count``, ordered by event.
 
     Names are the tracer's own, with the provider (``ros2:callback_start``), also of events that the
-    analysis makes no use of; in a recording of ours they are the names of its tables.
+    analysis makes no use of, and also in a recording that was converted from a trace; where we
+    recorded ourselves they are the names of the tables.
     """
-    counts = getattr(recording.events, "counts", None)
-    if counts is None:
+    counts = getattr(recording.events, "counts", recording.info.trace_events)
+    if not counts:
         counts = {name: frame.height for name, frame in recording.events.items()}
     rows = sorted((name, count) for name, count in counts.items() if count)
     return pl.DataFrame(rows, schema={"event": pl.String, "count": pl.Int64}, orient="row")
@@ -52,8 +57,13 @@ def event_counts(recording: Recording) -> pl.DataFrame:
 
 def lost_events(info: RecordingInfo) -> str:
     """What was lost while recording, in words for below a table; "nothing" is said as well."""
-    lost = [f"{count} {what.replace('_', ' ')}" for what, count in info.lost.items() if count]
-    return f"lost while recording: {', '.join(lost) or 'nothing'}"
+    return lost_text(info.lost)
+
+
+def lost_text(lost: Mapping[str, int]) -> str:
+    """The same from the counts by reason."""
+    reasons = [f"{count} {what.replace('_', ' ')}" for what, count in lost.items() if count]
+    return f"lost while recording: {', '.join(reasons) or 'nothing'}"
 
 
 def services(tables: events.EventTables) -> pl.DataFrame:
@@ -105,14 +115,17 @@ def named_chain(file: str | Path, name: str | None = None) -> str:
     if name is None:
         raise InputError(f"{file}: choose one of its named_paths with --chain: {known}")
     if name not in paths:
-        raise InputError(f"{file}: no path is named {name!r}; its named_paths: {known}")
+        close = close_names(name, paths)
+        hint = f"did you mean {' or '.join(close)}?" if close else f"its named_paths: {known}"
+        raise InputError(f"{file}: no path is named {name!r}; {hint}")
     return paths[name]
 
 
 def convert_recording(recording: Recording | str | Path, output: str | Path) -> Recording:
     """Write an open trace as a recording of ours: Parquet tables that are read in no time.
 
-    All events that the analysis knows are kept, so every figure stays the same to the nanosecond.
+    All events that the analysis knows are kept, so every figure stays the same to the nanosecond;
+    a note names the others.
 
     Raises:
         InputError: ``output`` exists already.
@@ -121,7 +134,22 @@ def convert_recording(recording: Recording | str | Path, output: str | Path) -> 
         recording = open_source(recording)
     if not len(recording.events):
         raise InputError(f"{recording.path}: no event in it is one that chainshaper knows")
-    return write_recording(output, recording.events, recording.info)
+    return write_recording(output, recording.events, _with_trace_events(recording))
+
+
+def _with_trace_events(recording: Recording) -> RecordingInfo:
+    """A trace's description with the events it had, and a note about those that are not kept."""
+    info = recording.info
+    if info.source != "lttng" or info.trace_events:
+        return info
+    counts = dict(event_counts(recording).iter_rows())
+    left = [name for name in counts if table_name(name) not in recording.events]
+    notes = info.notes
+    if left:
+        count = sum(counts[name] for name in left)
+        notes += (f"{count} events of kinds that chainshaper makes no use of were not kept: "
+                  f"{', '.join(left)}.",)  # fmt: skip
+    return info.model_copy(update={"trace_events": counts, "notes": notes})
 
 
 @dataclass(frozen=True)

@@ -76,6 +76,8 @@ class RecordingInfo(BaseModel):
     ``clock_offset_ns`` is what to add to event times for CLOCK_REALTIME. ``lost`` counts events
     that are known to be missing, by reason. ``realtime`` says whether SCHED_FIFO was in force
     for every thread it was asked for, ``notes`` what a reader of the figures must know.
+    ``trace_events`` are the events, by their full names, of the trace that it was converted from,
+    those included that no table keeps.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -93,6 +95,7 @@ class RecordingInfo(BaseModel):
     realtime: bool | None = None  # None: unknown
     notes: tuple[str, ...] = ()
     lost: dict[str, int] = {}
+    trace_events: dict[str, int] = {}
     stall_meter: StallMeterInfo | None = None
     chain: str | None = None  # the chain the application's description names first
     application: dict[str, Any] | None = None  # the description that ran, when we ran it

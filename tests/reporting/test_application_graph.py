@@ -2,6 +2,7 @@
 
 import json
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -57,6 +58,8 @@ def test_as_data(application: ApplicationDescription) -> None:
         "/rosout",
         "/parameter_events",
     }
+    (client,) = (c for c in found["callbacks"] if c["kind"] == "client")
+    assert (client["node"], client["topic"], client["symbol"]) == ("/relay", "/map", None)
     timer = next(c for c in found["callbacks"] if c["kind"] == "timer")
     assert (timer["period_ns"], timer["publishes"]) == (20_000_000, ["/x"])
     assert [(s["name"], s["servers"], s["clients"], s["internal"]) for s in found["services"]] == [
@@ -75,6 +78,13 @@ def test_as_a_picture(application: ApplicationDescription) -> None:
     for text in ("get_parameters", "/rosout", "/parameter_events"):
         assert text not in svg
         assert text in application_svg(application, everything=True)
+
+
+def test_pictures_say_what_was_lost(application: ApplicationDescription) -> None:
+    assert "lost" not in application_svg(application) + application_dot(application)
+    lossy = replace(application, lost={"discarded_events": 3, "lost_packets": 0})
+    for picture in (application_svg(lossy), application_dot(lossy)):
+        assert "lost while recording: 3 discarded events" in picture
 
 
 def test_as_dot(application: ApplicationDescription) -> None:

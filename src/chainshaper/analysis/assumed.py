@@ -3,9 +3,10 @@
 * A Python node (rclpy), or one that takes from a wait set, has no callback events. An instance of
   its subscription is assumed to begin with each take. What its thread publishes for the same node
   until its next take is counted as that instance's output; when it ends is not known.
-* A driver's own thread, a player of recorded data or a Python timer publishes outside all
-  callbacks. For a topic that its node publishes only like this a callback of kind ``unknown`` is
-  assumed, with the handle 0 and one instance per publication, so that chains can begin there.
+* A driver's own thread, a player of recorded data, a Python timer or the callback of a service's
+  client publishes outside all callbacks that events show. For a topic that its node publishes only
+  like this a callback of kind ``unknown`` is assumed, with the handle 0 and one instance per
+  publication, so that chains can begin there.
 
 Assumed instances have ``assumed`` set and no ``end``; they have no response times.
 """
@@ -103,8 +104,9 @@ def _with_callbacks(objects: Objects, outside: pl.DataFrame) -> Objects:
         pl.col(name).cast(type_) for name, type_ in CALLBACK_SCHEMA.items()
     )
     notes = tuple(
-        f"{node} publishes {topic} outside its callbacks (from a thread of its own, or from "
-        "Python): a chain that begins there is measured from the publication."
+        f"{node} publishes {topic} outside its callbacks (from a thread of its own, from Python, "
+        "or from a service client's callback): a chain that begins there is measured from the "
+        "publication."
         for node, topic in outside.select("node", "topic").iter_rows()
     )
     return replace(objects, callbacks=callbacks, notes=(*objects.notes, *notes))

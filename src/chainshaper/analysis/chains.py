@@ -7,10 +7,11 @@ ends with a node ends with what that node publishes, or, if it publishes nothing
 that it subscribes to.
 """
 
-import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from chainshaper.analysis.close_names import close_names
+from chainshaper.analysis.objects import INTERNAL_TOPICS
 from chainshaper.analysis.paths import Path, PathSearch, Stage, Vertex
 from chainshaper.app import ApplicationGraph, Callback, Chain
 from chainshaper.errors import InputError
@@ -171,9 +172,12 @@ def _stage(graph: ApplicationGraph, spec: str, name: str) -> Stage:
             f"chain {spec!r}: the recording shows no topics at all; tracing has to start before "
             "the application does"
         )
-    close = difflib.get_close_matches(name, sorted(topics | nodes.keys()), n=3, cutoff=0.5)
+    close = close_names(name, topics | nodes.keys())
     hint = (
-        f"did you mean {' or '.join(close)}?" if close else "the names there are: " + _some(topics)
+        f"did you mean {' or '.join(close)}?"
+        if close
+        else f"the names there are: {_some(topics - INTERNAL_TOPICS or topics)}; "
+        "`chainshaper graph` shows all of them"
     )
     raise InputError(f"chain {spec!r}: no topic or node is called {name}; {hint}")
 

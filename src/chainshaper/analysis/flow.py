@@ -11,6 +11,7 @@ import polars as pl
 
 from chainshaper import events
 from chainshaper.analysis.assumed import with_assumed_readers, with_assumed_writers
+from chainshaper.analysis.departures import with_departures
 from chainshaper.analysis.instances import callback_instances
 from chainshaper.analysis.matching import by_number, latest_before
 from chainshaper.analysis.messages import link_takes, publications, takes
@@ -28,7 +29,8 @@ class DataFlow:
       that no event shows added (:mod:`~chainshaper.analysis.assumed`). An instance's number is
       its row.
     * ``publications``: see :func:`~chainshaper.analysis.messages.publications`, with the
-      ``instance`` in which each was published and its ``callback_id`` (null: outside callbacks).
+      ``instance`` in which each was published and its ``callback_id`` (null: outside callbacks),
+      and when it was ``sent`` (:mod:`~chainshaper.analysis.departures`).
     * ``takes``: see :func:`~chainshaper.analysis.messages.takes`, with the ``publication`` that
       was read and the ``instance`` that got the message (null: none did).
     * ``events``: the tables all this came from.
@@ -58,7 +60,12 @@ def data_flow(tables: events.EventTables, clock_offset_ns: int = 0) -> DataFlow:
     taken = _consumed(taken, instances)
     published = _published_in(published, instances, objects)
     objects, instances, published = with_assumed_writers(objects, instances, published)
-    notes = (*objects.notes, *_about_execution_times(tables, instances))
+    published = with_departures(published, tables, objects)
+    notes = (
+        *objects.notes,
+        *_about_execution_times(tables, instances),
+        *_about_messages_within_processes(tables, instances),
+    )
     return DataFlow(objects, instances, published, taken, tables, notes)
 
 
@@ -68,6 +75,18 @@ def _about_execution_times(tables: events.EventTables, instances: pl.DataFrame) 
     return (
         "sched_switch was recorded, but shows none of the application's threads (inside a "
         "container threads have other numbers): execution times cannot be known.",
+    )
+
+
+def _about_messages_within_processes(
+    tables: events.EventTables, instances: pl.DataFrame
+) -> tuple[str, ...]:
+    count = int(instances["intra_process"].sum())
+    if not count or events.table(tables, "rclcpp_ring_buffer_dequeue").height:
+        return ()
+    return (
+        f"{count} callback instances got their message within their process, of which no other "
+        "event tells (before Iron, or not enabled): chains cannot be followed through them.",
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import polars as pl
 
 from chainshaper import events
-from chainshaper.analysis.matching import latest_before
+from chainshaper.analysis.matching import key_numbers, latest_before
 
 __all__ = ["callback_instances", "cpu_time"]
 
@@ -28,7 +28,8 @@ def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> p
       end was lost) or when there is none (still running as the recording stopped). A
       `callback_end` without a start belongs to nobody;
     * ``execution_ns``: CPU time (paper: e), from the ``thread_time`` columns where the source
-      has them, else from `sched_switch` (:func:`cpu_time`), else null;
+      has them, else from `sched_switch` (:func:`cpu_time`), else null, also where a thread seems
+      to have used none;
     * ``intra_process``: whether its message came through a ring buffer;
     * ``assumed``: always false here, see :mod:`~chainshaper.analysis.flow`.
     """
@@ -48,7 +49,7 @@ def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> p
         pl.lit(False).alias("assumed"),
     )
     if frame["execution_ns"].null_count() == frame.height and "sched_switch" in tables:
-        frame = frame.with_columns(cpu_time(tables, frame).alias("execution_ns"))
+        frame = _plausible(frame.with_columns(cpu_time(tables, frame).alias("execution_ns")))
     return frame.with_row_index("instance")
 
 
@@ -77,12 +78,8 @@ def _paired(tables: events.EventTables) -> pl.DataFrame:
 
 def _keyed(table: pl.DataFrame) -> tuple[Any, Any, Any]:
     """Thread, callback and time of a table's rows as arrays; both pid and tid in one number."""
-    thread = pl.col("pid").fill_null(-1).cast(pl.Int64) * 2**32 + pl.col("tid").fill_null(-1)
-    return (
-        table.select(thread).to_series().to_numpy(),
-        table["callback"].fill_null(0).to_numpy(),
-        table["time"].to_numpy(),
-    )
+    callback, thread = key_numbers(table, ["callback", "pid", "tid"])
+    return thread, callback, table["time"].to_numpy()
 
 
 def cpu_time(tables: events.EventTables, spans: pl.DataFrame) -> pl.Series:
@@ -102,6 +99,18 @@ def cpu_time(tables: events.EventTables, spans: pl.DataFrame) -> pl.Series:
         rows = rows.drop("switched", "used", "running")
     used = pl.col("used_at_end") - pl.col("used_at_start")
     return rows.sort("row").select(used.alias("execution_ns")).to_series()
+
+
+def _plausible(frame: pl.DataFrame) -> pl.DataFrame:
+    """``execution_ns`` without what cannot be: a callback that ran used its core.
+
+    Where most instances of a thread used none, `sched_switch` speaks of another thread with the
+    same number (the trace was taken inside a container); where single ones did, switches were lost.
+    """
+    used, thread = pl.col("execution_ns"), ["pid", "tid"]
+    never = (used == 0) & (pl.col("end") > pl.col("start"))
+    stranger = never.sum().over(thread) * 2 > used.count().over(thread)
+    return frame.with_columns(pl.when(~(never | stranger)).then(used).alias("execution_ns"))
 
 
 def _running_time(tables: events.EventTables) -> pl.DataFrame:

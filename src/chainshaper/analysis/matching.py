@@ -6,11 +6,14 @@ created there, or it belongs to whatever its thread was doing at that moment. Bo
 cost is linear in the rows once both sides are sorted by time.
 """
 
+from itertools import zip_longest
 from typing import Literal
 
+import numpy as np
+import numpy.typing as npt
 import polars as pl
 
-__all__ = ["by_number", "first_after", "in_order", "latest_before", "nearest"]
+__all__ = ["by_number", "first_after", "in_order", "key_numbers", "latest_before", "nearest"]
 
 
 def latest_before(
@@ -52,7 +55,8 @@ def nearest(
 
     For two events of one constructor whose order differs between versions of a library.
     """
-    return _asof(left, right, by, left_on, right_on, strategy="nearest", strictly=False)
+    right = right.drop_nulls([*by, right_on])
+    return _by_polars(left, right, by, left_on, right_on, strategy="nearest", strictly=False)
 
 
 def _asof(
@@ -62,33 +66,73 @@ def _asof(
     left_on: str,
     right_on: str,
     *,
+    strategy: Literal["backward", "forward"],
+    strictly: bool,
+) -> pl.DataFrame:
+    # Numba takes a moment to import: only who matches events pays for it.
+    from chainshaper.analysis.asof import latest_rows, next_rows
+
+    right = right.drop_nulls([*by, right_on])
+    left, right = _in_order(left, left_on), _in_order(right, right_on)
+    keys = key_numbers(left, by), key_numbers(right, by)
+    if len(keys[0]) != 2 or any(left.schema[key] != right.schema[key] for key in by):
+        return _by_polars(left, right, by, left_on, right_on, strategy=strategy, strictly=strictly)
+    timeless = left[left_on].null_count()  # sorted, they come first, and match nothing
+    found = (latest_rows if strategy == "backward" else next_rows)(
+        (keys[0][0][timeless:], keys[0][1][timeless:]),
+        left[left_on][timeless:].to_numpy(),
+        (keys[1][0], keys[1][1]),
+        right[right_on].to_numpy(),
+        strictly=strictly,
+    )
+    index = pl.repeat(None, timeless, dtype=pl.Int64, eager=True).append(pl.Series(found))
+    unknown = (index < 0).fill_null(True)
+    for key in by:
+        unknown |= left[key].is_null()
+    if unknown.any():
+        index = index.set(unknown, None)
+    columns = right.drop(by).select(pl.all().gather(index))
+    return left.hstack(columns.rename({n: f"{n}_right" for n in columns.columns if n in left}))
+
+
+def _by_polars(
+    left: pl.DataFrame,
+    right: pl.DataFrame,
+    by: list[str],
+    left_on: str,
+    right_on: str,
+    *,
     strategy: Literal["backward", "forward", "nearest"],
     strictly: bool,
 ) -> pl.DataFrame:
-    right = right.drop_nulls([*by, right_on])
-    packed = len(by) == 2 and all(left.schema[key] in _HALF for key in by)
-    if packed:
-        left, right = (frame.with_columns(_pack(*by).alias("key")) for frame in (left, right))
-        right = right.drop(by)
-    joined = _in_order(left, left_on).join_asof(
+    return _in_order(left, left_on).join_asof(
         _in_order(right, right_on),
         left_on=left_on,
         right_on=right_on,
-        by="key" if packed else by or None,
+        by=by or None,
         strategy=strategy,
         allow_exact_matches=not strictly,
         coalesce=False,
         check_sortedness=False,  # both are sorted; Polars cannot check it within groups
     )
-    return joined.drop("key") if packed else joined
 
 
-_HALF = (pl.Int32(), pl.UInt32())
-
-
-def _pack(first: str, second: str) -> pl.Expr:
-    """Two 32-bit keys as one of 64 bits, with which Polars groups in a fraction of the memory."""
-    return (pl.col(first).cast(pl.Int64) * 2**32) + pl.col(second).cast(pl.Int64)
+def key_numbers(frame: pl.DataFrame, by: list[str]) -> list[npt.NDArray[np.int64]]:
+    """The key columns as two 64-bit numbers per row; other numbers of numbers do not fit."""
+    whole, halves = [], []
+    for key in by:
+        column = frame[key].to_physical().fill_null(0).to_numpy()
+        if column.dtype.kind not in "iu":
+            return []
+        if column.dtype.itemsize == 8:
+            whole.append(column.view(np.int64))
+        else:
+            halves.append(column.astype(np.int64))
+    for first, second in zip_longest(halves[::2], halves[1::2]):
+        whole.append(first if second is None else first << 32 | second & 0xFFFFFFFF)
+    while len(whole) < 2:
+        whole.append(np.zeros(frame.height, np.int64))
+    return whole
 
 
 def _in_order(frame: pl.DataFrame, time: str) -> pl.DataFrame:
@@ -96,14 +140,14 @@ def _in_order(frame: pl.DataFrame, time: str) -> pl.DataFrame:
     return frame if frame[time].is_sorted() else frame.sort(time, maintain_order=True)
 
 
-def in_order(frame: pl.DataFrame, time: str, *ties: str) -> pl.DataFrame:
+def in_order(frame: pl.DataFrame, time: str, *ties: str, nulls_last: bool = False) -> pl.DataFrame:
     """``frame`` sorted by ``time`` and, where times are equal, by ``ties``; else as it was.
 
     Looking whether all times grow costs a fraction of what sorting by several columns does.
     """
     if bool((frame[time].diff().drop_nulls() > 0).all()):
         return frame
-    return frame.sort(time, *ties, maintain_order=True)
+    return frame.sort(time, *ties, nulls_last=nulls_last, maintain_order=True)
 
 
 def by_number(rows: pl.DataFrame, number: str, column: str, height: int) -> pl.Series:

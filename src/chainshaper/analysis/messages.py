@@ -40,6 +40,9 @@ def publications(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     """
     written = _written(tables, objects)
     handed = _handed_over(tables, objects)
+    if not handed.height:
+        written = written.with_columns(intra_time=pl.lit(None, dtype=pl.Int64))
+        return in_order(written, "time", "pid", "tid").with_row_index("publication")
     # One publish() may do both, ring buffers first: the next write by the same publisher on the
     # same thread is the same message.
     both = latest_before(

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from chainshaper import events
+from chainshaper.analysis.identity import numbered
 from chainshaper.analysis.matching import first_after, latest_before, nearest
 
 __all__ = ["CALLBACK_SCHEMA", "INTERNAL_TOPICS", "Objects", "resolve_objects"]
@@ -53,9 +54,9 @@ class Objects:
       (``pid, handle``) under which a callback ran from ``valid_from`` until that address was
       registered again (``valid_to``, null: never). ``callback_id`` numbers callbacks from 0; one
       that was recreated, or that also has an intra-process twin, has several registrations.
-      ``kind`` is timer, subscription, service or unknown, ``topic`` the topic or the service's
-      name. ``observed`` is false for subscriptions whose library emits no callback events
-      (rclpy): their instances are assumed from what they take and publish.
+      ``kind`` is timer, subscription, service, client or unknown, ``topic`` the topic or the
+      service's name. ``observed`` is false for what emits no callback events: subscriptions of
+      rclpy, whose instances are assumed from what they take and publish, and all clients.
     * ``buffers``: ``pid, buffer, valid_from, callback_id``: intra-process ring buffers.
     * ``notes``: what cannot be known from this recording, in plain words.
     """
@@ -83,11 +84,9 @@ def resolve_objects(tables: events.EventTables) -> Objects:
     )
     registered = _with_symbols(tables, registered)
     strangers = _unregistered(tables, registered)
-    callbacks = pl.concat(
-        [registered, strangers, _callbackless(tables, subscriptions, registered)],
-        how="diagonal_relaxed",
-    )
-    callbacks = _numbered(tables, callbacks)
+    silent = [_callbackless(tables, subscriptions, registered), _client_callbacks(tables, nodes)]
+    callbacks = pl.concat([registered, strangers, *silent], how="diagonal_relaxed")
+    callbacks = numbered(tables, callbacks)
     names = _name_types(publishers, subscriptions, callbacks)
     return Objects(
         nodes=nodes,
@@ -220,6 +219,28 @@ def _service_callbacks(tables: events.EventTables, nodes: pl.DataFrame) -> pl.Da
     return joined.select("pid", "handle", "valid_from", "node", "topic", kind=pl.lit("service"))
 
 
+def _client_callbacks(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
+    """Clients of services: they exist, but no version of rclcpp says when their callback runs."""
+    created = events.table(tables, "rcl_client_init").select(
+        "pid",
+        "node_handle",
+        pl.col("client_handle").alias("handle"),
+        pl.col("time").alias("valid_from"),
+        pl.col("service_name").alias("topic"),
+    )
+    joined = _with_node(created, nodes, "valid_from")
+    return joined.select(
+        "pid",
+        "handle",
+        "valid_from",
+        "node",
+        "topic",
+        valid_to=pl.lit(None, dtype=pl.Int64),
+        kind=pl.lit("client"),
+        observed=pl.lit(False),
+    )
+
+
 def _with_symbols(tables: events.EventTables, registered: pl.DataFrame) -> pl.DataFrame:
     """Add ``valid_to``, ``observed`` and the ``symbol`` registered while the handle was valid."""
     registered = registered.sort("valid_from", maintain_order=True).with_columns(
@@ -280,60 +301,6 @@ def _callbackless(
     )
 
 
-def _numbered(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFrame:
-    """Add ``callback_id``: registrations of what is the same callback to a person share one.
-
-    Two registrations are one callback when they belong to the same subscription (intra-process
-    twins), or when node, kind, topic, period and symbol agree and the first was done before the
-    second began: its address was reused, or its last instance started before.
-    """
-    missing = pl.format("unknown (process {})", "pid")
-    callbacks = callbacks.sort("valid_from", "handle", maintain_order=True).with_columns(
-        named=pl.col("node").is_not_null(), node=pl.col("node").fill_null(missing)
-    )
-    identity = ["pid", "kind", "node", "topic", "period_ns", "symbol"]
-    last_start = _last_starts(tables, callbacks, identity)
-    latest: dict[tuple[object, ...], tuple[int, int]] = {}  # identity → (id, row) seen last
-    of_subscription: dict[int, int] = {}
-    ids: list[int] = []
-    count = 0
-    columns = [*identity, "subscription", "valid_from", "valid_to", "named"]
-    for row, values in enumerate(callbacks.select(columns).iter_rows()):
-        *key, subscription, valid_from, _, named = values
-        found = of_subscription.get(subscription)
-        if found is None and named and tuple(key) in latest:
-            previous, at = latest[tuple(key)]
-            freed = callbacks["valid_to"][at]
-            ended = last_start.get(at)
-            if (freed is not None and freed <= valid_from) or (
-                ended is not None and ended < valid_from
-            ):
-                found = previous
-        number = count if found is None else found
-        count = max(count, number + 1)
-        ids.append(number)
-        latest[tuple(key)] = (number, row)
-        if subscription is not None:
-            of_subscription.setdefault(subscription, number)
-    return callbacks.drop("named").with_columns(pl.Series("callback_id", ids, dtype=pl.UInt32))
-
-
-def _last_starts(
-    tables: events.EventTables, callbacks: pl.DataFrame, identity: list[str]
-) -> dict[int, int]:
-    """Row of a registration → time of its last instance, for those that look alike."""
-    alike = callbacks.with_row_index("row").filter(pl.len().over(identity) > 1)
-    if alike.is_empty():
-        return {}
-    handles = alike.select("pid", callback="handle").unique()
-    starts = events.table(tables, "callback_start").select("time", "pid", "callback")
-    starts = starts.join(handles, on=["pid", "callback"], how="semi")
-    owner = alike.select("row", "valid_from", "pid", callback="handle")
-    found = latest_before(starts, owner, ["pid", "callback"], "time", "valid_from")
-    last = found.drop_nulls("row").group_by("row").agg(pl.col("time").max())
-    return dict(last.select("row", "time").iter_rows())
-
-
 def _buffers(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFrame:
     """Ring buffer → intra-process buffer → subscription object → callback."""
     buffers = events.table(tables, "rclcpp_buffer_to_ipb").select(
@@ -376,7 +343,8 @@ def _notes(tables: events.EventTables, callbacks: pl.DataFrame) -> tuple[str, ..
         )
     elif running and not created["rcl_node_init"]:
         notes.append("no node was created during the recording: names of nodes cannot be known.")
-    for node, topic in callbacks.filter(~pl.col("observed")).select("node", "topic").iter_rows():
+    silent = callbacks.filter(~pl.col("observed") & (pl.col("kind") == "subscription"))
+    for node, topic in silent.select("node", "topic").iter_rows():
         notes.append(
             f"{node} takes {topic} without callback events (a Python node, or a wait set): its "
             "response times cannot be known; what its thread publishes until its next take is "

@@ -12,14 +12,15 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from chainshaper.analysis.asof import key_table, place_of
+
 __all__ = ["ends_of_starts"]
 
 Int64s = npt.NDArray[np.int64]
-UInt64s = npt.NDArray[np.uint64]
 
 
 def ends_of_starts(
-    starts: tuple[Int64s, UInt64s, Int64s], ends: tuple[Int64s, UInt64s, Int64s]
+    starts: tuple[Int64s, Int64s, Int64s], ends: tuple[Int64s, Int64s, Int64s]
 ) -> Int64s:
     """For every start the row of its end, −1 for none.
 
@@ -37,33 +38,9 @@ def ends_of_starts(
 
 
 @numba.njit(cache=True, nogil=True)
-def _slot(keys, thread, callback):
-    """The place of a key in the open-addressed table; −1 when it is half full."""
-    threads, callbacks, taken = keys
-    slots = len(threads)
-    mixed = (np.uint64(thread) * np.uint64(0x9E3779B97F4A7C15)) ^ (
-        callback * np.uint64(0xC2B2AE3D27D4EB4F)
-    )
-    at = np.int64((mixed >> np.uint64(17)) % np.uint64(slots))
-    while taken[at]:
-        if threads[at] == thread and callbacks[at] == callback:
-            return at
-        at = at + 1 if at + 1 < slots else 0
-    if 2 * taken[slots] >= slots:
-        return np.int64(-1)
-    taken[slots] += 1
-    threads[at], callbacks[at], taken[at] = thread, callback, 1
-    return at
-
-
-@numba.njit(cache=True, nogil=True)
 def _walk(starts, ends, result, slots):  # noqa: PLR0912 - one compiled loop
     """Fill ``result``; false where ``slots`` are too few for all keys."""
-    keys = (
-        np.zeros(slots, dtype=np.int64),
-        np.zeros(slots, dtype=np.uint64),
-        np.zeros(slots + 1, dtype=np.int64),
-    )
+    keys = key_table(slots)
     latest = np.full(slots, -1, dtype=np.int64)  # the open start; −1: the last event was an end
     opened = np.zeros(slots, dtype=np.int64)  # starts minus ends
     seen = np.full(slots, -1, dtype=np.int64)  # the moment for which `was_open` holds
@@ -84,14 +61,14 @@ def _walk(starts, ends, result, slots):  # noqa: PLR0912 - one compiled loop
         for step in range(3):
             if step == 1:
                 for row in range(i, next_i):
-                    at = _slot(keys, starts[0][row], starts[1][row])
+                    at = place_of(keys, starts[0][row], starts[1][row], True)
                     if at < 0:
                         return False
                     latest[at] = row
                     opened[at] += 1
                 continue
             for row in range(j, next_j):
-                at = _slot(keys, ends[0][row], ends[1][row])
+                at = place_of(keys, ends[0][row], ends[1][row], True)
                 if at < 0:
                     return False
                 if seen[at] != moment:

@@ -7,6 +7,7 @@ whose callback starts later: after transport, and after whatever else its execut
 import polars as pl
 
 from chainshaper.analysis.flow import DataFlow
+from chainshaper.analysis.matching import by_number
 from chainshaper.analysis.traversals import Traversals
 from chainshaper.app import ApplicationGraph
 
@@ -37,8 +38,9 @@ def reception(
         & pl.col("instance").is_not_null()
     ).select("callback_id", "publication", "instance")
     taken = taken.filter(pl.col("callback_id") == pl.col("callback_id").min())
-    taken = taken.unique("publication", keep="first", maintain_order=True)
-    started = pl.lit(flow.instances["start"]).gather(pl.col("instance"))
-    taken = taken.select("publication", started.alias("received"))
-    rows = traversals.frame.join(taken, on="publication", how="left", maintain_order="left")
-    return rows.select("traversal", "received", reception_ns=pl.col("received") - pl.col("start"))
+    # Of several takes the first: what is laid out last stays.
+    reader = by_number(taken.reverse(), "publication", "instance", flow.publications.height)
+    received = flow.instances["start"].gather(reader.gather(traversals.frame["publication"]))
+    return traversals.frame.select(
+        "traversal", received=received, reception_ns=received - pl.col("start")
+    )

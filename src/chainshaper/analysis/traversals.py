@@ -26,9 +26,10 @@ from dataclasses import dataclass
 
 import polars as pl
 
+from chainshaper.analysis.departures import discarded_instances, why_not_sent
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.graph import MESSAGE_FILTER, goes_on_elsewhere, graph_of
-from chainshaper.analysis.matching import by_number, first_after
+from chainshaper.analysis.matching import by_number, first_after, in_order
 from chainshaper.analysis.messages import overwritten_in
 from chainshaper.app import ApplicationGraph, Callback, Chain
 
@@ -40,11 +41,16 @@ REASONS: dict[str, str] = {
     "not taken": "published, but not taken by the time the recording ended",
     "not executed": "taken, but no callback instance got it",
     "not published": "its callback instance ended without publishing",
+    "discarded": "withheld on purpose: it had overrun its slot or outlived its lifespan, or newer "
+    "messages had filled its asynchronous publisher's history",
+    "not sent": "handed to an asynchronous publisher, whose thread had not sent it by the time the "
+    "recording ended",
     "still running": "its callback instance had not ended when the recording did, or its end "
     "was lost",
 }
 """Why a traversal is incomplete."""
 
+_IN_NODE = ["not published", "discarded", "not sent", "still running"]
 _REASON = pl.Enum(list(REASONS))
 _VIA = pl.Enum(["instance", "sibling"])
 
@@ -134,27 +140,38 @@ def _publish(
         pl.col("instance").alias(f"instance_{hop}"),
         pl.col("publication").alias(f"publication_{hop}"),
     )
-    joined = state.join(own, on=f"instance_{hop}", how="left", maintain_order="left")
-    return joined.with_columns(pl.lit(False).alias(f"sibling_{hop}"))
+    instance, publication = f"instance_{hop}", f"publication_{hop}"
+    first = by_number(own.drop_nulls(), instance, publication, flow.instances.height)
+    if first.count() == own[instance].count():
+        state = state.with_columns(first.gather(state[instance]).alias(publication))
+    else:  # an instance that publishes several times begins as many traversals
+        state = state.join(own, on=instance, how="left", maintain_order="left")
+    return state.with_columns(pl.lit(False).alias(f"sibling_{hop}"))
 
 
 def _published_by_node(flow: DataFlow, callback: Callback, topic: str) -> pl.DataFrame:
-    return flow.publications.filter(
+    """``later, sent, created``: the node's publications, and since when their publisher exists."""
+    publishers = flow.objects.publishers.select("publisher", created="valid_from")
+    here = flow.publications.filter(
         (pl.col("topic") == topic)
         & (pl.col("pid") == callback.pid)
         & (pl.col("node") == callback.node)
-    ).select(later="publication", sent="time")
+    ).select("publisher", later="publication", sent="time")
+    return here.join(publishers, on="publisher", how="left", maintain_order="left")
 
 
 def _publish_by_sibling(
     flow: DataFlow, state: pl.DataFrame, hop: int, here: pl.DataFrame
 ) -> pl.DataFrame:
-    """Fill in the first publication by the node after the instance's start."""
+    """Fill in the first publication by the node after the instance's start.
+
+    A node that was created anew in between knows nothing of the messages of the one before it.
+    """
     waiting = pl.col(f"publication_{hop}").is_null() & pl.col(f"instance_{hop}").is_not_null()
     rows = state.with_row_index("row").filter(waiting)
     start = _looked_up(flow.instances, "start", f"instance_{hop}").alias("start")
     found = first_after(rows.select("row", start), here, [], "start", "sent", strictly=True)
-    later = found.select("row", "later").drop_nulls()
+    later = found.filter(pl.col("created") <= pl.col("start")).select("row", "later")
     joined = state.with_row_index("row").join(later, on="row", how="left", maintain_order="left")
     return joined.with_columns(
         pl.coalesce(f"publication_{hop}", "later"),
@@ -185,7 +202,17 @@ def _unless_published(flow: DataFlow, state: pl.DataFrame, hop: int) -> pl.DataF
     stuck = pl.col("reason").is_null() & instance.is_not_null() & publication.is_null()
     ended = _looked_up(flow.instances, "end", f"instance_{hop}").is_not_null()
     why = pl.when(ended).then(pl.lit("not published")).otherwise(pl.lit("still running"))
-    return _broken(state, stuck, hop, why)
+    if "gate_release" in flow.events:
+        withheld = discarded_instances(flow.takes, flow.events, flow.objects, flow.instances.height)
+        gone = pl.lit(withheld).gather(instance)
+        why = pl.when(ended & gone.is_not_null()).then(pl.lit("discarded")).otherwise(why)
+    state = _broken(state, stuck, hop, why)
+    if not flow.publications["sent"].null_count():
+        return state
+    kept = pl.lit(flow.publications["sent"].is_null()).gather(publication)
+    unsent = pl.lit(why_not_sent(flow.publications, flow.events, flow.objects))
+    kept_back = pl.col("reason").is_null() & kept.fill_null(False)
+    return _broken(state, kept_back, hop, unsent.gather(publication))
 
 
 def _take(flow: DataFlow, state: pl.DataFrame, hop: int, callback: Callback) -> pl.DataFrame:
@@ -248,11 +275,12 @@ def _described(
     last = len(chain.callbacks) - 1
     frame = state.with_columns(
         start=_looked_up(flow.instances, "start", "instance_0"),
-        end=_looked_up(flow.publications, "time", f"publication_{last}"),
-    ).sort("start", "end", f"publication_{last}", nulls_last=True, maintain_order=True)
+        end=_looked_up(flow.publications, "sent", f"publication_{last}"),
+    )
+    frame = in_order(frame, "start", "end", f"publication_{last}", nulls_last=True)
     frame = frame.with_row_index("traversal")
     # A message that was not taken broke its chain on the topic before the hop it did not reach.
-    on_the_way = pl.col("reason").is_in(["not published", "still running"]).not_()
+    on_the_way = pl.col("reason").is_in(_IN_NODE).not_()
     place = pl.col("broken_hop").cast(pl.Int64) - on_the_way.cast(pl.Int64)
     summary = frame.select(
         "traversal",
@@ -301,7 +329,7 @@ def _hop(flow: DataFlow, chain: Chain, frame: pl.DataFrame, hop: int) -> pl.Data
 
 def _published_at(flow: DataFlow, hop: int, chain: Chain) -> pl.Expr:
     """When the hop's message left: for a ring buffer when it was put there, else with DDS."""
-    time = _looked_up(flow.publications, "time", f"publication_{hop}")
+    time = _looked_up(flow.publications, "sent", f"publication_{hop}")
     if hop == len(chain.callbacks) - 1 or not flow.takes["intra_process"].any():
         return time
     put = _looked_up(flow.publications, "intra_time", f"publication_{hop}")

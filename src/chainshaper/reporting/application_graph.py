@@ -17,7 +17,7 @@ from rich.table import Table
 from chainshaper.app import Callback
 from chainshaper.durations import format_duration
 from chainshaper.errors import InputError, OperationError
-from chainshaper.exploration import ApplicationDescription
+from chainshaper.exploration import ApplicationDescription, lost_text
 
 __all__ = [
     "application_dot",
@@ -159,6 +159,8 @@ def application_dot(application: ApplicationDescription, *, everything: bool = F
     """The graph in the language of Graphviz: a cluster per node, ellipses for topics."""
     graph = application.graph
     lines = ["digraph application {", "  rankdir=LR;", "  node [fontname=Helvetica, fontsize=11];"]
+    if any(application.lost.values()):
+        lines.append(f"  label={_quoted(lost_text(application.lost))};")
     shown = [c for c in graph.callbacks if everything or not is_internal(c.topic)]
     number = {(node.name, node.pid): index for index, node in enumerate(graph.nodes)}
     for callback in shown:

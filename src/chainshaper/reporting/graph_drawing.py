@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from html import escape
 
 from chainshaper.app import Callback
-from chainshaper.exploration import ApplicationDescription
+from chainshaper.exploration import ApplicationDescription, lost_text
 from chainshaper.reporting.application_graph import callback_text, is_internal, short_symbol
 from chainshaper.reporting.layered_layout import Box, Edge, Layout, lay_out
 
@@ -82,6 +82,11 @@ def application_svg(application: ApplicationDescription, *, everything: bool = F
         _topic(topic, layout.corners[len(nodes) + index], pills[index])
         for index, topic in enumerate(topics)
     ]
+    if any(application.lost.values()):
+        text = escape(lost_text(application.lost))
+        parts.append(
+            f'<text class="small" x="0" y="{layout.height + MARGIN / 2:.1f}">{text}</text>'
+        )
     return _document(layout, parts)
 
 

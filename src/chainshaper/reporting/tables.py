@@ -7,13 +7,15 @@ import polars as pl
 from rich.markup import escape
 from rich.table import Table
 
-from chainshaper.analysis import LatencyAnalysis, LatencyStatistics
+from chainshaper.analysis import LatencyStatistics
 from chainshaper.durations import format_duration, milliseconds
-from chainshaper.planning import Plan, publish_slots
+from chainshaper.planning import Plan, band_predictions, publish_slots
+from chainshaper.reporting.application_graph import short_symbol
 from chainshaper.reporting.predictions import prediction_json
 from chainshaper.steps import Comparison, Measurement
 
 __all__ = [
+    "bands_table",
     "callback_rows",
     "callback_table",
     "comparison_json",
@@ -45,6 +47,8 @@ def statistics_json(statistics: LatencyStatistics) -> dict[str, Any]:
 def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[str, Any]:
     """One chain's latency as plain data; ``instances`` adds every complete traversal.
 
+    Without ``stalls_watched`` nobody looked for stalls of the machine, so ``disturbed`` is 0
+    whatever it did.
     Instances have their start and end in ns of the trace clock (wall clock).
     """
     analysis = measurement.analysis
@@ -56,7 +60,9 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
         "subscriber_undisturbed": _optional(analysis.subscriber_undisturbed),
         "incomplete_by_reason": analysis.incomplete,
         "silent": analysis.silent,
-        "overruns": measurement.overruns,
+        "overruns": None if measurement.overruns is None else sum(measurement.overruns.values()),
+        "overruns_by_policy": measurement.overruns,
+        "stalls_watched": measurement.longest_stall_ns is not None,
         "longest_stall_ns": measurement.longest_stall_ns,
         "realtime": measurement.recording.info.realtime,
         "lost": measurement.recording.info.lost,
@@ -96,8 +102,12 @@ def _titled(title: str) -> Table:
     return Table(title=escape(title), title_justify="left")
 
 
-def latency_table(analysis: LatencyAnalysis) -> Table:
-    """End-to-end latency: at publication and at the subscriber, all cycles and undisturbed ones."""
+def latency_table(measurement: Measurement) -> Table:
+    """End-to-end latency: at publication and at the subscriber, all cycles and undisturbed ones.
+
+    Where nobody watched the machine, no cycle is called undisturbed.
+    """
+    analysis = measurement.analysis
     table = _titled(f"End-to-end latency of {analysis.chain.spec} [ms]")
     table.add_column("")
     columns: list[tuple[str, LatencyStatistics | None]] = [
@@ -106,6 +116,8 @@ def latency_table(analysis: LatencyAnalysis) -> Table:
         ("at the subscriber", analysis.subscriber),
         ("…undisturbed", analysis.subscriber_undisturbed),
     ]
+    if measurement.longest_stall_ns is None:
+        columns = columns[::2]
     for name, _ in columns:
         table.add_column(name, justify="right")
     for title, field in _FIGURES:
@@ -144,11 +156,17 @@ def comparison_table(comparison: Comparison) -> Table:
     table.add_row("  jitter (max − min)", *(_figure(a.statistics, "jitter_ns") for a in analyses))
     table.add_section()
     table.add_row("cycles", *(str(a.statistics.count) for a in analyses))
-    table.add_row("  disturbed by the machine", *(str(a.statistics.disturbed) for a in analyses))
+    table.add_row(
+        "  disturbed by the machine",
+        *(
+            "not watched" if m.longest_stall_ns is None else str(m.analysis.statistics.disturbed)
+            for m in comparison.measurements
+        ),
+    )
     table.add_row("  incomplete", *(str(a.statistics.incomplete) for a in analyses))
     table.add_row(
         "  too late for their slot",
-        *(ABSENT if m.overruns is None else str(m.overruns) for m in comparison.measurements),
+        *(_overruns(measurement) for measurement in comparison.measurements),
     )
     table.add_row(
         "longest stall of the machine",
@@ -174,6 +192,14 @@ def comparison_table(comparison: Comparison) -> Table:
     return table
 
 
+def _overruns(measurement: Measurement) -> str:
+    """How many outputs overran, and what was done about them: ``3 (2 discard, 1 wait)``."""
+    if measurement.overruns is None:
+        return ABSENT
+    done = ", ".join(f"{count} {policy}" for policy, count in measurement.overruns.items())
+    return f"{sum(measurement.overruns.values())}{f' ({done})' if done else ''}"
+
+
 def _add_section(table: Table, title: str, columns: Sequence[LatencyStatistics | None]) -> None:
     table.add_row(f"[bold]{title}[/]", *[""] * len(columns))
     for name, field in _FIGURES:
@@ -196,7 +222,10 @@ def plan_table(plan: Plan) -> Table:
         table.add_column(name, justify="right" if name in ("core", "priority") else "left")
     for server in plan.servers:
         slots = " ".join(f"[{milliseconds(a)}, {milliseconds(b)})" for a, b in server.slots)
-        threads = ", ".join(thread.node for thread in server.threads)
+        threads = ", ".join(
+            thread.node + (" (publisher)" if thread.role == "publisher" else "")
+            for thread in server.threads
+        )
         # Brackets of half-open intervals are not Rich's markup.
         table.add_row(
             server.name,
@@ -206,8 +235,9 @@ def plan_table(plan: Plan) -> Table:
             threads,
         )
     predicted = plan.predicted
+    offset = f", starting {milliseconds(plan.offset_ns)} late" if plan.offset_ns else ""
     table.caption = (
-        f"cycle {milliseconds(plan.cycle_ns)}; "
+        f"cycle {milliseconds(plan.cycle_ns)}{offset}; "
         f"predicted average {milliseconds(predicted.mean_ns)}, "
         f"maximum {milliseconds(predicted.max_ns)}, jitter at most "
         f"{milliseconds(predicted.jitter_ns)}"
@@ -215,42 +245,58 @@ def plan_table(plan: Plan) -> Table:
     return table
 
 
+def bands_table(plan: Plan) -> Table:
+    """What a plan predicts of each latency band."""
+    table = _titled("Predicted latency bands [ms]")
+    for name in ("slot", "share of cycles", "jitter at most"):
+        table.add_column(name, justify="right")
+    for start, end, share, jitter in band_predictions(plan):
+        slot = escape(f"[{milliseconds(start)}, {milliseconds(end)})")
+        table.add_row(slot, f"{share:.1%}", milliseconds(jitter))
+    return table
+
+
 def callback_rows(statistics: pl.DataFrame) -> list[dict[str, Any]]:
     """Callback statistics as plain data: response and execution times in ns."""
-    rows = []
-    for row in statistics.to_dicts():
-        rows.append(
-            {
-                key: row[key]
-                for key in ("node", "kind", "topic", "period_ns", "pid", "tids", "count")
-            }
-            | {"response_ns": row["response_ns"], "execution_ns": row["execution_ns"]}
-        )
-    return rows
+    keys = ("node", "kind", "topic", "period_ns", "pid", "tids", "count")
+    times = ("response_ns", "execution_ns")
+    return [{key: row[key] for key in (*keys, *times)} for row in statistics.to_dicts()]
 
 
 def callback_table(statistics: pl.DataFrame) -> Table:
-    """Every callback: its thread, how often it ran, and its execution and response times."""
+    """Every callback: its thread, how often it ran, and its execution and response times.
+
+    Execution times have columns only where there are any.
+    """
     table = _titled("Callbacks [ms]")
     for name in ("node", "callback", "thread", "count"):
         right = name in {"thread", "count"}
         table.add_column(name, justify="right" if right else "left", overflow="fold")
-    for name in ("execution", "response"):
+    measured = [name for name in ("execution", "response") if statistics[f"{name}_ns"].count()]
+    for name in measured:
         for figure in ("min", "mean", "max"):
             table.add_column(f"{name}\n{figure}", justify="right", no_wrap=True)
-    for row in statistics.iter_rows(named=True):
-        period = row["period_ns"]
-        trigger = row["topic"] if period is None else f"every {format_duration(period)}"
+    rows = statistics.to_dicts()
+    triggers = [(row["pid"], row["node"], _trigger(row)) for row in rows]
+    for row, (pid, node, trigger) in zip(rows, triggers, strict=True):
+        alike = triggers.count((pid, node, trigger)) > 1
+        function = f" ({short_symbol(row['symbol'])})" if alike and row["symbol"] else ""
         tids = row["tids"]
         table.add_row(
-            row["node"],
-            f"{row['kind']} {trigger or ''}",
+            escape(node),
+            escape(trigger + function),
             str(tids[0]) if len(tids) == 1 else f"{len(tids)} threads",
             str(row["count"]),
             *(
-                ABSENT if row[field] is None else milliseconds(row[field][figure])
-                for field in ("execution_ns", "response_ns")
+                ABSENT if row[f"{name}_ns"] is None else milliseconds(row[f"{name}_ns"][figure])
+                for name in measured
                 for figure in ("min", "mean", "max")
             ),
         )
     return table
+
+
+def _trigger(row: dict[str, Any]) -> str:
+    period = row["period_ns"]
+    what = row["topic"] if period is None else f"every {format_duration(period)}"
+    return f"{row['kind']} {what or ''}".rstrip()

@@ -1,15 +1,17 @@
 """LTTng traces as recordings: the folders that `ros2 trace` writes.
 
 Events keep their names without the provider (``ros2:callback_start`` → ``callback_start``) and get
-the columns and types of :mod:`chainshaper.events`; what the analysis does not know is left out.
-Tables are decoded in groups that are used together, because one pass over a trace costs nearly the
-same for one table as for twenty: those of the objects' creation, of callbacks and of messages at
-once, since every analysis needs them (an overview only creation); what the upper layers say about
-the same messages, `sched_switch` and the executor's when somebody asks for them.
+the columns and types of :mod:`chainshaper.events`; what the analysis does not know is left out
+(:mod:`~chainshaper.sources.event_fields`). Tables are decoded in groups that are used together,
+because one pass over a trace costs nearly the same for one table as for twenty: those of the
+objects' creation, of callbacks and of messages at once, since every analysis needs them (an
+overview only creation); what the upper layers say about the same messages, `sched_switch` and the
+executor's when somebody asks for them.
 
-Times stay what the tracer wrote, ns of CLOCK_MONOTONIC. CARET keeps the events of an
-application's start and emits them again when tracing begins; those carry ``init_timestamp``, the
-time at which they really happened, and are put there.
+Times stay what the tracer wrote, ns of CLOCK_MONOTONIC. Process numbers do too, with one exception:
+containers number their processes independently of each other, so folders of several hosts are
+read host by host, and where two of them use the same number, the later host's are moved
+(:data:`NEXT_HOST`).
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,13 +26,24 @@ from chainshaper.errors import InputError, OperationError
 from chainshaper.recording import Recording, RecordingInfo
 from chainshaper.sources.ctf import CtfError, CtfTrace, count_events, open_trace, read_events
 from chainshaper.sources.ctf.read import Events
-from chainshaper.sources.ctf.types import ArrayType, StructType, field_name
+from chainshaper.sources.ctf.types import ArrayType
+from chainshaper.sources.event_fields import (
+    CARET_INIT,
+    declared_fields,
+    event_table,
+    merged,
+    missing_fields,
+    table_name,
+)
 from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids, rmw_of_threads
 
-__all__ = ["Progress", "TraceTables", "open_lttng_trace"]
+__all__ = ["NEXT_HOST", "Progress", "TraceTables", "open_lttng_trace"]
 
 Progress: TypeAlias = Callable[[float, str], None]
 """Told the share of the work that is done, from 0 to 1, and what is being done."""
+
+NEXT_HOST = 10_000_000
+"""Added to the process and thread numbers of the next host; Linux goes up to 4,194,304."""
 
 _EXECUTOR = frozenset(name for name in events.FIELDS if name.startswith("rclcpp_executor_"))
 _SWITCHES = frozenset(("sched_switch",))
@@ -42,7 +55,7 @@ _CREATION = frozenset(
 _UPPER_LAYERS = frozenset(("rclcpp_publish", "rcl_publish", "rcl_take", "rclcpp_take"))
 _MESSAGES = frozenset(events.FIELDS) - _EXECUTOR - _SWITCHES - _CREATION - _UPPER_LAYERS
 _GROUPS = (_CREATION, _MESSAGES, _UPPER_LAYERS, _EXECUTOR, _SWITCHES)
-_ALSO = frozenset(("caret_init",))  # read with the creation, but no table of ours
+_ALSO = frozenset((CARET_INIT,))  # read with the creation
 _WHO_RUNS = ("callback_start", "rmw_publish", "rmw_take", "rclcpp_publish")
 
 
@@ -55,17 +68,24 @@ class TraceTables(Mapping[str, pl.DataFrame]):
 
     def __init__(self, trace: CtfTrace, progress: Progress, overview: bool) -> None:
         self._trace = trace
+        self._hosts = _by_host(trace)
+        self._fields = declared_fields(trace)
         self._progress = progress
         self._read: dict[str, pl.DataFrame] = {}
         self._sources: dict[str, list[str]] = {}
         for full_name in trace.event_names:
-            name = _plain(full_name)
-            if name in events.FIELDS or name in _ALSO:
+            name = table_name(full_name)
+            if name is not None:
                 self._sources.setdefault(name, []).append(full_name)
         self.counts: dict[str, int] = {}
         self.warnings: tuple[str, ...] = ()
         self._names: dict[int, str] = {}
-        self._decode(_CREATION | _ALSO | (frozenset() if overview else _MESSAGES))
+        self._anonymous = 0
+        self._pids: set[int] = set()
+        self._moved: dict[str, int] = {}
+        # Where numbers may collide, everybody's have to be seen first.
+        everything = not overview or len(self._hosts) > 1
+        self._decode(_CREATION | _ALSO | (_MESSAGES if everything else frozenset()))
 
     def creation(self) -> events.EventTables:
         """The tables of the objects' creation, and CARET's `caret_init`; empty ones included."""
@@ -111,34 +131,82 @@ class TraceTables(Mapping[str, pl.DataFrame]):
     def _counted(self, name: str) -> int:
         return sum(self.counts.get(source, 0) for source in self._sources.get(name, ()))
 
-    def _with_unread(self, found: Events) -> dict[str, int]:
-        """Counts of all events, with those of streams in which nothing was asked for."""
-        with _as_our_errors():
-            others = count_events(replace(self._trace, streams=found.unread))
-        return {name: count + others.get(name, 0) for name, count in found.counts.items()}
+    def notes(self) -> tuple[str, ...]:
+        """What a reader of the tables must know: damage, absent fields, numbers that were moved."""
+        moved = [
+            f"processes and threads of host {host} have {by} added to their numbers, which another "
+            "host's processes have as well."
+            for host, by in self._moved.items()
+            if by
+        ]
+        anonymous = (
+            f"{self._anonymous} events say no process or thread and cannot be used: record with "
+            "`ros2 trace`, or `lttng add-context --userspace --type=vpid --type=vtid`."
+        )
+        return (
+            *self.warnings,
+            *missing_fields(self._fields, self.counts),
+            *moved,
+            *([anonymous] if self._anonymous else ()),
+        )
 
     def _decode(self, group: frozenset[str]) -> None:
+        parts: dict[str, list[pl.DataFrame]] = {}
+        first, nameless = not self.counts, not self._names
+        for place, (host, trace) in enumerate(self._hosts.items()):
+            found = self._decoded(trace, group, place)
+            if first:
+                self._take_stock(trace, found)
+                self._settle_numbers(host, found)
+            if nameless:
+                self._note_names(host, found)
+            for name in group:
+                for full in self._sources.get(name, ()):
+                    decoded = found.pop(full)  # let go of what is in no table
+                    table = event_table(decoded, name, trace.clock_offset_ns)
+                    self._anonymous += (decoded.height - table.height) * first
+                    parts.setdefault(name, []).append(self._with_moved_numbers(table, host))
+        for name, tables in parts.items():
+            self._read[name] = tables[0] if len(tables) == 1 else merged(tables)
+
+    def _decoded(self, trace: CtfTrace, group: frozenset[str], place: int) -> Events:
         wanted = [full for name in group for full in self._sources.get(name, ())]
-        what = "decoding events"
-        self._progress(0.0, what)
+        what, hosts = "decoding events", len(self._hosts)
+        self._progress(place / hosts, what)
         with _as_our_errors():
-            found = read_events(
-                self._trace, wanted, progress=lambda share: self._progress(share, what)
+            return read_events(
+                trace,
+                wanted,
+                progress=lambda share: self._progress((place + share) / hosts, what),
             )
-        if not self.counts:
-            self.counts = self._with_unread(found)
-            self.warnings = found.warnings
-        if not self._names:
-            rare = {name: frame for name, frame in found.items() if _plain(name) in _CREATION}
-            self._names = _process_names(rare) or _process_names(found)
-        for name in group:
-            parts = [
-                _table(found.pop(full), name, self._trace) for full in self._sources.get(name, ())
-            ]
-            if len(parts) == 1:
-                self._read[name] = parts[0]
-            elif parts:
-                self._read[name] = _merged(parts)
+
+    def _take_stock(self, trace: CtfTrace, found: Events) -> None:
+        """Counts of all events, those of streams included in which nothing was asked for."""
+        with _as_our_errors():
+            others = count_events(replace(trace, streams=found.unread))
+        for name, count in found.counts.items():
+            self.counts[name] = self.counts.get(name, 0) + count + others.get(name, 0)
+        self.warnings += found.warnings
+
+    def _settle_numbers(self, host: str, found: Events) -> None:
+        """Move the host's process numbers out of the way if another host has one of them."""
+        if len(self._hosts) == 1:
+            self._moved[host] = 0
+            return
+        known = [frame for frame in found.values() if frame.schema["pid"].is_integer()]
+        pids = {pid for frame in known for pid in frame["pid"].unique().drop_nulls().to_list()}
+        beyond = max(self._moved.values(), default=0) + NEXT_HOST
+        self._moved[host] = beyond if pids & self._pids else 0
+        self._pids |= pids
+
+    def _note_names(self, host: str, found: Events) -> None:
+        rare = {name: frame for name, frame in found.items() if table_name(name) in _CREATION}
+        names = _process_names(rare) or _process_names(found)
+        self._names |= {pid + self._moved[host]: name for pid, name in names.items()}
+
+    def _with_moved_numbers(self, table: pl.DataFrame, host: str) -> pl.DataFrame:
+        moved = self._moved[host]
+        return table.with_columns(pl.col("pid", "tid") + moved) if moved else table
 
 
 def open_lttng_trace(
@@ -166,7 +234,7 @@ def open_lttng_trace(
         source="lttng",
         host=", ".join(host for host in hosts if host),
         kernel=_kernel(trace),
-        distribution=distribution_of(creation, _declared_fields(trace)),
+        distribution=distribution_of(creation, _field_lengths(trace)),
         rmw=rmw_of_gids(creation) or rmw_of_threads(tables.thread_names()),
         clock_offset_ns=trace.clock_offset_ns,
         processes=processes_of(creation, tables.commands()),
@@ -174,7 +242,7 @@ def open_lttng_trace(
             "discarded_events": trace.discarded_events,
             "lost_packets": trace.lost_packets,
         },
-        notes=(*trace.warnings, *tables.warnings),
+        notes=(*trace.warnings, *tables.notes()),
     )
     return Recording(Path(paths[0]), info, tables)
 
@@ -200,35 +268,30 @@ def _untold(*_: object) -> None:
     """Progress that nobody watches."""
 
 
-def _plain(full_name: str) -> str:
-    return full_name.rpartition(":")[2]
+def _by_host(trace: CtfTrace) -> dict[str, CtfTrace]:
+    """The trace in parts, one per host whose processes were traced.
 
-
-def _table(frame: pl.DataFrame, name: str, trace: CtfTrace) -> pl.DataFrame:
-    """A decoded event's frame as an event table."""
-    types = {**events.COMMON_COLUMNS, **events.FIELDS.get(name, {})}
-    if "init_timestamp" in frame.columns:
-        happened = pl.col("init_timestamp")
-        wall_clock = happened > trace.clock_offset_ns
-        at = pl.when(wall_clock).then(happened - trace.clock_offset_ns).otherwise(happened)
-        frame = frame.with_columns(time=at.cast(pl.Int64)).sort("time", maintain_order=True)
-    if name in events.FIELDS:
-        frame = frame.select(column for column in types if column in frame.columns)
-    different = {c: t for c, t in types.items() if c in frame.columns and frame.schema[c] != t}
-    return frame.cast(different, strict=False) if different else frame  # type: ignore[arg-type]
-
-
-def _merged(parts: list[pl.DataFrame]) -> pl.DataFrame:
-    """Several providers' events of one name, by time; CARET's copy of an event is not another."""
-    merged = pl.concat(parts, how="diagonal_relaxed").sort("time", maintain_order=True)
-    return merged.unique(maintain_order=True) if merged.height else merged
+    The kernel's folder goes with its own host, or with the first one: containers run on its
+    kernel, but their threads have other numbers there.
+    """
+    hosts = [str(folder.declared.env.get("hostname", "")) for folder in trace.folders]
+    kernel = [folder.declared.env.get("domain") == "kernel" for folder in trace.folders]
+    traced = list(dict.fromkeys(h for h, k in zip(hosts, kernel, strict=True) if not k))
+    if len(traced) < 2:
+        return {"": trace}
+    owners = [host if host in traced else traced[0] for host in hosts]
+    return {
+        host: replace(trace, streams=tuple(s for s in trace.streams if owners[s.folder] == host))
+        for host in traced
+    }
 
 
 def _process_names(frames: Mapping[str, pl.DataFrame]) -> dict[int, str]:
     """Process → name of its main thread, or of any thread where that was not seen."""
     names: dict[int, str] = {}
     for frame in frames.values():
-        if "procname" in frame.columns:
+        numbers = all(frame.schema[column].is_integer() for column in ("pid", "tid"))
+        if numbers and "procname" in frame.columns:
             seen = frame.select("pid", "tid", "procname").unique().drop_nulls()
             for pid, tid, name in seen.iter_rows():
                 if pid == tid or pid not in names:
@@ -236,18 +299,12 @@ def _process_names(frames: Mapping[str, pl.DataFrame]) -> dict[int, str]:
     return names
 
 
-def _declared_fields(trace: CtfTrace) -> dict[str, dict[str, int]]:
+def _field_lengths(trace: CtfTrace) -> dict[str, dict[str, int]]:
     """Event → its fields, with the length of those that are arrays."""
-    declared: dict[str, dict[str, int]] = {}
-    for folder in trace.folders:
-        for stream in folder.declared.streams.values():
-            for event in stream.events.values():
-                if isinstance(event.fields, StructType):
-                    declared[_plain(event.name)] = {
-                        field_name(f.name): f.type.length if isinstance(f.type, ArrayType) else 0
-                        for f in event.fields.fields
-                    }
-    return declared
+    return {
+        name: {f: t.length if isinstance(t, ArrayType) else 0 for f, t in fields.items()}
+        for name, fields in declared_fields(trace).items()
+    }
 
 
 def _kernel(trace: CtfTrace) -> str:

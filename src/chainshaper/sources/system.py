@@ -54,10 +54,12 @@ def distribution_of(tables: EventTables, fields: Mapping[str, Mapping[str, int]]
     ``tables`` are those of the objects' creation; ``fields`` the declared events' fields, with
     the length of those that are arrays (0: no array).
     """
-    if "caret_init" in tables and tables["caret_init"].height:
-        return str(tables["caret_init"]["distribution"][0])
-    if "rcl_init" in tables and tables["rcl_init"].height:
-        found = re.match(r"(\d+)\.(\d+)", str(tables["rcl_init"]["version"][0]))
+    said = _first(tables, "caret_init", "distribution")
+    if said is not None:
+        return said
+    version_text = _first(tables, "rcl_init", "version")
+    if version_text is not None:
+        found = re.match(r"(\d+)\.(\d+)", version_text)
         if found is not None:
             version = int(found[1]), int(found[2])
             return next((name for below, name in _RELEASES if version < below), _LATER)
@@ -72,16 +74,24 @@ def distribution_of(tables: EventTables, fields: Mapping[str, Mapping[str, int]]
     return "humble" if "rclcpp_executor_execute" in fields else None
 
 
+def _first(tables: EventTables, event: str, field: str) -> str | None:
+    """The first value of an event's field, if it is known."""
+    frame = tables.get(event)
+    if frame is None or field not in frame.columns:
+        return None
+    return next((str(value) for value in frame[field].head(1).drop_nulls()), None)
+
+
 def rmw_of_gids(tables: EventTables) -> str | None:
     """The RMW from CARET's event, or from the vendor in the endpoints' gids."""
-    named = tables.get("rmw_implementation")
-    if named is not None and named.height:
-        return str(named["rmw_impl"][0])
+    named = _first(tables, "rmw_implementation", "rmw_impl")
+    if named is not None:
+        return named
     for event in ("rmw_publisher_init", "rmw_subscription_init"):
         endpoints = tables.get(event)
         if endpoints is None or not endpoints.height or "gid" not in endpoints.columns:
             continue
-        vendors = {tuple(gid[:2]) for gid in endpoints["gid"].head(1000).to_list()}
+        vendors = {tuple(gid[:2]) for gid in endpoints["gid"].drop_nulls().head(1000)}
         names = {_VENDORS.get(vendor) for vendor in vendors}
         if len(names) == 1:
             return names.pop()

@@ -1,0 +1,76 @@
+"""When messages really left, and which were withheld on purpose.
+
+Publishing and leaving are two things where a thread of its own sends for the executor: the
+`rmw_publish` of an asynchronous publisher is recorded, and the source timestamp taken, when the
+message is handed over. `asynchronous_send` says when, and whether, it was sent; sources that
+cannot know this lack the table, and then what the output's subscriber saw has to be looked at.
+
+A shaping node may discard a message that overran its slot (`gate_release` without a release).
+"""
+
+import polars as pl
+
+from chainshaper import events
+from chainshaper.analysis.matching import by_number
+from chainshaper.analysis.objects import Objects
+
+__all__ = ["discarded_instances", "why_not_sent", "with_departures"]
+
+
+def with_departures(
+    published: pl.DataFrame, tables: events.EventTables, objects: Objects
+) -> pl.DataFrame:
+    """``published`` with a column ``sent``: when each message left (null: it never did)."""
+    created = events.table(tables, "rcl_publisher_init", ["asynchronous"])
+    created = created.filter(pl.col("asynchronous").fill_null(0) != 0)
+    if not created.height:
+        return published.with_columns(sent=pl.col("time"))
+    asynchronous = objects.publishers.join(
+        created.select("pid", rmw_handle="rmw_publisher_handle"), on=["pid", "rmw_handle"]
+    )
+    ours = published["publisher"].is_in(asynchronous["publisher"].implode())
+    sends = _sends(published, tables, objects)
+    left = by_number(
+        sends.filter(pl.col("outcome") == "sent"), "publication", "time", published.height
+    )
+    return published.with_columns(sent=pl.when(ours).then(left).otherwise("time"))
+
+
+def why_not_sent(
+    published: pl.DataFrame, tables: events.EventTables, objects: Objects
+) -> pl.Series:
+    """Per publication the reason why it was not sent; only of use for those without ``sent``."""
+    sends = _sends(published, tables, objects).with_columns(reason=pl.lit("discarded"))
+    return by_number(sends, "publication", "reason", published.height).fill_null("not sent")
+
+
+def _sends(published: pl.DataFrame, tables: events.EventTables, objects: Objects) -> pl.DataFrame:
+    """``publication, publisher, time, outcome`` of what publisher threads dealt with."""
+    table = events.table(tables, "asynchronous_send")
+    publishers = objects.publishers.select("pid", "publisher", rmw_publisher_handle="rmw_handle")
+    return (
+        table.join(publishers, on=["pid", "rmw_publisher_handle"], how="inner")
+        .select("publisher", "time", "outcome", source_timestamp="timestamp")
+        .join(
+            published.select("publication", "publisher", "source_timestamp"),
+            on=["publisher", "source_timestamp"],
+            how="inner",
+        )
+    )
+
+
+def discarded_instances(
+    taken: pl.DataFrame, tables: events.EventTables, objects: Objects, instances: int
+) -> pl.Series:
+    """Per callback instance whether it was a gate's that discarded its message (else null)."""
+    gates = objects.callbacks.select("pid", "callback_id", callback="handle").unique()
+    discarded = (
+        events.table(tables, "gate_release")
+        .filter(pl.col("release").is_null())
+        .join(gates, on=["pid", "callback"], how="inner")
+        .select("callback_id", "source_timestamp", discarded=pl.lit(True))
+    )
+    found = taken.select("callback_id", "source_timestamp", "instance").join(
+        discarded, on=["callback_id", "source_timestamp"], how="inner"
+    )
+    return by_number(found.drop_nulls("instance"), "instance", "discarded", instances)

@@ -1,0 +1,123 @@
+"""Plans in force as tables: servers with their slots, threads and counters, and runs."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from rich.markup import escape
+from rich.table import Table
+
+from chainshaper.durations import format_duration
+from chainshaper.enforcement.journal import Journal
+from chainshaper.enforcement.runs import RunState, ServerState
+from chainshaper.enforcement.server_threads import WantedScheduling
+from chainshaper.planning.plan_parts import slot_text
+
+__all__ = ["changes_table", "run_line", "runs_table", "servers_table"]
+
+
+def servers_table(state: RunState) -> Table:
+    """The servers of a run, a row each, with what they have done since they were armed."""
+    table = Table(title=escape(_title(state)), title_justify="left", caption=_caption(state))
+    for name in ("server", "core", "priority", "slots", "threads", "kept by"):
+        table.add_column(name, overflow="fold")
+    for name in ("slots opened", "late", "worst", "overruns"):
+        table.add_column(name, justify="right")
+    for server in state.servers:
+        table.add_row(
+            escape(server.name),
+            str(server.core),
+            str(server.priority),
+            " ".join(slot_text(slot) for slot in server.slots),
+            ", ".join(map(str, server.threads)) or "none",
+            server.kept_by,
+            *_counted(server),
+        )
+    return table
+
+
+def runs_table(runs: Sequence[tuple[Journal, RunState | None]]) -> Table:
+    """Every run on this machine: its plan, back end and owner, and how it is doing."""
+    table = Table(title="Plans in force", title_justify="left")
+    for name in ("run", "plan", "back end", "owner", "state"):
+        table.add_column(name, overflow="fold")
+    for journal, state in runs:
+        owner = journal.owner
+        table.add_row(
+            journal.path.parent.name,
+            escape(state.plan) if state else "not known yet",
+            state.back_end if state else "",
+            str(owner) if owner is not None else "gone",
+            _condition(owner is not None, state),
+        )
+    return table
+
+
+def changes_table(changes: Sequence[WantedScheduling]) -> Table:
+    """What a plan would give to each thread, a row each."""
+    table = Table(title="What threads would get", title_justify="left")
+    for name in ("node", "pid", "tid", "name", "role", "server", "class", "core", "why"):
+        table.add_column(name, overflow="fold")
+    for one in changes:
+        thread, wanted = one.thread.thread, one.wanted
+        policy = "RR" if wanted.takes_turns else "FIFO"
+        table.add_row(
+            escape(", ".join(one.thread.nodes)),
+            str(thread.pid),
+            str(thread.tid),
+            escape(thread.comm),
+            thread.role,
+            escape(one.server or ""),
+            "as it is" if wanted.priority is None else f"{policy} {wanted.priority}",
+            ", ".join(map(str, wanted.cores)) if wanted.cores else "as they are",
+            one.reason,
+        )
+    return table
+
+
+def run_line(state: RunState) -> str:
+    """The state of a run in one line, for where there is no terminal."""
+    parts = []
+    for server in state.servers:
+        counted = dict(zip(("slots", "late", "worst", "overruns"), _counted(server), strict=True))
+        told = ", ".join(f"{key} {value}" for key, value in counted.items() if value != "-")
+        if told:
+            parts.append(f"{server.name}: {told}")
+    return "; ".join(parts) or f"in force with {state.back_end}"
+
+
+def _title(state: RunState) -> str:
+    return f"{state.plan or 'plan'} in force with {state.back_end}"
+
+
+def _caption(state: RunState) -> str:
+    if state.anchor_ns is None:
+        return ""
+    said = f"cycles of {format_duration(state.cycle_ns)}"
+    if state.drift_ns is not None:
+        said += f"; the chain begins {_signed(state.drift_ns)} from where it did"
+    return said
+
+
+def _signed(duration_ns: int) -> str:
+    sign = "-" if duration_ns < 0 else "+"
+    return sign + format_duration(abs(duration_ns))
+
+
+def _counted(server: ServerState) -> list[str]:
+    counters = server.counters
+    lateness = counters.longest_lateness_ns
+    values: list[Any] = [
+        counters.slots,
+        counters.late_entries,
+        None if lateness is None else format_duration(lateness),
+        counters.overruns,
+    ]
+    return ["-" if value is None else str(value) for value in values]
+
+
+def _condition(alive: bool, state: RunState | None) -> str:
+    if not alive:
+        return "crashed: `chainshaper release` undoes it"
+    if state is None:
+        return "being set up"
+    return f"failed: {escape(state.failure)}" if state.failure else run_line(state)
