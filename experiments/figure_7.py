@@ -12,7 +12,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from avp_sample import MS, PERIOD_NS, avp_sample
+from avp_sample import MS, ORIGIN, PERIOD_NS, avp_sample
 from numpy.typing import NDArray
 
 from chainshaper.planning import BandChoice, choose_bands, plan_shaping
@@ -34,6 +34,7 @@ def main() -> None:
     parser.add_argument("--draw", type=Path)
     arguments = parser.parse_args()
     found = choice(avp_sample(arguments.samples))
+    print(f"{ORIGIN}\n")
     print("bands   ours [ms]        gain     paper [ms]")
     before = found.curve[0].mean_ns
     for placement in found.curve[:MOST_BANDS]:

@@ -9,7 +9,7 @@ throttler in front of them takes the place of a timer.
 
 import argparse
 
-from avp_sample import MS, PERIOD_NS, avp_sample, synthetic_sample
+from avp_sample import MS, ORIGIN, PERIOD_NS, avp_sample, synthetic_sample
 
 from chainshaper.planning import Plan, let_per_callback, let_per_chain, plan_shaping
 
@@ -41,6 +41,7 @@ def plans(samples: int) -> dict[str, tuple[Plan, Plan, Plan]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--samples", type=int, default=3000)
+    print(f"{ORIGIN}\n")
     print(f"{'':<15}{'':<8}" + "".join(f"{column:<20}" for column in COLUMNS))
     for name, row in plans(parser.parse_args().samples).items():
         ours = [

@@ -11,10 +11,12 @@ from dataclasses import dataclass
 import polars as pl
 
 from chainshaper.analysis import LatencyAnalysis
+from chainshaper.overruns import gate_releases
 from chainshaper.planning import Plan, publish_slots
+from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.recording import Recording
 
-__all__ = ["BandHeld", "FigureHeld", "PredictionHeld", "cycles_until_output", "hold_prediction"]
+__all__ = ["BandHeld", "FigureHeld", "PredictionHeld", "hold_prediction"]
 
 STANDARD_ERRORS = 3  # beyond so many, an average is not what was predicted
 
@@ -64,11 +66,6 @@ class PredictionHeld:
     jitter: FigureHeld
     bands: tuple[BandHeld, ...]
     late: int
-
-
-def cycles_until_output(plan: Plan) -> int:
-    """How many cycles after its own an output is due: 0, and more under LET."""
-    return (plan.predicted.max_ns - 1) // plan.cycle_ns
 
 
 def hold_prediction(plan: Plan, recording: Recording, analysis: LatencyAnalysis) -> PredictionHeld:
@@ -146,16 +143,16 @@ def _outputs(
     taken = analysis.hops.filter(pl.col("hop") == last).select("traversal", "source_timestamp")
     if "gate_release" in recording.events:
         released = (
-            recording.events["gate_release"]
-            .select("source_timestamp", "slot", "cycles_waited")
+            gate_releases(recording, plan)
+            .select("source_timestamp", "slot", "overrun")
             .unique("source_timestamp", keep="first")
         )
         joined = chosen.join(taken, on="traversal", how="left").join(
             released, on="source_timestamp", how="left"
         )
         if joined["slot"].count():
-            in_time = pl.col("cycles_waited") <= cycles_until_output(plan)
-            return joined.select("latency_ns", "slot", in_time=in_time.fill_null(False))
+            in_time = pl.col("overrun").is_null() & pl.col("slot").is_not_null()
+            return joined.select("latency_ns", "slot", in_time=in_time)
     starts = [start for start, _ in slots]
     return chosen.select(
         "latency_ns",

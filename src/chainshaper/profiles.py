@@ -11,7 +11,9 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from chainshaper import events
 from chainshaper.analysis import DataFlow, LatencyAnalysis
+from chainshaper.analysis.disturbance import overlapping
 from chainshaper.analysis.graph import goes_on_elsewhere
 from chainshaper.app import ApplicationGraph, Callback, Chain
 from chainshaper.durations import format_duration
@@ -71,6 +73,8 @@ def profile_of(
         realtime=recording.info.realtime,
         longest_stall_ns=longest_stall_ns,
         utilisation=_utilisation(flow, graph, core_of),
+        longest_send_ns=_longest_send(flow),
+        output_depth=_output_depth(flow, stages[-1].node, chain.topics[-1]),
     )
 
 
@@ -248,6 +252,37 @@ def _executors(
         {name: thread.cores[0] for name, thread in found.items() if thread.cores},
         {name: thread.priority for name, thread in found.items() if thread.priority},
     )
+
+
+def _longest_send(flow: DataFlow) -> int | None:
+    """How long asynchronous publishers were busy sending one message, at most (ns).
+
+    Without sends that a stall of the machine fell into: it says nothing about sending.
+    """
+    sends = events.table(flow.events, "asynchronous_send").filter(pl.col("outcome") == "sent")
+    if not sends.height:
+        return None
+    stalls = events.table(flow.events, "machine_stall")
+    began = sends["time"].to_numpy()
+    stalled = overlapping(
+        began,
+        began + sends["duration"].to_numpy(),
+        stalls["time"].to_numpy(),
+        (stalls["time"] + stalls["duration"]).to_numpy(),
+    )
+    calm = sends.filter(~pl.Series(stalled))
+    return int((calm if calm.height else sends)["duration"].max())  # type: ignore[arg-type]
+
+
+def _output_depth(flow: DataFlow, node: str, topic: str) -> int | None:
+    """The history (keep last) of the writer of the chain's output."""
+    writers = flow.objects.publishers.filter((pl.col("node") == node) & (pl.col("topic") == topic))
+    depths = (
+        events.table(flow.events, "rcl_publisher_init", ["queue_depth"])
+        .join(writers.select("pid", publisher_handle="handle"), on=["pid", "publisher_handle"])
+        .filter(pl.col("queue_depth") > 0)["queue_depth"]
+    )
+    return int(depths.min()) if depths.len() else None  # type: ignore[arg-type]
 
 
 def _utilisation(flow: DataFlow, graph: ApplicationGraph, core_of: dict[str, int]) -> float | None:

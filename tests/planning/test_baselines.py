@@ -15,7 +15,13 @@ from chainshaper.planning.baselines import (
     server_per_chain,
 )
 from chainshaper.planning.graphs import over_cores, with_first_node_apart, with_sink
-from chainshaper.planning.plan import Plan, Thread, publish_slots, server_of
+from chainshaper.planning.plan import (
+    Plan,
+    Thread,
+    publish_slots,
+    publishing_servers,
+    server_of,
+)
 from chainshaper.planning.plan_file import dump_plan
 from chainshaper.planning.shaping import plan_shaping
 
@@ -229,6 +235,35 @@ def test_further_sinks_get_slots_of_their_own() -> None:
         with_sink(plan, np.array([1, 2]) * MS, "late")
     with pytest.raises(InputError, match="shapes one output already"):
         with_sink(server_per_chain(plan), np.array([1, 2]) * MS, "/late")
+
+
+def test_further_sinks_of_asynchronous_publishers_gate_their_threads() -> None:
+    latencies = np.array([300, 450]) * MS
+    plan = plan_shaping(
+        *(latencies, 764 * MS),
+        output="/v1",
+        publisher="/n1",
+        nodes=["/n0", "/n1"],
+        publication="asynchronous",
+    )
+    sinks = with_sink(plan, np.array([300, 470]) * MS, "/late", publisher="/n0")
+    assert _slots_ms(sinks) == {
+        "chain": [(0, 471)],  # open until the slower sink is done
+        "output": [(451, 452)],
+        "output_n0": [(471, 472)],
+    }
+    assert sinks.servers[2].threads == (Thread(node="/n0", role="publisher"),)
+    # While the executors may still run, a publisher's thread stays below them.
+    assert [server.priority for server in sinks.servers] == [2, 3, 1]
+    assert sinks.further_shaping_nodes == ()
+    assert publishing_servers(sinks) == sinks.servers[1:]
+    for shaped, publisher in ((plan, None), (_two_nodes(), "/n0")):
+        with pytest.raises(InputError, match="published alike"):
+            with_sink(shaped, latencies, "/late", publisher=publisher)
+    with pytest.raises(InputError, match="already in server 'output'"):
+        with_sink(plan, latencies, "/late", publisher="/n1")
+    with pytest.raises(InputError, match="shapes /v1 already"):
+        with_sink(_two_nodes(), latencies, "/v1")
 
 
 def _two_nodes() -> Plan:

@@ -17,6 +17,12 @@ def test_one_duration_a_line(tmp_path: Path) -> None:
     assert found.tolist() == [59_100_000, 250_000, 100_000, 1_000_000_000]
 
 
+def test_a_file_as_spreadsheets_write_it(tmp_path: Path) -> None:
+    file = tmp_path / "latencies.csv"
+    file.write_bytes(b"\xef\xbb\xbf59.1ms\r\n60ms\r\n")
+    assert read_latencies(file).tolist() == [59_100_000, 60_000_000]
+
+
 @pytest.mark.parametrize("dtype", [np.int64, np.uint32, np.float64])
 def test_whole_nanoseconds_of_any_type(tmp_path: Path, dtype: type) -> None:
     file = tmp_path / "latencies.npy"
@@ -33,6 +39,7 @@ def test_whole_nanoseconds_of_any_type(tmp_path: Path, dtype: type) -> None:
         ("1ms\n999999999s\n", ":2: 999999999s is no latency"),
         ("", "0 latencies are too few"),
         ("1ms\n", "1 latencies are too few"),
+        ("0ms\n0ms\n", "every latency is 0ms"),
     ],
 )
 def test_wrong_lines_are_named(tmp_path: Path, text: str, words: str) -> None:

@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy import stats  # type: ignore[import-untyped]
 
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.margins import derive_margin, fit_tail
 from chainshaper.planning.plan_file import dump_plan
 from chainshaper.planning.shaping import plan_shaping, plan_warnings
-
-stats = pytest.importorskip("scipy.stats")
 
 MS = 1_000_000
 

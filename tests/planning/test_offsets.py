@@ -156,8 +156,14 @@ def _loaded(periods: list[int], load: float) -> list[Plan]:
     ]
 
 
-def test_thirty_chains_that_nearly_fill_a_core_are_fitted() -> None:
-    found = with_offsets(_loaded([50, 100, 200], 0.87))
+@pytest.mark.parametrize(
+    ("periods", "load"),
+    # Of chains with 40 and 50 ms, every two meet in each distance modulo 10 ms.
+    [([50, 100, 200], 0.87), ([40, 50, 100, 200], 0.87), ([40, 50, 100, 200], 0.93)],
+)
+def test_thirty_chains_that_nearly_fill_a_core_are_fitted(periods: list[int], load: float) -> None:
+    plans = _loaded(periods, load)
+    found = with_offsets(plans)
     busy = sorted(
         (start, end)
         for plan in found
@@ -167,6 +173,7 @@ def test_thirty_chains_that_nearly_fill_a_core_are_fitted() -> None:
     for (_, end), (start, _) in itertools.pairwise([*busy, (busy[0][0] + 200 * MS, 0)]):
         assert end <= start
     assert found[0].offset_ns == 0
+    assert with_offsets(plans) == found
 
 
 def _wrapped(start: int, length: int) -> tuple[int, int]:
@@ -174,11 +181,22 @@ def _wrapped(start: int, length: int) -> tuple[int, int]:
     return start, start + length
 
 
+def test_a_core_too_full_for_many_chains_is_proven() -> None:
+    if find_spec("ortools") is None:
+        pytest.skip("ortools is not installed")
+    # Seven slots of 11 ms and one of 10.5 ms every 50 ms fill 98 ms of 100, but do not fit: the
+    # 39.5 ms that the latter leaves twice have room for three each.
+    chains = [_plan("half", 50 * MS, (1, 2, [(0, 21 * MS // 2)]))]
+    chains += [_plan(f"c{number}", 100 * MS, (1, 2, [(0, 11 * MS)])) for number in range(7)]
+    with pytest.raises(OperationError, match=r"no offsets at which half, c0, .* any two"):
+        with_offsets(chains, time_limit_s=100)
+
+
 def test_what_is_not_known_is_said_not_to_be_known() -> None:
     if find_spec("ortools") is None:
         pytest.skip("ortools is not installed")
-    with pytest.raises(OperationError, match=r"undecided: within 0.3 s .* fill 87.0% of core 1"):
-        with_offsets(_loaded([40, 50, 100, 200], 0.87), time_limit_s=0.3)
+    with pytest.raises(OperationError, match=r"undecided: .* fill 99\.0% of core 1"):
+        with_offsets(_loaded([40, 50, 100, 200], 0.99), time_limit_s=0.3)
 
 
 def test_chains_that_cannot_take_turns_run_at_priorities_of_their_own() -> None:

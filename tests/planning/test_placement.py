@@ -20,7 +20,6 @@ def _plan() -> Plan:
 
 
 def test_bands_replace_the_publish_slot_and_nothing_else() -> None:
-    pytest.importorskip("numba")
     plan = _plan()
     banded = with_bands(plan, LATENCIES, 3)
     assert len(publish_slots(banded)) == 3
@@ -36,7 +35,6 @@ def test_bands_replace_the_publish_slot_and_nothing_else() -> None:
 
 
 def test_solvers_agree_in_order() -> None:
-    pytest.importorskip("numba")
     if find_spec("pyswarms") is None:
         pytest.skip("pyswarms is not installed")
     solvers: list[Solver] = ["exact", "pso", "random"]
@@ -48,7 +46,6 @@ def test_solvers_agree_in_order() -> None:
 
 
 def test_auto_takes_a_number_of_bands_from_the_curve() -> None:
-    pytest.importorskip("numba")
     curve = figure7_curve(_plan(), LATENCIES)
     auto = with_bands(_plan(), LATENCIES, "auto")
     bands = len(publish_slots(auto))
@@ -57,7 +54,6 @@ def test_auto_takes_a_number_of_bands_from_the_curve() -> None:
 
 
 def test_goals_and_limits_reach_the_placement() -> None:
-    pytest.importorskip("numba")
     ends = [end for _, end in publish_slots(with_bands(_plan(), LATENCIES, 4, max_gap_ns=5 * MS))]
     assert max(np.diff(ends)) <= 5 * MS
     shared = with_bands(_plan(), LATENCIES, 4, max_share=0.3)

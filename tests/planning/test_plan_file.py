@@ -261,6 +261,7 @@ def plans(draw: st.DrawFn) -> Plan:
             spec=draw(st.none() | st.text()),
             output=output,
             publisher=draw(st.none() | NAMES),
+            output_depth=draw(st.none() | st.integers(1, 100)),
             period_ns=period,
         ),
         evidence=Evidence(
@@ -272,6 +273,7 @@ def plans(draw: st.DrawFn) -> Plan:
             realtime=draw(st.none() | st.booleans()),
             longest_stall_ns=draw(st.none() | st.integers(0, 10**12)),
             utilisation=draw(st.none() | st.floats(0, 2)),
+            longest_send_ns=draw(st.none() | st.integers(0, 10**12)),
         ),
         margin=draw(
             st.integers(0, 10**9).map(lambda margin: Margin(epsilon_ns=margin))
@@ -288,13 +290,14 @@ def plans(draw: st.DrawFn) -> Plan:
         cycle_ns=period,
         offset_ns=draw(st.integers(0, 3)),
         anchor=draw(st.sampled_from(["stamp", "cycle"])),
+        overrun=draw(st.sampled_from(["wait", "discard", "publish"])),
         servers=(
             Server(
                 name="chain",
                 core=1,
                 priority=2,
                 slots=((0, period),),
-                threads=tuple(Thread(node=name, role="publisher") for name in sorted(others)),
+                threads=tuple(Thread(node=name) for name in sorted(others)),
             ),
             Server(
                 name=draw(st.text(min_size=1).filter(lambda name: name != "chain")),

@@ -12,10 +12,14 @@ from chainshaper.errors import InputError, OperationError
 from chainshaper.planning import (
     Plan,
     Thread,
+    band_predictions,
+    plan_json,
     plan_shaping,
     plan_warnings,
     predict_bands,
     publish_slots,
+    server_per_chain,
+    with_bands,
 )
 
 MS = 1_000_000
@@ -55,6 +59,7 @@ def test_asynchronous_publication_gates_the_publishers_thread() -> None:
     assert publish_slots(plan) == ((61 * MS, 62 * MS),)
     with pytest.raises(InputError, match="name the node"):
         _plan(publication="asynchronous", output="/t5")
+    assert _plan(publication="asynchronous") == _plan()  # eq. 2 and eq. 4: the same slots
 
 
 def test_bare_latencies_make_a_plan_to_study() -> None:
@@ -67,7 +72,7 @@ def test_the_last_nanosecond_fits_and_the_next_does_not() -> None:
     assert publish_slots(_plan(period_ns=62 * MS)) == ((61 * MS, 62 * MS),)
     with pytest.raises(OperationError, match=r"cycle of 61\.999999ms: 1ns too long") as caught:
         _plan(period_ns=62 * MS - 1)
-    assert "a margin of 999.999us" in str(caught.value)
+    assert "a margin of 999.999us, or a publish slot of 999.999us" in str(caught.value)
     assert "pipeline" not in str(caught.value)
     with pytest.raises(OperationError, match=r"12ms too long.*pipeline over several cores"):
         _plan(period_ns=50 * MS)
@@ -103,6 +108,19 @@ def test_prediction_of_the_papers_three_bands() -> None:
     assert predicted.max_ns == 87 * MS
     assert predicted.shares == (0.25, 0.25, 0.5)
     assert predicted.mean_ns == (2 * 63 + 2 * 78 + 4 * 87) * MS // 8
+
+
+def test_each_band_has_a_share_and_a_jitter() -> None:
+    latencies = np.array([40, 63, 64, 78, 79, 79, 80, 84]) * MS
+    plan = with_bands(plan_shaping(latencies, 100 * MS), latencies, 3, grid_ns=MS)
+    bands = band_predictions(plan)
+    assert [(band.start_ns, band.end_ns) for band in bands] == list(publish_slots(plan))
+    assert tuple(band.share for band in bands) == plan.predicted.shares
+    assert [band.jitter_ns for band in bands] == [MS] * 3
+    assert plan_json(plan)["predicted_bands"][2] == {
+        **{"start_ns": 85 * MS, "end_ns": 86 * MS, "share": bands[2].share, "jitter_ns": MS}
+    }
+    assert band_predictions(server_per_chain(plan)) == ()
 
 
 @pytest.mark.parametrize("ends", [[], [5, 5], [7, 5], [5, 9]])

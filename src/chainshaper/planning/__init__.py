@@ -24,6 +24,7 @@ from chainshaper.planning.placement import (
     with_long_slot,
 )
 from chainshaper.planning.plan import (
+    BandPrediction,
     ChainOfPlan,
     Evidence,
     Margin,
@@ -33,6 +34,7 @@ from chainshaper.planning.plan import (
     ShapingNode,
     Slot,
     Thread,
+    band_predictions,
     output_server,
     publish_slots,
     server_of,
@@ -43,6 +45,7 @@ from chainshaper.planning.shaping import plan_shaping, plan_warnings, predict_ba
 
 __all__ = [
     "BandChoice",
+    "BandPrediction",
     "CallbackTimes",
     "ChainOfPlan",
     "Evidence",
@@ -56,6 +59,7 @@ __all__ = [
     "Slot",
     "Thread",
     "band_choice",
+    "band_predictions",
     "check_latencies",
     "choose_bands",
     "derive_margin",

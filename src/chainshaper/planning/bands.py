@@ -45,6 +45,7 @@ __all__ = [
     "mean_of",
     "place_bands",
     "placement_curve",
+    "refuse_more_than_fit",
 ]
 
 Goal: TypeAlias = Literal["mean", "jitter", "gap"]
@@ -134,11 +135,10 @@ def place_bands(
     x_ν − (x_1 − Δ), or the largest gap between neighbouring bands.
 
     Raises:
-        InputError: a number of bands or a goal that makes no sense.
+        InputError: a goal that makes no sense, or as :func:`refuse_more_than_fit`.
         OperationError: no placement exists; the message names the constraint that prevents it.
     """
-    if bands < 1:
-        raise InputError(f"{bands} bands: plan with one band at least")
+    refuse_more_than_fit(problem, bands)
     if minimise == "jitter" and mean_at_most_ns is None:
         raise InputError("the smallest jitter is that of one band: say which average it may cost")
     if minimise == "gap":
@@ -162,17 +162,36 @@ def placement_curve(problem: BandProblem, most_bands: int) -> list[Placement]:
     Raises:
         OperationError: no number of bands up to ``most_bands`` can be placed.
     """
-    tables = _solve(problem, most_bands)
+    most = min(most_bands, _room(problem))
+    tables = _solve(problem, most)
     curve: list[Placement] = []
-    for bands in range(1, most_bands + 1):
+    for bands in range(1, most + 1):
         best = _best(tables, bands)
         if best is not None:
             curve.append(best)
         elif curve:
             break
     if not curve:
-        raise OperationError(_why_none(problem, most_bands))
+        raise OperationError(_why_none(problem, most))
     return curve
+
+
+def refuse_more_than_fit(problem: BandProblem, bands: int) -> None:
+    """Refuse a number of bands for which there is no room, whatever the grid and other limits.
+
+    Raises:
+        InputError: no bands, or more than publish slots fit behind the shortest latency.
+    """
+    if bands < 1:
+        raise InputError(f"{bands} bands: plan with one band at least")
+    most = _room(problem)
+    if bands > most:
+        raise InputError(
+            f"{bands} bands cannot be placed: between the shortest latency"
+            f" {format_duration(int(problem.latencies_ns[0]))} and the last slot's end"
+            f" {format_duration(problem.last_end_ns)} there is room for {most} publish slots of"
+            f" {format_duration(problem.publish_slot_ns)}; use fewer bands or a shorter slot"
+        )
 
 
 def enough_bands(curve: list[Placement], least_gain: float = 0.02) -> Placement:
@@ -305,6 +324,12 @@ def _smallest_gap(problem: BandProblem, bands: int, mean_at_most_ns: int | None)
     return found
 
 
+def _room(problem: BandProblem) -> int:
+    """How many publish slots fit: x_1 ≥ L̲ + Δ + 1 ns, then steps of Δ + 1 ns at least."""
+    behind = problem.last_end_ns - int(problem.latencies_ns[0])
+    return max(1, behind // (problem.publish_slot_ns + 1))
+
+
 def _refuse_slower(best: Placement, mean_at_most_ns: int | None) -> None:
     if mean_at_most_ns is not None and best.mean_ns > mean_at_most_ns:
         raise OperationError(
@@ -317,14 +342,6 @@ def _refuse_slower(best: Placement, mean_at_most_ns: int | None) -> None:
 def _why_none(problem: BandProblem, bands: int) -> str:
     """Which constraint leaves no placement: the one without which there is one."""
     said = f"{bands} bands cannot be placed: "
-    slot, room = problem.publish_slot_ns, problem.last_end_ns - int(problem.latencies_ns[0])
-    most = max(1, room // (slot + 1))  # x_1 ≥ L̲ + Δ + 1 ns, then steps of Δ + 1 ns at least
-    if bands > most:
-        return (
-            f"{said}between the shortest latency {format_duration(int(problem.latencies_ns[0]))}"
-            f" and the last slot's end {format_duration(problem.last_end_ns)} there is room for"
-            f" {most} publish slots of {format_duration(slot)}; use fewer bands or a shorter slot"
-        )
     limits = []
     if problem.max_share is not None:
         without = replace(problem, max_share=None)
@@ -343,5 +360,5 @@ def _why_none(problem: BandProblem, bands: int) -> str:
         return f"{said}the largest gap and the largest share exclude each other; relax one"
     return (
         f"{said}the grid of {format_duration(problem.grid_ns)} is too coarse for slots of"
-        f" {format_duration(slot)}; use a finer one"
+        f" {format_duration(problem.publish_slot_ns)}; use a finer one"
     )

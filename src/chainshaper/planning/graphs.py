@@ -16,12 +16,15 @@ from chainshaper.planning.latency_file import check_latencies
 from chainshaper.planning.plan import (
     Plan,
     Server,
+    ShapingNode,
     Thread,
     output_server,
     publish_slots,
+    publishing_servers,
     revised,
     wrong_values_refused,
 )
+from chainshaper.planning.publisher_threads import below_executors
 from chainshaper.planning.shaping import OUTPUT_PRIORITY, shaping_node_like
 
 __all__ = ["over_cores", "with_first_node_apart", "with_sink"]
@@ -85,8 +88,13 @@ def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int) -> Plan:
     return revised(plan, servers=(first, behind, *others))
 
 
-def with_sink(plan: Plan, latencies_ns: NDArray[np.int64], output: str) -> Plan:
+def with_sink(
+    plan: Plan, latencies_ns: NDArray[np.int64], output: str, *, publisher: str | None = None
+) -> Plan:
     """A shaped plan with one more shaped output: another sink of the same graph (end of 5.4).
+
+    The sink gets a shaping node of its own, or, where the plan's output is published
+    asynchronously, its ``publisher`` is the node whose publisher thread is gated.
 
     ``latencies_ns`` are those from the start of the graph to this sink. Its publish slot starts
     the plan's margin after the longest of them, or where a publish slot that is in the way on
@@ -94,20 +102,23 @@ def with_sink(plan: Plan, latencies_ns: NDArray[np.int64], output: str) -> Plan:
     plan's prediction goes on to describe its first output.
 
     Raises:
-        InputError: a plan without a shaping node, latencies or a topic that no plan may have.
+        InputError: a plan that shapes nothing or publishes in the other way, a sink that it
+            shapes already, latencies or a topic that no plan may have.
         OperationError: the slot does not fit into the cycle.
     """
     node, publishing = plan.shaping_node, output_server(plan)
-    if node is None or publishing is None:
+    if publishing is None or not publishing.threads:
         raise InputError("a further sink needs a plan that shapes one output already")
+    if output in {plan.chain.output, *(other.output for other in plan.further_shaping_nodes)}:
+        raise InputError(f"the plan shapes {output} already: name each sink once")
     slot_start, slot_end = publish_slots(plan)[-1]
     length = slot_end - slot_start
     done = int(check_latencies(latencies_ns).max()) + plan.margin.epsilon_ns
     start = done
     taken = [
         slot
-        for server in plan.servers
-        if (server.core, server.priority) == (node.core, OUTPUT_PRIORITY)
+        for server in publishing_servers(plan)
+        if server.core == publishing.core
         for slot in server.slots
     ]
     for other_start, other_end in sorted(taken):
@@ -120,19 +131,34 @@ def with_sink(plan: Plan, latencies_ns: NDArray[np.int64], output: str) -> Plan:
             " shorter slot, or another core for one of the outputs"
         )
     with wrong_values_refused():
-        added = shaping_node_like(node, output)
+        added, thread = _gate_like(node, output, publisher)
         server = Server(
-            name=f"output_{added.name}",
-            core=added.core,
+            name=f"output_{thread.node.strip('/')}",
+            core=publishing.core,
             priority=OUTPUT_PRIORITY,
             slots=((start, start + length),),
-            threads=(added.thread,),
+            threads=(thread,),
         )
         return revised(
             plan,
-            servers=(*_open_until(plan, done), server),
-            further_shaping_nodes=(*plan.further_shaping_nodes, added),
+            servers=below_executors([*_open_until(plan, done), server]),
+            further_shaping_nodes=(*plan.further_shaping_nodes, *added),
         )
+
+
+def _gate_like(
+    node: ShapingNode | None, output: str, publisher: str | None
+) -> tuple[tuple[ShapingNode, ...], Thread]:
+    """The shaping node that a further sink needs, if any, and the thread that publishes it."""
+    if node is not None and publisher is None:
+        added = shaping_node_like(node, output)
+        return (added,), added.thread
+    if node is None and publisher is not None:
+        return (), Thread(node=publisher, role="publisher")
+    raise InputError(
+        "the sinks of one plan are published alike: name the publisher of a sink where the plan"
+        " gates publishers' threads, and only there"
+    )
 
 
 def _chain_server(plan: Plan) -> Server:
@@ -144,8 +170,8 @@ def _chain_server(plan: Plan) -> Server:
 
 def _open_until(plan: Plan, end: int) -> tuple[Server, ...]:
     """The servers, of which those that run the graph to its end stay open until ``end``."""
-    gates = {node.thread for node in (plan.shaping_node, *plan.further_shaping_nodes) if node}
-    running = [server for server in plan.servers if not gates & set(server.threads)]
+    publishing = publishing_servers(plan)
+    running = [server for server in plan.servers if server not in publishing]
     latest = max((server.slots[-1][1] for server in running), default=end)
     return tuple(
         server.model_copy(update={"slots": (*server.slots[:-1], (server.slots[-1][0], end))})

@@ -23,12 +23,15 @@ def read_latencies(path: str | Path) -> NDArray[np.int64]:
 
     Raises:
         InputError: no such file, a line that is no duration (named with its number), an array
-            that does not hold whole nanoseconds, fewer than two latencies.
+            that does not hold whole nanoseconds, fewer than two latencies, or none above zero.
     """
     path = Path(path)
     try:
         found = _read_array(path) if path.suffix == ".npy" else _read_lines(path)
-        return check_latencies(found)
+        latencies = check_latencies(found)
+        if not latencies.any():
+            raise InputError("every latency is 0ms: check the unit, and what was measured")
+        return latencies
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     except InputError as error:
@@ -78,12 +81,15 @@ def _read_array(path: Path) -> object:
     try:
         return np.load(path, allow_pickle=False)
     except (ValueError, EOFError) as error:
-        raise InputError(f"{path}: not a NumPy array file ({error})") from error
+        raise InputError(
+            f"{path}: not a NumPy file of numbers: write it with numpy.save, whole nanoseconds in"
+            " one row"
+        ) from error
 
 
 def _read_lines(path: Path) -> NDArray[np.int64]:
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # spreadsheets begin with a byte-order mark
     except UnicodeDecodeError as error:
         raise InputError(
             f"{path}: not a text of one duration a line ({error}); arrays end in .npy"

@@ -14,14 +14,17 @@ where one fails there is no number.
 
 The parameters are estimated by L-moments (Hosking and Wallis, *Parameter and quantile estimation
 for the generalized Pareto distribution*, Technometrics 29, 1987), which for a few hundred
-excesses err less than maximum likelihood does. The goodness of fit (Anderson–Darling) and the
+excesses err less than maximum likelihood does. They may put the end of a bounded tail before the
+longest latency measured, which is then made the end (Dupuis and Tsao, *A hybrid estimator for
+generalized Pareto and extreme-value distributions*, Communications in Statistics 27, 1998). The
+goodness of fit (Anderson–Darling) and the
 confidence interval come from one parametric bootstrap, because tables for known parameters do
-not hold for estimated ones. In simulations with normal, exponential and uniform-sum latencies the
-95 % interval held the true value in 86 to 97 of 100 samples of 5,000, and missed on the low side
-when it missed: for small samples it is somewhat optimistic.
+not hold for estimated ones. In simulations with normal, exponential, triangular and uniform-sum
+latencies the 95 % interval for a probability of 1e-5 held the true value in 97 to 100 of 100
+samples of 5,000 and in 93 to 98 of 100 samples of 1,500; where it missed it was too low. Where the
+density does not vanish at the end of the distribution, it errs on the high side.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,6 +49,8 @@ GOODNESS = 0.10  # the fit's own test must not come near rejection
 CONFIDENCE = 0.95
 BOOTSTRAPS = 999
 WIDEST_INTERVAL = 0.5  # of the latency itself; wider, the sample does not tell
+
+LEAST_LOG = np.log(1e-12)  # of a probability: a fitted end may stand at the longest excess itself
 
 _Floats = NDArray[np.float64]
 
@@ -117,11 +122,13 @@ def fit_tail(latencies_ns: NDArray[np.int64], probability: float, seed: int = 0)
     _refuse_not_stationary(latencies)
     random = np.random.default_rng(seed)
     tried = []
-    for threshold in _thresholds(latencies):
+    thresholds = _thresholds(latencies)
+    for threshold in thresholds[:1]:
+        _refuse_clusters(latencies, threshold)
+    for threshold in thresholds:
         fit = _fit_above(latencies, threshold, probability, random)
         tried.append(fit.goodness)
         if fit.goodness >= GOODNESS:
-            _refuse_clusters(latencies, threshold)
             _refuse_vague(fit, latencies.size)
             return fit
     raise OperationError(
@@ -132,13 +139,16 @@ def fit_tail(latencies_ns: NDArray[np.int64], probability: float, seed: int = 0)
     )
 
 
-def _thresholds(latencies: NDArray[np.int64]) -> Iterator[int]:
+def _thresholds(latencies: NDArray[np.int64]) -> list[int]:
+    """Where a tail may begin, ascending; none where equal latencies leave too few beyond."""
     ordered = np.sort(latencies)
     longest = min(ordered.size ** (2 / 3), MOST_EXCESSES)
-    for share in TAILS:
-        threshold = int(ordered[-round(share * longest) - 1])
-        if np.count_nonzero(latencies > threshold) >= FEWEST_EXCESSES:
-            yield threshold
+    thresholds = [int(ordered[-round(share * longest) - 1]) for share in TAILS]
+    return [
+        threshold
+        for threshold in thresholds
+        if np.count_nonzero(latencies > threshold) >= FEWEST_EXCESSES
+    ]
 
 
 def _fit_above(
@@ -176,13 +186,15 @@ def _l_moment_fit(ordered: _Floats) -> tuple[_Floats, _Floats]:
     """Shape and scale for each row of ascending excesses.
 
     With λ₁ the mean and λ₂ half the mean difference of two, ξ = 2 − λ₁/λ₂ and σ = λ₁(1 − ξ).
+    Where that distribution would end, at −σ/ξ, before the longest excess, it is made to end there.
     """
     size = ordered.shape[1]
     first = ordered.mean(axis=1)
     weights = (2 * np.arange(size) - (size - 1)) / (size * (size - 1))
     second = ordered @ weights
     shape = 2 - first / second
-    return shape, first * (1 - shape)
+    scale = first * (1 - shape)
+    return np.maximum(shape, -scale / ordered[:, -1]), scale
 
 
 def _quantile(
@@ -196,13 +208,14 @@ def _quantile(
 
 
 def _anderson_darling(pareto: object, ordered: _Floats, shape: _Floats, scale: _Floats) -> _Floats:
-    """A² of each row; infinite where an excess lies beyond the fitted distribution's end."""
+    """A² of each row of ascending excesses."""
     size = ordered.shape[1]
     parameters = {"c": shape[:, np.newaxis], "scale": scale[:, np.newaxis]}
     below = pareto.logcdf(ordered, **parameters)  # type: ignore[attr-defined]
     above = pareto.logsf(ordered, **parameters)[:, ::-1]  # type: ignore[attr-defined]
     weights = (2 * np.arange(1, size + 1) - 1) / size
-    result: _Floats = -size - ((below + above) * weights).sum(axis=1)
+    logarithms = np.maximum(below, LEAST_LOG) + np.maximum(above, LEAST_LOG)
+    result: _Floats = -size - (logarithms * weights).sum(axis=1)
     return result
 
 

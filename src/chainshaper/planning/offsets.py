@@ -15,27 +15,33 @@ to the first by a chain of tight pairs (pairs whose difference is at an end of a
 interval), and start all of them earlier until some pair becomes tight. Repeated, that links
 every chain to the first without breaking a constraint: if there is a solution, there is one in
 which the tight pairs form a tree, and it is enough to try the ends of allowed intervals. Many
-chains are first fitted in one after the other, which is quick and mostly enough; where it is not,
-the CP-SAT solver of OR-tools decides, which is exact as well but may run out of time.
+chains are first fitted in one after the other, pushing each other out where there is no room, which
+is quick and mostly enough; where it is not, the CP-SAT solver of OR-tools decides, which is exact
+as well but may run out of time.
 """
 
 import math
 import random
+import time
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 from typing import TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
+
 from chainshaper.durations import format_duration
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.extras import extra_library
-from chainshaper.planning.plan import Plan, output_server, revised
+from chainshaper.planning.plan import Plan, publishing_servers, revised
 from chainshaper.planning.shaping import OUTPUT_PRIORITY
 
 __all__ = ["place_chains", "with_offsets"]
 
 MOST_SEARCHED = 4  # chains; beyond, CP-SAT is faster
 TIME_LIMIT_SECONDS = 60.0
-FITTING_ORDERS = 20  # in which chains are fitted in one by one, before the solver is asked
+MOST_CYCLES = 2_000  # of all chains in a hyper-period that is played out for the solver
+MOST_FITTINGS = 10_000  # of one chain, before the solver is asked; some seconds for 30 chains
 
 _Intervals: TypeAlias = list[tuple[int, int]]  # closed, ascending
 _Allowed: TypeAlias = dict[tuple[int, int], tuple[int, _Intervals]]
@@ -73,12 +79,10 @@ def _with_own_priorities(plans: Sequence[Plan]) -> list[Plan]:
     rank = {k: place for place, k in enumerate(order)}
     ranked = []
     for k, plan in enumerate(plans):
-        nodes = (plan.shaping_node, *plan.further_shaping_nodes)
-        threads = {node.thread for node in nodes if node is not None}
-        publishing = output_server(plan)
+        publishing = publishing_servers(plan)
         servers = tuple(
             server
-            if server is publishing or threads & set(server.threads)
+            if server in publishing
             else server.model_copy(update={"priority": OUTPUT_PRIORITY + 1 + rank[k]})
             for server in plan.servers
         )
@@ -118,7 +122,7 @@ def with_offsets(
         if len(group) <= MOST_SEARCHED:
             solution = _search(plans, allowed, group, {group[0]: 0})
         else:
-            solution = _fitted(plans, allowed, group) or _solve(plans, allowed, group, time_limit_s)
+            solution = _decide(plans, allowed, group, time_limit_s)
         if solution is None:
             raise OperationError(
                 f"there are no offsets at which {', '.join(_name(plans[k]) for k in group)} keep"
@@ -192,8 +196,12 @@ def _search(
         return placed
     tried = set()
     for k in (k for k in group if k not in placed):
-        for offset in _tight_offsets(plans[k].cycle_ns, allowed, k, placed):
-            if (k, offset) not in tried and _fits(allowed, k, offset, placed):
+        candidates = _candidates(plans, allowed, k, placed)
+        fitting = np.ones(candidates.size, dtype=bool)
+        for j, base in placed.items():
+            fitting &= _apart(allowed, j, k, candidates - base)
+        for offset in candidates[fitting].tolist():
+            if (k, offset) not in tried:
                 tried.add((k, offset))
                 found = _search(plans, allowed, group, {**placed, k: offset})
                 if found is not None:
@@ -201,50 +209,80 @@ def _search(
     return None
 
 
-def _tight_offsets(cycle: int, allowed: _Allowed, k: int, placed: dict[int, int]) -> Iterator[int]:
+def _candidates(
+    plans: Sequence[Plan], allowed: _Allowed, k: int, placed: dict[int, int]
+) -> NDArray[np.int64]:
+    """Offsets of chain k, ascending, at which it is tight with one of the placed chains; or 0."""
+    cycle, found = plans[k].cycle_ns, [np.zeros(1, dtype=np.int64)]
     for j, base in placed.items():
         difference = _differences(allowed, j, k)
         if difference is not None:
             common, intervals = difference
-            for end in {end for interval in intervals for end in interval}:
-                yield from range((base + end) % common, cycle, common)
+            ends = np.array(intervals, dtype=np.int64).ravel()
+            repeats = np.arange(0, cycle, common, dtype=np.int64)
+            found.append(np.add.outer((base + ends) % common, repeats).ravel())
+    return np.unique(np.concatenate(found))
 
 
-def _fits(allowed: _Allowed, k: int, offset: int, placed: dict[int, int]) -> bool:
-    for j, base in placed.items():
-        difference = _differences(allowed, j, k)
-        if difference is not None:
-            common, intervals = difference
-            distance = (offset - base) % common
-            if not any(
-                first <= distance <= last or (first > last and not last < distance < first)
-                for first, last in intervals
-            ):
-                return False
-    return True
+def _decide(
+    plans: Sequence[Plan], allowed: _Allowed, group: list[int], time_limit_s: float
+) -> dict[int, int] | None:
+    deadline = time.monotonic() + time_limit_s
+    solution = _fitted(plans, allowed, group, deadline)
+    if solution is None:
+        solution = _solve(plans, allowed, group, max(0.0, deadline - time.monotonic()))
+    return solution
 
 
-def _fitted(plans: Sequence[Plan], allowed: _Allowed, group: list[int]) -> dict[int, int] | None:
-    """Chains placed one after the other where they first fit, in a few orders; None says nothing.
+def _fitted(
+    plans: Sequence[Plan], allowed: _Allowed, group: list[int], deadline: float
+) -> dict[int, int] | None:
+    """Chains fitted in one after the other; None says nothing.
 
-    The first order is by period, the longest busy first among equals; the others are random.
+    A chain that fits nowhere is put where it pushes out what was hardest to place the least, and
+    those chains wait their turn again. Every time a chain does not fit it weighs more, so that
+    the hard ones come to stay and the others move around them (guided ejection: Nagata and
+    Bräysy, Operations Research Letters 37, 2009).
     """
-    order = sorted(group, key=lambda k: (plans[k].cycle_ns, -_busy(plans[k])))
+    waiting = sorted(group, key=lambda k: (-plans[k].cycle_ns, _busy(plans[k])))
+    weight = dict.fromkeys(group, 1)
+    placed: dict[int, int] = {}
     generator = random.Random(0)  # noqa: S311 - no secrets here; the same plans, the same offsets
-    for _ in range(FITTING_ORDERS):
-        placed: dict[int, int] = {}
-        for k in order:
-            candidates = sorted({0, *_tight_offsets(plans[k].cycle_ns, allowed, k, placed)})
-            fitting = (offset for offset in candidates if _fits(allowed, k, offset, placed))
-            offset = next(fitting, None)
-            if offset is None:
-                break
-            placed[k] = offset
-        else:
+    for _ in range(MOST_FITTINGS):
+        if not waiting:
             first = placed[group[0]]
             return {k: (offset - first) % plans[k].cycle_ns for k, offset in placed.items()}
-        generator.shuffle(order)
+        if time.monotonic() > deadline:
+            break
+        k = waiting.pop()
+        candidates = _candidates(plans, allowed, k, placed)
+        in_the_way = {j: ~_apart(allowed, j, k, candidates - placed[j]) for j in placed}
+        cost = sum((weight[j] * hit for j, hit in in_the_way.items()), np.zeros(candidates.size))
+        least = np.flatnonzero(cost == cost.min())
+        chosen = least[0]
+        if cost[chosen]:
+            weight[k] += 1
+            chosen = generator.choice(least)
+        for j, hit in in_the_way.items():
+            if hit[chosen]:
+                del placed[j]
+                waiting.append(j)
+        placed[k] = int(candidates[chosen])
     return None
+
+
+def _apart(allowed: _Allowed, j: int, k: int, distances: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which distances from an offset of chain j to one of chain k keep their slots apart."""
+    difference = _differences(allowed, j, k)
+    if difference is None:
+        return np.ones(distances.size, dtype=bool)
+    common, intervals = difference
+    distances = distances % common
+    apart = np.zeros(distances.size, dtype=bool)
+    for first, last in intervals:
+        inside = (distances >= first) & (distances <= last)
+        apart |= inside if first <= last else (distances >= first) | (distances <= last)
+    return apart
 
 
 def _busy(plan: Plan) -> int:
@@ -267,6 +305,13 @@ def _solve(
                 offsets[k] - offsets[j] - common * cycles,
                 cp_model.Domain.from_intervals([list(interval) for interval in intervals]),
             )
+    for slots in _played_out(plans, group):
+        model.add_no_overlap(
+            [
+                model.new_fixed_size_interval_var(offsets[k] + start, end - start, "")
+                for k, start, end in slots
+            ]
+        )
     solver = cp_model.CpSolver()
     solver.parameters.max_time_in_seconds = time_limit_s
     solver.parameters.num_workers = 1  # the same plans give the same offsets
@@ -275,12 +320,31 @@ def _solve(
         return None
     if status not in (cp_model.OPTIMAL, cp_model.FEASIBLE):
         raise OperationError(
-            f"undecided: within {time_limit_s:g} s neither offsets for {len(group)} chains that"
-            f" share cores were found nor a proof that there are none. {_fullest(plans, group)} Put"
+            f"undecided: in the time allowed neither offsets for {len(group)} chains that share"
+            f" cores were found nor a proof that there are none. {_fullest(plans, group)} Put"
             " fewer chains on it, shorten slots, use periods with a large common divisor, or allow"
             " more time"
         )
     return {k: int(solver.value(offset)) for k, offset in offsets.items()}
+
+
+def _played_out(plans: Sequence[Plan], group: list[int]) -> Iterator[list[tuple[int, int, int]]]:
+    """Per core and priority, every slot of a hyper-period and of the cycle before it.
+
+    As (chain, start, end), from the chain's offset on. Pairs of chains say all that there is to
+    say, but only from slots side by side does a solver see that a core is too full for all of
+    them. Nothing, where a hyper-period is too long to be of use.
+    """
+    hyper_period = math.lcm(*(plans[k].cycle_ns for k in group))
+    if sum(hyper_period // plans[k].cycle_ns for k in group) > MOST_CYCLES:
+        return
+    for place in sorted(set().union(*(_places(plans[k]) for k in group))):
+        yield [
+            (k, start + cycle, end + cycle)
+            for k in group
+            for start, end in _slots(plans[k], place)
+            for cycle in range(-plans[k].cycle_ns, hyper_period, plans[k].cycle_ns)
+        ]
 
 
 def _loads(plans: Sequence[Plan]) -> dict[tuple[int, int], float]:

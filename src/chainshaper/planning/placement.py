@@ -30,6 +30,7 @@ from chainshaper.planning.plan import (
     publish_slots,
     revised,
 )
+from chainshaper.planning.publisher_threads import below_executors
 from chainshaper.planning.shaping import predict_bands
 from chainshaper.planning.swarm import place_by_swarm, place_randomly
 
@@ -215,8 +216,8 @@ def _last_publish_slot(plan: Plan) -> Slot:
 
 def _with_publish_slots(plan: Plan, slots: tuple[Slot, ...], predicted: Prediction) -> Plan:
     publishing = output_server(plan)
-    servers = tuple(
+    servers = [
         server.model_copy(update={"slots": slots}) if server is publishing else server
         for server in plan.servers
-    )
-    return revised(plan, servers=servers, predicted=predicted)
+    ]
+    return revised(plan, servers=below_executors(servers), predicted=predicted)

@@ -10,19 +10,34 @@ without the suffix and their values carry a unit (``period: 100ms``). Slots are 
 intervals ``(start, end)`` in nanoseconds after the start of a cycle.
 """
 
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import combinations, pairwise
-from typing import Annotated, Any, Literal, TypeAlias
+from itertools import combinations
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from chainshaper.durations import format_duration
 from chainshaper.errors import InputError
+from chainshaper.planning.plan_parts import (
+    PER_CALLBACK,
+    Anchor,
+    BandPrediction,
+    ChainOfPlan,
+    Evidence,
+    Margin,
+    Overrun,
+    Policy,
+    Prediction,
+    Server,
+    ShapingNode,
+    Slot,
+    Thread,
+    slot_text,
+)
+from chainshaper.planning.publisher_threads import check_publisher_threads
 from chainshaper.yaml_file import (
     Duration,
-    FullName,
     Part,
     PositiveDuration,
     explanations,
@@ -33,9 +48,11 @@ from chainshaper.yaml_file import (
 __all__ = [
     "PER_CALLBACK",
     "Anchor",
+    "BandPrediction",
     "ChainOfPlan",
     "Evidence",
     "Margin",
+    "Overrun",
     "Plan",
     "Policy",
     "Prediction",
@@ -43,179 +60,14 @@ __all__ = [
     "ShapingNode",
     "Slot",
     "Thread",
+    "band_predictions",
     "output_server",
     "publish_slots",
+    "publishing_servers",
     "revised",
     "server_of",
     "wrong_values_refused",
 ]
-
-
-def _node_name(value: str) -> str:
-    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", value):
-        raise ValueError(
-            f"{value!r} is not a node's name: write letters, digits and underscores, no slash, no"
-            " digit first"
-        )
-    return value
-
-
-Slot: TypeAlias = tuple[Duration, Duration]
-"""A time slot [start, end) of a cycle."""
-
-Policy: TypeAlias = Literal[
-    "shaped",
-    "one-long-slot",
-    "server-per-callback",
-    "server-per-chain",
-    "let-per-callback",
-    "let-per-chain",
-]
-PER_CALLBACK = ("server-per-callback", "let-per-callback")
-"""Policies whose slots follow from the callbacks, so that an execution may span cycles."""
-
-Anchor: TypeAlias = Literal["stamp", "cycle"]
-
-
-class ChainOfPlan(Part):
-    """The chain that is planned for, as far as it is known.
-
-    ``publisher`` is the node that publishes ``output``, the chain's last topic. A plan computed
-    from bare latencies knows only the period; it can be studied but not carried out.
-    """
-
-    spec: str | None = None
-    output: FullName | None = None
-    publisher: FullName | None = None
-    period_ns: PositiveDuration
-
-
-class Evidence(Part):
-    """The measurements that the plan rests on: end-to-end latencies under high SCHED_FIFO.
-
-    ``incomplete`` counts traversals without an end, ``disturbed`` those that a stall of the
-    machine hit, ``utilisation`` is the share of its core that the chain's execution takes.
-    ``None`` is: not known.
-    """
-
-    recording: str | None = None
-    samples: Annotated[int, Field(ge=1)]
-    min_latency_ns: Duration
-    mean_latency_ns: Duration
-    max_latency_ns: PositiveDuration
-    incomplete: Annotated[int, Field(ge=0)] = 0
-    disturbed: Annotated[int, Field(ge=0)] = 0
-    realtime: bool | None = None
-    longest_stall_ns: Duration | None = None
-    utilisation: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
-
-    @model_validator(mode="after")
-    def _ordered(self) -> "Evidence":
-        if not self.min_latency_ns <= self.mean_latency_ns <= self.max_latency_ns:
-            raise wrong_value("min, mean and max latency must ascend: correct them", "mean_latency")
-        return self
-
-
-class Margin(Part):
-    """How far the chain's slot reaches beyond the longest latency measured (ε of eq. 1).
-
-    ``given`` by a person, or ``derived`` from the tail of the measured latencies: then the plan
-    keeps the probability of an overrun per cycle that it was derived for, and the confidence
-    interval of the margin.
-    """
-
-    epsilon_ns: Duration
-    source: Literal["given", "derived"] = "given"
-    overrun_probability: Annotated[float, Field(gt=0, lt=1)] | None = None
-    confidence_interval_ns: tuple[Duration, Duration] | None = None
-
-
-class Thread(Part):
-    """A thread of a node that runs inside a server: its executor, or its asynchronous publisher.
-
-    DDS threads other than the publisher's are never gated (section 3.1), so they have no role.
-    """
-
-    node: FullName
-    role: Literal["executor", "publisher"] = "executor"
-
-
-class Server(Part):
-    """A table-driven reservation server (section 2.2.1): its threads run in its slots only.
-
-    A smaller ``priority`` is better, which is LITMUS^RT's order.
-    """
-
-    name: Annotated[str, Field(min_length=1)]
-    core: Annotated[int, Field(ge=0)]
-    priority: Annotated[int, Field(ge=1)]
-    slots: Annotated[tuple[Slot, ...], Field(min_length=1)]
-    threads: tuple[Thread, ...] = ()
-
-    @model_validator(mode="after")
-    def _slots_ascend(self) -> "Server":
-        for number, (start, end) in enumerate(self.slots):
-            if end <= start:
-                raise wrong_value(
-                    f"the slot {_slot_text((start, end))} is empty: its end must come after its"
-                    " start",
-                    "slots",
-                    number,
-                )
-        for number, (before, after) in enumerate(pairwise(self.slots), start=1):
-            if after[0] < before[1]:
-                raise wrong_value(
-                    f"the slot {_slot_text(after)} begins before {_slot_text(before)} ends: write"
-                    " a server's slots in ascending order, without overlap",
-                    "slots",
-                    number,
-                )
-        return self
-
-
-class ShapingNode(Part):
-    """The node that takes the chain's output from ``input`` and republishes it on ``output``.
-
-    It publishes in the slots of the server that holds its thread. ``core`` and ``fifo_priority``
-    are those of its executor; it sleeps until ``spin_ns`` before the slot and spins from there,
-    and pauses for ``pause_ns`` after a publication so that delivery is not delayed by it.
-    """
-
-    name: Annotated[str, AfterValidator(_node_name)]
-    input: FullName
-    output: FullName
-    core: Annotated[int, Field(ge=0)]
-    fifo_priority: Annotated[int, Field(ge=1, le=98)]
-    spin_ns: Duration
-    pause_ns: Duration
-
-    @property
-    def thread(self) -> Thread:
-        """The node's executor, as servers name it."""
-        return Thread(node=f"/{self.name}")
-
-    @model_validator(mode="after")
-    def _two_topics(self) -> "ShapingNode":
-        if self.input == self.output:
-            raise wrong_value(
-                f"the shaping node would feed itself: input and output are both {self.input};"
-                f" let the chain publish on another topic, such as {self.output}_tmp",
-                "input",
-            )
-        return self
-
-
-class Prediction(Part):
-    """What the plan promises: end-to-end latency, and the share of cycles per latency band.
-
-    A band is represented by the end of its slot (section 4.1). The jitter is the widest
-    distance of two outputs, from the start of the first slot to the end of the last.
-    """
-
-    mean_ns: Duration
-    max_ns: Duration
-    jitter_ns: Duration
-    shares: tuple[Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)], ...] = ()
 
 
 class Plan(Part):
@@ -225,10 +77,11 @@ class Plan(Part):
     several chains share cores, this chain's cycles start ``offset_ns`` after the instant from
     which all of them count; slots count from the start of the chain's own cycle nevertheless.
     ``anchor`` says what starts a cycle for the shaping node: the stamp that each message carries
-    from the chain's first callback, or the servers' own cycle. ``shaping_node`` serves the
-    chain's output; it is absent when the publisher's own thread is gated (asynchronous
-    publication) or nothing is. ``further_shaping_nodes`` serve other sinks, or the topics inside
-    a chain whose callbacks follow LET one by one.
+    from the chain's first callback, or the servers' own cycle. ``overrun`` says what becomes of
+    an output that missed its last slot. ``shaping_node`` serves the chain's output; it is absent
+    when the publisher's own thread is gated (asynchronous publication) or nothing is.
+    ``further_shaping_nodes`` serve other sinks, or the topics inside a chain whose callbacks
+    follow LET one by one.
     """
 
     format: Literal[1] = 1
@@ -239,6 +92,7 @@ class Plan(Part):
     cycle_ns: PositiveDuration
     offset_ns: Duration = 0
     anchor: Anchor = "stamp"
+    overrun: Overrun = "wait"
     servers: Annotated[tuple[Server, ...], Field(min_length=1)]
     shaping_node: ShapingNode | None = None
     further_shaping_nodes: tuple[ShapingNode, ...] = ()
@@ -251,6 +105,7 @@ class Plan(Part):
         _check_overlaps(self)
         for where, node in _shaping_nodes(self):
             _check_shaping_node(self, node, where)
+        check_publisher_threads(self)
         return self
 
 
@@ -279,6 +134,35 @@ def publish_slots(plan: Plan) -> tuple[Slot, ...]:
     return server.slots if (server := output_server(plan)) else ()
 
 
+def band_predictions(plan: Plan) -> tuple[BandPrediction, ...]:
+    """The prediction band by band; none where nothing is shaped, or slots were edited in number.
+
+    Slots count from the start of a cycle, under LET one after the execution's own.
+    """
+    slots, shares = publish_slots(plan), plan.predicted.shares
+    if len(slots) != len(shares):
+        return ()
+    return tuple(
+        BandPrediction(start, end, share, end - start)
+        for (start, end), share in zip(slots, shares, strict=True)
+    )
+
+
+def publishing_servers(plan: Plan) -> tuple[Server, ...]:
+    """All servers in whose slots something is published: the output, other sinks, inner topics.
+
+    They hold shaping nodes' threads or publishers' threads; the others run the chain.
+    """
+    nodes = {node.thread for _, node in _shaping_nodes(plan)}
+    output = output_server(plan)
+    return tuple(
+        server
+        for server in plan.servers
+        if server is output
+        or any(thread in nodes or thread.role == "publisher" for thread in server.threads)
+    )
+
+
 def revised(plan: Plan, **changes: object) -> Plan:
     """A copy of a plan with some fields replaced, checked like any other plan.
 
@@ -301,10 +185,6 @@ def wrong_values_refused() -> Iterator[None]:
     except ValidationError as error:
         problems = [f"{key_text(where)}: {reason}" for where, reason in explanations(error, Plan)]
         raise InputError("; ".join(problems)) from error
-
-
-def _slot_text(slot: tuple[int, int]) -> str:
-    return f"[{format_duration(slot[0])}, {format_duration(slot[1])})"
 
 
 def _shaping_nodes(plan: Plan) -> Iterator[tuple[tuple[str | int, ...], ShapingNode]]:
@@ -342,7 +222,7 @@ def _check_servers(plan: Plan) -> None:
         for slot_number, slot in enumerate(server.slots):
             if slot[1] > plan.cycle_ns:
                 raise wrong_value(
-                    f"the slot {_slot_text(slot)} ends after the cycle"
+                    f"the slot {slot_text(slot)} ends after the cycle"
                     f" {format_duration(plan.cycle_ns)}: move it, or split it in two slots",
                     *("servers", number, "slots", slot_number),
                 )
@@ -365,7 +245,7 @@ def _check_overlaps(plan: Plan) -> None:
             for other in one.slots:
                 if slot[0] < other[1] and other[0] < slot[1]:
                     raise wrong_value(
-                        f"the slot {_slot_text(slot)} overlaps {_slot_text(other)} of server"
+                        f"the slot {slot_text(slot)} overlaps {slot_text(other)} of server"
                         f" {one.name!r} on core {one.core} at the same priority {one.priority}:"
                         " move one of them, or give one server another priority",
                         *("servers", number, "slots", slot_number),

@@ -14,7 +14,7 @@ from typing import Any
 import yaml
 
 from chainshaper.errors import InputError, OperationError
-from chainshaper.planning.plan import Plan, publish_slots
+from chainshaper.planning.plan import Plan, band_predictions, publish_slots
 from chainshaper.yaml_file import AS_YAML, read_model
 
 __all__ = ["Plan", "dump_plan", "load_plan", "plan_json", "save_plan", "save_plans"]
@@ -30,6 +30,7 @@ _SECTION_COMMENTS = {
     "margin": "epsilon: how far the chain's slot reaches beyond the longest latency measured",
     "offset": "this chain's cycles start so much after the instant that all chains count from",
     "anchor": "what starts a cycle: the message's origin stamp (stamp), or the servers (cycle)",
+    "overrun": "an output that missed its last slot: wait for the next, discard, publish at once",
     "servers": "a thread runs only in its server's slots; a smaller priority is better",
     "shaping_node": "republishes the chain's output in the slots of its server",
     "predicted": "for the slots as planned; not updated when they are edited",
@@ -135,10 +136,14 @@ def plan_json(plan: Plan) -> dict[str, Any]:
     """The plan as plain data for ``--json``: integer nanoseconds, keys ending in ``_ns``.
 
     ``bands_ns`` are the ends of the publish slots, ascending; the slots themselves are pairs of
-    nanoseconds in ``servers``.
+    nanoseconds in ``servers``. ``predicted_bands`` are those of
+    :func:`~chainshaper.planning.plan.band_predictions`.
     """
-    bands = [end for _, end in publish_slots(plan)]
-    return {**plan.model_dump(mode="json"), "bands_ns": bands}
+    return {
+        **plan.model_dump(mode="json"),
+        "bands_ns": [end for _, end in publish_slots(plan)],
+        "predicted_bands": [band._asdict() for band in band_predictions(plan)],
+    }
 
 
 class _Inline(list[Any]):

@@ -13,7 +13,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.errors import InputError
+from chainshaper.durations import format_duration
+from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.bands import Goal
 from chainshaper.planning.baselines import (
     CallbackTimes,
@@ -38,6 +39,7 @@ from chainshaper.planning.plan import (
     Anchor,
     Evidence,
     Margin,
+    Overrun,
     Plan,
     Policy,
     revised,
@@ -50,6 +52,8 @@ Publication: TypeAlias = Literal["synchronous", "asynchronous"]
 
 DEFAULT_EPSILON_NS = 1_000_000
 DEFAULT_CORE = 1
+OWN_SLOTS = (*PER_CALLBACK, "let-per-chain")
+"""Policies whose plan has no slot behind the chain's, in the same cycle."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +64,9 @@ class Profile:
     per callback, ``topics`` what each of these publishes for the chain. ``core_of`` names the
     core of every node whose executor takes part, also on branches that the chain waits for.
     ``callbacks`` are those of the chain and its branches, see
-    :func:`~chainshaper.planning.baselines.server_per_callback`. The rest is evidence.
+    :func:`~chainshaper.planning.baselines.server_per_callback`. ``output_depth`` is the history
+    of the output's writer, ``longest_send_ns`` how long its asynchronous publisher took to send.
+    The rest is evidence.
     """
 
     latencies_ns: NDArray[np.int64]
@@ -77,6 +83,8 @@ class Profile:
     realtime: bool | None = None
     longest_stall_ns: int | None = None
     utilisation: float | None = None
+    longest_send_ns: int | None = None
+    output_depth: int | None = None
 
 
 @dataclass(frozen=True)
@@ -106,6 +114,7 @@ class PlanRequest:
     slot_start_ns: int | None = None
     first_slot_ns: int | None = None
     anchor: Anchor = "stamp"
+    overrun: Overrun = "wait"
     spin_ns: int = 300_000
     pause_ns: int = 500_000
 
@@ -118,7 +127,7 @@ def plan_chain(
 ) -> Plan:
     """The plan of the requested policy for a measured chain.
 
-    ``sinks`` are profiles of further outputs of the same graph, which get a shaping node each.
+    ``sinks`` are profiles of further outputs of the same graph, each of which is shaped too.
 
     Raises:
         InputError: wishes that exclude each other, or a policy that needs more than the profile
@@ -128,7 +137,9 @@ def plan_chain(
     """
     _refuse_contradictions(request, bool(sinks))
     margin = _margin(profile, request)
-    if request.policy in PER_CALLBACK:
+    if request.policy == "let-per-chain":
+        _refuse_longer_than_period(profile)
+    if request.policy in OWN_SLOTS:
         plan = _with_policy(
             _shaped(_shortened(profile, request, margin), request, margin, sinks), profile, request
         )
@@ -136,7 +147,8 @@ def plan_chain(
     else:
         plan = _with_policy(_shaped(profile, request, margin, sinks), profile, request)
     for sink in sinks:
-        plan = with_sink(plan, sink.latencies_ns, _output(sink))
+        publisher = sink.nodes[-1] if request.publication == "asynchronous" else None
+        plan = with_sink(plan, sink.latencies_ns, _output(sink), publisher=publisher)
     return plan
 
 
@@ -155,11 +167,21 @@ def band_choice(plan: Plan, profile: Profile, request: PlanRequest) -> BandChoic
 def _shortened(profile: Profile, request: PlanRequest, margin: Margin) -> Profile:
     """The profile with no latency beyond what shaping could hold in a cycle.
 
-    Where each callback has slots of its own, shaping is only the start of the plan.
+    Where the policy has slots of its own, shaping is only the start of the plan.
     """
     longest = profile.period_ns - margin.epsilon_ns - request.publish_slot_ns
     latencies = check_latencies(profile.latencies_ns)
     return replace(profile, latencies_ns=np.minimum(latencies, max(1, longest)))
+
+
+def _refuse_longer_than_period(profile: Profile) -> None:
+    longest, period = int(check_latencies(profile.latencies_ns).max()), profile.period_ns
+    if longest >= period:
+        raise OperationError(
+            f"the longest latency {format_duration(longest)} is not shorter than the period"
+            f" {format_duration(period)}, in which LET per chain has to be done: plan LET per"
+            " callback, or a longer period"
+        )
 
 
 def _measured(evidence: Evidence, latencies_ns: NDArray[np.int64]) -> Evidence:
@@ -172,6 +194,7 @@ def _shaped(
     profile: Profile, request: PlanRequest, margin: Margin, sinks: Sequence[Profile]
 ) -> Plan:
     last = profile.nodes[-1] if profile.nodes else None
+    asynchronous = request.publication == "asynchronous"
     plan = plan_shaping(
         profile.latencies_ns,
         profile.period_ns,
@@ -188,8 +211,11 @@ def _shaped(
         realtime=profile.realtime,
         longest_stall_ns=profile.longest_stall_ns,
         utilisation=profile.utilisation,
+        longest_send_ns=profile.longest_send_ns if asynchronous else None,
+        output_depth=profile.output_depth if asynchronous else None,
         core=profile.core_of.get(last or "", DEFAULT_CORE),
         anchor=request.anchor,
+        overrun=request.overrun,
         fifo_priority=profile.fifo_priority,
         spin_ns=request.spin_ns,
         pause_ns=request.pause_ns,

@@ -20,6 +20,7 @@ from chainshaper.planning.plan import (
     ChainOfPlan,
     Evidence,
     Margin,
+    Overrun,
     Plan,
     Prediction,
     Server,
@@ -28,6 +29,7 @@ from chainshaper.planning.plan import (
     publish_slots,
     wrong_values_refused,
 )
+from chainshaper.planning.publication import publication_warnings
 
 __all__ = ["evidence_of", "plan_shaping", "plan_warnings", "predict_bands", "shaping_node_like"]
 
@@ -56,9 +58,12 @@ def plan_shaping(
     realtime: bool | None = None,
     longest_stall_ns: int | None = None,
     utilisation: float | None = None,
+    longest_send_ns: int | None = None,
+    output_depth: int | None = None,
     core: int = 1,
     output_core: int | None = None,
     anchor: Anchor = "stamp",
+    overrun: Overrun = "wait",
     fifo_priority: int = 84,
     spin_ns: int = 300_000,
     pause_ns: int = 500_000,
@@ -77,15 +82,18 @@ def plan_shaping(
         period_ns: the chain's period.
         spec, output, publisher, nodes: the chain as written, its last topic, the node that
             publishes it, and the nodes whose executors run the chain's callbacks. Without
-            ``output`` the plan has no shaping node: it can be studied, not carried out.
+            ``output`` the plan names no publishing thread: it can be studied, not carried out.
         epsilon_ns, publish_slot_ns: ε and Δ.
         margin: a margin that was derived from the latencies, in place of ``epsilon_ns``.
         publication: ``synchronous`` splices a shaping node behind the output; ``asynchronous``
             puts the publisher's own thread into R_m°.
-        recording, incomplete, disturbed, realtime, longest_stall_ns, utilisation: where the
-            latencies come from and how they were taken, for the plan's evidence.
+        recording, incomplete, disturbed, realtime, longest_stall_ns, utilisation,
+            longest_send_ns: where the latencies come from and how they were taken, for the
+            plan's evidence.
+        output_depth: history of the output's writer (keep last).
         core, output_core: cores of the two servers.
         anchor, fifo_priority, spin_ns, pause_ns: for the shaping node.
+        overrun: what becomes of an output that missed its slot.
 
     Raises:
         InputError: latencies or values that no plan may have.
@@ -100,7 +108,7 @@ def plan_shaping(
             f" found {format_duration(epsilon_ns)}, {format_duration(publish_slot_ns)} and"
             f" {format_duration(period_ns)}"
         )
-    if publication == "asynchronous" and publisher is None:
+    if publication == "asynchronous" and output is not None and publisher is None:
         raise InputError(
             "asynchronous publication gates the publisher's own thread: name the node that"
             " publishes the chain's output"
@@ -123,7 +131,13 @@ def plan_shaping(
         if publication == "asynchronous" and publisher is not None:
             publishing = [Thread(node=publisher, role="publisher")]
         return Plan(
-            chain=ChainOfPlan(spec=spec, output=output, publisher=publisher, period_ns=period_ns),
+            chain=ChainOfPlan(
+                spec=spec,
+                output=output,
+                publisher=publisher,
+                output_depth=output_depth,
+                period_ns=period_ns,
+            ),
             evidence=evidence_of(
                 latencies,
                 recording=recording,
@@ -132,11 +146,13 @@ def plan_shaping(
                 realtime=realtime,
                 longest_stall_ns=longest_stall_ns,
                 utilisation=utilisation,
+                longest_send_ns=longest_send_ns,
             ),
             margin=margin or Margin(epsilon_ns=epsilon_ns),
             policy="shaped",
             cycle_ns=period_ns,
             anchor=anchor,
+            overrun=overrun,
             servers=(
                 Server(
                     name="chain",
@@ -172,6 +188,7 @@ def evidence_of(
     realtime: bool | None = None,
     longest_stall_ns: int | None = None,
     utilisation: float | None = None,
+    longest_send_ns: int | None = None,
 ) -> Evidence:
     """The latencies' statistics together with the conditions they were taken under."""
     return Evidence(
@@ -185,6 +202,7 @@ def evidence_of(
         realtime=realtime,
         longest_stall_ns=longest_stall_ns,
         utilisation=utilisation,
+        longest_send_ns=longest_send_ns,
     )
 
 
@@ -281,7 +299,7 @@ def plan_warnings(plan: Plan) -> list[str]:
             f"the chain's execution takes {evidence.utilisation:.1%} of its core: latencies"
             " will pile up from cycle to cycle, whatever the slots."
         )
-    return warnings
+    return [*warnings, *publication_warnings(plan)]
 
 
 def _names(output: str) -> dict[str, str]:
@@ -298,6 +316,8 @@ def _refuse_too_long(longest: int, epsilon: int, publish_slot: int, period: int)
     if missing <= 0:
         return
     remedies = ["a longer period", "a shorter chain"]
+    if longest + epsilon < period:
+        remedies.insert(0, f"a publish slot of {format_duration(period - longest - epsilon)}")
     if longest + publish_slot <= period:
         remedies.insert(0, f"a margin of {format_duration(period - longest - publish_slot)}")
     if longest >= period:

@@ -13,8 +13,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.errors import InputError, OperationError
-from chainshaper.planning.bands import BandProblem, Placement, broken_constraint, mean_of
+from chainshaper.durations import format_duration
+from chainshaper.errors import OperationError
+from chainshaper.planning.bands import (
+    BandProblem,
+    Placement,
+    broken_constraint,
+    mean_of,
+    refuse_more_than_fit,
+)
 from chainshaper.planning.extras import extra_library
 
 __all__ = ["place_by_swarm", "place_randomly"]
@@ -34,17 +41,15 @@ def place_by_swarm(problem: BandProblem, bands: int, seed: int | None = None) ->
     breaks a constraint costs more than any that does not, in proportion to how far it is off.
 
     Raises:
-        InputError: fewer than one band.
+        InputError: as :func:`~chainshaper.planning.bands.refuse_more_than_fit`.
         OperationError: the swarm ended at a placement that breaks a constraint.
         PlatformError: PySwarms is not installed.
     """
-    _refuse_none(bands)
+    refuse_more_than_fit(problem, bands)
     if bands == 1:
         return _checked(problem, (problem.last_end_ns,), "the single band")
     lowest = float(problem.latencies_ns[0] + problem.publish_slot_ns)
     highest = float(problem.last_end_ns - problem.publish_slot_ns)
-    if lowest >= highest:
-        raise OperationError("there is no room for a slot before the last; plan with one band")
     bounds = (np.full(bands - 1, lowest), np.full(bands - 1, highest))
     with _quiet_and_seeded(seed):
         swarm = extra_library("pyswarms", "placement by particle swarm").single.GlobalBestPSO(
@@ -61,10 +66,11 @@ def place_randomly(problem: BandProblem, bands: int, seed: int | None = None) ->
     """Place bands at random, every allowed placement on the grid being equally likely.
 
     Raises:
-        InputError: fewer than one band.
-        OperationError: no draw out of ten thousand keeps all constraints.
+        InputError: as :func:`~chainshaper.planning.bands.refuse_more_than_fit`.
+        OperationError: the grid is too coarse for so many, or no draw out of ten thousand keeps
+            all constraints.
     """
-    _refuse_none(bands)
+    refuse_more_than_fit(problem, bands)
     if bands == 1:
         return _checked(problem, (problem.last_end_ns,), "the single band")
     grid, slot = problem.grid_ns, problem.publish_slot_ns
@@ -74,7 +80,10 @@ def place_randomly(problem: BandProblem, bands: int, seed: int | None = None) ->
     spare = slot // grid
     remaining = size - spare * (bands - 2)
     if remaining < bands - 1:
-        raise OperationError(f"there is no room for {bands} bands; use fewer, or a shorter slot")
+        raise OperationError(
+            f"{bands} bands cannot be placed: the grid of {format_duration(grid)} is too coarse for"
+            f" slots of {format_duration(slot)}; use a finer one"
+        )
     random = np.random.default_rng(seed)
     for _ in range(RANDOM_TRIES):
         drawn = np.sort(random.choice(remaining, size=bands - 1, replace=False))
@@ -83,11 +92,6 @@ def place_randomly(problem: BandProblem, bands: int, seed: int | None = None) ->
         if broken_constraint(problem, placed) is None:
             break
     return _checked(problem, placed, "the last random draw")
-
-
-def _refuse_none(bands: int) -> None:
-    if bands < 1:
-        raise InputError(f"{bands} bands: plan with one band at least")
 
 
 def _checked(problem: BandProblem, ends: tuple[int, ...], what: str) -> Placement:

@@ -1,0 +1,222 @@
+"""What a plan is made of: the chain, the evidence, the margin, servers, shaping nodes, prediction.
+
+Each part checks itself; what they must fit together is :mod:`chainshaper.planning.plan`'s. Slots
+are half-open intervals ``(start, end)`` in nanoseconds after the start of a cycle.
+"""
+
+import re
+from itertools import pairwise
+from typing import Annotated, Literal, NamedTuple, TypeAlias
+
+from pydantic import AfterValidator, Field, model_validator
+
+from chainshaper.durations import format_duration
+from chainshaper.yaml_file import Duration, FullName, Part, PositiveDuration, wrong_value
+
+__all__ = [
+    "PER_CALLBACK",
+    "Anchor",
+    "BandPrediction",
+    "ChainOfPlan",
+    "Evidence",
+    "Margin",
+    "Overrun",
+    "Policy",
+    "Prediction",
+    "Server",
+    "ShapingNode",
+    "Slot",
+    "Thread",
+    "slot_text",
+]
+
+
+def _node_name(value: str) -> str:
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", value):
+        raise ValueError(
+            f"{value!r} is not a node's name: write letters, digits and underscores, no slash, no"
+            " digit first"
+        )
+    return value
+
+
+Slot: TypeAlias = tuple[Duration, Duration]
+"""A time slot [start, end) of a cycle."""
+
+Policy: TypeAlias = Literal[
+    "shaped",
+    "one-long-slot",
+    "server-per-callback",
+    "server-per-chain",
+    "let-per-callback",
+    "let-per-chain",
+]
+PER_CALLBACK = ("server-per-callback", "let-per-callback")
+"""Policies whose slots follow from the callbacks, so that an execution may span cycles."""
+
+Anchor: TypeAlias = Literal["stamp", "cycle"]
+
+Overrun: TypeAlias = Literal["wait", "discard", "publish"]
+"""What becomes of an output that missed its last slot: see :mod:`chainshaper.enforcement.gate`."""
+
+
+class ChainOfPlan(Part):
+    """The chain that is planned for, as far as it is known.
+
+    ``publisher`` is the node that publishes ``output``, the chain's last topic. A plan computed
+    from bare latencies knows only the period; it can be studied but not carried out.
+    ``output_depth`` is the history (keep last) of the output's writer, where it is known.
+    """
+
+    spec: str | None = None
+    output: FullName | None = None
+    publisher: FullName | None = None
+    output_depth: Annotated[int, Field(ge=1)] | None = None
+    period_ns: PositiveDuration
+
+
+class Evidence(Part):
+    """The measurements that the plan rests on: end-to-end latencies under high SCHED_FIFO.
+
+    ``incomplete`` counts traversals without an end, ``disturbed`` those that a stall of the
+    machine hit, ``utilisation`` is the share of its core that the chain's execution takes,
+    ``longest_send_ns`` how long the output's asynchronous publisher took to send one message.
+    ``None`` is: not known.
+    """
+
+    recording: str | None = None
+    samples: Annotated[int, Field(ge=1)]
+    min_latency_ns: Duration
+    mean_latency_ns: Duration
+    max_latency_ns: PositiveDuration
+    incomplete: Annotated[int, Field(ge=0)] = 0
+    disturbed: Annotated[int, Field(ge=0)] = 0
+    realtime: bool | None = None
+    longest_stall_ns: Duration | None = None
+    utilisation: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    longest_send_ns: Duration | None = None
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "Evidence":
+        if not self.min_latency_ns <= self.mean_latency_ns <= self.max_latency_ns:
+            raise wrong_value("min, mean and max latency must ascend: correct them", "mean_latency")
+        return self
+
+
+class Margin(Part):
+    """How far the chain's slot reaches beyond the longest latency measured (ε of eq. 1).
+
+    ``given`` by a person, or ``derived`` from the tail of the measured latencies: then the plan
+    keeps the probability of an overrun per cycle that it was derived for, and the confidence
+    interval of the margin.
+    """
+
+    epsilon_ns: Duration
+    source: Literal["given", "derived"] = "given"
+    overrun_probability: Annotated[float, Field(gt=0, lt=1)] | None = None
+    confidence_interval_ns: tuple[Duration, Duration] | None = None
+
+
+class Thread(Part):
+    """A thread of a node that runs inside a server: its executor, or its asynchronous publisher.
+
+    DDS threads other than the publisher's are never gated (section 3.1), so they have no role.
+    """
+
+    node: FullName
+    role: Literal["executor", "publisher"] = "executor"
+
+
+class Server(Part):
+    """A table-driven reservation server (section 2.2.1): its threads run in its slots only.
+
+    A smaller ``priority`` is better, which is LITMUS^RT's order.
+    """
+
+    name: Annotated[str, Field(min_length=1)]
+    core: Annotated[int, Field(ge=0)]
+    priority: Annotated[int, Field(ge=1)]
+    slots: Annotated[tuple[Slot, ...], Field(min_length=1)]
+    threads: tuple[Thread, ...] = ()
+
+    @model_validator(mode="after")
+    def _slots_ascend(self) -> "Server":
+        for number, (start, end) in enumerate(self.slots):
+            if end <= start:
+                raise wrong_value(
+                    f"the slot {slot_text((start, end))} is empty: its end must come after its"
+                    " start",
+                    "slots",
+                    number,
+                )
+        for number, (before, after) in enumerate(pairwise(self.slots), start=1):
+            if after[0] < before[1]:
+                raise wrong_value(
+                    f"the slot {slot_text(after)} begins before {slot_text(before)} ends: write"
+                    " a server's slots in ascending order, without overlap",
+                    "slots",
+                    number,
+                )
+        return self
+
+
+class ShapingNode(Part):
+    """The node that takes the chain's output from ``input`` and republishes it on ``output``.
+
+    It publishes in the slots of the server that holds its thread. ``core`` and ``fifo_priority``
+    are those of its executor; it sleeps until ``spin_ns`` before the slot and spins from there,
+    and pauses for ``pause_ns`` after a publication so that delivery is not delayed by it.
+    """
+
+    name: Annotated[str, AfterValidator(_node_name)]
+    input: FullName
+    output: FullName
+    core: Annotated[int, Field(ge=0)]
+    fifo_priority: Annotated[int, Field(ge=1, le=98)]
+    spin_ns: Duration
+    pause_ns: Duration
+
+    @property
+    def thread(self) -> Thread:
+        """The node's executor, as servers name it."""
+        return Thread(node=f"/{self.name}")
+
+    @model_validator(mode="after")
+    def _two_topics(self) -> "ShapingNode":
+        if self.input == self.output:
+            raise wrong_value(
+                f"the shaping node would feed itself: input and output are both {self.input};"
+                f" let the chain publish on another topic, such as {self.output}_tmp",
+                "input",
+            )
+        return self
+
+
+class Prediction(Part):
+    """What the plan promises: end-to-end latency, and the share of cycles per latency band.
+
+    A band is represented by the end of its slot (section 4.1). The jitter is the widest
+    distance of two outputs, from the start of the first slot to the end of the last.
+    """
+
+    mean_ns: Duration
+    max_ns: Duration
+    jitter_ns: Duration
+    shares: tuple[Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)], ...] = ()
+
+
+class BandPrediction(NamedTuple):
+    """One latency band: its slot, its share of the cycles, and the jitter within it at most.
+
+    An output of the band leaves somewhere in its slot, so the jitter is the slot's length.
+    """
+
+    start_ns: int
+    end_ns: int
+    share: float
+    jitter_ns: int
+
+
+def slot_text(slot: Slot) -> str:
+    """A slot as people write it: ``[86ms, 87ms)``."""
+    return f"[{format_duration(slot[0])}, {format_duration(slot[1])})"
