@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain, small_chain_text
 
 from chainshaper import run_application, shape_application
@@ -14,6 +15,10 @@ from chainshaper.planning import Plan, plan_shaping
 from chainshaper.recording import Recording
 
 CYCLES = 12
+
+# How long an example takes is the machine's affair: no test asserts an absolute time.
+settings.register_profile("chainshaper", deadline=None)
+settings.load_profile("chainshaper")
 
 
 @pytest.fixture

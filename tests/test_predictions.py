@@ -17,7 +17,8 @@ from chainshaper.planning import (
     plan_chain,
     publish_slots,
 )
-from chainshaper.predictions import cycles_until_output, hold_prediction
+from chainshaper.planning.overruns import cycles_until_output
+from chainshaper.predictions import hold_prediction
 from chainshaper.recording import Recording
 from chainshaper.reporting.predictions import prediction_json
 

@@ -26,7 +26,9 @@ if TYPE_CHECKING:
         find_chain,
         load_named_paths,
     )
+    from chainshaper.applying import apply_plan, planned_changes
     from chainshaper.doctor import examine_machine
+    from chainshaper.enforcement.runs import end_run, find_runs
     from chainshaper.errors import ChainshaperError, InputError, OperationError, PlatformError
     from chainshaper.exploration import (
         ApplicationDescription,
@@ -59,6 +61,7 @@ if TYPE_CHECKING:
         profile_chains,
         shape_application,
     )
+    from chainshaper.thread_search import find_threads
     from chainshaper.workload.description import Application, load_application
     from chainshaper.workload.live import run_application
 
@@ -72,7 +75,9 @@ _HOMES = {
         "find_chain",
         "load_named_paths",
     ),
+    "chainshaper.applying": ("apply_plan", "planned_changes"),
     "chainshaper.doctor": ("examine_machine",),
+    "chainshaper.enforcement.runs": ("end_run", "find_runs"),
     "chainshaper.errors": ("ChainshaperError", "InputError", "OperationError", "PlatformError"),
     "chainshaper.exploration": (
         "ApplicationDescription",
@@ -105,6 +110,7 @@ _HOMES = {
         "profile_chains",
         "shape_application",
     ),
+    "chainshaper.thread_search": ("find_threads",),
     "chainshaper.workload.description": ("Application", "load_application"),
     "chainshaper.workload.live": ("run_application",),
 }
@@ -126,6 +132,7 @@ __all__ = [
     "Recording",
     "analyse_latency",
     "application_graph",
+    "apply_plan",
     "callback_statistics",
     "compare_recordings",
     "convert_recording",
@@ -133,9 +140,12 @@ __all__ = [
     "describe_application",
     "draw_distribution",
     "draw_latency",
+    "end_run",
     "event_counts",
     "examine_machine",
     "find_chain",
+    "find_runs",
+    "find_threads",
     "hop_breakdown",
     "list_chains",
     "load_application",
@@ -148,6 +158,7 @@ __all__ = [
     "plan_chain",
     "plan_recording",
     "plan_shaping",
+    "planned_changes",
     "profile_chains",
     "run_application",
     "save_plan",

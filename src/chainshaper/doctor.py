@@ -8,12 +8,13 @@ import os
 import platform
 import resource
 import shutil
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal, TypeAlias
 
 import polars as pl
 
+from chainshaper.enforcement.back_ends import offered_back_ends
 from chainshaper.enforcement.realtime import available_cores, may_use_fifo, throttle_fraction
 from chainshaper.enforcement.threads import foreign_realtime_processes
 from chainshaper.recording import StallMeterInfo
@@ -57,8 +58,7 @@ def examine_machine(watch_ns: int = 5_000_000_000) -> MachineReport:
         _memory_lock(),
         _other_realtime(),
         _dds(),
-        _freezer(),
-        _sched_ext(),
+        *_back_ends(),
         _tool("bpftrace", "recording ROS 2 without LTTng", "apt install bpftrace"),
         _tool("lttng", "recording ROS 2 with LTTng", "apt install lttng-tools"),
         _tool("ros2", "shaping ROS 2 applications", "install ROS 2, and source its setup.bash"),
@@ -146,33 +146,15 @@ def _dds() -> Check:
     return Check("Cyclone DDS for Python", "good", version, purpose)
 
 
-def _freezer() -> Check:
-    purpose = "servers for unmodified threads (back end freezer)"
-    for line in Path("/proc/mounts").read_text().splitlines():
-        _, mount, kind, *_ = line.split()
-        if kind == "cgroup2":
-            writable = os.access(mount, os.W_OK)
-            return Check(
-                "cgroup v2",
-                "good" if writable else "limited",
-                mount if writable else f"{mount}, not writable",
-                purpose,
-                "" if writable else "run as root, or have the cgroup delegated to you",
-            )
-    return Check("cgroup v2", "absent", "not mounted", purpose, "mount -t cgroup2 none DIR")
-
-
-def _sched_ext() -> Check:
-    purpose = "servers in the kernel (back end scx)"
-    if Path("/sys/kernel/sched_ext").is_dir():
-        return Check("sched_ext", "good", "in this kernel", purpose)
-    return Check(
-        "sched_ext",
-        "absent",
-        "not in this kernel",
-        purpose,
-        "a kernel from 6.12 on with CONFIG_SCHED_CLASS_EXT, such as Debian's 6.16",
-    )
+def _back_ends() -> Iterator[Check]:
+    """What `chainshaper apply` can use here, strongest first."""
+    for offer in offered_back_ends():
+        name = f"back end {offer.name}"
+        if offer.missing is None:
+            yield Check(name, "good", "can be used", offer.strength)
+        else:
+            found, _, remedy = offer.missing.partition(": ")
+            yield Check(name, "absent", found, offer.strength, remedy)
 
 
 def _tool(name: str, purpose: str, remedy: str) -> Check:

@@ -4,9 +4,14 @@
 message that waits go when its slot starts, at x_α − Δ; only one that arrives inside the slot
 leaves later. So every figure is predicted twice: as if each output left at the start of its
 slot, and at its end. A measurement should lie between the two, near the first.
+
+A gate counts its slots from the message's own origin. Where a back end holds back a publisher's
+thread instead, slots count from the cycle, and a chain that began late in it has so much less
+latency: an output's place is its latency plus how late its chain began.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import polars as pl
 
@@ -14,10 +19,12 @@ from chainshaper.analysis import LatencyAnalysis
 from chainshaper.overruns import gate_releases
 from chainshaper.planning import Plan, publish_slots
 from chainshaper.planning.overruns import cycles_until_output
+from chainshaper.planning.publisher_threads import publisher_servers
 from chainshaper.recording import Recording
 
 __all__ = ["BandHeld", "FigureHeld", "PredictionHeld", "hold_prediction"]
 
+WAKE_UP_NS = 250_000
 STANDARD_ERRORS = 3  # beyond so many, an average is not what was predicted
 
 
@@ -86,18 +93,22 @@ def hold_prediction(plan: Plan, recording: Recording, analysis: LatencyAnalysis)
         longest, jitter = slots[-1][0], slots[-1][0] - slots[0][0]
     elif slots:
         longest, jitter = min(longest, slots[-1][0]), 0
-    slack = STANDARD_ERRORS * _standard_error(plan, slots, analysis)
+    errors = STANDARD_ERRORS * _standard_error(plan, slots, analysis)
+    began_late = outputs["place"] - outputs["latency_ns"]
+    latest, usually = began_late.max() or 0, began_late.mean() or 0
     return PredictionHeld(
-        mean=_figure(mean, predicted.mean_ns, measured.mean_ns, slack),
-        max=_figure(longest, predicted.max_ns, measured.max_ns),
-        jitter=_figure(jitter, predicted.jitter_ns, measured.jitter_ns),
+        mean=_figure(mean, predicted.mean_ns, measured.mean_ns, errors + usually, errors),
+        max=_figure(longest, predicted.max_ns, measured.max_ns, latest),
+        jitter=_figure(jitter, predicted.jitter_ns, measured.jitter_ns, 0, latest),
         bands=bands,
         late=outputs.height - in_time.height,
     )
 
 
-def _figure(at_start: int, at_end: int, measured: int | None, slack: float = 0.0) -> FigureHeld:
-    holds = None if measured is None else at_start - slack <= measured <= at_end + slack
+def _figure(
+    at_start: int, at_end: int, measured: int | None, below: Any = 0, above: Any = 0
+) -> FigureHeld:
+    holds = None if measured is None else at_start - below <= measured <= at_end + above
     return FigureHeld(at_start, at_end, measured, holds)
 
 
@@ -133,10 +144,10 @@ def _represented_by_slot_ends(plan: Plan) -> bool:
 def _outputs(
     plan: Plan, slots: list[tuple[int, int]], recording: Recording, analysis: LatencyAnalysis
 ) -> pl.DataFrame:
-    """Undisturbed complete traversals: ``latency_ns``, ``slot`` and ``in_time``.
+    """Undisturbed complete traversals: ``latency_ns``, ``place``, ``slot`` and ``in_time``.
 
     The slot is the one that the gate says it released the message in. Without a gate's events it
-    is the last that had started when the output came.
+    is the last that had started when the output came, at its ``place`` in the cycle (ns).
     """
     chosen = analysis.traversals.filter(pl.col("complete") & ~pl.col("disturbed"))
     last = len(analysis.chain.callbacks) - 1
@@ -152,20 +163,35 @@ def _outputs(
         )
         if joined["slot"].count():
             in_time = pl.col("overrun").is_null() & pl.col("slot").is_not_null()
-            return joined.select("latency_ns", "slot", in_time=in_time)
+            return joined.select("latency_ns", "slot", place="latency_ns", in_time=in_time)
     starts = [start for start, _ in slots]
-    return chosen.select(
-        "latency_ns",
-        slot=sum((pl.col("latency_ns") >= start).cast(pl.Int32) for start in starts)
+    late = _lateness(chosen["start"], plan.cycle_ns) if any(publisher_servers(plan)) else 0
+    return chosen.select("latency_ns", place=pl.col("latency_ns") + late).with_columns(
+        slot=sum((pl.col("place") >= start).cast(pl.Int32) for start in starts)
         + pl.lit(-1, dtype=pl.Int32),
-        in_time=pl.col("latency_ns") < (cycles_until_output(plan) + 1) * plan.cycle_ns,
+        in_time=pl.col("place") < (cycles_until_output(plan) + 1) * plan.cycle_ns,
     )
+
+
+def _lateness(starts: pl.Series, cycle_ns: int) -> pl.Series:
+    """How long after the start of the cycle each chain began (ns).
+
+    When cycles started is not recorded. The earliest beginning stands for it, which is the one
+    behind the widest part of the cycle that has none, and came a wake-up after the start.
+    """
+    places = (starts % cycle_ns).sort()
+    if not len(places):
+        return starts
+    gaps = places.diff().fill_null(places[0] + cycle_ns - places[-1])
+    earliest: int = places[gaps.arg_max() or 0]
+    behind: pl.Series = starts - (earliest - WAKE_UP_NS)
+    return pl.select(behind % cycle_ns).to_series()
 
 
 def _band(
     slot: tuple[int, int], predicted: float | None, own: pl.DataFrame, total: int
 ) -> BandHeld:
-    latency = own["latency_ns"].to_numpy()
+    latency, place = own["latency_ns"].to_numpy(), own["place"].to_numpy()
     low, high = (int(latency.min()), int(latency.max())) if latency.size else (None, None)
     return BandHeld(
         slot_start_ns=slot[0],
@@ -173,7 +199,7 @@ def _band(
         predicted_share=predicted,
         count=latency.size,
         share=latency.size / total if total else None,
-        inside=int(((latency >= slot[0]) & (latency < slot[1])).sum()),
+        inside=int(((place >= slot[0]) & (place < slot[1])).sum()),
         min_ns=low,
         mean_ns=round(float(latency.mean())) if latency.size else None,
         max_ns=high,

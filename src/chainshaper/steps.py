@@ -7,22 +7,23 @@ in a room.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-
-import polars as pl
 
 from chainshaper import events
 from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
 from chainshaper.durations import format_duration
 from chainshaper.errors import InputError
+from chainshaper.overruns import overruns_in
 from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain
-from chainshaper.predictions import PredictionHeld, cycles_until_output, hold_prediction
+from chainshaper.planning.publisher_threads import publisher_servers
+from chainshaper.predictions import PredictionHeld, hold_prediction
 from chainshaper.profiles import profile_of
 from chainshaper.recording import Recording
 from chainshaper.sources import open_source
 from chainshaper.splicing.application import splice_application
 from chainshaper.workload.description import Application
-from chainshaper.workload.live import Progress, origin_timer, run_application
+from chainshaper.workload.live import Enforcement, Progress, origin_timer, run_application
 
 __all__ = [
     "Comparison",
@@ -43,14 +44,15 @@ class Measurement:
     """A recording with its chain's latency analysis.
 
     ``longest_stall_ns`` is the machine's own during the recording (None: nobody watched it),
-    ``overruns`` counts messages that came too late for their publish slot (None: no gate ran),
-    ``plan`` is the plan in force, and ``held`` its prediction beside this measurement.
+    ``overruns`` counts outputs that came too late for their publish slot, per policy that was
+    applied to them: ``wait``, ``discard``, ``publish`` (None: nothing was gated). ``plan`` is the
+    plan in force, and ``held`` its prediction beside this measurement.
     """
 
     recording: Recording
     analysis: LatencyAnalysis
     longest_stall_ns: int | None
-    overruns: int | None
+    overruns: dict[str, int] | None
     plan: Plan | None
     held: PredictionHeld | None
 
@@ -90,17 +92,12 @@ def measure_latency(
     analysis = analyse_latency(recording, chain_of(recording, chain))
     if plan is None and recording.info.plan is not None:
         plan = Plan.model_validate(recording.info.plan, strict=False)
-    overruns = None
-    if "gate_release" in recording.events:
-        expected = 0 if plan is None else cycles_until_output(plan)
-        late = pl.col("cycles_waited") > expected
-        overruns = recording.events["gate_release"].filter(late).height
     planned_for = plan is not None and plan.chain.output in (None, analysis.chain.topics[-1])
     return Measurement(
         recording=recording,
         analysis=analysis,
         longest_stall_ns=_longest_stall(recording),
-        overruns=overruns,
+        overruns=overruns_in(recording, plan, analysis),
         plan=plan,
         held=hold_prediction(plan, recording, analysis) if plan and planned_for else None,
     )
@@ -170,15 +167,25 @@ def shape_application(
     *,
     cycles: int = 320,
     realtime: bool | None = None,
+    enforcement: Enforcement | None = None,
     command: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Recording:
     """Splice the plan's shaping node into an application, run it and record it.
 
+    ``enforcement`` puts the plan's servers in force while it runs. A shaping node does without;
+    the thread of an asynchronous publisher is gated unless somebody else sees to it
+    (:mod:`chainshaper.publisher_gating`).
+
     Raises:
         InputError: the plan does not fit the application; and what
             :func:`~chainshaper.workload.live.run_application` raises.
+        PlatformError: the plan gates a publisher's thread, and threads cannot be frozen here.
     """
+    if any(publisher_servers(plan)) and enforcement is None:
+        from chainshaper.publisher_gating import publishers_gated
+
+        enforcement = partial(publishers_gated, plan)
     period = origin_timer(application).timer_ns
     if period != plan.chain.period_ns:
         raise InputError(
@@ -192,6 +199,7 @@ def shape_application(
         cycles=cycles,
         realtime=realtime,
         plan=plan.model_dump(mode="json"),
+        enforcement=enforcement,
         command=command,
         progress=progress,
     )

@@ -8,9 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from command_line import called, json_of, refused
-
-pytest.importorskip("numba")
+from command_line import called, json_of, message_of, refused
 
 US = 1_000
 
@@ -90,7 +88,9 @@ def test_the_exact_solver_finds_what_trying_everything_finds(tmp_path: Path) -> 
         arguments = _arguments(case, tmp_path)
         if least is None:
             impossible += 1
-            message = refused(1, *arguments, "--solver", "exact", "--json")
+            finished = called(*arguments, "--solver", "exact", "--json")
+            # More bands than find room in any way are wrong use, other limits a failure.
+            message = message_of(finished, 2 if "there is room for" in finished.err else 1)
             assert "cannot be placed" in message, case
             continue
         possible += 1
@@ -119,8 +119,9 @@ def test_the_binding_constraint_is_named(tmp_path: Path) -> None:
         "1us",
     ]
     common += ["--publish-slot", "3us"]
-    said = refused(1, *common, "--bands", "11")
-    assert "there is room for 10 publish slots of 3us" in said
+    for too_many in ("11", "1000000000"):
+        said = refused(2, *common, "--bands", too_many)
+        assert "there is room for 10 publish slots of 3us" in said
     assert "at 30.0% of the executions" in refused(1, *common, "--bands", "2", "--max-share", "30%")
     coarse: list[str | Path] = [*common, "--bands", "5"]
     coarse[coarse.index("1us")] = "20us"
@@ -143,6 +144,22 @@ def test_the_solvers_and_their_seeds(tmp_path: Path) -> None:
     swarm = [json_of(*common, "--solver", "pso", "--seed", "3") for _ in range(2)]
     assert swarm[0]["bands_ns"] == swarm[1]["bands_ns"]
     assert swarm[0]["predicted"]["mean_ns"] >= exact
+
+
+def test_each_band_is_told_its_share_and_jitter(tmp_path: Path) -> None:
+    file = tmp_path / "latencies.txt"
+    file.write_text("40ms\n61ms\n70ms\n85ms\n")
+    common: list[str | Path] = ["plan", "--latencies", file, "--period", "100ms"]
+    bands = json_of(*common, "--bands", "3")["predicted_bands"]
+    assert [(band["share"], band["jitter_ns"]) for band in bands] == [
+        (0.25, 1_000_000),  # slots [40.001, 41.001), [69, 70), [86, 87) ms
+        (0.5, 1_000_000),
+        (0.25, 1_000_000),
+    ]
+    shown = called(*common, "--bands", "3").out
+    assert "Predicted latency bands" in shown
+    assert "50.0%" in shown
+    assert "Predicted latency bands" not in called(*common).out
 
 
 def test_auto_shows_the_curve_and_says_why_it_stops(tmp_path: Path) -> None:
@@ -178,7 +195,6 @@ def test_auto_shows_the_curve_and_says_why_it_stops(tmp_path: Path) -> None:
         (("--policy", "let-per-callback"), "needs the chain's callbacks"),
         (("--policy", "server-per-callback"), "needs the chain's callbacks"),
         (("--epsilon", "1ms", "--overrun-probability", "1e-6"), "either given or derived"),
-        (("--publication", "asynchronous"), "name the node that publishes"),
         (("--sink", "/a../b"), "give a recording for several"),
     ],
 )
@@ -199,12 +215,28 @@ def test_policies_from_bare_latencies(tmp_path: Path) -> None:
     assert long["predicted"]["mean_ns"] == (62 + 62 + 70 + 85) * 1_000_000 // 4
     let = json_of(*common, "let-per-chain")
     assert let["predicted"]["mean_ns"] == 101_000_000, "one period, and the slot"
+    file.write_text("40ms\n99.5ms\n")  # too long for a slot behind it, short enough for LET
+    nearly = json_of(*common, "let-per-chain")
+    assert nearly["predicted"] == let["predicted"]
+    assert nearly["evidence"]["max_latency_ns"] == 99_500_000
+    file.write_text("40ms\n100ms\n")
+    assert "has to be done" in refused(1, *common, "let-per-chain")
+    file.write_text("40ms\n61ms\n70ms\n85ms\n")
     alone = json_of(*common, "server-per-chain")
     assert (alone["bands_ns"], alone["predicted"]["jitter_ns"]) == ([], 45_000_000)
 
 
+@pytest.mark.parametrize("policy", ["shaped", "server-per-chain", "let-per-chain"])
+def test_slots_do_not_depend_on_who_publishes(policy: str, tmp_path: Path) -> None:
+    # Eq. 2 and eq. 4 differ in what Δ is the longest time of, and in the thread in the slot.
+    file = tmp_path / "latencies.txt"
+    file.write_text("40ms\n61ms\n70ms\n85ms\n")
+    common: list[str | Path] = ["plan", "--latencies", file, "--period", "100ms"]
+    common += ["--policy", policy, "--publication"]
+    assert json_of(*common, "asynchronous") == json_of(*common, "synchronous")
+
+
 def test_a_margin_is_derived_or_refused(tmp_path: Path) -> None:
-    pytest.importorskip("scipy")
     file = tmp_path / "latencies.txt"
     generator = random.Random(6)
     drawn = [f"{60 + sum(generator.random() for _ in range(12)):.6f}ms\n" for _ in range(2000)]

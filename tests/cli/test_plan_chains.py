@@ -50,6 +50,7 @@ def test_chains_take_turns_where_they_can(tmp_path: Path) -> None:
     values = json_of("offsets", *files, "-o", tmp_path / "placed")
     first, second = values["plans"]
     assert (first["offset_ns"], second["offset_ns"]) == (0, 41 * MS)
+    assert "cycle 100.000, starting 41.000 late" in " ".join(called("offsets", *files).out.split())
     assert [Path(file).name for file in values["files"]] == ["1_a.yaml", "2_b.yaml"]
     assert load_plan(tmp_path / "placed" / "2_b.yaml").offset_ns == 41 * MS
     again = refused(2, "offsets", *files, "-o", tmp_path / "placed")
@@ -84,6 +85,8 @@ def test_several_chains_of_a_recording(tmp_path: Path, unshaped: Recording) -> N
 def test_a_further_sink(unshaped: Recording) -> None:
     values = json_of("plan", unshaped.path, "--sink", "/t1../t2", "--publish-slot", "100us")
     assert [node["output"] for node in values["further_shaping_nodes"]] == ["/t2"]
+    twice = refused(2, "plan", unshaped.path, "--sink", "/t1../t3")
+    assert "the plan shapes /t3 already" in twice
 
 
 def test_compare_shows_prediction_beside_measurement(

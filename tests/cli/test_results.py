@@ -23,6 +23,7 @@ VERBS = (
     "plan",
     "shape",
     "compare",
+    "threads",
     "doctor",
 )
 

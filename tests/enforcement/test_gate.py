@@ -36,7 +36,8 @@ def test_stamped_messages_leave_in_the_first_slot_they_can_reach(
     arrival: int, leaves_at: int, slot: int, cycles_waited: int
 ) -> None:
     release = release_of(BANDS, arrival, stamp_ns=1000)
-    assert release == Release(leaves_at, 1000, slot, cycles_waited, "stamp")
+    overrun = "wait" if cycles_waited else None
+    assert release == Release(leaves_at, 1000, slot, cycles_waited, "stamp", overrun)
 
 
 @pytest.mark.parametrize(
@@ -56,13 +57,13 @@ def test_the_cycle_anchor_counts_from_its_phase(
 ) -> None:
     gate = replace(ONE, anchor="cycle", phase_ns=7)
     assert release_of(gate, arrival, stamp_ns=1) == Release(
-        leaves_at, origin, 0, cycles_waited, "cycle"
+        leaves_at, origin, 0, cycles_waited, "cycle", "wait" if cycles_waited else None
     )
 
 
 def test_a_message_without_a_stamp_is_anchored_to_the_cycle() -> None:
     gate = replace(ONE, phase_ns=30)
-    assert release_of(gate, 1000, stamp_ns=None) == Release(1090, 930, 0, 1, "cycle")
+    assert release_of(gate, 1000, stamp_ns=None) == Release(1090, 930, 0, 1, "cycle", "wait")
 
 
 def test_a_stamp_slightly_from_the_future_still_starts_cycle_0() -> None:
@@ -75,6 +76,7 @@ def test_a_stamp_far_from_the_future_is_of_no_use() -> None:
     gate = replace(ONE, max_future_ns=150)
     assert release_of(gate, 1000, stamp_ns=1151).anchor == "cycle"
     hours_ahead = release_of(Gate(((60 * MS, 61 * MS),), 100 * MS), 0, stamp_ns=7200 * SECOND)
+    assert hours_ahead.at_ns is not None
     assert hours_ahead.at_ns < 100 * MS, "the message would be held for two hours"
 
 
@@ -103,6 +105,8 @@ def test_ten_cycles_is_the_oldest_stamp_unless_said_otherwise() -> None:
         ({"slots": ((30, 40), (10, 20))}, "must ascend"),
         ({"slots": ((10, 20), (19, 30))}, "not overlap"),
         ({"anchor": "clock"}, "choose one of stamp, cycle"),
+        ({"overrun": "drop"}, "choose one of wait, discard, publish"),
+        ({"due_cycles": -1}, "due beforehand"),
     ],
 )
 def test_gates_that_make_no_sense_are_refused(changes: dict[str, object], reason: str) -> None:
@@ -131,6 +135,8 @@ def test_a_message_leaves_at_the_first_instant_inside_a_slot(
 ) -> None:
     release = release_of(gate, arrival, stamp)
 
+    assert release.at_ns is not None
+    assert release.slot is not None
     instant = max(arrival, release.origin_ns)  # no cycle exists before the first one
     while not _inside_a_slot(gate, instant - release.origin_ns):
         instant += 1
@@ -214,4 +220,6 @@ def test_a_shaper_without_stamps_keeps_the_phase_of_the_last_good_one() -> None:
     good = shaper.decide(message(5_042 * MS + offset), 5_072 * MS)
     stampless = shaper.decide(message(0), 5_172 * MS)
     assert stampless.anchor == "cycle"
+    assert good.at_ns is not None
+    assert stampless.at_ns is not None
     assert stampless.at_ns - good.at_ns == 100 * MS

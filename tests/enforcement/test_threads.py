@@ -2,8 +2,11 @@
 
 import os
 import threading
+from pathlib import Path
 
 import pytest
+from actors import acting
+from processes import wait_for
 
 from chainshaper.enforcement.realtime import (
     available_cores,
@@ -16,27 +19,13 @@ from chainshaper.enforcement.threads import (
     Scheduling,
     Thread,
     apply_scheduling,
+    find_thread,
     foreign_realtime_processes,
+    innermost_id,
     list_threads,
-    role_of,
+    start_of,
 )
 from chainshaper.errors import OperationError, PlatformError
-
-
-@pytest.mark.parametrize("name", ["recv", "recvUC", "recvMC", "tev", "gc", "lease", "dq.user"])
-def test_cyclone_dds_threads_are_known_by_name(name: str) -> None:
-    assert role_of(name, is_main=False) == "dds"
-
-
-@pytest.mark.parametrize("name", ["dds.ev.0", "dds.udp.7410", "dds.shm.7413"])
-def test_fast_dds_threads_are_known_by_name(name: str) -> None:
-    assert role_of(name, is_main=False) == "dds"
-
-
-def test_other_threads_are_told_apart() -> None:
-    assert role_of("dds.asyn.0.1", is_main=False) == "publisher"
-    assert role_of("node1", is_main=True) == "executor"
-    assert role_of("python3", is_main=False) == "unknown"
 
 
 def test_a_process_has_its_main_thread_first_and_named_threads_by_name() -> None:
@@ -60,12 +49,40 @@ def test_a_process_has_its_main_thread_first_and_named_threads_by_name() -> None
     assert set(threads[0].cores) == os.sched_getaffinity(0)
     sender = next(t for t in threads if t.tid == thread.native_id)
     assert (sender.comm, sender.role) == ("xmit.user with ", "dds")  # the kernel keeps 15 bytes
+    assert sender.kind == "transmit"
+    assert sender.started >= threads[0].started
+    assert sender.identity == (thread.native_id, sender.started)
 
 
 def test_a_process_that_is_gone_has_no_threads() -> None:
     pid = os.posix_spawn("/bin/true", ["true"], {})
     os.waitpid(pid, 0)
     assert list_threads(pid) == ()
+
+
+def test_a_thread_is_found_by_its_id_alone(tmp_path: Path) -> None:
+    with acting(tmp_path, "a") as actor:
+        found = find_thread(actor.tids["a"])
+        assert found == actor.thread("a")
+        assert found is not None
+        assert found.pid == actor.pid
+        assert start_of(actor.pid, actor.tids["a"]) == found.started
+        actor.end("a")
+        wait_for(lambda: find_thread(actor.tids["a"]) is None, "the end of a thread")
+        assert start_of(actor.pid, actor.tids["a"]) is None
+
+
+def test_a_name_with_brackets_and_spaces_does_not_confuse(tmp_path: Path) -> None:
+    with acting(tmp_path, ") R 1 2 (") as actor:
+        thread = actor.thread(") R 1 2 (")
+        assert thread.comm == ") R 1 2 ("
+        assert thread.started >= actor.thread("main").started
+
+
+def test_in_a_container_a_thread_has_an_id_of_its_own() -> None:
+    assert innermost_id("Name:\tx\nNSpid:\t4711\t12\t3\n") == 3
+    assert innermost_id("Name:\tx\nNSpid:\t4711\n") == 4711
+    assert innermost_id("Name:\tx\n") is None  # a kernel without pid namespaces
 
 
 def _thread(tid: int) -> Thread:

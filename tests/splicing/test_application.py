@@ -1,6 +1,7 @@
 """Splicing the shaping node into a description: one publisher remapped, one node added."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,9 +9,10 @@ from small_chain import EXECUTOR_CORE, small_chain
 
 from chainshaper import shape_application
 from chainshaper.errors import InputError
-from chainshaper.planning import Plan, plan_shaping, publish_slots
+from chainshaper.planning import Plan, let_per_chain, plan_shaping, publish_slots
 from chainshaper.planning.plan import revised
-from chainshaper.splicing.application import splice_application
+from chainshaper.planning.publication import Writer
+from chainshaper.splicing.application import splice_application, writers_of
 from chainshaper.workload.description import Application, TopicDescription
 
 
@@ -84,6 +86,70 @@ def test_a_plan_without_a_shaping_node_is_refused(application: Application, plan
     bare = plan_shaping(np.array([5_000_000, 20_000_000]), plan.cycle_ns)
     with pytest.raises(InputError, match="no `shaping_node`, so there is nothing to splice"):
         splice_application(application, bare)
+
+
+def _asynchronous(**changes: Any) -> Plan:
+    """A plan that gates the publisher thread of the small chain's last node."""
+    return plan_shaping(
+        np.array([5_000_000, 20_000_000]),
+        50_000_000,
+        **{
+            "output": "/t3",
+            "publisher": "/third",
+            "nodes": ("/first", "/second", "/third"),
+            "publication": "asynchronous",
+            "publish_slot_ns": 10_000_000,
+            **changes,
+        },
+    )
+
+
+def test_how_overruns_are_treated_goes_with_the_gate(application: Application, plan: Plan) -> None:
+    for overrun in ("wait", "discard", "publish"):
+        spliced = splice_application(application, revised(plan, overrun=overrun))
+        gate = spliced.nodes["chainshaper_t3"].callbacks[0].gate
+        assert gate is not None
+        assert (gate.overrun, gate.due_cycles) == (overrun, 0)
+    let = splice_application(application, let_per_chain(plan))
+    gate = let.nodes["chainshaper_t3"].callbacks[0].gate
+    assert gate is not None
+    assert gate.due_cycles == 1
+
+
+def test_a_gated_publisher_needs_no_node(application: Application) -> None:
+    assert splice_application(application, _asynchronous()) == application
+
+
+def test_a_gated_publisher_discards_by_a_lifespan(application: Application) -> None:
+    discarding = _asynchronous(overrun="discard")
+    spliced = splice_application(application, discarding)
+    assert spliced.topic("/t3").lifespan_ns == 31_000_000
+    assert application.topic("/t3").lifespan_ns is None
+    assert Application.model_validate(spliced.model_dump()) == spliced
+    shorter = spliced.topic("/t3").model_copy(update={"lifespan_ns": 9_000_000})
+    own = application.model_copy(update={"topics": {"/t3": shorter}})
+    kept = splice_application(own, discarding).topic("/t3")
+    assert kept.lifespan_ns == 9_000_000, "the application's own is stricter"
+
+
+def test_a_gated_publisher_has_to_publish_asynchronously(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="/third publishes /t3 synchronously"):
+        splice_application(small_chain(tmp_path), _asynchronous())
+
+
+def test_a_gated_publisher_is_not_run_without_its_server(
+    application: Application, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match="carry it out with `chainshaper apply`"):
+        shape_application(application, _asynchronous(), tmp_path / "rec")
+
+
+def test_who_writes_what_is_read_off_the_description(application: Application) -> None:
+    assert writers_of(application) == [
+        Writer("/first", "/t1", 10, False),
+        Writer("/second", "/t2", 10, False),
+        Writer("/third", "/t3", 10, True),
+    ]
 
 
 def test_a_plan_with_more_shaping_nodes_than_can_run_is_refused(

@@ -118,6 +118,9 @@ def test_the_right_one_is_read(tmp_path: Path) -> None:
 
 def test_the_examples_are_right(tmp_path: Path) -> None:
     assert load_application(synthetic_chain()).chain == "/t1../t5"
+    examples = Path(__file__).parents[2] / "examples"
+    asynchronous = load_application(examples / "asynchronous_chain.yaml")
+    assert asynchronous.topic("/t5").publication == "asynchronous"
     assert tuple(small_chain(tmp_path).nodes) == NODES
     assert "asynchronous" in small_chain_text(publication="asynchronous")
 

@@ -6,7 +6,8 @@ import polars as pl
 import pytest
 
 from chainshaper import events
-from chainshaper.workload.event_log import LAYOUT, WIDTH, EventLog
+from chainshaper.enforcement.gate import ANCHORS, OVERRUNS
+from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS, EventLog, number_of
 from chainshaper.workload.event_reading import ProcessLog, event_tables, stall_table
 
 
@@ -23,6 +24,7 @@ def _types(name: str, fields: tuple[str, ...]) -> dict[str, pl.DataType]:
 def test_every_event_is_read_back_as_it_was_recorded(name: str, fields: tuple[str, ...]) -> None:
     log = EventLog()
     values = dict(zip(fields, range(1, len(fields) + 1), strict=True))
+    values |= {field: len(words) - 1 for field, words in WORDS.items() if field in fields}
     log.point(name)(5000, *values.values())
     tables = event_tables([_process(log)], from_ns=0)
 
@@ -30,15 +32,43 @@ def test_every_event_is_read_back_as_it_was_recorded(name: str, fields: tuple[st
     assert dict(tables[name].schema) == _types(name, fields)
     expected: dict[str, Any] = {"time": 5000, "pid": 100, "tid": 100, "cpu": 1, **values}
     if name == "gate_release":
-        expected["anchor"] = "cycle"
+        expected |= {"anchor": "cycle", "overrun": "publish"}
+    if name == "asynchronous_send":
+        expected["outcome"] = "overwritten"
     assert tables[name].to_dicts() == [expected]
 
 
 def test_the_layout_says_what_the_event_tables_say() -> None:
     for name, fields in LAYOUT:
         known = {**events.FIELDS[name], **events.OPTIONAL_FIELDS.get(name, {})}
-        assert set(events.FIELDS[name]) <= set(fields) <= set(known), name
+        assert set(events.FIELDS[name]) <= set(fields) <= {*known, *events.COMMON_COLUMNS}, name
         assert 2 + len(fields) <= WIDTH, name
+
+
+def test_words_are_those_that_the_gate_uses() -> None:
+    assert (WORDS["anchor"], WORDS["overrun"]) == (ANCHORS, OVERRUNS)
+    assert number_of("outcome", "overwritten") == 2
+
+
+def test_a_discarded_message_has_no_release_and_no_slot() -> None:
+    log = EventLog()
+    overrun = number_of("overrun", "discard")
+    log.point("gate_release")(9, 1, 2, 3, 4, ABSENT, ABSENT, 0, 0, overrun)
+    log.point("gate_release")(19, 1, 2, 3, 4, 18, 0, 0, 1, number_of("overrun", None))
+    table = event_tables([_process(log)], from_ns=0)["gate_release"]
+    assert table.select("release", "slot", "anchor", "overrun").rows() == [
+        (None, None, "stamp", "discard"),
+        (18, 0, "cycle", None),
+    ]
+
+
+def test_what_another_thread_did_keeps_its_number() -> None:
+    log = EventLog()
+    log.point("asynchronous_send")(9, 123, 1, 2, number_of("outcome", "sent"), 5)
+    log.point("callback_end")(10, 1, 0)
+    tables = event_tables([_process(log)], from_ns=0)
+    assert tables["asynchronous_send"]["tid"].to_list() == [123]
+    assert tables["callback_end"]["tid"].to_list() == [100]
 
 
 def test_the_largest_numbers_fit() -> None:

@@ -210,8 +210,8 @@ def _check_releases(recording: Recording, plan: Plan) -> pl.DataFrame:
     assert (releases["time"] >= releases["release"]).all(), "it left before its release"
     waited = (releases["release"] - releases["origin"]) // plan.cycle_ns
     assert releases["cycles_waited"].to_list() == waited.to_list()
-    overruns = measure_latency(recording).overruns
-    assert overruns == (releases["cycles_waited"] > 0).sum()
+    overruns = measure_latency(recording).overruns or {}
+    assert overruns.get("wait", 0) == (releases["cycles_waited"] > 0).sum()
     return releases
 
 
@@ -223,7 +223,7 @@ def test_shaped_outputs_leave_in_their_slot_or_are_counted(shaped: Recording, pl
     assert measured.plan == plan
     assert measured.analysis.statistics.incomplete == 0
     assert measured.analysis.chain.topics == ("/t1", "/t2", "/t3_tmp", "/t3")
-    if measured.overruns == 0:
+    if not measured.overruns:
         assert measured.analysis.statistics.min_ns is not None
         # The stamp is read a moment before the callback's start is; 0.1 ms is far above that.
         assert measured.analysis.statistics.min_ns >= publish_slots(plan)[0][0] - 100_000
@@ -243,7 +243,7 @@ def test_asynchronous_publication_has_a_thread_of_its_own(tmp_path: Path) -> Non
     application = small_chain(tmp_path, publication="asynchronous")
     recording = run_application(application, tmp_path / "rec", cycles=CYCLES)
     (publisher,) = _threads(recording, "publisher")
-    assert (publisher.node, publisher.comm) == ("/third", "dds.asyn.0")
+    assert (publisher.node, publisher.comm) == ("/third", "dds.asyn.0.1")
     assert publisher.cores == (EXECUTOR_CORE,)
     if recording.info.realtime:
         assert (publisher.policy, publisher.priority) == ("SCHED_FIFO", 79), "below its executor"

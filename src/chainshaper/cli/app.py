@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import typer
 
+from chainshaper.cli.apply import apply
 from chainshaper.cli.callbacks import callbacks
 from chainshaper.cli.chains import chains
 from chainshaper.cli.compare import compare
@@ -15,8 +16,11 @@ from chainshaper.cli.info import info
 from chainshaper.cli.latency import latency
 from chainshaper.cli.offsets import offsets
 from chainshaper.cli.plan import plan
+from chainshaper.cli.release import release
 from chainshaper.cli.run import run
 from chainshaper.cli.shape import shape
+from chainshaper.cli.status import status
+from chainshaper.cli.threads import threads
 
 __all__ = ["app"]
 
@@ -42,6 +46,10 @@ VERBS: tuple[Callable[..., None], ...] = (
     offsets,
     shape,
     compare,
+    threads,
+    apply,
+    status,
+    release,
     doctor,
 )
 for verb in VERBS:

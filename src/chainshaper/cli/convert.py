@@ -17,4 +17,4 @@ def convert(trace: TraceArgument, output: RecordingOutput) -> None:
         opened = open_source(*trace, progress=report)
         written = convert_recording(opened, output)
     show_line(str(written.path.absolute()))
-    notes((*opened.info.notes, lost_events(opened.info)))
+    notes((*written.info.notes, lost_events(written.info)))

@@ -35,6 +35,7 @@ def latency(
     """
     from chainshaper.cli.output import late_progress, notes, print_json, show, show_line
     from chainshaper.exploration import lost_events, named_chain
+    from chainshaper.overruns import overruns_text
     from chainshaper.reporting.breakdown import breakdown_json, breakdown_table
     from chainshaper.reporting.tables import latency_json, latency_table
     from chainshaper.sources import open_source
@@ -52,12 +53,14 @@ def latency(
         found = latency_json(measurement, instances=instances)
         print_json({**found, **breakdown_json(analysis)})
         return
-    show(latency_table(analysis), breakdown_table(analysis))
+    show(latency_table(measurement), breakdown_table(analysis))
     counts = f"{analysis.statistics.disturbed} cycles disturbed by the machine"
+    if measurement.longest_stall_ns is None:
+        counts = "stalls of the machine not watched"
     if analysis.incomplete:
         reasons = ", ".join(f"{count} {reason}" for reason, count in analysis.incomplete.items())
         counts += f"; incomplete: {reasons}"
     if measurement.overruns:
-        counts += f"; {measurement.overruns} outputs were too late for their slot"
+        counts += f"; {overruns_text(measurement.overruns)}"
     show_line(f"{counts}; {lost_events(opened.info)}")
     notes(analysis.notes)

@@ -59,6 +59,10 @@ def plan(
         options.Anchor,
         typer.Option(help="What slots count from: the message's stamp, or the cycle."),
     ] = options.Anchor.STAMP,
+    overrun: Annotated[
+        options.Overrun,
+        typer.Option(help="An output that missed its slot: wait for the next, or not, or at once."),
+    ] = options.Overrun.WAIT,
     spin: Annotated[
         int, duration_option("--spin", "How long the gate watches the clock before its slot.")
     ] = "300us",  # type: ignore[assignment]
@@ -96,6 +100,7 @@ def plan(
         slot_start_ns=slot_start,
         first_slot_ns=first_slot,
         anchor=anchor.value,
+        overrun=overrun.value,
         spin_ns=spin,
         pause_ns=pause,
     )
@@ -136,9 +141,9 @@ def _print_one(
     json: bool,
 ) -> None:
     from chainshaper.cli.output import notes, print_json, show, show_line
-    from chainshaper.planning import band_choice, plan_json, plan_warnings, save_plan
+    from chainshaper.planning import band_choice, plan_json, plan_warnings, publish_slots, save_plan
     from chainshaper.reporting.predictions import choice_json, choice_table
-    from chainshaper.reporting.tables import plan_table
+    from chainshaper.reporting.tables import bands_table, plan_table
 
     choice = band_choice(planned, profile, request) if request.bands == "auto" else None
     if output is not None:
@@ -151,7 +156,8 @@ def _print_one(
         values: dict[str, Any] = {**plan_json(planned), "warnings": plan_warnings(planned)}
         print_json(values if choice is None else {**values, "choice": choice_json(choice)})
         return
-    show(plan_table(planned), *([] if choice is None else [choice_table(choice)]))
+    bands = [bands_table(planned)] if len(publish_slots(planned)) > 1 else []
+    show(plan_table(planned), *bands, *([] if choice is None else [choice_table(choice)]))
     notes(plan_warnings(planned))
     for path in (curve, output):
         if path is not None:

@@ -22,6 +22,7 @@ __all__ = [
     "MaxShareOption",
     "MeanAtMostOption",
     "Minimise",
+    "Overrun",
     "PeriodOption",
     "PlanOutput",
     "Policy",
@@ -39,6 +40,14 @@ class Anchor(str, Enum):
 
     STAMP = "stamp"
     CYCLE = "cycle"
+
+
+class Overrun(str, Enum):
+    """What becomes of an output that missed its last slot."""
+
+    WAIT = "wait"
+    DISCARD = "discard"
+    PUBLISH = "publish"
 
 
 class Policy(str, Enum):

@@ -30,6 +30,7 @@ def shape(
     The publisher's output topic is remapped, and the shaping node republishes it in its slots.
     """
     from chainshaper.cli.output import notes, progress, show_line
+    from chainshaper.overruns import overruns_in, overruns_text
     from chainshaper.planning import load_plan
     from chainshaper.steps import shape_application
     from chainshaper.workload.description import load_application
@@ -45,5 +46,8 @@ def shape(
             command=sys.argv,
             progress=report,
         )
+    overruns = overruns_in(recording, planned)
+    if overruns:
+        notes([overruns_text(overruns)])
     notes(recording.info.notes)
     show_line(str(recording.path))

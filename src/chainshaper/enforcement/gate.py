@@ -13,7 +13,12 @@ Slots repeat every cycle and are counted from an **anchor**, the instant at whic
   the messages say. The output is strictly periodic, and messages need no stamp.
 
 A message that arrives before a slot waits for its start; one that arrives inside a slot leaves
-at once; one that missed its last slot takes the first slot of a later cycle and is counted.
+at once. One that comes behind the last slot it was due in is an **overrun** (section 6): the
+chain ran longer than it was planned for. What becomes of it is a policy:
+
+* ``wait``: it takes the first slot of a later cycle, so that outputs come in slots only;
+* ``discard``: it is never published, so that nobody acts on old data;
+* ``publish``: it leaves at once, so that it does not become older still.
 
 This module is deliberately free of any import outside the standard library: it also runs
 inside a ROS 2 node, where nothing of ours may be installed.
@@ -27,10 +32,12 @@ from dataclasses import dataclass, replace
 
 __all__ = [
     "ANCHORS",
+    "OVERRUNS",
     "Gate",
     "Release",
     "Shaper",
     "clock_offset",
+    "missed",
     "origin_of",
     "release_of",
     "sleep_until",
@@ -38,6 +45,7 @@ __all__ = [
 ]
 
 ANCHORS = ("stamp", "cycle")
+OVERRUNS = ("wait", "discard", "publish")
 
 
 @dataclass(frozen=True)
@@ -49,6 +57,11 @@ class Gate:
     with the ``stamp`` anchor it is used for messages whose stamp is of no use. A stamp is of use
     when its message is at most ``max_age_ns`` old and comes at most ``max_future_ns`` from the
     future (clocks of different hosts disagree a little).
+
+    A message is due in the cycle that it belongs to, or ``due_cycles`` later (1 under logical
+    execution time); what comes behind the last slot of that cycle is treated as ``overrun``
+    says. With the ``cycle`` anchor a message belongs to the cycle that it arrives in, since
+    nothing says in which one its chain began.
     """
 
     slots: tuple[tuple[int, int], ...]
@@ -57,10 +70,16 @@ class Gate:
     phase_ns: int = 0
     max_age_ns: int | None = None  # None: ten cycles
     max_future_ns: int = 1_000_000
+    overrun: str = "wait"
+    due_cycles: int = 0
 
     def __post_init__(self) -> None:
         if self.anchor not in ANCHORS:
             raise ValueError(f"anchor {self.anchor!r}: choose one of {', '.join(ANCHORS)}")
+        if self.overrun not in OVERRUNS:
+            raise ValueError(f"overrun {self.overrun!r}: choose one of {', '.join(OVERRUNS)}")
+        if self.due_cycles < 0:
+            raise ValueError(f"due {self.due_cycles} cycles later: no message is due beforehand")
         if self.cycle_ns <= 0:
             raise ValueError(f"cycle of {self.cycle_ns} ns: it must be longer than nothing")
         if not self.slots:
@@ -79,16 +98,18 @@ class Gate:
 class Release:
     """The gate's decision for one message; times are ns of CLOCK_MONOTONIC.
 
-    ``at_ns`` is when the message may leave (not after the arrival: at once), ``slot`` which of
-    the slots that is, ``cycles_waited`` how many cycles after its own (0 is the rule; more means
-    that the chain overran its last slot), ``anchor`` what the slots were counted from.
+    ``at_ns`` is when the message may leave (not after the arrival: at once; None: never),
+    ``slot`` which of the slots that is (None: it is in none), ``cycles_waited`` how many cycles
+    after its own, ``anchor`` what the slots were counted from. ``overrun`` is None for a message
+    that came in time, and otherwise the policy that was applied to it.
     """
 
-    at_ns: int
+    at_ns: int | None
     origin_ns: int
-    slot: int
+    slot: int | None
     cycles_waited: int
     anchor: str
+    overrun: str | None = None
 
 
 def release_of(gate: Gate, arrival_ns: int, stamp_ns: int | None) -> Release:
@@ -101,6 +122,9 @@ def release_of(gate: Gate, arrival_ns: int, stamp_ns: int | None) -> Release:
         1060
         >>> release_of(gate, arrival_ns=1070, stamp_ns=1000).at_ns      # missed: the next cycle
         1160
+        >>> gate = Gate(slots=((60, 61),), cycle_ns=100, overrun="publish")
+        >>> release_of(gate, arrival_ns=1070, stamp_ns=1000).at_ns      # missed: at once
+        1070
     """
     if gate.anchor == "stamp" and stamp_ns is not None and _usable(gate, arrival_ns - stamp_ns):
         origin, anchor = stamp_ns, "stamp"
@@ -109,13 +133,25 @@ def release_of(gate: Gate, arrival_ns: int, stamp_ns: int | None) -> Release:
         origin, anchor = arrival_ns - elapsed, "cycle"
     # A stamp slightly from the future puts the arrival before its own cycle: cycle 0 still.
     cycle = max(0, (arrival_ns - origin) // gate.cycle_ns)
+    overran = arrival_ns >= origin + gate.due_cycles * gate.cycle_ns + gate.slots[-1][1]
+    if overran and gate.overrun != "wait":
+        at_once = arrival_ns if gate.overrun == "publish" else None
+        return Release(at_once, origin, None, cycle, anchor, gate.overrun)
     while True:
         cycle_start = origin + cycle * gate.cycle_ns
         for slot, (start, end) in enumerate(gate.slots):
             if arrival_ns < cycle_start + end:
                 at = max(arrival_ns, cycle_start + start)
-                return Release(at, origin, slot, cycle, anchor)
+                return Release(at, origin, slot, cycle, anchor, "wait" if overran else None)
         cycle += 1
+
+
+def missed(gate: Gate, release: Release, now_ns: int) -> bool:
+    """Whether the slot that a message was to leave in is over (ns of CLOCK_MONOTONIC)."""
+    if release.slot is None:
+        return False
+    _, end = gate.slots[release.slot]
+    return now_ns >= release.origin_ns + release.cycles_waited * gate.cycle_ns + end
 
 
 def _usable(gate: Gate, age_ns: int) -> bool:
@@ -226,15 +262,24 @@ class Shaper:
         return release
 
     def hold(self, payload: bytes) -> tuple[Release, int, int]:
-        """Wait until a message may leave: the decision, its arrival and the time then (ns)."""
+        """Wait until a message may leave: the decision, its arrival and the time then (ns).
+
+        One that is to be discarded is not waited for. Where overruns are discarded, so is a
+        message that came in time and would leave behind its slot because this thread woke late.
+        """
         arrival = time.monotonic_ns()
         release = self.decide(payload, arrival)
+        if release.at_ns is None:
+            return release, arrival, arrival
         self._waited = self._waiting.so_far()
         sleep_until(release.at_ns - self.spin_ns)
         if time.monotonic_ns() < release.at_ns:
             # Awake in time: what other threads took before is of no consequence.
             self._waited = self._waiting.so_far()
-        return release, arrival, watch_until(release.at_ns)
+        awake = watch_until(release.at_ns)
+        if self.gate.overrun == "discard" and missed(self.gate, release, awake):
+            release = replace(release, at_ns=None, slot=None, overrun="discard")
+        return release, arrival, awake
 
     def time_lost(self, release: Release, published_ns: int) -> int:
         """How much of the delay between a release and its publication the machine itself took (ns).
@@ -243,6 +288,8 @@ class Shaper:
         delay, besides the microseconds that publishing takes, nobody used: interrupts, or a core
         that was taken away from the whole system. To be called right after publishing.
         """
+        if release.at_ns is None:
+            return 0
         return max(0, published_ns - release.at_ns - (self._waiting.so_far() - self._waited))
 
 

@@ -17,6 +17,7 @@ __all__ = [
     "available_cores",
     "check_cores",
     "die_with_parent",
+    "interrupted_with_parent",
     "lock_memory",
     "may_use_fifo",
     "set_thread_name",
@@ -88,6 +89,13 @@ def die_with_parent(parent_pid: int) -> None:
     _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() != parent_pid:  # it died before the request was in force
         os.kill(os.getpid(), signal.SIGKILL)
+
+
+def interrupted_with_parent(parent_pid: int) -> None:
+    """Have the kernel send this process SIGINT when its parent dies, however that happens."""
+    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGINT, 0, 0, 0)
+    if os.getppid() != parent_pid:
+        os.kill(os.getpid(), signal.SIGINT)
 
 
 def set_thread_name(name: str) -> None:

@@ -1,28 +1,41 @@
-"""Which thread does what in a process of the application, and giving it class and core.
+"""Threads as the kernel shows them, and giving them class and cores.
 
-The paper's Thread Allocator (section 4.2): executors run the callbacks, DDS threads carry the
-messages, and the two are scheduled differently. A thread is recognised by its name, because that
-is all an unmodified process shows: executors run on the main thread (tid = pid), DDS
-implementations name their own threads.
+The paper's Thread Allocator (section 4.2) schedules executors, which run the callbacks, and DDS
+threads, which carry the messages, differently. This module looks at single threads; which node
+a thread belongs to is found in :mod:`chainshaper.enforcement.allocation`.
+
+A thread is identified by its id *and* the time at which it started: ids are used again.
 """
 
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias
 
+from chainshaper.enforcement.dds_threads import DdsKind, ThreadRole, dds_kind, role_of
 from chainshaper.errors import OperationError
 
 __all__ = [
+    "POLICIES",
+    "RESET_ON_FORK",
+    "SCHED_DEADLINE",
+    "TICK_NS",
     "Scheduling",
     "Thread",
-    "ThreadRole",
     "apply_scheduling",
+    "find_thread",
     "foreign_realtime_processes",
+    "innermost_id",
     "list_threads",
+    "parents",
+    "read_proc",
+    "start_of",
 ]
 
-ThreadRole: TypeAlias = Literal["executor", "dds", "publisher", "unknown"]
+SCHED_DEADLINE = 6
+RESET_ON_FORK = getattr(os, "SCHED_RESET_ON_FORK", 0x40000000)
+"""A flag that shares the word with the policy."""
+TICK_NS = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
+"""The kernel tells the start of a thread in ticks of 10 ms."""
 
 POLICIES = {
     os.SCHED_OTHER: "SCHED_OTHER",
@@ -30,19 +43,19 @@ POLICIES = {
     os.SCHED_RR: "SCHED_RR",
     os.SCHED_BATCH: "SCHED_BATCH",
     os.SCHED_IDLE: "SCHED_IDLE",
-    6: "SCHED_DEADLINE",
+    SCHED_DEADLINE: "SCHED_DEADLINE",
+    7: "SCHED_LITMUS" if Path("/proc/litmus").is_dir() else "SCHED_EXT",
 }
-
-# Cyclone DDS 0.10 and 11 (`xmit.user` and `dq.*` are per channel), then Fast DDS from 2.13 on.
-_DDS_NAMES = {"recv", "recvUC", "recvMC", "tev", "gc", "lease", "debmon"}
-_DDS_PREFIXES = ("dq.", "xmit.", "rcv.", "dds.ev", "dds.udp", "dds.tcp", "dds.shm")
-# Threads that publish on behalf of an executor: Fast DDS's, and the live workload's own.
-_PUBLISHER_PREFIXES = ("dds.asyn",)
 
 
 @dataclass(frozen=True)
 class Thread:
-    """A thread as the kernel shows it at one instant."""
+    """A thread as the kernel shows it at one instant.
+
+    ``started`` counts clock ticks (:data:`TICK_NS`) since the machine booted. ``inner_tid`` is
+    the id that the thread has for itself: in a container, tracers record that one. ``role`` and
+    ``kind`` are what its name and place say (:mod:`chainshaper.enforcement.dds_threads`).
+    """
 
     tid: int
     pid: int
@@ -51,52 +64,136 @@ class Thread:
     policy: str
     priority: int
     cores: tuple[int, ...]
+    started: int = 0
+    inner_tid: int = 0
+    kind: DdsKind | None = None
+
+    @property
+    def identity(self) -> tuple[int, int]:
+        """What no other thread has until the machine boots again: id and start."""
+        return (self.tid, self.started)
 
 
 @dataclass(frozen=True)
 class Scheduling:
-    """What a thread should get: SCHED_FIFO ``priority`` (None: its class is left alone), cores."""
+    """What a thread should get; what is None is left alone.
+
+    ``priority`` is that of SCHED_FIFO or, with ``takes_turns``, of SCHED_RR, under which threads
+    of one priority share their time.
+    """
 
     priority: int | None
     cores: tuple[int, ...] | None
+    takes_turns: bool = False
 
-
-def role_of(comm: str, is_main: bool) -> ThreadRole:
-    if comm.startswith(_PUBLISHER_PREFIXES):
-        return "publisher"
-    if comm in _DDS_NAMES or comm.startswith(_DDS_PREFIXES):
-        return "dds"
-    return "executor" if is_main else "unknown"
+    @property
+    def policy(self) -> int:
+        """The scheduling class that goes with ``priority``."""
+        return os.SCHED_RR if self.takes_turns else os.SCHED_FIFO
 
 
 def list_threads(pid: int) -> tuple[Thread, ...]:
     """The threads of a process, main thread first; empty when the process is gone."""
-    found = []
     try:
-        tids = sorted(int(entry.name) for entry in Path(f"/proc/{pid}/task").iterdir())
+        with os.scandir(f"/proc/{pid}/task") as entries:
+            tids = [int(entry.name) for entry in entries]
+        inner_pid = innermost_id(read_proc(f"/proc/{pid}/status").decode(errors="replace"))
     except OSError:
         return ()
-    for tid in tids:
+    tids.sort(key=lambda tid: (tid != pid, tid))
+    found = (_thread(pid, tid, inner_pid) for tid in tids)
+    return tuple(thread for thread in found if thread is not None)
+
+
+def find_thread(tid: int) -> Thread | None:
+    """The thread with this id, None when there is none."""
+    try:
+        status = read_proc(f"/proc/{tid}/status").decode(errors="replace")
+    except OSError:
+        return None
+    pid = int(next(line.split()[1] for line in status.splitlines() if line.startswith("Tgid:")))
+    return _thread(pid, tid, innermost_id(status) if pid == tid else None)
+
+
+def _thread(pid: int, tid: int, inner_pid: int | None) -> Thread | None:
+    """One thread, None if it has ended; ``inner_pid`` is its process's, None if not known.
+
+    Looked at every second, on machines with thousands of threads: a single file is read.
+    """
+    folder = f"/proc/{pid}/task/{tid}"
+    try:
+        comm, fields = _stat(folder)
+        cores = tuple(sorted(os.sched_getaffinity(tid)))
+        inner_tid = tid
+        if inner_pid != pid:  # in a pid namespace of its own
+            inner_tid = innermost_id(read_proc(f"{folder}/status").decode(errors="replace")) or tid
+    except OSError:
+        return None
+    policy = int(fields[38])
+    return Thread(
+        tid=tid,
+        pid=pid,
+        comm=comm,
+        role=role_of(comm, is_main=tid == pid),
+        policy=POLICIES.get(policy, str(policy)),
+        priority=int(fields[37]),
+        cores=cores,
+        started=int(fields[19]),
+        inner_tid=inner_tid,
+        kind=None if tid == pid else dds_kind(comm),
+    )
+
+
+def parents() -> dict[int, int]:
+    """All processes with their parents, by id."""
+    with os.scandir("/proc") as entries:
+        pids = sorted(int(entry.name) for entry in entries if entry.name.isdigit())
+    found = {}
+    for pid in pids:
         try:
-            comm = Path(f"/proc/{pid}/task/{tid}/comm").read_text().rstrip("\n")
-            # The reset-on-fork flag shares the word with the policy.
-            policy = os.sched_getscheduler(tid) & ~getattr(os, "SCHED_RESET_ON_FORK", 0)
-            priority = os.sched_getparam(tid).sched_priority
-            cores = tuple(sorted(os.sched_getaffinity(tid)))
-        except (OSError, ProcessLookupError):
-            continue  # it ended between the listing and the look
-        found.append(
-            Thread(
-                tid=tid,
-                pid=pid,
-                comm=comm,
-                role=role_of(comm, is_main=tid == pid),
-                policy=POLICIES.get(policy, str(policy)),
-                priority=priority,
-                cores=cores,
-            )
-        )
-    return tuple(found)
+            found[pid] = int(_stat(f"/proc/{pid}")[1][1])
+        except OSError:
+            continue  # it ended meanwhile
+    return found
+
+
+def read_proc(path: str) -> bytes:
+    """A whole file of /proc.
+
+    Raises:
+        OSError: what it is about has ended, or belongs to somebody else.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        content = b""
+        while part := os.read(descriptor, 1 << 16):
+            content += part
+    finally:
+        os.close(descriptor)
+    return content
+
+
+def _stat(folder: str) -> tuple[str, list[bytes]]:
+    """A task's name, and the fields of /proc/…/stat from its state on (proc(5), the third)."""
+    stat = read_proc(f"{folder}/stat")
+    name_end = stat.rindex(b")")  # a name may contain spaces and brackets
+    name = stat[stat.index(b"(") + 1 : name_end]
+    return name.decode(errors="replace"), stat[name_end + 1 :].split()
+
+
+def innermost_id(status: str) -> int | None:
+    """A task's id in its own pid namespace: the last number of `NSpid:` in /proc/…/status."""
+    line = next((line for line in status.splitlines() if line.startswith("NSpid:")), "")
+    numbers = line.split()[1:]
+    return int(numbers[-1]) if numbers else None
+
+
+def start_of(pid: int, tid: int) -> int | None:
+    """When a thread started, in clock ticks since the machine booted; None if there is none."""
+    try:
+        return int(_stat(f"/proc/{pid}/task/{tid}")[1][19])
+    except OSError:
+        return None
 
 
 def apply_scheduling(thread: Thread, wanted: Scheduling) -> None:
@@ -110,7 +207,7 @@ def apply_scheduling(thread: Thread, wanted: Scheduling) -> None:
     """
     try:
         if wanted.priority is not None:
-            os.sched_setscheduler(thread.tid, os.SCHED_FIFO, os.sched_param(wanted.priority))
+            os.sched_setscheduler(thread.tid, wanted.policy, os.sched_param(wanted.priority))
         if wanted.cores is not None:
             os.sched_setaffinity(thread.tid, wanted.cores)
     except ProcessLookupError:
@@ -128,17 +225,11 @@ def foreign_realtime_processes() -> tuple[str, ...]:
     Kernel threads (which have no executable) and our own children are not among them.
     """
     found = []
-    for entry in Path("/proc").iterdir():
-        if not entry.name.isdigit():
-            continue
-        pid = int(entry.name)
+    for pid, parent in parents().items():
         try:
-            if not (entry / "cmdline").read_bytes():
-                continue  # a kernel thread
-            parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
-        except (OSError, ValueError, IndexError):
-            continue
-        if os.getpid() in (pid, parent):
+            if os.getpid() in (pid, parent) or not read_proc(f"/proc/{pid}/cmdline"):
+                continue  # ours, or a kernel thread
+        except OSError:
             continue
         realtime = [t for t in list_threads(pid) if t.policy in ("SCHED_FIFO", "SCHED_RR")]
         if realtime:

@@ -3,12 +3,19 @@
 What the Republisher Editor does to a launch file is done here to the description of the live
 workload: the publisher's output topic is remapped to ``…_tmp``, and a node that subscribes to
 that topic and republishes on the original one is added. Subscribers notice nothing.
+
+Where the plan gates the publisher's own thread instead (section 3.2.1, Design 1), no node is
+added: the application is held against what the plan takes it for, and its output gets the
+lifespan by which DDS discards what overran.
 """
 
 from pydantic import ValidationError
 
 from chainshaper.errors import InputError
+from chainshaper.planning.overruns import cycles_until_output, output_lifespan
 from chainshaper.planning.plan import Plan, ShapingNode, publish_slots
+from chainshaper.planning.publication import Writer, check_publication
+from chainshaper.planning.publisher_threads import publisher_servers
 from chainshaper.workload.description import (
     Application,
     CallbackDescription,
@@ -17,16 +24,22 @@ from chainshaper.workload.description import (
 )
 from chainshaper.yaml_file import explanations, key_text
 
-__all__ = ["splice_application"]
+__all__ = ["splice_application", "writers_of"]
 
 
 def splice_application(application: Application, plan: Plan) -> Application:
-    """The application extended by the plan's shaping node; the given one is left as it is.
+    """The application as the plan wants it to run; the given one is left as it is.
+
+    It is extended by the plan's shaping node or, where the plan gates the publisher's thread, given
+    the lifespan that the plan's treatment of overruns needs.
 
     Raises:
-        InputError: the plan has no shaping node or does not fit the application.
+        InputError: the plan shapes nothing, or does not fit the application.
     """
     shaping = plan.shaping_node
+    if shaping is None and any(publisher_servers(plan)):
+        check_publication(plan, writers_of(application))
+        return _with_lifespan(application, plan.chain.output, output_lifespan(plan))
     if shaping is None:
         raise InputError(
             "the plan has no `shaping_node`, so there is nothing to splice: plan again with "
@@ -65,6 +78,31 @@ def splice_application(application: Application, plan: Plan) -> Application:
     return application.model_copy(update={"nodes": nodes, "topics": topics})
 
 
+def writers_of(application: Application) -> list[Writer]:
+    """Who publishes what in a described application, and how."""
+    return [
+        Writer(
+            node="/" + name.strip("/"),
+            topic=topic,
+            depth=application.topic(topic).depth,
+            asynchronous=application.topic(topic).publication == "asynchronous",
+        )
+        for name, callback in application.callbacks()
+        for topic in callback.publishes
+    ]
+
+
+def _with_lifespan(
+    application: Application, topic: str | None, lifespan_ns: int | None
+) -> Application:
+    if topic is None or lifespan_ns is None:
+        return application
+    described = application.topic(topic)
+    shortest = min(lifespan_ns, described.lifespan_ns or lifespan_ns)
+    changed = described.model_copy(update={"lifespan_ns": shortest})
+    return application.model_copy(update={"topics": {**application.topics, topic: changed}})
+
+
 def _described(plan: Plan, shaping: ShapingNode) -> NodeDescription:
     try:
         return NodeDescription(
@@ -78,6 +116,8 @@ def _described(plan: Plan, shaping: ShapingNode) -> NodeDescription:
                         slots=publish_slots(plan),
                         cycle_ns=plan.cycle_ns,
                         anchor=plan.anchor,
+                        overrun=plan.overrun,
+                        due_cycles=cycles_until_output(plan),
                         spin_ns=shaping.spin_ns,
                         pause_ns=shaping.pause_ns,
                     ),

@@ -137,12 +137,13 @@ def stamp_message(template: bytearray, stamp_ns: int) -> bytes:
     return bytes(template)
 
 
-def _qos(reliability: str, depth: int) -> Any:
+def _qos(reliability: str, depth: int, lifespan_ns: int | None = None) -> Any:
     reliable = Policy.Reliability.Reliable(max_blocking_time=100_000_000)
     return Qos(
         reliable if reliability == "reliable" else Policy.Reliability.BestEffort,
         Policy.History.KeepLast(depth),
         Policy.Durability.Volatile,
+        *([] if lifespan_ns is None else [Policy.Lifespan(lifespan_ns)]),
     )
 
 
@@ -151,11 +152,21 @@ def _topic(participant: Any, name: str) -> Any:
 
 
 class Publisher:
-    """A writer of one topic that takes serialized messages."""
+    """A writer of one topic that takes serialized messages.
 
-    def __init__(self, participant: Any, topic: str, reliability: str, depth: int) -> None:
+    Messages that a subscription has not taken ``lifespan_ns`` after they reached it are gone.
+    """
+
+    def __init__(
+        self,
+        participant: Any,
+        topic: str,
+        reliability: str,
+        depth: int,
+        lifespan_ns: int | None = None,
+    ) -> None:
         self._writer = DataWriter(
-            participant, _topic(participant, topic), qos=_qos(reliability, depth)
+            participant, _topic(participant, topic), qos=_qos(reliability, depth, lifespan_ns)
         )
         self._handle = self._writer._ref
 

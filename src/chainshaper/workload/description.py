@@ -87,11 +87,16 @@ class ExecutionTime(Part):
 
 
 class GateDescription(Part):
-    """A gate in a callback: the received message is republished inside ``slots`` only."""
+    """A gate in a callback: the received message is republished inside ``slots`` only.
+
+    The fields are those of :class:`~chainshaper.enforcement.gate.Gate`.
+    """
 
     slots: Annotated[tuple[tuple[Duration, Duration], ...], Field(min_length=1)]
     cycle_ns: PositiveDuration
     anchor: Literal["stamp", "cycle"] = "stamp"
+    overrun: Literal["wait", "discard", "publish"] = "wait"
+    due_cycles: Annotated[int, Field(ge=0)] = 0
     spin_ns: Duration = 0
     pause_ns: Duration = 0
 
@@ -149,11 +154,15 @@ class NodeDescription(Part):
 
 
 class TopicDescription(Part):
-    """How a topic is published, and its quality of service (keep-last ``depth``)."""
+    """How a topic is published, and its quality of service (keep-last ``depth``).
+
+    A message that is older than ``lifespan_ns`` is neither sent nor received any more.
+    """
 
     publication: Literal["synchronous", "asynchronous"] = "synchronous"
     reliability: Literal["reliable", "best_effort"] = "reliable"
     depth: int = Field(default=10, ge=1)
+    lifespan_ns: PositiveDuration | None = None
     payload: int = Field(default=1024, ge=0, le=16_000_000)  # bytes behind the header
 
 

@@ -1,7 +1,8 @@
 """The event log of one process of the live workload: written without disturbing the process.
 
-A trace point appends six integers to an array in locked memory; names are written once, at
-start-up. Nothing touches a file or a pipe before the run is over. The layout is read back by
+A trace point appends a few integers to an array in locked memory, in one step, so that threads
+may share the log; names are written once, at start-up. Nothing touches a file or a pipe before
+the run is over. The layout is read back by
 :mod:`chainshaper.workload.event_reading`, which turns it into the tables of
 :mod:`chainshaper.events`.
 """
@@ -11,7 +12,7 @@ from collections.abc import Callable
 from time import monotonic_ns
 from typing import Any
 
-__all__ = ["LAYOUT", "WIDTH", "EventLog"]
+__all__ = ["ABSENT", "LAYOUT", "WIDTH", "WORDS", "EventLog", "number_of"]
 
 LAYOUT: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("callback_start", ("callback", "thread_time", "is_intra_process")),
@@ -36,13 +37,30 @@ LAYOUT: tuple[tuple[str, tuple[str, ...]], ...] = (
             "slot",
             "cycles_waited",
             "anchor",
+            "overrun",
         ),
     ),
+    ("asynchronous_send", ("tid", "rmw_publisher_handle", "timestamp", "outcome", "duration")),
     ("machine_stall", ("duration",)),
 )
 """Event names and the order of their fields; an event's number is its place in this list."""
 
-WIDTH = 10  # event number, time, and up to eight fields
+WIDTH = 11  # event number, time, and up to nine fields
+
+ABSENT = -1
+"""Stands for null in fields that may be."""
+
+WORDS: dict[str, tuple[str, ...]] = {
+    "anchor": ("stamp", "cycle"),
+    "overrun": ("wait", "discard", "publish"),
+    "outcome": ("sent", "expired", "overwritten"),
+}
+"""Fields that hold words are recorded as places in these lists."""
+
+
+def number_of(field: str, word: str | None) -> int:
+    """The number under which a word of :data:`WORDS` is recorded."""
+    return ABSENT if word is None else WORDS[field].index(word)
 
 
 class EventLog:

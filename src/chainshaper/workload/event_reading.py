@@ -8,9 +8,12 @@ import numpy as np
 import polars as pl
 
 from chainshaper import events
-from chainshaper.workload.event_log import LAYOUT, WIDTH
+from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS
 
 __all__ = ["ProcessLog", "event_tables", "stall_table"]
+
+
+_MAY_BE_ABSENT = {"gate_release": ("release", "slot")}
 
 
 @dataclass(frozen=True)
@@ -49,14 +52,21 @@ def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataF
 
 
 def _typed(name: str, frame: pl.DataFrame, log: ProcessLog) -> pl.DataFrame:
-    if name == "gate_release":
-        anchor = pl.when(pl.col("anchor") == 0).then(pl.lit("stamp")).otherwise(pl.lit("cycle"))
-        frame = frame.with_columns(anchor.alias("anchor"))
+    frame = frame.with_columns(
+        pl.when(pl.col(field) != ABSENT).then(pl.col(field)).alias(field)
+        for field in _MAY_BE_ABSENT.get(name, ())
+    )
+    frame = frame.with_columns(
+        pl.col(field).replace_strict(dict(enumerate(words)), default=None, return_dtype=pl.String())
+        for field, words in WORDS.items()
+        if field in frame.columns
+    )
+    tid = pl.col("tid") if "tid" in frame.columns else pl.lit(log.pid)  # executors: the main thread
     types = {**events.FIELDS[name], **events.OPTIONAL_FIELDS.get(name, {})}
     return frame.select(
         pl.col("time").cast(pl.Int64),
         pl.lit(log.pid, dtype=pl.Int32).alias("pid"),
-        pl.lit(log.pid, dtype=pl.Int32).alias("tid"),  # executors run on the main thread
+        tid.cast(pl.Int32).alias("tid"),
         pl.lit(log.core, dtype=pl.Int32).alias("cpu"),
         *(pl.col(field).cast(type_) for field, type_ in types.items() if field in frame.columns),
     )

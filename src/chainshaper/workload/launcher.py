@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import IO, Any
 
@@ -84,17 +84,19 @@ def _signal_name(number: int) -> str:
         return f"signal {number}"
 
 
-def start_child(name: str, module: str, environment: dict[str, str]) -> Child:
-    """Start ``python -m module`` in a session of its own, with pipes to talk to it.
+def start_child(
+    name: str, module: str, environment: dict[str, str], arguments: Sequence[str] = ()
+) -> Child:
+    """Start ``python -m module ARGUMENTS`` in a session of its own, with pipes to talk to it.
 
     A session of its own keeps Ctrl-C for us: we end children in order, they do not die at random.
     """
     errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the child
     try:
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", module]
+            [sys.executable, "-P", "-m", module, *arguments]
             if sys.version_info >= (3, 11)
-            else [sys.executable, "-m", module],
+            else [sys.executable, "-m", module, *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,

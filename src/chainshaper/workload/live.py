@@ -8,9 +8,10 @@ that end with the run, so nothing on the machine is different afterwards.
 import os
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from chainshaper.durations import format_duration
 from chainshaper.enforcement.gate import clock_offset
@@ -40,12 +41,31 @@ from chainshaper.workload.event_reading import ProcessLog, event_tables, stall_t
 from chainshaper.workload.launcher import Child, end_all, first_casualty, start_child
 from chainshaper.workload.stall_watch import promote_meters, read_meters, start_meters
 
-__all__ = ["Progress", "origin_timer", "run_application"]
+__all__ = ["Enforcement", "Progress", "StartedNodes", "origin_timer", "run_application"]
 
 Progress = Callable[[float, str], None]
 """Called with the share done (0 to 1) and what is being done."""
 
+
+@dataclass(frozen=True)
+class StartedNodes:
+    """The nodes of a live run while they wait for its start.
+
+    ``pids`` has the process of each node's full name; ``anchor_ns`` (CLOCK_MONOTONIC) is the
+    first expiry of the timer that starts the chain, from which its cycles count.
+    """
+
+    pids: dict[str, int]
+    anchor_ns: int
+
+
+Enforcement: TypeAlias = Callable[[StartedNodes], AbstractContextManager[object]]
+"""Puts reservation servers in force for as long as its context lasts: see `run_application`."""
+
 WARM_UP_CYCLES = 5
+LEAD_NS = 300_000_000
+ENFORCING_NS = 2_000_000_000
+"""Servers have to be in force before the first cycle; starting their processes takes a while."""
 DISCOVERY_NS = 20_000_000_000
 ANSWER_S = 60.0
 """A process that is silent for longer, discovery included, hangs."""
@@ -60,6 +80,7 @@ def run_application(
     cycles: int = 320,
     realtime: bool | None = None,
     plan: dict[str, Any] | None = None,
+    enforcement: Enforcement | None = None,
     command: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> Recording:
@@ -67,7 +88,9 @@ def run_application(
 
     ``realtime`` None takes SCHED_FIFO where it is permitted and notes where it is not; False
     does without. ``plan`` is stored with the recording. A few cycles before the recorded ones
-    warm the caches and are left out.
+    warm the caches and are left out. ``enforcement`` is entered when all nodes stand ready and
+    their threads have their scheduling, and left when the run is over, however it ends, before
+    any node is asked to leave: a thread that is kept from running could not.
 
     Raises:
         InputError: ``output`` exists, or the chain has no timer to count cycles by.
@@ -101,11 +124,13 @@ def run_application(
         memory_locked = _await_ready([*nodes.values(), *meters.values()])
         _allocate_threads(application, nodes, realtime)
         promote_meters(meters, realtime)
-        timing = _Timing.of(application, timer, cycles)
+        lead = LEAD_NS if enforcement is None else LEAD_NS + ENFORCING_NS
+        timing = _Timing.of(application, timer, cycles, time.monotonic_ns() + lead)
         offset_before = clock_offset()
-        for child in [*nodes.values(), *meters.values()]:
-            child.tell(**timing.for_processes())
-        threads = _watch(nodes, meters, timing, progress)
+        with _enforced(enforcement, nodes, timing):
+            for child in [*nodes.values(), *meters.values()]:
+                child.tell(**timing.for_processes())
+            threads = _watch(nodes, meters, timing, progress)
         progress(1.0, "collecting events")
         logs = [_read_log(name, child, application) for name, child in nodes.items()]
         stalls, meter_info = read_meters(meters, realtime) if meters else ([], None)
@@ -164,15 +189,17 @@ class _Timing:
     """The instants of a run (ns of CLOCK_MONOTONIC)."""
 
     start_ns: int
+    anchor_ns: int
     record_from_ns: int
     last_timer_ns: int
     stop_ns: int
     meter_from_ns: int
 
     @classmethod
-    def of(cls, application: Application, timer: CallbackDescription, cycles: int) -> "_Timing":
+    def of(
+        cls, application: Application, timer: CallbackDescription, cycles: int, start: int
+    ) -> "_Timing":
         period = timer.timer_ns or 0
-        start = time.monotonic_ns() + 300_000_000
         first = start + timer.phase_ns + WARM_UP_CYCLES * period
         end = first + cycles * period
         gates = [cb.gate for _, cb in application.callbacks() if cb.gate is not None]
@@ -180,6 +207,7 @@ class _Timing:
         grid = release % stall_meter.PERIOD_NS + METER_BEHIND_NS
         return cls(
             start_ns=start,
+            anchor_ns=start + timer.phase_ns,
             # Just before the first recorded expiry: instances are not cut in two.
             record_from_ns=first - min(1_000_000, period // 10),
             last_timer_ns=end - min(1_000_000, period // 10),
@@ -198,6 +226,15 @@ class _Timing:
         }
 
 
+def _enforced(
+    enforcement: Enforcement | None, nodes: dict[str, Child], timing: _Timing
+) -> AbstractContextManager[object]:
+    if enforcement is None:
+        return nullcontext()
+    pids = {node_name(name): child.pid for name, child in nodes.items()}
+    return enforcement(StartedNodes(pids, timing.anchor_ns))
+
+
 def _start_nodes(
     application: Application, timer: CallbackDescription, nodes: dict[str, Child]
 ) -> None:
@@ -207,8 +244,14 @@ def _start_nodes(
     domain = free_domain()
     environment = {"CYCLONEDDS_URI": closed_domain_configuration()}
     for name in application.nodes:
-        nodes[name] = start_child(f"node {name}", NODE_MODULE, environment)
+        nodes[name] = start_child(f"node {name}", NODE_MODULE, environment, _ros_arguments(name))
         nodes[name].tell(**_spec(application, name, timer, domain))
+
+
+def _ros_arguments(name: str) -> tuple[str, ...]:
+    """A node's name as ROS 2 programs get it: whoever looks at its command line knows it."""
+    namespace, _, base = node_name(name).rpartition("/")
+    return ("--ros-args", "-r", f"__node:={base}", "-r", f"__ns:={namespace or '/'}")
 
 
 def _spec(

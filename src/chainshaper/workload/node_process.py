@@ -6,11 +6,11 @@ it is locked into memory.
 """
 
 import os
-import queue
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from chainshaper.enforcement.gate import Gate, Shaper, origin_of, sleep_until
@@ -21,13 +21,13 @@ from chainshaper.enforcement.realtime import (
     stop_garbage_collection,
 )
 from chainshaper.workload import dds, protocol
-from chainshaper.workload.event_log import EventLog
+from chainshaper.workload.asynchronous import AsynchronousWriter, Note, PublisherThread
+from chainshaper.workload.event_log import ABSENT, EventLog, number_of
 from chainshaper.workload.execution import ExecutionTimes, spend
 from chainshaper.workload.executor import Executor, SubscriptionEntity, Timer
 
 __all__ = ["NodeProcess", "main"]
 
-ASYNCHRONOUS_PUBLISHER = "dds.asyn.0"  # the name that Fast DDS gives to its own
 STALL_NS = 100_000
 """As the stall meter's threshold."""
 
@@ -56,7 +56,8 @@ class TracedPublisher:
     def send(self, payload: bytes) -> tuple[int, int]:
         """Publish; the time of publication (ns) and the source timestamp.
 
-        As rmw_cyclonedds does: one time stamp, given to the trace point and to DDS.
+        As the rmw layers do: one time stamp, given to the trace point and to DDS. With
+        asynchronous publication that is when the message was handed over, not when it was sent.
         """
         source_timestamp, now = time.time_ns(), time.monotonic_ns()
         self.write(payload, source_timestamp)
@@ -80,6 +81,7 @@ class NodeProcess:
         self.participant = dds.join_domain(spec["domain"])
         self.executor = Executor(self.participant, self.log)
         self.publishers: dict[str, dds.Publisher] = {}
+        self.publisher_thread: PublisherThread | None = None
         self.shapers: list[Shaper] = []
         self.first_due: list[tuple[Timer, int]] = []
         self.execution_times: list[ExecutionTimes] = []
@@ -92,6 +94,7 @@ class NodeProcess:
                 "rcl_publish",
                 "rmw_publish",
                 "gate_release",
+                "asynchronous_send",
                 "machine_stall",
             )
         }
@@ -180,7 +183,9 @@ class NodeProcess:
 
     def _publisher(self, topic: str) -> "TracedPublisher":
         qos = self.spec["topics"][topic]
-        publisher = dds.Publisher(self.participant, topic, qos["reliability"], qos["depth"])
+        publisher = dds.Publisher(
+            self.participant, topic, qos["reliability"], qos["depth"], qos["lifespan_ns"]
+        )
         self.publishers[topic] = publisher
         handle, rmw_handle = self.new_handle(), self.new_handle()
         self.log.init(
@@ -190,10 +195,11 @@ class NodeProcess:
             rmw_publisher_handle=rmw_handle,
             topic_name=topic,
             queue_depth=qos["depth"],
+            asynchronous=int(qos["publication"] == "asynchronous"),
         )
         return TracedPublisher(
             write=(
-                _hand_over_to_publisher_thread(publisher.write)
+                self._asynchronously(publisher.write, qos, rmw_handle)
                 if qos["publication"] == "asynchronous"
                 else publisher.write
             ),
@@ -202,6 +208,16 @@ class NodeProcess:
             rmw_handle=rmw_handle,
             point=self._point,
         )
+
+    def _asynchronously(
+        self, write: Callable[[bytes, int], None], qos: dict[str, Any], rmw_handle: int
+    ) -> Callable[[bytes, int], None]:
+        """Let the process's publisher thread do the writing."""
+        if self.publisher_thread is None:
+            self.publisher_thread = PublisherThread()
+        note = _noting_sends(self._point["asynchronous_send"], rmw_handle)
+        writer = AsynchronousWriter(write, qos["depth"], qos["lifespan_ns"], note)
+        return partial(self.publisher_thread.publish, writer)
 
     def _computing_body(
         self, handle: int, times: ExecutionTimes, publishers: list["TracedPublisher"]
@@ -235,12 +251,21 @@ class NodeProcess:
         pause when another message waits already: one that missed its slot leaves together with
         the next, and must not make that one late as well.
 
-        Delay that no other thread caused is recorded like the stall meter's own findings.
+        Delay that no other thread caused is recorded like the stall meter's own findings. A
+        message that overran and is to be discarded is recorded, and not published.
         """
         start, end = self._point["callback_start"], self._point["callback_end"]
         released, stalled = self._point["gate_release"], self._point["machine_stall"]
-        slots = tuple((begin, finish) for begin, finish in gate["slots"])
-        shaper = Shaper(Gate(slots, gate["cycle_ns"], gate["anchor"]), gate["spin_ns"])
+        shaper = Shaper(
+            Gate(
+                slots=tuple((begin, finish) for begin, finish in gate["slots"]),
+                cycle_ns=gate["cycle_ns"],
+                anchor=gate["anchor"],
+                overrun=gate["overrun"],
+                due_cycles=gate["due_cycles"],
+            ),
+            gate["spin_ns"],
+        )
         self.shapers.append(shaper)
         pause_ns = gate["pause_ns"]
 
@@ -248,23 +273,25 @@ class NodeProcess:
             assert message is not None  # noqa: S101 - a gate has a subscription, by validation
             start(time.monotonic_ns(), handle, time.thread_time_ns(), 0)
             release, arrival, woke_ns = shaper.hold(message.payload)
-            published, source_timestamp = publisher.send(message.payload)
-            lost = shaper.time_lost(release, published)
-            if not subscription.ready():
-                sleep_until(published + pause_ns)
-            publisher.record(message.payload, published, source_timestamp)
-            if lost >= STALL_NS:
-                stalled(release.at_ns, lost)
+            if release.at_ns is not None:
+                published, source_timestamp = publisher.send(message.payload)
+                lost = shaper.time_lost(release, published)
+                if not subscription.ready():
+                    sleep_until(published + pause_ns)
+                publisher.record(message.payload, published, source_timestamp)
+                if lost >= STALL_NS:
+                    stalled(release.at_ns, lost)
             released(
                 woke_ns,
                 handle,
                 message.source_timestamp,
                 arrival,
                 release.origin_ns,
-                release.at_ns,
-                release.slot,
+                ABSENT if release.at_ns is None else release.at_ns,
+                ABSENT if release.slot is None else release.slot,
                 release.cycles_waited,
-                int(release.anchor == "cycle"),
+                number_of("anchor", release.anchor),
+                number_of("overrun", release.overrun),
             )
             end(time.monotonic_ns(), handle, time.thread_time_ns())
 
@@ -300,23 +327,21 @@ class NodeProcess:
         for times in self.execution_times:
             times.refill(min(1 + (stop_ns - start_ns) // min(periods), 100_000))
         for shaper in self.shapers:
-            phase = start_ns + self.spec["origin_phase"]
-            shaper.gate = Gate(shaper.gate.slots, shaper.gate.cycle_ns, shaper.gate.anchor, phase)
+            shaper.gate = replace(shaper.gate, phase_ns=start_ns + self.spec["origin_phase"])
         stop_garbage_collection()
         self.executor.spin_until(stop_ns, last_timer_ns)
 
 
-def _hand_over_to_publisher_thread(write: Callable[[bytes, int], None]) -> Callable[..., None]:
-    """Asynchronous publication (paper, section 2.2): a thread of its own sends the messages."""
-    pending: queue.SimpleQueue[tuple[bytes, int]] = queue.SimpleQueue()
+def _noting_sends(record: Callable[..., None], rmw_handle: int) -> Note:
+    """What records the sends of one publisher, whichever thread they happen in."""
 
-    def send() -> None:
-        set_thread_name(ASYNCHRONOUS_PUBLISHER)
-        while True:
-            write(*pending.get())
+    def note(time_ns: int, source_timestamp: int, outcome: str, duration_ns: int) -> None:
+        tid = threading.get_native_id()
+        record(
+            time_ns, tid, rmw_handle, source_timestamp, number_of("outcome", outcome), duration_ns
+        )
 
-    threading.Thread(target=send, daemon=True).start()
-    return lambda payload, source_timestamp: pending.put((payload, source_timestamp))
+    return note
 
 
 def main() -> None:

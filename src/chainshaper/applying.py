@@ -1,0 +1,451 @@
+"""Carrying out a plan on a running application: the function behind `chainshaper apply`.
+
+    find the threads ─► priorities and cores ─► servers ─► anchor ─► arm ─► watch ─► all as before
+
+Nothing of the application is changed but where and when its threads run, and everything that is
+changed stands in a journal first (:mod:`chainshaper.enforcement.journal`): whatever ends the run,
+this function, a signal or a crash, puts it back. Servers are armed only when all nodes run, and
+released before a command of ours is told to end, since a stopped thread cannot.
+
+The shaping node is its own server: it holds messages back by itself, so its thread gets a
+priority and a core, and no slots from a back end.
+"""
+
+import contextlib
+import os
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from chainshaper.durations import format_duration
+from chainshaper.enforcement.allocation import Allocation, new_and_ended
+from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, make_back_end
+from chainshaper.enforcement.journal import Journal, discard_journal, open_journal
+from chainshaper.enforcement.phase import DriftWatch, measure_phase
+from chainshaper.enforcement.realtime import (
+    available_cores,
+    check_cores,
+    interrupted_with_parent,
+)
+from chainshaper.enforcement.release_after import start_watching
+from chainshaper.enforcement.resctl import litmus_commands
+from chainshaper.enforcement.runs import RunState, ServerState, save_run_state
+from chainshaper.enforcement.scheduling_memory import (
+    change_scheduling,
+    restore_scheduling,
+)
+from chainshaper.enforcement.server_threads import WantedScheduling, plan_scheduling, server_members
+from chainshaper.enforcement.servers import (
+    BackEnd,
+    ReservationServer,
+    ServerCounters,
+    ServerTable,
+)
+from chainshaper.enforcement.threads import Thread
+from chainshaper.errors import OperationError
+from chainshaper.planning import Plan
+from chainshaper.planning.plan_parts import ShapingNode
+from chainshaper.planning.publication import publication_warnings
+from chainshaper.recording import Recording
+from chainshaper.thread_search import find_threads
+
+__all__ = ["LEAD_NS", "Applied", "Changes", "apply_plan", "planned_changes", "server_table"]
+
+LEAD_NS = 2_000_000
+"""The cycle starts so long after the chain's timer expires (DESIGN section 6)."""
+
+START_NS = 30_000_000_000
+"""A command has this long to start all nodes of the plan."""
+
+_LOOK_S = 1.0
+_END_PATIENCE_S = 10.0
+_NOTHING = ServerCounters(None, None, None, None)
+
+
+@dataclass(frozen=True)
+class Applied:
+    """How a run ended: its last state, and the exit code of the command (None: there was none)."""
+
+    state: RunState
+    exit_code: int | None
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What a plan would change: threads, or the commands of LITMUS^RT's tools."""
+
+    back_end: str
+    reason: str
+    threads: tuple[WantedScheduling, ...]
+    commands: tuple[tuple[str, ...], ...]
+    notes: tuple[str, ...]
+
+
+@dataclass
+class _Run:
+    """What there is to keep together, and to put back, while a plan is in force."""
+
+    plan: Plan
+    choice: Choice
+    journal: Journal
+    recording: Recording | None
+    stop: threading.Event
+    command: subprocess.Popen[bytes] | None = None
+    servers: BackEnd | None = None
+
+    @property
+    def folder(self) -> Path:
+        return self.journal.path.parent
+
+    @property
+    def command_ended(self) -> bool:
+        return self.command is not None and self.command.poll() is not None
+
+
+def apply_plan(
+    plan: Plan,
+    command: Sequence[str] = (),
+    *,
+    back_end: str = "auto",
+    recording: Recording | None = None,
+    phase_ns: int | None = None,
+    wait_ns: int | None = None,
+    plan_path: str = "",
+    folder: Path | None = None,
+    stop: threading.Event | None = None,
+    watch: Callable[[RunState], None] = lambda _: None,
+    progress: Callable[[float, str], None] = lambda *_: None,
+) -> Applied:
+    """Put a plan in force until ``stop`` is set, the command ends, or the servers fail.
+
+    ``command`` is started first; without one, the application runs already. Its nodes have
+    ``wait_ns`` to appear (default: 30 s with a command, else none). ``phase_ns`` is where in a
+    cycle the chain's first timer expires, on CLOCK_MONOTONIC; it is measured where it is not
+    given. ``recording`` is one of the very processes, if there is one. ``watch`` gets the state
+    every second; ``folder`` is where runs keep what they need (default: `/run/chainshaper`).
+
+    Raises:
+        InputError: the plan names no threads, or its table is not one.
+        PlatformError: the machine lacks a core or the back end.
+        OperationError: a node does not appear or is ambiguous, the chain has no regular
+            beginning, the kernel refuses something, or the servers failed while in force.
+    """
+    table = server_table(plan)
+    check_cores({server.core: f"server {server.name}" for server in plan.servers})
+    choice = choose_back_end(back_end)
+    journal = open_journal(folder)
+    run = _Run(plan, choice, journal, recording, stop or threading.Event())
+    watcher = start_watching(run.folder)
+    try:
+        if command:
+            run.command = _start(command)
+        if wait_ns is None:
+            wait_ns = START_NS if command else 0
+        found = _await_nodes(run, wait_ns, progress)
+        _schedule(run, found)
+        run.servers = make_back_end(choice.name, table, run.folder, journal)
+        state = _initial_state(run, table, command, plan_path)
+        state = _arm(run, run.servers, found, state, phase_ns, progress)
+        state = _keep(run, run.servers, found, state, watch)
+    finally:
+        _put_back(run)
+        watcher.kill()  # the journal is gone, so it has nothing to do
+        watcher.wait()
+    if state.failure is not None:
+        raise OperationError(f"the servers failed: {state.failure}; everything is as it was before")
+    return Applied(state, run.command.returncode if run.command else None)
+
+
+def planned_changes(
+    plan: Plan,
+    back_end: str = "auto",
+    *,
+    recording: Recording | None = None,
+    phase_ns: int | None = None,
+) -> Changes:
+    """What :func:`apply_plan` would do; nothing is changed.
+
+    LITMUS^RT's commands are given on any kernel, with ``TID:NODE`` for threads that do not run.
+
+    Raises: as :func:`apply_plan`.
+    """
+    table = server_table(plan)
+    found = find_threads(plan, recording)
+    if back_end != "litmus":
+        choice = choose_back_end(back_end)
+        threads = plan_scheduling(plan, found, available_cores())
+        return Changes(choice.name, choice.reason, threads, (), found.notes)
+    notes = found.notes
+    try:
+        members: dict[str, list[int | str]] = {
+            name: [member.thread.tid for member in group]
+            for name, group in server_members(plan, found).items()
+        }
+        if phase_ns is None:
+            origin = _origin(plan, found)
+            phase_ns = measure_phase(origin.pid, origin.tid, plan.cycle_ns).at_ns
+    except OperationError:
+        members = {s.name: [f"TID:{t.node}" for t in s.threads] for s in plan.servers}
+        notes += ("slots are counted from a beginning that is measured when the chain runs",)
+    anchor = 0 if phase_ns is None else phase_ns + LEAD_NS
+    commands = litmus_commands(table, members, anchor)
+    return Changes("litmus", "asked for", (), commands, notes)
+
+
+def server_table(plan: Plan) -> ServerTable:
+    """The servers of a plan whose threads a back end has to keep inside their slots.
+
+    Raises:
+        OperationError: there are none.
+    """
+    gated_by_themselves = {node.thread for node in _shaping_nodes(plan)}
+    servers = tuple(
+        ReservationServer(server.name, server.core, server.priority, server.slots)
+        for server in plan.servers
+        if any(thread not in gated_by_themselves for thread in server.threads)
+    )
+    if not servers:
+        raise OperationError(
+            "the plan's servers name no threads of the application, so there is nothing to apply: "
+            "plan from a recording (`chainshaper plan REC --chain FIRST..LAST`)"
+        )
+    return ServerTable(plan.cycle_ns, servers)
+
+
+def _shaping_nodes(plan: Plan) -> list[ShapingNode]:
+    first = [] if plan.shaping_node is None else [plan.shaping_node]
+    return [*first, *plan.further_shaping_nodes]
+
+
+def _start(command: Sequence[str]) -> subprocess.Popen[bytes]:
+    """Start the user's command; Ctrl-C reaches us, and the command when we are done with it.
+
+    Should we be killed, it gets a SIGINT as from its terminal.
+    """
+    try:
+        return subprocess.Popen(
+            command,
+            start_new_session=True,
+            preexec_fn=partial(interrupted_with_parent, os.getpid()),  # noqa: PLW1509 - one call
+        )
+    except OSError as error:
+        raise OperationError(f"{command[0]} cannot be started: {error.strerror}") from error
+
+
+def _await_nodes(run: _Run, wait_ns: int, progress: Callable[[float, str], None]) -> Allocation:
+    """Look until all nodes of the plan run, and their threads have stopped becoming more."""
+    begun, found = time.monotonic_ns(), find_threads(run.plan, run.recording)
+    while True:
+        waited, complete = time.monotonic_ns() - begun, True
+        try:
+            server_members(run.plan, found)
+        except OperationError:
+            complete = False
+            if run.command_ended and run.command is not None:
+                raise OperationError(
+                    f"the command ended with code {run.command.returncode} before all nodes of "
+                    "the plan were running"
+                ) from None
+            if run.stop.is_set() or waited >= wait_ns:
+                raise
+        progress(min(1.0, waited / max(1, wait_ns)), "finding the nodes")
+        if wait_ns:
+            run.stop.wait(_LOOK_S)
+        now = find_threads(run.plan, run.recording)
+        if complete and not any(new_and_ended(found, now)):
+            return now
+        found = now
+
+
+def _schedule(run: _Run, found: Allocation) -> None:
+    """Give threads their priorities and cores, as far as the back end leaves that to us."""
+    for one in plan_scheduling(run.plan, found, available_cores()):
+        wanted = one.wanted
+        if one.server is not None and run.choice.name == "fifo":
+            continue  # that is all it does
+        if one.server is not None and run.choice.name in ("scx", "litmus"):
+            # Their servers are scheduling classes of their own.
+            wanted = replace(wanted, priority=None, takes_turns=False)
+        change_scheduling(run.journal, one.thread.thread, wanted)
+
+
+def _initial_state(
+    run: _Run, table: ServerTable, command: Sequence[str], plan_path: str
+) -> RunState:
+    gated = {server.name for server in table.servers}
+    keeper = run.choice.name if gates(run.choice.name) else "nobody: priority only"
+    return RunState(
+        run=run.folder.name,
+        owner=os.getpid(),
+        plan=plan_path,
+        command=tuple(command),
+        back_end=run.choice.name,
+        reason=run.choice.reason,
+        started_ns=time.monotonic_ns(),
+        cycle_ns=run.plan.cycle_ns,
+        anchor_ns=None,
+        phase_spread_ns=None,
+        drift_ns=None,
+        servers=tuple(
+            ServerState(
+                server.name,
+                server.core,
+                server.priority,
+                server.slots,
+                (),
+                keeper if server.name in gated else "gate",
+                _NOTHING,
+            )
+            for server in run.plan.servers
+        ),
+        notes=tuple(publication_warnings(run.plan)),
+        failure=None,
+    )
+
+
+def _origin(plan: Plan, found: Allocation) -> Thread:
+    """The thread that begins the chain: the first executor of the server whose slot comes first."""
+    members = server_members(plan, found)
+    for server in sorted(plan.servers, key=lambda one: (one.slots[0][0], one.priority)):
+        for member in members[server.name]:
+            if member.thread.role == "executor":
+                return member.thread
+    raise OperationError(
+        "no server of the plan holds an executor, so nothing says where in a cycle the chain "
+        "begins: give its phase (--phase)"
+    )
+
+
+def _arm(  # noqa: PLR0917 - the parts of a run, each used once
+    run: _Run,
+    servers: BackEnd,
+    found: Allocation,
+    state: RunState,
+    phase_ns: int | None,
+    progress: Callable[[float, str], None],
+) -> RunState:
+    """Measure where the chain begins, put its threads into the servers, and close these."""
+    notes, spread = state.notes, None
+    if phase_ns is None:
+        origin = _origin(run.plan, found)
+        phase = measure_phase(
+            origin.pid,
+            origin.tid,
+            run.plan.cycle_ns,
+            progress=lambda share: progress(share, "measuring where in a cycle the chain begins"),
+        )
+        phase_ns, spread = phase.at_ns, phase.spread_ns
+        if spread > LEAD_NS:
+            notes += (
+                f"the chain's beginning varies by {format_duration(spread)} from cycle to cycle: "
+                "it is started by something less regular than a timer",
+            )
+    anchor = (phase_ns + LEAD_NS) % run.plan.cycle_ns
+    threads = _assign(run.plan, found, servers, {server.name: () for server in run.plan.servers})
+    servers.arm(anchor)
+    return replace(
+        _with_threads(state, threads), anchor_ns=anchor, phase_spread_ns=spread, notes=notes
+    )
+
+
+def _assign(
+    plan: Plan, found: Allocation, servers: BackEnd, already: dict[str, tuple[int, ...]]
+) -> dict[str, tuple[int, ...]]:
+    """Put the threads that are not in their servers yet there; the threads of each server."""
+    themselves = {node.thread.node for node in _shaping_nodes(plan)}
+    threads = {}
+    for name, members in server_members(plan, found).items():
+        for member in members:
+            tid = member.thread.tid
+            if tid not in already[name] and themselves.isdisjoint(member.nodes):
+                servers.assign(tid, name)
+        threads[name] = tuple(member.thread.tid for member in members)
+    return threads
+
+
+def _with_threads(state: RunState, threads: dict[str, tuple[int, ...]]) -> RunState:
+    return replace(
+        state, servers=tuple(replace(one, threads=threads[one.name]) for one in state.servers)
+    )
+
+
+def _keep(
+    run: _Run,
+    servers: BackEnd,
+    found: Allocation,
+    state: RunState,
+    watch: Callable[[RunState], None],
+) -> RunState:
+    """Watch over the run until it is to end; the state as it was last."""
+    begins = (state.anchor_ns or 0) - (0 if gates(run.choice.name) else LEAD_NS)
+    origin = _origin(run.plan, found)
+    drift = DriftWatch(origin.pid, origin.tid, run.plan.cycle_ns, begins)
+    while True:
+        counters = servers.counters()
+        state = replace(
+            state,
+            servers=tuple(
+                replace(one, counters=counters.get(one.name, _NOTHING)) for one in state.servers
+            ),
+            drift_ns=drift.latest_ns,
+            failure=servers.failure(),
+        )
+        save_run_state(run.folder, state)
+        watch(state)
+        if state.failure is not None or run.command_ended or run.stop.wait(_LOOK_S):
+            return state
+        now = find_threads(run.plan, run.recording)
+        new, _ = new_and_ended(found, now)
+        if new:
+            state, found = _taken_in(run, servers, now, state), now
+
+
+def _taken_in(run: _Run, servers: BackEnd, found: Allocation, state: RunState) -> RunState:
+    """Threads that appeared later get what the plan says; a node on its way up is left for now."""
+    already = {one.name: one.threads for one in state.servers}
+    with contextlib.suppress(OperationError):
+        _schedule(run, found)
+        return _with_threads(state, _assign(run.plan, found, servers, already))
+    return state
+
+
+def _put_back(run: _Run) -> None:
+    """Everything as it was: first let all threads go, then end our command, then the rest."""
+    problems: list[str] = []
+    if run.servers is not None:
+        try:
+            run.servers.release()
+        except OperationError as error:
+            problems.append(str(error))
+    if run.command is not None:
+        _end(run.command)
+    problems += [
+        f"{one.tid} ({one.comm}): {one.reason}"
+        for one in restore_scheduling(run.journal)
+        if one.fate == "failed"
+    ]
+    if problems:
+        raise OperationError(
+            f"not everything could be put back: {'; '.join(problems)}; {run.journal.path} says "
+            "what was there, `chainshaper release` tries again"
+        )
+    for path in run.folder.iterdir():
+        if path != run.journal.path and path.is_file():
+            path.unlink()
+    discard_journal(run.journal)
+
+
+def _end(started: subprocess.Popen[bytes]) -> None:
+    """End the command and what it started as a terminal would: SIGINT, and harder if need be."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+        if started.poll() is not None:
+            return
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(started.pid, number)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            started.wait(_END_PATIENCE_S)

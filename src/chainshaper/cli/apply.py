@@ -1,0 +1,197 @@
+"""`chainshaper apply`: put a plan in force on a running application."""
+
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from chainshaper.cli.options import JsonOption, duration_option
+
+if TYPE_CHECKING:
+    from chainshaper.enforcement.runs import RunState
+    from chainshaper.planning import Plan
+    from chainshaper.recording import Recording
+
+__all__ = ["apply"]
+
+LINE_EVERY = 10
+
+
+def apply(
+    plan: Annotated[
+        Path, typer.Argument(metavar="plan.yaml", help="The plan.", show_default=False)
+    ],
+    command: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[-- COMMAND…]",
+            help="Start this, such as `ros2 launch …`, and end when it ends. Default: attach to "
+            "what runs.",
+            show_default=False,
+        ),
+    ] = None,
+    backend: Annotated[
+        str,
+        typer.Option(
+            "--backend",
+            metavar="NAME",
+            help="auto (the strongest that works here), scx, litmus, freezer or fifo.",
+        ),
+    ] = "auto",
+    phase: Annotated[
+        int | None,
+        duration_option(
+            "--phase",
+            "Where in a cycle the chain's timer expires, on CLOCK_MONOTONIC. Default: measured.",
+        ),
+    ] = None,
+    recording: Annotated[
+        Path | None,
+        typer.Option(
+            "--recording",
+            metavar="REC",
+            help="A recording of these very processes: it tells executors for sure.",
+            show_default=False,
+        ),
+    ] = None,
+    wait: Annotated[
+        int | None,
+        duration_option(
+            "--wait",
+            "How long the plan's nodes have to appear. Default: 30s with a COMMAND, else no time.",
+        ),
+    ] = None,
+    dry_run: Annotated[
+        bool,
+        typer.Option(
+            "--dry-run", help="Show what would be done to which thread, and change nothing."
+        ),
+    ] = False,
+    json: JsonOption = False,
+) -> None:
+    """Keep the threads of an application inside a plan's slots, until Ctrl-C.
+
+    Whatever ends it, everything is as it was before.
+    """
+    from dataclasses import asdict
+
+    from chainshaper.applying import apply_plan
+    from chainshaper.cli.output import notes, print_json, show
+    from chainshaper.errors import OperationError
+    from chainshaper.planning import load_plan
+    from chainshaper.reporting.servers import servers_table
+    from chainshaper.sources import open_source
+
+    planned = load_plan(plan)
+    recorded = None if recording is None else open_source(recording)
+    if dry_run:
+        _show_changes(planned, backend, recorded, phase, json=json)
+        return
+    stop = threading.Event()
+    with _signals_set(stop), _watching() as (watch, report):
+        done = apply_plan(
+            planned,
+            command or (),
+            back_end=backend,
+            recording=recorded,
+            phase_ns=phase,
+            wait_ns=wait,
+            plan_path=str(plan),
+            stop=stop,
+            watch=watch,
+            progress=report,
+        )
+    if json:
+        print_json(asdict(done.state) | {"exit_code": done.exit_code})
+    else:
+        show(servers_table(done.state))
+    notes(done.state.notes)
+    if done.exit_code and not stop.is_set():
+        raise OperationError(f"the command ended with code {done.exit_code}")
+
+
+def _show_changes(
+    plan: "Plan", backend: str, recording: "Recording | None", phase_ns: int | None, *, json: bool
+) -> None:
+    import shlex
+    from dataclasses import asdict
+
+    from chainshaper.applying import planned_changes
+    from chainshaper.cli.output import notes, print_json, show, show_line
+    from chainshaper.reporting.servers import changes_table
+
+    changes = planned_changes(plan, backend, recording=recording, phase_ns=phase_ns)
+    if json:
+        print_json(asdict(changes))
+        return
+    if changes.commands:
+        for command in changes.commands:
+            show_line(shlex.join(command))
+    else:
+        show(changes_table(changes.threads))
+    notes((f"back end {changes.back_end}: {changes.reason}", *changes.notes))
+
+
+@contextmanager
+def _signals_set(stop: threading.Event) -> Iterator[None]:
+    """Ctrl-C, a closed terminal and `kill` end the run in order."""
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    before = {
+        number: signal.signal(number, end)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _watching() -> "Iterator[tuple[Callable[[RunState], None], Callable[[float, str], None]]]":
+    """What shows the state of a run, and progress before: a live table, or a line now and then."""
+    from chainshaper.cli.output import progress
+    from chainshaper.reporting.servers import run_line, servers_table
+
+    with ExitStack() as shown:
+        report = shown.enter_context(progress("applying"))
+        if not sys.stderr.isatty():
+            yield _lines(run_line), report
+            return
+        from rich.console import Console
+        from rich.live import Live
+
+        live: Live | None = None
+
+        def watch(state: "RunState") -> None:
+            nonlocal live
+            if live is None:
+                shown.pop_all().close()  # the bar makes room for the table
+                live = Live(console=Console(stderr=True), transient=True, auto_refresh=False)
+                shown.enter_context(live)
+            live.update(servers_table(state), refresh=True)
+
+        yield watch, report
+
+
+def _lines(text: "Callable[[RunState], str]") -> "Callable[[RunState], None]":
+    seen = 0
+
+    def watch(state: "RunState") -> None:
+        nonlocal seen
+        if seen == 0:
+            sys.stderr.write(f"in force with {state.back_end}: {state.reason}; Ctrl-C ends it\n")
+        elif seen % LINE_EVERY == 0:
+            sys.stderr.write(text(state) + "\n")
+        seen += 1
+
+    return watch

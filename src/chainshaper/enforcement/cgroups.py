@@ -1,0 +1,207 @@
+"""Control groups of version 2, as far as stopping single threads needs them.
+
+Writing ``1`` to a group's ``cgroup.freeze`` stops every thread in it on its way back to user
+space, and ``0`` lets them go on: no signal is delivered, and futexes, condition variables, sleeps
+and polls do not notice. A group holds whole processes by default. A **threaded** group may hold
+some threads of a process while the others stay where they are, on one condition: all groups that
+share a process lie in one *threaded domain* (kernel: Documentation/admin-guide/cgroup-v2.rst,
+"Threads"). So a thread's new group is made directly beneath the group in which the thread is
+now, which has two more merits: the thread keeps every limit that its group puts on it, and the
+way back is always the same, up to the parent. Until the child is removed the parent's type reads
+``domain threaded``; the kernel itself makes it ``domain`` again.
+"""
+
+import contextlib
+import errno
+import os
+import time
+from pathlib import Path
+
+from chainshaper.errors import OperationError, PlatformError
+
+__all__ = [
+    "cgroup_of",
+    "dissolve",
+    "has_ended",
+    "make_threaded_child",
+    "mount_point",
+    "move_thread",
+    "started_at",
+    "threads_in",
+]
+
+MOUNTS = Path("/proc/mounts")
+_THREADED_CONTROLLERS = {"cpu", "cpuset", "perf_event", "pids"}
+_REMEDY = (
+    "run as root, or start the application in a group that is yours "
+    "(`systemd-run --user --scope`, or a unit with Delegate=yes)"
+)
+
+
+def mount_point() -> Path:
+    """Where the version 2 hierarchy is mounted.
+
+    Raises:
+        PlatformError: it is not.
+    """
+    # Beside version 1 hierarchies it usually stands at /sys/fs/cgroup/unified.
+    for line in MOUNTS.read_text().splitlines():
+        _, folder, kind, *_ = line.split()
+        if kind == "cgroup2":
+            return Path(folder.encode().decode("unicode_escape"))
+    raise PlatformError(
+        "no cgroup v2 hierarchy is mounted here, so threads cannot be frozen: "
+        "`mount -t cgroup2 none /sys/fs/cgroup/unified`, or boot with "
+        "systemd.unified_cgroup_hierarchy=1"
+    )
+
+
+def cgroup_of(tid: int) -> Path:
+    """The folder of the group in which a thread is.
+
+    Raises:
+        OperationError: there is no such thread.
+        PlatformError: its group cannot be seen from here.
+    """
+    try:
+        lines = Path(f"/proc/{tid}/cgroup").read_text().splitlines()
+    except OSError:
+        raise OperationError(f"there is no thread {tid}: it has ended, or never was") from None
+    path = next((line[len("0::") :] for line in lines if line.startswith("0::")), "")
+    root = mount_point()
+    folder = root / path.lstrip("/")
+    # A thread outside our cgroup namespace shows as "/../…", or as a path that is not here.
+    if not path or ".." in folder.parts or not folder.is_dir():
+        raise PlatformError(
+            f"thread {tid} is in the cgroup {path or '(none)'}, which is not to be seen under "
+            f"{root}: run on the host, or in the thread's own container"
+        )
+    return folder
+
+
+def make_threaded_child(parent: Path, name: str) -> Path:
+    """Make an empty threaded group directly beneath the group of the threads it is for.
+
+    Raises:
+        OperationError: the name is taken.
+        PlatformError: the machine or the privileges do not allow it; nothing is left behind.
+    """
+    folder = parent / name
+    try:
+        folder.mkdir()
+    except FileExistsError:
+        raise OperationError(
+            f"the cgroup {folder} exists already, left by a run that ended badly: "
+            "`chainshaper release` removes it"
+        ) from None
+    except OSError as error:
+        reason = os.strerror(error.errno or 0)
+        raise PlatformError(f"no cgroup can be made in {parent} ({reason}): {_REMEDY}") from error
+    try:
+        (folder / "cgroup.type").write_text("threaded")
+    except OSError as error:
+        folder.rmdir()
+        raise PlatformError(_why_not_threaded(parent, error)) from error
+    return folder
+
+
+def _why_not_threaded(parent: Path, error: OSError) -> str:
+    """What stands in the way of threaded groups: the kernel only says EOPNOTSUPP."""
+    told = f"threads of the cgroup {parent} cannot be frozen one by one"
+    controllers = set(_read(parent / "cgroup.subtree_control").split()) - _THREADED_CONTROLLERS
+    if controllers:
+        names = ", ".join(sorted(controllers))
+        return (
+            f"{told}: it hands the controllers {names} down to its children, which rules threaded "
+            f"groups out; run the application in a group that does not (its own scope or unit)"
+        )
+    for child in sorted(parent.iterdir()):
+        kind = _read(child / "cgroup.type").strip()
+        if kind == "domain" and "populated 1" in _read(child / "cgroup.events"):
+            return (
+                f"{told}: its child {child.name} holds processes of its own; run the application "
+                f"in a group without others beneath it (its own scope or unit)"
+            )
+    return f"{told} ({os.strerror(error.errno or 0)}): {_REMEDY}"
+
+
+def move_thread(tid: int, folder: Path) -> bool:
+    """Put one thread into a group; False when the thread has ended.
+
+    Raises:
+        PlatformError: the group is of another process, or the privilege is missing.
+        OperationError: the group is gone, or the kernel refuses for a reason of its own.
+    """
+    try:
+        (folder / "cgroup.threads").write_text(str(tid))
+    except OSError as error:
+        if error.errno == errno.ESRCH:
+            return False
+        reason = os.strerror(error.errno or 0)
+        if error.errno in {errno.EACCES, errno.EPERM, errno.EROFS}:
+            raise PlatformError(
+                f"thread {tid} cannot be moved to {folder} ({reason}): {_REMEDY}"
+            ) from error
+        raise OperationError(
+            f"thread {tid} cannot be moved to the cgroup {folder} ({reason}): is it a thread of "
+            "the kernel, or has its process been moved to another group meanwhile?"
+        ) from error
+    return True
+
+
+def threads_in(folder: Path) -> tuple[int, ...]:
+    """The living threads of a group; none when the group is gone."""
+    return tuple(int(tid) for tid in _read(folder / "cgroup.threads").split())
+
+
+def dissolve(folder: Path, within_s: float = 1.0) -> str | None:
+    """Thaw a group, put its threads back into the parent, remove it; harmless when repeated.
+
+    Returns None, or what is left in a sentence: this is called where nothing must be raised,
+    since the next group waits for its turn.
+    """
+    with contextlib.suppress(OSError):
+        (folder / "cgroup.freeze").write_text("0")
+    deadline = time.monotonic() + within_s
+    reason = ""
+    while folder.is_dir():
+        # Children may be born while their parents are being moved, and a process that is being
+        # killed holds its group for a moment longer: once is not always enough.
+        for tid in threads_in(folder):
+            try:
+                # Moving to a group that is not frozen thaws, whatever became of cgroup.freeze.
+                move_thread(tid, folder.parent)
+            except (OperationError, PlatformError) as error:
+                reason = str(error)
+        try:
+            folder.rmdir()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            reason = reason or os.strerror(error.errno or 0)
+            if time.monotonic() > deadline:
+                return f"the cgroup {folder} is left behind: {reason}"
+            time.sleep(0.001)
+    return None
+
+
+def started_at(tid: int) -> int | None:
+    """When a thread was born, in clock ticks after boot; None when it has ended.
+
+    Thread ids are used again: two looks at a thread are at the same thread if this is the same.
+    """
+    stat = _read(Path(f"/proc/{tid}/stat"))
+    return int(stat.rpartition(")")[2].split()[19]) if stat else None
+
+
+def has_ended(tid: int, born: int) -> bool:
+    """Whether the thread that was born then is gone, or a zombie that nobody has waited for."""
+    stat = _read(Path(f"/proc/{tid}/stat")).rpartition(")")[2].split()
+    return not stat or int(stat[19]) != born or stat[0] in {"Z", "X"}
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text()
+    except OSError:  # gone, or a file that this kind of group does not have
+        return ""

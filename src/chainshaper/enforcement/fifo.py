@@ -1,0 +1,125 @@
+"""The back end `fifo`: servers as SCHED_FIFO priorities, on any kernel, without slots.
+
+Each server's threads get its core and a real-time priority in the order of the servers
+(:mod:`.server_threads`). That isolates a chain from what is less important; it does not hold back
+anything, so a shaping node's gate has to. Several threads of one server take turns under SCHED_RR.
+
+Who carries out a whole plan has given its threads their priorities already
+(:func:`.server_threads.plan_scheduling`), in an order that also knows what no table says, such as
+a shaping node. Threads that stand in the journal by then are left as they are.
+"""
+
+from collections.abc import Mapping
+
+from chainshaper.enforcement.allocation import NodeThread
+from chainshaper.enforcement.journal import Journal, discard_journal, open_journal
+from chainshaper.enforcement.scheduling_memory import (
+    change_scheduling,
+    is_remembered,
+    restore_scheduling,
+)
+from chainshaper.enforcement.server_threads import (
+    below_their_siblings,
+    server_priorities,
+    wanted_of_members,
+)
+from chainshaper.enforcement.servers import ServerCounters, ServerTable
+from chainshaper.enforcement.threads import find_thread
+from chainshaper.errors import InputError, OperationError
+
+__all__ = ["Fifo", "create"]
+
+
+def create(table: ServerTable, journal: Journal | None = None) -> "Fifo":
+    """Prepare servers; nothing is changed before :meth:`Fifo.arm`.
+
+    What was there is kept in ``journal``; without one, in a journal of its own that is discarded
+    with the release.
+
+    Raises:
+        InputError: the table has more priorities than there are.
+    """
+    server_priorities(_priorities(table).values())
+    return Fifo(table, journal)
+
+
+class Fifo:
+    """A table of servers in force as priorities; see :class:`.servers.BackEnd`."""
+
+    name = "fifo"
+
+    def __init__(self, table: ServerTable, journal: Journal | None) -> None:
+        self._table = table
+        self._journal = journal
+        self._owns_journal = journal is None
+        self._members: dict[str, list[NodeThread]] = {s.name: [] for s in table.servers}
+        self._armed = False
+
+    def assign(self, tid: int, server: str) -> None:
+        """Put a thread into a server; one that has ended is passed over.
+
+        Raises:
+            InputError: no such server.
+            OperationError: the kernel refuses.
+        """
+        if server not in self._members:
+            raise InputError(f"no server {server!r}: choose of {', '.join(self._members)}")
+        thread = find_thread(tid)
+        if thread is None or (self._journal is not None and is_remembered(self._journal, thread)):
+            return
+        self._members[server].append(NodeThread(thread, (), "", ""))
+        if self._armed:
+            self._schedule()
+
+    def arm(self, anchor_ns: int) -> None:  # noqa: ARG002 - priorities know no cycle
+        """Give all threads the priority and core of their servers.
+
+        Raises:
+            OperationError: the kernel refuses; what was given before stays until the release.
+        """
+        self._armed = True
+        self._schedule()
+
+    def counters(self) -> dict[str, ServerCounters]:
+        """Nothing is counted: there are no slots."""
+        nothing = ServerCounters(None, None, None, None)
+        return {server.name: nothing for server in self._table.servers}
+
+    def failure(self) -> str | None:
+        """None: there is nothing that could stop."""
+        return None
+
+    def release(self) -> None:
+        """Every thread as it was before.
+
+        Raises:
+            OperationError: the kernel refuses for some; the others are as before.
+        """
+        self._armed = False
+        if self._journal is None:
+            return
+        outcomes = restore_scheduling(self._journal)
+        failed = [
+            f"{one.tid} ({one.comm}): {one.reason}" for one in outcomes if one.fate == "failed"
+        ]
+        if failed:
+            raise OperationError(
+                f"threads that could not be put back: {'; '.join(failed)}; {self._journal.path} "
+                "says what they had"
+            )
+        if self._owns_journal:
+            discard_journal(self._journal)
+            self._journal = None
+
+    def _schedule(self) -> None:
+        if self._journal is None:
+            self._journal = open_journal()
+        cores = {server.name: server.core for server in self._table.servers}
+        for one in below_their_siblings(
+            wanted_of_members(self._members, cores, _priorities(self._table))
+        ):
+            change_scheduling(self._journal, one.thread.thread, one.wanted)
+
+
+def _priorities(table: ServerTable) -> Mapping[str, int]:
+    return {server.name: server.priority for server in table.servers}

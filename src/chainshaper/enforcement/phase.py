@@ -1,0 +1,185 @@
+"""When in a cycle does a chain begin? Measured from outside, without a trace.
+
+Servers' cycles must be anchored to the chain (DESIGN section 6): a ROS timer fires at its own phase
+of CLOCK_MONOTONIC, and the slot of the chain's server has to open just after it. The timer wakes
+the executor of the chain's first node, which the kernel counts: the third number of
+`/proc/PID/task/TID/schedstat` is how often a thread was put on a core (sched-stats.rst), the second
+for how long it was ready before that. Watched for some cycles, the wake-ups that come once in every
+cycle at the same place are the timer's; of several such places the one after the longest rest is
+where the chain begins.
+"""
+
+import contextlib
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from chainshaper.durations import format_duration
+from chainshaper.enforcement.cgroups import has_ended, started_at
+from chainshaper.errors import OperationError
+
+__all__ = ["DriftWatch", "Phase", "find_phase", "measure_phase", "watch_wake_ups"]
+
+POLL_NS = 250_000
+WATCHER_PRIORITY = 95
+SEEN_IN = 0.8
+"""A place counts when wake-ups come there in this share of the cycles."""
+
+
+@dataclass(frozen=True)
+class Phase:
+    """Where in a cycle a thread begins: ``at_ns`` after multiples of it, on CLOCK_MONOTONIC.
+
+    ``spread_ns`` is how far apart most of the ``wake_ups`` at this place lie, in ``cycles`` that
+    were watched.
+    """
+
+    at_ns: int
+    spread_ns: int
+    wake_ups: int
+    cycles: int
+
+
+def measure_phase(
+    pid: int,
+    tid: int,
+    cycle_ns: int,
+    cycles: int = 12,
+    progress: Callable[[float], None] = lambda _: None,
+) -> Phase:
+    """Watch a thread for some cycles and find its phase.
+
+    Raises:
+        OperationError: it ended, or does not wake up regularly.
+    """
+    found = watch_wake_ups(pid, tid, cycles * cycle_ns, progress)
+    phase = find_phase(found, cycle_ns, cycles)
+    if phase is None:
+        raise OperationError(
+            f"thread {tid} of process {pid} was watched for {format_duration(cycles * cycle_ns)} "
+            f"and does not wake up once in every {format_duration(cycle_ns)} ({len(found)} "
+            "wake-ups): is the chain running, with the period of the plan? Its phase can also be "
+            "given (--phase)"
+        )
+    return phase
+
+
+def watch_wake_ups(
+    pid: int, tid: int, for_ns: int, progress: Callable[[float], None] = lambda _: None
+) -> npt.NDArray[np.int64]:
+    """When a thread became ready to run, each time it did (ns of CLOCK_MONOTONIC).
+
+    A wake-up is known to lie between two looks, and the later of them is taken, minus the time
+    that the thread had to wait for its core.
+
+    Raises:
+        OperationError: the thread has ended.
+    """
+    found: list[int] = []
+    path = Path(f"/proc/{pid}/task/{tid}/schedstat")
+    started = now = time.monotonic_ns()
+    born = started_at(tid)
+    try:
+        with _undisturbed(), path.open("rb", buffering=0) as file:
+            waited, times = _waited_and_times(file.read())
+            while now < started + for_ns:
+                time.sleep(POLL_NS / 1e9)
+                file.seek(0)
+                waited_by_now, times_by_now = _waited_and_times(file.read())
+                now = time.monotonic_ns()
+                if times_by_now > times:
+                    found.append(now - (waited_by_now - waited))
+                waited, times = waited_by_now, times_by_now
+                progress(min(1.0, (now - started) / for_ns))
+        if born is None or has_ended(tid, born):
+            raise ProcessLookupError(tid)  # dead, and nobody has waited for it yet
+    except (OSError, ValueError) as error:
+        raise OperationError(
+            f"thread {tid} of process {pid} ended while its phase was measured: start the "
+            "application again"
+        ) from error
+    return np.array(found, dtype=np.int64)
+
+
+def find_phase(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> Phase | None:
+    """The place in the cycle where wake-ups come regularly after the longest rest.
+
+        >>> find_phase(np.array([1020, 1030, 1090, 1120, 1131, 1220, 1229, 1320]), 100, 4).at_ns
+        20
+
+    None when there is no place that has some in four of five cycles.
+    """
+    if not len(wake_ups):
+        return None
+    width = max(1, cycle_ns // 50)
+    places = np.sort(wake_ups % cycle_ns)
+    # A circle has no first place: the first two turns of it have every neighbour.
+    turned = np.concatenate([places, places + cycle_ns])
+    best: Phase | None = None
+    longest_rest = -1
+    for number, place in enumerate(places):
+        last = int(np.searchsorted(turned, place + width, side="right"))
+        here = turned[number:last]
+        inside = (wake_ups - place) % cycle_ns <= width
+        seen = len(np.unique((wake_ups[inside] - place) // cycle_ns))
+        before = turned[number - 1 + len(places)] - cycle_ns
+        rest = int(place - before) if len(places) > 1 else cycle_ns
+        if seen >= SEEN_IN * cycles and rest > longest_rest:
+            longest_rest = rest
+            # The first of each cycle: what follows it is the same thread going on.
+            firsts = here[: max(1, seen)]
+            at = int(np.median(firsts)) % cycle_ns
+            spread = int(np.percentile(firsts, 90) - np.percentile(firsts, 10))
+            best = Phase(at, spread, len(here), cycles)
+    return best
+
+
+class DriftWatch:
+    """Looks every ten seconds, in a thread of its own, where a thread begins its cycles now.
+
+    ``latest_ns`` is how far that is from ``expected_ns`` (None: not seen yet). Held back by a
+    server, a thread begins with its slot; once its timer expires inside the slot, it begins so
+    much later, and that is the drift. Where nothing holds it, its beginning is seen to move.
+    """
+
+    EVERY_S = 10.0
+    CYCLES = 8
+
+    def __init__(self, pid: int, tid: int, cycle_ns: int, expected_ns: int) -> None:
+        self.latest_ns: int | None = None
+        self._thread, self._cycle_ns, self._expected_ns = (pid, tid), cycle_ns, expected_ns
+        threading.Thread(target=self._look_again, name="drift-watch", daemon=True).start()
+
+    def _look_again(self) -> None:
+        with contextlib.suppress(OperationError):  # the thread has ended
+            while True:
+                time.sleep(self.EVERY_S)
+                seen = watch_wake_ups(*self._thread, self.CYCLES * self._cycle_ns)
+                phase = find_phase(seen, self._cycle_ns, self.CYCLES)
+                if phase is not None:
+                    half = self._cycle_ns // 2
+                    moved = phase.at_ns - self._expected_ns
+                    self.latest_ns = (moved + half) % self._cycle_ns - half
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """The calling thread at a high priority, where it is permitted: it sleeps nearly always."""
+    policy, priority = os.sched_getscheduler(0), os.sched_getparam(0)
+    with contextlib.suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(WATCHER_PRIORITY))
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, policy, priority)
+
+
+def _waited_and_times(text: bytes) -> tuple[int, int]:
+    _, waited, times = text.split()
+    return int(waited), int(times)

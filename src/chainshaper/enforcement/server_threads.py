@@ -1,0 +1,226 @@
+"""From a plan's servers to threads, and from threads to their real-time priorities.
+
+On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DESIGN section 6):
+
+* DDS threads of the application stand above all servers, on other cores where there are any:
+  what they deliver must not wait for what it is delivered to;
+* servers stand below 88 in the order of their own priority, smaller first;
+* several threads of one server share a priority under SCHED_RR, so that they take turns;
+* an asynchronous publisher stands below every other thread of its process on its core. It shares
+  the writer's lock with them and spins on it: above them, it would never let them release it;
+* all others, best effort, are left alone.
+
+The result is a list that can be looked at before anything is done.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from chainshaper.enforcement.allocation import Allocation, NodeThread
+from chainshaper.enforcement.threads import Scheduling
+from chainshaper.errors import InputError, OperationError
+from chainshaper.planning.plan import Plan
+from chainshaper.planning.plan import Thread as PlannedThread
+
+__all__ = [
+    "DDS_PRIORITY",
+    "WantedScheduling",
+    "below_their_siblings",
+    "plan_scheduling",
+    "server_members",
+    "server_priorities",
+    "wanted_of_members",
+]
+
+DDS_PRIORITY = 90
+BEST_SERVER_PRIORITY = 87
+STEP = 2
+"""Between two servers there is room for a publisher below the better one's threads."""
+
+
+@dataclass(frozen=True)
+class WantedScheduling:
+    """What a thread shall get, for which server (None: it is in none), and why."""
+
+    thread: NodeThread
+    wanted: Scheduling
+    server: str | None
+    reason: str
+
+
+def server_members(plan: Plan, allocation: Allocation) -> dict[str, tuple[NodeThread, ...]]:
+    """The threads of each server of a plan, by the server's name.
+
+    Nodes of one process may share an executor: then it is one thread of their server.
+
+    Raises:
+        OperationError: a planned thread is not running, two processes are the same node, or one
+            thread executes nodes of two servers.
+    """
+    homes: dict[tuple[int, int], str] = {}
+    members: dict[str, tuple[NodeThread, ...]] = {}
+    for server in plan.servers:
+        found = {
+            thread.thread.identity: thread
+            for planned in server.threads
+            for thread in _threads_for(planned, allocation)
+        }
+        for identity, thread in found.items():
+            if identity in homes:
+                raise OperationError(
+                    f"thread {thread.thread.tid} ({thread.thread.comm}) executes "
+                    f"{', '.join(thread.nodes)}, which the plan has in the servers "
+                    f"{homes[identity]} and {server.name}: put them into one server, or start "
+                    "them as processes of their own"
+                )
+            homes[identity] = server.name
+        members[server.name] = tuple(found.values())
+    return members
+
+
+def server_priorities(priorities: Iterable[int]) -> dict[int, int]:
+    """The real-time priority for each server priority: 87 for the best, 85, 83 …
+
+    Raises:
+        InputError: there are more than 43 of them.
+    """
+    ranks = sorted(set(priorities))
+    lowest = BEST_SERVER_PRIORITY - STEP * (len(ranks) - 1)
+    if lowest <= 1:
+        raise InputError(
+            f"{len(ranks)} different server priorities do not fit below {DDS_PRIORITY}: give "
+            "servers that never overlap the same priority"
+        )
+    return {rank: BEST_SERVER_PRIORITY - STEP * place for place, rank in enumerate(ranks)}
+
+
+def plan_scheduling(
+    plan: Plan, allocation: Allocation, available_cores: Sequence[int]
+) -> tuple[WantedScheduling, ...]:
+    """What every thread concerned by a plan shall get: servers' threads first, then DDS threads.
+
+    Raises:
+        OperationError: see :func:`server_members`.
+        InputError: see :func:`server_priorities`.
+    """
+    members = server_members(plan, allocation)
+    cores = {server.name: server.core for server in plan.servers}
+    priorities = {server.name: server.priority for server in plan.servers}
+    own = wanted_of_members(members, cores, priorities)
+    pids = {member.thread.pid for group in members.values() for member in group}
+    planned = {member.thread.identity for group in members.values() for member in group}
+    others = [
+        thread
+        for thread in allocation.threads
+        if thread.thread.pid in pids and thread.thread.identity not in planned
+    ]
+    free_cores = tuple(sorted(set(available_cores) - set(cores.values())))
+    beside = _dds_threads(others, free_cores)
+    return below_their_siblings((*own, *beside, *_out_of_the_way(own, others)))
+
+
+def wanted_of_members(
+    members: Mapping[str, Sequence[NodeThread]],
+    cores: Mapping[str, int],
+    priorities: Mapping[str, int],
+) -> tuple[WantedScheduling, ...]:
+    """Class, priority and core of servers' threads; the three mappings are by server's name."""
+    ranks = server_priorities(priorities.values())
+    return tuple(
+        WantedScheduling(
+            member,
+            Scheduling(
+                ranks[priorities[server]], (cores[server],), takes_turns=len(members[server]) > 1
+            ),
+            server,
+            f"server priority {priorities[server]}",
+        )
+        for server in sorted(members, key=lambda name: priorities[name])
+        for member in members[server]
+    )
+
+
+def below_their_siblings(wanted: Sequence[WantedScheduling]) -> tuple[WantedScheduling, ...]:
+    """The same with each publisher below the other threads of its process on its core."""
+    lowered = []
+    for one in wanted:
+        thread, core = one.thread.thread, (one.wanted.cores or (None,))[0]
+        siblings = [
+            other.wanted.priority
+            for other in wanted
+            if other.thread.thread.pid == thread.pid
+            and other.thread.thread.role != "publisher"
+            and other.wanted.priority is not None
+            and core in (other.wanted.cores or other.thread.thread.cores)
+        ]
+        priority = one.wanted.priority
+        if thread.role == "publisher" and priority is not None and siblings:
+            below = min(siblings) - 1
+            if below < priority:
+                scheduling = Scheduling(max(1, below), one.wanted.cores, one.wanted.takes_turns)
+                reason = "below its siblings, whose locks it spins on"
+                lowered.append(WantedScheduling(one.thread, scheduling, one.server, reason))
+                continue
+        lowered.append(one)
+    return tuple(lowered)
+
+
+def _threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThread]:
+    owners = [thread for thread in allocation.threads if planned.node in thread.nodes]
+    found = [owner for owner in owners if owner.thread.role == planned.role]
+    pids = sorted({owner.thread.pid for owner in owners})
+    if len(pids) > 1:
+        raise OperationError(
+            f"node {planned.node} is ambiguous: processes {', '.join(map(str, pids))} all have it; "
+            "end those that are not meant, or give each a namespace of its own"
+        )
+    if not pids:
+        known = sorted({node for thread in allocation.threads for node in thread.nodes})
+        raise OperationError(
+            f"node {planned.node} of the plan is not running, or cannot be recognised; running: "
+            f"{', '.join(known) or 'no node'}; start it with `--ros-args -r __node:=NAME`, or name "
+            "a recording of it"
+        )
+    if not found:
+        what = "asynchronous publisher" if planned.role == "publisher" else planned.role
+        raise OperationError(
+            f"process {pids[0]} of node {planned.node} has no thread that is known to be its "
+            f"{what}: see `chainshaper threads {pids[0]}`"
+        )
+    return found
+
+
+def _dds_threads(others: Sequence[NodeThread], cores: tuple[int, ...]) -> list[WantedScheduling]:
+    """DDS threads above all servers; on machines without a free core they stay where they are."""
+    wanted = Scheduling(DDS_PRIORITY, cores or None)
+    return [
+        WantedScheduling(thread, wanted, None, "DDS threads deliver for the servers")
+        for thread in others
+        if thread.thread.role == "dds"
+    ]
+
+
+def _out_of_the_way(
+    own: Sequence[WantedScheduling], others: Sequence[NodeThread]
+) -> list[WantedScheduling]:
+    """Siblings of no class of their own leave the core of a publisher, which would outrank them."""
+    cores: dict[int, set[int]] = {}
+    for one in own:
+        if one.thread.thread.role == "publisher" and one.wanted.cores:
+            cores.setdefault(one.thread.thread.pid, set()).update(one.wanted.cores)
+    moved = []
+    for thread in others:
+        shared = cores.get(thread.thread.pid, set()) & set(thread.thread.cores)
+        if not shared or thread.thread.role == "dds":
+            continue
+        elsewhere = tuple(sorted(set(thread.thread.cores) - shared))
+        if not elsewhere:
+            raise OperationError(
+                f"thread {thread.thread.tid} ({thread.thread.comm}) of process "
+                f"{thread.thread.pid} may run on core {min(shared)} only, where the process's "
+                "asynchronous publisher would outrank it and never let it release the writer's "
+                "lock: let it run on another core too (`taskset`)"
+            )
+        reason = "not on the core of its process's asynchronous publisher"
+        moved.append(WantedScheduling(thread, Scheduling(None, elsewhere), None, reason))
+    return moved

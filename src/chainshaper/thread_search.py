@@ -1,0 +1,84 @@
+"""From a process, a plan, or nothing to go by, to the threads of a running application.
+
+The function behind `chainshaper threads`. It joins what /proc shows with what a recording of the
+same processes saw, as far as they are still the same.
+"""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from chainshaper.enforcement.allocation import Allocation, RecordedProcess, allocate
+from chainshaper.enforcement.processes import (
+    Process,
+    descendants,
+    find_applications,
+    list_processes,
+)
+from chainshaper.errors import InputError
+
+if TYPE_CHECKING:
+    from chainshaper.planning.plan import Plan
+    from chainshaper.recording import Recording
+
+__all__ = ["find_threads"]
+
+
+def find_threads(
+    where: "int | Plan | None" = None, recording: "Recording | None" = None
+) -> Allocation:
+    """Find the threads of an application and what each of them does.
+
+    ``where`` is a process, which stands for its descendants too; a plan, for the nodes of its
+    servers; or None for all that looks like an application of ROS 2 or DDS. ``recording`` is one
+    of the processes that still run, if there is one.
+
+    Raises:
+        InputError: there is no such process.
+    """
+    processes = list_processes()
+    recorded: tuple[RecordedProcess, ...] = ()
+    notes: tuple[str, ...] = ()
+    if recording is not None:
+        # Reading events is slow to import: only who has a recording pays for it.
+        from chainshaper.recorded_threads import recorded_processes
+
+        recorded, notes = recorded_processes(recording)
+    if isinstance(where, int):
+        family = descendants({process.pid: process.parent for process in processes}, where)
+        chosen = tuple(process for process in processes if process.pid in family)
+        if not any(process.pid == where for process in chosen):
+            raise InputError(f"no process {where}: it has ended, or is the kernel's own")
+    else:
+        found = allocate(find_applications(processes), recorded, among=processes)
+        nodes = None if where is None else _planned_nodes(where)
+        chosen = tuple(process for process in processes if _hosts(process, found, nodes))
+        notes += _missing(found, nodes or {})
+        if where is None and not chosen:
+            notes += ("no process looks like an application of ROS 2 or DDS",)
+    found = allocate(chosen, recorded, among=processes)
+    if recorded and not any(one.nodes_known_by == "recording" for one in found.threads):
+        notes += ("none of these processes is in the recording: they were started after it",)
+    return replace(found, notes=notes + found.notes)
+
+
+def _planned_nodes(plan: "Plan") -> dict[str, str]:
+    """The nodes of a plan's servers, with the server's name."""
+    return {thread.node: server.name for server in plan.servers for thread in server.threads}
+
+
+def _hosts(process: Process, found: Allocation, nodes: dict[str, str] | None) -> bool:
+    """Whether a process has one of these nodes; if None, any node, or takes part in DDS."""
+    own = {node for one in found.threads if one.thread.pid == process.pid for node in one.nodes}
+    if nodes is None:
+        return bool(own) or process.participates
+    return not own.isdisjoint(nodes)
+
+
+def _missing(found: Allocation, nodes: dict[str, str]) -> tuple[str, ...]:
+    running = {node for one in found.threads for node in one.nodes}
+    return tuple(
+        f"node {node} of server {server} is not running, or cannot be recognised; running: "
+        f"{', '.join(sorted(running)) or 'no node'}"
+        for node, server in nodes.items()
+        if node not in running
+    )

@@ -1,0 +1,56 @@
+"""A process to be gated: one thread notes when it runs, another computes on without a lock.
+
+    python stamping_process.py SECONDS OUTPUT CORE OTHER_CORE
+
+The main thread reads the clock without pause and keeps the windows in which it did: a gap of more
+than 0.2 ms ends one. The other thread is inside one long call that needs no interpreter lock, so
+freezing the first cannot hold it up.
+"""
+
+import hashlib
+import json
+import os
+import sys
+import threading
+import time
+
+GAP_NS = 200_000
+
+
+def compute_on(core: int, seconds: float) -> None:
+    os.sched_setaffinity(threading.get_native_id(), {core})
+    hashlib.pbkdf2_hmac("sha256", b"password", b"salt", int(20_000_000 * seconds))
+
+
+def cpu_ns(tid: int | None) -> int:
+    with open(f"/proc/self/task/{tid}/schedstat") as file:  # noqa: PTH123
+        return int(file.read().split()[0])
+
+
+def main() -> None:
+    seconds, output, core, other_core = float(sys.argv[1]), *sys.argv[2:]
+    other = threading.Thread(target=compute_on, args=(int(other_core), seconds), daemon=True)
+    other.start()
+    while (
+        cpu_ns(other.native_id) < 10_000_000
+    ):  # it has been given the lock, and is inside its call
+        time.sleep(0.005)
+    os.sched_setaffinity(0, {int(core)})
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
+    end = time.monotonic_ns() + int(seconds * 1e9)
+    windows = []
+    first = last = time.monotonic_ns()
+    while last < end:
+        now = time.monotonic_ns()
+        if now - last > GAP_NS:
+            windows.append((first, last))
+            first = now
+        last = now
+    with open(output, "w") as file:  # noqa: PTH123 - as little as possible is imported
+        json.dump([*windows, (first, last)], file)
+    os._exit(0)  # the other thread is not waited for
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,221 @@
+"""The process that opens and closes the servers of one core."""
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from gated import (
+    CORE,
+    MS,
+    ahead_of_others,
+    kill,
+    needs_cgroups,
+    own_cgroup,
+    share_inside,
+    sleeping,
+    stamping,
+)
+from processes import children_of, wait_for
+
+from chainshaper.enforcement import cgroups
+from chainshaper.enforcement.freezer import Freezer, create
+from chainshaper.enforcement.realtime import may_use_fifo
+from chainshaper.enforcement.servers import ReservationServer, ServerTable
+from chainshaper.enforcement.slot_dispatcher import PRIORITY, overrun
+from chainshaper.enforcement.threads import list_threads
+
+pytestmark = needs_cgroups
+
+CYCLE = 20 * MS
+CAP_SYS_NICE = 23
+
+
+@contextmanager
+def freezer(folder: Path, cycle: int, *slots: tuple[tuple[int, int], ...]) -> Iterator[Freezer]:
+    servers = tuple(
+        ReservationServer(f"server-{number}", CORE, 1, own) for number, own in enumerate(slots)
+    )
+    back_end = create(ServerTable(cycle, servers), folder / "run")
+    try:
+        yield back_end
+    finally:
+        back_end.release()
+
+
+def dispatcher_of(back_end: Freezer) -> int:
+    (pid,) = children_of(back_end.supervisor)
+    return pid
+
+
+def frozen(folder: Path) -> bool:
+    return "frozen 1" in (folder / "cgroup.events").read_text()
+
+
+def test_it_runs_on_the_core_that_it_gates_above_everything_there(tmp_path: Path) -> None:
+    if not may_use_fifo():
+        pytest.skip("SCHED_FIFO is not permitted (CAP_SYS_NICE)")
+    with freezer(tmp_path, CYCLE, ((0, 5 * MS),)) as back_end:
+        (thread,) = list_threads(dispatcher_of(back_end))
+        assert (thread.policy, thread.priority, thread.cores) == ("SCHED_FIFO", PRIORITY, (CORE,))
+        assert thread.comm == f"dispatcher/{CORE}"
+        (watcher,) = list_threads(back_end.supervisor)
+        assert watcher.priority > PRIORITY
+        assert back_end.real_time()
+        status = Path(f"/proc/{thread.pid}/status").read_text()
+        locked = next(line for line in status.splitlines() if line.startswith("VmLck"))
+        assert int(locked.split()[1]) > 0, "its memory may be swapped out"
+
+
+def test_what_a_terminal_sends_is_not_for_them(tmp_path: Path) -> None:
+    with freezer(tmp_path, CYCLE, ((0, 5 * MS),)) as back_end:
+        dispatcher = dispatcher_of(back_end)
+        assert os.getsid(back_end.supervisor) != os.getsid(0)
+        assert os.getsid(dispatcher) != os.getsid(0)
+        for number in (signal.SIGINT, signal.SIGHUP):
+            kill(dispatcher, number)
+            kill(back_end.supervisor, number)
+        time.sleep(0.2)
+        assert back_end.failure() is None
+        assert dispatcher_of(back_end) == dispatcher
+
+
+def test_without_the_class_it_gates_as_well_as_it_can_and_says_so(tmp_path: Path) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("dropping one capability needs root")
+    libc = ctypes.CDLL(None)
+
+    def drop() -> None:  # PR_CAPBSET_DROP: root does not get it back with the exec
+        libc.prctl(24, CAP_SYS_NICE, 0, 0, 0)
+
+    with stamping(tmp_path, 6) as spinner:
+        script = Path(__file__).with_name("freezer_owner.py")
+        arguments = [tmp_path / "run", CORE, 40, 20, spinner.tid]
+        owner = subprocess.Popen(
+            [sys.executable, str(script), *map(str, arguments)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            preexec_fn=drop,  # noqa: PLW1509 - the child execs at once
+        )
+        assert owner.stdin is not None
+        assert owner.stdout is not None
+        with owner, owner.stdin:
+            assert owner.stdout.readline().startswith("in force")
+            begin = time.monotonic_ns()
+            owner.stdin.write("real time\n")
+            owner.stdin.flush()
+            assert owner.stdout.readline() == "False\n"
+            time.sleep(1)
+            end = time.monotonic_ns()
+        windows = spinner.windows(begin, end)
+        ran = sum(b - a for a, b in windows)
+        assert 0 < ran < 0.8 * (end - begin), "half of the time is its own"
+
+
+def test_after_a_stall_what_should_be_open_by_then_counts(tmp_path: Path) -> None:
+    slots = ((5 * MS, 12 * MS),)
+    with stamping(tmp_path, 5) as spinner, freezer(tmp_path, CYCLE, slots) as back_end:
+        back_end.assign(spinner.tid, "server-0")
+        back_end.arm(0)
+        wait_for(lambda: (back_end.counters()["server-0"].slots or 0) >= 20, "20 slots")
+        before = back_end.counters()["server-0"]
+        dispatcher = dispatcher_of(back_end)
+        kill(dispatcher, signal.SIGSTOP)  # for less than what passes for hung
+        time.sleep(0.15)
+        kill(dispatcher, signal.SIGCONT)
+        resumed = time.monotonic_ns()
+        with ahead_of_others(spinner.tid):
+            time.sleep(1)
+            end = time.monotonic_ns()
+        after = back_end.counters()["server-0"]
+        assert back_end.failure() is None
+        back_end.release()
+
+        assert before.slots is not None
+        assert after.slots is not None
+        # Slots that passed meanwhile are not opened belatedly, one after the other.
+        assert after.slots - before.slots <= (end - resumed) // CYCLE + 3
+        windows = spinner.windows(resumed + CYCLE, end)
+        assert len(windows) > 20
+        assert share_inside(windows, slots, CYCLE, 0) > 0.99
+
+
+def test_an_entry_that_comes_late_is_counted_with_its_lateness(tmp_path: Path) -> None:
+    # Slots of 95 % of a cycle: whenever the dispatcher comes back it enters one late.
+    with freezer(tmp_path, 100 * MS, ((0, 95 * MS),)) as back_end:
+        back_end.arm(0)
+        wait_for(lambda: (back_end.counters()["server-0"].slots or 0) >= 2, "slots")
+        before = back_end.counters()["server-0"]
+        for _ in range(3):
+            kill(dispatcher_of(back_end), signal.SIGSTOP)
+            time.sleep(0.15)  # one slot's start lies in it at least
+            kill(dispatcher_of(back_end), signal.SIGCONT)
+            time.sleep(0.2)
+        after = back_end.counters()["server-0"]
+        assert back_end.failure() is None
+        assert before.late_entries is not None
+        assert after.late_entries is not None
+        assert after.longest_lateness_ns is not None
+        assert after.late_entries > before.late_entries
+        assert after.longest_lateness_ns > MS
+
+
+def test_thirty_two_servers_share_a_core(tmp_path: Path) -> None:
+    slots = [((number * MS, (number + 1) * MS),) for number in range(32)]
+    with freezer(tmp_path, 40 * MS, *slots) as back_end:
+        back_end.arm(0)
+        time.sleep(1.5)
+        opened = [counters.slots for counters in back_end.counters().values()]
+        assert back_end.failure() is None
+        assert min(opened) > 10  # type: ignore[type-var, operator]
+        assert max(opened) - min(opened) <= 3  # type: ignore[type-var, operator]
+
+
+def test_boundaries_without_room_between_them_leave_it_a_sign_of_life(tmp_path: Path) -> None:
+    slots = [((number * MS // 4, (number + 1) * MS // 4),) for number in range(8)]
+    with sleeping() as pid, freezer(tmp_path, 2 * MS, *slots) as back_end:
+        back_end.arm(0)
+        time.sleep(1.5)
+        back_end.assign(pid, "server-3")  # and it answers
+        assert back_end.failure() is None
+
+
+def test_where_a_frozen_thread_was_tells_whether_it_wanted_to_run(tmp_path: Path) -> None:
+    with own_cgroup("overrun") as home, stamping(tmp_path, 20) as spinner, sleeping() as sleeper:
+        folders, threads = {}, {}
+        for name, pid in (("busy", spinner.tid), ("idle", sleeper)):
+            (home / "cgroup.procs").write_text(str(pid))
+            folders[name] = cgroups.make_threaded_child(home, name)
+            cgroups.move_thread(pid, folders[name])
+            threads[name] = os.open(folders[name] / "cgroup.threads", os.O_RDONLY)
+        wait_for(lambda: overrun([threads["busy"]]) is None, "it to run")
+        for folder in folders.values():
+            (folder / "cgroup.freeze").write_text("1")
+            wait_for(lambda: frozen(folder), "the freezer")  # noqa: B023
+        assert overrun([threads["busy"]]) is True
+        assert overrun([threads["idle"]]) is False
+        assert overrun([threads["idle"], threads["busy"]]) is True
+        for folder in folders.values():
+            assert cgroups.dissolve(folder) is None
+        assert overrun(threads.values()) is False, "the groups are gone"
+        for file in threads.values():
+            os.close(file)
+
+
+def test_what_it_writes_to_is_on_no_disk(tmp_path: Path) -> None:
+    """A store to a page that is being written back would wait for the disk."""
+    with freezer(tmp_path, CYCLE, ((0, 5 * MS),)) as back_end:
+        maps = Path(f"/proc/{dispatcher_of(back_end)}/maps").read_text().splitlines()
+        shared = [
+            line for line in maps if line.split()[1].startswith("rw") and "s" in line.split()[1]
+        ]
+        assert len(shared) == 1
+        assert "/memfd:freezer.counters" in shared[0]
+        assert Path(tmp_path / "run" / "freezer.counters").is_symlink()

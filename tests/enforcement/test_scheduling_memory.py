@@ -1,0 +1,295 @@
+"""Threads of others get a class and cores, and get back what they had: whatever happens."""
+
+import ctypes
+import os
+import random
+import signal
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from actors import Actor, acting
+from processes import wait_for
+
+from chainshaper.enforcement import journal as journal_module
+from chainshaper.enforcement.journal import Journal, find_journals, open_journal
+from chainshaper.enforcement.realtime import available_cores, may_use_fifo
+from chainshaper.enforcement.scheduling_memory import (
+    Outcome,
+    change_scheduling,
+    restore_inherited,
+    restore_scheduling,
+)
+from chainshaper.enforcement.scheduling_state import SchedulingState, set_state, state_of
+from chainshaper.enforcement.threads import RESET_ON_FORK, Scheduling
+from chainshaper.errors import OperationError
+
+pytestmark = pytest.mark.skipif(
+    not may_use_fifo(), reason="SCHED_FIFO is not permitted here: run as root to have this tested"
+)
+
+FIRST, LAST = available_cores()[0], available_cores()[-1]
+WANTED = Scheduling(30, (LAST,))
+
+
+@pytest.fixture
+def journal(tmp_path: Path) -> Journal:
+    return open_journal(tmp_path / "journals", "run")
+
+
+def _fates(outcomes: tuple[Outcome, ...]) -> dict[str, str]:
+    return {outcome.comm: outcome.fate for outcome in outcomes}
+
+
+def _states(actor: Actor) -> dict[str, SchedulingState]:
+    return {name: state_of(tid) for name, tid in actor.tids.items()}
+
+
+def test_class_and_cores_are_changed_and_put_back(tmp_path: Path, journal: Journal) -> None:
+    with acting(tmp_path, "a", "b") as actor:
+        os.sched_setscheduler(actor.tids["a"], os.SCHED_RR | RESET_ON_FORK, os.sched_param(7))
+        os.setpriority(os.PRIO_PROCESS, actor.tids["b"], 5)
+        before = _states(actor)
+        change_scheduling(journal, actor.thread("a"), WANTED)
+        change_scheduling(journal, actor.thread("b"), Scheduling(31, (FIRST,), takes_turns=True))
+        a, b = state_of(actor.tids["a"]), state_of(actor.tids["b"])
+        assert (a.scheduling_class.policy, a.scheduling_class.priority) == (os.SCHED_FIFO, 30)
+        assert (b.scheduling_class.policy, b.scheduling_class.priority) == (os.SCHED_RR, 31)
+        assert (a.cores, b.cores) == ((LAST,), (FIRST,))
+        assert _fates(restore_scheduling(journal)) == {"a": "restored", "b": "restored"}
+        assert _states(actor) == before
+        assert _fates(restore_scheduling(journal)) == {"a": "unchanged", "b": "unchanged"}
+        assert _states(actor) == before
+
+
+def test_several_changes_go_back_to_what_was_there_at_first(
+    tmp_path: Path, journal: Journal
+) -> None:
+    with acting(tmp_path, "a") as actor:
+        before = _states(actor)
+        for wanted in (WANTED, Scheduling(None, (FIRST,)), Scheduling(12, None)):
+            change_scheduling(journal, actor.thread("a"), wanted)
+        restore_scheduling(journal)
+        assert _states(actor) == before
+
+
+def test_what_somebody_else_has_changed_since_is_theirs(tmp_path: Path, journal: Journal) -> None:
+    with acting(tmp_path, "a") as actor:
+        tid = actor.tids["a"]
+        before = state_of(tid)
+        change_scheduling(journal, actor.thread("a"), WANTED)
+        os.sched_setscheduler(tid, os.SCHED_RR, os.sched_param(5))
+        (outcome,) = restore_scheduling(journal)
+        assert outcome.fate == "left"
+        assert "somebody else has changed it since: SCHED_RR 5" in outcome.reason
+        now = state_of(tid)
+        assert now.scheduling_class.policy == os.SCHED_RR
+        assert now.cores == before.cores, "the cores were ours still"
+
+
+def test_what_somebody_else_set_between_two_changes_is_what_was_there(
+    tmp_path: Path, journal: Journal
+) -> None:
+    with acting(tmp_path, "a") as actor:
+        tid = actor.tids["a"]
+        change_scheduling(journal, actor.thread("a"), WANTED)
+        os.sched_setscheduler(tid, os.SCHED_RR, os.sched_param(5))
+        change_scheduling(journal, actor.thread("a"), Scheduling(40, None))
+        assert _fates(restore_scheduling(journal)) == {"a": "restored"}
+        held = state_of(tid).scheduling_class
+        assert (held.policy, held.priority) == (os.SCHED_RR, 5)
+
+
+def test_threads_and_processes_that_have_ended_are_no_error(
+    tmp_path: Path, journal: Journal
+) -> None:
+    with acting(tmp_path, "a", "b") as actor:
+        ended = actor.thread("a")
+        change_scheduling(journal, ended, WANTED)
+        change_scheduling(journal, actor.thread("b"), WANTED)
+        actor.end("a")
+        change_scheduling(journal, ended, WANTED)
+        assert _fates(restore_scheduling(journal)) == {"a": "ended", "b": "restored"}
+    assert _fates(restore_scheduling(journal)) == {"a": "ended", "b": "ended"}
+
+
+def test_a_thread_that_got_the_id_of_one_that_ended_is_not_touched(
+    tmp_path: Path, journal: Journal
+) -> None:
+    with acting(tmp_path, "a") as actor:
+        change_scheduling(journal, actor.thread("a"), WANTED)
+        text = journal.path.read_text()
+        started = actor.thread("a").started
+        journal.path.write_text(text.replace(f'"started": {started}', f'"started": {started - 1}'))
+        changed = state_of(actor.tids["a"])
+        (outcome,) = [one for one in restore_scheduling(journal) if one.comm == "a"][:1]
+        assert outcome.fate == "ended"
+        journal.path.write_text(text)
+        assert changed.scheduling_class.priority == 30
+        assert _fates(restore_scheduling(journal))["a"] in ("restored", "unchanged")
+
+
+def test_what_threads_inherited_goes_back_to_what_their_parents_had(
+    tmp_path: Path, journal: Journal
+) -> None:
+    with acting(tmp_path, "early") as actor:
+        before = state_of(actor.pid)
+        early = state_of(actor.tids["early"])
+        time.sleep(0.05)  # starts are told in ticks of 10 ms
+        change_scheduling(journal, actor.thread("main"), WANTED)
+        time.sleep(0.05)
+        actor.begin("late")  # by the main thread
+        child = actor.fork()
+        for tid in (actor.tids["late"], child):
+            assert state_of(tid).scheduling_class.priority == 30, "the kernel lets it inherit"
+        assert {one.tid for one in restore_inherited(journal)} == {actor.tids["late"], child}
+        for tid in (actor.tids["late"], child):
+            assert state_of(tid) == before
+        assert state_of(actor.pid).scheduling_class.priority == 30, "what we set stays"
+        assert state_of(actor.tids["early"]) == early
+        assert restore_inherited(journal) == ()
+        restore_scheduling(journal)
+        assert state_of(actor.pid) == before
+
+
+def test_a_thread_that_is_changed_after_it_inherited_gets_its_parents_original(
+    tmp_path: Path, journal: Journal
+) -> None:
+    with acting(tmp_path) as actor:
+        before = state_of(actor.pid)
+        time.sleep(0.05)
+        change_scheduling(journal, actor.thread("main"), WANTED)
+        time.sleep(0.05)
+        actor.begin("late")
+        change_scheduling(journal, actor.thread("late"), Scheduling(29, (FIRST,)))
+        assert set(_fates(restore_scheduling(journal)).values()) == {"restored"}
+        assert state_of(actor.tids["late"]) == before
+
+
+def test_a_new_thread_of_a_class_of_its_own_is_left_alone(tmp_path: Path, journal: Journal) -> None:
+    with acting(tmp_path) as actor:
+        change_scheduling(journal, actor.thread("main"), WANTED)
+        time.sleep(0.05)
+        tid = actor.begin("late")
+        os.sched_setscheduler(tid, os.SCHED_FIFO, os.sched_param(3))
+        restore_scheduling(journal)
+        assert state_of(tid).scheduling_class.priority == 3
+
+
+_APPLIER = """
+import random, sys, time
+from chainshaper.enforcement.journal import open_journal
+from chainshaper.enforcement.realtime import available_cores
+from chainshaper.enforcement.scheduling_memory import change_scheduling
+from chainshaper.enforcement.threads import Scheduling, list_threads
+
+journal = open_journal(sys.argv[2])
+cores = available_cores()
+print("ready", flush=True)
+while True:
+    for thread in list_threads(int(sys.argv[1])):
+        change_scheduling(
+            journal, thread, Scheduling(random.randint(1, 20), (random.choice(cores),))
+        )
+"""
+
+
+def test_killed_at_any_moment_it_leaves_nothing_that_cannot_be_put_back(tmp_path: Path) -> None:
+    names = [f"thread{number}" for number in range(8)]
+    with acting(tmp_path, *names) as actor:
+        before = _states(actor)
+        for attempt in range(12):
+            folder = tmp_path / f"journals{attempt}"
+            applier = subprocess.Popen(
+                [sys.executable, "-c", _APPLIER, str(actor.pid), str(folder)],
+                stdout=subprocess.PIPE,
+            )
+            assert applier.stdout is not None
+            applier.stdout.readline()
+            time.sleep(random.uniform(0, 0.1))
+            applier.kill()
+            applier.communicate()
+            (journal,) = find_journals(folder)
+            assert journal.owner is None
+            outcomes = restore_scheduling(journal)
+            assert set(_fates(outcomes).values()) <= {"restored", "unchanged"}
+            assert _states(actor) == before, f"attempt {attempt}"
+
+
+def test_nothing_is_changed_when_it_cannot_be_written_down(
+    tmp_path: Path, journal: Journal
+) -> None:
+    with acting(tmp_path, "a") as actor:
+        before = _states(actor)
+        journal.path.unlink()
+        journal.path.mkdir()
+        with pytest.raises(OperationError, match=r"so nothing is changed|cannot be read"):
+            change_scheduling(journal, actor.thread("a"), WANTED)
+        assert _states(actor) == before
+
+
+def test_what_the_kernel_refuses_names_the_thread_and_what_was_wanted(
+    tmp_path: Path, journal: Journal
+) -> None:
+    with acting(tmp_path, "a") as actor:
+        tid = actor.tids["a"]
+        with pytest.raises(OperationError, match=rf"thread {tid} \(a\).*SCHED_FIFO 500"):
+            change_scheduling(journal, actor.thread("a"), Scheduling(500, None))
+        with pytest.raises(OperationError, match=r"cores 1023: Invalid argument"):
+            change_scheduling(journal, actor.thread("a"), Scheduling(None, (1023,)))
+        assert _fates(restore_scheduling(journal)) == {"a": "unchanged"}
+
+
+def test_after_a_boot_nothing_is_touched(
+    tmp_path: Path, journal: Journal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with acting(tmp_path, "a") as actor:
+        change_scheduling(journal, actor.thread("a"), WANTED)
+        with monkeypatch.context() as another_boot:
+            another_boot.setattr(journal_module, "boot_id", lambda: "another")
+            assert restore_scheduling(journal) == ()
+            assert restore_inherited(journal) == ()
+        assert state_of(actor.tids["a"]).scheduling_class.priority == 30
+
+
+def _set_deadline(tid: int) -> bool:
+    """Give a thread 1 ms of every 100 ms under SCHED_DEADLINE; False where that is refused."""
+    if os.uname().machine != "x86_64":
+        return False
+    attributes = struct.pack("IIQiIQQQ", 48, 6, 0, 0, 0, 1_000_000, 100_000_000, 100_000_000)
+    libc = ctypes.CDLL(None, use_errno=True)
+    return bool(libc.syscall(314, tid, attributes, 0) == 0)  # sched_setattr
+
+
+def test_sched_deadline_is_refused_and_stays(tmp_path: Path, journal: Journal) -> None:
+    with acting(tmp_path, "a") as actor:
+        if not _set_deadline(actor.tids["a"]):
+            pytest.skip("SCHED_DEADLINE is not permitted here")
+        with pytest.raises(OperationError, match=r"\(a\).* runs under SCHED_DEADLINE.*chrt"):
+            change_scheduling(journal, actor.thread("a"), WANTED)
+        assert state_of(actor.tids["a"]).scheduling_class.policy == 6
+        assert restore_scheduling(journal) == ()
+        # Somebody may also give it to a thread that we have changed.
+        os.sched_setscheduler(actor.tids["a"], os.SCHED_OTHER, os.sched_param(0))
+        change_scheduling(journal, actor.thread("a"), Scheduling(30, None))
+        assert _set_deadline(actor.tids["a"])
+        assert _fates(restore_scheduling(journal)) == {"a": "left"}
+        assert state_of(actor.tids["a"]).scheduling_class.policy == 6
+
+
+def test_a_state_can_be_set_aspect_by_aspect(tmp_path: Path) -> None:
+    with acting(tmp_path, "a") as actor:
+        tid = actor.tids["a"]
+        before = state_of(tid)
+        wanted = SchedulingState(before.scheduling_class, 3, (LAST,))
+        set_state(tid, wanted, ["nice"])
+        assert (state_of(tid).nice, state_of(tid).cores) == (3, before.cores)
+        set_state(tid, wanted, ["cores"])
+        assert state_of(tid) == wanted
+        actor.process.send_signal(signal.SIGKILL)
+        wait_for(lambda: not Path(f"/proc/{actor.pid}/task/{tid}").exists(), "its end")
+        with pytest.raises(ProcessLookupError):
+            set_state(tid, before, ["cores"])

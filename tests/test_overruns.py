@@ -1,0 +1,153 @@
+"""Outputs that missed their slot: counted by what was done about them, recorded live."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from command_line import called, json_of
+from small_chain import PERIOD_NS, small_chain
+
+from chainshaper import measure_latency, save_plan, shape_application
+from chainshaper.overruns import gate_releases, overruns_in, overruns_text
+from chainshaper.planning import Plan, let_per_chain, plan_shaping, publish_slots
+from chainshaper.planning.plan import revised
+from chainshaper.recording import Recording
+
+MS = 1_000_000
+
+
+def _too_early() -> Plan:
+    """A publish slot in the midst of the small chain's latencies: every other output overruns."""
+    return plan_shaping(
+        np.array([4, 6]) * MS,
+        PERIOD_NS,
+        spec="/t1../t3",
+        output="/t3",
+        publisher="/third",
+        nodes=("/first", "/second", "/third"),
+    )
+
+
+def _shaped(folder: Path, overrun: str) -> Recording:
+    plan = revised(_too_early(), overrun=overrun)
+    return shape_application(small_chain(folder), plan, folder / overrun, cycles=24)
+
+
+def test_discarded_outputs_are_not_published_and_not_lost(tmp_path: Path) -> None:
+    recording = _shaped(tmp_path, "discard")
+    measured = measure_latency(recording)
+    releases = recording.events["gate_release"]
+    discarded = releases.filter(pl.col("overrun") == "discard")
+    assert 0 < discarded.height < releases.height
+    assert measured.overruns == {"discard": discarded.height}
+    assert discarded["release"].null_count() == discarded["slot"].null_count() == discarded.height
+    assert measured.analysis.incomplete == {"discarded": discarded.height}
+    assert measured.analysis.statistics.count == releases.height - discarded.height
+    # Nothing was let go outside the slot of its own cycle.
+    let_go = releases.filter(pl.col("release").is_not_null())
+    ((start, end),) = publish_slots(_too_early())
+    within = let_go["time"] - let_go["origin"]
+    assert ((within >= start) & (within < end)).all()
+    assert measured.held is not None
+    assert measured.held.late == 0
+
+
+def test_outputs_published_at_once_wait_for_nothing(tmp_path: Path) -> None:
+    recording = _shaped(tmp_path, "publish")
+    measured = measure_latency(recording)
+    late = recording.events["gate_release"].filter(pl.col("overrun").is_not_null())
+    assert measured.overruns == {"publish": late.height}
+    assert late.height > 0
+    assert measured.analysis.incomplete == {}
+    assert (late["release"] == late["arrival"]).all()
+    assert late["slot"].null_count() == late.height
+    assert measured.held is not None
+    assert measured.held.late > 0
+
+
+def test_what_was_done_is_reported_wherever_the_latency_is(tmp_path: Path) -> None:
+    plan_file, output = tmp_path / "plan.yaml", tmp_path / "rec"
+    application = tmp_path / "small_chain.yaml"
+    small_chain(tmp_path)
+    latencies = tmp_path / "latencies.txt"
+    latencies.write_text("4ms\n6ms\n")
+    made = called(
+        "plan", "--latencies", latencies, "--period", "50ms", "--overrun", "discard", "--json"
+    )
+    assert json.loads(made.out)["overrun"] == "discard"
+    save_plan(revised(_too_early(), overrun="discard"), plan_file)
+    shaped = called("shape", application, plan_file, "-o", output, "--cycles", "24")
+    assert shaped.code == 0, shaped
+    count = (measure_latency(output).overruns or {})["discard"]
+    said = overruns_text({"discard": count})
+    assert said in shaped.err
+    assert said in called("latency", output).out
+    values = json_of("latency", output)
+    assert (values["overruns"], values["overruns_by_policy"]) == (count, {"discard": count})
+    assert f"{count} ({count} discard)" in called("compare", output, output).out
+    both = json_of("compare", output, output)["recordings"]
+    assert [one["overruns_by_policy"] for one in both] == [{"discard": count}] * 2
+
+
+def test_an_unshaped_recording_has_no_overruns(unshaped: Recording) -> None:
+    assert overruns_in(unshaped, None) is None
+    assert measure_latency(unshaped).overruns is None
+
+
+def _without_column(recording: Recording, cycles_waited: list[int]) -> Recording:
+    """A recording from before there was a choice."""
+    table = recording.events["gate_release"].drop("overrun").head(len(cycles_waited))
+    waited = pl.Series("cycles_waited", cycles_waited, dtype=pl.Int32)
+    return replace(
+        recording, events={**recording.events, "gate_release": table.with_columns(waited)}
+    )
+
+
+def test_older_recordings_are_read_by_the_cycles_their_outputs_waited(
+    shaped: Recording, plan: Plan
+) -> None:
+    old = _without_column(shaped, [0, 1, 2, 0])
+    assert gate_releases(old, plan)["overrun"].to_list() == [None, "wait", "wait", None]
+    assert overruns_in(old, plan) == {"wait": 2}
+    assert overruns_in(old, None) == {"wait": 2}
+    assert overruns_in(old, let_per_chain(plan)) == {"wait": 1}, "they are due a cycle later"
+
+
+def test_of_a_gated_publisher_what_was_not_sent_was_discarded(unshaped: Recording) -> None:
+    plan = plan_shaping(
+        np.array([4, 20]) * MS,
+        PERIOD_NS,
+        output="/t3",
+        publisher="/third",
+        publication="asynchronous",
+        overrun="discard",
+    )
+    outcomes = ["sent", "expired", "sent", "overwritten"]
+    sends = pl.DataFrame({"outcome": outcomes})
+    gated = replace(unshaped, events={**unshaped.events, "asynchronous_send": sends})
+    assert overruns_in(gated, plan) == {"discard": 2}
+    analysis = measure_latency(unshaped).analysis
+    later = analysis.traversals.with_columns(
+        latency_ns=pl.Series([PERIOD_NS - 1, PERIOD_NS]).extend_constant(
+            5 * MS, analysis.traversals.height - 2
+        )
+    )
+    late = replace(analysis, traversals=later)
+    assert overruns_in(gated, plan, late) == {"wait": 1, "discard": 2}
+
+
+@pytest.mark.parametrize(
+    ("overruns", "said"),
+    [
+        ({"wait": 1}, "1 output was too late for its slot (1 waited for the next slot)"),
+        (
+            {"discard": 2, "publish": 3},
+            "5 outputs were too late for their slot (2 discarded, 3 published at once)",
+        ),
+    ],
+)
+def test_overruns_in_words(overruns: dict[str, int], said: str) -> None:
+    assert overruns_text(overruns) == said

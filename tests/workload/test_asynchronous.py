@@ -1,0 +1,212 @@
+"""Asynchronous publication: the history, and the one thread that sends, gated and not."""
+
+import os
+import threading
+import time
+from pathlib import Path
+
+import polars as pl
+import pytest
+from frozen_thread import freezing_publisher_of, need_threaded_cgroups
+from hypothesis import given
+from hypothesis import strategies as st
+from processes import children_of, wait_for
+from small_chain import PERIOD_NS, small_chain
+
+from chainshaper.analysis import LatencyAnalysis
+from chainshaper.errors import OperationError
+from chainshaper.planning import PlanRequest
+from chainshaper.recording import Recording
+from chainshaper.steps import measure_latency, plan_recording
+from chainshaper.workload.asynchronous import AsynchronousWriter, PublisherThread
+from chainshaper.workload.description import Application
+from chainshaper.workload.live import run_application
+
+MS = 1_000_000
+SLOT = (22 * MS, 32 * MS)  # behind the longest latency of the small chain
+
+
+class Wire:
+    """What a writer gave to DDS, and what it noted."""
+
+    def __init__(self, depth: int, lifespan_ns: int | None = None) -> None:
+        self.sent: list[bytes] = []
+        self.noted: list[tuple[int, str]] = []
+        self.writer = AsynchronousWriter(
+            write=lambda payload, _: self.sent.append(payload),
+            depth=depth,
+            lifespan_ns=lifespan_ns,
+            note=lambda _, stamp, outcome, __: self.noted.append((stamp, outcome)),
+        )
+
+
+def test_the_history_keeps_the_last_messages() -> None:
+    wire = Wire(depth=2)
+    for number in range(1, 5):
+        wire.writer.keep(bytes([number]), number)
+    for _ in range(4):
+        wire.writer.send_next()
+    assert wire.sent == [b"\3", b"\4"]
+    assert wire.noted == [(1, "overwritten"), (2, "overwritten"), (3, "sent"), (4, "sent")]
+
+
+def test_a_message_older_than_its_lifespan_is_not_sent() -> None:
+    wire = Wire(depth=10, lifespan_ns=1_000_000_000)
+    now = time.time_ns()
+    wire.writer.keep(b"old", now - 2_000_000_000)
+    wire.writer.keep(b"new", now)
+    wire.writer.send_next()
+    wire.writer.send_next()
+    assert wire.sent == [b"new"]
+    assert wire.noted == [(now - 2_000_000_000, "expired"), (now, "sent")]
+
+
+@given(st.integers(1, 5), st.lists(st.booleans(), max_size=40))
+def test_every_message_has_one_outcome_and_order_is_kept(depth: int, steps: list[bool]) -> None:
+    """Publishing (true) and sending (false) in any order."""
+    wire = Wire(depth)
+    published = 0
+    for publishes in [*steps, *[False] * depth]:
+        if publishes:
+            published += 1
+            wire.writer.keep(bytes([published]), published)
+        else:
+            wire.writer.send_next()
+    assert sorted(stamp for stamp, _ in wire.noted) == list(range(1, published + 1))
+    assert wire.sent == sorted(wire.sent)
+    overwritten = sum(outcome == "overwritten" for _, outcome in wire.noted)
+    assert len(wire.sent) == published - overwritten
+
+
+def test_one_thread_sends_for_all_writers() -> None:
+    senders: set[int] = set()
+    sent: list[str] = []
+
+    def writer(name: str) -> AsynchronousWriter:
+        def write(payload: bytes, source_timestamp: int) -> None:
+            senders.add(threading.get_native_id())
+            sent.append(f"{name}{source_timestamp}")
+
+        return AsynchronousWriter(write, 10, None, lambda *_: None)
+
+    thread, first, second = PublisherThread(), writer("a"), writer("b")
+    for number in range(3):
+        thread.publish(first, b"", number)
+        thread.publish(second, b"", number)
+    wait_for(lambda: len(sent) == 6, "six messages")
+    assert sent == ["a0", "b0", "a1", "b1", "a2", "b2"]
+    assert len(senders) == 1
+    assert threading.get_native_id() not in senders
+
+
+def _asynchronous(folder: Path, **quality: object) -> Application:
+    application = small_chain(folder, publication="asynchronous")
+    topic = application.topic("/t3").model_copy(update=quality)
+    return application.model_copy(update={"topics": {"/t3": topic}})
+
+
+def _outcomes(recording: Recording) -> dict[str, int]:
+    return dict(recording.events["asynchronous_send"]["outcome"].value_counts().iter_rows())
+
+
+def _usual_response(analysis: LatencyAnalysis) -> float:
+    """How long the executor of the publishing node is busy with an instance (ns, median)."""
+    last = analysis.hops.filter(pl.col("hop") == 2)
+    return float(last.select((pl.col("end") - pl.col("start")).median()).item())
+
+
+def _bulk(latencies: pl.Series) -> float:
+    """How far apart nine in ten latencies lie: what stalls of the machine hit is left out."""
+    high, low = latencies.quantile(0.95), latencies.quantile(0.05)
+    assert high is not None
+    assert low is not None
+    return high - low
+
+
+def test_the_publication_is_when_the_message_was_sent_not_handed_over(tmp_path: Path) -> None:
+    recording = run_application(_asynchronous(tmp_path), tmp_path / "rec", cycles=12)
+    events = recording.events
+    sends = events["asynchronous_send"]
+    analysis = measure_latency(recording).analysis
+    assert analysis.traversals["end"].to_list() == sends["time"].to_list()
+    handed_over = events["rmw_publish"].join(
+        sends, on=["pid", "rmw_publisher_handle", "timestamp"], suffix="_sent"
+    )
+    assert handed_over.height == sends.height
+    assert (handed_over["tid"] == handed_over["pid"]).all(), "the executor hands over"
+    assert (handed_over["tid_sent"] != handed_over["pid"]).all(), "another thread sends"
+    assert (handed_over["time"] <= handed_over["time_sent"]).all()
+
+    request = PlanRequest(publication="asynchronous", publish_slot_ns=10 * MS)
+    plan = plan_recording(recording, request=request)
+    assert plan.chain.output_depth == 10
+    assert plan.evidence.longest_send_ns in sends["duration"].to_list()
+    assert plan_recording(recording).evidence.longest_send_ns is None, "nobody's thread is gated"
+
+
+def test_a_gated_publisher_thread_shapes_the_latency_and_stops_nobody_else(tmp_path: Path) -> None:
+    need_threaded_cgroups()
+    application = _asynchronous(tmp_path)
+    before = measure_latency(run_application(application, tmp_path / "before", cycles=40)).analysis
+    gating = freezing_publisher_of("/third", SLOT, PERIOD_NS)
+    recording = run_application(application, tmp_path / "after", cycles=40, enforcement=gating)
+    after = measure_latency(recording).analysis
+
+    assert after.incomplete == {}, "nothing is lost"
+    assert _outcomes(recording) == {"sent": 40}
+    assert (after.traversals["latency_ns"] >= SLOT[0] - MS).all(), "it was sent outside the slot"
+    for column in ("latency_ns", "reception_ns"):
+        assert _bulk(after.traversals[column]) < 0.5 * _bulk(before.traversals[column])
+    # The executor was never blocked, although its process's publisher was, for four fifths of
+    # the time: it took no longer than without gating, far less than the slot is closed for.
+    closed = PERIOD_NS - (SLOT[1] - SLOT[0])
+    assert _usual_response(after) < 0.25 * closed
+
+
+def test_a_publisher_that_is_stopped_for_long_loses_the_oldest_and_nothing_waits_for_it(
+    tmp_path: Path,
+) -> None:
+    """The thread runs in every tenth cycle only, with a history of three."""
+    need_threaded_cgroups()
+    gating = freezing_publisher_of("/third", SLOT, 10 * PERIOD_NS)
+    recording = run_application(
+        _asynchronous(tmp_path, depth=3), tmp_path / "rec", cycles=30, enforcement=gating
+    )
+    analysis = measure_latency(recording).analysis
+    outcomes = _outcomes(recording)
+    assert outcomes["sent"] < outcomes["overwritten"]
+    # Messages of the warm-up, which is not recorded, have an outcome, too.
+    assert 0 < analysis.incomplete["discarded"] <= outcomes["overwritten"]
+    assert analysis.traversals.height == 30, "the executor went on"
+    kept = analysis.traversals.filter("complete")["latency_ns"]
+    assert (kept < 3 * PERIOD_NS).all(), "the newest are kept"
+
+
+def test_what_outlived_its_lifespan_is_not_sent(tmp_path: Path) -> None:
+    need_threaded_cgroups()
+    gating = freezing_publisher_of("/third", SLOT, 10 * PERIOD_NS)
+    application = _asynchronous(tmp_path, depth=20, lifespan_ns=2 * PERIOD_NS)
+    recording = run_application(application, tmp_path / "rec", cycles=30, enforcement=gating)
+    outcomes = _outcomes(recording)
+    assert set(outcomes) == {"sent", "expired"}
+    assert outcomes["expired"] > outcomes["sent"]
+    analysis = measure_latency(recording).analysis
+    assert 0 < analysis.incomplete["discarded"] <= outcomes["expired"]
+    assert (analysis.traversals.filter("complete")["latency_ns"] < 4 * PERIOD_NS).all()
+
+
+def test_a_run_that_is_given_up_while_a_thread_is_frozen_leaves_nothing(tmp_path: Path) -> None:
+    group = need_threaded_cgroups()
+
+    def give_up(share: float, what: str) -> None:
+        if what == "recording":
+            raise OperationError("enough")
+
+    gating = freezing_publisher_of("/third", SLOT, 10 * PERIOD_NS)
+    with pytest.raises(OperationError, match="enough"):
+        run_application(
+            _asynchronous(tmp_path), tmp_path / "rec", enforcement=gating, progress=give_up
+        )
+    assert children_of(os.getpid()) == []
+    assert list(group.glob("chainshaper-test-*")) == []
+    assert not (tmp_path / "rec").exists()
