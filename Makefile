@@ -1,12 +1,16 @@
 # `make demo` and `make test` need nothing but Python 3.10 or newer; see scripts/setup.
 
-.PHONY: demo test lint benchmark docs clean
+.PHONY: demo test test-kernel lint benchmark docs clean
 
 demo: .venv/.ready
 	.venv/bin/chainshaper demo
 
 test: lint
 	.venv/bin/python -m pytest
+
+# The sched_ext back end on Debian's kernels, in QEMU. Fetches about 50 MB once; ten minutes or so.
+test-kernel: .venv/.ready-dev
+	.venv/bin/python tests/kernel/run_kernel_checks.py
 
 lint: .venv/.ready-dev
 	.venv/bin/ruff check .

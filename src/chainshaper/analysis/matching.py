@@ -7,7 +7,7 @@ cost is linear in the rows once both sides are sorted by time.
 """
 
 from itertools import zip_longest
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -118,21 +118,28 @@ def _by_polars(
 
 
 def key_numbers(frame: pl.DataFrame, by: list[str]) -> list[npt.NDArray[np.int64]]:
-    """The key columns as two 64-bit numbers per row; other numbers of numbers do not fit."""
-    whole, halves = [], []
+    """The key columns as two 64-bit numbers per row; empty where they do not fit into those."""
+    whole: list[npt.NDArray[Any]] = []
+    halves: list[npt.NDArray[Any]] = []
     for key in by:
         column = frame[key].to_physical().fill_null(0).to_numpy()
         if column.dtype.kind not in "iu":
             return []
-        if column.dtype.itemsize == 8:
-            whole.append(column.view(np.int64))
-        else:
-            halves.append(column.astype(np.int64))
+        (whole if column.dtype.itemsize == 8 else halves).append(column)
     for first, second in zip_longest(halves[::2], halves[1::2]):
-        whole.append(first if second is None else first << 32 | second & 0xFFFFFFFF)
-    while len(whole) < 2:
+        whole.append(_paired(first, first if second is None else second))
+    if not whole:
         whole.append(np.zeros(frame.height, np.int64))
-    return whole
+    if len(whole) == 1:
+        whole.append(whole[0])
+    return [column.view(np.int64) for column in whole]
+
+
+def _paired(first: npt.NDArray[Any], second: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+    """Two columns of 32 bits as one of 64, without a third in between."""
+    both = np.empty((len(first), 2), np.int32)
+    both[:, 0], both[:, 1] = first, second
+    return both.view(np.int64)[:, 0]
 
 
 def _in_order(frame: pl.DataFrame, time: str) -> pl.DataFrame:

@@ -1,0 +1,261 @@
+"""The part of libbpf that a struct_ops policy needs, over ctypes.
+
+libbpf.so.1 comes with every distribution that has BPF at all; binding to it directly saves a
+compiler, a kernel-header package and a Python dependency on the machine. An object file is opened,
+adjusted (constants, flags, programs left out), loaded, and its struct_ops map attached, which
+gives a link. The link is a file descriptor: when the process ends, however it ends, the kernel
+closes it and takes the policy away.
+
+Functions raise OSError with what libbpf said; who knows what the object is for says what to do.
+"""
+
+import ctypes
+import functools
+import os
+import struct
+from pathlib import Path
+from typing import Any
+
+from chainshaper.errors import PlatformError
+
+__all__ = [
+    "BpfObject",
+    "ProgramRun",
+    "delete_element",
+    "kernel_enum_value",
+    "load_libbpf",
+    "look_up_element",
+    "update_element",
+]
+
+LIBRARY = "libbpf.so.1"
+OLDEST = (1, 4)
+"""From here on libbpf tolerates members of sched_ext_ops that the kernel does not know."""
+
+_KIND_ENUM64 = 19
+_BTF_TYPE = struct.Struct("<III")
+_TEST_RUN_OPTIONS = struct.Struct("<QQQIIQQIIIIIIII")
+_WARNING = 0
+_LONGEST_LOG = 1 << 20
+_TOLD = 400
+
+_messages: list[str] = []
+"""What libbpf has warned of since the object was opened; it has no better place for reasons."""
+
+
+@functools.cache
+def load_libbpf() -> Any:
+    """The library, with its functions declared.
+
+    Raises:
+        PlatformError: it is absent or too old.
+    """
+    remedy = f"install libbpf {OLDEST[0]}.{OLDEST[1]} or newer (Debian 13: apt install libbpf1)"
+    try:
+        library = ctypes.CDLL(LIBRARY, use_errno=True)
+    except OSError as error:
+        raise PlatformError(f"{LIBRARY} cannot be loaded ({error}): {remedy}") from error
+    found = (library.libbpf_major_version(), library.libbpf_minor_version())
+    if found < OLDEST:
+        raise PlatformError(f"{LIBRARY} is version {found[0]}.{found[1]}: {remedy}")
+    pointer, text, number = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int
+    for name, result, *arguments in (
+        ("bpf_object__open_file", pointer, text, pointer),
+        ("bpf_object__load", number, pointer),
+        ("bpf_object__close", None, pointer),
+        ("bpf_object__find_map_by_name", pointer, pointer, text),
+        ("bpf_object__find_program_by_name", pointer, pointer, text),
+        ("bpf_program__fd", number, pointer),
+        ("bpf_map__fd", number, pointer),
+        ("bpf_map__initial_value", pointer, pointer, pointer),
+        ("bpf_map__attach_struct_ops", pointer, pointer),
+        ("bpf_link__destroy", number, pointer),
+        ("bpf_map_update_elem", number, number, pointer, pointer, ctypes.c_uint64),
+        ("bpf_map_lookup_elem", number, number, pointer, pointer),
+        ("bpf_map_delete_elem", number, number, pointer),
+        ("bpf_prog_test_run_opts", number, number, pointer),
+        ("btf__load_vmlinux_btf", pointer),
+        ("btf__free", None, pointer),
+        ("btf__find_by_name", number, pointer, text),
+        ("btf__type_by_id", pointer, pointer, ctypes.c_uint32),
+        ("btf__name_by_offset", text, pointer, ctypes.c_uint32),
+        ("libbpf_set_print", pointer, pointer),
+    ):
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, arguments
+    library.libbpf_set_print(_printer)
+    return library
+
+
+def _keep_message(level: int, pattern: bytes, arguments: int) -> int:
+    if level == _WARNING:
+        text = ctypes.create_string_buffer(_LONGEST_LOG)
+        ctypes.CDLL(None).vsnprintf(
+            text, ctypes.c_size_t(len(text)), pattern, ctypes.c_void_p(arguments)
+        )
+        _messages.append(text.value.decode(errors="replace").strip())
+    return 0
+
+
+_printer = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int, ctypes.c_char_p, ctypes.c_void_p)(
+    _keep_message
+)
+
+
+def _failure(step: str) -> OSError:
+    number = ctypes.get_errno()
+    # The verifier gives its reason at the end of a long log.
+    said = "; ".join(message[-_TOLD:] for message in _messages[-3:] if message)
+    reason = f"{step}: {os.strerror(number)}"
+    return OSError(number, f"{reason} ({said})" if said else reason)
+
+
+class BpfObject:
+    """An object file: opened first, then adjusted, then loaded into the kernel.
+
+    Raises:
+        OSError: libbpf cannot read it.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._library = load_libbpf()
+        _messages.clear()
+        self._object: int | None = self._library.bpf_object__open_file(bytes(path), None)
+        if not self._object:
+            raise _failure(f"opening {path}")
+
+    def _map(self, name: str) -> int:
+        found: int | None = self._library.bpf_object__find_map_by_name(self._object, name.encode())
+        if not found:
+            raise KeyError(f"the object has no map {name}")
+        return found
+
+    def initial_bytes(self, map_name: str, size: int) -> "ctypes.Array[ctypes.c_char]":
+        """The first ``size`` bytes that a map of constants or operations will have; writable."""
+        address = self._library.bpf_map__initial_value(
+            self._map(map_name), ctypes.byref(ctypes.c_size_t())
+        )
+        if not address:
+            raise KeyError(f"map {map_name} has no initial value")
+        return (ctypes.c_char * size).from_address(address)
+
+    def load(self) -> None:
+        """Have the kernel verify and keep all maps and programs.
+
+        Raises:
+            OSError: the kernel refuses; with the last messages of libbpf.
+        """
+        if self._library.bpf_object__load(self._object):
+            raise _failure("loading")
+
+    def map_descriptor(self, name: str) -> int:
+        """The file descriptor of a map of a loaded object."""
+        return int(self._library.bpf_map__fd(self._map(name)))
+
+    def program_descriptor(self, name: str) -> int:
+        """The file descriptor of a program of a loaded object."""
+        program = self._library.bpf_object__find_program_by_name(self._object, name.encode())
+        if not program:
+            raise KeyError(f"the object has no program {name}")
+        return int(self._library.bpf_program__fd(program))
+
+    def attach_operations(self, map_name: str) -> int:
+        """Put a struct_ops map in force; the address of its link, for :meth:`detach`.
+
+        Raises:
+            OSError: the kernel refuses.
+        """
+        link: int | None = self._library.bpf_map__attach_struct_ops(self._map(map_name))
+        if not link:
+            raise _failure("attaching")
+        return link
+
+    def detach(self, link: int) -> None:
+        """End what :meth:`attach_operations` began."""
+        self._library.bpf_link__destroy(link)
+
+    def close(self) -> None:
+        """Give back maps and programs; harmless when repeated."""
+        if self._object:
+            self._library.bpf_object__close(self._object)
+            self._object = None
+
+
+def update_element(map_descriptor: int, key: int, value: bytes) -> None:
+    """Write one element of a map with 32-bit keys.
+
+    Raises:
+        OSError: the kernel refuses.
+    """
+    number = ctypes.c_uint32(key)
+    if load_libbpf().bpf_map_update_elem(map_descriptor, ctypes.byref(number), value, 0):
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+
+
+def look_up_element(map_descriptor: int, key: int, size: int) -> bytes:
+    """Read one element, of ``size`` bytes, of a map with 32-bit keys.
+
+    Raises:
+        OSError: there is none.
+    """
+    number, value = ctypes.c_uint32(key), ctypes.create_string_buffer(size)
+    if load_libbpf().bpf_map_lookup_elem(map_descriptor, ctypes.byref(number), value):
+        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+    return value.raw
+
+
+def delete_element(map_descriptor: int, key: int) -> None:
+    """Remove one element; harmless when there is none."""
+    number = ctypes.c_uint32(key)
+    load_libbpf().bpf_map_delete_elem(map_descriptor, ctypes.byref(number))
+
+
+class ProgramRun:
+    """A `SEC("syscall")` program, ready to be run on the calling core any number of times.
+
+    ``context`` is what the program reads and writes. Everything is laid out beforehand, so that
+    whoever counts microseconds may run it by ``function(*arguments)``.
+    """
+
+    def __init__(self, descriptor: int, context_size: int) -> None:
+        self.context = ctypes.create_string_buffer(context_size)
+        address = ctypes.addressof(self.context)
+        values = [0] * 15
+        values[0], values[5], values[7] = _TEST_RUN_OPTIONS.size, address, context_size
+        self._options = ctypes.create_string_buffer(_TEST_RUN_OPTIONS.pack(*values))
+        self.function = load_libbpf().bpf_prog_test_run_opts
+        self.arguments = (descriptor, ctypes.c_void_p(ctypes.addressof(self._options)))
+
+    def __call__(self) -> None:
+        """Run it.
+
+        Raises:
+            OSError: the kernel refuses, or the program reports failure.
+        """
+        failed = self.function(*self.arguments)
+        result = _TEST_RUN_OPTIONS.unpack_from(self._options)[9]
+        if failed or result:
+            raise OSError(ctypes.get_errno(), f"the program returned {result}")
+
+
+def kernel_enum_value(enum: str, name: str) -> int | None:
+    """The value of an enumerator of the running kernel, None when it has none of this name."""
+    library = load_libbpf()
+    btf = library.btf__load_vmlinux_btf()
+    if not btf:
+        return None
+    try:
+        number = library.btf__find_by_name(btf, enum.encode())
+        if number < 0:
+            return None
+        address = library.btf__type_by_id(btf, number)
+        _, information, _ = _BTF_TYPE.unpack(ctypes.string_at(address, _BTF_TYPE.size))
+        wide = information >> 24 & 0x1F == _KIND_ENUM64
+        member = struct.Struct("<III" if wide else "<II")
+        members = ctypes.string_at(address + _BTF_TYPE.size, (information & 0xFFFF) * member.size)
+        for text, low, *high in member.iter_unpack(members):
+            if library.btf__name_by_offset(btf, text) == name.encode():
+                return int(low | (high[0] << 32 if wide else 0))
+        return None
+    finally:
+        library.btf__free(btf)

@@ -1,0 +1,77 @@
+/* SPDX-License-Identifier: MIT OR GPL-2.0-only */
+/*
+ * The maps between the policy (table.bpf.c) and its loader (../scx_table.py).
+ *
+ * Every table exists twice: one generation is in force while the loader writes the other. All
+ * times are nanoseconds of CLOCK_MONOTONIC.
+ */
+#ifndef TABLE_ABI_H
+#define TABLE_ABI_H
+
+#define TABLE_MAX_SERVERS 128		/* ids 1 to 127; 0 means best effort */
+#define TABLE_MAX_SLOTS 64		/* of one server */
+#define TABLE_MAX_SERVERS_PER_CPU 32
+#define TABLE_MAX_CPUS 512
+#define TABLE_GENERATIONS 2
+
+/* Instead of a server id: a thread of the loader that goes from core to core. */
+#define TABLE_VISITOR 0xffffffffU
+
+struct table_slot {
+	unsigned long long start, end;	/* half open, after the start of a cycle */
+};
+
+/* Key: generation * TABLE_MAX_SERVERS + id. A cycle of 0: there is no such server. */
+struct table_server {
+	unsigned long long cycle;
+	unsigned long long anchor;	/* a start of a cycle, in the past */
+	unsigned long long rotation;	/* how long a thread of many has its turn */
+	unsigned int cpu;
+	unsigned int priority;		/* smaller is better */
+	unsigned int slot_count;
+	unsigned int pad;
+	struct table_slot slots[TABLE_MAX_SLOTS];	/* ascending, disjoint */
+};
+
+/* Key: generation * TABLE_MAX_CPUS + cpu. */
+struct table_cpu {
+	unsigned int count;
+	unsigned int ids[TABLE_MAX_SERVERS_PER_CPU];	/* best priority first */
+};
+
+/* Key: server id. Written by the policy, kept when the table changes. */
+struct table_counters {
+	unsigned long long slots;
+	unsigned long long late_entries;
+	unsigned long long longest_lateness;
+	unsigned long long overruns;
+	unsigned long long open_since;	/* start of the slot that is open; 0: none is */
+	unsigned long long turn;	/* start of the rotation period that its runner was chosen in */
+};
+
+/* Why the kernel ended the policy; a kind of 0: it has not. */
+struct table_exit {
+	int kind;
+	int pad;
+	long long code;
+	char reason[64];
+	char message[192];
+};
+
+/* Fixed before the policy is loaded, so that the verifier leaves out what is not used. */
+struct table_config {
+	unsigned int has_timer;		/* 0 on PREEMPT_RT, which refuses bpf_timer */
+	unsigned int cpu_count;		/* one more than the highest number of a core */
+};
+
+struct table_instant {
+	long long seconds, nanoseconds;	/* as in struct timespec */
+};
+
+/* What a kicker gets from table_boundary: until when to sleep, and until when then once more. */
+struct table_wake {
+	struct table_instant boundary;
+	struct table_instant planning;
+};
+
+#endif

@@ -1,0 +1,91 @@
+"""The guest's file system: an initramfs with Python, libbpf, the package, and the checks."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent.parent
+
+_NOT_NEEDED = (
+    "usr/share",
+    "usr/lib/python3*/test",
+    "usr/lib/python3*/idlelib",
+    "usr/lib/python3*/pydoc_data",
+    "usr/lib/python3*/ensurepip",
+    "usr/lib/python3*/lib-dynload/_codecs_*",
+    "usr/lib/*/gconv",
+    "usr/lib/*/perl*",
+    "usr/lib/*/libcrypto*",
+    "usr/lib/*/libdb-*",
+    "var",
+)
+_INIT = """#!/usr/bin/python3.13
+import sys
+sys.path.insert(0, "/checks")
+import guest_init
+guest_init.main()
+"""
+
+
+def unpack_kernel(package: Path, folder: Path) -> Path:
+    """The bootable image in a kernel package."""
+    subprocess.run(["dpkg-deb", "--extract", package, folder], check=True)
+    images = [*folder.glob("**/vmlinuz"), *folder.glob("boot/vmlinuz-*")]
+    if len(images) != 1:
+        raise FileNotFoundError(f"{package} holds {len(images)} kernel images")
+    return images[0]
+
+
+def make_image(userland: list[Path], folder: Path) -> Path:
+    """An initramfs in ``folder``; the C program is compiled for it."""
+    root = folder / "root"
+    root.mkdir()
+    for package in userland:
+        subprocess.run(["dpkg-deb", "--extract", package, root], check=True)
+    for pattern in _NOT_NEEDED:
+        for path in root.glob(pattern):
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink()
+    for name in ("bin", "lib", "lib64", "sbin"):
+        if not (root / name).exists():
+            (root / name).symlink_to(f"usr/{name}")
+    ignored = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(ROOT / "src", root / "src", ignore=ignored)
+    shutil.copytree(HERE / "guest", root / "checks", ignore=ignored)
+    subprocess.run(
+        ["cc", "-O2", "-Wall", "-static", "-o", root / "checks/spin", HERE / "guest/spin.c"],
+        check=True,
+    )
+    init = root / "init"
+    init.write_text(_INIT)
+    init.chmod(0o755)
+    return _archive(root, folder / "initramfs.cpio")
+
+
+def _archive(root: Path, output: Path) -> Path:
+    """A cpio archive (format newc, which the kernel reads), uncompressed: unpacked sooner."""
+    with output.open("wb") as file:
+        for number, path in enumerate(sorted(root.rglob("*")), start=1):
+            status = path.lstat()
+            data = b""
+            if path.is_symlink():
+                data = bytes(path.readlink())
+            elif path.is_file():
+                data = path.read_bytes()
+            name = str(path.relative_to(root)).encode()
+            file.write(_header(number, status.st_mode, len(data), len(name)) + name + b"\0")
+            file.write(b"\0" * (-file.tell() % 4) + data)
+            file.write(b"\0" * (-file.tell() % 4))
+        end = b"TRAILER!!!"
+        file.write(_header(0, 0, 0, len(end)) + end + b"\0")
+        file.write(b"\0" * (-file.tell() % 512))
+    return output
+
+
+def _header(number: int, mode: int, size: int, name_length: int) -> bytes:
+    """newc: the magic, then 13 fields of eight hexadecimal digits; everything belongs to root."""
+    fields = (number, mode, 0, 0, 1, 0, size, 0, 0, 0, 0, name_length + 1, 0)
+    return b"070701" + b"".join(b"%08X" % field for field in fields)
