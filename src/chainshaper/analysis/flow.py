@@ -5,6 +5,7 @@ publications and takes into four frames that refer to each other by number. It c
 number of sorts and joins, however many events there are.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import polars as pl
@@ -52,10 +53,12 @@ def data_flow(tables: events.EventTables, clock_offset_ns: int = 0) -> DataFlow:
     matters only for traces from before Jazzy (:mod:`~chainshaper.analysis.messages`).
     """
     objects = resolve_objects(tables)
-    instances = callback_instances(tables, objects.callbacks)
-    taken = takes(tables, objects)
-    published = publications(tables, objects)
-    taken = link_takes(tables, taken, published, clock_offset_ns)
+    with ThreadPoolExecutor(max_workers=1) as beside:  # instances and messages meet only below
+        running = beside.submit(callback_instances, tables, objects.callbacks)
+        taken = takes(tables, objects)
+        published = publications(tables, objects)
+        taken = link_takes(tables, taken, published, clock_offset_ns)
+        instances = running.result()
     instances, taken = with_assumed_readers(instances, taken, objects)
     taken = _consumed(taken, instances)
     published = _published_in(published, instances, objects)

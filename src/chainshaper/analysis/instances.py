@@ -37,9 +37,10 @@ def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> p
     owners = callbacks.filter(pl.col("observed")).select(
         "callback_id", "pid", callback="handle", registered="valid_from"
     )
-    owned = latest_before(paired, owners, ["pid", "callback"], "start", "registered")
-    frame = owned.filter(pl.col("callback_id").is_not_null()).select(
-        "callback_id",
+    started = paired.select("pid", "callback", "start")  # in order of time, and stays so
+    owned = latest_before(started, owners, ["pid", "callback"], "start", "registered")
+    frame = paired.select(
+        owned["callback_id"],
         "pid",
         "tid",
         "start",
@@ -47,7 +48,7 @@ def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> p
         pl.when(pl.col("used") >= 0).then("used").alias("execution_ns"),
         "intra_process",
         pl.lit(False).alias("assumed"),
-    )
+    ).drop_nulls("callback_id")
     if frame["execution_ns"].null_count() == frame.height and "sched_switch" in tables:
         frame = _plausible(frame.with_columns(cpu_time(tables, frame).alias("execution_ns")))
     return frame.with_row_index("instance")

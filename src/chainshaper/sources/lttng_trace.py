@@ -17,6 +17,7 @@ read host by host, and where two of them use the same number, the later host's a
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from threading import Lock
 from typing import TypeAlias
 
 import polars as pl
@@ -72,6 +73,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         self._fields = declared_fields(trace)
         self._progress = progress
         self._read: dict[str, pl.DataFrame] = {}
+        self._decoding = Lock()  # the analysis asks for tables from two threads
         self._sources: dict[str, list[str]] = {}
         for full_name in trace.event_names:
             name = table_name(full_name)
@@ -115,8 +117,9 @@ class TraceTables(Mapping[str, pl.DataFrame]):
     def __getitem__(self, name: str) -> pl.DataFrame:
         if name not in self:
             raise KeyError(name)
-        if name not in self._read:
-            self._decode(next(group for group in _GROUPS if name in group))
+        with self._decoding:
+            if name not in self._read:
+                self._decode(next(group for group in _GROUPS if name in group))
         return self._read[name]
 
     def __contains__(self, name: object) -> bool:
@@ -159,7 +162,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
                 self._take_stock(trace, found)
                 self._settle_numbers(host, found)
             if nameless:
-                self._note_names(host, found)
+                self._note_names(host, trace, found)
             for name in group:
                 for full in self._sources.get(name, ()):
                     decoded = found.pop(full)  # let go of what is in no table
@@ -177,6 +180,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
             return read_events(
                 trace,
                 wanted,
+                nameless=[full for full in wanted if table_name(full) not in _CREATION],
                 progress=lambda share: self._progress((place + share) / hosts, what),
             )
 
@@ -199,9 +203,13 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         self._moved[host] = beyond if pids & self._pids else 0
         self._pids |= pids
 
-    def _note_names(self, host: str, found: Events) -> None:
-        rare = {name: frame for name, frame in found.items() if table_name(name) in _CREATION}
-        names = _process_names(rare) or _process_names(found)
+    def _note_names(self, host: str, trace: CtfTrace, found: Events) -> None:
+        """What processes are called, from their objects' creation if it was traced."""
+        names = _process_names(found)
+        if not names and not any(name in self for name in _CREATION):
+            ran = [full for name in _WHO_RUNS for full in self._sources.get(name, ())]
+            with _as_our_errors():
+                names = _process_names(read_events(trace, ran))
         self._names |= {pid + self._moved[host]: name for pid, name in names.items()}
 
     def _with_moved_numbers(self, table: pl.DataFrame, host: str) -> pl.DataFrame:

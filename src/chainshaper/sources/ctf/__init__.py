@@ -45,6 +45,7 @@ def read_events(
     names: Collection[str] | None = None,
     *,
     context: bool = False,
+    nameless: Collection[str] = (),
     threads: int | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Events:
@@ -57,7 +58,8 @@ def read_events(
     * ``time``: Int64, ns on the trace's own clock (CLOCK_MONOTONIC for LTTng), its offset not
       added; ``cpu``: Int32; ``pid``, ``tid``: integers as recorded (``vpid``, ``vtid`` in user
       space, ``pid``, ``tid`` in the kernel); null where the trace has none.
-    * ``procname``: Categorical, where recorded.
+    * ``procname``: Categorical, where recorded; not for the events that are ``nameless``, since
+      reading it is most of the work for an event without other texts.
     * the payload under its own names without LTTng's leading underscore; a field called like
       one of the above is ``payload.<name>``.  Integers and floats keep their width and sign,
       enumerations their integer; strings and text arrays are String (bytes that are not UTF-8
@@ -69,6 +71,8 @@ def read_events(
     ``progress`` is told the share that is done, from 0 to 1.
     Raises `CtfError` where a file is gone or changes while it is read.
     """
+    from chainshaper.sources.ctf.assembly import Wanted
     from chainshaper.sources.ctf.read import read
 
-    return read(trace, names, context, threads, progress)
+    asked = frozenset(trace.event_names if names is None else names)
+    return read(trace, Wanted(asked, frozenset(nameless), context), threads, progress)

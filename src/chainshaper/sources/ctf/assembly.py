@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from uuid import UUID
@@ -37,7 +37,7 @@ from chainshaper.sources.ctf.types import (
     field_name,
 )
 
-__all__ = ["Assembly", "Table", "assemble", "attach"]
+__all__ = ["Assembly", "Table", "Wanted", "assemble", "attach"]
 
 _STREAM_WIDTH = 20
 _EVENT_WIDTH = 11
@@ -58,6 +58,19 @@ class Table:
     levels: int
     has_cpu: bool
     counter: int
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is to be read: events that get a table, and which of their context.
+
+    pid, tid and procname always, procname not for the ``nameless`` ones; the other context fields
+    with ``context``.
+    """
+
+    names: frozenset[str] = frozenset()
+    nameless: frozenset[str] = frozenset()
+    context: bool = False
 
 
 @dataclass
@@ -88,21 +101,16 @@ class Assembly:
         return np.array(self.event_rows or [[0] * _EVENT_WIDTH], np.int64)
 
 
-def assemble(
-    folders: Sequence[tuple[Path, TraceClass]],
-    wanted: Callable[[str], bool],
-    context: bool = False,
-) -> Assembly:
+def assemble(folders: Sequence[tuple[Path, TraceClass]], wanted: Wanted) -> Assembly:
     """Lay out every stream and event class of all ``folders``.
 
-    ``wanted`` says by name which events get a table; ``context`` asks for context fields
-    other than pid, tid and procname too.  Raises `CtfError` for types that cannot be read.
+    Raises `CtfError` for types that cannot be read.
     """
     assembly = Assembly()
     for path, trace in folders:
         first = len(assembly.stream_rows)
         try:
-            _folder(assembly, len(assembly.folders), trace, wanted, context)
+            _folder(assembly, len(assembly.folders), trace, wanted)
         except LayoutError as error:
             raise CtfError(
                 path / "metadata", None, str(error), "the trace cannot be read"
@@ -128,8 +136,7 @@ def _folder(
     assembly: Assembly,
     folder: int,
     trace: TraceClass,
-    wanted: Callable[[str], bool],
-    context: bool,
+    wanted: Wanted,
 ) -> None:
     reader = Reader(big=trace.byte_order == "be", registers=len(REGISTERS))
     header, _ = compile_fields(reader, "trace.packet.header", trace.packet_header, fixed=True)
@@ -149,7 +156,7 @@ def _folder(
         else:
             row[17] &= ~(1 << REGISTERS["uuid_low"])
         has_cpu = bool(row[17] >> REGISTERS["cpu_id"] & 1)
-        rows = _events(assembly, own, stream, trace, has_cpu, wanted, context)
+        rows = _events(assembly, own, stream, trace, has_cpu, wanted)
         reader.registers = max(reader.registers, own.registers)
         row[12:16] = _id_table(assembly, rows)
         assembly.stream_rows.append(row)
@@ -169,16 +176,15 @@ def _events(
     stream: StreamClass,
     trace: TraceClass,
     has_cpu: bool,
-    wanted: Callable[[str], bool],
-    context: bool,
+    wanted: Wanted,
 ) -> dict[int, int]:
     """Lay out a stream class's events; returns their rows by event id."""
     rows: dict[int, int] = {}
     roots = dict(reader.roots)
     for event in stream.events.values():
         own = Reader(reader.big, reader.registers, dict(roots))
-        keep = wanted(event.name)
-        steps, columns = _event(own, stream, event, trace, keep, context)
+        keep = event.name in wanted.names
+        steps, columns = _event(own, stream, event, trace, wanted)
         reader.registers = max(reader.registers, own.registers)
         number, storage = -1, None
         row = [0] * _EVENT_WIDTH
@@ -208,18 +214,20 @@ def _event(
     stream: StreamClass,
     event: EventClass,
     trace: TraceClass,
-    keep: bool,
-    context: bool,
+    asked: Wanted,
 ) -> tuple[list[Step], list[tuple[str, Shape]]]:
     """The steps of an event behind its header, and its columns by their final names."""
+    keep = event.name in asked.names
     names = _standard_names(stream, event, trace) if keep else {}
+    if event.name in asked.nameless:
+        names = {place: name for place, name in names.items() if name != "procname"}
     columns: list[tuple[str, Shape]] = []
     steps: list[Step] = []
     for scope, kind in (
         ("stream.event.context", stream.event_context),
         ("event.context", event.context),
     ):
-        wanted = None if keep and context else frozenset(n for s, n in names if s == scope)
+        wanted = None if keep and asked.context else frozenset(n for s, n in names if s == scope)
         more, found = compile_fields(reader, scope, kind, wanted)
         steps += more
         for name, shape in found:

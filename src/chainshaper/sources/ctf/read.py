@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from chainshaper.sources.ctf.assembly import Assembly, Table, assemble, attach
+from chainshaper.sources.ctf.assembly import Assembly, Table, Wanted, assemble, attach
 from chainshaper.sources.ctf.columns import column
 from chainshaper.sources.ctf.decode import (
     LARGE_BYTES,
@@ -49,7 +49,7 @@ class Events(dict[str, pl.DataFrame]):
 
 def count(trace: CtfTrace, threads: int | None = None) -> tuple[dict[str, int], tuple[str, ...]]:
     """Events per name in order of the names, zeros included, and warnings."""
-    assembly = _assembly(trace, frozenset(), context=False)
+    assembly = _assembly(trace, Wanted())
     with _mapped(trace.streams) as streams:
         walks = _walks(streams, assembly, np.zeros(0, np.int64), threads)
     return _counts(trace, assembly, walks), tuple(w for found in walks for w in found.warnings)
@@ -57,14 +57,12 @@ def count(trace: CtfTrace, threads: int | None = None) -> tuple[dict[str, int], 
 
 def read(
     trace: CtfTrace,
-    names: Collection[str] | None,
-    context: bool,
+    wanted: Wanted,
     threads: int | None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Events:
     """See `chainshaper.sources.ctf.read_events`."""
-    wanted = frozenset(trace.event_names if names is None else names)
-    assembly = _assembly(trace, wanted, context)
+    assembly = _assembly(trace, wanted)
     rows = {assembly.event_streams[e] for e, t in enumerate(assembly.event_tables) if t >= 0}
     used = [s for s in trace.streams if not rows.isdisjoint(s.table[:, 2].tolist())]
     borders = span_borders(used, threads or default_threads())
@@ -98,9 +96,9 @@ def _counts(trace: CtfTrace, assembly: Assembly, walks: list[Walk]) -> dict[str,
     return counts
 
 
-def _assembly(trace: CtfTrace, wanted: frozenset[str], context: bool) -> Assembly:
+def _assembly(trace: CtfTrace, wanted: Wanted) -> Assembly:
     folders = [(folder.path, folder.declared) for folder in trace.folders]
-    return assemble(folders, wanted.__contains__, context)
+    return assemble(folders, wanted)
 
 
 @contextmanager

@@ -81,11 +81,11 @@ def open_trace(*paths: Path | str) -> CtfTrace:
     metadata cannot be understood; stream files with damage give ``warnings`` instead.
     """
     # Numba is slow to import: only who opens a trace pays for it.
-    from chainshaper.sources.ctf.assembly import assemble
+    from chainshaper.sources.ctf.assembly import Wanted, assemble
     from chainshaper.sources.ctf.streams import packet_table, stream_paths
 
     folders = [CtfFolder(path, read_metadata(path / "metadata")) for path in _find(paths)]
-    assembly = assemble([(f.path, f.declared) for f in folders], lambda _: False)
+    assembly = assemble([(f.path, f.declared) for f in folders], Wanted())
     warnings = _clock_warnings(folders)
     streams: list[CtfStream] = []
     for number, folder in enumerate(folders):
