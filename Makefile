@@ -17,12 +17,14 @@ lint: .venv/.ready-dev
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 
-# Needs a quiet machine and about four minutes; prints tables, asserts nothing.
+# Needs a quiet machine and about a quarter of an hour; prints tables, asserts nothing.
 benchmark: .venv/.ready-dev
 	.venv/bin/python benchmarks/shaping_jitter.py
 	.venv/bin/python benchmarks/band_placement.py
 	.venv/bin/python benchmarks/ctf_decode.py
 	.venv/bin/python benchmarks/trace_to_latency.py
+	.venv/bin/python benchmarks/enforcement/enter_exit.py
+	.venv/bin/python benchmarks/enforcement/configurations.py
 
 docs: .venv/.ready-dev
 	.venv/bin/mkdocs build --strict

@@ -34,12 +34,14 @@ def real_time_threads(pids: list[int]) -> list[str]:
     return [t.comm for pid in pids for t in list_threads(pid) if t.policy == "SCHED_FIFO"]
 
 
-def wait_for(condition: Callable[[], bool], what: str, seconds: float = 20.0) -> None:
+def wait_for(
+    condition: Callable[[], bool], what: str, seconds: float = 20.0, pause: float = 0.02
+) -> None:
     """Wait until something has happened; a test that waits in vain fails, and says for what."""
     deadline = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < deadline, f"waited {seconds} s in vain for {what}"
-        time.sleep(0.02)
+        time.sleep(pause)
 
 
 def _pids() -> list[int]:

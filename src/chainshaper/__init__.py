@@ -26,8 +26,9 @@ if TYPE_CHECKING:
         find_chain,
         load_named_paths,
     )
-    from chainshaper.applying import apply_plan, planned_changes
+    from chainshaper.applying import apply_plan
     from chainshaper.doctor import examine_machine
+    from chainshaper.dry_run import planned_changes
     from chainshaper.enforcement.runs import end_run, find_runs
     from chainshaper.errors import ChainshaperError, InputError, OperationError, PlatformError
     from chainshaper.exploration import (
@@ -75,7 +76,7 @@ _HOMES = {
         "find_chain",
         "load_named_paths",
     ),
-    "chainshaper.applying": ("apply_plan", "planned_changes"),
+    "chainshaper.applying": ("apply_plan",),
     "chainshaper.doctor": ("examine_machine",),
     "chainshaper.enforcement.runs": ("end_run", "find_runs"),
     "chainshaper.errors": ("ChainshaperError", "InputError", "OperationError", "PlatformError"),
@@ -86,6 +87,7 @@ _HOMES = {
         "event_counts",
         "list_chains",
     ),
+    "chainshaper.dry_run": ("planned_changes",),
     "chainshaper.planning": (
         "Plan",
         "PlanRequest",

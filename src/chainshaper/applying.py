@@ -22,10 +22,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from chainshaper.dry_run import LEAD_NS, first_thread, server_table, shaping_nodes
 from chainshaper.durations import format_duration
 from chainshaper.enforcement.allocation import Allocation, new_and_ended
 from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, make_back_end
-from chainshaper.enforcement.journal import Journal, discard_journal, open_journal
+from chainshaper.enforcement.claims import claim_run
+from chainshaper.enforcement.journal import Journal
 from chainshaper.enforcement.phase import DriftWatch, measure_phase
 from chainshaper.enforcement.realtime import (
     available_cores,
@@ -33,31 +35,17 @@ from chainshaper.enforcement.realtime import (
     interrupted_with_parent,
 )
 from chainshaper.enforcement.release_after import start_watching
-from chainshaper.enforcement.resctl import litmus_commands
-from chainshaper.enforcement.runs import RunState, ServerState, save_run_state
-from chainshaper.enforcement.scheduling_memory import (
-    change_scheduling,
-    restore_scheduling,
-)
-from chainshaper.enforcement.server_threads import WantedScheduling, plan_scheduling, server_members
-from chainshaper.enforcement.servers import (
-    BackEnd,
-    ReservationServer,
-    ServerCounters,
-    ServerTable,
-)
-from chainshaper.enforcement.threads import Thread
+from chainshaper.enforcement.runs import RunState, ServerState, remove_run, save_run_state
+from chainshaper.enforcement.scheduling_memory import change_scheduling, restore_scheduling
+from chainshaper.enforcement.server_threads import plan_scheduling, server_members
+from chainshaper.enforcement.servers import BackEnd, ServerCounters, ServerTable
 from chainshaper.errors import OperationError
 from chainshaper.planning import Plan
-from chainshaper.planning.plan_parts import ShapingNode
 from chainshaper.planning.publication import publication_warnings
 from chainshaper.recording import Recording
 from chainshaper.thread_search import find_threads
 
-__all__ = ["LEAD_NS", "Applied", "Changes", "apply_plan", "planned_changes", "server_table"]
-
-LEAD_NS = 2_000_000
-"""The cycle starts so long after the chain's timer expires (DESIGN section 6)."""
+__all__ = ["Applied", "apply_plan"]
 
 START_NS = 30_000_000_000
 """A command has this long to start all nodes of the plan."""
@@ -75,17 +63,6 @@ class Applied:
     exit_code: int | None
 
 
-@dataclass(frozen=True)
-class Changes:
-    """What a plan would change: threads, or the commands of LITMUS^RT's tools."""
-
-    back_end: str
-    reason: str
-    threads: tuple[WantedScheduling, ...]
-    commands: tuple[tuple[str, ...], ...]
-    notes: tuple[str, ...]
-
-
 @dataclass
 class _Run:
     """What there is to keep together, and to put back, while a plan is in force."""
@@ -95,6 +72,7 @@ class _Run:
     journal: Journal
     recording: Recording | None
     stop: threading.Event
+    watcher: subprocess.Popen[bytes] | None = None
     command: subprocess.Popen[bytes] | None = None
     servers: BackEnd | None = None
 
@@ -121,7 +99,7 @@ def apply_plan(
     watch: Callable[[RunState], None] = lambda _: None,
     progress: Callable[[float, str], None] = lambda *_: None,
 ) -> Applied:
-    """Put a plan in force until ``stop`` is set, the command ends, or the servers fail.
+    """Put a plan in force until ``stop`` is set, the command or the application ends, or it fails.
 
     ``command`` is started first; without one, the application runs already. Its nodes have
     ``wait_ns`` to appear (default: 30 s with a command, else none). ``phase_ns`` is where in a
@@ -131,17 +109,19 @@ def apply_plan(
 
     Raises:
         InputError: the plan names no threads, or its table is not one.
-        PlatformError: the machine lacks a core or the back end.
-        OperationError: a node does not appear or is ambiguous, the chain has no regular
-            beginning, the kernel refuses something, or the servers failed while in force.
+        PlatformError: the machine lacks a core or the back end, or we a privilege.
+        OperationError: another run governs one of the cores or nodes, a node does not appear or
+            is ambiguous, the chain has no regular beginning, the kernel refuses something, the
+            servers failed while in force, or the application, not being our command, has ended.
     """
     table = server_table(plan)
     check_cores({server.core: f"server {server.name}" for server in plan.servers})
     choice = choose_back_end(back_end)
-    journal = open_journal(folder)
+    nodes = {thread.node for server in plan.servers for thread in server.threads}
+    journal = claim_run({server.core for server in plan.servers}, nodes, folder)
     run = _Run(plan, choice, journal, recording, stop or threading.Event())
-    watcher = start_watching(run.folder)
     try:
+        run.watcher = start_watching(run.folder)
         if command:
             run.command = _start(command)
         if wait_ns is None:
@@ -154,72 +134,12 @@ def apply_plan(
         state = _keep(run, run.servers, found, state, watch)
     finally:
         _put_back(run)
-        watcher.kill()  # the journal is gone, so it has nothing to do
-        watcher.wait()
+        if run.watcher is not None:
+            run.watcher.kill()  # the journal is gone, so it has nothing to do
+            run.watcher.wait()
     if state.failure is not None:
-        raise OperationError(f"the servers failed: {state.failure}; everything is as it was before")
+        raise OperationError(f"{state.failure}; everything is as it was before")
     return Applied(state, run.command.returncode if run.command else None)
-
-
-def planned_changes(
-    plan: Plan,
-    back_end: str = "auto",
-    *,
-    recording: Recording | None = None,
-    phase_ns: int | None = None,
-) -> Changes:
-    """What :func:`apply_plan` would do; nothing is changed.
-
-    LITMUS^RT's commands are given on any kernel, with ``TID:NODE`` for threads that do not run.
-
-    Raises: as :func:`apply_plan`.
-    """
-    table = server_table(plan)
-    found = find_threads(plan, recording)
-    if back_end != "litmus":
-        choice = choose_back_end(back_end)
-        threads = plan_scheduling(plan, found, available_cores())
-        return Changes(choice.name, choice.reason, threads, (), found.notes)
-    notes = found.notes
-    try:
-        members: dict[str, list[int | str]] = {
-            name: [member.thread.tid for member in group]
-            for name, group in server_members(plan, found).items()
-        }
-        if phase_ns is None:
-            origin = _origin(plan, found)
-            phase_ns = measure_phase(origin.pid, origin.tid, plan.cycle_ns).at_ns
-    except OperationError:
-        members = {s.name: [f"TID:{t.node}" for t in s.threads] for s in plan.servers}
-        notes += ("slots are counted from a beginning that is measured when the chain runs",)
-    anchor = 0 if phase_ns is None else phase_ns + LEAD_NS
-    commands = litmus_commands(table, members, anchor)
-    return Changes("litmus", "asked for", (), commands, notes)
-
-
-def server_table(plan: Plan) -> ServerTable:
-    """The servers of a plan whose threads a back end has to keep inside their slots.
-
-    Raises:
-        OperationError: there are none.
-    """
-    gated_by_themselves = {node.thread for node in _shaping_nodes(plan)}
-    servers = tuple(
-        ReservationServer(server.name, server.core, server.priority, server.slots)
-        for server in plan.servers
-        if any(thread not in gated_by_themselves for thread in server.threads)
-    )
-    if not servers:
-        raise OperationError(
-            "the plan's servers name no threads of the application, so there is nothing to apply: "
-            "plan from a recording (`chainshaper plan REC --chain FIRST..LAST`)"
-        )
-    return ServerTable(plan.cycle_ns, servers)
-
-
-def _shaping_nodes(plan: Plan) -> list[ShapingNode]:
-    first = [] if plan.shaping_node is None else [plan.shaping_node]
-    return [*first, *plan.further_shaping_nodes]
 
 
 def _start(command: Sequence[str]) -> subprocess.Popen[bytes]:
@@ -308,19 +228,6 @@ def _initial_state(
     )
 
 
-def _origin(plan: Plan, found: Allocation) -> Thread:
-    """The thread that begins the chain: the first executor of the server whose slot comes first."""
-    members = server_members(plan, found)
-    for server in sorted(plan.servers, key=lambda one: (one.slots[0][0], one.priority)):
-        for member in members[server.name]:
-            if member.thread.role == "executor":
-                return member.thread
-    raise OperationError(
-        "no server of the plan holds an executor, so nothing says where in a cycle the chain "
-        "begins: give its phase (--phase)"
-    )
-
-
 def _arm(  # noqa: PLR0917 - the parts of a run, each used once
     run: _Run,
     servers: BackEnd,
@@ -332,7 +239,7 @@ def _arm(  # noqa: PLR0917 - the parts of a run, each used once
     """Measure where the chain begins, put its threads into the servers, and close these."""
     notes, spread = state.notes, None
     if phase_ns is None:
-        origin = _origin(run.plan, found)
+        origin = first_thread(run.plan, found)
         phase = measure_phase(
             origin.pid,
             origin.tid,
@@ -357,7 +264,7 @@ def _assign(
     plan: Plan, found: Allocation, servers: BackEnd, already: dict[str, tuple[int, ...]]
 ) -> dict[str, tuple[int, ...]]:
     """Put the threads that are not in their servers yet there; the threads of each server."""
-    themselves = {node.thread.node for node in _shaping_nodes(plan)}
+    themselves = {node.thread.node for node in shaping_nodes(plan)}
     threads = {}
     for name, members in server_members(plan, found).items():
         for member in members:
@@ -383,9 +290,10 @@ def _keep(
 ) -> RunState:
     """Watch over the run until it is to end; the state as it was last."""
     begins = (state.anchor_ns or 0) - (0 if gates(run.choice.name) else LEAD_NS)
-    origin = _origin(run.plan, found)
+    origin = first_thread(run.plan, found)
     drift = DriftWatch(origin.pid, origin.tid, run.plan.cycle_ns, begins)
     while True:
+        is_over = run.command_ended or run.stop.is_set()
         counters = servers.counters()
         state = replace(
             state,
@@ -393,25 +301,56 @@ def _keep(
                 replace(one, counters=counters.get(one.name, _NOTHING)) for one in state.servers
             ),
             drift_ns=drift.latest_ns,
-            failure=servers.failure(),
+            failure=_failure(run, servers, state),
         )
         save_run_state(run.folder, state)
         watch(state)
-        if state.failure is not None or run.command_ended or run.stop.wait(_LOOK_S):
+        if state.failure is not None or is_over:
             return state
+        if run.stop.wait(_LOOK_S):
+            continue
+        if run.watcher is not None and run.watcher.poll() is not None:  # somebody killed it
+            run.watcher = start_watching(run.folder)
         now = find_threads(run.plan, run.recording)
         new, _ = new_and_ended(found, now)
-        if new:
-            state, found = _taken_in(run, servers, now, state), now
+        state = _with_threads(state, _living(now, state))
+        with contextlib.suppress(OperationError):  # a node is on its way up: at the next look
+            if new:
+                state = _taken_in(run, servers, now, state)
+            found = now
+
+
+def _failure(run: _Run, servers: BackEnd, state: RunState) -> str | None:
+    """Why the plan is no longer in force: the back end, or nobody is left to govern."""
+    reason = servers.failure()
+    if reason is not None:
+        return f"the servers failed: {reason}"
+    # What we have started ends by itself, and has perhaps still to write down what it saw; and
+    # somebody may have ended both the application and us.
+    if (
+        run.command is None
+        and not run.stop.is_set()
+        and not any(one.threads for one in state.servers)
+    ):
+        return "the application has ended: no thread of the plan's nodes is left"
+    return None
+
+
+def _living(found: Allocation, state: RunState) -> dict[str, tuple[int, ...]]:
+    """The threads of each server that have not ended."""
+    there = {one.thread.tid for one in found.threads}
+    return {one.name: tuple(tid for tid in one.threads if tid in there) for one in state.servers}
 
 
 def _taken_in(run: _Run, servers: BackEnd, found: Allocation, state: RunState) -> RunState:
-    """Threads that appeared later get what the plan says; a node on its way up is left for now."""
+    """Threads that appeared later get what the plan says.
+
+    Raises:
+        OperationError: not all nodes are there, or a thread has ended again.
+    """
     already = {one.name: one.threads for one in state.servers}
-    with contextlib.suppress(OperationError):
-        _schedule(run, found)
-        return _with_threads(state, _assign(run.plan, found, servers, already))
-    return state
+    _schedule(run, found)
+    return _with_threads(state, _assign(run.plan, found, servers, already))
 
 
 def _put_back(run: _Run) -> None:
@@ -434,10 +373,7 @@ def _put_back(run: _Run) -> None:
             f"not everything could be put back: {'; '.join(problems)}; {run.journal.path} says "
             "what was there, `chainshaper release` tries again"
         )
-    for path in run.folder.iterdir():
-        if path != run.journal.path and path.is_file():
-            path.unlink()
-    discard_journal(run.journal)
+    remove_run(run.journal)
 
 
 def _end(started: subprocess.Popen[bytes]) -> None:

@@ -5,12 +5,14 @@ cycles start. So nothing has to be found or measured, and the thread of each pub
 names goes into its server; executors and DDS threads of the same process run on.
 """
 
+import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from chainshaper.enforcement.back_ends import choose_back_end, make_back_end
-from chainshaper.enforcement.journal import discard_journal, open_journal
+from chainshaper.enforcement.claims import claim_run
 from chainshaper.enforcement.release_after import start_watching
+from chainshaper.enforcement.runs import remove_run
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.enforcement.threads import list_threads
 from chainshaper.errors import OperationError
@@ -27,7 +29,8 @@ def publishers_gated(plan: Plan, nodes: StartedNodes) -> Iterator[None]:
 
     Raises:
         PlatformError: threads cannot be frozen here.
-        OperationError: a node has no such thread, or the servers failed meanwhile.
+        OperationError: another run governs one of the cores or nodes, a node has no such thread,
+            or the servers failed meanwhile.
     """
     choice = choose_back_end("freezer")  # the others want threads that nobody scheduled before
     held = [(server, names) for _, server, names in publisher_servers(plan)]
@@ -35,9 +38,12 @@ def publishers_gated(plan: Plan, nodes: StartedNodes) -> Iterator[None]:
         plan.cycle_ns,
         tuple(ReservationServer(s.name, s.core, s.priority, s.slots) for s, _ in held),
     )
-    journal = open_journal()
-    watcher = start_watching(journal.path.parent)
+    journal = claim_run(
+        {server.core for server, _ in held}, {name for _, names in held for name in names}
+    )
+    watcher: subprocess.Popen[bytes] | None = None
     try:
+        watcher = start_watching(journal.path.parent)
         servers = make_back_end(choice.name, table, journal.path.parent, journal)
         try:
             for server, names in held:
@@ -50,12 +56,10 @@ def publishers_gated(plan: Plan, nodes: StartedNodes) -> Iterator[None]:
         finally:
             servers.release()
     finally:
-        for path in journal.path.parent.iterdir():
-            if path != journal.path:
-                path.unlink()
-        discard_journal(journal)
-        watcher.kill()
-        watcher.wait()
+        remove_run(journal)
+        if watcher is not None:
+            watcher.kill()
+            watcher.wait()
     if failure is not None:
         raise OperationError(f"the servers failed while the application ran: {failure}")
 

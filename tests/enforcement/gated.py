@@ -140,9 +140,12 @@ def share_inside(
     return 1 - sum(kept) / max(1, total)
 
 
-def groups_left(owner_pid: int) -> list[Path]:
-    """Cgroups that a run of this owner has not removed."""
-    return sorted(mount_point().rglob(f"chainshaper-{owner_pid}-*"))
+def groups_left(owner_pid: int | None = None) -> list[Path]:
+    """Cgroups that a run of this owner, or of any, has not removed."""
+    name = "chainshaper-*" if owner_pid is None else f"chainshaper-{owner_pid}-*"
+    while True:
+        with contextlib.suppress(FileNotFoundError):  # one was removed while we looked: once more
+            return sorted(mount_point().rglob(name))
 
 
 def kill(pid: int, number: int = signal.SIGKILL) -> None:

@@ -4,110 +4,30 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-import pytest
+from applied_plans import (
+    CLI,
+    CYCLE,
+    MS,
+    NODE,
+    applied,
+    leftovers,
+    needs_fifo,
+    node_command,
+    plan_for,
+    running_node,
+    scheduling,
+    server,
+)
 from gated import needs_cgroups
 from processes import wait_for
 
-from chainshaper.enforcement.cgroups import mount_point
-from chainshaper.enforcement.journal import journals_folder
-from chainshaper.enforcement.realtime import available_cores, may_use_fifo
+from chainshaper.enforcement.realtime import available_cores
 from chainshaper.enforcement.threads import list_threads
-from chainshaper.planning import Plan, save_plan
-from chainshaper.planning.plan_parts import (
-    ChainOfPlan,
-    Evidence,
-    Margin,
-    Prediction,
-    Server,
-    Thread,
-)
-
-MS = 1_000_000
-CYCLE = 100 * MS
-NODE = Path(__file__).with_name("ticking_node.py")
-CLI = [sys.executable, "-m", "chainshaper"]
-needs_fifo = pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted")
-
-
-def plan_for(*servers: Server) -> Plan:
-    return Plan(
-        chain=ChainOfPlan(period_ns=CYCLE),
-        evidence=Evidence(
-            samples=1000,
-            min_latency_ns=5 * MS,
-            mean_latency_ns=5 * MS,
-            max_latency_ns=5 * MS,
-        ),
-        margin=Margin(epsilon_ns=MS),
-        policy="server-per-chain",
-        cycle_ns=CYCLE,
-        servers=servers,
-        predicted=Prediction(mean_ns=CYCLE, max_ns=CYCLE, jitter_ns=MS),
-    )
-
-
-def server(name: str, node: str, *slots: tuple[int, int]) -> Server:
-    return Server(
-        name=name,
-        core=available_cores()[-1],
-        priority=1,
-        slots=tuple((start * MS, end * MS) for start, end in slots),
-        threads=(Thread(node=f"/{node}"),),
-    )
-
-
-def node_command(name: str, output: Path, period: int = CYCLE, busy: int = 5 * MS) -> list[str]:
-    arguments = [str(period), str(busy), str(output)]
-    return [sys.executable, str(NODE), *arguments, "--ros-args", "-r", f"__node:={name}"]
-
-
-@contextmanager
-def running_node(name: str, output: Path, **options: int) -> Iterator[subprocess.Popen[bytes]]:
-    with subprocess.Popen(node_command(name, output, **options)) as process:
-        wait_for(lambda: output.exists() and output.stat().st_size > 0, f"node {name}")
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
-@contextmanager
-def applied(plan: Plan, folder: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
-    """`chainshaper apply` as its own process, in force."""
-    path = folder / "plan.yaml"
-    save_plan(plan, path)
-    with subprocess.Popen(
-        [*CLI, "apply", str(path), *options],
-        stderr=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as process:
-        try:
-            assert process.stderr is not None
-            said: list[str] = []
-            while not said or not said[-1].startswith("in force"):
-                said.append(process.stderr.readline())
-                assert said[-1], f"it ended: {''.join(said)}"
-            yield process
-        finally:
-            process.kill()
-
-
-def scheduling(pid: int) -> list[object]:
-    return [(t.tid, t.policy, t.priority, t.cores) for t in list_threads(pid)]
-
-
-def leftovers() -> list[Path]:
-    """Groups and runs of ours that are on this machine."""
-    runs = journals_folder()
-    return [*mount_point().rglob("chainshaper-*"), *(runs.iterdir() if runs.is_dir() else ())]
+from chainshaper.planning import save_plan
 
 
 def windows(output: Path) -> np.ndarray:

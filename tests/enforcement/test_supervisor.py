@@ -144,6 +144,19 @@ def test_a_stopped_dispatcher_is_taken_for_hung(tmp_path: Path) -> None:
         assert f"dispatcher of core {CORE} hung" in run.ask("failure")
 
 
+def test_threads_of_a_silent_dispatcher_are_let_go_first_and_closed_again_if_it_comes_back(
+    tmp_path: Path,
+) -> None:
+    with run_of(tmp_path) as run:
+        (group,) = groups_left(run.owner.pid)
+        kill(run.dispatchers[0], signal.SIGSTOP)
+        wait_for(lambda: not run.is_frozen(), "the thread to be let go", pause=0.001)
+        kill(run.dispatchers[0], signal.SIGCONT)
+        wait_for(run.is_frozen, "it to be closed again")
+        assert groups_left(run.owner.pid) == [group]
+        assert run.ask("failure") == "None"
+
+
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_an_owner_that_dies_without_a_release_leaves_nothing(
     tmp_path: Path, number: signal.Signals

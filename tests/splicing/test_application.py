@@ -137,13 +137,6 @@ def test_a_gated_publisher_has_to_publish_asynchronously(tmp_path: Path) -> None
         splice_application(small_chain(tmp_path), _asynchronous())
 
 
-def test_a_gated_publisher_is_not_run_without_its_server(
-    application: Application, tmp_path: Path
-) -> None:
-    with pytest.raises(InputError, match="carry it out with `chainshaper apply`"):
-        shape_application(application, _asynchronous(), tmp_path / "rec")
-
-
 def test_who_writes_what_is_read_off_the_description(application: Application) -> None:
     assert writers_of(application) == [
         Writer("/first", "/t1", 10, False),

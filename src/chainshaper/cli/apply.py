@@ -122,8 +122,8 @@ def _show_changes(
     import shlex
     from dataclasses import asdict
 
-    from chainshaper.applying import planned_changes
     from chainshaper.cli.output import notes, print_json, show, show_line
+    from chainshaper.dry_run import planned_changes
     from chainshaper.reporting.servers import changes_table
 
     changes = planned_changes(plan, backend, recording=recording, phase_ns=phase_ns)

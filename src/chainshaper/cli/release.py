@@ -29,7 +29,10 @@ def release(
         raise InputError(f"no run {run!r}: {known}")
     problems: list[str] = []
     for journal in chosen:
-        left = end_run(journal)
+        try:
+            left = end_run(journal)
+        except OperationError as error:  # the others are ended all the same
+            left = (str(error),)
         problems += left
         if not left:
             show_line(f"{journal.path.parent.name}: everything is as it was before")

@@ -121,18 +121,19 @@ def _missing_for_freezer() -> str | None:
     except PlatformError as error:
         return str(error)
     if not any(os.access(one, os.W_OK, effective_ids=True) for one in (folder, own)):
-        return f"{folder} is not writable: run as root, or in a unit with Delegate=yes"
-    if not may_use_fifo():
-        return "SCHED_FIFO is not permitted: run as root, or with CAP_SYS_NICE"
-    return None
+        return (
+            f"{folder} is not writable: run as root, with CAP_DAC_OVERRIDE, or in a unit with "
+            "Delegate=yes"
+        )
+    return _missing_for_fifo()
 
 
 def _missing_for_fifo() -> str | None:
     if may_use_fifo():
         return None
     return (
-        "SCHED_FIFO is not permitted: run as root, or give your user an rtprio limit of 98 in "
-        "/etc/security/limits.conf"
+        "SCHED_FIFO is not permitted: run as root or with CAP_SYS_NICE, or give your user an "
+        "rtprio limit of 98 in /etc/security/limits.conf"
     )
 
 

@@ -58,7 +58,7 @@ from chainshaper.enforcement.freezer_supervisor import how_it_ended, module_comm
 from chainshaper.enforcement.servers import ServerCounters, ServerTable
 from chainshaper.enforcement.slot_boundaries import (
     Anchoring,
-    check_slots,
+    check_table,
     first_anchoring,
     next_anchoring,
 )
@@ -86,7 +86,7 @@ def create(table: ServerTable, run_directory: Path) -> "Freezer":
         OperationError: another run is in force, or a process of ours does not start.
         PlatformError: no cgroup v2 here, a core is missing, or the folder cannot be written to.
     """
-    _check(table)
+    check_table(table)
     cgroups.mount_point()
     try:
         run_directory.mkdir(parents=True, exist_ok=True)
@@ -105,16 +105,6 @@ def create(table: ServerTable, run_directory: Path) -> "Freezer":
     except BaseException:
         log.close()
         raise
-
-
-def _check(table: ServerTable) -> None:
-    names = [server.name for server in table.servers]
-    if not names or table.cycle_ns <= 0:
-        raise InputError("a table of servers needs a cycle time and at least one server")
-    for server in table.servers:
-        if names.count(server.name) > 1:
-            raise InputError(f"two servers are named {server.name}: rename one")
-        check_slots(server.name, server.slots, table.cycle_ns)
 
 
 class Freezer:
@@ -380,10 +370,14 @@ class Freezer:
         if self._ending:
             return
         code = self._supervisor.wait()
-        said = log_text(self.run_directory)
-        self._failure = "; ".join(said.splitlines()) or f"the supervisor {how_it_ended(code)}"
+        said = log_text(self.run_directory).splitlines()
+        if code < 0:  # it could not say so itself
+            hung = " (it hung, or was stopped)" if still >= _LOOKS_UNTIL_HUNG else ""
+            said.insert(0, f"the supervisor {how_it_ended(code)}{hung}")
+        self._failure = "; ".join(said) or f"the supervisor {how_it_ended(code)}"
         with self._lock:
-            self._restore()
+            if not self._released:
+                self._restore()
 
     def _restore(self) -> tuple[str, ...]:
         left = restore(self._state.groups)

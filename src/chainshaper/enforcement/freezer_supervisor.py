@@ -7,6 +7,11 @@ Whoever it is, it ends all dispatchers, thaws the threads, puts them back and re
 says why in the run's log, and ends. It has a session of its own, so what is sent to the owner's
 terminal does not reach it, and it out-ranks the dispatchers.
 
+A dispatcher that gives no sign of life for a tenth of a second may hang, or its core may have been
+taken from the machine for a moment. So its threads are let go first, and questions asked later: one
+that comes back closes what has to be closed, at the price of a cycle or less in which a server's
+threads ran freely; one that stays away for half a second has failed.
+
 The sign of life must stand still over several looks of the supervisor, rather than for some time:
 a machine that stalls as a whole is nobody's fault.
 
@@ -24,15 +29,22 @@ from pathlib import Path
 from types import FrameType
 
 from chainshaper.enforcement.freezer_counters import BEATS, SUPERVISOR, CounterPage, open_page
-from chainshaper.enforcement.freezer_state import COUNTERS, load_state, remove_state, restore
+from chainshaper.enforcement.freezer_state import (
+    COUNTERS,
+    load_state,
+    remove_state,
+    restore,
+    thaw,
+)
 from chainshaper.enforcement.realtime import set_thread_name
 from chainshaper.errors import ChainshaperError, OperationError, PlatformError
 
 __all__ = ["main", "module_command"]
 
 PRIORITY = 98
-LOOK_S = 0.06
-LOOKS_UNTIL_HUNG = 8
+LOOK_S = 0.02
+LOOKS_UNTIL_THAWED = 4
+LOOKS_UNTIL_HUNG = 24
 _START_S = 10.0
 
 
@@ -86,7 +98,12 @@ def how_it_ended(code: int) -> str:
     return f"was killed by signal {-code}"
 
 
-def _watch(owner: int, page: CounterPage, dispatchers: dict[int, subprocess.Popen[bytes]]) -> str:
+def _watch(
+    owner: int,
+    page: CounterPage,
+    dispatchers: dict[int, subprocess.Popen[bytes]],
+    run_directory: Path,
+) -> str:
     """Returns when something has gone wrong: what. ``owner`` is a pidfd."""
     poll = select.poll()
     poll.register(owner, select.POLLIN)
@@ -106,8 +123,18 @@ def _watch(owner: int, page: CounterPage, dispatchers: dict[int, subprocess.Pope
             beats = page.words[page.core(core) + BEATS]
             still[core] = still[core] + 1 if beats == seen[core] else 0
             seen[core] = beats
+            if still[core] == LOOKS_UNTIL_THAWED:
+                _let_go(run_directory, core)
             if still[core] >= LOOKS_UNTIL_HUNG:
                 return f"the dispatcher of core {core} hung, or somebody stopped it"
+
+
+def _let_go(run_directory: Path, core: int) -> None:
+    """Thaw the threads of all servers of a core; they stay in their groups."""
+    state = load_state(run_directory)
+    if state is not None:
+        served = {server.name for server in state.table.servers if server.core == core}
+        thaw(group for group in state.groups if group.server in served)
 
 
 def _end(run_directory: Path, dispatchers: dict[int, subprocess.Popen[bytes]]) -> tuple[str, ...]:
@@ -160,7 +187,7 @@ def main() -> None:
             os.close(int(commands))
         _wait_until_running(page, dispatchers)
         _become_first()
-        reason, code = _watch(owner, page, dispatchers), OperationError.exit_code
+        reason, code = _watch(owner, page, dispatchers, run_directory), OperationError.exit_code
     except _EndAsked:
         pass
     except ChainshaperError as error:

@@ -66,13 +66,16 @@ class Journal:
     def entries(self, kind: str | None = None) -> tuple[dict[str, Any], ...]:
         """All that was noted, oldest first; a ``kind`` alone if one is given.
 
-        A last line that a crash cut off is left out: what it speaks of was never done.
+        A last line that a crash cut off is left out: what it speaks of was never done. A journal
+        that has been discarded says nothing.
 
         Raises:
             OperationError: the file cannot be read, or is no journal.
         """
         try:
             lines = self.path.read_text().split("\n")
+        except FileNotFoundError:
+            return ()
         except OSError as error:
             raise OperationError(
                 f"{self.path}: the journal cannot be read: {error.strerror}"

@@ -17,12 +17,19 @@ from pathlib import Path
 
 from chainshaper.enforcement.journal import FILE, Journal
 from chainshaper.enforcement.runs import undo_run
+from chainshaper.errors import OperationError
 
 __all__ = ["start_watching"]
 
+_START_S = 20.0
+
 
 def start_watching(folder: Path) -> subprocess.Popen[bytes]:
-    """Have a process watch the caller, in a session of its own; it is ready when this returns."""
+    """Have a process watch the caller, in a session of its own; it is ready when this returns.
+
+    Raises:
+        OperationError: it does not start.
+    """
     reading, writing = os.pipe()
     try:
         watcher = subprocess.Popen(
@@ -35,8 +42,16 @@ def start_watching(folder: Path) -> subprocess.Popen[bytes]:
         )
     finally:
         os.close(writing)
-    os.read(reading, 1)  # it says that it is there, or ends
+    there, _, _ = select.select([reading], [], [], _START_S)  # it says so, or ends
+    said = os.read(reading, 1) if there else b""
     os.close(reading)
+    if not said:
+        watcher.kill()
+        watcher.wait()
+        raise OperationError(
+            "the process that undoes our changes should we be killed does not start: is the "
+            "machine overloaded, or somebody ending our processes?"
+        )
     return watcher
 
 
@@ -45,7 +60,8 @@ def main() -> None:
     owner, folder, ready = int(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
     for ignored in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(ignored, signal.SIG_IGN)
-    with contextlib.suppress(ProcessLookupError):
+    # It may have been killed already, and then nobody listens.
+    with contextlib.suppress(ProcessLookupError, BrokenPipeError):
         ended = os.pidfd_open(owner)
         os.write(ready, b"!")
         os.close(ready)

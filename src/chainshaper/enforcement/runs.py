@@ -7,6 +7,7 @@ the owner is gone, all is undone from what the folder says (`chainshaper release
 """
 
 import contextlib
+import fcntl
 import json
 import os
 import signal
@@ -20,13 +21,14 @@ from chainshaper.enforcement import freezer_state, litmus
 from chainshaper.enforcement.journal import Journal, discard_journal, find_journals
 from chainshaper.enforcement.scheduling_memory import restore_scheduling
 from chainshaper.enforcement.servers import ServerCounters
-from chainshaper.errors import OperationError
+from chainshaper.errors import OperationError, PlatformError
 
 __all__ = [
     "RunState",
     "ServerState",
     "end_run",
     "find_runs",
+    "remove_run",
     "runs_as_json",
     "save_run_state",
     "undo_run",
@@ -91,7 +93,8 @@ def find_runs(folder: Path | None = None) -> Iterator[tuple[Journal, RunState | 
         state = None
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             state = _from_json(json.loads((journal.path.parent / FILE).read_text()))
-        yield journal, state
+        if journal.path.exists():  # not over meanwhile
+            yield journal, state
 
 
 def runs_as_json(folder: Path | None = None) -> list[dict[str, Any]]:
@@ -110,6 +113,8 @@ def runs_as_json(folder: Path | None = None) -> list[dict[str, Any]]:
 def end_run(journal: Journal) -> tuple[str, ...]:
     """End a run: its owner does it, or we do where it is gone. What could not be undone, if so.
 
+    An owner that somebody has stopped (Ctrl-Z) is made to go on: it could not end otherwise.
+
     Raises:
         OperationError: the owner does not react, or is not ours to end.
     """
@@ -118,6 +123,9 @@ def end_run(journal: Journal) -> tuple[str, ...]:
         return undo_run(journal)
     try:
         os.kill(owner, signal.SIGTERM)
+        os.kill(owner, signal.SIGCONT)
+    except ProcessLookupError:
+        return undo_run(journal)
     except PermissionError:
         raise OperationError(
             f"the run {journal.path.parent.name} belongs to process {owner} of another user: end "
@@ -139,20 +147,44 @@ def end_run(journal: Journal) -> tuple[str, ...]:
 def undo_run(journal: Journal) -> tuple[str, ...]:
     """Undo what a run whose owner is gone has changed; what could not be undone, in sentences.
 
-    The journal stays where something is left, so that it can be tried again.
+    The journal stays where something is left, so that it can be tried again. Who is at it while
+    somebody else is waits, and finds it done.
     """
-    folder, left = journal.path.parent, []
-    for undo in (_thaw, _restore_threads, _back_to_former_plugin):
-        try:
-            left += undo(journal)
-        except OperationError as error:
-            left.append(str(error))
-    if not left:
-        for path in folder.iterdir():
-            if path != journal.path and path.is_file():
-                path.unlink()
-        discard_journal(journal)
+    left: list[str] = []
+    with _locked(journal.path.parent):
+        if not journal.path.exists():
+            return ()
+        for undo in (_thaw, _restore_threads, _back_to_former_plugin):
+            try:
+                left += undo(journal)
+            except (OperationError, PlatformError) as error:
+                left.append(str(error))
+        if not left:
+            remove_run(journal)
     return tuple(left)
+
+
+def remove_run(journal: Journal) -> None:
+    """Remove the folder of a run that is over: what the back end kept there, then the journal."""
+    for path in journal.path.parent.iterdir():
+        if path != journal.path and not path.is_dir():
+            path.unlink(missing_ok=True)
+    discard_journal(journal)
+
+
+@contextlib.contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Nobody else undoes the run of this folder; a folder that is gone needs no lock."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except FileNotFoundError:
+        yield
+        return
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def _thaw(journal: Journal) -> list[str]:

@@ -7,7 +7,9 @@ has ended is done with, and one that has its id by now is recognised by its star
 
 Threads inherit class and cores from those that create them. What an application starts while we
 have changed it is not in the journal, but shows a class that only we have given to its family:
-it gets its parent's original (:func:`restore_inherited`).
+it gets its parent's original (:func:`restore_inherited`). A daemon has left its family, since the
+process between them has ended; it is known by the cgroup of the thread that was changed, and by
+all that we gave to that one, a real-time class included.
 
 SCHED_DEADLINE has parameters that the kernel admits only together with all others: threads under
 it are refused.
@@ -37,9 +39,10 @@ from chainshaper.enforcement.threads import (
     Thread,
     list_threads,
     parents,
+    read_proc,
     start_of,
 )
-from chainshaper.errors import OperationError
+from chainshaper.errors import OperationError, PlatformError
 
 __all__ = [
     "Outcome",
@@ -70,7 +73,8 @@ class Outcome:
 class _Remembered:
     """A thread of the journal: what it had at first, and all that it was given since.
 
-    ``changed_at`` counts clock ticks since the machine booted.
+    ``changed_at`` counts clock ticks since the machine booted; ``cgroups`` are those in which it
+    was then, as /proc shows them.
     """
 
     tid: int
@@ -78,6 +82,7 @@ class _Remembered:
     pid: int
     comm: str
     changed_at: int
+    cgroups: str
     original: SchedulingState
     given: tuple[SchedulingState, ...]
 
@@ -90,6 +95,7 @@ def change_scheduling(journal: Journal, thread: Thread, wanted: Scheduling) -> N
     Raises:
         OperationError: it runs under SCHED_DEADLINE, the journal cannot be written (then nothing
             is changed), or the kernel refuses.
+        PlatformError: the privilege to change it is missing.
     """
     try:
         target = _target(state_of(thread.tid), wanted)
@@ -98,6 +104,12 @@ def change_scheduling(journal: Journal, thread: Thread, wanted: Scheduling) -> N
             set_state(thread.tid, target, [a for a in ASPECTS if _differ(now, target, a)])
     except ProcessLookupError:
         return
+    except PermissionError as error:
+        raise PlatformError(
+            f"thread {thread.tid} ({thread.comm}) of process {thread.pid} may not be given "
+            f"{state_text(target)}: run as root or with CAP_SYS_NICE, or as the user of that "
+            "process with an rtprio limit of 98"
+        ) from error
     except OSError as error:
         raise OperationError(
             f"thread {thread.tid} ({thread.comm}) of process {thread.pid}: the kernel refuses "
@@ -136,6 +148,7 @@ def note_scheduling(journal: Journal, thread: Thread, target: SchedulingState) -
         pid=thread.pid,
         comm=thread.comm,
         at=clock_gettime_ns(CLOCK_BOOTTIME) // TICK_NS,
+        cgroups=_cgroups_of(thread.tid),
         before=state_as_json(before),
         given=state_as_json(target),
     )
@@ -162,8 +175,9 @@ def restore_scheduling(journal: Journal) -> tuple[Outcome, ...]:
 def restore_inherited(journal: Journal) -> tuple[Outcome, ...]:
     """Give threads that inherited a class or cores of ours what their parent had before.
 
-    They are threads that started after the change, in a process of the journal or in one that it
-    started. To be repeated while an application runs; threads in the journal are not touched.
+    They are threads that started after the change, in a process of the journal, in one that it
+    started, or in a daemon. To be repeated while an application runs; threads in the journal are
+    not touched.
     """
     if journal.outdated:
         return ()
@@ -179,6 +193,11 @@ def restore_inherited(journal: Journal) -> tuple[Outcome, ...]:
             if outcome is not None:
                 done.add(thread.identity)
                 outcomes.append(outcome)
+    strangers = (thread for pid in parent_of for thread in list_threads(pid))
+    for daemon in (one for one in strangers if one.identity not in done):
+        outcome = _disinherit(daemon, _forebears(daemon, remembered))
+        if outcome is not None:
+            outcomes.append(outcome)
     return tuple(outcomes)
 
 
@@ -225,6 +244,27 @@ def _disinherit(thread: Thread, family: list[_Remembered]) -> Outcome | None:
     return Outcome(thread.tid, thread.comm, "restored", "it had inherited what we had set")
 
 
+def _forebears(thread: Thread, remembered: list[_Remembered]) -> list[_Remembered]:
+    """Those of whom a thread has everything that we gave them, which no relation would explain."""
+    if thread.priority == 0:
+        return []  # cores alone are no evidence
+    try:
+        now = state_of(thread.tid)
+    except ProcessLookupError:
+        return []
+    return [
+        one for one in remembered if now in one.given and _cgroups_of(thread.tid) == one.cgroups
+    ]
+
+
+def _cgroups_of(tid: int) -> str:
+    """The cgroups of a thread, in all hierarchies; empty when it has ended."""
+    try:
+        return read_proc(f"/proc/{tid}/cgroup").decode(errors="replace")
+    except OSError:
+        return ""
+
+
 def _without_inheritance(
     state: SchedulingState, started: int, family: list[_Remembered]
 ) -> SchedulingState:
@@ -254,7 +294,13 @@ def _remembered(journal: Journal) -> list[_Remembered]:
         key = (entry["tid"], entry["started"])
         if key not in threads:
             threads[key] = _Remembered(
-                *key, entry["pid"], entry["comm"], entry["at"], before, (given,)
+                *key,
+                entry["pid"],
+                entry["comm"],
+                entry["at"],
+                entry["cgroups"],
+                before,
+                (given,),
             )
             continue
         earlier = threads[key]

@@ -63,6 +63,7 @@ TICK_NS = 20_000_000
 _REST_NS = 1_000_000  # after a boundary; frozen threads, too, need the core to reach the freezer
 _ROOM_NS = 200_000  # at least, between a tick and the boundaries around it
 _WATCH_NS = 100_000  # before a boundary, instead of sleeping
+_THAWED_AFTER_NS = 60_000_000  # the supervisor waits for a sign of life a little longer
 _FAR = 1 << 62
 _NOTHING: frozenset[int] = frozenset()
 
@@ -92,7 +93,7 @@ class Dispatcher:
         self.upcoming = (_FAR, self.boundaries[0])
         self.ahead: Iterator[tuple[int, Boundary]] = iter(())
         self.unexamined: set[int] = set()
-        self.last_tick = time.monotonic_ns()
+        self.last_tick = self.last_sign = time.monotonic_ns()
         self.parent = os.getppid()
 
     def run(self) -> None:
@@ -125,6 +126,7 @@ class Dispatcher:
             if rest >= _ROOM_NS:
                 sleep_until(at + rest)  # those who were let in wait for us to sleep
             self._note(boundary, closing, switched - at)
+            self._give_sign(switched)
             self.upcoming = following
 
     def thaw_all(self) -> None:
@@ -180,11 +182,19 @@ class Dispatcher:
     def _tick(self) -> None:
         """A sign of life, and all that has waited."""
         self.last_tick = time.monotonic_ns()
-        self.words[self.own + BEATS] += 1
+        self._give_sign(self.last_tick)
         if os.getppid() != self.parent:
             raise OperationError("the supervisor is gone")
         self._examine()
         self._obey()
+
+    def _give_sign(self, now: int) -> None:
+        """Show that we live. After long without that, the supervisor has thawed what we closed."""
+        self.words[self.own + BEATS] += 1
+        if now - self.last_sign > _THAWED_AFTER_NS and self.open is not None:
+            for server in sorted(set(range(len(self.groups))) - self.open):
+                self._write(server, b"1")
+        self.last_sign = now
 
     def _count(self, counters: int, lateness: int) -> None:
         self.words[counters + SLOTS] += 1

@@ -1,0 +1,123 @@
+"""What carrying out a plan would change, before anything is: `chainshaper apply --dry-run`.
+
+Also what both need to know of a plan beside the threads that run: the table of servers for a back
+end, and the thread with which the chain begins.
+"""
+
+from dataclasses import dataclass
+
+from chainshaper.enforcement.allocation import Allocation
+from chainshaper.enforcement.back_ends import choose_back_end
+from chainshaper.enforcement.phase import measure_phase
+from chainshaper.enforcement.realtime import available_cores
+from chainshaper.enforcement.resctl import litmus_commands
+from chainshaper.enforcement.server_threads import WantedScheduling, plan_scheduling, server_members
+from chainshaper.enforcement.servers import ReservationServer, ServerTable
+from chainshaper.enforcement.threads import Thread
+from chainshaper.errors import OperationError
+from chainshaper.planning import Plan
+from chainshaper.planning.plan_parts import ShapingNode
+from chainshaper.recording import Recording
+from chainshaper.thread_search import find_threads
+
+__all__ = [
+    "LEAD_NS",
+    "Changes",
+    "first_thread",
+    "planned_changes",
+    "server_table",
+    "shaping_nodes",
+]
+
+LEAD_NS = 2_000_000
+"""The cycle starts so long after the chain's timer expires (DESIGN section 6)."""
+
+
+@dataclass(frozen=True)
+class Changes:
+    """What a plan would change: threads, or the commands of LITMUS^RT's tools."""
+
+    back_end: str
+    reason: str
+    threads: tuple[WantedScheduling, ...]
+    commands: tuple[tuple[str, ...], ...]
+    notes: tuple[str, ...]
+
+
+def planned_changes(
+    plan: Plan,
+    back_end: str = "auto",
+    *,
+    recording: Recording | None = None,
+    phase_ns: int | None = None,
+) -> Changes:
+    """What :func:`.applying.apply_plan` would do; nothing is changed.
+
+    LITMUS^RT's commands are given on any kernel, with ``TID:NODE`` for threads that do not run.
+
+    Raises: as :func:`.applying.apply_plan`.
+    """
+    table = server_table(plan)
+    found = find_threads(plan, recording)
+    if back_end != "litmus":
+        choice = choose_back_end(back_end)
+        threads = plan_scheduling(plan, found, available_cores())
+        return Changes(choice.name, choice.reason, threads, (), found.notes)
+    notes = found.notes
+    try:
+        members: dict[str, list[int | str]] = {
+            name: [member.thread.tid for member in group]
+            for name, group in server_members(plan, found).items()
+        }
+        if phase_ns is None:
+            origin = first_thread(plan, found)
+            phase_ns = measure_phase(origin.pid, origin.tid, plan.cycle_ns).at_ns
+    except OperationError:
+        members = {s.name: [f"TID:{t.node}" for t in s.threads] for s in plan.servers}
+        notes += ("slots are counted from a beginning that is measured when the chain runs",)
+    anchor = 0 if phase_ns is None else phase_ns + LEAD_NS
+    commands = litmus_commands(table, members, anchor)
+    return Changes("litmus", "asked for", (), commands, notes)
+
+
+def server_table(plan: Plan) -> ServerTable:
+    """The servers of a plan whose threads a back end has to keep inside their slots.
+
+    Raises:
+        OperationError: there are none.
+    """
+    gated_by_themselves = {node.thread for node in shaping_nodes(plan)}
+    servers = tuple(
+        ReservationServer(server.name, server.core, server.priority, server.slots)
+        for server in plan.servers
+        if any(thread not in gated_by_themselves for thread in server.threads)
+    )
+    if not servers:
+        raise OperationError(
+            "the plan's servers name no threads of the application, so there is nothing to apply: "
+            "plan from a recording (`chainshaper plan REC --chain FIRST..LAST`)"
+        )
+    return ServerTable(plan.cycle_ns, servers)
+
+
+def shaping_nodes(plan: Plan) -> list[ShapingNode]:
+    """The shaping nodes of a plan, of all its chains."""
+    first = [] if plan.shaping_node is None else [plan.shaping_node]
+    return [*first, *plan.further_shaping_nodes]
+
+
+def first_thread(plan: Plan, found: Allocation) -> Thread:
+    """The thread that begins the chain: the first executor of the server whose slot comes first.
+
+    Raises:
+        OperationError: no server holds an executor, or see :func:`.server_members`.
+    """
+    members = server_members(plan, found)
+    for server in sorted(plan.servers, key=lambda one: (one.slots[0][0], one.priority)):
+        for member in members[server.name]:
+            if member.thread.role == "executor":
+                return member.thread
+    raise OperationError(
+        "no server of the plan holds an executor, so nothing says where in a cycle the chain "
+        "begins: give its phase (--phase)"
+    )
