@@ -124,6 +124,16 @@ def test_a_server_per_callback_is_the_papers_table_4_row_1() -> None:
     assert {server.name: server.core for server in plan.servers}["front_filter"] == 0
 
 
+def test_the_margin_is_every_callbacks() -> None:
+    slower = replace(_profile(), period_ns=200 * MS)
+    plan = plan_chain(slower, PlanRequest(policy="server-per-callback", epsilon_ns=MS // 2))
+    slots = {server.name: [(a // MS, b // MS) for a, b in server.slots] for server in plan.servers}
+    assert slots["throttler"] == [(0, 4)], "two callbacks, each rounded up to whole ms"
+    assert slots["rear_filter"] == [(4, 25)]
+    with pytest.raises(OperationError, match=r"takes \d+ms, .* plan with a smaller margin"):
+        plan_chain(_profile(), PlanRequest(policy="server-per-callback", epsilon_ns=2 * MS))
+
+
 def test_shaping_opens_a_server_on_each_core_of_the_graph() -> None:
     plan = plan_recording(_recorded(), CHAIN, PlanRequest(epsilon_ns=2 * MS))
     assert [(server.name, server.core) for server in plan.servers] == [
@@ -200,7 +210,7 @@ def test_executions_that_span_cycles_can_be_planned_callback_by_callback() -> No
     with pytest.raises(OperationError, match="pipeline over several cores"):
         plan_chain(long, PlanRequest())
     for policy in ("server-per-callback", "let-per-callback"):
-        plan = plan_chain(long, PlanRequest(policy=policy))
+        plan = plan_chain(long, PlanRequest(policy=policy, epsilon_ns=0))
         assert plan.evidence.max_latency_ns == 141 * MS
         assert any("is not shorter than the cycle" in text for text in plan_warnings(plan))
 

@@ -13,15 +13,14 @@ priority and a core, and no slots from a back end.
 
 import contextlib
 import os
-import signal
 import subprocess
 import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
+from chainshaper.command_process import end_command, start_command
 from chainshaper.dry_run import LEAD_NS, first_thread, server_table, shaping_nodes
 from chainshaper.durations import format_duration
 from chainshaper.enforcement.allocation import Allocation, new_and_ended
@@ -29,15 +28,11 @@ from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, ma
 from chainshaper.enforcement.claims import claim_run
 from chainshaper.enforcement.journal import Journal
 from chainshaper.enforcement.phase import DriftWatch, measure_phase
-from chainshaper.enforcement.realtime import (
-    available_cores,
-    check_cores,
-    interrupted_with_parent,
-)
+from chainshaper.enforcement.realtime import available_cores, check_cores
 from chainshaper.enforcement.release_after import start_watching
 from chainshaper.enforcement.runs import RunState, ServerState, remove_run, save_run_state
 from chainshaper.enforcement.scheduling_memory import change_scheduling, restore_scheduling
-from chainshaper.enforcement.server_threads import plan_scheduling, server_members
+from chainshaper.enforcement.server_threads import left_by_back_end, plan_scheduling, server_members
 from chainshaper.enforcement.servers import BackEnd, ServerCounters, ServerTable
 from chainshaper.errors import OperationError
 from chainshaper.planning import Plan
@@ -51,7 +46,6 @@ START_NS = 30_000_000_000
 """A command has this long to start all nodes of the plan."""
 
 _LOOK_S = 1.0
-_END_PATIENCE_S = 10.0
 _NOTHING = ServerCounters(None, None, None, None)
 
 
@@ -123,7 +117,7 @@ def apply_plan(
     try:
         run.watcher = start_watching(run.folder)
         if command:
-            run.command = _start(command)
+            run.command = start_command(command)
         if wait_ns is None:
             wait_ns = START_NS if command else 0
         found = _await_nodes(run, wait_ns, progress)
@@ -140,21 +134,6 @@ def apply_plan(
     if state.failure is not None:
         raise OperationError(f"{state.failure}; everything is as it was before")
     return Applied(state, run.command.returncode if run.command else None)
-
-
-def _start(command: Sequence[str]) -> subprocess.Popen[bytes]:
-    """Start the user's command; Ctrl-C reaches us, and the command when we are done with it.
-
-    Should we be killed, it gets a SIGINT as from its terminal.
-    """
-    try:
-        return subprocess.Popen(
-            command,
-            start_new_session=True,
-            preexec_fn=partial(interrupted_with_parent, os.getpid()),  # noqa: PLW1509 - one call
-        )
-    except OSError as error:
-        raise OperationError(f"{command[0]} cannot be started: {error.strerror}") from error
 
 
 def _await_nodes(run: _Run, wait_ns: int, progress: Callable[[float, str], None]) -> Allocation:
@@ -184,14 +163,10 @@ def _await_nodes(run: _Run, wait_ns: int, progress: Callable[[float, str], None]
 
 def _schedule(run: _Run, found: Allocation) -> None:
     """Give threads their priorities and cores, as far as the back end leaves that to us."""
-    for one in plan_scheduling(run.plan, found, available_cores()):
-        wanted = one.wanted
-        if one.server is not None and run.choice.name == "fifo":
-            continue  # that is all it does
-        if one.server is not None and run.choice.name in ("scx", "litmus"):
-            # Their servers are scheduling classes of their own.
-            wanted = replace(wanted, priority=None, takes_turns=False)
-        change_scheduling(run.journal, one.thread.thread, wanted)
+    wanted = plan_scheduling(run.plan, found, available_cores())
+    for one in left_by_back_end(run.choice.name, wanted):
+        if one.server is None or run.choice.name != "fifo":  # that is all the latter does
+            change_scheduling(run.journal, one.thread.thread, one.wanted)
 
 
 def _initial_state(
@@ -362,7 +337,7 @@ def _put_back(run: _Run) -> None:
         except OperationError as error:
             problems.append(str(error))
     if run.command is not None:
-        _end(run.command)
+        end_command(run.command)
     problems += [
         f"{one.tid} ({one.comm}): {one.reason}"
         for one in restore_scheduling(run.journal)
@@ -374,14 +349,3 @@ def _put_back(run: _Run) -> None:
             "what was there, `chainshaper release` tries again"
         )
     remove_run(run.journal)
-
-
-def _end(started: subprocess.Popen[bytes]) -> None:
-    """End the command and what it started as a terminal would: SIGINT, and harder if need be."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
-        if started.poll() is not None:
-            return
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(started.pid, number)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            started.wait(_END_PATIENCE_S)

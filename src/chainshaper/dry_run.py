@@ -11,7 +11,12 @@ from chainshaper.enforcement.back_ends import choose_back_end
 from chainshaper.enforcement.phase import measure_phase
 from chainshaper.enforcement.realtime import available_cores
 from chainshaper.enforcement.resctl import litmus_commands
-from chainshaper.enforcement.server_threads import WantedScheduling, plan_scheduling, server_members
+from chainshaper.enforcement.server_threads import (
+    WantedScheduling,
+    left_by_back_end,
+    plan_scheduling,
+    server_members,
+)
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.enforcement.threads import Thread
 from chainshaper.errors import OperationError
@@ -61,7 +66,8 @@ def planned_changes(
     found = find_threads(plan, recording)
     if back_end != "litmus":
         choice = choose_back_end(back_end)
-        threads = plan_scheduling(plan, found, available_cores())
+        wanted = plan_scheduling(plan, found, available_cores())
+        threads = left_by_back_end(choice.name, wanted)
         return Changes(choice.name, choice.reason, threads, (), found.notes)
     notes = found.notes
     try:

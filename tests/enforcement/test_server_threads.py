@@ -1,5 +1,8 @@
 """From a plan's servers to threads and priorities: by hand, and what must always hold."""
 
+import os
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,6 +13,7 @@ from chainshaper.enforcement.dds_threads import ThreadRole
 from chainshaper.enforcement.server_threads import (
     DDS_PRIORITY,
     WantedScheduling,
+    left_by_back_end,
     plan_scheduling,
     server_members,
     server_priorities,
@@ -83,6 +87,29 @@ def test_servers_stand_below_dds_in_the_order_of_their_priority() -> None:
         201: Scheduling(90, (0,)),
         # Best effort, unknown threads and other processes are left alone.
     }
+
+
+def test_servers_that_are_scheduling_classes_get_ordinary_threads() -> None:
+    plan = _plan(_server("chain", EXECUTOR_A, EXECUTOR_B))
+    (real_time,) = _node("/a", 100, "executor")
+    real_time = replace(
+        real_time, thread=replace(real_time.thread, policy="SCHED_FIFO", priority=80)
+    )
+    allocation = _allocation([real_time], _node("/b", 200, "executor", "dds"))
+    wanted = plan_scheduling(plan, allocation, (0, 1))
+    dds = Scheduling(90, (0,))
+    assert _by_tid(left_by_back_end("scx", wanted)) == {
+        100: Scheduling(0, (1,)),  # real-time threads run above every server of sched_ext's
+        200: Scheduling(None, (1,)),
+        201: dds,
+    }
+    assert _by_tid(left_by_back_end("litmus", wanted)) == {
+        100: Scheduling(None, (1,)),
+        200: Scheduling(None, (1,)),
+        201: dds,
+    }
+    assert left_by_back_end("freezer", wanted) == wanted
+    assert Scheduling(0, None).policy == os.SCHED_OTHER
 
 
 def test_several_threads_of_a_server_take_turns() -> None:

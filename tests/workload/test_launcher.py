@@ -23,6 +23,7 @@ BODIES = {
     "real_time_signal": "import os\nos.kill(os.getpid(), 40)",
     "babbles": "print('hello', flush=True)\ninput()\ninput()",
     "cut_off": "import json\nprint(json.dumps({'bytes': 100}), flush=True)\nprint('short')",
+    "hesitates": "print('{', end='', flush=True)\ninput()\ninput()",
     "says_its_pid": "import json, os\nprint(json.dumps({'pid': os.getpid()}), flush=True)\ninput()",
     "stubborn": (
         "import signal, time\n"
@@ -188,3 +189,26 @@ def _alive(pid: int) -> bool:
     except OSError:
         return False
     return state not in ("Z", "X")
+
+
+def test_one_that_stops_in_the_midst_of_a_line_is_not_waited_for_forever(nursery: Nursery) -> None:
+    with pytest.raises(OperationError, match=r"node hesitates \(pid \d+\) has not answered for"):
+        nursery.start("hesitates").hear(within_s=1.0)
+
+
+def test_waiting_ends_with_a_signal_whoever_else_handles_it(nursery: Nursery) -> None:
+    """Libraries install handlers after which the kernel goes on with an interrupted `read`."""
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGALRM, interrupted)
+    try:
+        signal.siginterrupt(signal.SIGALRM, False)
+        child = nursery.start("hesitates")
+        signal.setitimer(signal.ITIMER_REAL, 0.5)
+        with pytest.raises(KeyboardInterrupt):
+            child.hear(within_s=30.0)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)

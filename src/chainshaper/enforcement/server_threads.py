@@ -14,7 +14,7 @@ The result is a list that can be looked at before anything is done.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from chainshaper.enforcement.allocation import Allocation, NodeThread
 from chainshaper.enforcement.threads import Scheduling
@@ -26,6 +26,7 @@ __all__ = [
     "DDS_PRIORITY",
     "WantedScheduling",
     "below_their_siblings",
+    "left_by_back_end",
     "plan_scheduling",
     "server_members",
     "server_priorities",
@@ -117,6 +118,29 @@ def plan_scheduling(
     free_cores = tuple(sorted(set(available_cores) - set(cores.values())))
     beside = _dds_threads(others, free_cores)
     return below_their_siblings((*own, *beside, *_out_of_the_way(own, others)))
+
+
+def left_by_back_end(
+    back_end: str, wanted: Iterable[WantedScheduling]
+) -> tuple[WantedScheduling, ...]:
+    """What threads get from us where a back end schedules its servers' threads itself.
+
+    Under sched_ext and LITMUS^RT servers are scheduling classes of their own: their threads need
+    no priority, and sched_ext's may have none, since the kernel runs real-time threads above it.
+    """
+    if back_end not in ("scx", "litmus"):
+        return tuple(wanted)
+    return tuple(
+        one
+        if one.server is None
+        else replace(
+            one,
+            wanted=Scheduling(
+                0 if back_end == "scx" and one.thread.thread.priority else None, one.wanted.cores
+            ),
+        )
+        for one in wanted
+    )
 
 
 def wanted_of_members(

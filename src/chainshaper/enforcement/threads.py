@@ -79,7 +79,7 @@ class Scheduling:
     """What a thread should get; what is None is left alone.
 
     ``priority`` is that of SCHED_FIFO or, with ``takes_turns``, of SCHED_RR, under which threads
-    of one priority share their time.
+    of one priority share their time; 0 is an ordinary thread's, of SCHED_OTHER.
     """
 
     priority: int | None
@@ -89,6 +89,8 @@ class Scheduling:
     @property
     def policy(self) -> int:
         """The scheduling class that goes with ``priority``."""
+        if self.priority == 0:
+            return os.SCHED_OTHER
         return os.SCHED_RR if self.takes_turns else os.SCHED_FIFO
 
 

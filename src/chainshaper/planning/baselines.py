@@ -96,8 +96,8 @@ def server_per_callback(
     if end > plan.cycle_ns:
         raise OperationError(
             f"one slot per callback takes {format_duration(end)}, the cycle is"
-            f" {format_duration(plan.cycle_ns)}: shape the chain instead, or move callbacks to"
-            " another core"
+            f" {format_duration(plan.cycle_ns)}: shape the chain instead, plan with a smaller"
+            " margin (--epsilon), or move callbacks to another core"
         )
     last, (start, _) = callbacks[-1], slots[-1]
     with wrong_values_refused():

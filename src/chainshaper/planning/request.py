@@ -271,7 +271,7 @@ def _per_callback(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
             " plan from a recording"
         )
     if request.policy == "server-per-callback":
-        return server_per_callback(plan, profile.callbacks)
+        return server_per_callback(plan, profile.callbacks, margin_ns=plan.margin.epsilon_ns)
     if request.publication == "asynchronous":
         return let_per_callback_asynchronous(plan, profile.nodes)
     return let_per_callback(plan, profile.topics)

@@ -10,6 +10,7 @@ from chainshaper.durations import format_duration
 from chainshaper.enforcement.journal import Journal
 from chainshaper.enforcement.runs import RunState, ServerState
 from chainshaper.enforcement.server_threads import WantedScheduling
+from chainshaper.enforcement.threads import POLICIES, Scheduling
 from chainshaper.planning.plan_parts import slot_text
 
 __all__ = ["changes_table", "run_line", "runs_table", "servers_table"]
@@ -59,7 +60,6 @@ def changes_table(changes: Sequence[WantedScheduling]) -> Table:
         table.add_column(name, overflow="fold")
     for one in changes:
         thread, wanted = one.thread.thread, one.wanted
-        policy = "RR" if wanted.takes_turns else "FIFO"
         table.add_row(
             escape(", ".join(one.thread.nodes)),
             str(thread.pid),
@@ -67,11 +67,18 @@ def changes_table(changes: Sequence[WantedScheduling]) -> Table:
             escape(thread.comm),
             thread.role,
             escape(one.server or ""),
-            "as it is" if wanted.priority is None else f"{policy} {wanted.priority}",
+            _class_text(wanted),
             ", ".join(map(str, wanted.cores)) if wanted.cores else "as they are",
             one.reason,
         )
     return table
+
+
+def _class_text(wanted: Scheduling) -> str:
+    if wanted.priority is None:
+        return "as it is"
+    policy = POLICIES[wanted.policy].removeprefix("SCHED_")
+    return f"{policy} {wanted.priority}" if wanted.priority else policy
 
 
 def run_line(state: RunState) -> str:

@@ -9,8 +9,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
 from typing import IO, Any
 
 from chainshaper.errors import OperationError
@@ -20,11 +20,14 @@ __all__ = ["Child", "end_all", "first_casualty", "start_child"]
 
 @dataclass(frozen=True)
 class Child:
-    """A process of ours: what it is for people, and its pipes and error output."""
+    """A process of ours: what it is for people, its pipes and error output, and what of its
+    output was received and not taken yet.
+    """
 
     name: str
     process: subprocess.Popen[bytes]
     errors: IO[bytes]
+    received: bytearray = field(default_factory=bytearray, repr=False)
 
     @property
     def pid(self) -> int:
@@ -38,31 +41,45 @@ class Child:
             self.process.stdin.flush()
 
     def hear(self, within_s: float | None = None) -> dict[str, Any]:
-        """Its next line, waited for as long as it takes or ``within_s``.
+        """Its next line, waited for as long as it takes or, between its parts, ``within_s``.
 
         Raises:
             OperationError: it died instead, or kept silent.
         """
-        assert self.process.stdout is not None  # noqa: S101 - start_child opens it
-        if not select.select([self.process.stdout], [], [], within_s)[0]:
-            raise OperationError(
-                f"{self.name} (pid {self.pid}) has not answered for {within_s:g} s: it hangs, or "
-                "somebody stopped it"
-            )
-        line = self.process.stdout.readline()
+        line = self._take(lambda received: received.find(b"\n") + 1, within_s)
         try:
             heard: dict[str, Any] = json.loads(line)
         except ValueError:
             raise OperationError(self.obituary()) from None
         return heard
 
-    def hear_bytes(self, size: int) -> bytes:
-        """The bytes that follow a line."""
+    def hear_bytes(self, size: int, within_s: float | None = None) -> bytes:
+        """The bytes that follow a line; raises as :meth:`hear` does."""
+        if not size:
+            return b""
+        return self._take(lambda received: size if len(received) >= size else 0, within_s)
+
+    def _take(self, enough: Callable[[bytearray], int], within_s: float | None) -> bytes:
+        """What has arrived, once ``enough`` says how much of it is to be taken.
+
+        Waiting in `select`, not in `read`: no library's signal handlers make the kernel go on
+        with it, so Ctrl-C always ends the wait.
+        """
         assert self.process.stdout is not None  # noqa: S101 - start_child opens it
-        data = self.process.stdout.read(size)
-        if len(data) != size:
-            raise OperationError(self.obituary())
-        return data
+        pipe = self.process.stdout.fileno()
+        while not (length := enough(self.received)):
+            if not select.select([pipe], [], [], within_s)[0]:
+                raise OperationError(
+                    f"{self.name} (pid {self.pid}) has not answered for {within_s:g} s: it hangs, "
+                    "or somebody stopped it"
+                )
+            arrived = os.read(pipe, 1 << 20)
+            if not arrived:
+                raise OperationError(self.obituary())
+            self.received.extend(arrived)
+        taken = bytes(self.received[:length])
+        del self.received[:length]
+        return taken
 
     def obituary(self) -> str:
         """One sentence about how it died, with the last thing it said."""

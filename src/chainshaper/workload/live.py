@@ -361,7 +361,7 @@ def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[Thread
 
 def _read_log(name: str, child: Child, application: Application) -> ProcessLog:
     answer = child.hear(ANSWER_S)
-    rows = child.hear_bytes(answer["bytes"])
+    rows = child.hear_bytes(answer["bytes"], ANSWER_S)
     core = application.scheduling_of(name).core
     return ProcessLog(child.pid, core, rows, tuple(answer["objects"]))
 
