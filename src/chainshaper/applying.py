@@ -83,6 +83,7 @@ def apply_plan(
     plan: Plan,
     command: Sequence[str] = (),
     *,
+    command_stdout: int | None = None,
     back_end: str = "auto",
     recording: Recording | None = None,
     phase_ns: int | None = None,
@@ -95,7 +96,8 @@ def apply_plan(
 ) -> Applied:
     """Put a plan in force until ``stop`` is set, the command or the application ends, or it fails.
 
-    ``command`` is started first; without one, the application runs already. Its nodes have
+    ``command`` is started first, with ``command_stdout`` as its output if that is not ours;
+    without one, the application runs already. Its nodes have
     ``wait_ns`` to appear (default: 30 s with a command, else none). ``phase_ns`` is where in a
     cycle the chain's first timer expires, on CLOCK_MONOTONIC; it is measured where it is not
     given. ``recording`` is one of the very processes, if there is one. ``watch`` gets the state
@@ -117,7 +119,7 @@ def apply_plan(
     try:
         run.watcher = start_watching(run.folder)
         if command:
-            run.command = start_command(command)
+            run.command = start_command(command, stdout=command_stdout)
         if wait_ns is None:
             wait_ns = START_NS if command else 0
         found = _await_nodes(run, wait_ns, progress)

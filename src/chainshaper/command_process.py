@@ -48,11 +48,14 @@ def check_command(command: Sequence[str]) -> None:
 
 
 def start_command(
-    command: Sequence[str], environment: Mapping[str, str] | None = None
+    command: Sequence[str],
+    environment: Mapping[str, str] | None = None,
+    stdout: int | None = None,
 ) -> subprocess.Popen[bytes]:
     """Start the command with ``environment`` added to ours.
 
-    Should we be killed, it gets a SIGINT as from its terminal.
+    What it prints goes to the file descriptor ``stdout``, or where ours goes. Should we be killed,
+    it gets a SIGINT as from its terminal.
 
     Raises:
         InputError: see :func:`check_command`.
@@ -63,6 +66,7 @@ def start_command(
         return subprocess.Popen(
             command,
             env={**os.environ, **(environment or {})},
+            stdout=stdout,
             start_new_session=True,
             preexec_fn=partial(_as_from_a_terminal, os.getpid()),  # noqa: PLW1509 - one call
         )

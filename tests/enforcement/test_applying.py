@@ -120,14 +120,17 @@ def test_release_ends_a_run_that_is_in_force(tmp_path: Path) -> None:
 def test_a_command_is_started_governed_and_ended(tmp_path: Path) -> None:
     output = tmp_path / "windows"
     plan = plan_for(server("first", "origin", (0, 30)))
-    command = node_command("origin", output)
-    with applied(plan, tmp_path, "--backend", "fifo", "--", *command) as run:
+    talking = ("sh", "-c", 'echo so says the command; exec "$@"', "sh")
+    command = [*talking, *node_command("origin", output)]
+    with applied(plan, tmp_path, "--backend", "fifo", "--json", "--", *command) as run:
         assert "FIFO" in str(
             [t.policy for p in _processes_of(str(output)) for t in list_threads(p)]
         )
         run.send_signal(signal.SIGTERM)
-        assert run.wait(timeout=40) == 0
+        stdout, _ = run.communicate(timeout=40)
+        assert run.returncode == 0
     assert not _processes_of(str(NODE))
+    assert json.loads(stdout)["command"] == command, "what the command says goes elsewhere"
 
 
 @needs_fifo

@@ -98,6 +98,7 @@ def apply(
         done = apply_plan(
             planned,
             command or (),
+            command_stdout=sys.stderr.fileno() if json else None,  # standard output is ours
             back_end=backend,
             recording=recorded,
             phase_ns=phase,

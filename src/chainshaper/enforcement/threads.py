@@ -224,14 +224,16 @@ def apply_scheduling(thread: Thread, wanted: Scheduling) -> None:
 def foreign_realtime_processes() -> tuple[str, ...]:
     """Real-time threads of other user processes, as ``comm (pid)``: they spoil measurements.
 
-    Kernel threads (which have no executable) and our own children are not among them.
+    Kernel threads (which have no executable), our own children and what enforces a plan are not
+    among them.
     """
     found = []
     for pid, parent in parents().items():
         try:
-            if os.getpid() in (pid, parent) or not read_proc(f"/proc/{pid}/cmdline"):
-                continue  # ours, or a kernel thread
+            command = read_proc(f"/proc/{pid}/cmdline")
         except OSError:
+            continue
+        if os.getpid() in (pid, parent) or not command or b"chainshaper.enforcement." in command:
             continue
         realtime = [t for t in list_threads(pid) if t.policy in ("SCHED_FIFO", "SCHED_RR")]
         if realtime:
