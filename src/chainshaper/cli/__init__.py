@@ -12,8 +12,11 @@ from types import FrameType
 __all__ = ["main"]
 
 
-def main() -> None:
-    """Entry point of `chainshaper`."""
+def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
+    """Entry point of `chainshaper`: run these arguments (default: the process's own).
+
+    ``name`` is what the command is called in its help.
+    """
     from chainshaper.cli.app import app
     from chainshaper.errors import ChainshaperError
 
@@ -23,7 +26,7 @@ def main() -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # an ASCII terminal gets "?" for µ
     try:
-        app(prog_name="chainshaper")
+        app(arguments, prog_name=name)
     except ChainshaperError as error:
         print(f"error: {error}", file=sys.stderr)  # noqa: T201 - the last line of a failed command
         sys.exit(error.exit_code)

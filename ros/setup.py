@@ -1,0 +1,44 @@
+"""For colcon: the package of this repository that it builds, of the type `ament_python`.
+
+colcon installs no dependencies. Those without a package of a distribution come from PyPI, into the
+Python that ROS runs with: ``python3 -m pip install .`` in the folder above does that, and is all
+that `ros2 chain` needs, with or without colcon.
+
+It stands in a folder of its own because colcon cannot read what setuptools makes of a
+pyproject.toml beside it. Paths are relative to this folder, as colcon demands.
+"""
+
+import re
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = "chainshaper"
+SOURCES = "../src"
+PROJECT = Path("../pyproject.toml")
+VERSION = re.search(r'^version = "(.+)"$', PROJECT.read_text(), re.MULTILINE)
+assert VERSION is not None  # noqa: S101 - pyproject.toml is ours
+
+PACKAGE = Path(SOURCES, NAME)
+DATA = [
+    str(path.relative_to(PACKAGE))
+    for path in PACKAGE.rglob("*")
+    if path.is_file() and path.suffix not in {".py", ".pyc"}
+]
+
+setup(
+    name=NAME,
+    version=VERSION[1],
+    package_dir={"": SOURCES},
+    packages=find_packages(SOURCES),
+    package_data={NAME: DATA},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+    ],
+    zip_safe=False,
+    entry_points={
+        "console_scripts": ["chainshaper = chainshaper.cli:main"],
+        "ros2cli.command": ["chain = chainshaper.cli.ros2_chain:ChainCommand"],
+    },
+)

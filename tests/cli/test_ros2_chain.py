@@ -1,0 +1,107 @@
+"""`ros2 chain` is `chainshaper`: the same verbs, options, output and exit codes."""
+
+import argparse
+import subprocess
+import sys
+from collections.abc import Sequence
+from importlib.metadata import entry_points
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from chainshaper.cli.ros2_chain import ChainCommand
+
+ROOT = Path(__file__).parents[2]
+
+
+def _ros2(*arguments: str) -> int:
+    """Stands for `ros2`: parses as its `add_subparsers_on_demand` does (ros2cli 0.18 to 0.38)."""
+    parser = argparse.ArgumentParser("ros2")
+    subparsers = parser.add_subparsers(dest=" command")
+    extension = ChainCommand()
+    command_parser = subparsers.add_parser("chain")
+    try:
+        known, _ = parser.parse_known_args(arguments)  # upstream suppresses what this prints
+        assert getattr(known, " command") == "chain"
+    except SystemExit:
+        pass
+    command_parser.set_defaults(_command=extension)
+    extension.add_arguments(command_parser, "ros2 chain", argv=None)
+    args = parser.parse_args(arguments)
+    code: int = extension.main(parser=parser, args=args)
+    return code
+
+
+def _said(capsys: pytest.CaptureFixture[str], arguments: Sequence[str]) -> tuple[int, str]:
+    try:
+        code = _ros2(*arguments)
+    except SystemExit as ended:
+        code = int(ended.code or 0)
+    return code, capsys.readouterr().out
+
+
+def test_it_is_found_by_ros2(capsys: pytest.CaptureFixture[str]) -> None:
+    (found,) = entry_points(group="ros2cli.command")
+    assert found.name == "chain"
+    assert found.load() is ChainCommand
+    assert ChainCommand.__doc__, "the line that `ros2` shows"
+
+
+def test_help_is_of_the_verbs_and_of_each_verb(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in (["chain", "--help"], ["chain"]):
+        code, said = _said(capsys, arguments)
+        assert code == 0
+        assert "latency" in said
+        assert "ros2 chain" in said
+    code, said = _said(capsys, ["chain", "latency", "-h"])
+    assert (code, "--instances" in said) == (0, True)
+
+
+def test_arguments_and_exit_codes_are_the_same(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    file = tmp_path / "latencies.txt"
+    file.write_text("20ms\n30ms\n")
+    arguments = ["plan", "--latencies", str(file), "--period", "100ms", "--json"]
+    code, said = _said(capsys, ["chain", *arguments])
+    assert code == 0
+    direct = subprocess.run(
+        [sys.executable, "-m", "chainshaper", *arguments],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert said == direct.stdout
+    assert _ros2("chain", "info", str(tmp_path / "nothing")) == 2
+    assert _ros2("chain", "no-such-verb") == 2
+
+
+def test_the_versions_agree() -> None:
+    version = ElementTree.parse(ROOT / "ros" / "package.xml").findtext("version")  # noqa: S314 - our own
+    assert f'version = "{version}"' in (ROOT / "pyproject.toml").read_text()
+
+
+def test_colcon_would_install_everything(tmp_path: Path) -> None:
+    """What colcon runs for an `ament_python` package, as far as setuptools goes."""
+    pytest.importorskip("setuptools", reason="setuptools is not in this environment")
+    prefix = tmp_path / "install"
+    build = subprocess.run(
+        [
+            *(sys.executable, "setup.py", "-q", "egg_info", "--egg-base", str(tmp_path)),
+            *("build", "--build-base", str(tmp_path / "build")),
+            *("install_lib", "--install-dir", str(prefix / "lib"), "--no-compile"),
+            *("install_data", "--install-dir", str(prefix)),
+        ],
+        cwd=ROOT / "ros",
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert build.returncode == 0, build.stderr
+    installed = {p.relative_to(prefix / "lib") for p in (prefix / "lib").rglob("*") if p.is_file()}
+    ours = {p.relative_to(ROOT / "src") for p in (ROOT / "src" / "chainshaper").rglob("*")}
+    wanted = {p for p in ours if (ROOT / "src" / p).is_file() and "__pycache__" not in p.parts}
+    assert wanted - installed == set()
+    assert (prefix / "share/ament_index/resource_index/packages/chainshaper").is_file()
+    assert (prefix / "share/chainshaper/package.xml").is_file()
