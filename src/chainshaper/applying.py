@@ -266,9 +266,10 @@ def _keep(
     watch: Callable[[RunState], None],
 ) -> RunState:
     """Watch over the run until it is to end; the state as it was last."""
-    begins = (state.anchor_ns or 0) - (0 if gates(run.choice.name) else LEAD_NS)
-    origin = first_thread(run.plan, found)
-    drift = DriftWatch(origin.pid, origin.tid, run.plan.cycle_ns, begins)
+    origin, gated = first_thread(run.plan, found), gates(run.choice.name)
+    begins = (state.anchor_ns or 0) - (0 if gated else LEAD_NS)
+    slots = next((s.slots for s in state.servers if gated and origin.tid in s.threads), ())
+    drift = DriftWatch(origin.pid, origin.tid, run.plan.cycle_ns, begins, slots)
     while True:
         is_over = run.command_ended or run.stop.is_set()
         counters = servers.counters()

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chainshaper.enforcement.phase import find_phase, measure_phase
+from chainshaper.enforcement.phase import find_drift, find_phase, measure_phase, watch_wake_ups
 from chainshaper.errors import OperationError
 
 MS = 1_000_000
@@ -102,3 +102,43 @@ def test_a_thread_that_never_wakes_has_no_phase_and_the_remedy_is_named() -> Non
                 measure_phase(process.pid, process.pid, 10 * MS)
         finally:
             process.kill()
+
+
+def test_being_stopped_at_a_slots_end_is_no_beginning() -> None:
+    """Wake-ups as seen of a node on a chain's server [0, 70): it begins with the slot, or in it."""
+    slots = ((0, 70 * MS),)
+    for begins in (0, 3 * MS):
+        wake_ups = [
+            1_000 * CYCLE + 17 * MS + cycle * CYCLE + at
+            for cycle in range(8)
+            for at in (begins + 100_000, begins + 9 * MS, 70 * MS + 900_000)
+        ]
+        seen, anchor = np.array(wake_ups), 17 * MS
+        assert find_drift(seen, CYCLE, 8, anchor, slots) == begins + 100_000
+        assert find_drift(seen, CYCLE, 8, anchor) == -29_100_000, "which is why slots are looked at"
+    assert find_drift(np.array([], dtype=np.int64), CYCLE, 8, 0, slots) is None
+
+
+def test_wake_ups_without_work_can_be_left_out() -> None:
+    """It wakes five times per period and works in one of them."""
+    body = (
+        "import time\n"
+        "due, number = time.monotonic_ns(), 0\n"
+        "print(flush=True)\n"
+        "while True:\n"
+        "    due, number = due + 10_000_000, number + 1\n"
+        "    time.sleep(max(0, due - time.monotonic_ns()) / 1e9)\n"
+        "    used = time.thread_time_ns()\n"
+        "    while number % 5 == 0 and time.thread_time_ns() - used < 3_000_000:\n"
+        "        pass\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", body], stdout=subprocess.PIPE) as process:
+        try:
+            assert process.stdout is not None
+            process.stdout.readline()
+            every = watch_wake_ups(process.pid, process.pid, 500 * MS)
+            working = watch_wake_ups(process.pid, process.pid, 500 * MS, least_ns=1_500_000)
+        finally:
+            process.kill()
+    assert 0 < len(working) < len(every) / 2
+    assert find_phase(working, 50 * MS, 10) is not None

@@ -13,7 +13,7 @@ import contextlib
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,10 +24,21 @@ from chainshaper.durations import format_duration
 from chainshaper.enforcement.cgroups import has_ended, started_at
 from chainshaper.errors import OperationError
 
-__all__ = ["DriftWatch", "Phase", "find_phase", "measure_phase", "watch_wake_ups"]
+__all__ = [
+    "DriftWatch",
+    "Phase",
+    "find_drift",
+    "find_phase",
+    "measure_phase",
+    "watch_wake_ups",
+]
 
 POLL_NS = 250_000
 WATCHER_PRIORITY = 95
+TO_STOP_NS = 20_000
+"""Stopping and continuing a thread that waits for something wakes it for 5 to 7 us of its time; an
+executor that finds its timer expired needs tens."""
+
 SEEN_IN = 0.8
 """A place counts when wake-ups come there in this share of the cycles."""
 
@@ -71,31 +82,37 @@ def measure_phase(
 
 
 def watch_wake_ups(
-    pid: int, tid: int, for_ns: int, progress: Callable[[float], None] = lambda _: None
+    pid: int,
+    tid: int,
+    for_ns: int,
+    progress: Callable[[float], None] = lambda _: None,
+    *,
+    least_ns: int = 0,
 ) -> npt.NDArray[np.int64]:
     """When a thread became ready to run, each time it did (ns of CLOCK_MONOTONIC).
 
     A wake-up is known to lie between two looks, and the later of them is taken, minus the time
-    that the thread had to wait for its core.
+    that the thread had to wait for its core. Those after which it ran for less than ``least_ns``
+    are left out.
 
     Raises:
         OperationError: the thread has ended.
     """
-    found: list[int] = []
+    found: list[tuple[int, int]] = []  # when, and how long the thread had run by then
     path = Path(f"/proc/{pid}/task/{tid}/schedstat")
     started = now = time.monotonic_ns()
     born = started_at(tid)
     try:
         with _undisturbed(), path.open("rb", buffering=0) as file:
-            waited, times = _waited_and_times(file.read())
+            ran, waited, times = map(int, file.read().split())
             while now < started + for_ns:
                 time.sleep(POLL_NS / 1e9)
                 file.seek(0)
-                waited_by_now, times_by_now = _waited_and_times(file.read())
+                ran_by_now, waited_by_now, times_by_now = map(int, file.read().split())
                 now = time.monotonic_ns()
                 if times_by_now > times:
-                    found.append(now - (waited_by_now - waited))
-                waited, times = waited_by_now, times_by_now
+                    found.append((now - (waited_by_now - waited), ran))
+                ran, waited, times = ran_by_now, waited_by_now, times_by_now
                 progress(min(1.0, (now - started) / for_ns))
         if born is None or has_ended(tid, born):
             raise ProcessLookupError(tid)  # dead, and nobody has waited for it yet
@@ -104,7 +121,8 @@ def watch_wake_ups(
             f"thread {tid} of process {pid} ended while its phase was measured: start the "
             "application again"
         ) from error
-    return np.array(found, dtype=np.int64)
+    wake_ups = np.array([*found, (0, ran)], dtype=np.int64)
+    return wake_ups[:-1][np.diff(wake_ups[:, 1]) >= least_ns, 0]
 
 
 def find_phase(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> Phase | None:
@@ -140,6 +158,31 @@ def find_phase(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> P
     return best
 
 
+def find_drift(
+    wake_ups: npt.NDArray[np.int64],
+    cycle_ns: int,
+    cycles: int,
+    expected_ns: int,
+    slots: Sequence[tuple[int, int]] = (),
+) -> int | None:
+    """How far behind ``expected_ns`` a thread begins its cycles (ns, negative: before), if it does.
+
+    ``slots`` count from there, and are all in which a server lets the thread run: being stopped as
+    one ends wakes a thread too, and is not how it begins.
+
+        >>> find_drift(np.array([1003, 1070, 1103, 1170, 1203, 1270]), 100, 3, 1000, [(0, 70)])
+        3
+    """
+    if slots:
+        places = (wake_ups - expected_ns) % cycle_ns
+        wake_ups = wake_ups[np.any([(s <= places) & (places < e) for s, e in slots], axis=0)]
+    phase = find_phase(wake_ups, cycle_ns, cycles)
+    if phase is None:
+        return None
+    half = cycle_ns // 2
+    return (phase.at_ns - expected_ns + half) % cycle_ns - half
+
+
 class DriftWatch:
     """Looks every ten seconds, in a thread of its own, where a thread begins its cycles now.
 
@@ -151,21 +194,33 @@ class DriftWatch:
     EVERY_S = 10.0
     CYCLES = 8
 
-    def __init__(self, pid: int, tid: int, cycle_ns: int, expected_ns: int) -> None:
+    def __init__(
+        self,
+        pid: int,
+        tid: int,
+        cycle_ns: int,
+        expected_ns: int,
+        slots: Sequence[tuple[int, int]] = (),
+    ) -> None:
         self.latest_ns: int | None = None
         self._thread, self._cycle_ns, self._expected_ns = (pid, tid), cycle_ns, expected_ns
+        self._slots = slots
         threading.Thread(target=self._look_again, name="drift-watch", daemon=True).start()
 
     def _look_again(self) -> None:
         with contextlib.suppress(OperationError):  # the thread has ended
             while True:
                 time.sleep(self.EVERY_S)
-                seen = watch_wake_ups(*self._thread, self.CYCLES * self._cycle_ns)
-                phase = find_phase(seen, self._cycle_ns, self.CYCLES)
-                if phase is not None:
-                    half = self._cycle_ns // 2
-                    moved = phase.at_ns - self._expected_ns
-                    self.latest_ns = (moved + half) % self._cycle_ns - half
+                seen = watch_wake_ups(
+                    *self._thread,
+                    self.CYCLES * self._cycle_ns,
+                    least_ns=TO_STOP_NS if self._slots else 0,
+                )
+                drift = find_drift(
+                    seen, self._cycle_ns, self.CYCLES, self._expected_ns, self._slots
+                )
+                if drift is not None:
+                    self.latest_ns = drift
 
 
 @contextlib.contextmanager
@@ -178,8 +233,3 @@ def _undisturbed() -> Iterator[None]:
         yield
     finally:
         os.sched_setscheduler(0, policy, priority)
-
-
-def _waited_and_times(text: bytes) -> tuple[int, int]:
-    _, waited, times = text.split()
-    return int(waited), int(times)
