@@ -122,7 +122,8 @@ def watch_wake_ups(
             "application again"
         ) from error
     wake_ups = np.array([*found, (0, ran)], dtype=np.int64)
-    return wake_ups[:-1][np.diff(wake_ups[:, 1]) >= least_ns, 0]
+    ran_after = np.diff(wake_ups[:, 1])
+    return np.asarray(wake_ups[:-1, 0][ran_after >= least_ns], dtype=np.int64)
 
 
 def find_phase(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> Phase | None:
