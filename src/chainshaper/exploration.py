@@ -38,6 +38,7 @@ __all__ = [
     "lost_text",
     "named_chain",
     "services",
+    "with_trace_events",
 ]
 
 
@@ -134,10 +135,10 @@ def convert_recording(recording: Recording | str | Path, output: str | Path) -> 
         recording = open_source(recording)
     if not len(recording.events):
         raise InputError(f"{recording.path}: no event in it is one that chainshaper knows")
-    return write_recording(output, recording.events, _with_trace_events(recording))
+    return write_recording(output, recording.events, with_trace_events(recording))
 
 
-def _with_trace_events(recording: Recording) -> RecordingInfo:
+def with_trace_events(recording: Recording) -> RecordingInfo:
     """A trace's description with the events it had, and a note about those that are not kept."""
     info = recording.info
     if info.source != "lttng" or info.trace_events:

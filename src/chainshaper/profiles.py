@@ -249,7 +249,7 @@ def _executors(
     by_pid = {thread.pid: thread for thread in recording.info.threads if thread.role == "executor"}
     found = {node.name: by_pid[node.pid] for node in graph.nodes if node.pid in by_pid}
     return (
-        {name: thread.cores[0] for name, thread in found.items() if thread.cores},
+        {name: thread.cores[0] for name, thread in found.items() if len(thread.cores) == 1},
         {name: thread.priority for name, thread in found.items() if thread.priority},
     )
 

@@ -11,10 +11,10 @@ import os
 import platform
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import polars as pl
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -24,6 +24,7 @@ from chainshaper.events import EventTables
 from chainshaper.yaml_file import explanations, key_text
 
 __all__ = [
+    "EndpointInfo",
     "Recording",
     "RecordingInfo",
     "StallMeterInfo",
@@ -50,6 +51,30 @@ class ThreadInfo(BaseModel):
     policy: str  # SCHED_FIFO, SCHED_OTHER, ...
     priority: int
     cores: tuple[int, ...]
+
+
+class EndpointInfo(BaseModel):
+    """A publisher or subscription with its QoS, as DDS discovery and the trace show them.
+
+    What neither tells is None: without ROS 2 at hand only the trace does, and not every RMW tells
+    others about its history. Durations are ns, None also where there is no limit. QoS words are
+    those of `ros2 topic info -v` in lower case.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    node: str
+    topic: str
+    kind: Literal["publisher", "subscription"]
+    type: str | None = None  # std_msgs/msg/Header
+    reliability: str | None = None
+    durability: str | None = None
+    history: str | None = None
+    depth: int | None = None
+    deadline_ns: int | None = None
+    lifespan_ns: int | None = None
+    liveliness: str | None = None
+    liveliness_lease_ns: int | None = None
 
 
 class StallMeterInfo(BaseModel):
@@ -92,6 +117,7 @@ class RecordingInfo(BaseModel):
     command: tuple[str, ...] = ()
     processes: dict[int, str] = {}  # pid → the node or command it runs
     threads: tuple[ThreadInfo, ...] = ()
+    endpoints: tuple[EndpointInfo, ...] = ()
     realtime: bool | None = None  # None: unknown
     notes: tuple[str, ...] = ()
     lost: dict[str, int] = {}
@@ -201,8 +227,13 @@ def refuse_existing(path: str | Path) -> Path:
     return path
 
 
-def write_recording(path: str | Path, tables: EventTables, info: RecordingInfo) -> Recording:
+def write_recording(
+    path: str | Path, tables: EventTables | Iterable[EventTables], info: RecordingInfo
+) -> Recording:
     """Write a recording, whole or not at all, and open it.
+
+    ``tables`` may come in parts, one after the other in time, for a recording that is larger than
+    memory. A table of several parts is a folder of Parquet files, which readers take for one.
 
     Raises:
         InputError: ``path`` exists already.
@@ -214,15 +245,9 @@ def write_recording(path: str | Path, tables: EventTables, info: RecordingInfo) 
         partial = Path(
             tempfile.mkdtemp(prefix=f".{path.name}.partial-", dir=path.absolute().parent)
         )
-        for name, frame in tables.items():
-            # By way of memory: writing to a file itself, Polars reports a full disk as a file
-            # that is out of specification.
-            content = io.BytesIO()
-            frame.write_parquet(content, compression="zstd")
-            with (partial / f"{name}.parquet").open("wb") as stream:
-                stream.write(content.getbuffer())
-                stream.flush()
-                os.fsync(stream.fileno())
+        for part in [tables] if isinstance(tables, Mapping) else tables:
+            for name, frame in part.items():
+                _write_table(_next_part(partial / f"{name}.parquet"), frame)
         (partial / INFO_FILE).write_text(info.model_dump_json(indent=2) + "\n")
         partial.chmod(0o755)
         partial.rename(path)
@@ -232,3 +257,23 @@ def write_recording(path: str | Path, tables: EventTables, info: RecordingInfo) 
         if partial is not None and partial.exists():
             shutil.rmtree(partial, ignore_errors=True)
     return open_recording(path)
+
+
+def _next_part(file: Path) -> Path:
+    """Where the next part of a table goes: the first one is a file, several are a folder."""
+    if file.is_file():
+        first = file.rename(file.with_suffix(".first"))
+        file.mkdir()
+        first.rename(file / "000000.parquet")
+    return file / f"{len(list(file.iterdir())):06}.parquet" if file.is_dir() else file
+
+
+def _write_table(file: Path, frame: pl.DataFrame) -> None:
+    # By way of memory: writing to a file itself, Polars reports a full disk as a file that is out
+    # of specification.
+    content = io.BytesIO()
+    frame.write_parquet(content, compression="zstd", compression_level=1, statistics=False)
+    with file.open("wb") as stream:
+        stream.write(content.getbuffer())
+        stream.flush()
+        os.fsync(stream.fileno())

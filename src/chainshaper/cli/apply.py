@@ -1,17 +1,16 @@
 """`chainshaper apply`: put a plan in force on a running application."""
 
-import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from chainshaper.cli.options import JsonOption, duration_option
+from chainshaper.cli.signals import stop_on_signals
 
 if TYPE_CHECKING:
     from chainshaper.enforcement.runs import RunState
@@ -94,7 +93,7 @@ def apply(
         _show_changes(planned, backend, recorded, phase, json=json)
         return
     stop = threading.Event()
-    with _signals_set(stop), _watching() as (watch, report):
+    with stop_on_signals(stop), _watching() as (watch, report):
         done = apply_plan(
             planned,
             command or (),
@@ -137,24 +136,6 @@ def _show_changes(
     else:
         show(changes_table(changes.threads))
     notes((f"back end {changes.back_end}: {changes.reason}", *changes.notes))
-
-
-@contextmanager
-def _signals_set(stop: threading.Event) -> Iterator[None]:
-    """Ctrl-C, a closed terminal and `kill` end the run in order."""
-
-    def end(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
-
-    before = {
-        number: signal.signal(number, end)
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    }
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager

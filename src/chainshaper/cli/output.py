@@ -13,7 +13,7 @@ from chainshaper.errors import OperationError
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-__all__ = ["late_progress", "notes", "print_json", "progress", "show", "show_line"]
+__all__ = ["late_progress", "notes", "print_json", "progress", "show", "show_line", "stage_lines"]
 
 PATIENCE_S = 2.0
 """What takes longer than this shows its progress."""
@@ -67,7 +67,7 @@ def notes(lines: Iterator[str] | tuple[str, ...] | list[str]) -> None:
 def progress(title: str) -> Iterator[Callable[[float, str], None]]:
     """A progress bar on stderr; without a terminal one line per stage instead."""
     if not sys.stderr.isatty():
-        yield _stage_lines(title)
+        yield stage_lines(title)
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -121,7 +121,8 @@ def late_progress(title: str) -> Iterator[Callable[[float, str], None]]:
                 over = True
 
 
-def _stage_lines(title: str) -> Callable[[float, str], None]:
+def stage_lines(title: str) -> Callable[[float, str], None]:
+    """Progress as one line per stage, for where a bar would disturb what others print."""
     last = ""
 
     def report(share: float, what: str) -> None:  # noqa: ARG001 - the signature of progress

@@ -28,6 +28,7 @@ __all__ = [
     "below_their_siblings",
     "left_by_back_end",
     "plan_scheduling",
+    "scheduling_around",
     "server_members",
     "server_priorities",
     "wanted_of_members",
@@ -107,6 +108,24 @@ def plan_scheduling(
     members = server_members(plan, allocation)
     cores = {server.name: server.core for server in plan.servers}
     priorities = {server.name: server.priority for server in plan.servers}
+    return scheduling_around(members, cores, priorities, allocation, available_cores)
+
+
+def scheduling_around(
+    members: Mapping[str, Sequence[NodeThread]],
+    cores: Mapping[str, int],
+    priorities: Mapping[str, int],
+    allocation: Allocation,
+    available_cores: Sequence[int],
+) -> tuple[WantedScheduling, ...]:
+    """What the threads of servers, and the others of their processes, shall get.
+
+    ``members``, ``cores`` and ``priorities`` are by server's name.
+
+    Raises:
+        OperationError: a thread cannot leave the core of a publisher that would outrank it.
+        InputError: see :func:`server_priorities`.
+    """
     own = wanted_of_members(members, cores, priorities)
     pids = {member.thread.pid for group in members.values() for member in group}
     planned = {member.thread.identity for group in members.values() for member in group}

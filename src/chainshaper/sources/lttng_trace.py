@@ -38,7 +38,7 @@ from chainshaper.sources.event_fields import (
 )
 from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids, rmw_of_threads
 
-__all__ = ["NEXT_HOST", "Progress", "TraceTables", "open_lttng_trace"]
+__all__ = ["CREATION", "NEXT_HOST", "Progress", "TraceTables", "open_lttng_trace"]
 
 Progress: TypeAlias = Callable[[float, str], None]
 """Told the share of the work that is done, from 0 to 1, and what is being done."""
@@ -48,14 +48,15 @@ NEXT_HOST = 10_000_000
 
 _EXECUTOR = frozenset(name for name in events.FIELDS if name.startswith("rclcpp_executor_"))
 _SWITCHES = frozenset(("sched_switch",))
-_CREATION = frozenset(
+CREATION = frozenset(
     name
     for name in events.FIELDS
     if name.endswith(("_init", "_added", "_register", "_link_node", "_to_ipb", "_to_subscription"))
 ) | {"rmw_implementation", "rclcpp_construct_ring_buffer"}
+"""The events of objects' creation, which say what all others are about."""
 _UPPER_LAYERS = frozenset(("rclcpp_publish", "rcl_publish", "rcl_take", "rclcpp_take"))
-_MESSAGES = frozenset(events.FIELDS) - _EXECUTOR - _SWITCHES - _CREATION - _UPPER_LAYERS
-_GROUPS = (_CREATION, _MESSAGES, _UPPER_LAYERS, _EXECUTOR, _SWITCHES)
+_MESSAGES = frozenset(events.FIELDS) - _EXECUTOR - _SWITCHES - CREATION - _UPPER_LAYERS
+_GROUPS = (CREATION, _MESSAGES, _UPPER_LAYERS, _EXECUTOR, _SWITCHES)
 _ALSO = frozenset((CARET_INIT,))  # read with the creation
 _WHO_RUNS = ("callback_start", "rmw_publish", "rmw_take", "rclcpp_publish")
 
@@ -87,18 +88,18 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         self._moved: dict[str, int] = {}
         # Where numbers may collide, everybody's have to be seen first.
         everything = not overview or len(self._hosts) > 1
-        self._decode(_CREATION | _ALSO | (_MESSAGES if everything else frozenset()))
+        self._decode(CREATION | _ALSO | (_MESSAGES if everything else frozenset()))
 
     def creation(self) -> events.EventTables:
         """The tables of the objects' creation, and CARET's `caret_init`; empty ones included."""
-        return {name: self._read[name] for name in _CREATION | _ALSO if name in self._read}
+        return {name: self._read[name] for name in CREATION | _ALSO if name in self._read}
 
     def commands(self) -> dict[int, str]:
         """Process → its name, as far as the tracer recorded it with the objects' creation.
 
         Where nothing was created during the recording, everything that ran is looked at.
         """
-        tables = [self._read[name] for name in _CREATION if name in self._read]
+        tables = [self._read[name] for name in CREATION if name in self._read]
         if not any(self._counted(name) for name in ("rcl_node_init", "rcl_init")):
             tables += [self[name] for name in _WHO_RUNS if name in self]
         return {
@@ -180,7 +181,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
             return read_events(
                 trace,
                 wanted,
-                nameless=[full for full in wanted if table_name(full) not in _CREATION],
+                nameless=[full for full in wanted if table_name(full) not in CREATION],
                 progress=lambda share: self._progress((place + share) / hosts, what),
             )
 
@@ -206,7 +207,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
     def _note_names(self, host: str, trace: CtfTrace, found: Events) -> None:
         """What processes are called, from their objects' creation if it was traced."""
         names = _process_names(found)
-        if not names and not any(name in self for name in _CREATION):
+        if not names and not any(name in self for name in CREATION):
             ran = [full for name in _WHO_RUNS for full in self._sources.get(name, ())]
             with _as_our_errors():
                 names = _process_names(read_events(trace, ran))

@@ -3,11 +3,14 @@
 Virtual machines and firmware stop all threads of a core for milliseconds now and then. A thread
 at the highest priority that only sleeps and looks at the clock wakes late exactly then; the
 figures of a run can only be judged beside what it saw. One process per core:
-``python -m chainshaper.workload.stall_meter`` speaks the launcher's protocol.
+``python -m chainshaper.workload.stall_meter`` speaks the launcher's protocol. Where nobody knows
+beforehand how long a run takes, :data:`ENOUGH` ends the watch early.
 """
 
+import signal
 import time
 from array import array
+from collections.abc import Callable
 
 from chainshaper.enforcement.gate import sleep_until
 from chainshaper.enforcement.realtime import (
@@ -18,7 +21,7 @@ from chainshaper.enforcement.realtime import (
 )
 from chainshaper.workload import protocol
 
-__all__ = ["PERIOD_NS", "PRIORITY", "THRESHOLD_NS", "main", "watch"]
+__all__ = ["ENOUGH", "PERIOD_NS", "PRIORITY", "THRESHOLD_NS", "main", "watch"]
 
 PERIOD_NS = 1_000_000
 """A wake-up costs some 20 us on a virtual machine: more of them would disturb what they watch."""
@@ -26,12 +29,21 @@ THRESHOLD_NS = 100_000
 """Wake-ups later than this are recorded: what the kernel needs to wake a thread is less."""
 PRIORITY = 98
 """Above everything it watches, so that none of it looks like a stall."""
+ENOUGH = signal.SIGUSR1
+ORDINARY = 1_000_000
+"""So many ordinary wake-ups are enough to know their median, however long a run takes."""
 
 
 def watch(
-    start_ns: int, stop_ns: int, period_ns: int = PERIOD_NS, threshold_ns: int = THRESHOLD_NS
+    start_ns: int,
+    stop_ns: int,
+    period_ns: int = PERIOD_NS,
+    threshold_ns: int = THRESHOLD_NS,
+    enough: Callable[[], bool] = lambda: False,
 ) -> "tuple[array[int], int, int]":
     """Sleep in steps of ``period_ns`` from ``start_ns`` until ``stop_ns`` on the calling thread.
+
+    It is over as well when ``enough`` says so.
 
     Returns the stalls as pairs (when it should have woken, how late it was), the number of
     wake-ups, and the median lateness of the ordinary ones (all ns).
@@ -41,7 +53,7 @@ def watch(
     clock = time.monotonic_ns
     due = start_ns
     wakeups = 0
-    while due < stop_ns:
+    while due < stop_ns and not enough():
         sleep_until(due)
         now = clock()
         late = now - due
@@ -49,7 +61,7 @@ def watch(
         if late >= threshold_ns:
             stalls.extend((due, late))
             due += late // period_ns * period_ns  # stay on the grid
-        else:
+        elif len(lateness) < ORDINARY:
             lateness.append(late)
         due += period_ns
     ordinary = sorted(lateness)
@@ -61,10 +73,14 @@ def main() -> None:
     spec = protocol.receive()
     die_with_parent(spec["parent"])
     set_thread_name("stall-meter")
+    signals: list[int] = []
+    signal.signal(ENOUGH, lambda number, _: signals.append(number))
     protocol.send(missing=[], memory_locked=lock_memory())
     times = protocol.receive()
     stop_garbage_collection()
-    stalls, wakeups, ordinary = watch(times["meter_from_ns"], times["stop_ns"])
+    stalls, wakeups, ordinary = watch(
+        times["meter_from_ns"], times["stop_ns"], enough=lambda: bool(signals)
+    )
     protocol.send_events(stalls.tobytes(), wakeups=wakeups, median_lateness_ns=ordinary)
     protocol.wait_for_leave()
 

@@ -1,12 +1,15 @@
 """Watching the machine's own stalls from outside: one stall meter process per core.
 
-Beside a run the launcher starts, times and ends the meters with everything else; on its own,
-:func:`measure_stalls` answers "how badly does this machine stall?".
+Beside a run of the live workload the launcher starts, times and ends the meters with everything
+else; :func:`stalls_watched` does it beside whatever else runs, and :func:`measure_stalls` answers
+"how badly does this machine stall?".
 """
 
 import os
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 
 import polars as pl
 
@@ -16,9 +19,17 @@ from chainshaper.workload import stall_meter
 from chainshaper.workload.event_reading import stall_table
 from chainshaper.workload.launcher import Child, end_all, start_child
 
-__all__ = ["measure_stalls", "promote_meters", "read_meters", "start_meters"]
+__all__ = [
+    "StallWatch",
+    "measure_stalls",
+    "promote_meters",
+    "read_meters",
+    "stalls_watched",
+    "start_meters",
+]
 
 MODULE = "chainshaper.workload.stall_meter"
+LONGEST_NS = 7 * 24 * 3600 * 1_000_000_000
 
 
 def start_meters(cores: Iterable[int], meters: dict[int, Child]) -> None:
@@ -57,6 +68,40 @@ def read_meters(
     return stalls, info
 
 
+@dataclass
+class StallWatch:
+    """What meters saw, once the watch is over: the `machine_stall` table, and how it was taken."""
+
+    table: pl.DataFrame | None = None
+    info: StallMeterInfo | None = None
+
+
+@contextmanager
+def stalls_watched(cores: Iterable[int], realtime: bool) -> Iterator[StallWatch]:
+    """Watch cores for as long as the context lasts.
+
+    Raises:
+        OperationError: a meter died.
+    """
+    meters: dict[int, Child] = {}
+    watch, finished = StallWatch(), False
+    try:
+        start_meters(cores, meters)
+        for child in meters.values():
+            child.hear()
+        promote_meters(meters, realtime)
+        start = time.monotonic_ns() + 50_000_000
+        for child in meters.values():
+            child.tell(start_ns=start, meter_from_ns=start, stop_ns=start + LONGEST_NS)
+        yield watch
+        for child in meters.values():
+            child.process.send_signal(stall_meter.ENOUGH)
+        stalls, watch.info = read_meters(meters, realtime)
+        watch.table, finished = stall_table(stalls), True
+    finally:
+        end_all(meters.values(), patience_s=2.0 if finished else 0.0)
+
+
 def measure_stalls(
     cores: Iterable[int], duration_ns: int, realtime: bool
 ) -> tuple[pl.DataFrame, StallMeterInfo]:
@@ -65,19 +110,8 @@ def measure_stalls(
     Raises:
         OperationError: a meter died.
     """
-    meters: dict[int, Child] = {}
-    finished = False
-    try:
-        start_meters(cores, meters)
-        for child in meters.values():
-            child.hear()
-        promote_meters(meters, realtime)
-        start = time.monotonic_ns() + 50_000_000
-        times = {"start_ns": start, "meter_from_ns": start, "stop_ns": start + duration_ns}
-        for child in meters.values():
-            child.tell(**times)
-        stalls, info = read_meters(meters, realtime)
-        finished = True
-    finally:
-        end_all(meters.values(), patience_s=2.0 if finished else 0.0)
-    return stall_table(stalls), info
+    with stalls_watched(cores, realtime) as watch:
+        time.sleep(duration_ns / 1e9)
+    assert watch.table is not None  # noqa: S101 - the watch is over
+    assert watch.info is not None  # noqa: S101
+    return watch.table, watch.info

@@ -1,0 +1,96 @@
+"""`chainshaper profile`: record under the paper's profiling condition."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from chainshaper.cli.options import JsonOption, RecordingOutput
+from chainshaper.cli.record import (
+    BufferOption,
+    CommandArgument,
+    DurationOption,
+    Source,
+    SourceOption,
+    record_and_show,
+)
+from chainshaper.errors import InputError
+
+__all__ = ["profile"]
+
+
+def profile(
+    output: RecordingOutput,
+    command: CommandArgument = None,
+    chain: Annotated[
+        str | None,
+        typer.Option(
+            "--chain",
+            metavar="FIRST..LAST",
+            help="The chain whose nodes get the priority; --like tells which those are.",
+            show_default=False,
+        ),
+    ] = None,
+    like: Annotated[
+        Path | None,
+        typer.Option(
+            "--like",
+            metavar="REC",
+            help="An earlier recording of the application, which knows the chain's nodes.",
+            show_default=False,
+        ),
+    ] = None,
+    node: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--node",
+            metavar="NAME",
+            help="A node that gets the priority (may be repeated). Default: the chain's, or all.",
+            show_default=False,
+        ),
+    ] = None,
+    core: Annotated[
+        int | None,
+        typer.Option(
+            "--core",
+            min=0,
+            help="Where executors run. Default: the last core. DDS threads run on the others.",
+            show_default=False,
+        ),
+    ] = None,
+    source: SourceOption = Source.LTTNG,
+    duration: DurationOption = None,
+    buffer: BufferOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Record with the chain's threads under SCHED_FIFO, DDS threads on another core.
+
+    This is how the latencies are measured that a plan is computed from. Whatever ends it, all
+    threads are as before. What happened before the priorities were in force is left out.
+    """
+    from chainshaper.command_process import check_command
+    from chainshaper.profiling import chain_nodes, profiling_condition
+    from chainshaper.recording import refuse_existing
+
+    if not command:
+        raise InputError("no command given: `chainshaper profile -o REC -- ros2 launch …`")
+    if chain is not None and like is None and not node:
+        raise InputError(
+            f"which nodes {chain} has, an earlier recording knows: name it with --like REC "
+            "(`chainshaper record`), or name the nodes with --node"
+        )
+    if like is not None and chain is None:
+        raise InputError(f"--like {like} is about the nodes of a chain: name it with --chain")
+    refuse_existing(output)
+    check_command(command)
+    names = [f"/{name.strip('/')}" for name in node or ()]
+    if like is not None and chain is not None:
+        names += chain_nodes(like, chain)
+    condition = profiling_condition(names, core)
+    record_and_show(
+        *(output, command, source, duration, buffer),
+        json=json,
+        chain=chain,
+        scheduling=condition,
+        watch_stalls=True,
+    )

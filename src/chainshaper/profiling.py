@@ -1,0 +1,151 @@
+"""The paper's profiling condition: a chain alone with its interference (sections 2.5 and 4.2).
+
+L̄ and L̲, from which slots are computed, are measured with the executors of the chain's nodes under
+SCHED_FIFO at a high priority on one core, and their DDS threads above them on the others. What else
+runs keeps its class, so it cannot disturb the chain; interference that remains is what no schedule
+avoids (section 2.3).
+
+Threads are changed as `apply` changes them: what was there stands in a journal first, and is put
+back whatever ends the run. Threads that appear later get theirs at the next look.
+"""
+
+import time
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from chainshaper.analysis import data_flow, find_chain, graph_of
+from chainshaper.durations import format_duration
+from chainshaper.enforcement.allocation import Allocation, NodeThread, allocate
+from chainshaper.enforcement.claims import claim_run
+from chainshaper.enforcement.journal import Journal
+from chainshaper.enforcement.processes import Process
+from chainshaper.enforcement.realtime import available_cores, check_cores, may_use_fifo
+from chainshaper.enforcement.release_after import start_watching
+from chainshaper.enforcement.runs import remove_run
+from chainshaper.enforcement.scheduling_memory import change_scheduling, restore_scheduling
+from chainshaper.enforcement.server_threads import scheduling_around
+from chainshaper.errors import OperationError, PlatformError
+from chainshaper.recording import Recording
+from chainshaper.sources import open_source
+
+__all__ = ["chain_nodes", "profiling_condition"]
+
+START_NS = 30_000_000_000
+"""The nodes have this long to appear."""
+
+_SERVER = "the chain"
+
+
+@contextmanager
+def profiling_condition(
+    nodes: Collection[str] = (), core: int | None = None, folder: Path | None = None
+) -> Iterator[Callable[[Sequence[Process]], bool]]:
+    """Have the threads of ``nodes`` (default: of all) run as the paper profiles a chain.
+
+    It gives what :func:`chainshaper.record.record_command` wants for its ``scheduling``. ``core``
+    is where the executors run; by default the last that we may use. ``folder`` is where runs keep
+    their journals (default: `/run/chainshaper`).
+
+    Raises:
+        PlatformError: no such core, or SCHED_FIFO is not permitted.
+        OperationError: `apply` governs one of the nodes, or the core; not all could be put back.
+            And where it is called: a node does not appear, or the kernel refuses something.
+    """
+    if not may_use_fifo():
+        raise PlatformError(
+            "profiling needs SCHED_FIFO: run as root, or give your user an rtprio limit of 98 in "
+            "/etc/security/limits.conf; without, `chainshaper record` records as things are"
+        )
+    core = available_cores()[-1] if core is None else core
+    check_cores({core: "the chain"})
+    journal = claim_run({core}, nodes, folder)
+    watcher = None
+    try:
+        watcher = start_watching(journal.path.parent)
+        yield _Condition(frozenset(nodes), core, journal).see_to_it
+    finally:
+        _put_back(journal)
+        if watcher is not None:
+            watcher.kill()
+            watcher.wait()
+
+
+def chain_nodes(recording: Recording | str | Path, chain: str) -> tuple[str, ...]:
+    """The nodes of a chain in an earlier recording of the application, in its order.
+
+    Raises:
+        InputError: no such recording or chain.
+    """
+    if not isinstance(recording, Recording):
+        recording = open_source(recording)
+    graph = graph_of(data_flow(recording.events, recording.info.clock_offset_ns))
+    found = find_chain(graph, chain)
+    return tuple(dict.fromkeys(graph.callbacks[number].node for number in found.callbacks))
+
+
+@dataclass
+class _Condition:
+    """What is wished for, and which threads have it already. No ``nodes``: all of them."""
+
+    nodes: frozenset[str]
+    core: int
+    journal: Journal
+    begun_ns: int = field(default_factory=time.monotonic_ns)
+    done: set[tuple[int, int]] = field(default_factory=set)
+
+    def see_to_it(self, processes: Sequence[Process]) -> bool:
+        """Give new threads what they shall have; whether all nodes have it, and nothing was new."""
+        found = allocate(processes)
+        there = {node for one in found.threads for node in one.nodes}
+        members = _executors(found, self.nodes, processes)
+        if not members or not self.nodes <= there:
+            if time.monotonic_ns() - self.begun_ns > START_NS:
+                raise OperationError(
+                    f"{_missing(self.nodes - there)} has not appeared within "
+                    f"{format_duration(START_NS)}; running: {', '.join(sorted(there)) or 'no node'}"
+                )
+            return False
+        wanted = scheduling_around(
+            {_SERVER: members}, {_SERVER: self.core}, {_SERVER: 1}, found, available_cores()
+        )
+        new = [one for one in wanted if one.thread.thread.identity not in self.done]
+        for one in new:
+            # One after the other, as under SCHED_FIFO in the paper: no turns.
+            scheduling = replace(one.wanted, takes_turns=False)
+            change_scheduling(self.journal, one.thread.thread, scheduling)
+            self.done.add(one.thread.thread.identity)
+        return not new
+
+
+def _executors(
+    found: Allocation, nodes: frozenset[str], processes: Sequence[Process]
+) -> list[NodeThread]:
+    """The threads that execute these nodes, or publish for them; of all nodes if none are named.
+
+    `ros2 launch` is a node as well, and nobody's chain: what has started other nodes is left out.
+    """
+    owners = {one.thread.pid for one in found.threads if one.nodes}
+    launchers = {one.parent for one in processes if one.pid in owners}
+    return [
+        one
+        for one in found.threads
+        if one.thread.role in ("executor", "publisher")
+        and (nodes & set(one.nodes) if nodes else one.nodes and one.thread.pid not in launchers)
+    ]
+
+
+def _missing(nodes: Collection[str]) -> str:
+    return f"node {', '.join(sorted(nodes))}" if nodes else "a node"
+
+
+def _put_back(journal: Journal) -> None:
+    left = [one for one in restore_scheduling(journal) if one.fate == "failed"]
+    if left:
+        problems = "; ".join(f"{one.tid} ({one.comm}): {one.reason}" for one in left)
+        raise OperationError(
+            f"not everything could be put back: {problems}; {journal.path} says what was there, "
+            "`chainshaper release` tries again"
+        )
+    remove_run(journal)

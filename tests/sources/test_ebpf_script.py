@@ -1,0 +1,174 @@
+"""The bpftrace script and its output, without tracing: what bpftrace accepts, what we read."""
+
+import subprocess
+from pathlib import Path
+
+import polars as pl
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from traced_program import build, skip_without_bpftrace
+
+from chainshaper import events
+from chainshaper.sources.ebpf_output import HEADER, lost_events, read_printed
+from chainshaper.sources.ebpf_script import (
+    FIRST_POINT,
+    NAME_PLACE,
+    RMW_PLACE,
+    TEXT_BYTES,
+    TEXT_CODE,
+    TEXT_LINES,
+    bpftrace_script,
+)
+from chainshaper.sources.trace_points import FUNCTION_PREFIX, TracePoint, trace_points
+from chainshaper.sources.tracing_libraries import TracingLibrary, installed_libraries
+
+ALL = frozenset(FUNCTION_PREFIX + event for event in events.FIELDS)
+
+
+def library(version: str | None, path: str = "/opt/ros/any/lib/libtracetools.so") -> TracingLibrary:
+    return TracingLibrary(Path(path), ALL, version)
+
+
+def point(event: str, version: str | None = "8.2.3") -> TracePoint:
+    (found,) = (one for one in trace_points([library(version)]) if one.event == event)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("version", "flags"), [("4.1.1", "-DHUMBLE"), ("7.1.0", "-O2"), ("8.2.3", "-O2")]
+)
+def test_bpftrace_accepts_the_script_of_every_distribution(
+    version: str, flags: str, tmp_path: Path
+) -> None:
+    skip_without_bpftrace()
+    built = build(tmp_path / "a prefix", flags, version=version)
+    points = trace_points(installed_libraries({"AMENT_PREFIX_PATH": str(built.prefix)}))
+    script = tmp_path / "events.bt"
+    script.write_text(bpftrace_script(points, (1, 2), attached=True))
+    options = subprocess.run(["bpftrace", "--help"], capture_output=True, text=True, check=False)
+    dry_run = "--dry-run" if "--dry-run" in options.stdout + options.stderr else "-d"
+    command = ["bpftrace", dry_run, str(script)]
+    run = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert run.returncode == 0, run.stderr[-2000:]
+
+
+def test_arguments_are_the_columns_but_for_what_no_function_is_given() -> None:
+    assert [a.column for a in point("rcl_init").arguments] == ["context_handle"]
+    assert [(a.column, a.place) for a in point("rclcpp_publish").arguments] == [("message", 1)]
+    old, new = point("rmw_publish", "7.1.0"), point("rmw_publish", "8.2.3")
+    assert [a.column for a in old.arguments] == ["message"]
+    assert [a.column for a in new.arguments] == ["rmw_publisher_handle", "message", "timestamp"]
+    for event in ("callback_start", "rclcpp_ring_buffer_enqueue", "rmw_take"):
+        assert [a.column for a in point(event).arguments] == list(events.FIELDS[event])
+        assert point(event).arguments[-1].kind == "flag"
+
+
+def test_only_exported_functions_get_a_probe() -> None:
+    few = TracingLibrary(Path("/lib.so"), frozenset({"ros_trace_callback_end", "other"}), None)
+    points = trace_points([few])
+    assert [one.event for one in points] == ["callback_end"]
+    assert bpftrace_script(points).count("uprobe:") == 1
+
+
+def test_limits_hold_for_every_probe_and_follow_what_is_started() -> None:
+    script = bpftrace_script(trace_points([library("8.2.3")]), (17, 18))
+    assert "@traced[17] = 1;" in script
+    assert "tracepoint:sched:sched_process_fork /@traced[pid]/" in script
+    probes = [line for line in script.splitlines() if line.startswith("uprobe:")]
+    assert all(line.endswith("/@traced[pid]/") for line in probes)
+    assert "@traced" not in bpftrace_script(trace_points([library("8.2.3")]))
+
+
+def printed_text(text: bytes, place: int, skipped: int) -> list[str]:
+    """What the script prints of a text that lies ``skipped`` bytes behind an aligned address."""
+    memory = b"\xab" * skipped + text + b"\0" + b"\xcd" * 64 * TEXT_LINES
+    lines = []
+    for number in range(TEXT_LINES):
+        part = memory[64 * number : 64 * (number + 1)]
+        words = [int.from_bytes(part[at : at + 8], "little", signed=True) for at in range(0, 64, 8)]
+        values = [TEXT_CODE, 1000, 7, 7, 0, 16 * place + number, skipped, *words]
+        lines.append("\t".join(map(str, values)))
+        if part[-1] == 0:
+            break
+    return lines
+
+
+@given(
+    name=st.binary(max_size=TEXT_BYTES - 1).filter(lambda text: b"\0" not in text),
+    skipped=st.integers(0, 7),
+    reversed_lines=st.booleans(),
+)
+def test_names_of_any_length_and_alignment_are_put_together_again(
+    tmp_path_factory: pytest.TempPathFactory, name: bytes, skipped: int, reversed_lines: bool
+) -> None:
+    lines = printed_text(name, 3, skipped)
+    lines += printed_text(b"/other", 8, 0)  # another text of the same event
+    code = FIRST_POINT
+    event = f"{code}\t1000\t7\t7\t0\t21\t22\t23"
+    lines = [*reversed(lines), event] if reversed_lines else [event, *lines]
+    file = tmp_path_factory.mktemp("printed") / "events.txt"
+    file.write_text(HEADER + "\n".join(lines) + "\n")
+    printed = read_printed(file, [point("rcl_service_init")], ahead_ns=0)
+    row = printed.tables["rcl_service_init"].row(0, named=True)
+    assert row["service_name"] == name.decode(errors="replace")
+    assert (row["service_handle"], row["node_handle"], row["rmw_service_handle"]) == (21, 22, 23)
+    assert printed.cut_names == 0
+
+
+def test_a_name_whose_beginning_was_lost_is_unknown_and_a_longer_one_is_cut_and_counted(
+    tmp_path: Path,
+) -> None:
+    lost = printed_text(b"/a" * 60, 3, 0)[1:]
+    long = [line.replace("\t1000\t", "\t2000\t") for line in printed_text(b"/b" * 600, 3, 5)]
+    rows = [f"{FIRST_POINT}\t{time}\t7\t7\t0\t21\t22\t23" for time in (1000, 2000)]
+    file = tmp_path / "events.txt"
+    file.write_text(HEADER + "\n".join([*rows, *lost, *long]) + "\n")
+    printed = read_printed(file, [point("rcl_service_init")], ahead_ns=0)
+    first, second = printed.tables["rcl_service_init"]["service_name"]
+    assert first is None
+    assert ("/b" * 600).startswith(second)
+    assert len(second) >= TEXT_BYTES
+    assert printed.cut_names == 1
+
+
+def test_lines_of_other_cores_are_sorted_and_bpftraces_own_are_left_out(tmp_path: Path) -> None:
+    code = FIRST_POINT
+    file = tmp_path / "events.txt"
+    file.write_text(
+        f"{HEADER}Attaching 3 probes...\n{code}\t3000\t7\t8\t1\t140737488355327\n"
+        f"Lost 12 events\n{code}\t1000\t7\t7\t0\t5\nLost 30 events\n"
+        '1\t2000\t0\t0\t0\t0\t120\t0\t7\t-81\t\t\t\t\t\tswapper/0\tnode with "\n'
+        "1\t2500\t7\t7\t0\t\t\t\t8\n"
+        f"\n{code}\t40"  # it was killed here
+    )
+    other = tmp_path / "said.log"
+    other.write_text("Lost 1 events\n")
+    printed = read_printed(file, [point("callback_end")], ahead_ns=100)
+    assert printed.tables["callback_end"].rows() == [(900, 7, 7, 0, 5), (2900, 7, 8, 1, 2**47 - 1)]
+    switches = printed.tables["sched_switch"]
+    assert switches.select("time", "prev_tid", "next_tid", "next_prio").rows() == [
+        (1900, 0, 7, -81),
+        (2400, None, 8, None),
+    ]
+    assert switches.row(0, named=True)["next_comm"] == 'node with "'
+    assert lost_events(file, other, tmp_path / "absent") == 43
+
+
+def test_names_of_handles_come_with_the_event_they_were_read_at(tmp_path: Path) -> None:
+    points = [point("rmw_publish"), point("rmw_take")]
+    take = f"{FIRST_POINT + 1}\t1000\t7\t7\t0\t77\t78\t79\t1"
+    lines = [take, *printed_text(b"/t1", NAME_PLACE, 2), *printed_text(b"rmw_x", RMW_PLACE, 0)]
+    file = tmp_path / "events.txt"
+    file.write_text(HEADER + "\n".join(lines) + "\n")
+    printed = read_printed(file, points, ahead_ns=0)
+    assert printed.handles.rows() == [(7, "rmw_take", 77, "/t1")]
+    assert printed.rmw == "rmw_x"
+
+
+def test_a_version_that_is_no_argument_comes_from_the_librarys_package(tmp_path: Path) -> None:
+    file = tmp_path / "events.txt"
+    file.write_text(f"{HEADER}{FIRST_POINT}\t1000\t7\t7\t0\t77\n")
+    printed = read_printed(file, [point("rcl_init")], ahead_ns=0)
+    assert printed.tables["rcl_init"].select("context_handle", "version").rows() == [(77, "8.2.3")]
+    assert printed.tables["rcl_init"].schema["version"] == pl.String

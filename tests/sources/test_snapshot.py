@@ -1,0 +1,128 @@
+"""Asking the ROS graph, in the environment and with the interpreter of the application."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from processes import wait_for
+
+from chainshaper.recording import EndpointInfo
+from chainshaper.sources.snapshot import ask_graph, environment_of
+
+RCLPY = '''
+"""As much of rclpy 7.1 (Jazzy) as is used, telling what two nodes over Cyclone DDS told."""
+import enum, os, types
+
+WORDS = "RELIABLE BEST_EFFORT VOLATILE TRANSIENT_LOCAL KEEP_LAST UNKNOWN AUTOMATIC"
+Words = enum.Enum("Words", WORDS)
+
+class Duration:
+    def __init__(self, nanoseconds):
+        self.nanoseconds = nanoseconds
+
+INFINITE = Duration(9223372036854775807)
+
+def endpoint(name, namespace, reliability, durability, history, depth, deadline, lifespan):
+    profile = types.SimpleNamespace(
+        reliability=Words[reliability], durability=Words[durability], history=Words[history],
+        depth=depth, deadline=deadline, lifespan=lifespan, liveliness=Words.AUTOMATIC,
+        liveliness_lease_duration=INFINITE,
+    )
+    return types.SimpleNamespace(node_name=name, node_namespace=namespace,
+                                 topic_type="sensor_msgs/msg/Image", qos_profile=profile)
+
+class Node:
+    def get_topic_names_and_types(self):
+        return [("/t1", ["sensor_msgs/msg/Image"])]
+    def get_publishers_info_by_topic(self, topic):
+        qos = ("RELIABLE", "VOLATILE", "KEEP_LAST", 10, INFINITE, INFINITE)
+        own, one = endpoint("_chainshaper_snapshot", "/", *qos), endpoint("node1", "/", *qos)
+        return [own, one, one]
+    def get_subscriptions_info_by_topic(self, topic):
+        return [endpoint("node2", "/front", "BEST_EFFORT", "TRANSIENT_LOCAL", "UNKNOWN", 0,
+                         Duration(100_000_000), Duration(0))]
+    def destroy_node(self):
+        pass
+
+def init(args):
+    print("a library says something first")
+    if "LD_PRELOAD" in os.environ or os.environ["RMW_IMPLEMENTATION"] != "rmw_cyclonedds_cpp":
+        raise RuntimeError("another environment than the node's")
+
+def create_node(name, enable_rosout, start_parameter_services):
+    return Node()
+
+def shutdown():
+    pass
+'''
+
+
+@pytest.fixture
+def application(tmp_path: Path) -> dict[str, str]:
+    """A node's environment: its own `ros2`, run by a Python that finds this `rclpy`."""
+    (tmp_path / "rclpy.py").write_text(RCLPY)
+    (tmp_path / "ros2").write_text(f"#!{sys.executable} -B\n")
+    (tmp_path / "ros2").chmod(0o755)
+    return {
+        "PATH": str(tmp_path),  # no other Python is on it
+        "PYTHONPATH": str(tmp_path),
+        "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp",
+        "LD_PRELOAD": "/opt/caret/libcaret.so",
+    }
+
+
+def test_types_and_qos_of_every_endpoint_are_told(application: dict[str, str]) -> None:
+    found, problem = ask_graph(application)
+    assert problem is None
+    publisher = EndpointInfo(
+        node="/node1",
+        topic="/t1",
+        kind="publisher",
+        type="sensor_msgs/msg/Image",
+        reliability="reliable",
+        durability="volatile",
+        history="keep_last",
+        depth=10,
+        liveliness="automatic",
+    )
+    subscription = EndpointInfo(
+        node="/front/node2",
+        topic="/t1",
+        kind="subscription",
+        type="sensor_msgs/msg/Image",
+        reliability="best_effort",
+        durability="transient_local",
+        history="unknown",
+        depth=0,
+        deadline_ns=100_000_000,
+        liveliness="automatic",
+    )
+    assert found == (publisher, publisher, subscription)  # two publishers stay two
+
+
+def test_a_graph_that_cannot_be_asked_is_no_more_than_a_reason(
+    application: dict[str, str], tmp_path: Path
+) -> None:
+    found, problem = ask_graph({**application, "RMW_IMPLEMENTATION": "rmw_connextdds"})
+    assert (found, problem) == ((), "RuntimeError: another environment than the node's")
+    (tmp_path / "rclpy.py").unlink()
+    assert ask_graph(application) == ((), "ModuleNotFoundError: No module named 'rclpy'")
+    (tmp_path / "ros2").unlink()
+    found, problem = ask_graph(application)
+    assert found == ()
+    assert problem is not None
+    assert "No such file or directory: 'python3'" in problem
+
+
+def test_the_environment_of_a_process_is_what_it_was_started_with() -> None:
+    process = subprocess.Popen(["sleep", "60"], env={"ROS_DOMAIN_ID": "7", "EMPTY": ""})
+    try:
+        wait_for(lambda: bool(environment_of(process.pid)), "its start")
+        assert environment_of(process.pid) == {"ROS_DOMAIN_ID": "7", "EMPTY": ""}
+    finally:
+        process.kill()
+        process.wait()
+    assert environment_of(process.pid) == {}
+    assert environment_of(os.getpid())["PATH"]

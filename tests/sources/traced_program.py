@@ -1,0 +1,111 @@
+"""A program with the trace points of ROS 2, without ROS 2, and runs of it under the eBPF tracer."""
+
+import os
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from chainshaper.events import EventTables
+from chainshaper.recording import RecordingInfo
+from chainshaper.sources.ebpf import EbpfTracer
+
+__all__ = ["Program", "Traced", "build", "skip_without_bpftrace", "skip_without_gcc", "traced"]
+
+_SOURCES = Path(__file__).parent / "tracetools"
+_PACKAGE = "<package><name>tracetools</name><version>{}</version></package>"
+
+
+@dataclass(frozen=True)
+class Program:
+    """Where it is installed, as below a prefix of ROS 2."""
+
+    prefix: Path
+
+    @property
+    def executable(self) -> Path:
+        return self.prefix / "lib/application"
+
+    @property
+    def library(self) -> Path:
+        return self.prefix / "lib/libtracetools.so"
+
+    def command(self, *arguments: str) -> tuple[str, ...]:
+        return (str(self.executable), *arguments)
+
+    def run(self, *arguments: str) -> list[list[str]]:
+        """Run it to its end; the fields of what it printed."""
+        run = subprocess.run(
+            self.command(*arguments), capture_output=True, text=True, check=True, timeout=60
+        )
+        return [line.split("\t") for line in run.stdout.splitlines()]
+
+    def waiting(self, *arguments: str) -> "subprocess.Popen[str]":
+        """Start it, and return when it says that it is ready; it goes on when it reads a line."""
+        process = subprocess.Popen(
+            self.command(*arguments),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        return process
+
+
+@dataclass(frozen=True)
+class Traced:
+    """What the tracer made of a run, and what the program printed itself."""
+
+    tables: EventTables
+    info: RecordingInfo
+    printed: list[list[str]]
+
+
+def skip_without_gcc() -> None:
+    if shutil.which("gcc") is None:
+        pytest.skip("no gcc to build the traced program with")
+
+
+def skip_without_bpftrace() -> None:
+    if shutil.which("bpftrace") is None:
+        pytest.skip("bpftrace is not installed")
+    if os.geteuid() != 0:
+        pytest.skip("tracing with eBPF needs root")
+    trial = ["bpftrace", "-e", "BEGIN { exit(); } tracepoint:sched:sched_switch { }"]
+    run = subprocess.run(trial, capture_output=True, text=True, check=False, timeout=60)
+    if run.returncode:
+        pytest.skip(f"bpftrace does not work here: {run.stderr.strip()}")
+
+
+def build(prefix: Path, *flags: str, version: str = "8.2.3") -> Program:
+    """Compile library and program; ``version`` is what the library's package says."""
+    skip_without_gcc()
+    program = Program(prefix)
+    program.library.parent.mkdir(parents=True)
+    package = prefix / "share/tracetools/package.xml"
+    package.parent.mkdir(parents=True)
+    package.write_text(_PACKAGE.format(version))
+    gcc = ["gcc", "-O1", *flags]
+    library = [str(_SOURCES / "tracetools.c"), "-shared", "-fPIC", "-o", str(program.library)]
+    subprocess.run([*gcc, *library], check=True)
+    if "-DDISABLED" not in flags:
+        here = ["-L" + str(program.library.parent), "-ltracetools", "-Wl,-rpath,$ORIGIN"]
+        application = [str(_SOURCES / "application.c"), *here, "-pthread"]
+        subprocess.run([*gcc, *application, "-o", str(program.executable)], check=True)
+    return program
+
+
+def traced(tracer: EbpfTracer, run: Callable[[], list[list[str]]] = lambda: []) -> Traced:
+    """Trace while ``run`` runs."""
+    try:
+        tracer.start()
+        printed = run()
+        assert tracer.failure() is None
+        tracer.stop()
+    finally:
+        tracer.remove()
+    return Traced(*tracer.recording(), printed)
