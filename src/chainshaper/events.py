@@ -176,9 +176,14 @@ OPTIONAL_FIELDS: dict[str, dict[str, pl.DataType]] = {
     "callback_end": {"thread_time": _NANOSECONDS},
     # Not 0: a thread of its own sends what this publisher is given (`asynchronous_send`).
     "rcl_publisher_init": {"asynchronous": pl.Int32()},
-    # Null: the message came in time; otherwise what was done about the overrun, "wait",
-    # "discard" or "publish". Recordings from before there was a choice lack it.
-    "gate_release": {"overrun": pl.String()},
+    "gate_release": {
+        # Null: the message came in time; otherwise what was done about the overrun, "wait",
+        # "discard" or "publish", or about a message behind its mode's slot, also "next-slot".
+        # Recordings from before there was a choice lack it.
+        "overrun": pl.String(),
+        "mode": pl.String(),  # of the message's cycle; null: the gate knows no modes
+        "published": _NANOSECONDS,  # when publishing returned, in the log of a ROS 2 node
+    },
 }
 
 

@@ -20,6 +20,7 @@ _DONE = {
     "wait": "waited for the next slot",
     "discard": "discarded",
     "publish": "published at once",
+    "next-slot": "left in the slot behind their mode's",
 }
 
 

@@ -11,6 +11,7 @@ from chainshaper.planning import (
     ChainOfPlan,
     Evidence,
     Margin,
+    Modes,
     Plan,
     Prediction,
     Server,
@@ -137,6 +138,27 @@ WRONG_VALUES = [
     ("samples: 320", "samples: 2001-99-99", 16, "evidence.samples", "whole number"),
 ]
 
+MODES = """\
+modes:
+  topic: /mode
+  default: city
+  bands: {city: 2, highway: 1}
+  late: next-slot
+"""
+WRONG_MODES = [  # what is replaced, by what, the line in the modes, the key, and some words
+    ("default: city", "default: sea", 3, "modes.default", "write one of city, highway"),
+    ("default: city", "default: 1st", 3, "modes.default", "not a mode's name"),
+    ("default: city", "default: on", 3, "modes.default", "not a text"),
+    ("highway: 1", "highway: 3", 4, "modes.bands.highway", "from 1 to 2"),
+    ("highway: 1", "highway: 0", 4, "modes.bands.highway", "greater than or equal to 1"),
+    ("{city: 2, highway: 1}", "{}", 4, "modes.bands", "too short"),
+    ("{city: 2, highway: 1}", "[2, 1]", 4, "modes.bands", "dictionary"),
+    ("topic: /mode", "topic: mode", 2, "modes.topic", "full ROS"),
+    ("topic: /mode", "topic: /t5_tmp", 2, "modes.topic", "carries the chain's output"),
+    ("late: next-slot", "late: never", 5, "modes.late", "'next-slot'"),
+    ("late: next-slot", "early: wait", 5, "modes.early", "unknown key"),
+]
+
 
 @pytest.mark.parametrize("case", WRONG_VALUES, ids=lambda case: case[1].strip())
 def test_a_wrong_value_is_named(tmp_path: Path, case: tuple[str, str, int, str, str]) -> None:
@@ -147,6 +169,43 @@ def test_a_wrong_value_is_named(tmp_path: Path, case: tuple[str, str, int, str, 
     problem = str(caught.value).splitlines()[-1]
     assert problem.startswith(f"{tmp_path / 'plan.yaml'}:{line}: {key}: ")
     assert words in problem
+
+
+def test_a_mode_publishes_in_a_slot_of_its_own(tmp_path: Path) -> None:
+    modes = _load(tmp_path, _with_modes(MODES)).modes
+    assert modes is not None
+    assert (modes.bands, modes.default, modes.late) == (
+        {"city": 2, "highway": 1},
+        "city",
+        "next-slot",
+    )
+    shorter = _load(tmp_path, _with_modes(MODES.replace("  late: next-slot\n", ""))).modes
+    assert shorter is not None
+    assert shorter.late == "wait"
+
+
+@pytest.mark.parametrize("case", WRONG_MODES, ids=lambda case: case[1])
+def test_a_wrong_mode_is_named(tmp_path: Path, case: tuple[str, str, int, str, str]) -> None:
+    old, new, line, key, words = case
+    good = _with_modes(MODES)
+    line += good[: good.index("modes:")].count("\n")
+    with pytest.raises(InputError) as caught:
+        _load(tmp_path, _with_modes(MODES.replace(old, new)))
+    problem = str(caught.value).splitlines()[-1]
+    assert problem.startswith(f"{tmp_path / 'plan.yaml'}:{line}: {key}: ")
+    assert words in problem
+
+
+def test_modes_need_a_shaping_node(tmp_path: Path) -> None:
+    text = _with_modes(MODES)
+    start, end = text.index("shaping_node:"), text.index("predicted:")
+    with pytest.raises(InputError, match="modes: only a shaping node knows the mode"):
+        _load(tmp_path, text[:start] + text[end:])
+
+
+def _with_modes(modes: str) -> str:
+    two_slots = GOOD.replace("- [64000us, 0.065s]", "- [40ms, 41ms]\n      - [64ms, 65ms]")
+    return two_slots + modes
 
 
 def test_every_wrong_value_is_named_once(tmp_path: Path) -> None:
@@ -238,6 +297,16 @@ NAMES = st.from_regex(r"(/[A-Za-z_][A-Za-z0-9_]{0,5}){1,3}", fullmatch=True)
 SHARES = st.lists(st.floats(0, 1), max_size=4).map(tuple)
 
 
+def modes(slots: int) -> st.SearchStrategy[Modes]:
+    """Modes with names that YAML might take for something else, in any of the slots."""
+    names = st.sampled_from(["city", "on", "no", "null", "e1", "_"])
+    return st.builds(
+        lambda bands, late: Modes(topic="/mode", default=min(bands), bands=bands, late=late),
+        st.dictionaries(names, st.integers(1, slots), min_size=1),
+        st.sampled_from(["wait", "discard", "publish", "next-slot"]),
+    )
+
+
 @st.composite
 def plans(draw: st.DrawFn) -> Plan:
     """Any plan the rules allow: times anywhere in 64 bits, names as ROS 2 permits them."""
@@ -308,6 +377,7 @@ def plans(draw: st.DrawFn) -> Plan:
             ),
         ),
         shaping_node=node,
+        modes=draw(st.none() | modes(len(slots))),
         predicted=Prediction(mean_ns=1, max_ns=high, jitter_ns=0, shares=draw(SHARES)),
     )
 

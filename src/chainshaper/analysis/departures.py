@@ -14,7 +14,7 @@ from chainshaper import events
 from chainshaper.analysis.matching import by_number
 from chainshaper.analysis.objects import Objects
 
-__all__ = ["discarded_instances", "why_not_sent", "with_departures"]
+__all__ = ["discarded_instances", "gate_decisions", "why_not_sent", "with_departures"]
 
 
 def with_departures(
@@ -63,14 +63,32 @@ def discarded_instances(
     taken: pl.DataFrame, tables: events.EventTables, objects: Objects, instances: int
 ) -> pl.Series:
     """Per callback instance whether it was a gate's that discarded its message (else null)."""
-    gates = objects.callbacks.select("pid", "callback_id", callback="handle").unique()
     discarded = (
-        events.table(tables, "gate_release")
+        gate_decisions(tables, objects)
         .filter(pl.col("release").is_null())
-        .join(gates, on=["pid", "callback"], how="inner")
         .select("callback_id", "source_timestamp", discarded=pl.lit(True))
     )
     found = taken.select("callback_id", "source_timestamp", "instance").join(
         discarded, on=["callback_id", "source_timestamp"], how="inner"
     )
     return by_number(found.drop_nulls("instance"), "instance", "discarded", instances)
+
+
+def gate_decisions(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
+    """The table `gate_release` with the ``callback_id`` of each gate.
+
+    A shaping node in ROS 2 does not know its callback's handle. A decision of its is there once for
+    each subscription of its process; which one took the message, the source timestamp tells.
+    """
+    decisions = events.table(tables, "gate_release")
+    callbacks = objects.callbacks.select("pid", "callback_id", "kind", callback="handle")
+    known = decisions.join(
+        callbacks.drop("kind").unique(), on=["pid", "callback"], how="inner", maintain_order="left"
+    )
+    if not decisions["callback"].null_count():
+        return known
+    listening = callbacks.filter(pl.col("kind") == "subscription").select("pid", "callback_id")
+    unknown = decisions.filter(pl.col("callback").is_null()).join(
+        listening.unique(), on="pid", how="inner", maintain_order="left"
+    )
+    return pl.concat([known, unknown.select(known.columns)])

@@ -24,6 +24,7 @@ import numpy.typing as npt
 import polars as pl
 
 from chainshaper import events
+from chainshaper.analysis.departures import gate_decisions
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.traversals import Traversals
 
@@ -160,14 +161,11 @@ def _releases(flow: DataFlow, traversals: Traversals) -> pl.DataFrame:
     arrived = traversals.hops.filter(pl.col("hop") == last).select(
         "traversal", "callback_id", "source_timestamp"
     )
-    gates = flow.objects.callbacks.select("pid", "callback_id", callback="handle").unique()
     in_time = (pl.col("cycles_waited") == 0) & (pl.col("arrival") < pl.col("release"))
     released = (
-        events.table(flow.events, "gate_release")
-        .select("pid", "callback", "source_timestamp", "release", "origin", held=in_time)
-        .join(gates, on=["pid", "callback"], how="inner")
+        gate_decisions(flow.events, flow.objects)
+        .select("callback_id", "source_timestamp", "release", "origin", held=in_time)
         .unique(["callback_id", "source_timestamp"], keep="last", maintain_order=True)
-        .drop("pid", "callback")
     )
     return arrived.join(released, on=["callback_id", "source_timestamp"], how="inner").select(
         "traversal", "release", "origin", "held"

@@ -20,6 +20,13 @@ chain ran longer than it was planned for. What becomes of it is a policy:
 * ``discard``: it is never published, so that nobody acts on old data;
 * ``publish``: it leaves at once, so that it does not become older still.
 
+With **modes** (section 3.3) each mode of the system has its own slot: the latency is constant
+within a mode, and the servers stay as they are when it changes. An early message waits for the
+slot of its mode, past the slots before it; one that comes behind it is treated like an overrun,
+by a policy of its own, which may also be ``next-slot``: it takes the next slot of the cycle.
+Which mode a message has is decided by the cycle it belongs to: a change is in force from the
+first cycle that begins after it was announced, and no cycle has two modes.
+
 This module is deliberately free of any import outside the standard library: it also runs
 inside a ROS 2 node, where nothing of ours may be installed.
 """
@@ -28,12 +35,16 @@ import ctypes
 import os
 import threading
 import time
+from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 __all__ = [
     "ANCHORS",
+    "LATE",
     "OVERRUNS",
     "Gate",
+    "Modes",
     "Release",
     "Shaper",
     "clock_offset",
@@ -41,11 +52,37 @@ __all__ = [
     "origin_of",
     "release_of",
     "sleep_until",
+    "text_of",
     "watch_until",
 ]
 
 ANCHORS = ("stamp", "cycle")
 OVERRUNS = ("wait", "discard", "publish")
+LATE = (*OVERRUNS, "next-slot")
+
+
+@dataclass(frozen=True)
+class Modes:
+    """Which slot the messages of each mode leave in.
+
+    ``bands`` has the place of every mode's slot in the gate's ``slots``. ``default`` is in force
+    until a mode is announced. ``late`` says what becomes of a message that comes behind its
+    mode's slot; with ``next-slot`` one that comes behind the last slot, too, is an overrun like
+    any other.
+    """
+
+    bands: Mapping[str, int]
+    default: str
+    late: str = "wait"
+
+    def __post_init__(self) -> None:
+        if self.default not in self.bands:
+            raise ValueError(
+                f"the default mode {self.default!r} has no band: choose one of "
+                f"{', '.join(self.bands)}"
+            )
+        if self.late not in LATE:
+            raise ValueError(f"late {self.late!r}: choose one of {', '.join(LATE)}")
 
 
 @dataclass(frozen=True)
@@ -72,6 +109,7 @@ class Gate:
     max_future_ns: int = 1_000_000
     overrun: str = "wait"
     due_cycles: int = 0
+    modes: Modes | None = None
 
     def __post_init__(self) -> None:
         if self.anchor not in ANCHORS:
@@ -92,6 +130,19 @@ class Gate:
                     f"cycle of {self.cycle_ns} ns"
                 )
             previous_end = end
+        for mode, band in ({} if self.modes is None else self.modes.bands).items():
+            if not 0 <= band < len(self.slots):
+                raise ValueError(
+                    f"mode {mode!r} has the band {band}, but the slots are numbered 0 to "
+                    f"{len(self.slots) - 1}"
+                )
+
+    @property
+    def policy(self) -> str:
+        """What becomes of a message that comes behind the last slot that is open to it."""
+        if self.modes is None or self.modes.late == "next-slot":
+            return self.overrun
+        return self.modes.late
 
 
 @dataclass(frozen=True)
@@ -101,7 +152,8 @@ class Release:
     ``at_ns`` is when the message may leave (not after the arrival: at once; None: never),
     ``slot`` which of the slots that is (None: it is in none), ``cycles_waited`` how many cycles
     after its own, ``anchor`` what the slots were counted from. ``overrun`` is None for a message
-    that came in time, and otherwise the policy that was applied to it.
+    that came in time, and otherwise the policy that was applied to it. ``mode`` is the mode of
+    its cycle; None: there are no modes.
     """
 
     at_ns: int | None
@@ -110,12 +162,16 @@ class Release:
     cycles_waited: int
     anchor: str
     overrun: str | None = None
+    mode: str | None = None
 
 
-def release_of(gate: Gate, arrival_ns: int, stamp_ns: int | None) -> Release:
+def release_of(
+    gate: Gate, arrival_ns: int, stamp_ns: int | None, changes: Sequence[tuple[int, str]] = ()
+) -> Release:
     """Decide when a message that arrived at ``arrival_ns`` may leave.
 
     ``stamp_ns`` is its origin on CLOCK_MONOTONIC (see :func:`origin_of`), None if it has none.
+    ``changes`` are the modes that were announced, each with the time (ns), ascending.
 
         >>> gate = Gate(slots=((60, 61),), cycle_ns=100)
         >>> release_of(gate, arrival_ns=1040, stamp_ns=1000).at_ns      # early: held
@@ -125,25 +181,52 @@ def release_of(gate: Gate, arrival_ns: int, stamp_ns: int | None) -> Release:
         >>> gate = Gate(slots=((60, 61),), cycle_ns=100, overrun="publish")
         >>> release_of(gate, arrival_ns=1070, stamp_ns=1000).at_ns      # missed: at once
         1070
+        >>> modes = Modes(bands={"city": 1, "highway": 0}, default="city", late="next-slot")
+        >>> gate = Gate(slots=((20, 21), (60, 61)), cycle_ns=100, modes=modes)
+        >>> release_of(gate, arrival_ns=1010, stamp_ns=1000).at_ns      # early for its mode: held
+        1060
+        >>> release_of(gate, 1110, 1100, changes=[(1050, "highway")]).at_ns
+        1120
     """
     if gate.anchor == "stamp" and stamp_ns is not None and _usable(gate, arrival_ns - stamp_ns):
         origin, anchor = stamp_ns, "stamp"
     else:
         elapsed = (arrival_ns - gate.phase_ns) % gate.cycle_ns
         origin, anchor = arrival_ns - elapsed, "cycle"
+    mode, first, slots = None, 0, gate.slots
+    if gate.modes is not None:
+        mode = _mode_at(gate.modes, origin, changes)
+        first, slots = _open_to(gate, gate.modes, mode)
     # A stamp slightly from the future puts the arrival before its own cycle: cycle 0 still.
     cycle = max(0, (arrival_ns - origin) // gate.cycle_ns)
-    overran = arrival_ns >= origin + gate.due_cycles * gate.cycle_ns + gate.slots[-1][1]
-    if overran and gate.overrun != "wait":
-        at_once = arrival_ns if gate.overrun == "publish" else None
-        return Release(at_once, origin, None, cycle, anchor, gate.overrun)
+    due_from = origin + gate.due_cycles * gate.cycle_ns
+    overran, policy = arrival_ns >= due_from + slots[-1][1], gate.policy
+    if overran and policy != "wait":
+        at_once = arrival_ns if policy == "publish" else None
+        return Release(at_once, origin, None, cycle, anchor, policy, mode)
+    treated = "wait" if overran else None
+    if mode is not None and not overran and arrival_ns >= due_from + slots[0][1]:
+        treated = "next-slot"
     while True:
         cycle_start = origin + cycle * gate.cycle_ns
-        for slot, (start, end) in enumerate(gate.slots):
+        for slot, (start, end) in enumerate(slots, first):
             if arrival_ns < cycle_start + end:
                 at = max(arrival_ns, cycle_start + start)
-                return Release(at, origin, slot, cycle, anchor, "wait" if overran else None)
+                return Release(at, origin, slot, cycle, anchor, treated, mode)
         cycle += 1
+
+
+def _mode_at(modes: Modes, origin_ns: int, changes: Sequence[tuple[int, str]]) -> str:
+    """The mode of the cycle that began at ``origin_ns``."""
+    announced = (mode for since, mode in reversed(changes) if since <= origin_ns)
+    return next(announced, modes.default)
+
+
+def _open_to(gate: Gate, modes: Modes, mode: str) -> tuple[int, tuple[tuple[int, int], ...]]:
+    """The slots that are open to a mode, behind the place of the first of them."""
+    band = modes.bands[mode]
+    last = len(gate.slots) if modes.late == "next-slot" else band + 1
+    return band, gate.slots[band:last]
 
 
 def missed(gate: Gate, release: Release, now_ns: int) -> bool:
@@ -174,6 +257,20 @@ def origin_of(payload: bytes) -> int | None:
     if (seconds == 0 and nanoseconds == 0) or nanoseconds >= 1_000_000_000:
         return None
     return seconds * 1_000_000_000 + nanoseconds
+
+
+def text_of(payload: bytes) -> str | None:
+    """The text of a serialized ``std_msgs/String``, None where the bytes are none.
+
+    Behind the encapsulation header stand the length, with the final NUL, and the characters.
+    """
+    if len(payload) < 8:
+        return None
+    order = "little" if payload[1] & 1 else "big"
+    length = int.from_bytes(payload[4:8], order)  # type: ignore[arg-type]
+    if not 1 <= length <= len(payload) - 8:
+        return None
+    return payload[8 : 7 + length].decode(errors="replace")
 
 
 class _Timespec(ctypes.Structure):
@@ -248,6 +345,23 @@ class Shaper:
         self._offset = clock_offset()
         self._waiting = _WaitingTime()
         self._waited = 0
+        # So many changes reach back further than the oldest stamp that is of use.
+        self._changes: deque[tuple[int, str]] = deque(maxlen=64)
+
+    @property
+    def mode(self) -> str | None:
+        """The mode that was announced last; None without modes."""
+        if self.gate.modes is None:
+            return None
+        return self._changes[-1][1] if self._changes else self.gate.modes.default
+
+    def switch(self, mode: str | None, now_ns: int) -> bool:
+        """A mode is announced, in force from the next cycle on; False: there is none like it."""
+        if self.gate.modes is None or mode is None or mode not in self.gate.modes.bands:
+            return False
+        if mode != self.mode:
+            self._changes.append((now_ns, mode))
+        return True
 
     def decide(self, payload: bytes, arrival_ns: int) -> Release:
         """When the message that arrived may leave, after :func:`release_of`."""
@@ -255,7 +369,8 @@ class Shaper:
         stepped = abs(offset - self._offset) > self.STEP_NS
         self._offset = offset
         stamp = None if stepped else origin_of(payload)
-        release = release_of(self.gate, arrival_ns, None if stamp is None else stamp - offset)
+        origin = None if stamp is None else stamp - offset
+        release = release_of(self.gate, arrival_ns, origin, self._changes)
         if release.anchor == "stamp":
             phase = release.origin_ns % self.gate.cycle_ns
             self.gate = replace(self.gate, phase_ns=phase)
@@ -272,12 +387,13 @@ class Shaper:
         if release.at_ns is None:
             return release, arrival, arrival
         self._waited = self._waiting.so_far()
-        sleep_until(release.at_ns - self.spin_ns)
-        if time.monotonic_ns() < release.at_ns:
-            # Awake in time: what other threads took before is of no consequence.
-            self._waited = self._waiting.so_far()
+        if release.at_ns > arrival:
+            sleep_until(release.at_ns - self.spin_ns)
+            if time.monotonic_ns() < release.at_ns:
+                # Awake in time: what other threads took before is of no consequence.
+                self._waited = self._waiting.so_far()
         awake = watch_until(release.at_ns)
-        if self.gate.overrun == "discard" and missed(self.gate, release, awake):
+        if self.gate.policy == "discard" and missed(self.gate, release, awake):
             release = replace(release, at_ns=None, slot=None, overrun="discard")
         return release, arrival, awake
 

@@ -26,6 +26,7 @@ from chainshaper.planning.plan_parts import (
     ChainOfPlan,
     Evidence,
     Margin,
+    Modes,
     Overrun,
     Policy,
     Prediction,
@@ -52,6 +53,7 @@ __all__ = [
     "ChainOfPlan",
     "Evidence",
     "Margin",
+    "Modes",
     "Overrun",
     "Plan",
     "Policy",
@@ -81,7 +83,7 @@ class Plan(Part):
     an output that missed its last slot. ``shaping_node`` serves the chain's output; it is absent
     when the publisher's own thread is gated (asynchronous publication) or nothing is.
     ``further_shaping_nodes`` serve other sinks, or the topics inside a chain whose callbacks
-    follow LET one by one.
+    follow LET one by one. With ``modes`` the slot of an output depends on the mode of the system.
     """
 
     format: Literal[1] = 1
@@ -96,6 +98,7 @@ class Plan(Part):
     servers: Annotated[tuple[Server, ...], Field(min_length=1)]
     shaping_node: ShapingNode | None = None
     further_shaping_nodes: tuple[ShapingNode, ...] = ()
+    modes: Modes | None = None
     predicted: Prediction
 
     @model_validator(mode="after")
@@ -105,6 +108,7 @@ class Plan(Part):
         _check_overlaps(self)
         for where, node in _shaping_nodes(self):
             _check_shaping_node(self, node, where)
+        _check_modes(self)
         check_publisher_threads(self)
         return self
 
@@ -282,3 +286,28 @@ def _check_shaping_node(plan: Plan, node: ShapingNode, where: tuple[Any, ...]) -
             *where,
             "core",
         )
+
+
+def _check_modes(plan: Plan) -> None:
+    if plan.modes is None:
+        return
+    if plan.shaping_node is None:
+        raise wrong_value(
+            "only a shaping node knows the mode of the system, and the plan has no `shaping_node`:"
+            " remove the modes, or plan with synchronous publication",
+            "modes",
+        )
+    if plan.modes.topic in (plan.shaping_node.input, plan.shaping_node.output):
+        raise wrong_value(
+            f"{plan.modes.topic} carries the chain's output: name the topic on which the mode is"
+            " published",
+            *("modes", "topic"),
+        )
+    slots = len(publish_slots(plan))
+    for mode, band in plan.modes.bands.items():
+        if band > slots:
+            raise wrong_value(
+                f"the band {band}, but the shaping node publishes in {slots} slots: write a number"
+                f" from 1 to {slots}, or add a slot",
+                *("modes", "bands", mode),
+            )

@@ -33,6 +33,7 @@ _SECTION_COMMENTS = {
     "overrun": "an output that missed its last slot: wait for the next, discard, publish at once",
     "servers": "a thread runs only in its server's slots; a smaller priority is better",
     "shaping_node": "republishes the chain's output in the slots of its server",
+    "modes": "each mode's band, 1 is the first slot; the topic (std_msgs/String) names the mode",
     "predicted": "for the slots as planned; not updated when they are edited",
 }
 
@@ -57,6 +58,8 @@ def dump_plan(plan: Plan) -> str:
         del values["offset"]
     if not values["further_shaping_nodes"]:
         del values["further_shaping_nodes"]
+    if "modes" in values:
+        values["modes"]["bands"] = _InlineMapping(values["modes"]["bands"])
     values["predicted"]["shares"] = _Inline(values["predicted"]["shares"])
     if "confidence_interval" in values["margin"]:
         values["margin"]["confidence_interval"] = _Inline(values["margin"]["confidence_interval"])

@@ -20,6 +20,7 @@ __all__ = [
     "ChainOfPlan",
     "Evidence",
     "Margin",
+    "Modes",
     "Overrun",
     "Policy",
     "Prediction",
@@ -39,6 +40,16 @@ def _node_name(value: str) -> str:
         )
     return value
 
+
+def _mode_name(value: str) -> str:
+    if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", value):
+        raise ValueError(
+            f"{value!r} is not a mode's name: write letters, digits and underscores, no digit first"
+        )
+    return value
+
+
+ModeName = Annotated[str, AfterValidator(_mode_name)]
 
 Slot: TypeAlias = tuple[Duration, Duration]
 """A time slot [start, end) of a cycle."""
@@ -188,6 +199,32 @@ class ShapingNode(Part):
                 f"the shaping node would feed itself: input and output are both {self.input};"
                 f" let the chain publish on another topic, such as {self.output}_tmp",
                 "input",
+            )
+        return self
+
+
+class Modes(Part):
+    """Which latency band the chain's output has in each mode of the system (sections 3.3, 6).
+
+    The active mode's name is read from ``topic``, a ``std_msgs/msg/String``; until one is read it
+    is ``default``. ``bands`` has the number of each mode's band, 1 for the slot that comes first of
+    those that the shaping node publishes in. An output that is early for its mode's slot waits for
+    it. ``late`` says what becomes of one that comes behind it: ``wait`` for the same slot of the
+    next cycle, ``discard``, ``publish`` at once, or take the ``next-slot`` of the cycle.
+    """
+
+    topic: FullName
+    default: ModeName
+    bands: Annotated[dict[ModeName, Annotated[int, Field(ge=1)]], Field(min_length=1)]
+    late: Literal["wait", "discard", "publish", "next-slot"] = "wait"
+
+    @model_validator(mode="after")
+    def _default_exists(self) -> "Modes":
+        if self.default not in self.bands:
+            raise wrong_value(
+                f"the mode {self.default!r} has no band: write one of {', '.join(self.bands)}, or"
+                " give it a band",
+                "default",
             )
         return self
 

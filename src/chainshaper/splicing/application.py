@@ -13,13 +13,14 @@ from pydantic import ValidationError
 
 from chainshaper.errors import InputError
 from chainshaper.planning.overruns import cycles_until_output, output_lifespan
-from chainshaper.planning.plan import Plan, ShapingNode, publish_slots
+from chainshaper.planning.plan import Modes, Plan, ShapingNode, publish_slots
 from chainshaper.planning.publication import Writer, check_publication
 from chainshaper.planning.publisher_threads import publisher_servers
 from chainshaper.workload.description import (
     Application,
     CallbackDescription,
     GateDescription,
+    ModesDescription,
     NodeDescription,
 )
 from chainshaper.yaml_file import explanations, key_text
@@ -66,6 +67,11 @@ def splice_application(application: Application, plan: Plan) -> Application:
         raise InputError(
             f"the application publishes {shaping.input} already, the name that the plan gives to "
             "the unshaped output: change `shaping_node.input` in the plan"
+        )
+    if plan.modes is not None and plan.modes.topic not in application.announced():
+        raise InputError(
+            f"the plan's modes are named on {plan.modes.topic}, but no callback of the application "
+            "`announces` modes there: describe one, or remove `modes` from the plan"
         )
     nodes = {
         name: _remapped(node, shaping.output, shaping.input) if name == publishers[0] else node
@@ -118,6 +124,7 @@ def _described(plan: Plan, shaping: ShapingNode) -> NodeDescription:
                         anchor=plan.anchor,
                         overrun=plan.overrun,
                         due_cycles=cycles_until_output(plan),
+                        modes=_described_modes(plan.modes),
                         spin_ns=shaping.spin_ns,
                         pause_ns=shaping.pause_ns,
                     ),
@@ -129,6 +136,13 @@ def _described(plan: Plan, shaping: ShapingNode) -> NodeDescription:
             f"{key_text(where)}: {reason}" for where, reason in explanations(error, NodeDescription)
         ]
         raise InputError(f"the plan's shaping node cannot be run: {'; '.join(problems)}") from error
+
+
+def _described_modes(modes: Modes | None) -> ModesDescription | None:
+    if modes is None:
+        return None
+    bands = {mode: band - 1 for mode, band in modes.bands.items()}
+    return ModesDescription(topic=modes.topic, bands=bands, default=modes.default, late=modes.late)
 
 
 def _remapped(node: NodeDescription, old: str, new: str) -> NodeDescription:

@@ -1,0 +1,159 @@
+// A gate at work: holds each message until its release, and minds the clocks.
+//
+// Stamps are CLOCK_REALTIME, sleeping is CLOCK_MONOTONIC; the offset between the two is taken anew
+// for every message, since the wall clock may be stepped. A message under way during a step is
+// anchored to the cycle instead, at the phase that the last good stamp had. No ROS 2 here.
+
+#ifndef CHAINSHAPER_SHAPING__SHAPER_HPP_
+#define CHAINSHAPER_SHAPING__SHAPER_HPP_
+
+#include <errno.h>
+#include <time.h>
+
+#include <cstdint>
+#include <cstdlib>
+#include <deque>
+#include <limits>
+#include <optional>
+#include <string>
+#include <utility>
+
+#include "gate.hpp"
+
+namespace chainshaper
+{
+
+inline std::int64_t clock_ns(clockid_t clock)
+{
+  timespec now{};
+  clock_gettime(clock, &now);
+  return now.tv_sec * std::int64_t{1'000'000'000} + now.tv_nsec;
+}
+
+inline std::int64_t monotonic_ns() {return clock_ns(CLOCK_MONOTONIC);}
+
+// Sleep until an instant of CLOCK_MONOTONIC; returns at once when it has passed.
+inline void sleep_until(std::int64_t deadline_ns)
+{
+  deadline_ns = std::max<std::int64_t>(0, deadline_ns);
+  timespec request{};
+  request.tv_sec = static_cast<time_t>(deadline_ns / 1'000'000'000);
+  request.tv_nsec = static_cast<long>(deadline_ns % 1'000'000'000);  // NOLINT(runtime/int)
+  while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &request, nullptr) == EINTR) {
+    // A signal ends the sleep early; the deadline stays the same.
+  }
+}
+
+// Watch the clock until an instant has come; the time then. Waking from a sleep takes some tens
+// of microseconds, and not always the same.
+inline std::int64_t watch_until(std::int64_t deadline_ns)
+{
+  std::int64_t now = monotonic_ns();
+  while (now < deadline_ns) {
+    now = monotonic_ns();
+  }
+  return now;
+}
+
+// CLOCK_REALTIME minus CLOCK_MONOTONIC, to a fraction of a microsecond.
+inline std::int64_t clock_offset()
+{
+  std::int64_t best_width = std::numeric_limits<std::int64_t>::max();
+  std::int64_t best = 0;
+  for (int attempt = 0; attempt < 5 && best_width >= 2'000; ++attempt) {
+    const std::int64_t before = monotonic_ns();
+    const std::int64_t realtime = clock_ns(CLOCK_REALTIME);
+    const std::int64_t after = monotonic_ns();
+    if (after - before < best_width) {  // a longer bracket means that something came between
+      best_width = after - before;
+      best = realtime - (before + after) / 2;
+    }
+  }
+  return best;
+}
+
+// What became of one message.
+struct Held
+{
+  Release release;
+  std::int64_t arrival_ns;
+  std::int64_t awake_ns;
+};
+
+class Shaper
+{
+public:
+  Shaper(Gate gate, std::int64_t spin_ns)
+  : gate_(std::move(gate)), spin_ns_(spin_ns), offset_(clock_offset())
+  {
+    check(gate_);
+  }
+
+  void set_phase(std::int64_t phase_ns) {gate_.phase_ns = phase_ns;}
+
+  const Gate & gate() const {return gate_;}
+
+  // A mode is announced, in force from the next cycle on; false: there is none like it.
+  bool announce(const std::string & name, std::int64_t now_ns)
+  {
+    const auto mode = gate_.modes ? gate_.modes->find(name) : std::nullopt;
+    if (!mode) {
+      return false;
+    }
+    if (*mode != (changes_.empty() ? gate_.modes->initial : changes_.back().second)) {
+      changes_.emplace_back(now_ns, *mode);
+      if (changes_.size() > 64) {  // reaches back further than the oldest stamp that is of use
+        changes_.pop_front();
+      }
+    }
+    return true;
+  }
+
+  // Wait until a message with this stamp (CLOCK_REALTIME) may leave. One that is to be discarded
+  // is not waited for; where overruns are discarded, so is a message whose slot is over when this
+  // thread wakes.
+  Held hold(std::optional<std::int64_t> stamp_ns)
+  {
+    Held held{{}, monotonic_ns(), 0};
+    held.release = decide(stamp_ns, held.arrival_ns);
+    if (!held.release.at_ns) {
+      held.awake_ns = held.arrival_ns;
+      return held;
+    }
+    sleep_until(*held.release.at_ns - spin_ns_);
+    held.awake_ns = watch_until(*held.release.at_ns);
+    if (policy_of(gate_) == Policy::discard && missed(gate_, held.release, held.awake_ns)) {
+      held.release.at_ns.reset();
+      held.release.slot.reset();
+      held.release.overrun = Policy::discard;
+    }
+    return held;
+  }
+
+private:
+  Release decide(std::optional<std::int64_t> stamp_ns, std::int64_t arrival_ns)
+  {
+    constexpr std::int64_t step_ns = 500'000;  // slewing moves the clock by far less in a cycle
+    const std::int64_t offset = clock_offset();
+    const bool stepped = std::abs(offset - offset_) > step_ns;
+    offset_ = offset;
+    std::optional<std::int64_t> origin;
+    if (stamp_ns && !stepped) {
+      origin = *stamp_ns - offset;
+    }
+    const Release release = release_of(gate_, arrival_ns, origin, changes_);
+    if (release.anchor == Anchor::stamp) {
+      gate_.phase_ns = release.origin_ns % gate_.cycle_ns;
+    }
+    return release;
+  }
+
+  Gate gate_;
+  std::int64_t spin_ns_;
+  std::int64_t offset_;
+  std::deque<Change> changes_;
+};
+
+}  // namespace chainshaper
+
+#endif  // CHAINSHAPER_SHAPING__SHAPER_HPP_

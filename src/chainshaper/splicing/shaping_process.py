@@ -1,0 +1,242 @@
+"""The shaping node of a plan as a ROS 2 process: its files, and what a launch file has to start.
+
+Three kinds do the same: ``python`` needs no building, ``cpp`` is one package for all types,
+``typed`` is the paper's package, generated for one type. All read the same parameters, which say
+what the plan says, and write the same log (:mod:`chainshaper.splicing.gate_log`).
+"""
+
+import ast
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import yaml
+
+from chainshaper.enforcement import gate
+from chainshaper.errors import InputError, OperationError
+from chainshaper.planning.overruns import cycles_until_output
+from chainshaper.planning.plan import Plan, ShapingNode, server_of
+from chainshaper.splicing.generated_package import (
+    GENERIC_PACKAGE,
+    generic_package,
+    message_type_named,
+    typed_package,
+)
+
+__all__ = [
+    "NodeKind",
+    "ShapingProcess",
+    "python_node",
+    "shaping_parameters",
+    "write_shaping_process",
+    "write_throttler",
+]
+
+NodeKind: TypeAlias = Literal["python", "cpp", "typed"]
+_PYTHON_NODES = Path(__file__).parent / "nodes" / "python"
+
+
+@dataclass(frozen=True)
+class ShapingProcess:
+    """A process that a launch file starts: a shaping node, or a throttler.
+
+    It is either a ``command`` (without ``--ros-args``; name, namespace, parameters and remappings
+    are for the launch file to add) or an ``executable`` of a ``package``. ``parameters_file`` is
+    a ROS 2 parameters file; ``remappings`` are pairs such as ``("input", "/t5_tmp")``.
+    """
+
+    name: str
+    namespace: str
+    command: tuple[str, ...] | None
+    package: str | None
+    executable: str | None
+    parameters_file: Path
+    remappings: tuple[tuple[str, str], ...]
+
+
+def write_shaping_process(
+    plan: Plan,
+    node: ShapingNode,
+    kind: NodeKind,
+    folder: Path,
+    *,
+    message_type: str | None = None,
+    log: Path | None = None,
+) -> ShapingProcess:
+    """Write a shaping node of a plan into ``folder``; what a launch file has to start.
+
+    ``message_type`` is the type of the chain's output, such as ``sensor_msgs/msg/Image``: the
+    ``typed`` kind is generated for it, the others find it out when they run. ``log`` is where the
+    node notes what it did with each message. Files that are there and equal are left alone.
+
+    Raises:
+        InputError: a file is there with another content; no type for the typed kind, or none that
+            there is.
+        OperationError: a file cannot be written.
+    """
+    if kind == "typed" and message_type is None:
+        raise InputError(
+            f"the typed shaping node is generated for one type, and that of {node.output} is not "
+            "known: name it, as `ros2 topic type` prints it, or choose the kind cpp"
+        )
+    package, files = _program(kind, "shaping_node", node.name, message_type)
+    remappings = (("input", node.input), ("output", node.output))
+    process = _process(folder, node.name, package, "shaping_node", remappings)
+    _write(folder, {**files, f"{node.name}.yaml": _yaml(shaping_parameters(plan, node, log))})
+    return process
+
+
+def write_throttler(
+    topics: Mapping[str, str],
+    period_ns: int,
+    kind: Literal["python", "cpp"],
+    folder: Path,
+    *,
+    name: str = "chainshaper_throttler",
+    phase_ns: int = 0,
+    core: int | None = None,
+    fifo_priority: int | None = None,
+    depth: int = 10,
+) -> ShapingProcess:
+    """Write a throttler into ``folder`` (paper, section 5.1); what a launch file has to start.
+
+    Each of the ``topics`` is republished on the one it maps to, once every ``period_ns``, at
+    ``phase_ns`` after multiples of it on CLOCK_MONOTONIC. ``depth`` is the history of the
+    publishers where that of the originals is not known.
+
+    Raises:
+        InputError: no topics, no period, or a file is there with another content.
+        OperationError: a file cannot be written.
+    """
+    if not topics or period_ns <= 0:
+        raise InputError("a throttler needs topics and a period longer than nothing")
+    parameters = {
+        "inputs": list(topics),
+        "outputs": list(topics.values()),
+        "period_ns": period_ns,
+        "phase_ns": phase_ns,
+        "core": -1 if core is None else core,
+        "fifo_priority": fifo_priority or 0,
+        "output_depth": depth,
+    }
+    package, files = _program(kind, "throttler", name, None)
+    _write(folder, {**files, f"{name}.yaml": _yaml(parameters)})
+    return _process(folder, name, package, "throttler", ())
+
+
+def shaping_parameters(plan: Plan, node: ShapingNode, log: Path | None) -> dict[str, Any]:
+    """The ROS 2 parameters of a shaping node; times are ns, slots pairs laid end to end."""
+    server = server_of(plan, node.thread)
+    slots = () if server is None else server.slots
+    parameters: dict[str, Any] = {
+        "slots_ns": [bound for slot in slots for bound in slot],
+        "cycle_ns": plan.cycle_ns,
+        "anchor": plan.anchor,
+        "phase_ns": plan.offset_ns,
+        "overrun": plan.overrun,
+        "due_cycles": _due_cycles(plan, node),
+        "spin_ns": node.spin_ns,
+        "pause_ns": node.pause_ns,
+        "core": node.core,
+        "fifo_priority": node.fifo_priority,
+        "output_depth": plan.chain.output_depth or 10,
+        "log": "" if log is None else str(log.absolute()),
+    }
+    if plan.modes is not None and node == plan.shaping_node:
+        parameters |= {
+            "mode_topic": plan.modes.topic,
+            "mode_names": list(plan.modes.bands),
+            "mode_slots": [band - 1 for band in plan.modes.bands.values()],
+            "mode_default": plan.modes.default,
+            "mode_late": plan.modes.late,
+        }
+    return parameters
+
+
+def _due_cycles(plan: Plan, node: ShapingNode) -> int:
+    # Under LET per callback each topic inside the chain is due a cycle after the one before it.
+    if plan.policy == "let-per-callback" and node in plan.further_shaping_nodes:
+        return plan.further_shaping_nodes.index(node) + 1
+    return cycles_until_output(plan)
+
+
+def python_node(executable: str) -> str:
+    """The one file of a Python node: the gate as it is, what it needs of ROS 2, and the node.
+
+    What one of these parts imports from another is there already, so such imports are left out.
+    """
+    parts = [
+        Path(gate.__file__),
+        _PYTHON_NODES / "endpoints.py",
+        _PYTHON_NODES / f"{executable}.py",
+    ]
+    texts = [_without_own_imports(part.read_text(encoding="utf-8")) for part in parts]
+    return "#!/usr/bin/env python3\n" + "\n\n".join(texts)
+
+
+def _without_own_imports(text: str) -> str:
+    lines = text.splitlines(keepends=True)
+    for statement in reversed(ast.parse(text).body):
+        if isinstance(statement, ast.ImportFrom) and (statement.module or "").startswith(
+            "chainshaper."
+        ):
+            del lines[statement.lineno - 1 : statement.end_lineno]
+    return "".join(lines)
+
+
+def _program(
+    kind: NodeKind, executable: str, name: str, message_type: str | None
+) -> tuple[str | None, dict[str, str]]:
+    """The package that has an executable, if it has one, and the files by their paths."""
+    if kind == "python":
+        return None, {f"{name}.py": python_node(executable)}
+    package, files = GENERIC_PACKAGE, generic_package()
+    if kind == "typed" and message_type is not None:
+        known = message_type_named(message_type)
+        package, files = known.node_package, typed_package(known)
+    return package, {f"{package}/{path}": text for path, text in files.items()}
+
+
+def _process(
+    folder: Path,
+    name: str,
+    package: str | None,
+    executable: str,
+    remappings: tuple[tuple[str, str], ...],
+) -> ShapingProcess:
+    folder = folder.absolute()
+    return ShapingProcess(
+        name=name,
+        namespace="/",
+        command=("python3", str(folder / f"{name}.py")) if package is None else None,
+        package=package,
+        executable=None if package is None else executable,
+        parameters_file=folder / f"{name}.yaml",
+        remappings=remappings,
+    )
+
+
+def _yaml(parameters: dict[str, Any]) -> str:
+    # The name or namespace that a launch file gives the node may be another one.
+    return yaml.safe_dump({"/**": {"ros__parameters": parameters}}, sort_keys=False)
+
+
+def _write(folder: Path, files: dict[str, str]) -> None:
+    """Write files beside and rename them, once all that are there already were looked at."""
+    try:
+        for name, text in files.items():
+            path = folder / name
+            if path.exists() and path.read_bytes() != text.encode():
+                raise InputError(
+                    f"{path} exists already with another content and is not overwritten: name "
+                    "another folder, or remove it"
+                )
+        for name, text in files.items():
+            path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            partial = path.with_name(f".{path.name}.partial")
+            partial.write_text(text, encoding="utf-8")
+            partial.replace(path)
+    except OSError as error:
+        raise OperationError(f"{error.filename}: cannot be written: {error.strerror}") from error

@@ -1,0 +1,114 @@
+"""`chainshaper splice` as a person or a script runs it."""
+
+from pathlib import Path
+
+import pytest
+from command_line import called, json_of, refused
+
+from chainshaper.planning import Plan, save_plan
+
+ROBOT = '<launch>\n  <node pkg="robot" exec="third" name="third"/>\n</launch>\n'
+
+
+@pytest.fixture
+def files(tmp_path: Path, plan: Plan) -> tuple[Path, Path, Path]:
+    """A plan, a launch file that starts its publisher, and a folder that is not there yet."""
+    save_plan(plan, tmp_path / "plan.yaml")
+    (tmp_path / "robot.launch.xml").write_text(ROBOT)
+    return tmp_path / "plan.yaml", tmp_path / "robot.launch.xml", tmp_path / "spliced"
+
+
+def test_it_shows_a_diff_and_what_to_launch(files: tuple[Path, Path, Path]) -> None:
+    plan, robot, folder = files
+    finished = called("splice", plan, robot, "-o", folder)
+    lines = finished.out.splitlines()
+    assert (finished.code, finished.err) == (0, "")
+    assert lines[:2] == [f"--- {robot}", f"+++ {folder}/robot.launch.xml"]
+    assert '-  <node pkg="robot" exec="third" name="third"/>' in lines
+    assert '+    <remap from="/t3" to="/t3_tmp"/>' in lines
+    assert lines[-1] == f"ros2 launch {folder}/robot.launch.xml"
+    assert robot.read_text() == ROBOT
+
+
+def test_its_json_says_the_same(files: tuple[Path, Path, Path]) -> None:
+    plan, robot, folder = files
+    said = json_of("splice", plan, robot, "-o", folder)
+    copy = str(folder / "robot.launch.xml")
+    assert said["folder"] == str(folder)
+    assert said["launch"] == {str(robot): copy}
+    assert said["originals"] == {copy: str(robot)}
+    assert said["shaping_nodes"] == ["chainshaper_t3"]
+    assert said["logs"] == [str(folder / "logs/chainshaper_t3.csv")]
+    assert said["diff"].startswith(f"--- {robot}\n")
+    assert (said["notes"], said["setup"]) == ([], None)
+
+
+def test_notes_go_to_standard_error(files: tuple[Path, Path, Path]) -> None:
+    plan, robot, folder = files
+    robot.write_text(ROBOT.replace(' name="third"', ""))
+    finished = called("splice", plan, robot, "-o", folder)
+    assert "note: " in finished.err
+    assert "the remap is bound to the name third" in finished.err
+
+
+def test_launch_arguments_are_written_as_for_ros2_launch(files: tuple[Path, Path, Path]) -> None:
+    plan, robot, folder = files
+    robot.write_text(
+        '<launch><arg name="n" default="other"/>'
+        '<node pkg="robot" exec="third" name="$(var n)"/></launch>'
+    )
+    assert "nobody publishes /t3" in refused(2, "splice", plan, robot, "-o", folder)
+    assert called("splice", plan, robot, "n:=third", "-o", folder).code == 0
+
+
+def test_undo_needs_the_folder_only(files: tuple[Path, Path, Path]) -> None:
+    plan, robot, folder = files
+    assert called("splice", plan, robot, "-o", folder).code == 0
+    assert called("splice", "--undo", "-o", folder).out == f"{folder} is removed\n"
+    assert not folder.exists()
+    assert called("splice", plan, robot, "-o", folder).code == 0
+    assert json_of("splice", plan, robot, "--undo", "-o", folder) == {"removed": str(folder)}
+    assert "nothing to undo" in refused(2, "splice", "--undo", "-o", folder)
+
+
+def test_a_plan_s_own_recording_tells_publishers_where_it_exists(
+    files: tuple[Path, Path, Path], plan: Plan
+) -> None:
+    path, robot, folder = files
+    recording = path.parent / "recording"
+    recording.mkdir()
+    (recording / "recording.json").write_text(
+        '{"source": "lttng", "clock_offset_ns": 0, "endpoints": ['
+        '{"node": "/third", "topic": "/t3", "kind": "publisher"},'
+        '{"node": "/fourth", "topic": "/t3", "kind": "publisher"}]}'
+    )
+    two = "/t3 has 2 publishers, /fourth, /third"
+    assert two in refused(2, "splice", path, robot, "-o", folder, "--recording", recording)
+    path.write_text(
+        path.read_text().replace("evidence:\n", f"evidence:\n  recording: {recording}\n")
+    )
+    assert two in refused(2, "splice", path, robot, "-o", folder)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{plan}", "-o", "{folder}"], "give a plan and the launch files"),
+        (["-o", "{folder}"], "give a plan and the launch files"),
+        (["{plan}", "{robot}", "-o", "{folder}", "--build"], "--node python needs no building"),
+        (["{plan}", "{robot}", "-o", "{folder}", "--node", "typed"], "not known: name it"),
+        (
+            ["{plan}", "{robot}", "-o", "{folder}", "--node", "typed", "--type", "Header"],
+            "'Header' is not a message type",
+        ),
+        (["{robot}", "{robot}", "-o", "{folder}"], "robot.launch.xml"),
+        (["{plan}", "{plan}", "-o", "{folder}"], "plan.yaml"),
+    ],
+)
+def test_wrong_use_is_refused_and_nothing_written(
+    files: tuple[Path, Path, Path], arguments: list[str], message: str
+) -> None:
+    plan, robot, folder = files
+    words = [word.format(plan=plan, robot=robot, folder=folder) for word in arguments]
+    assert message in refused(2, "splice", *words)
+    assert not folder.exists()

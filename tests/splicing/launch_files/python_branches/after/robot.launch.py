@@ -1,0 +1,14 @@
+from launch.actions import ExecuteProcess
+import os
+
+from launch import LaunchDescription
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    ld = LaunchDescription([ExecuteProcess(cmd=['python3', '{AFTER}/shaping_nodes/chainshaper_pose.py', '--ros-args', '-r', '__node:=chainshaper_pose', '-r', '__ns:=/', '-r', 'input:=/pose_tmp', '-r', 'output:=/pose', '--params-file', '{AFTER}/shaping_nodes/chainshaper_pose.yaml'], output='screen')])
+    if os.environ.get('SIMULATED') == '1':
+        ld.add_action(Node(remappings=[('/pose', '/pose_tmp')], package='sim', executable='truth', name='ndt'))
+    else:
+        ld.add_action(Node(remappings=[('/pose', '/pose_tmp')], package='localizer', executable='ndt', name='ndt'))
+    return ld

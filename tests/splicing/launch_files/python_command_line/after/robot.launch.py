@@ -1,0 +1,11 @@
+from launch.actions import ExecuteProcess
+from launch import LaunchDescription
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    return LaunchDescription([
+        ExecuteProcess(cmd=['python3', '{AFTER}/shaping_nodes/chainshaper_pose.py', '--ros-args', '-r', '__node:=chainshaper_pose', '-r', '__ns:=/', '-r', 'input:=/pose_tmp', '-r', 'output:=/pose', '--params-file', '{AFTER}/shaping_nodes/chainshaper_pose.yaml'], output='screen'),
+        Node(package='localizer', executable='ndt', name='ndt',
+             arguments=['--ros-args', '-r', 'out:=/pose_tmp', '--log-level', 'debug']),
+    ])

@@ -1,0 +1,13 @@
+from launch.actions import ExecuteProcess
+from launch import LaunchDescription
+from launch_ros.actions import Node
+
+REMAPS = [('points', '/p')]
+
+
+def generate_launch_description():
+    return LaunchDescription([
+        ExecuteProcess(cmd=['python3', '{AFTER}/shaping_nodes/chainshaper_pose.py', '--ros-args', '-r', '__node:=chainshaper_pose', '-r', '__ns:=/', '-r', 'input:=/pose_tmp', '-r', 'output:=/pose', '--params-file', '{AFTER}/shaping_nodes/chainshaper_pose.yaml'], output='screen'),
+        Node(package='localizer', executable='ndt', name='ndt', remappings=[('/pose', '/pose_tmp'), *REMAPS]),
+        Node(package='planner', executable='planner', name='planner', remappings=[]),
+    ])

@@ -1,0 +1,20 @@
+from launch.actions import ExecuteProcess
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration, TextSubstitution
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    robot = LaunchConfiguration('robot', default='one')
+    return LaunchDescription([
+        ExecuteProcess(cmd=['python3', '{AFTER}/shaping_nodes/chainshaper_pose.py', '--ros-args', '-r', '__node:=chainshaper_pose', '-r', '__ns:=/', '-r', 'input:=/pose_tmp', '-r', 'output:=/pose', '--params-file', '{AFTER}/shaping_nodes/chainshaper_pose.yaml'], output='screen'),
+        DeclareLaunchArgument('kind', default_value='ndt', description='which localizer'),
+        Node(
+            remappings=[('/pose', '/pose_tmp')],
+            package='localizer',
+            executable='ndt',
+            name=LaunchConfiguration('kind'),
+            namespace=[TextSubstitution(text='robot_'), robot],
+        ),
+    ])

@@ -1,0 +1,17 @@
+"""Starts robot.launch.py with its output shaped; written by `chainshaper splice`."""
+
+from launch import LaunchDescription
+from launch.actions import ExecuteProcess, IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import SetRemap
+
+
+def generate_launch_description():
+    return LaunchDescription(
+        [
+            ExecuteProcess(cmd=['python3', '{AFTER}/shaping_nodes/chainshaper_localization_pose.py', '--ros-args', '-r', '__node:=chainshaper_localization_pose', '-r', '__ns:=/', '-r', 'input:=/localization/pose_tmp', '-r', 'output:=/localization/pose', '--params-file', '{AFTER}/shaping_nodes/chainshaper_localization_pose.yaml'], output='screen'),
+            SetRemap('ndt:/localization/out', '/localization/pose_tmp'),
+            IncludeLaunchDescription(PythonLaunchDescriptionSource('{BEFORE}/robot.launch.py'), launch_arguments=[('namespace', LaunchConfiguration('namespace'))]),
+        ]
+    )

@@ -1,0 +1,16 @@
+"""Starts robot.launch.py with its output shaped; written by `chainshaper splice`."""
+
+from launch import LaunchDescription
+from launch.actions import ExecuteProcess, IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch_ros.actions import SetRemap
+
+
+def generate_launch_description():
+    return LaunchDescription(
+        [
+            ExecuteProcess(cmd=['python3', '{AFTER}/shaping_nodes/chainshaper_pose.py', '--ros-args', '-r', '__node:=chainshaper_pose', '-r', '__ns:=/', '-r', 'input:=/pose_tmp', '-r', 'output:=/pose', '--params-file', '{AFTER}/shaping_nodes/chainshaper_pose.yaml'], output='screen'),
+            SetRemap('ndt:/a/out', '/pose_tmp'),
+            IncludeLaunchDescription(PythonLaunchDescriptionSource('{BEFORE}/robot.launch.py')),
+        ]
+    )

@@ -1,0 +1,10 @@
+# -*- coding: utf-8 -*-
+from launch.actions import ExecuteProcess
+from launch_ros.actions import Node ; from launch import LaunchDescription  # Größe
+def generate_launch_description() :
+	return LaunchDescription ( initial_entities = [ ExecuteProcess(cmd=['python3', '{AFTER}/shaping_nodes/chainshaper_pose.py', '--ros-args', '-r', '__node:=chainshaper_pose', '-r', '__ns:=/', '-r', 'input:=/pose_tmp', '-r', 'output:=/pose', '--params-file', '{AFTER}/shaping_nodes/chainshaper_pose.yaml'], output='screen'), Node
+		(
+		  # Ä
+		  name = ( "ndt" ), package="Ö" "x", executable='''ndt''',
+		  remappings = ( ( 'out', ( "/pose_tmp" ) ) , ) ) ]
+	)

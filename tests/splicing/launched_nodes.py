@@ -1,0 +1,95 @@
+"""What a launch file starts, asked of ROS 2 itself; run by the Python of a ROS 2 environment.
+
+Standard input holds a JSON array of jobs: a launch `file`, its `arguments`, names of `topics`. The
+file is carried out by `launch`, except that no process is started: the arguments that each node
+would get are noted instead. A node is then made of them by `rclpy`, and asked what the topics are
+called. Nodes that nobody named are called like their executables. For each job a JSON array is
+printed, with pairs of a node's full name and its names of the topics; or the text of an error.
+"""
+
+import asyncio
+import json
+import sys
+from typing import Any
+
+import rclpy
+from launch import LaunchContext
+from launch.actions import (
+    ExecuteProcess,
+    IncludeLaunchDescription,
+    RegisterEventHandler,
+    TimerAction,
+)
+from launch.actions.execute_local import ExecuteLocal
+from launch.launch_description_sources import AnyLaunchDescriptionSource
+from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
+from launch_ros.actions import LifecycleNode, LoadComposableNodes, Node
+from launch_ros.actions.load_composable_nodes import get_composable_node_load_request
+
+started: list[tuple[str, list[str]]] = []
+
+
+def note_process(action: ExecuteProcess, context: LaunchContext) -> None:
+    """In place of starting a process."""
+    words = [perform_substitutions(context, list(word)) for word in action.cmd[1:]]
+    name = "process"
+    if isinstance(action, Node):
+        executable = normalize_to_list_of_substitutions(action.node_executable)
+        name = perform_substitutions(context, executable)
+    if "--ros-args" in words:
+        started.append((name, words))
+
+
+def note_components(action: LoadComposableNodes, context: LaunchContext) -> None:
+    """In place of asking a container, which hands on rules, name and namespace in this order."""
+    for description in action._LoadComposableNodes__composable_node_descriptions:
+        request = get_composable_node_load_request(description, context)
+        if request is not None:
+            rules = list(request.remap_rules)
+            rules += [f"__node:={request.node_name}"] if request.node_name else []
+            rules += [f"__ns:={request.node_namespace}"] if request.node_namespace else []
+            words = [word for rule in rules for word in ("-r", rule)]
+            started.append((request.plugin_name.rpartition(":")[2], ["--ros-args", *words]))
+
+
+def carry_out(entity: Any, context: LaunchContext) -> None:
+    """Visit entities in order, as the launch service does, without waiting for events."""
+    for inner in entity.visit(context) or ():
+        carry_out(inner, context)
+
+
+def nodes_of(file: str, arguments: dict[str, str], topics: list[str]) -> list[Any]:
+    """The nodes that a launch file starts, and what they call the topics."""
+    started.clear()
+    context = LaunchContext()
+    context._set_asyncio_loop(asyncio.new_event_loop())
+    source = AnyLaunchDescriptionSource(file)
+    carry_out(IncludeLaunchDescription(source, launch_arguments=arguments.items()), context)
+    found = []
+    for name, words in started:
+        node = rclpy.create_node(name, cli_args=words, use_global_arguments=False)
+        names = {topic: node.resolve_topic_name(topic) for topic in topics}
+        found.append((node.get_fully_qualified_name(), names))
+        node.destroy_node()
+    return found
+
+
+def main() -> None:
+    ExecuteLocal.execute = note_process
+    LifecycleNode.execute = Node.execute
+    LoadComposableNodes.execute = note_components
+    TimerAction.execute = lambda action, _: action.actions
+    RegisterEventHandler.execute = lambda action, _: action.event_handler.describe()[1]
+    rclpy.init()
+    results: list[Any] = []
+    for job in json.load(sys.stdin):
+        try:
+            results.append(nodes_of(**job))
+        except Exception as error:
+            results.append(str(error))
+    rclpy.shutdown()
+    json.dump(results, sys.stdout)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,120 @@
+"""A Python node in a process of its own, on a stand-in for rclpy: lines in, lines out."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from queue import Queue
+from typing import Any
+
+from chainshaper.splicing.shaping_process import ShapingProcess
+
+__all__ = ["RELIABLE", "NodeRun", "running_node", "stamped"]
+
+STAND_IN = Path(__file__).parent / "rclpy_stand_in.py"
+
+# As rmw_cyclonedds tells it of a publisher: neither its history nor its depth is known.
+RELIABLE = {
+    "history": 3,
+    "depth": 0,
+    "reliability": 1,
+    "durability": 2,
+    "lifespan": "infinite",
+    "deadline": "infinite",
+    "liveliness": 1,
+    "liveliness_lease_duration": "infinite",
+}
+
+
+class NodeRun:
+    """A running node: what it said is in ``said``, in the order in which it did."""
+
+    def __init__(self, process: "subprocess.Popen[str]") -> None:
+        self.process = process
+        self.said: list[dict[str, Any]] = []
+        self._lines: Queue[str | None] = Queue()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            self._lines.put(line)
+        self._lines.put(None)
+
+    def tell(self, **what: Any) -> None:
+        """Give it a line."""
+        assert self.process.stdin is not None
+        self.process.stdin.write(json.dumps(what) + "\n")
+        self.process.stdin.flush()
+
+    def hear(self, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        """The next thing it says that is wanted."""
+        while (line := self._lines.get(timeout=30)) is not None:
+            words = json.loads(line) if line.startswith("{") else {"text": line.strip()}
+            self.said.append(words)
+            if wanted(words):
+                return words
+        raise AssertionError(f"it ended without saying so: {self.said}")
+
+    def end(self, how: signal.Signals | None = None) -> int:
+        """End it, by the end of its input or by a signal; its exit code, all said being read."""
+        assert self.process.stdin is not None
+        if how is None:
+            self.process.stdin.close()
+        else:
+            self.process.send_signal(how)
+        while (line := self._lines.get(timeout=30)) is not None:
+            self.said.append(json.loads(line) if line.startswith("{") else {"text": line.strip()})
+        return self.process.wait(30)
+
+
+@contextmanager
+def running_node(
+    process: ShapingProcess,
+    folder: Path,
+    publishers: dict[str, list[dict[str, Any]]],
+    **environment: str,
+) -> Iterator[NodeRun]:
+    """A Python node that runs where only the stand-in and PyYAML can be imported."""
+    modules = folder / "modules"
+    modules.mkdir(exist_ok=True)
+    shutil.copyfile(STAND_IN, modules / "rclpy.py")
+    assert process.command is not None
+    arguments = [f"{match}:={target}" for match, target in process.remappings]
+    child = subprocess.Popen(
+        [
+            sys.executable,
+            *process.command[1:],
+            "--params-file",
+            process.parameters_file,
+            *arguments,
+        ],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={
+            **os.environ,
+            "PYTHONPATH": str(modules),
+            "STAND_IN_PUBLISHERS": json.dumps(publishers),
+            **environment,
+        },
+    )
+    try:
+        yield NodeRun(child)
+    finally:
+        child.kill()
+        child.wait()
+
+
+def stamped(rest: bytes = b"rest", age_ns: int = 0) -> bytes:
+    """A serialized message whose chain began when this is called, or so long before."""
+    seconds, nanoseconds = divmod(time.time_ns() - age_ns, 1_000_000_000)
+    stamp = seconds.to_bytes(4, "little", signed=True) + nanoseconds.to_bytes(4, "little")
+    return b"\0\1\0\0" + stamp + rest

@@ -1,0 +1,221 @@
+"""A stand-in for rclpy, where there is no ROS 2: as much of its API as the Python nodes use.
+
+Built after rclpy of Jazzy. It receives and publishes lines of JSON on the standard streams, and
+knows of the publishers that ``STAND_IN_PUBLISHERS`` describes, whom it discovers at the second
+look. Its submodules, and the message packages, are this module under other names.
+"""
+
+import inspect
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from enum import Enum, IntEnum
+from types import SimpleNamespace
+from typing import Any
+
+import yaml
+
+_state = {"ok": False, "stopped": False}
+
+
+class ExternalShutdownException(Exception):  # noqa: N818 - upstream's name
+    """The process is to stop."""
+
+
+class QoSHistoryPolicy(IntEnum):
+    SYSTEM_DEFAULT, KEEP_LAST, KEEP_ALL, UNKNOWN = range(4)
+
+
+class QoSReliabilityPolicy(IntEnum):
+    SYSTEM_DEFAULT, RELIABLE, BEST_EFFORT, UNKNOWN = range(4)
+
+
+class QoSDurabilityPolicy(IntEnum):
+    SYSTEM_DEFAULT, TRANSIENT_LOCAL, VOLATILE, UNKNOWN = range(4)
+
+
+class QoSLivelinessPolicy(IntEnum):
+    SYSTEM_DEFAULT, AUTOMATIC, _, MANUAL_BY_TOPIC, UNKNOWN = range(5)
+
+
+class ClockType(IntEnum):
+    STEADY_TIME = 3
+
+
+class QoSProfile(SimpleNamespace):
+    """Upstream checks its fields; the test does here, from the line that is written."""
+
+
+class Clock(SimpleNamespace):
+    """Nothing asks it for the time."""
+
+
+class Parameter(SimpleNamespace):
+    """A name and a value; upstream's first argument has a position."""
+
+    def __init__(self, name: str, *, value: Any) -> None:
+        super().__init__(name=name, value=value)
+
+
+class SetParametersResult(SimpleNamespace):
+    """Of rcl_interfaces.msg."""
+
+
+class Subscription:
+    """Upstream has the class inside since Iron."""
+
+    if not os.environ.get("STAND_IN_HUMBLE"):
+
+        class CallbackType(Enum):
+            MESSAGE_ONLY = 0
+            WITH_MESSAGE_INFO = 1
+
+
+class Image:
+    """Of sensor_msgs.msg."""
+
+
+class String(SimpleNamespace):
+    """Of std_msgs.msg."""
+
+
+def _say(**what: Any) -> None:
+    sys.stdout.write(json.dumps(what) + "\n")
+    sys.stdout.flush()
+
+
+def init() -> None:
+    _state["ok"] = True
+    signal.signal(signal.SIGTERM, _stop)
+
+
+def _stop(*_: object) -> None:
+    _state["ok"] = False
+    raise ExternalShutdownException
+
+
+def ok() -> bool:
+    return _state["ok"]
+
+
+def try_shutdown() -> None:
+    _state["ok"] = False
+    _say(event="shutdown")
+
+
+def spin(node: "Node") -> None:
+    """Give each line to its subscription; timers expire between lines."""
+    _say(event="spinning")
+    for line in sys.stdin:
+        message = json.loads(line)
+        if "set" in message:
+            node.on_set([Parameter(*message["set"][:1], value=message["set"][1])])
+        elif "tick" in message:
+            for timer in node.timers:
+                timer()
+        else:
+            _deliver(node.subscriptions[message["topic"]], message)
+    raise ExternalShutdownException
+
+
+def _deliver(subscription: tuple[Any, bool], message: dict[str, Any]) -> None:
+    callback, raw = subscription
+    if not raw:
+        callback(String(data=message["data"]))
+    elif len(inspect.signature(callback).parameters) == 2 and hasattr(Subscription, "CallbackType"):
+        callback(bytes.fromhex(message["payload"]), {"source_timestamp": message["source"]})
+    else:
+        callback(bytes.fromhex(message["payload"]))
+
+
+class Logger:
+    def _log(self, text: str, **_: float) -> None:
+        _say(log=text)
+
+    info = warning = fatal = _log
+
+
+class Publisher:
+    def __init__(self, topic: str) -> None:
+        self._topic = topic
+
+    def publish(self, payload: bytes) -> None:
+        _say(published=self._topic, payload=payload.hex(), time=time.monotonic_ns())
+
+
+class Node:
+    def __init__(self, _: str, *, automatically_declare_parameters_from_overrides: bool) -> None:
+        assert automatically_declare_parameters_from_overrides
+        words = sys.argv[1:]
+        rules = [word.split(":=") for word in words if ":=" in word]
+        self._names = dict(rules)
+        file = words[words.index("--params-file") + 1]
+        with open(file, encoding="utf-8") as stream:  # noqa: PTH123
+            self._parameters = yaml.safe_load(stream)["/**"]["ros__parameters"]
+        self._publishers = json.loads(os.environ["STAND_IN_PUBLISHERS"])
+        self._looks = 0
+        self.subscriptions: dict[str, tuple[Callable[..., None], bool]] = {}
+        self.timers: list[Callable[[], None]] = []
+        self.on_set: Callable[[list[Parameter]], object] = lambda _: None
+
+    def get_parameter_or(self, name: str, otherwise: Parameter) -> Parameter:
+        return Parameter(name, value=self._parameters.get(name, otherwise.value))
+
+    def get_logger(self) -> Logger:
+        return Logger()
+
+    def resolve_topic_name(self, topic: str) -> str:
+        return str(self._names.get(topic, topic))
+
+    def get_publishers_info_by_topic(self, topic: str) -> list[SimpleNamespace]:
+        self._looks += 1
+        if self._looks == 1:
+            return []
+        return [
+            SimpleNamespace(
+                node_name="node5",
+                node_namespace="/ns",
+                topic_type=info["type"],
+                qos_profile=SimpleNamespace(**info["qos"]),
+            )
+            for info in self._publishers.get(self.resolve_topic_name(topic), [])
+        ]
+
+    def create_publisher(self, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
+        topic = self.resolve_topic_name(topic)
+        _say(publisher=topic, type=message_type.__name__, qos=vars(qos))
+        return Publisher(topic)
+
+    def create_subscription(
+        self,
+        message_type: type,
+        topic: str,
+        callback: Callable[..., None],
+        qos: QoSProfile,
+        *,
+        raw: bool = False,
+    ) -> None:
+        topic = self.resolve_topic_name(topic)
+        _say(subscription=topic, type=message_type.__name__, qos=vars(qos), raw=raw)
+        self.subscriptions[topic] = (callback, raw)
+
+    def create_timer(self, seconds: float, callback: Callable[[], None], clock: Clock) -> None:
+        _say(timer=seconds, clock=clock.clock_type, time=time.monotonic_ns())
+        self.timers.append(callback)
+
+    def add_on_set_parameters_callback(self, callback: Callable[..., object]) -> None:
+        self.on_set = callback
+
+    def destroy_node(self) -> None:
+        pass
+
+
+for _name in (
+    *("rclpy." + part for part in ("clock", "executors", "node", "parameter", "qos")),
+    *("rclpy.subscription", "rcl_interfaces", "rcl_interfaces.msg"),
+    *("std_msgs", "std_msgs.msg", "sensor_msgs", "sensor_msgs.msg"),
+):
+    sys.modules[_name] = sys.modules[__name__]

@@ -1,0 +1,167 @@
+"""The gate in C++ decides what the gate in Python decides, and its log is read."""
+
+import random
+import shutil
+import struct
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from chainshaper import splicing
+from chainshaper.enforcement.gate import (
+    ANCHORS,
+    LATE,
+    OVERRUNS,
+    Gate,
+    Modes,
+    missed,
+    origin_of,
+    release_of,
+)
+from chainshaper.splicing.gate_log import read_gate_log
+
+HEADERS = Path(splicing.__file__).parent / "nodes" / "cpp" / "include"
+CASES = 5000
+
+
+@pytest.fixture(scope="module")
+def driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("g++ is not installed, so the C++ gate cannot be compiled")
+    program = tmp_path_factory.mktemp("cpp") / "gate"
+    source = Path(__file__).parent / "cpp_gate.cpp"
+    warnings = ["-Wall", "-Wextra", "-Wconversion", "-Werror"]
+    subprocess.run(
+        [compiler, "-std=c++17", "-O1", *warnings, f"-I{HEADERS}", source, "-o", program],
+        check=True,
+        timeout=150,
+    )
+    return program
+
+
+@dataclass(frozen=True)
+class Case:
+    """A question to the gate: its answer has to be the same in both languages."""
+
+    gate: Gate
+    arrival_ns: int
+    stamp_ns: int | None
+    changes: list[tuple[int, str]]
+    now_ns: int
+
+    def text(self) -> str:
+        """As the driver reads it; modes are named by their numbers."""
+        gate, modes = self.gate, self.gate.modes
+        names = [] if modes is None else list(modes.bands)
+        words = [ANCHORS.index(gate.anchor), gate.phase_ns, _or_dash(gate.max_age_ns)]
+        words += [gate.max_future_ns, LATE.index(gate.overrun), gate.due_cycles]
+        words += [len(gate.slots), *(bound for slot in gate.slots for bound in slot)]
+        words += [len(names)]
+        if modes is not None:
+            words += [*modes.bands.values(), names.index(modes.default), LATE.index(modes.late)]
+        words += [len(self.changes)]
+        words += [word for time, mode in self.changes for word in (time, names.index(mode))]
+        words += [self.arrival_ns, _or_dash(self.stamp_ns), self.now_ns, gate.cycle_ns]
+        return " ".join(map(str, words))
+
+    def answer(self) -> str:
+        """What the Python gate decides, as the driver prints it."""
+        release = release_of(self.gate, self.arrival_ns, self.stamp_ns, self.changes)
+        names = [] if self.gate.modes is None else list(self.gate.modes.bands)
+        words = [
+            _or_dash(release.at_ns),
+            release.origin_ns,
+            _or_dash(release.slot),
+            release.cycles_waited,
+            ANCHORS.index(release.anchor),
+            "-" if release.overrun is None else LATE.index(release.overrun),
+            "-" if release.mode is None else names.index(release.mode),
+            int(missed(self.gate, release, self.now_ns)),
+        ]
+        return " ".join(map(str, words))
+
+
+def _or_dash(value: int | None) -> int | str:
+    return "-" if value is None else value
+
+
+def _any_case(draw: random.Random) -> Case:
+    """Small numbers, so that every border is met again and again; sometimes real ones."""
+    scale = draw.choice([1, 1, 1_000_000])
+    cycle = draw.randint(2, 40)
+    cuts = sorted(draw.sample(range(cycle + 1), min(cycle + 1, draw.choice([2, 4, 6]))))
+    slots = tuple((a * scale, b * scale) for a, b in zip(cuts[::2], cuts[1::2], strict=False))
+    modes, changes = None, []
+    if draw.random() < 0.5:
+        bands = {f"mode{n}": draw.randrange(len(slots)) for n in range(draw.randint(1, 3))}
+        modes = Modes(bands, draw.choice(list(bands)), draw.choice(LATE))
+        times = sorted(draw.randint(0, 300) * scale for _ in range(draw.randint(0, 4)))
+        changes = [(time, draw.choice(list(bands))) for time in times]
+    gate = Gate(
+        slots=slots,
+        cycle_ns=cycle * scale,
+        anchor=draw.choice(ANCHORS),
+        phase_ns=draw.randint(-100, 100) * scale,
+        max_age_ns=draw.choice([None, draw.randint(0, 300) * scale]),
+        max_future_ns=draw.randint(0, 50) * scale,
+        overrun=draw.choice(OVERRUNS),
+        due_cycles=draw.randint(0, 2),
+        modes=modes,
+    )
+    stamp = draw.choice([None, draw.randint(0, 300) * scale])
+    arrival, now = draw.randint(0, 300) * scale, draw.randint(0, 400) * scale
+    return Case(gate, arrival, stamp, changes, now)
+
+
+def test_both_gates_decide_alike(driver: Path) -> None:
+    draw = random.Random(20240612)
+    cases = [_any_case(draw) for _ in range(CASES)]
+    questions = "\n".join([str(CASES), *(case.text() for case in cases)])
+    run = subprocess.run(
+        [driver], input=questions, capture_output=True, text=True, check=True, timeout=60
+    )
+    answers = [line.strip() for line in run.stdout.splitlines()]
+    assert len(answers) == CASES
+    for case, answer in zip(cases, answers, strict=True):
+        assert answer == case.answer(), case
+    treated = {case.answer().split()[5] for case in cases}
+    assert treated == {"-", "0", "1", "2", "3"}, "some treatment never occurred"
+
+
+def test_both_read_the_same_origin_from_a_payload(driver: Path) -> None:
+    draw = random.Random(5)
+    payloads = [draw.randbytes(draw.randint(0, 14)) for _ in range(500)]
+    # Most random nanoseconds are none, so half of the payloads get a stamp that could be one.
+    for payload in draw.sample(payloads, 250):
+        stamp = struct.pack("<iI", draw.randint(-(2**31), 2**31 - 1), draw.randint(0, 10**9))
+        payloads.append(b"\0\1\0\0" + stamp + payload)
+        payloads.append(b"\0\0\0\0" + stamp[3::-1] + stamp[:3:-1] + payload)
+    payloads += [b"\0\1\0\0" + bytes(8), b"\0\1\0\0" + bytes(7) + b"\1"]
+    lines = "\n".join(payload.hex() for payload in payloads) + "\n"
+    run = subprocess.run(
+        [driver, "--origins"], input=lines, capture_output=True, text=True, check=True, timeout=60
+    )
+    origins = [origin_of(payload) for payload in payloads]
+    assert [line.strip() for line in run.stdout.splitlines()] == [
+        str(_or_dash(origin)) for origin in origins
+    ]
+    assert origins.count(None) > 100 < len(origins) - origins.count(None)
+
+
+def test_the_log_of_the_cpp_node_is_read(driver: Path, tmp_path: Path) -> None:
+    log = tmp_path / "gate.csv"
+    for _ in range(2):  # a node that is started again adds to its log
+        subprocess.run([driver, str(log)], check=True, timeout=60)
+    table = read_gate_log(log)
+    assert table.height == 6
+    first, second, late = table.rows(named=True)[:3]
+    assert (first["mode"], first["slot"], first["overrun"]) == ("highway", 0, None)
+    assert first["release"] - first["origin"] == 20_000_000
+    assert first["arrival"] < first["release"] <= first["time"] <= first["published"]
+    assert (first["source_timestamp"], second["source_timestamp"]) == (5, None)
+    assert second["mode"] == "city"
+    assert (late["release"], late["slot"], late["published"]) == (None, None, None)
+    assert (late["overrun"], late["source_timestamp"]) == ("discard", 2**63 - 1)

@@ -1,0 +1,183 @@
+"""The folder of spliced launch files: whole or absent, replaced or removed only while ours."""
+
+import json
+import shutil
+from pathlib import Path
+from unittest import mock
+
+import pytest
+from launch_cases import plan_for
+
+from chainshaper import Plan, Splicing, splice_launch_files, undo_splice
+from chainshaper.errors import InputError, OperationError
+from chainshaper.planning.plan import revised
+
+NDT = '<launch>\n  <node pkg="l" exec="n" name="ndt"/>\n</launch>\n'
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Path:
+    path = tmp_path / "robot.launch.xml"
+    path.write_text(NDT)
+    return path
+
+
+@pytest.fixture
+def plan() -> Plan:
+    return plan_for("/ndt", "/pose")
+
+
+@pytest.fixture
+def spliced(robot: Path, plan: Plan, tmp_path: Path) -> Splicing:
+    return splice_launch_files(plan, [robot], tmp_path / "spliced")
+
+
+def _tree(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+def test_it_holds_the_copies_the_shaping_nodes_and_a_manifest(spliced: Splicing) -> None:
+    assert set(_tree(spliced.folder)) == {
+        "robot.launch.xml",
+        "shaping_nodes/chainshaper_pose.py",
+        "shaping_nodes/chainshaper_pose.yaml",
+        "splice.json",
+    }
+    assert spliced.logs == (spliced.folder / "logs/chainshaper_pose.csv",)
+    assert spliced.logs[0].parent.is_dir(), "the node makes no folder for its log"
+    assert str(spliced.logs[0]) in spliced.processes[0].parameters_file.read_text()
+
+
+def test_undo_removes_all_of_it(spliced: Splicing, robot: Path) -> None:
+    undo_splice(spliced.folder)
+    assert [path.name for path in robot.parent.iterdir()] == [robot.name]
+    assert robot.read_text() == NDT
+
+
+def test_what_running_and_building_leave_does_not_keep_it_from_being_removed(
+    spliced: Splicing,
+) -> None:
+    for name in ("__pycache__/a.pyc", "logs/chainshaper_pose.csv", "shaping_nodes/build/a/b"):
+        path = spliced.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("left")
+    undo_splice(spliced.folder)
+    assert not spliced.folder.exists()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["robot.launch.xml", "shaping_nodes/chainshaper_pose.yaml", "mine.txt", "mine/logs/a.csv"],
+)
+def test_what_the_user_changed_or_added_is_neither_removed_nor_replaced(
+    spliced: Splicing, robot: Path, plan: Plan, name: str
+) -> None:
+    path = spliced.folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("mine")
+    before = _tree(spliced.folder)
+
+    with pytest.raises(InputError, match=f"{name} was changed or added .* not removed: move away"):
+        undo_splice(spliced.folder)
+    with pytest.raises(InputError, match=f"{name} was changed or added since .* not overwritten"):
+        splice_launch_files(plan, [robot], spliced.folder)
+
+    assert _tree(spliced.folder) == before
+
+
+def test_what_the_user_removed_does_not_keep_the_rest_from_being_removed(
+    spliced: Splicing,
+) -> None:
+    (spliced.folder / "robot.launch.xml").unlink()
+    undo_splice(spliced.folder)
+    assert not spliced.folder.exists()
+
+
+@pytest.mark.parametrize("manifest", [None, "", "[]", '{"format": 2}', '{"format": 1}'])
+def test_a_folder_that_is_not_ours_is_left_alone(
+    tmp_path: Path, robot: Path, plan: Plan, manifest: str | None
+) -> None:
+    folder = tmp_path / "theirs"
+    folder.mkdir()
+    (folder / "a").touch()
+    if manifest is not None:
+        (folder / "splice.json").write_text(manifest)
+
+    with pytest.raises(InputError, match="was not written by `chainshaper splice`, so it is not r"):
+        undo_splice(folder)
+    with pytest.raises(InputError, match="was not written by `chainshaper splice`, so it is not o"):
+        splice_launch_files(plan, [robot], folder)
+
+    assert (folder / "a").exists()
+
+
+def test_nothing_to_undo_is_said(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such folder, so there is nothing to undo"):
+        undo_splice(tmp_path / "nothing")
+
+
+def test_another_plan_replaces_what_was_spliced(spliced: Splicing, robot: Path, plan: Plan) -> None:
+    other = revised(plan, overrun="discard")
+    splice_launch_files(other, [robot], spliced.folder)
+    parameters = spliced.processes[0].parameters_file.read_text()
+    assert "overrun: discard" in parameters
+    assert [path.name for path in robot.parent.iterdir() if path.name.startswith(".")] == []
+
+
+def test_the_same_again_leaves_the_folder_with_its_logs_as_it_is(
+    spliced: Splicing, robot: Path, plan: Plan
+) -> None:
+    spliced.logs[0].write_text("measured")
+    inode = spliced.folder.stat().st_ino
+    splice_launch_files(plan, [robot], spliced.folder)
+    assert spliced.folder.stat().st_ino == inode
+    assert spliced.logs[0].read_text() == "measured"
+
+
+def test_an_empty_folder_may_be_filled(tmp_path: Path, robot: Path, plan: Plan) -> None:
+    (tmp_path / "empty").mkdir()
+    assert splice_launch_files(plan, [robot], tmp_path / "empty").folder == tmp_path / "empty"
+    assert (tmp_path / "empty/robot.launch.xml").is_file()
+
+
+def test_a_folder_without_a_parent_is_refused(tmp_path: Path, robot: Path, plan: Plan) -> None:
+    with pytest.raises(InputError, match="no such folder to write spliced into"):
+        splice_launch_files(plan, [robot], tmp_path / "no" / "spliced")
+
+
+def test_the_older_folder_comes_back_where_the_new_one_cannot_take_its_place(
+    spliced: Splicing, robot: Path, plan: Plan
+) -> None:
+    before = _tree(spliced.folder)
+    rename = Path.rename
+
+    def failing(source: Path, target: Path) -> Path:
+        if ".partial-" in source.name:
+            raise OSError(5, "Input/output error")
+        return rename(source, target)
+
+    with (
+        mock.patch.object(Path, "rename", failing),
+        pytest.raises(OperationError, match=r"cannot be written: .*Input/output error"),
+    ):
+        splice_launch_files(revised(plan, overrun="discard"), [robot], spliced.folder)
+
+    assert _tree(spliced.folder) == before
+    assert [path.name for path in robot.parent.iterdir() if path.name.startswith(".")] == []
+
+
+def test_a_copy_whose_original_is_gone_names_the_original(
+    spliced: Splicing, robot: Path, plan: Plan, tmp_path: Path
+) -> None:
+    shutil.move(robot, tmp_path / "elsewhere.launch.xml")
+    with pytest.raises(InputError, match=r"robot\.launch\.xml: cannot be read \(No such file"):
+        splice_launch_files(plan, [spliced.folder / "robot.launch.xml"], tmp_path / "again")
+
+
+def test_the_manifest_names_the_originals(spliced: Splicing, robot: Path) -> None:
+    manifest = json.loads((spliced.folder / "splice.json").read_text())
+    assert manifest["copies"] == {"robot.launch.xml": str(robot)}

@@ -1,0 +1,77 @@
+"""Spliced launch files, before and after, asked of ROS 2 itself.
+
+`launch` says what each node would be started with, and `rclpy` what its topics are called then.
+Neither knows anything of our reading of launch files or of remap rules.
+"""
+
+import json
+import os
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+from launch_cases import CASES, PACKAGES, Case, splice_case
+from ros2 import ros2_environment
+
+pytestmark = pytest.mark.ros2
+
+ASKED = Path(__file__).parent / "launched_nodes.py"
+NAMES = ["input", "output", "out", "points", "in", "a", "ndt_pose", "~/out"]
+
+
+@pytest.fixture(scope="module")
+def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
+    """What ROS 2 says of every case, by its name: pairs of before and after."""
+    environment = ros2_environment()
+    prefixes = environment.get("AMENT_PREFIX_PATH", "")
+    environment["AMENT_PREFIX_PATH"] = f"{PACKAGES}{os.pathsep}{prefixes}"
+    jobs: list[dict[str, Any]] = []
+    names: list[str] = []
+    for case in CASES:
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            spliced = splice_case(case, tmp_path_factory.mktemp(case.name), monkeypatch)
+        ((original, copy),) = spliced.launch.items()
+        for arguments in (case.arguments, *case.variants):
+            more = {"arguments": arguments, "topics": [case.output, *NAMES]}
+            jobs += [{"file": str(file), **more} for file in (original, copy)]
+            names.append(case.name)
+    run = subprocess.run(
+        ["env", "python3", str(ASKED)],
+        env=environment,
+        input=json.dumps(jobs),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    found = json.loads(run.stdout.splitlines()[-1])  # before it stands what `launch` logs
+    pairs = list(zip(names, zip(found[::2], found[1::2], strict=True), strict=True))
+    return {name: [pair for other, pair in pairs if other == name] for name in names}
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_ros_2_remaps_the_publisher_and_nobody_else(
+    case: Case, answers: dict[str, list[Any]]
+) -> None:
+    shaping, tmp = "/chainshaper" + case.output.replace("/", "_"), f"{case.output}_tmp"
+    for before, after in answers[case.name]:
+        assert isinstance(before, list), before
+        assert isinstance(after, list), after
+        ours = [topics for node, topics in after if node == shaping]
+        assert [(one["input"], one["output"]) for one in ours] == [(tmp, case.output)]
+        others = [(node, topics) for node, topics in after if node != shaping]
+        assert [node for node, _ in others] == [node for node, _ in before]
+        assert case.publisher in [node for node, _ in before]
+        for (node, was), (_, now) in zip(before, others, strict=True):
+            changed = {name: full for name, full in now.items() if full != was[name]}
+            if node == case.publisher:
+                # What a rule led to the output; without one, the output's own name counts.
+                led = {name for name in NAMES if was[name] == case.output}
+                assert changed == dict.fromkeys(changed, tmp)
+                assert changed.keys() - {case.output} == led
+                assert led or case.output in changed
+            else:
+                # A rule bound to a name is heard by whoever has it, in any namespace.
+                namesake = node.rpartition("/")[2] == case.publisher.rpartition("/")[2]
+                assert not changed or (namesake and changed == {case.output: tmp}), node

@@ -1,0 +1,195 @@
+"""The shaping node and the throttler in a real ROS 2 environment, all three kinds."""
+
+import json
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+import pytest
+from ros2 import ros2_environment
+
+from chainshaper.planning import Modes, Plan
+from chainshaper.planning.plan import revised
+from chainshaper.splicing.gate_log import read_gate_log
+from chainshaper.splicing.generated_package import build_package
+from chainshaper.splicing.shaping_process import (
+    NodeKind,
+    ShapingProcess,
+    write_shaping_process,
+    write_throttler,
+)
+
+pytestmark = [pytest.mark.ros2, pytest.mark.timeout(600)]
+
+MS = 1_000_000
+SLOTS = ((15 * MS, 25 * MS), (30 * MS, 45 * MS))
+TYPE = "geometry_msgs/msg/PointStamped"
+COUNTERPART = Path(__file__).parent / "ros_counterpart.py"
+COUNT = 30
+
+
+@pytest.fixture(autouse=True, scope="module")
+def in_ros_environment() -> Iterator[None]:
+    """Everything that is started here is started in a ROS 2 environment."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        for name, value in ros2_environment().items():
+            monkeypatch.setenv(name, value)
+        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        yield
+
+
+def banded(plan: Plan) -> Plan:
+    servers = tuple(
+        server.model_copy(update={"slots": SLOTS}) if server.name == "output" else server
+        for server in plan.servers
+    )
+    modes = Modes(topic="/mode", default="city", bands={"city": 2, "highway": 1}, late="next-slot")
+    return revised(plan, servers=servers, modes=modes)
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> Path:
+    """A folder with both packages, built once."""
+    if shutil.which("colcon") is None:
+        pytest.skip("colcon is not on the PATH, so no package can be built")
+    folder = tmp_path_factory.mktemp("workspace")
+    assert plan.shaping_node is not None
+    for kind in ("cpp", "typed"):
+        write_shaping_process(plan, plan.shaping_node, kind, folder, message_type=TYPE)
+    build_package(folder)
+    return folder
+
+
+@contextmanager
+def started(
+    process: ShapingProcess, workspace: Path | None, exit_code: int = 0
+) -> Iterator["subprocess.Popen[str]"]:
+    """The process as a launch file would start it; ended by SIGINT, which it must obey."""
+    command = list(process.command or ())
+    if process.package is not None and workspace is not None and process.executable is not None:
+        folder = workspace / "install" / "lib" / process.package
+        command = [str(folder / process.executable)]
+    rules = [("__node", process.name), ("__ns", process.namespace), *process.remappings]
+    remaps = [word for match, target in rules for word in ("-r", f"{match}:={target}")]
+    parameters = ["--params-file", str(process.parameters_file)]
+    child = subprocess.Popen(
+        [*command, "--ros-args", *remaps, *parameters],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        yield child
+        child.send_signal(signal.SIGINT)
+        assert child.wait(20) == exit_code
+    finally:
+        child.kill()
+        child.wait()
+
+
+def exchanged(quality: str) -> list[dict[str, Any]]:
+    """What the counterpart saw of the output: its quality of service, then each message."""
+    run = subprocess.run(
+        ["python3", COUNTERPART, str(COUNT), quality],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=90,
+    )
+    return [json.loads(line) for line in run.stdout.splitlines()]
+
+
+@pytest.mark.parametrize("quality", ["latched", "best_effort"])
+@pytest.mark.parametrize("kind", ["python", "cpp", "typed"])
+def test_messages_come_back_in_the_slot_of_their_mode(
+    tmp_path: Path, plan: Plan, kind: NodeKind, quality: str, request: pytest.FixtureRequest
+) -> None:
+    workspace = None if kind == "python" else request.getfixturevalue("workspace")
+    plan, log = banded(plan), tmp_path / "gate.csv"
+    assert plan.shaping_node is not None
+    process = write_shaping_process(
+        plan, plan.shaping_node, kind, tmp_path, message_type=TYPE, log=log
+    )
+    with started(process, workspace):
+        offered, *messages = exchanged(quality)
+    assert offered["type"] == TYPE
+    assert (offered["reliability"], offered["durability"]) == (
+        ("RELIABLE", "TRANSIENT_LOCAL") if quality == "latched" else ("BEST_EFFORT", "VOLATILE")
+    )
+    if quality == "latched":
+        assert (offered["deadline"], offered["lifespan"]) == (1000 * MS, 2000 * MS)
+        assert [message["number"] for message in messages] == list(range(COUNT))
+    assert len(messages) > COUNT // 2
+    for message in messages:
+        assert message["frame"] == f"frame {message['number']}"
+        assert message["since_start"] >= SLOTS[0][0], "it left before its slot"
+
+    releases = read_gate_log(log)
+    assert releases.height == len(messages)
+    assert releases["source_timestamp"].null_count() == 0
+    assert set(releases["mode"]) == {"city", "highway"}
+    in_time = releases.filter(pl.col("overrun").is_null())
+    assert in_time.height > 0
+    for mode, band in {"city": 2, "highway": 1}.items():
+        own = in_time.filter(pl.col("mode") == mode)
+        assert set(own["slot"]) <= {band - 1}
+        start, end = SLOTS[band - 1]
+        assert (own["release"] - own["origin"]).is_between(start, end - 1).all()
+    assert (releases["time"] >= releases["release"]).all()
+    assert (releases["published"] >= releases["time"]).all()
+
+
+@pytest.mark.parametrize("kind", ["python", "cpp"])
+def test_it_stops_while_it_waits_for_its_input(
+    tmp_path: Path, plan: Plan, kind: NodeKind, request: pytest.FixtureRequest
+) -> None:
+    workspace = None if kind == "python" else request.getfixturevalue("workspace")
+    assert plan.shaping_node is not None
+    process = write_shaping_process(plan, plan.shaping_node, kind, tmp_path)
+    with started(process, workspace) as child:
+        assert child.stdout is not None
+        for line in child.stdout:
+            if "waiting for a publisher of /t3_tmp" in line:
+                break
+
+
+def test_a_typed_node_refuses_another_type(tmp_path: Path, plan: Plan, workspace: Path) -> None:
+    assert plan.shaping_node is not None
+    process = write_shaping_process(plan, plan.shaping_node, "typed", tmp_path, message_type=TYPE)
+    say = [*("ros2", "topic", "pub", "/t3_tmp", "std_msgs/msg/Header"), "{}"]
+    other = subprocess.Popen(say, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        with started(process, workspace, exit_code=1) as child:
+            output, _ = child.communicate(timeout=60)
+        assert f"made for {TYPE}, but its input is std_msgs/msg/Header" in output
+    finally:
+        other.kill()
+        other.wait()
+
+
+@pytest.mark.parametrize("kind", ["python", "cpp"])
+def test_the_throttler_publishes_once_a_period(
+    tmp_path: Path, kind: Any, request: pytest.FixtureRequest
+) -> None:
+    workspace = None if kind == "python" else request.getfixturevalue("workspace")
+    # Messages come every 50 ms, so that two are there each time.
+    process = write_throttler({"/t3_tmp": "/t3"}, 100 * MS, kind, tmp_path)
+    with started(process, workspace) as child:
+        _, *messages = exchanged("latched")
+        time.sleep(0.3)
+        child.send_signal(signal.SIGINT)
+        output, _ = child.communicate(timeout=20)
+    numbers = [message["number"] for message in messages]
+    assert numbers == sorted(set(numbers)), "none twice, in order"
+    assert COUNT // 4 <= len(numbers) <= COUNT * 3 // 4
+    (summary,) = [line for line in output.splitlines() if line.startswith("/t3: ")]
+    published, missing, dropped = [int(word) for word in summary.split() if word.isdigit()]
+    assert published == len(numbers)
+    assert published + dropped in (COUNT - 1, COUNT)  # one may have been taken and not published
+    assert missing > 0, "none came before and after"

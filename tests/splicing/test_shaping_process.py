@@ -1,0 +1,415 @@
+"""What is written for a shaping node, and the Python node at work on a stand-in for rclpy."""
+
+import ast
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from node_run import RELIABLE, running_node, stamped
+from small_chain import EXECUTOR_CORE
+
+from chainshaper.enforcement import gate
+from chainshaper.errors import InputError, OperationError
+from chainshaper.planning import Modes, Plan, ShapingNode, let_per_callback
+from chainshaper.planning.plan import revised
+from chainshaper.splicing.gate_log import read_gate_log
+from chainshaper.splicing.shaping_process import (
+    ShapingProcess,
+    write_shaping_process,
+    write_throttler,
+)
+
+MS = 1_000_000
+# Wide enough that a busy machine wakes the node within them.
+SLOTS = ((15 * MS, 25 * MS), (30 * MS, 45 * MS))
+PUBLISHERS = {"/t3_tmp": [{"type": "sensor_msgs/msg/Image", "qos": RELIABLE}]}
+
+
+@pytest.fixture
+def node(plan: Plan) -> ShapingNode:
+    assert plan.shaping_node is not None
+    return plan.shaping_node
+
+
+def banded(plan: Plan) -> Plan:
+    """Two slots, one for each mode."""
+    servers = tuple(
+        server.model_copy(update={"slots": SLOTS}) if server.name == "output" else server
+        for server in plan.servers
+    )
+    modes = Modes(topic="/mode", default="city", bands={"city": 2, "highway": 1}, late="next-slot")
+    return revised(plan, servers=servers, modes=modes)
+
+
+def parameters_of(process: ShapingProcess) -> dict[str, Any]:
+    written: dict[str, Any] = yaml.safe_load(process.parameters_file.read_text())
+    return written["/**"]["ros__parameters"]  # type: ignore[no-any-return]
+
+
+def test_a_python_node_is_one_file_with_the_gate_of_the_live_workload(
+    tmp_path: Path, plan: Plan, node: ShapingNode
+) -> None:
+    process = write_shaping_process(plan, node, "python", tmp_path)
+    assert process == ShapingProcess(
+        name="chainshaper_t3",
+        namespace="/",
+        command=("python3", str(tmp_path / "chainshaper_t3.py")),
+        package=None,
+        executable=None,
+        parameters_file=tmp_path / "chainshaper_t3.yaml",
+        remappings=(("input", "/t3_tmp"), ("output", "/t3")),
+    )
+    text = (tmp_path / "chainshaper_t3.py").read_text()
+    assert Path(gate.__file__).read_text() in text, "not byte for byte"
+    imported = [
+        getattr(statement, "module", None) or statement.names[0].name
+        for statement in ast.walk(ast.parse(text))
+        if isinstance(statement, ast.Import | ast.ImportFrom)
+    ]
+    assert not [module for module in imported if module.startswith("chainshaper")]
+
+
+def test_the_parameters_say_what_the_plan_says(
+    tmp_path: Path, plan: Plan, node: ShapingNode
+) -> None:
+    plan = revised(plan, overrun="discard", anchor="cycle", offset_ns=7 * MS)
+    process = write_shaping_process(plan, node, "python", tmp_path, log=tmp_path / "gate.csv")
+    assert parameters_of(process) == {
+        "slots_ns": [21 * MS, 22 * MS],
+        "cycle_ns": 50 * MS,
+        "anchor": "cycle",
+        "phase_ns": 7 * MS,
+        "overrun": "discard",
+        "due_cycles": 0,
+        "spin_ns": node.spin_ns,
+        "pause_ns": node.pause_ns,
+        "core": EXECUTOR_CORE,
+        "fifo_priority": node.fifo_priority,
+        "output_depth": 10,
+        "log": str(tmp_path / "gate.csv"),
+    }
+
+
+def test_under_let_each_topic_is_due_a_cycle_after_the_one_before_it(
+    tmp_path: Path, plan: Plan
+) -> None:
+    plan = let_per_callback(plan, ("/t1", "/t2", "/t3"))
+    assert plan.shaping_node is not None
+    due = {}
+    for node in (*plan.further_shaping_nodes, plan.shaping_node):
+        parameters = parameters_of(write_shaping_process(plan, node, "python", tmp_path))
+        due[node.output] = parameters["due_cycles"]
+    assert due == {"/t1": 1, "/t2": 2, "/t3": 3}
+
+
+def test_modes_are_numbered_by_the_places_of_their_slots(
+    tmp_path: Path, plan: Plan, node: ShapingNode
+) -> None:
+    parameters = parameters_of(write_shaping_process(banded(plan), node, "cpp", tmp_path))
+    assert parameters["slots_ns"] == [bound for slot in SLOTS for bound in slot]
+    assert {key: value for key, value in parameters.items() if key.startswith("mode")} == {
+        "mode_topic": "/mode",
+        "mode_names": ["city", "highway"],
+        "mode_slots": [1, 0],
+        "mode_default": "city",
+        "mode_late": "next-slot",
+    }
+
+
+@pytest.mark.parametrize("kind", ["python", "cpp", "typed"])
+def test_writing_again_changes_nothing(
+    tmp_path: Path, plan: Plan, node: ShapingNode, kind: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+    written: dict[Path, bytes] = {}
+    for _ in range(2):
+        process = write_shaping_process(
+            plan, node, kind, tmp_path, message_type="sensor_msgs/msg/Image"
+        )
+        files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+        assert files == (written or files)
+        written = files
+    assert not [path for path in written if path.name.endswith(".partial")]
+    assert (process.package, process.executable) == {
+        "python": (None, None),
+        "cpp": ("chainshaper_shaping", "shaping_node"),
+        "typed": ("shaping_sensor_msgs_image", "shaping_node"),
+    }[kind]
+
+
+def test_what_is_there_is_not_overwritten(tmp_path: Path, plan: Plan, node: ShapingNode) -> None:
+    mine = tmp_path / "chainshaper_t3.yaml"
+    mine.write_text("mine")
+    with pytest.raises(
+        InputError, match=r"chainshaper_t3\.yaml exists already with another content"
+    ):
+        write_shaping_process(plan, node, "python", tmp_path)
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"], "nothing half-written"
+
+
+def test_what_cannot_be_written_is_named(full_disk: Path, plan: Plan, node: ShapingNode) -> None:
+    with pytest.raises(OperationError, match=r"cannot be written: No space left"):
+        write_shaping_process(plan, node, "python", full_disk / "new")
+
+
+def test_a_typed_node_needs_a_type(tmp_path: Path, plan: Plan, node: ShapingNode) -> None:
+    with pytest.raises(InputError, match="that of /t3 is not known: name it"):
+        write_shaping_process(plan, node, "typed", tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+# At work ---------------------------------------------------------------------------------------
+
+
+def test_messages_leave_unchanged_inside_their_slot(
+    tmp_path: Path, plan: Plan, node: ShapingNode
+) -> None:
+    log = tmp_path / "gate.csv"
+    process = write_shaping_process(banded(plan), node, "python", tmp_path, log=log)
+    payloads = []
+    with running_node(process, tmp_path, PUBLISHERS) as run:
+        run.hear(lambda words: words.get("event") == "spinning")
+        for number in range(6):
+            if number == 3:
+                run.tell(topic="/mode", data="highway")
+                run.tell(topic="/mode", data="sea")
+                run.hear(lambda words: "no mode" in words.get("log", ""))
+            payloads.append(stamped(bytes([number])))
+            run.tell(topic="/t3_tmp", payload=payloads[-1].hex(), source=100 + number)
+            run.hear(lambda words: words.get("published") == "/t3")
+        assert run.end() == 0
+    published = [words["payload"] for words in run.said if "published" in words]
+    assert published == [payload.hex() for payload in payloads], "byte for byte, in order"
+    logged = [words["log"] for words in run.said if "log" in words]
+    assert "mode highway" in logged
+    assert "there is no mode 'sea'" in logged
+
+    releases = read_gate_log(log)
+    assert releases["source_timestamp"].to_list() == [100 + number for number in range(6)]
+    assert releases["mode"].to_list() == ["city"] * 3 + ["highway"] * 3
+    assert releases["slot"].to_list() == [1] * 3 + [0] * 3
+    since_start = (releases["release"] - releases["origin"]).to_list()
+    assert since_start == [SLOTS[1][0]] * 3 + [SLOTS[0][0]] * 3
+    assert (releases["time"] >= releases["release"]).all()
+    assert (releases["published"] >= releases["time"]).all()
+    times = [words["time"] for words in run.said if "published" in words]
+    assert all(a <= b for a, b in zip(releases["time"], times, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("offered", "publisher", "subscription"),
+    [
+        ({}, {"history": 1, "depth": 10, "reliability": 1, "durability": 2}, {}),
+        ({"reliability": 2}, {"reliability": 2}, {"reliability": 2}),
+        ({"durability": 1, "depth": 3, "history": 1}, {"durability": 1, "depth": 3}, {}),
+        ({"history": 2}, {"history": 2}, {"history": 2}),
+        # All unknown: the stated defaults.
+        ({"reliability": 3, "durability": 3, "liveliness": 4}, {"reliability": 1}, {}),
+        ({"lifespan": "2 s", "deadline": "1 s", "liveliness": 3}, {"liveliness": 3}, {}),
+    ],
+)
+def test_the_output_is_offered_as_the_original_was(  # noqa: PLR0917 - a row of the table
+    tmp_path: Path,
+    plan: Plan,
+    node: ShapingNode,
+    offered: dict[str, Any],
+    publisher: dict[str, Any],
+    subscription: dict[str, Any],
+) -> None:
+    process = write_shaping_process(plan, node, "python", tmp_path)
+    known = {"/t3_tmp": [{"type": "sensor_msgs/msg/Image", "qos": {**RELIABLE, **offered}}]}
+    with running_node(process, tmp_path, known) as run:
+        run.hear(lambda words: words.get("event") == "spinning")
+        made = next(words for words in run.said if "publisher" in words)
+        asked = next(words for words in run.said if "subscription" in words)
+    assert (made["publisher"], made["type"]) == ("/t3", "Image")
+    assert made["qos"].items() >= publisher.items()
+    for same in ("lifespan", "deadline", "liveliness_lease_duration"):
+        assert made["qos"][same] == {**RELIABLE, **offered}[same]
+    assert (asked["subscription"], asked["raw"]) == ("/t3_tmp", True)
+    assert asked["qos"].items() >= subscription.items()
+    for same in ("history", "depth", "reliability", "durability"):
+        assert asked["qos"][same] == made["qos"][same], "else the two do not match"
+    assert "lifespan" not in asked["qos"]
+
+
+def test_it_waits_for_the_publisher_and_says_so(
+    tmp_path: Path, plan: Plan, node: ShapingNode
+) -> None:
+    process = write_shaping_process(plan, node, "python", tmp_path)
+    with running_node(process, tmp_path, PUBLISHERS) as run:
+        run.hear(lambda words: words.get("event") == "spinning")
+    logged = [words["log"] for words in run.said if "log" in words]
+    assert logged[:2] == [
+        "waiting for a publisher of /t3_tmp",
+        "/t3_tmp is published by /ns/node5 as sensor_msgs/msg/Image",
+    ]
+
+
+def test_two_publishers_are_mentioned(tmp_path: Path, plan: Plan, node: ShapingNode) -> None:
+    process = write_shaping_process(plan, node, "python", tmp_path)
+    with running_node(process, tmp_path, {"/t3_tmp": PUBLISHERS["/t3_tmp"] * 2}) as run:
+        run.hear(lambda words: words.get("event") == "spinning")
+    assert any("has 2 publishers" in words.get("log", "") for words in run.said)
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, None])
+@pytest.mark.parametrize("publishers", [PUBLISHERS, {}], ids=["running", "waiting"])
+def test_it_stops_cleanly(
+    tmp_path: Path, plan: Plan, node: ShapingNode, how: signal.Signals | None, publishers: Any
+) -> None:
+    if how is None and not publishers:
+        pytest.skip("without a publisher nobody reads the input")
+    process = write_shaping_process(plan, node, "python", tmp_path)
+    with running_node(process, tmp_path, publishers) as run:
+        waits = "event" if publishers else "log"
+        run.hear(lambda words: waits in words)
+        assert run.end(how) == 0
+    assert run.said[-1] == {"event": "shutdown"}
+
+
+def test_what_overran_is_discarded_and_noted(tmp_path: Path, plan: Plan, node: ShapingNode) -> None:
+    log = tmp_path / "gate.csv"
+    process = write_shaping_process(
+        revised(plan, overrun="discard"), node, "python", tmp_path, log=log
+    )
+    with running_node(process, tmp_path, PUBLISHERS) as run:
+        run.hear(lambda words: words.get("event") == "spinning")
+        run.tell(topic="/t3_tmp", payload=stamped(age_ns=45 * MS).hex(), source=1)
+        run.end()
+    assert not [words for words in run.said if "published" in words]
+    (row,) = read_gate_log(log).rows(named=True)
+    assert (row["overrun"], row["anchor"], row["source_timestamp"]) == ("discard", "stamp", 1)
+    assert (row["release"], row["slot"], row["published"]) == (None, None, None)
+
+
+def test_on_humble_the_source_timestamp_is_not_known(
+    tmp_path: Path, plan: Plan, node: ShapingNode
+) -> None:
+    log = tmp_path / "gate.csv"
+    process = write_shaping_process(plan, node, "python", tmp_path, log=log)
+    with running_node(process, tmp_path, PUBLISHERS, STAND_IN_HUMBLE="1") as run:
+        run.tell(topic="/t3_tmp", payload=stamped().hex(), source=1)
+        run.hear(lambda words: "published" in words)
+        run.end()
+    assert read_gate_log(log)["source_timestamp"].to_list() == [None]
+
+
+def test_the_phase_of_the_cycle_can_be_set_while_it_runs(
+    tmp_path: Path, plan: Plan, node: ShapingNode
+) -> None:
+    log = tmp_path / "gate.csv"
+    plan = revised(plan, anchor="cycle")
+    process = write_shaping_process(plan, node, "python", tmp_path, log=log)
+    with running_node(process, tmp_path, PUBLISHERS) as run:
+        for phase in (0, 13 * MS):
+            run.tell(set=["phase_ns", phase])
+            run.tell(topic="/t3_tmp", payload=stamped().hex(), source=1)
+            run.hear(lambda words: "published" in words)
+        run.end()
+    assert [origin % (50 * MS) for origin in read_gate_log(log)["origin"]] == [0, 13 * MS]
+
+
+def test_a_log_that_cannot_be_written_does_not_stop_the_output(
+    tmp_path: Path, plan: Plan, node: ShapingNode
+) -> None:
+    log = tmp_path / "nowhere" / "gate.csv"
+    process = write_shaping_process(plan, node, "python", tmp_path, log=log)
+    with running_node(process, tmp_path, PUBLISHERS) as run:
+        run.tell(topic="/t3_tmp", payload=stamped().hex(), source=1)
+        run.hear(lambda words: "published" in words)
+    assert any("no log is written to" in words.get("log", "") for words in run.said)
+
+
+def test_parameters_that_make_no_gate_are_named(
+    tmp_path: Path, plan: Plan, node: ShapingNode
+) -> None:
+    process = write_shaping_process(plan, node, "python", tmp_path)
+    text = process.parameters_file.read_text()
+    process.parameters_file.write_text(text.replace("cycle_ns: 50000000", "cycle_ns: 5"))
+    with running_node(process, tmp_path, PUBLISHERS) as run:
+        assert run.end() == 1
+    assert any("slots must ascend" in words.get("log", "") for words in run.said)
+
+
+def test_the_gate_thread_is_realtime_or_it_says_why_not(
+    tmp_path: Path, plan: Plan, node: ShapingNode
+) -> None:
+    process = write_shaping_process(plan, node, "python", tmp_path)
+    with running_node(process, tmp_path, PUBLISHERS) as run:
+        run.hear(lambda words: words.get("event") == "spinning")
+        policy = os.sched_getscheduler(run.process.pid)
+        cores = os.sched_getaffinity(run.process.pid)
+    refused = any("is refused" in words.get("log", "") for words in run.said)
+    assert refused or (policy, cores) == (
+        os.SCHED_FIFO | os.SCHED_RESET_ON_FORK,
+        {EXECUTOR_CORE},
+    )
+
+
+def test_without_the_privilege_it_works_on(tmp_path: Path, plan: Plan, node: ShapingNode) -> None:
+    """A core that no machine has is refused to everybody."""
+    process = write_shaping_process(plan, node, "python", tmp_path)
+    text = process.parameters_file.read_text()
+    process.parameters_file.write_text(text.replace(f"core: {EXECUTOR_CORE}", "core: 1023"))
+    with running_node(process, tmp_path, PUBLISHERS) as run:
+        run.tell(topic="/t3_tmp", payload=stamped().hex(), source=1)
+        run.hear(lambda words: "published" in words)
+    assert any("core 1023 is refused" in words.get("log", "") for words in run.said)
+
+
+# The throttler --------------------------------------------------------------------------------
+
+RAW = {"/rear/raw": PUBLISHERS["/t3_tmp"], "/front/raw": PUBLISHERS["/t3_tmp"]}
+
+
+def test_the_throttler_publishes_what_is_newest_and_counts_the_rest(tmp_path: Path) -> None:
+    topics = {"/rear/raw": "/rear", "/front/raw": "/front"}
+    process = write_throttler(topics, 100 * MS, "python", tmp_path, phase_ns=30 * MS)
+    with running_node(process, tmp_path, RAW) as run:
+        run.hear(lambda words: words.get("event") == "spinning")
+        for payload in ("aa", "bb"):
+            run.tell(topic="/rear/raw", payload=payload, source=1)
+        run.tell(topic="/front/raw", payload="cc", source=1)
+        run.tell(tick=1)
+        run.tell(topic="/front/raw", payload="dd", source=1)
+        run.tell(tick=2)
+        assert run.end() == 0
+    published = [(words["published"], words["payload"]) for words in run.said if "payload" in words]
+    assert published == [("/rear", "bb"), ("/front", "cc"), ("/front", "dd")]
+    texts = [words["text"] for words in run.said if "text" in words]
+    assert texts == [
+        "/rear: 1 published, 1 times nothing new, 1 dropped for newer ones",
+        "/front: 2 published, 0 times nothing new, 0 dropped for newer ones",
+    ]
+    assert any("nothing new for /rear" in words.get("log", "") for words in run.said)
+    timers = [words for words in run.said if "timer" in words]
+    assert [int(words["timer"] * 1e9) for words in timers] == [100 * MS] * 2
+    # Made just after the phase: a timer keeps the phase at which it was made.
+    for words in timers:
+        assert (words["time"] - 30 * MS) % (100 * MS) < 50 * MS
+    assert {words["clock"] for words in timers} == {3}, "CLOCK_MONOTONIC"
+
+
+def test_the_throttler_is_in_the_cpp_package_too(tmp_path: Path) -> None:
+    process = write_throttler({"/raw": "/scan"}, 100 * MS, "cpp", tmp_path, core=1)
+    assert (process.package, process.executable) == ("chainshaper_shaping", "throttler")
+    assert (tmp_path / "chainshaper_shaping" / "src" / "throttler.cpp").is_file()
+    assert parameters_of(process)["core"] == 1
+
+
+@pytest.mark.parametrize(("topics", "period"), [({}, 1), ({"/raw": "/scan"}, 0)])
+def test_a_throttler_needs_topics_and_a_period(
+    tmp_path: Path, topics: dict[str, str], period: int
+) -> None:
+    with pytest.raises(InputError, match="needs topics and a period"):
+        write_throttler(topics, period, "python", tmp_path)
+
+
+def test_a_timer_keeps_its_nanoseconds_in_seconds() -> None:
+    """rclpy makes nanoseconds of seconds by multiplying and cutting off."""
+    for period in (1, 3, 33_333_333, 50 * MS, 99_999_999, 100_000_001, 3_600_000_000_007):
+        assert int(float((period + 0.5) / 1e9) * 1_000_000_000) == period
