@@ -6,13 +6,13 @@ import polars as pl
 import pytest
 
 from chainshaper import events
-from chainshaper.enforcement.gate import ANCHORS, OVERRUNS
+from chainshaper.enforcement.gate import ANCHORS, LATE
 from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS, EventLog, number_of
 from chainshaper.workload.event_reading import ProcessLog, event_tables, stall_table
 
 
 def _process(log: EventLog, pid: int = 100, core: int | None = 1) -> ProcessLog:
-    return ProcessLog(pid, core, log.rows.tobytes(), tuple(log.objects))
+    return ProcessLog(pid, core, log.rows.tobytes(), tuple(log.objects), modes=("city", "highway"))
 
 
 def _types(name: str, fields: tuple[str, ...]) -> dict[str, pl.DataType]:
@@ -25,6 +25,7 @@ def test_every_event_is_read_back_as_it_was_recorded(name: str, fields: tuple[st
     log = EventLog()
     values = dict(zip(fields, range(1, len(fields) + 1), strict=True))
     values |= {field: len(words) - 1 for field, words in WORDS.items() if field in fields}
+    values |= {"mode": 0} if "mode" in fields else {}
     log.point(name)(5000, *values.values())
     tables = event_tables([_process(log)], from_ns=0)
 
@@ -32,7 +33,7 @@ def test_every_event_is_read_back_as_it_was_recorded(name: str, fields: tuple[st
     assert dict(tables[name].schema) == _types(name, fields)
     expected: dict[str, Any] = {"time": 5000, "pid": 100, "tid": 100, "cpu": 1, **values}
     if name == "gate_release":
-        expected |= {"anchor": "cycle", "overrun": "publish"}
+        expected |= {"anchor": "cycle", "overrun": "next-slot", "mode": "city"}
     if name == "asynchronous_send":
         expected["outcome"] = "overwritten"
     assert tables[name].to_dicts() == [expected]
@@ -46,19 +47,19 @@ def test_the_layout_says_what_the_event_tables_say() -> None:
 
 
 def test_words_are_those_that_the_gate_uses() -> None:
-    assert (WORDS["anchor"], WORDS["overrun"]) == (ANCHORS, OVERRUNS)
+    assert (WORDS["anchor"], WORDS["overrun"]) == (ANCHORS, LATE)
     assert number_of("outcome", "overwritten") == 2
 
 
 def test_a_discarded_message_has_no_release_and_no_slot() -> None:
     log = EventLog()
     overrun = number_of("overrun", "discard")
-    log.point("gate_release")(9, 1, 2, 3, 4, ABSENT, ABSENT, 0, 0, overrun)
-    log.point("gate_release")(19, 1, 2, 3, 4, 18, 0, 0, 1, number_of("overrun", None))
+    log.point("gate_release")(9, 1, 2, 3, 4, ABSENT, ABSENT, 0, 0, overrun, ABSENT)
+    log.point("gate_release")(19, 1, 2, 3, 4, 18, 0, 0, 1, number_of("overrun", None), 1)
     table = event_tables([_process(log)], from_ns=0)["gate_release"]
-    assert table.select("release", "slot", "anchor", "overrun").rows() == [
-        (None, None, "stamp", "discard"),
-        (18, 0, "cycle", None),
+    assert table.select("release", "slot", "anchor", "overrun", "mode").rows() == [
+        (None, None, "stamp", "discard", None),
+        (18, 0, "cycle", None, "highway"),
     ]
 
 

@@ -21,8 +21,9 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 from chainshaper.enforcement.realtime import set_thread_name
+from chainshaper.workload.event_log import number_of
 
-__all__ = ["AsynchronousWriter", "Note", "PublisherThread"]
+__all__ = ["AsynchronousWriter", "Note", "PublisherThread", "noting_sends"]
 
 THREAD_NAME = "dds.asyn.0.1"  # Fast DDS's for user data
 
@@ -96,3 +97,15 @@ class PublisherThread:
         set_thread_name(THREAD_NAME)
         while True:
             self._waiting.get().send_next()
+
+
+def noting_sends(record: Callable[..., None], rmw_handle: int) -> Note:
+    """What records the sends of one publisher, whichever thread they happen in."""
+
+    def note(time_ns: int, source_timestamp: int, outcome: str, duration_ns: int) -> None:
+        tid = threading.get_native_id()
+        record(
+            time_ns, tid, rmw_handle, source_timestamp, number_of("outcome", outcome), duration_ns
+        )
+
+    return note

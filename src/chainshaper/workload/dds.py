@@ -48,6 +48,7 @@ __all__ = [
     "join_domain",
     "message_template",
     "stamp_message",
+    "text_message",
 ]
 
 _ANY = SampleState.Any | ViewState.Any | InstanceState.Any
@@ -72,6 +73,13 @@ class Stamped(IdlStruct, typename="chainshaper_msgs::msg::dds_::Stamped_"):
     header: Header
     number: uint64
     data: sequence[uint8]  # type: ignore[type-arg]
+
+
+@dataclass
+class String(IdlStruct, typename="std_msgs::msg::dds_::String_"):
+    """What a topic carries on which modes are announced."""
+
+    data: str
 
 
 @dataclass(frozen=True)
@@ -137,6 +145,11 @@ def stamp_message(template: bytearray, stamp_ns: int) -> bytes:
     return bytes(template)
 
 
+def text_message(text: str) -> bytes:
+    """A serialized ``std_msgs/String``."""
+    return bytes(String(text).serialize())
+
+
 def _qos(reliability: str, depth: int, lifespan_ns: int | None = None) -> Any:
     reliable = Policy.Reliability.Reliable(max_blocking_time=100_000_000)
     return Qos(
@@ -147,8 +160,8 @@ def _qos(reliability: str, depth: int, lifespan_ns: int | None = None) -> Any:
     )
 
 
-def _topic(participant: Any, name: str) -> Any:
-    return Topic(participant, "rt" + name, Stamped)  # ROS 2's prefix of topics
+def _topic(participant: Any, name: str, carries_text: bool) -> Any:
+    return Topic(participant, "rt" + name, String if carries_text else Stamped)  # ROS 2's prefix
 
 
 class Publisher:
@@ -164,9 +177,13 @@ class Publisher:
         reliability: str,
         depth: int,
         lifespan_ns: int | None = None,
+        *,
+        carries_text: bool = False,
     ) -> None:
         self._writer = DataWriter(
-            participant, _topic(participant, topic), qos=_qos(reliability, depth, lifespan_ns)
+            participant,
+            _topic(participant, topic, carries_text),
+            qos=_qos(reliability, depth, lifespan_ns),
         )
         self._handle = self._writer._ref
 
@@ -183,9 +200,19 @@ class Publisher:
 class Subscription:
     """A reader of one topic that gives serialized messages, oldest first."""
 
-    def __init__(self, participant: Any, topic: str, reliability: str, depth: int) -> None:
+    def __init__(
+        self,
+        participant: Any,
+        topic: str,
+        reliability: str,
+        depth: int,
+        *,
+        carries_text: bool = False,
+    ) -> None:
         self._reader = DataReader(
-            participant, _topic(participant, topic), qos=_qos(reliability, depth)
+            participant,
+            _topic(participant, topic, carries_text),
+            qos=_qos(reliability, depth),
         )
         self.condition = ReadCondition(self._reader, _ANY)
         self._handle = self._reader._ref

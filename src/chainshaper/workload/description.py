@@ -24,7 +24,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from chainshaper.enforcement.gate import Gate
+from chainshaper.enforcement.gate import Gate, Modes
+from chainshaper.workload.distributions import ExecutionTime, SimulationDescription
 from chainshaper.yaml_file import (
     AS_YAML,
     Duration,
@@ -40,6 +41,7 @@ __all__ = [
     "CallbackDescription",
     "ExecutionTime",
     "GateDescription",
+    "ModesDescription",
     "NodeDescription",
     "Scheduling",
     "TopicDescription",
@@ -50,40 +52,16 @@ __all__ = [
 _NODE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 
 
-class ExecutionTime(Part):
-    """CPU time of one callback instance: exactly one of the distributions.
+class ModesDescription(Part):
+    """The modes of a gate, as :class:`~chainshaper.enforcement.gate.Modes` has them.
 
-    ``constant``; ``uniform`` between two durations; ``normal`` with mean and standard deviation,
-    redrawn outside ``within``.
+    The active one's name is read from ``topic``, which a callback ``announces`` it on.
     """
 
-    constant_ns: Duration | None = None
-    uniform_ns: tuple[Duration, Duration] | None = None
-    normal_ns: tuple[Duration, Duration] | None = None
-    within_ns: tuple[Duration, Duration] | None = None
-
-    @model_validator(mode="after")
-    def _one_distribution(self) -> "ExecutionTime":
-        given = [self.constant_ns, self.uniform_ns, self.normal_ns]
-        if sum(value is not None for value in given) != 1:
-            raise wrong_value("give exactly one of constant, uniform, normal")
-        if (self.normal_ns is None) != (self.within_ns is None):
-            raise wrong_value("`within: [low, high]` goes with `normal`, and normal needs it")
-        for key, pair in (("uniform", self.uniform_ns), ("within", self.within_ns)):
-            if pair is not None and pair[0] > pair[1]:
-                raise wrong_value("the shorter duration comes first: exchange the two", key)
-        if self.normal_ns is not None and self.within_ns is not None:
-            mean, deviation = self.normal_ns
-            if deviation == 0 or not self.within_ns[0] <= mean <= self.within_ns[1]:
-                raise wrong_value(
-                    "the mean must lie within the limits, with a deviation above 0ms", "normal"
-                )
-            if self.within_ns[1] - self.within_ns[0] < deviation:
-                # Nearly every value would be drawn again, for ever if the limits are equal.
-                raise wrong_value(
-                    "the limits are closer together than one deviation: write `uniform`", "within"
-                )
-        return self
+    topic: FullName
+    bands: Annotated[dict[str, int], Field(min_length=1)]
+    default: str
+    late: Literal["wait", "discard", "publish", "next-slot"] = "wait"
 
 
 class GateDescription(Part):
@@ -97,15 +75,18 @@ class GateDescription(Part):
     anchor: Literal["stamp", "cycle"] = "stamp"
     overrun: Literal["wait", "discard", "publish"] = "wait"
     due_cycles: Annotated[int, Field(ge=0)] = 0
+    modes: ModesDescription | None = None
     spin_ns: Duration = 0
     pause_ns: Duration = 0
 
     @model_validator(mode="after")
     def _gate_exists(self) -> "GateDescription":
-        try:
-            Gate(slots=self.slots, cycle_ns=self.cycle_ns, anchor=self.anchor)
-        except ValueError as error:
-            raise wrong_value(str(error), "slots") from error
+        for key, modes in (("slots", None), ("modes", self.modes)):
+            try:
+                known = None if modes is None else Modes(modes.bands, modes.default, modes.late)
+                Gate(slots=self.slots, cycle_ns=self.cycle_ns, modes=known)
+            except ValueError as error:
+                raise wrong_value(str(error), key) from error
         for key, rest in (("spin", self.spin_ns), ("pause", self.pause_ns)):
             if rest >= self.cycle_ns:
                 raise wrong_value("must be shorter than the cycle: shorten it", key)
@@ -117,26 +98,50 @@ class CallbackDescription(Part):
 
     ``timer_ns`` is a timer's period and ``phase_ns`` delays its first expiry after the common
     start. ``gate`` makes the callback a latency-shaping one: it executes nothing and forwards
-    the message it received.
+    the message it received. A callback that ``announces`` modes publishes their names in turn,
+    one an instance, each as a ``std_msgs/String``.
+
+    ``synchronises`` has the inputs of a synchronising callback, which executes and publishes when
+    a message of every input has come, with the stamp of the first input's. Executors look at
+    callbacks of the ``kind`` service and client, whose subscription carries requests or
+    responses, behind those of topics.
     """
 
     timer_ns: PositiveDuration | None = None
     phase_ns: Duration = 0
     subscription: FullName | None = None
+    synchronises: tuple[FullName, ...] = ()
+    kind: Literal["subscription", "service", "client"] = "subscription"
     execution: ExecutionTime = ExecutionTime(constant_ns=0)
     publishes: tuple[FullName, ...] = ()
+    announces: tuple[str, ...] = ()
     gate: GateDescription | None = None
+
+    @property
+    def subscriptions(self) -> tuple[str, ...]:
+        """All topics that are subscribed to for this callback: the gate's modes come first."""
+        modes = None if self.gate is None else self.gate.modes
+        mode_topic = () if modes is None else (modes.topic,)
+        inputs = self.synchronises if self.subscription is None else (self.subscription,)
+        return (*mode_topic, *inputs)
 
     @model_validator(mode="after")
     def _one_trigger(self) -> "CallbackDescription":
-        if (self.timer_ns is None) == (self.subscription is None):
-            raise wrong_value("give either `timer: PERIOD` or `subscription: TOPIC`")
+        triggers = (self.timer_ns, self.subscription, self.synchronises or None)
+        if sum(trigger is not None for trigger in triggers) != 1:
+            raise wrong_value(
+                "give either `timer: PERIOD` or `subscription: TOPIC` or `synchronises: [TOPICS]`"
+            )
+        if len(self.synchronises) == 1 or len(set(self.synchronises)) < len(self.synchronises):
+            raise wrong_value("name two topics at least, each of them once", "synchronises")
         if self.phase_ns and self.timer_ns is None:
             raise wrong_value(
                 "a phase is a timer's delay after the common start: remove it", "phase"
             )
         if self.gate is not None and (self.subscription is None or len(self.publishes) != 1):
             raise wrong_value("a gate forwards one subscription to exactly one topic", "gate")
+        if self.announces and len(self.publishes) != 1:
+            raise wrong_value("modes are announced on exactly one topic", "announces")
         return self
 
 
@@ -186,6 +191,7 @@ class Application(Part):
     seed: int = Field(default=1, ge=0)
     scheduling: SchedulingOfApplication
     topics: dict[FullName, TopicDescription] = Field(default_factory=dict)
+    simulation: SimulationDescription = SimulationDescription()
     nodes: dict[str, NodeDescription] = Field(min_length=1)
 
     @model_validator(mode="after")
@@ -198,11 +204,20 @@ class Application(Part):
             if not _NODE.fullmatch(name):
                 raise wrong_value("a node's name has letters, digits, _ and / only", "nodes", name)
             for number, callback in enumerate(described.callbacks):
-                if callback.subscription is not None and callback.subscription not in publishers:
+                where = ("nodes", name, "callbacks", number)
+                for wanted in (callback.subscription, *callback.synchronises):
+                    if wanted is not None and wanted not in publishers:
+                        key = "synchronises" if callback.subscription is None else "subscription"
+                        raise wrong_value(
+                            f"no node publishes {wanted}; published are "
+                            f"{', '.join(sorted(publishers)) or 'no topics'}",
+                            *(*where, key),
+                        )
+                modes = None if callback.gate is None else callback.gate.modes
+                if modes is not None and modes.topic not in self.announced():
                     raise wrong_value(
-                        f"no node publishes {callback.subscription}; published are "
-                        f"{', '.join(sorted(publishers)) or 'no topics'}",
-                        *("nodes", name, "callbacks", number, "subscription"),
+                        f"no callback `announces` modes on {modes.topic}: describe one",
+                        *(*where, "gate", "modes", "topic"),
                     )
         for topic in self.topics:
             if topic not in publishers:
@@ -210,6 +225,9 @@ class Application(Part):
         self._refuse_equal_names()
         self._refuse_unknown_way_points(publishers.keys())
         self._refuse_endless_cycles()
+        for node in self.simulation.drift:
+            if node not in self.nodes:
+                raise wrong_value("no such node: remove it", "simulation", "drift", node)
         return self
 
     def _refuse_equal_names(self) -> None:
@@ -235,8 +253,9 @@ class Application(Part):
         """No message may circle for ever."""
         fed: dict[str, set[str]] = {}
         for _, callback in self.callbacks():
-            if callback.subscription is not None:
-                fed.setdefault(callback.subscription, set()).update(callback.publishes)
+            for topic in (callback.subscription, *callback.synchronises):
+                if topic is not None:
+                    fed.setdefault(topic, set()).update(callback.publishes)
         for start, nexts in fed.items():
             path, seen = [(start, iter(sorted(nexts)))], {start}
             while path:
@@ -259,6 +278,10 @@ class Application(Part):
         for name, node in self.nodes.items():
             for callback in node.callbacks:
                 yield name, callback
+
+    def announced(self) -> set[str]:
+        """The topics that carry the names of modes (``std_msgs/String``)."""
+        return {topic for _, cb in self.callbacks() if cb.announces for topic in cb.publishes}
 
     def topic(self, name: str) -> TopicDescription:
         """A topic's description, the default one where the file says nothing about it."""

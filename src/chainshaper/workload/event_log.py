@@ -38,6 +38,7 @@ LAYOUT: tuple[tuple[str, tuple[str, ...]], ...] = (
             "cycles_waited",
             "anchor",
             "overrun",
+            "mode",
         ),
     ),
     ("asynchronous_send", ("tid", "rmw_publisher_handle", "timestamp", "outcome", "duration")),
@@ -45,17 +46,20 @@ LAYOUT: tuple[tuple[str, tuple[str, ...]], ...] = (
 )
 """Event names and the order of their fields; an event's number is its place in this list."""
 
-WIDTH = 11  # event number, time, and up to nine fields
+WIDTH = 12  # event number, time, and up to ten fields
 
 ABSENT = -1
 """Stands for null in fields that may be."""
 
 WORDS: dict[str, tuple[str, ...]] = {
     "anchor": ("stamp", "cycle"),
-    "overrun": ("wait", "discard", "publish"),
+    "overrun": ("wait", "discard", "publish", "next-slot"),
     "outcome": ("sent", "expired", "overwritten"),
 }
-"""Fields that hold words are recorded as places in these lists."""
+"""Fields that hold words are recorded as places in these lists.
+
+So is ``mode``, in the list of the gate's own modes.
+"""
 
 
 def number_of(field: str, word: str | None) -> int:

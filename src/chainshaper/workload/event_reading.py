@@ -24,6 +24,7 @@ class ProcessLog:
     core: int | None  # the one its executor was pinned to
     rows: bytes
     objects: tuple[dict[str, Any], ...]
+    modes: tuple[str, ...] = ()  # that its gate knows
 
 
 def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataFrame]:
@@ -58,7 +59,7 @@ def _typed(name: str, frame: pl.DataFrame, log: ProcessLog) -> pl.DataFrame:
     )
     frame = frame.with_columns(
         pl.col(field).replace_strict(dict(enumerate(words)), default=None, return_dtype=pl.String())
-        for field, words in WORDS.items()
+        for field, words in {**WORDS, "mode": log.modes}.items()
         if field in frame.columns
     )
     tid = pl.col("tid") if "tid" in frame.columns else pl.lit(log.pid)  # executors: the main thread

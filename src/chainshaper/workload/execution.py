@@ -2,12 +2,13 @@
 
 import time
 import zlib
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["ExecutionTimes", "draw", "spend"]
+__all__ = ["BLOCK", "ExecutionTimes", "blocks", "draw", "spend"]
 
 BLOCK = 1024
 
@@ -23,6 +24,12 @@ def draw(
         return np.full(count, constant, dtype=np.int64)
     if (uniform := execution.get("uniform_ns")) is not None:
         return random.integers(uniform[0], uniform[1], count, dtype=np.int64, endpoint=True)
+    if (samples := execution.get("samples_ns")) is not None:
+        block = execution.get("block", 1)
+        starts = (random.random(-(-count // block)) * len(samples)).astype(np.int64)
+        places = (starts[:, None] + np.arange(block)).ravel()[:count] % len(samples)
+        drawn_samples: npt.NDArray[np.int64] = np.asarray(samples, dtype=np.int64)[places]
+        return drawn_samples
     mean, deviation = execution["normal_ns"]
     low, high = execution["within_ns"]
     drawn = random.normal(mean, deviation, count)
@@ -31,26 +38,37 @@ def draw(
     return drawn.astype(np.int64)
 
 
-class ExecutionTimes:
-    """The endless sequence of execution times of one callback, in ns.
+def blocks(
+    execution: dict[str, Any], seed: int, node: str, index: int
+) -> Iterator[npt.NDArray[np.int64]]:
+    """The endless sequence of execution times of one callback, in blocks of `BLOCK` values (ns).
 
     Seed, node and the callback's index in its node determine the sequence, so two runs of an
-    application, or a run and its simulation, spend the same time in the same instance. Values
-    are drawn in blocks: drawing must not cost time in the callback that spends them.
+    application, or a run and its simulation, spend the same time in the same instance. Stretches
+    of samples depend on the seed only: callbacks that were measured together draw together.
+    """
+    together = execution.get("block", 1) > 1
+    random = np.random.default_rng([seed] if together else [seed, zlib.crc32(node.encode()), index])
+    # Block by block: values redrawn outside their limits would otherwise make the sequence depend
+    # on how many were asked for at once.
+    while True:
+        yield draw(execution, BLOCK, random)
+
+
+class ExecutionTimes:
+    """The same sequence one by one.
+
+    Values are drawn beforehand: drawing must not cost time in the callback that spends them.
     """
 
     def __init__(self, execution: dict[str, Any], seed: int, node: str, index: int) -> None:
-        self._execution = execution
-        self._random = np.random.default_rng([seed, zlib.crc32(node.encode()), index])
+        self._blocks = blocks(execution, seed, node, index)
         self._values: list[int] = []
 
     def refill(self, count: int = BLOCK) -> None:
         """Have at least ``count`` values ready, so that the next ones cost nothing."""
-        # Block by block: values redrawn outside their limits would otherwise make the sequence
-        # depend on how many were asked for at once.
         while len(self._values) < count:
-            drawn = draw(self._execution, BLOCK, self._random)
-            self._values = [*reversed(drawn.tolist()), *self._values]
+            self._values = [*reversed(next(self._blocks).tolist()), *self._values]
 
     def next(self) -> int:
         """The execution time of the next instance."""

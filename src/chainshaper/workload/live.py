@@ -263,8 +263,7 @@ def _spec(
     for _, callback in application.callbacks():
         for topic in callback.publishes:
             writers[topic] = writers.get(topic, 0) + 1
-        if callback.subscription is not None:
-            topic = callback.subscription
+        for topic in callback.subscriptions:
             readers[topic] = readers.get(topic, 0) + 1
     return {
         "node": node_name(name),
@@ -275,6 +274,7 @@ def _spec(
         "origin_phase": timer.phase_ns,
         "callbacks": [cb.model_dump() for cb in application.nodes[name].callbacks],
         "topics": {topic: application.topic(topic).model_dump() for topic in writers},
+        "announced": sorted(application.announced()),
         "expected": {topic: (writers[topic], readers.get(topic, 0)) for topic in writers},
     }
 
@@ -363,7 +363,9 @@ def _read_log(name: str, child: Child, application: Application) -> ProcessLog:
     answer = child.hear(ANSWER_S)
     rows = child.hear_bytes(answer["bytes"], ANSWER_S)
     core = application.scheduling_of(name).core
-    return ProcessLog(child.pid, core, rows, tuple(answer["objects"]))
+    modes = [cb.gate.modes for cb in application.nodes[name].callbacks if cb.gate is not None]
+    names = tuple(modes[0].bands) if modes and modes[0] is not None else ()
+    return ProcessLog(child.pid, core, rows, tuple(answer["objects"]), names)
 
 
 def _notes(

@@ -6,14 +6,14 @@ it is locked into memory.
 """
 
 import os
-import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import cycle
 from typing import Any
 
-from chainshaper.enforcement.gate import Gate, Shaper, origin_of, sleep_until
+from chainshaper.enforcement.gate import Gate, Modes, Shaper, origin_of, sleep_until, text_of
 from chainshaper.enforcement.realtime import (
     die_with_parent,
     lock_memory,
@@ -21,10 +21,11 @@ from chainshaper.enforcement.realtime import (
     stop_garbage_collection,
 )
 from chainshaper.workload import dds, protocol
-from chainshaper.workload.asynchronous import AsynchronousWriter, Note, PublisherThread
+from chainshaper.workload.asynchronous import AsynchronousWriter, PublisherThread, noting_sends
 from chainshaper.workload.event_log import ABSENT, EventLog, number_of
 from chainshaper.workload.execution import ExecutionTimes, spend
 from chainshaper.workload.executor import Executor, SubscriptionEntity, Timer
+from chainshaper.workload.synchronising import Synchroniser
 
 __all__ = ["NodeProcess", "main"]
 
@@ -81,6 +82,7 @@ class NodeProcess:
         self.participant = dds.join_domain(spec["domain"])
         self.executor = Executor(self.participant, self.log)
         self.publishers: dict[str, dds.Publisher] = {}
+        self.subscriptions: list[tuple[str, dds.Subscription]] = []
         self.publisher_thread: PublisherThread | None = None
         self.shapers: list[Shaper] = []
         self.first_due: list[tuple[Timer, int]] = []
@@ -108,7 +110,9 @@ class NodeProcess:
             node_name=name,
             namespace="/" + namespace.strip("/"),
         )
-        for index, callback in enumerate(spec["callbacks"]):
+        kinds = ("subscription", "service", "client")  # as executors look at them
+        numbered = list(enumerate(spec["callbacks"]))
+        for index, callback in sorted(numbered, key=lambda each: kinds.index(each[1]["kind"])):
             self._add_callback(index, callback)
 
     # Building -----------------------------------------------------------------------------
@@ -118,24 +122,46 @@ class NodeProcess:
         publishers = [self._publisher(topic) for topic in callback["publishes"]]
         subscription = None
         if callback["subscription"] is not None:
-            qos = self.spec["topics"][callback["subscription"]]
-            subscription = dds.Subscription(
-                self.participant, callback["subscription"], qos["reliability"], qos["depth"]
-            )
+            subscription = self._subscription(callback["subscription"])
         if callback["gate"] is not None and subscription is not None:
-            body = self._shaping_body(handle, callback["gate"], publishers[0], subscription)
+            shaper = self._shaper(callback["gate"])
+            body = self._shaping_body(handle, shaper, callback["gate"], publishers[0], subscription)
+            if callback["gate"]["modes"] is not None:  # before the messages that it concerns
+                self._add_modes(callback["gate"]["modes"]["topic"], shaper)
         else:
             times = ExecutionTimes(
                 callback["execution"], self.spec["seed"], self.spec["node"], index
             )
             self.execution_times.append(times)
-            body = self._computing_body(handle, times, publishers)
+            announced = [dds.text_message(mode) for mode in callback["announces"]]
+            if callback["synchronises"]:
+                self._add_inputs(index, callback["synchronises"], times, publishers)
+                return
+            body = self._computing_body(handle, times, publishers, announced)
         if subscription is None:
             self._add_timer(handle, callback, body)
         else:
             self._add_subscription(handle, callback["subscription"], subscription, body)
         symbol = f"{self.spec['node']}::callback{index}"
         self.log.init("rclcpp_callback_register", callback=handle, symbol=symbol)
+
+    def _add_inputs(
+        self,
+        index: int,
+        topics: Sequence[str],
+        times: ExecutionTimes,
+        publishers: list["TracedPublisher"],
+    ) -> None:
+        """The subscriptions of a synchronising callback, each with a callback of its own."""
+        depths = [self.spec["topics"][topic]["depth"] for topic in topics]
+        synchroniser = Synchroniser[dds.Message](depths)
+        for number, topic in enumerate(topics):
+            handle = self.new_handle()
+            complete = partial(synchroniser.add, number)
+            body = self._computing_body(handle, times, publishers, [], complete)
+            self._add_subscription(handle, topic, self._subscription(topic), body)
+            symbol = f"{self.spec['node']}::callback{index}.{number}"
+            self.log.init("rclcpp_callback_register", callback=handle, symbol=symbol)
 
     def _add_timer(
         self, handle: int, callback: dict[str, Any], body: Callable[[dds.Message | None], None]
@@ -181,10 +207,41 @@ class NodeProcess:
             "rclcpp_subscription_callback_added", subscription=rclcpp_handle, callback=handle
         )
 
+    def _add_modes(self, topic: str, shaper: Shaper) -> None:
+        """Listen to the modes that are announced."""
+        handle = self.new_handle()
+        start, end = self._point["callback_start"], self._point["callback_end"]
+
+        def body(message: dds.Message | None) -> None:
+            assert message is not None  # noqa: S101 - it is a subscription's
+            now = time.monotonic_ns()
+            start(now, handle, time.thread_time_ns(), 0)
+            shaper.switch(text_of(message.payload), now)
+            end(time.monotonic_ns(), handle, time.thread_time_ns())
+
+        self._add_subscription(handle, topic, self._subscription(topic), body)
+
+    def _subscription(self, topic: str) -> dds.Subscription:
+        qos = self.spec["topics"][topic]
+        subscription = dds.Subscription(
+            self.participant,
+            topic,
+            qos["reliability"],
+            qos["depth"],
+            carries_text=topic in self.spec["announced"],
+        )
+        self.subscriptions.append((topic, subscription))
+        return subscription
+
     def _publisher(self, topic: str) -> "TracedPublisher":
         qos = self.spec["topics"][topic]
         publisher = dds.Publisher(
-            self.participant, topic, qos["reliability"], qos["depth"], qos["lifespan_ns"]
+            self.participant,
+            topic,
+            qos["reliability"],
+            qos["depth"],
+            qos["lifespan_ns"],
+            carries_text=topic in self.spec["announced"],
         )
         self.publishers[topic] = publisher
         handle, rmw_handle = self.new_handle(), self.new_handle()
@@ -215,31 +272,63 @@ class NodeProcess:
         """Let the process's publisher thread do the writing."""
         if self.publisher_thread is None:
             self.publisher_thread = PublisherThread()
-        note = _noting_sends(self._point["asynchronous_send"], rmw_handle)
+        note = noting_sends(self._point["asynchronous_send"], rmw_handle)
         writer = AsynchronousWriter(write, qos["depth"], qos["lifespan_ns"], note)
         return partial(self.publisher_thread.publish, writer)
 
     def _computing_body(
-        self, handle: int, times: ExecutionTimes, publishers: list["TracedPublisher"]
+        self,
+        handle: int,
+        times: ExecutionTimes,
+        publishers: list["TracedPublisher"],
+        announced: list[bytes],
+        complete: Callable[[dds.Message], dds.Message | None] | None = None,
     ) -> Callable[[dds.Message | None], None]:
-        """An ordinary callback: compute, then publish; the origin's stamp is passed on."""
+        """An ordinary callback: compute, then publish; the origin's stamp is passed on.
+
+        What is ``announced`` is published in turn instead. With ``complete`` nothing is done
+        until a message completes a set, for the message of it that is given then.
+        """
         start, end = self._point["callback_start"], self._point["callback_end"]
+        announcements = cycle(announced)
 
         def body(message: dds.Message | None) -> None:
             now, wall = time.monotonic_ns(), time.time_ns()
             start(now, handle, time.thread_time_ns(), 0)
+            if complete is not None and message is not None:
+                message = complete(message)
+                if message is None:
+                    end(time.monotonic_ns(), handle, time.thread_time_ns())
+                    return
             stamp = wall if message is None else origin_of(message.payload) or 0
             spend(times.next())
             for publisher in publishers:
-                payload = dds.stamp_message(publisher.template, stamp)
+                payload = next(announcements, None) or dds.stamp_message(publisher.template, stamp)
                 publisher.record(payload, *publisher.send(payload))
             end(time.monotonic_ns(), handle, time.thread_time_ns())
 
         return body
 
+    def _shaper(self, gate: dict[str, Any]) -> Shaper:
+        modes = gate["modes"]
+        shaper = Shaper(
+            Gate(
+                slots=tuple((begin, finish) for begin, finish in gate["slots"]),
+                cycle_ns=gate["cycle_ns"],
+                anchor=gate["anchor"],
+                overrun=gate["overrun"],
+                due_cycles=gate["due_cycles"],
+                modes=modes and Modes(modes["bands"], modes["default"], modes["late"]),
+            ),
+            gate["spin_ns"],
+        )
+        self.shapers.append(shaper)
+        return shaper
+
     def _shaping_body(
         self,
         handle: int,
+        shaper: Shaper,
         gate: dict[str, Any],
         publisher: "TracedPublisher",
         subscription: dds.Subscription,
@@ -256,18 +345,8 @@ class NodeProcess:
         """
         start, end = self._point["callback_start"], self._point["callback_end"]
         released, stalled = self._point["gate_release"], self._point["machine_stall"]
-        shaper = Shaper(
-            Gate(
-                slots=tuple((begin, finish) for begin, finish in gate["slots"]),
-                cycle_ns=gate["cycle_ns"],
-                anchor=gate["anchor"],
-                overrun=gate["overrun"],
-                due_cycles=gate["due_cycles"],
-            ),
-            gate["spin_ns"],
-        )
-        self.shapers.append(shaper)
         pause_ns = gate["pause_ns"]
+        modes = [] if gate["modes"] is None else list(gate["modes"]["bands"])
 
         def body(message: dds.Message | None) -> None:
             assert message is not None  # noqa: S101 - a gate has a subscription, by validation
@@ -292,6 +371,7 @@ class NodeProcess:
                 release.cycles_waited,
                 number_of("anchor", release.anchor),
                 number_of("overrun", release.overrun),
+                ABSENT if release.mode is None else modes.index(release.mode),
             )
             end(time.monotonic_ns(), handle, time.thread_time_ns())
 
@@ -308,12 +388,11 @@ class NodeProcess:
                 for topic, publisher in self.publishers.items()
                 if publisher.matched() < expected[topic][1]
             ]
-            subscribed = [c["subscription"] for c in self.spec["callbacks"] if c["subscription"]]
             missing += [
-                f"subscription to {topic} found {entity.subscription.matched()} of "
+                f"subscription to {topic} found {subscription.matched()} of "
                 f"{expected[topic][0]} writers"
-                for topic, entity in zip(subscribed, self.executor.subscriptions, strict=True)
-                if entity.subscription.matched() < expected[topic][0]
+                for topic, subscription in self.subscriptions
+                if subscription.matched() < expected[topic][0]
             ]
             if not missing or time.monotonic_ns() > deadline_ns:
                 return missing
@@ -330,18 +409,6 @@ class NodeProcess:
             shaper.gate = replace(shaper.gate, phase_ns=start_ns + self.spec["origin_phase"])
         stop_garbage_collection()
         self.executor.spin_until(stop_ns, last_timer_ns)
-
-
-def _noting_sends(record: Callable[..., None], rmw_handle: int) -> Note:
-    """What records the sends of one publisher, whichever thread they happen in."""
-
-    def note(time_ns: int, source_timestamp: int, outcome: str, duration_ns: int) -> None:
-        tid = threading.get_native_id()
-        record(
-            time_ns, tid, rmw_handle, source_timestamp, number_of("outcome", outcome), duration_ns
-        )
-
-    return note
 
 
 def main() -> None:

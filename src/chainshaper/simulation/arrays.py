@@ -1,0 +1,481 @@
+"""From a system in words to the engine's arrays, row by row."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from chainshaper.errors import InputError
+from chainshaper.planning.plan import Plan, Server, Thread
+from chainshaper.simulation import layout as at
+from chainshaper.simulation.layout import FOREVER, NONE, Int64s, Machine
+from chainshaper.simulation.queues import RESERVE, push_event
+from chainshaper.simulation.streams import AHEAD, Streams
+from chainshaper.simulation.system import Entity, SimulatedThread, System
+from chainshaper.workload.event_log import WORDS
+
+__all__ = ["Timing", "build_machine"]
+
+LOG_ENTRIES = 1 << 17
+POOL = 4096
+"""Messages under way, besides those in histories."""
+
+BEST_EFFORT = 1000
+KINDS = ("timer", "subscription", "service", "client")
+EXECUTORS = ("single-threaded", "static", "events")
+COSTS = ("wake_up", "take", "publish", "receive", "delivery")
+
+
+class Memory:
+    """One array with areas of rows, and what it takes to refer to their rows."""
+
+    def __init__(self, areas: Mapping[str, Int64s]) -> None:
+        self._columns = {name: area.shape[1] for name, area in areas.items()}
+        self._first: dict[str, int] = {}
+        self._areas: dict[str, Int64s] = {}
+        self.array = np.zeros(sum(area.size for area in areas.values()), dtype=np.int64)
+        first = 0
+        for name, area in areas.items():
+            self._first[name] = first
+            self._areas[name] = self.array[first : first + area.size].reshape(area.shape)
+            self._areas[name][:] = area
+            first += area.size
+
+    def __getitem__(self, name: str) -> Int64s:
+        """An area, as a view with a row per thing."""
+        return self._areas[name]
+
+    def place(self, name: str, row: int) -> int:
+        """Where a row of an area begins."""
+        return int(self._first[name] + row * self._columns[name])
+
+    def refer(
+        self, name: str, column: int, target: str, rows: npt.NDArray[np.bool_] | None = None
+    ) -> None:
+        """Turn a column's numbers of rows of ``target`` into their places."""
+        numbers = self._areas[name][:, column]
+        chosen = numbers != NONE if rows is None else rows & (numbers != NONE)
+        numbers[chosen] = self._first[target] + numbers[chosen] * self._columns[target]
+
+
+@dataclass(frozen=True)
+class Timing:
+    """The instants of a simulated run (ns); as in the live workload's."""
+
+    start_ns: int
+    anchor_ns: int
+    record_from_ns: int
+    last_timer_ns: int
+    stop_ns: int
+
+
+def build_machine(
+    system: System,
+    plan: Plan | None,
+    timing: Timing,
+    streams: Streams,
+    *,
+    events: bool,
+    switches: bool,
+    latencies: int,
+    warm_up: int,
+) -> tuple[Machine, tuple[int, ...]]:
+    """The arrays of a system before anything has happened, and the numbers of its cores.
+
+    ``events`` and ``switches`` say what is logged, ``latencies`` for how many instances of the
+    chain the latency is noted, behind the first ``warm_up`` ones.
+
+    Raises:
+        InputError: a server of the plan holds a thread that the system does not have.
+    """
+    places = {core: row for row, core in enumerate(sorted({t.core for t in system.threads}))}
+    servers = _assigned(system, plan)
+    for server in servers.values():
+        places.setdefault(server.core, len(places))
+    rings: list[int] = []
+
+    def ring(depth: int) -> int:
+        rings.extend([NONE] * depth)
+        return len(rings) - depth
+
+    cores, core_threads, boundaries, threads = _cores(system, plan, servers, places, timing)
+    _describe_threads(system, threads, streams)
+    gates, slots, bands, gate_rows = _gates(system, timing)
+    synchronisers, inputs, synchroniser_rows = _synchronisers(system, ring)
+    entities = _entities(system, timing, streams, {**gate_rows, **synchroniser_rows}, ring)
+    publishers, readers, announced = _publishers(system)
+    held = sum(system.application.topic(p.topic).depth for p in system.publishers)
+    pool = POOL + len(rings) + held + RESERVE
+    heap = pool + len(entities) + len(threads) + RESERVE
+    entries = LOG_ENTRIES if events else 0
+    areas = {
+        "control": np.zeros((1, at.CONTROL_COLUMNS), dtype=np.int64),
+        "threads": threads,
+        "entities": entities,
+        "publishers": publishers,
+        "readers": readers,
+        "gates": gates,
+        "synchronisers": synchronisers,
+        "inputs": inputs,
+        "cores": cores,
+        "core_threads": core_threads,
+        "boundaries": boundaries,
+        "slots": slots,
+        "bands": bands,
+        "changes": np.zeros((len(gates) * at.CHANGES_KEPT, 2), dtype=np.int64),
+        "announced": announced,
+        "rings": np.full((len(rings), 1), NONE, dtype=np.int64),
+        "streams": streams.rows(),
+        "draws": np.zeros((len(streams), AHEAD), dtype=np.int64),
+        "messages": np.full((pool, at.MESSAGE_COLUMNS), NONE, dtype=np.int64),
+        "heap": np.zeros((heap, at.HEAP_COLUMNS), dtype=np.int64),
+        "counts": np.zeros((at.LOG_KINDS, at.LOG_COLUMNS), dtype=np.int64),
+        **{
+            f"log {kind}": np.zeros((fields, entries), dtype=np.int64)
+            for kind, fields in enumerate(at.LOG_FIELDS)
+        },
+        "latencies": np.full((1, latencies), NONE, dtype=np.int64),
+    }
+    memory = Memory(areas)
+    _refer(memory)
+    control = memory["control"][0]
+    described = system.application.simulation
+    control[at.X_UNUSED] = pool
+    control[at.X_STOP] = timing.stop_ns
+    control[at.X_LAST_TIMER] = timing.last_timer_ns
+    control[at.X_RECORD_FROM] = timing.record_from_ns
+    control[at.X_LOGGING] = events
+    control[at.X_SWITCHES] = switches
+    control[at.X_SWITCH_COST] = described.context_switch_ns
+    control[at.X_PREEMPTION_COST] = described.preemption_ns
+    control[at.X_QUANTUM] = described.quantum_ns
+    control[at.X_AWAY] = round(1e6 * described.interrupts / (1 - described.interrupts))
+    control[at.X_CYCLE] = plan.cycle_ns if plan is not None else 0
+    control[at.X_WARM_UP] = warm_up
+    for row, entity in enumerate(system.entities):
+        if entity.kind == "timer":
+            place = memory.place("entities", row)
+            push_event(memory.array, memory["entities"][row, at.E_DUE], at.EXPIRY, place)
+    machine = Machine(
+        memory=memory.array,
+        threads=memory["threads"],
+        streams=memory["streams"],
+        draws=memory["draws"],
+        first_draw=memory.place("draws", 0),
+        counts=memory["counts"],
+        logs=tuple(memory[f"log {kind}"] for kind in range(at.LOG_KINDS)),
+        latencies=memory["latencies"][0],
+    )
+    streams.fill(machine)
+    return machine, tuple(places)
+
+
+def _refer(memory: Memory) -> None:
+    """Turn the numbers of rows into places, and note where the areas are."""
+    memory.refer("threads", at.T_CORE, "cores")
+    memory.refer("threads", at.T_FIRST, "entities")
+    memory.refer("threads", at.T_END, "entities")
+    for column in (at.T_WAKE, at.T_TAKE, at.T_PUBLISH, at.T_RECEIVE, at.T_DELIVERY):
+        memory.refer("threads", column, "streams")
+    memory.refer("threads", at.T_PUBLISHER_THREAD, "threads")
+    memory.refer("threads", at.T_DDS_THREAD, "threads")
+    memory.refer("entities", at.E_THREAD, "threads")
+    memory.refer("entities", at.E_EXECUTION, "streams")
+    memory.refer("entities", at.E_PUBLISHERS, "publishers")
+    memory.refer("entities", at.E_PUBLISHERS_END, "publishers")
+    memory.refer("entities", at.E_RING, "rings")
+    synchronising = memory["entities"][:, at.E_BODY] == at.SYNCHRONISE
+    memory.refer("entities", at.E_BODY_ROW, "gates", ~synchronising)
+    memory.refer("entities", at.E_BODY_ROW, "synchronisers", synchronising)
+    memory.refer("publishers", at.P_FIRST, "readers")
+    memory.refer("publishers", at.P_END, "readers")
+    memory.refer("publishers", at.P_MODES, "announced")
+    memory.refer("readers", at.R_ENTITY, "entities")
+    memory.refer("gates", at.G_SLOTS, "slots")
+    memory.refer("gates", at.G_SLOTS_END, "slots")
+    memory.refer("gates", at.G_BANDS, "bands")
+    memory.refer("gates", at.G_CHANGES, "changes")
+    memory.refer("synchronisers", at.S_FIRST, "inputs")
+    memory.refer("synchronisers", at.S_END, "inputs")
+    memory.refer("inputs", at.I_RING, "rings")
+    memory.refer("cores", at.C_FIRST, "core_threads")
+    memory.refer("cores", at.C_END, "core_threads")
+    memory.refer("core_threads", 0, "threads")
+    for column in (at.C_TABLE, at.C_TABLE_END, at.C_NEXT):
+        memory.refer("cores", column, "boundaries")
+    messages = memory["messages"]
+    messages[:-1, at.M_NEXT] = [memory.place("messages", row) for row in range(1, len(messages))]
+    for kind in range(at.LOG_KINDS):
+        stride = memory[f"log {kind}"].shape[1]
+        memory["counts"][kind] = (memory.place(f"log {kind}", 0), stride, 0)
+    control = memory["control"][0]
+    control[at.X_CORES] = memory.place("cores", 0)
+    control[at.X_CORES_END] = memory.place("cores", len(memory["cores"]))
+    control[at.X_FREE] = memory.place("messages", 0)
+    control[at.X_HEAP] = control[at.X_HEAP_END] = memory.place("heap", 0)
+    control[at.X_HEAP_LIMIT] = memory.place("heap", len(memory["heap"]) - RESERVE)
+    control[at.X_LOGS] = memory.place("counts", 0)
+    control[at.X_LATENCIES] = memory.place("latencies", 0)
+    control[at.X_LATENCIES_END] = control[at.X_LATENCIES] + memory["latencies"].shape[1]
+
+
+def _rows(rows: Sequence[Sequence[int]], columns: int) -> Int64s:
+    return np.array(rows, dtype=np.int64).reshape(-1, columns)
+
+
+def _assigned(system: System, plan: Plan | None) -> dict[int, Server]:
+    """The server of each thread that is in one."""
+    if plan is None:
+        return {}
+    threads = {
+        Thread(node=system.processes[t.process].node, role=t.role): number  # type: ignore[arg-type]
+        for number, t in enumerate(system.threads)
+        if t.role != "dds"
+    }
+    found: dict[int, Server] = {}
+    for server in plan.servers:
+        for thread in server.threads:
+            if thread not in threads:
+                raise InputError(
+                    f"server {server.name!r} of the plan holds the {thread.role} of {thread.node},"
+                    " which the application does not have: plan again from a recording of it"
+                )
+            found[threads[thread]] = server
+    return found
+
+
+def _always_open(plan: Plan, server: Server) -> bool:
+    """A shaping node holds its messages itself: its thread needs no slot to run in."""
+    nodes = [node for node in (plan.shaping_node, *plan.further_shaping_nodes) if node is not None]
+    return any(node.thread in server.threads for node in nodes)
+
+
+def _cores(
+    system: System,
+    plan: Plan | None,
+    servers: dict[int, Server],
+    places: dict[int, int],
+    timing: Timing,
+) -> tuple[Int64s, Int64s, Int64s, Int64s]:
+    """``cores``, ``core_threads``, ``boundaries``, and ``threads`` with core, rank and server."""
+    threads = np.full((len(system.threads), at.THREAD_COLUMNS), NONE, dtype=np.int64)
+    threads[:, at.T_ROW] = np.arange(len(threads))
+    cores = np.zeros((len(places), at.CORE_COLUMNS), dtype=np.int64)
+    boundaries: list[tuple[int, int]] = []
+    for number, thread in enumerate(system.threads):
+        server = servers.get(number)
+        threads[number, at.T_CORE] = places[thread.core if server is None else server.core]
+        threads[number, at.T_RANK] = BEST_EFFORT - thread.priority
+    core_threads: list[int] = []
+    for core, place in places.items():
+        own = [] if plan is None else [s for s in plan.servers if s.core == core]
+        ranked = sorted((s for s in own if s in servers.values()), key=lambda s: s.priority)
+        for number, server in servers.items():
+            if server in ranked:
+                bit = ranked.index(server)
+                threads[number, at.T_SERVER] = bit
+                threads[number, at.T_RANK] = bit - len(ranked)
+        mine = [n for n in range(len(threads)) if threads[n, at.T_CORE] == place]
+        row = cores[place]
+        row[at.C_FIRST], row[at.C_END] = len(core_threads), len(core_threads) + len(mine)
+        core_threads += mine
+        row[at.C_RUNNING], row[at.C_LAST] = NONE, NONE
+        row[at.C_UNTIL], row[at.C_BOUNDARY], row[at.C_DIRTY] = FOREVER, FOREVER, 1
+        if plan is not None and ranked:
+            table = _slot_table(plan, ranked)
+            row[at.C_TABLE], row[at.C_TABLE_END] = len(boundaries), len(boundaries) + len(table)
+            boundaries += table
+            _enter_table(row, table, timing.start_ns, timing.anchor_ns + plan.offset_ns, plan)
+    return cores, _rows([[n] for n in core_threads], 1), _rows(boundaries, 2), threads
+
+
+def _slot_table(plan: Plan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
+    """Rows (offset in the cycle, mask of the servers that are open from then on)."""
+    slots = [
+        ((0, plan.cycle_ns),) if _always_open(plan, server) else server.slots for server in ranked
+    ]
+    offsets = {0} | {instant for own in slots for slot in own for instant in slot}
+    return [
+        (
+            offset,
+            sum(
+                1 << bit
+                for bit, own in enumerate(slots)
+                if any(start <= offset < end for start, end in own)
+            ),
+        )
+        for offset in sorted(offsets)
+        if offset < plan.cycle_ns
+    ]
+
+
+def _enter_table(
+    row: Int64s, table: Sequence[tuple[int, int]], start: int, anchor: int, plan: Plan
+) -> None:
+    """The state of a core's table at the start of the run, which is anywhere in a cycle."""
+    elapsed = (start - anchor) % plan.cycle_ns
+    current = max(number for number, (offset, _) in enumerate(table) if offset <= elapsed)
+    row[at.C_MASK] = table[current][1]
+    following = (current + 1) % len(table)
+    row[at.C_NEXT] = row[at.C_TABLE] + following
+    offset = table[following][0] + (plan.cycle_ns if following <= current else 0)
+    row[at.C_BOUNDARY] = start - elapsed + offset
+
+
+def _describe_threads(system: System, threads: Int64s, streams: Streams) -> None:
+    described = system.application.simulation
+    for number, thread in enumerate(system.threads):
+        node = system.processes[thread.process].node
+        row = threads[number]
+        columns = (at.T_WAKE, at.T_TAKE, at.T_PUBLISH, at.T_RECEIVE, at.T_DELIVERY)
+        for place, (name, column) in enumerate(zip(COSTS, columns, strict=True)):
+            times = getattr(described, name)
+            if times is not None:
+                offset = len(COSTS) * ("executor", "publisher", "dds").index(thread.role)
+                row[column] = streams.cost(times, node, offset + place)
+        row[at.T_RUNNABLE], row[at.T_LEFT], row[at.T_SEQUENCE] = 0, 0, 0
+        row[at.T_PREEMPTED], row[at.T_USED] = 0, 0
+        if thread.role == "executor":
+            mine = [n for n, e in enumerate(system.entities) if e.process == thread.process]
+            row[at.T_KIND] = EXECUTORS.index(described.executor)
+            row[at.T_FIRST], row[at.T_END] = mine[0], mine[-1] + 1
+            row[at.T_STEP] = at.COLLECT
+            row[at.T_PUBLISHER_THREAD] = _sibling(system, thread, "publisher")
+            row[at.T_DDS_THREAD] = _sibling(system, thread, "dds")
+        else:
+            sends = thread.role == "publisher"
+            row[at.T_KIND] = at.PUBLISHER if sends else at.DDS
+            row[at.T_STEP] = at.SEND if sends else at.RECEIVE
+
+
+def _sibling(system: System, thread: SimulatedThread, role: str) -> int:
+    same = [
+        n for n, t in enumerate(system.threads) if t.process == thread.process and t.role == role
+    ]
+    return same[0] if same else NONE
+
+
+def _gates(
+    system: System, timing: Timing
+) -> tuple[Int64s, Int64s, Int64s, dict[tuple[int, int], int]]:
+    """``gates``, ``slots``, ``bands``, and the gate's row by (process, callback's place)."""
+    gates: list[list[int]] = []
+    slots: list[tuple[int, int]] = []
+    bands: list[int] = []
+    rows: dict[tuple[int, int], int] = {}
+    for entity in system.entities:
+        gate = entity.described.gate
+        if gate is None or entity.listens:
+            continue
+        rows[entity.process, entity.index] = len(gates)
+        row = [NONE] * at.GATE_COLUMNS
+        row[at.G_SLOTS], row[at.G_SLOTS_END] = len(slots), len(slots) + len(gate.slots)
+        slots += gate.slots
+        row[at.G_CYCLE], row[at.G_STAMPED] = gate.cycle_ns, int(gate.anchor == "stamp")
+        row[at.G_OVERRUN] = WORDS["overrun"].index(gate.overrun)
+        row[at.G_DUE], row[at.G_SPIN], row[at.G_PAUSE] = (
+            gate.due_cycles,
+            gate.spin_ns,
+            gate.pause_ns,
+        )
+        row[at.G_PHASE], row[at.G_CHANGED] = timing.anchor_ns, 0
+        row[at.G_CHANGES] = len(gates) * at.CHANGES_KEPT
+        if gate.modes is not None:
+            row[at.G_LATE] = WORDS["overrun"].index(gate.modes.late)
+            row[at.G_DEFAULT], row[at.G_BANDS] = system.modes.index(gate.modes.default), len(bands)
+            bands += [gate.modes.bands.get(mode, NONE) for mode in system.modes]
+        gates.append(row)
+    return _rows(gates, at.GATE_COLUMNS), _rows(slots, 2), _rows([[b] for b in bands], 1), rows
+
+
+def _synchronisers(
+    system: System, ring: Callable[[int], int]
+) -> tuple[Int64s, Int64s, dict[tuple[int, int], int]]:
+    """``synchronisers``, ``inputs``, and the row by (process, callback's place)."""
+    synchronisers: list[list[int]] = []
+    inputs: list[list[int]] = []
+    rows: dict[tuple[int, int], int] = {}
+    for number, entity in enumerate(system.entities):
+        if not entity.described.synchronises:
+            continue
+        key = (entity.process, entity.index)
+        if key not in rows:
+            rows[key] = len(synchronisers)
+            synchronisers.append([len(inputs), len(inputs) + len(entity.described.synchronises)])
+        depth = system.application.topic(entity.topic or "").depth
+        inputs.append([ring(depth), depth, int(number in system.chain.callbacks), 0, 0])
+    return _rows(synchronisers, at.SYNCHRONISER_COLUMNS), _rows(inputs, at.INPUT_COLUMNS), rows
+
+
+def _entities(
+    system: System,
+    timing: Timing,
+    streams: Streams,
+    bodies: dict[tuple[int, int], int],
+    ring: Callable[[int], int],
+) -> Int64s:
+    entities = np.zeros((len(system.entities), at.ENTITY_COLUMNS), dtype=np.int64)
+    executors = {t.process: n for n, t in enumerate(system.threads) if t.role == "executor"}
+    executions: dict[tuple[int, int], int] = {}  # inputs of a synchroniser execute the same
+    for number, entity in enumerate(system.entities):
+        row, described = entities[number], entity.described
+        process, callback = system.processes[entity.process], (entity.process, entity.index)
+        if callback not in executions:
+            executions[callback] = streams.callback(described.execution, process.node, entity.index)
+        row[at.E_ROW] = number
+        row[at.E_THREAD] = executors[entity.process]
+        row[at.E_KIND] = KINDS.index(entity.kind)
+        row[at.E_BODY] = _body(entity)
+        row[at.E_BODY_ROW] = bodies.get(callback, NONE)
+        row[at.E_INPUT] = entity.number
+        row[at.E_EXECUTION] = executions[callback]
+        row[at.E_PUBLISHERS] = entity.publishers[0] if entity.publishers else 0
+        row[at.E_PUBLISHERS_END] = row[at.E_PUBLISHERS] + len(entity.publishers)
+        row[at.E_STARTS_CHAIN] = number in system.chain.callbacks[:1]
+        row[at.E_ON_CHAIN] = number in system.chain.callbacks[1:]
+        row[at.E_LIFESPAN] = NONE
+        if entity.topic is None:
+            drift = system.application.simulation.drift.get(process.key, 0)
+            period = described.timer_ns or 0
+            row[at.E_PERIOD] = max(1, round(period * (1 - drift / 1_000_000)))
+            row[at.E_DUE] = timing.start_ns + described.phase_ns
+        else:
+            topic = system.application.topic(entity.topic)
+            row[at.E_RING], row[at.E_DEPTH] = ring(topic.depth), topic.depth
+            if topic.lifespan_ns is not None:
+                row[at.E_LIFESPAN] = topic.lifespan_ns
+    return entities
+
+
+def _body(entity: Entity) -> int:
+    if entity.listens:
+        return at.MODE_LISTENER
+    if entity.described.gate is not None:
+        return at.GATE
+    return at.SYNCHRONISE if entity.described.synchronises else at.COMPUTE
+
+
+def _publishers(system: System) -> tuple[Int64s, Int64s, Int64s]:
+    """``publishers``, ``readers``, ``announced``."""
+    rows = np.zeros((len(system.publishers), at.PUBLISHER_COLUMNS), dtype=np.int64)
+    readers: list[tuple[int, int]] = []
+    announced: list[int] = []
+    owner = {p: entity for entity in system.entities for p in entity.publishers}
+    chain = system.chain
+    ends = [(system.entities[c].publishers, chain.topics[-1]) for c in chain.callbacks[-1:]]
+    for number, publisher in enumerate(system.publishers):
+        row, topic = rows[number], system.application.topic(publisher.topic)
+        reached = system.readers.get(publisher.topic, ())
+        row[at.P_ROW] = number
+        row[at.P_FIRST], row[at.P_END] = len(readers), len(readers) + len(reached)
+        readers += [(entity, 0) for entity in reached]
+        row[at.P_ASYNCHRONOUS], row[at.P_DEPTH] = publisher.asynchronous, topic.depth
+        row[at.P_LIFESPAN] = NONE if topic.lifespan_ns is None else topic.lifespan_ns
+        row[at.P_ENDS_CHAIN] = any(
+            number in own and publisher.topic == topic for own, topic in ends
+        )
+        modes = owner[number].described.announces
+        row[at.P_MODES], row[at.P_MODES_COUNT] = len(announced), len(modes)
+        announced += [system.modes.index(mode) for mode in modes]
+    return rows, _rows(readers, at.READER_COLUMNS), _rows([[m] for m in announced], 1)

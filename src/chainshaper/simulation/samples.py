@@ -1,0 +1,206 @@
+"""Measured times instead of described ones: what a recording says about an application.
+
+Execution times are the CPU times of each callback's instances in the order in which they happened,
+so that stretches of them keep their correlation in time; callbacks that all ran once a cycle have
+as many, so that their stretches are of the same cycles. What publishing costs is not in them: a
+callback computes before it publishes.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from chainshaper import events
+from chainshaper.analysis import data_flow
+from chainshaper.analysis.disturbance import stalled_after
+from chainshaper.analysis.flow import DataFlow
+from chainshaper.errors import InputError
+from chainshaper.recording import Recording
+from chainshaper.sources import open_source
+from chainshaper.workload.description import Application, CallbackDescription
+from chainshaper.workload.distributions import ExecutionTime, SimulationDescription
+
+__all__ = ["measured_costs", "with_recorded_times"]
+
+DELIVERY_NS = 30_000
+"""A message is taken to be under way for so long: less than its publisher is still busy for."""
+
+COMPUTES_NS = 1_000_000
+"""A callback that computes for less is over before an interrupt says much."""
+
+FAR = 10
+"""What took so many times the median waited for something else."""
+
+MOST = 100_000
+"""Enough samples for any distribution."""
+
+
+def with_recorded_times(
+    application: Application, recording: Recording | str | Path, *, block: int = 1
+) -> Application:
+    """The application with execution times drawn from a recording of it, in stretches of ``block``.
+
+    Gates keep what they have: they compute nothing.
+
+    Raises:
+        InputError: a callback of the application is not in the recording, or its CPU time is not.
+    """
+    if not isinstance(recording, Recording):
+        recording = open_source(recording)
+    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    times = _computing_times(flow)
+    nodes = {}
+    for name, node in application.nodes.items():
+        callbacks = tuple(
+            callback
+            if callback.gate is not None
+            else _sampled(recording, times, "/" + name.strip("/"), callback, block)
+            for callback in node.callbacks
+        )
+        nodes[name] = node.model_copy(update={"callbacks": callbacks})
+    return application.model_copy(update={"nodes": nodes})
+
+
+def measured_costs(recording: Recording | str | Path) -> SimulationDescription:
+    """What a machine takes besides computing, from a recording of a live run on it.
+
+    Publishing lasts from a callback's last publication to its end; taking from the executor's
+    choice to the callback's start, and waking up from when a message was there, and its core free,
+    to that choice. Messages that waited for a busy executor say nothing about waking up. What the
+    most urgent executors were kept from while they computed, interrupts took.
+
+    Raises:
+        InputError: no message of the recording was taken by an executor that waited for it.
+    """
+    if not isinstance(recording, Recording):
+        recording = open_source(recording)
+    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    cores = {thread.tid: thread.cores for thread in recording.info.threads}
+    instances = flow.instances.select("instance", "tid", "start", "end").with_columns(
+        core=pl.col("tid").replace_strict(
+            {tid: own[0] for tid, own in cores.items() if len(own) == 1}, default=None
+        )
+    )
+    chosen = events.table(recording.events, "rclcpp_executor_get_next_ready")
+    read = (
+        flow.takes.select("publication", "instance")
+        .drop_nulls()
+        .join(flow.publications.select("publication", "sent", writer="instance"), on="publication")
+        .join(instances, on="instance")
+        .join(
+            instances.select(writer="instance", freed="end", writer_core="core"),
+            on="writer",
+            how="left",
+        )
+        .sort("start")
+        .join_asof(
+            chosen.select("tid", chosen="time").sort("chosen"),
+            left_on="start",
+            right_on="chosen",
+            by="tid",
+            check_sortedness=False,
+        )
+        .join_asof(
+            instances.select("tid", before="end").drop_nulls().sort("before"),
+            left_on="start",
+            right_on="before",
+            by="tid",
+            check_sortedness=False,
+        )
+    )
+    same_core = pl.col("core") == pl.col("writer_core")
+    there = pl.max_horizontal(
+        pl.col("sent") + DELIVERY_NS, pl.when(same_core).then("freed").otherwise("sent")
+    )
+    read = read.filter(~pl.Series(_stalled(flow, read["sent"], read["start"])))
+    waited = read.filter(pl.col("before").fill_null(0) <= pl.col("sent")).with_columns(there=there)
+    if not waited.height:
+        raise InputError(
+            f"{recording.path}: no executor waited for a message in it, so nothing says what "
+            "waking up costs: record an application whose callbacks are connected by topics"
+        )
+    last = flow.publications.group_by("instance").agg(pl.col("sent").max(), pl.len())
+    published = instances.join(last.drop_nulls(), on="instance").drop_nulls("end")
+    published = published.filter(~pl.Series(_stalled(flow, published["sent"], published["end"])))
+    return SimulationDescription(
+        wake_up=_ordinary(waited["chosen"] - waited["there"]),
+        take=_ordinary(read["start"] - read["chosen"]),
+        publish=_ordinary((published["end"] - published["sent"]) // published["len"]),
+        delivery=ExecutionTime(constant_ns=DELIVERY_NS),
+        interrupts=_share_taken(recording, flow),
+    )
+
+
+def _stalled(flow: DataFlow, start: pl.Series, end: pl.Series) -> npt.NDArray[np.bool_]:
+    """Which of some windows a stall of the machine hit: they say nothing about its costs."""
+    return stalled_after(flow, start.to_numpy(), end.to_numpy())
+
+
+def _share_taken(recording: Recording, flow: DataFlow) -> float:
+    """For which share of its response times the most urgent executors did not run (median)."""
+    executors = [thread for thread in recording.info.threads if thread.role == "executor"]
+    highest = max((thread.priority for thread in executors), default=0)
+    urgent = [thread.tid for thread in executors if thread.priority == highest]
+    lasted = pl.col("end") - pl.col("start")
+    computed = flow.instances.filter(
+        pl.col("tid").is_in(urgent) & (pl.col("execution_ns") > COMPUTES_NS)
+    ).select(share=1 - pl.col("execution_ns") / lasted)
+    median = computed["share"].median()
+    return min(0.5, max(0.0, float(median))) if isinstance(median, float) else 0.0
+
+
+def _ordinary(costs: pl.Series) -> ExecutionTime:
+    """What costs took, but for those that took so long that they waited for something else."""
+    median = costs.median()
+    return _samples(costs.filter(costs <= FAR * median) if isinstance(median, float) else costs)
+
+
+def _computing_times(flow: DataFlow) -> Mapping[tuple[str, str | int], pl.Series]:
+    """CPU times up to the first publication, by node and topic or period, in order of start."""
+    published = flow.publications.group_by("instance").agg(first=pl.col("time").min())
+    frame = (
+        flow.instances.join(published, on="instance", how="left", maintain_order="left")
+        .join(
+            flow.objects.callbacks.select("callback_id", "node", "topic", "period_ns").unique(
+                "callback_id"
+            ),
+            on="callback_id",
+        )
+        .with_columns(
+            used=pl.col("execution_ns")
+            - pl.when(pl.col("first").is_not_null())
+            .then(pl.col("end") - pl.col("first"))
+            .otherwise(0)
+        )
+        .drop_nulls("used")
+        .sort("start")
+    )
+    found: dict[tuple[str, str | int], pl.Series] = {}
+    for (node, topic, period), group in frame.group_by("node", "topic", "period_ns"):
+        found[str(node), int(period) if period is not None else str(topic)] = group["used"]
+    return found
+
+
+def _sampled(
+    recording: Recording,
+    times: Mapping[tuple[str, str | int], pl.Series],
+    node: str,
+    callback: CallbackDescription,
+    block: int,
+) -> CallbackDescription:
+    trigger = callback.timer_ns or callback.subscription or callback.synchronises[-1]
+    if (node, trigger) not in times:
+        raise InputError(
+            f"{recording.path} has no CPU times of {node}'s callback"
+            f" {callback.subscription or callback.synchronises or 'of its timer'}: record the"
+            " application that is described, with its threads' CPU times or sched_switch"
+        )
+    samples = _samples(times[node, trigger]).model_copy(update={"block": block})
+    return callback.model_copy(update={"execution": samples})
+
+
+def _samples(values: pl.Series) -> ExecutionTime:
+    return ExecutionTime(samples_ns=tuple(values.drop_nulls().clip(0).head(MOST).to_list()))

@@ -1,0 +1,208 @@
+"""Simulate an application, with or without a plan in force."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import polars as pl
+
+from chainshaper.durations import format_duration
+from chainshaper.errors import InputError, OperationError
+from chainshaper.planning.plan import Plan
+from chainshaper.planning.publisher_threads import publisher_servers
+from chainshaper.recording import (
+    Recording,
+    RecordingInfo,
+    ThreadInfo,
+    refuse_existing,
+    write_recording,
+)
+from chainshaper.simulation import layout as at
+from chainshaper.simulation.arrays import Timing, build_machine
+from chainshaper.simulation.engine import run
+from chainshaper.simulation.layout import Int64s, Machine
+from chainshaper.simulation.streams import Streams
+from chainshaper.simulation.system import System, build_system
+from chainshaper.simulation.tables import Names, created_objects, event_frames, name_objects
+from chainshaper.splicing.application import splice_application
+from chainshaper.workload.description import Application, application_as_written
+from chainshaper.workload.live import WARM_UP_CYCLES, origin_timer
+
+__all__ = ["simulate", "simulate_latencies"]
+
+START_NS = 1_000_000_000
+
+Progress = Callable[[float, str], None]
+
+
+def simulate(
+    application: Application,
+    output: str | Path,
+    plan: Plan | None = None,
+    *,
+    cycles: int = 320,
+    seed: int | None = None,
+    switches: bool = False,
+    command: Sequence[str] = (),
+    progress: Progress | None = None,
+) -> Recording:
+    """Simulate ``cycles`` periods of an application's chain and record its events.
+
+    ``plan`` is in force as `chainshaper apply` has it: its servers run their threads in their
+    slots, its shaping node is spliced in and holds the output. ``seed`` replaces the
+    description's. With ``switches`` the recording has `sched_switch` as well. Memory does not
+    grow with ``cycles``. As in a live run, a few cycles before the recorded ones are left out.
+
+    Raises:
+        InputError: ``output`` exists, the plan does not fit the application, or its chain has no
+            timer to count cycles by.
+        OperationError: messages pile up without end, or the recording cannot be written.
+    """
+    output = refuse_existing(output)
+    simulation = _prepare(application, plan, cycles, seed, events=True, switches=switches)
+    info = RecordingInfo(
+        source="simulated",
+        host="simulation",  # thread ids say nothing about any real machine
+        kernel="none",
+        clock_offset_ns=0,
+        command=tuple(command),
+        processes={p.pid: p.node for p in simulation.system.processes},
+        threads=_thread_infos(simulation.system, simulation.names),
+        realtime=True,
+        notes=(f"simulated; the first {WARM_UP_CYCLES} cycles were not recorded",),
+        chain=application.chain,
+        application=application_as_written(simulation.system.application),
+        plan=None if plan is None else plan.model_dump(mode="json"),
+    )
+    return write_recording(output, _run(simulation, progress), info)
+
+
+def simulate_latencies(
+    application: Application,
+    plan: Plan | None = None,
+    *,
+    cycles: int = 320,
+    seed: int | None = None,
+) -> Int64s:
+    """The end-to-end latencies of an application's chain, by simulation (ns, one per cycle).
+
+    What :func:`simulate` and the latency analysis of its recording give, without any event being
+    written. −1 stands for an instance that did not complete: its message was discarded, lost, or
+    merged with another's.
+
+    Raises: as :func:`simulate`.
+    """
+    simulation = _prepare(application, plan, cycles, seed, events=False, switches=False)
+    for _ in _run(simulation):
+        pass
+    return simulation.machine.latencies
+
+
+@dataclass(frozen=True)
+class _Simulation:
+    """A system with its machine, ready to run."""
+
+    system: System
+    machine: Machine
+    streams: Streams
+    names: Names
+
+
+def _run(
+    simulation: _Simulation, progress: Progress | None = None
+) -> Iterator[dict[str, pl.DataFrame]]:
+    """Run to the end; the event tables part by part as they fill up, objects first."""
+    machine, control = simulation.machine, simulation.machine.memory
+    yield created_objects(simulation.names)
+    while (reason := run(machine.memory)) != at.OVER:
+        if reason == at.MESSAGES_FULL:
+            raise OperationError(
+                "messages pile up without end: an executor or a publisher thread that never gets"
+                " to run, or a delivery that takes far longer than a period; correct the"
+                " description, or the plan's slots"
+            )
+        simulation.streams.fill(machine)
+        if reason == at.LOG_FULL:
+            yield _flush(simulation)
+        if progress is not None:
+            done = (control[at.X_NOW] - START_NS) / (control[at.X_STOP] - START_NS)
+            progress(float(done), "simulating")
+    if control[at.X_LOGGING]:
+        yield _flush(simulation)
+
+
+def _flush(simulation: _Simulation) -> dict[str, pl.DataFrame]:
+    frames = event_frames(simulation.system, simulation.names, simulation.machine)
+    simulation.machine.counts[:, at.A_COUNT] = 0
+    return frames
+
+
+def _prepare(
+    application: Application,
+    plan: Plan | None,
+    cycles: int,
+    seed: int | None,
+    *,
+    events: bool,
+    switches: bool,
+) -> _Simulation:
+    if cycles < 1:
+        raise InputError(f"{cycles} cycles cannot be simulated: ask for at least 1")
+    if seed is not None:
+        application = application.model_copy(update={"seed": seed})
+    timer = origin_timer(application)
+    period = timer.timer_ns or 0
+    if plan is not None:
+        if plan.chain.period_ns != period:
+            raise InputError(
+                f"the plan is for a chain with the period {format_duration(plan.chain.period_ns)},"
+                f" but {application.chain} of {application.name!r} has {format_duration(period)}:"
+                " plan again from a recording of this application"
+            )
+        application = _with_plan(application, plan)
+    system = build_system(application, follow_chain=not events)
+    first = START_NS + timer.phase_ns + WARM_UP_CYCLES * period
+    end = first + cycles * period
+    apart = min(1_000_000, period // 10)
+    timing = Timing(
+        start_ns=START_NS,
+        anchor_ns=START_NS + timer.phase_ns,
+        record_from_ns=first - apart,
+        last_timer_ns=end - apart,
+        stop_ns=end + max(2 * period, 200_000_000),
+    )
+    streams = Streams(application.seed)
+    machine, cores = build_machine(
+        system,
+        plan,
+        timing,
+        streams,
+        events=events,
+        switches=switches,
+        latencies=0 if events else cycles,
+        warm_up=WARM_UP_CYCLES,
+    )
+    return _Simulation(system, machine, streams, name_objects(system, machine, cores))
+
+
+def _with_plan(application: Application, plan: Plan) -> Application:
+    """With what the plan adds to the application itself; baselines have servers only."""
+    if plan.shaping_node is None and not any(publisher_servers(plan)):
+        return application
+    return splice_application(application, plan)
+
+
+def _thread_infos(system: System, names: Names) -> tuple[ThreadInfo, ...]:
+    return tuple(
+        ThreadInfo(
+            tid=thread.tid,
+            pid=system.processes[thread.process].pid,
+            comm=comm,
+            node=system.processes[thread.process].node,
+            role=thread.role,
+            policy="SCHED_FIFO",
+            priority=thread.priority,
+            cores=(int(core),),
+        )
+        for thread, comm, core in zip(system.threads, names.comms, names.cpus, strict=True)
+    )

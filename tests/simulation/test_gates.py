@@ -1,0 +1,185 @@
+"""The gate: its decisions against the live one's, and what it does to messages and time."""
+
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from schedules import application, simulated
+
+from chainshaper import events
+from chainshaper.enforcement.gate import Gate, Modes, missed, release_of
+from chainshaper.simulation import layout as at
+from chainshaper.simulation.gate_kernel import decide, missed_slot, switch_mode
+from chainshaper.workload.event_log import WORDS
+
+BEGIN = 1_500_000_000
+NAMES = ("city", "highway", "parking")
+PLACE = 100  # of the gate's row in an array that holds nothing else
+
+
+@st.composite
+def gates(draw: st.DrawFn) -> Gate:
+    cycle = draw(st.integers(10, 200))
+    edges = sorted(draw(st.sets(st.integers(0, cycle), min_size=2, max_size=8)))
+    edges = edges[: len(edges) // 2 * 2]
+    slots = tuple(zip(edges[::2], edges[1::2], strict=True))
+    modes = None
+    if draw(st.booleans()):
+        known = draw(st.lists(st.sampled_from(NAMES), min_size=1, unique=True))
+        bands = {name: draw(st.integers(0, len(slots) - 1)) for name in known}
+        late = draw(st.sampled_from(("wait", "discard", "publish", "next-slot")))
+        modes = Modes(bands, draw(st.sampled_from(known)), late)
+    return Gate(
+        slots=slots,
+        cycle_ns=cycle,
+        anchor=draw(st.sampled_from(("stamp", "cycle"))),
+        phase_ns=draw(st.integers(0, 300)),
+        max_future_ns=1_000_000,
+        overrun=draw(st.sampled_from(("wait", "discard", "publish"))),
+        due_cycles=draw(st.integers(0, 2)),
+        modes=modes,
+    )
+
+
+def as_array(gate: Gate) -> at.Int64s:
+    """The gate as the engine has it."""
+    memory = np.full(1000, at.NONE, dtype=np.int64)
+    slots, bands, changes = 200, 300, 400
+    row = memory[PLACE:]
+    row[at.G_SLOTS], row[at.G_SLOTS_END] = slots, slots + 2 * len(gate.slots)
+    memory[slots : slots + 2 * len(gate.slots)] = np.array(gate.slots).ravel()
+    row[at.G_CYCLE], row[at.G_PHASE] = gate.cycle_ns, gate.phase_ns
+    row[at.G_STAMPED] = gate.anchor == "stamp"
+    row[at.G_OVERRUN] = WORDS["overrun"].index(gate.overrun)
+    row[at.G_DUE], row[at.G_CHANGED], row[at.G_CHANGES] = gate.due_cycles, 0, changes
+    if gate.modes is not None:
+        row[at.G_LATE] = WORDS["overrun"].index(gate.modes.late)
+        row[at.G_DEFAULT], row[at.G_BANDS] = NAMES.index(gate.modes.default), bands
+        memory[bands : bands + 3] = [gate.modes.bands.get(name, at.NONE) for name in NAMES]
+    return memory
+
+
+def word(number: int, words: tuple[str, ...]) -> str | None:
+    return None if number == at.NONE else words[number]
+
+
+@given(
+    gate=gates(),
+    arrival=st.integers(3_000, 6_000),
+    age=st.integers(-50, 2_500),
+    announced=st.lists(st.tuples(st.integers(2_000, 6_000), st.sampled_from(NAMES)), max_size=4),
+    late_by=st.integers(0, 400),
+)
+def test_the_compiled_gate_decides_as_the_live_one(
+    gate: Gate, arrival: int, age: int, announced: list[tuple[int, str]], late_by: int
+) -> None:
+    memory = as_array(gate)
+    changes: list[tuple[int, str]] = []
+    current = None if gate.modes is None else gate.modes.default
+    for time, name in sorted(announced, key=lambda change: change[0]):
+        if gate.modes is None:
+            continue
+        memory[at.X_NOW] = time
+        switch_mode(memory, PLACE, NAMES.index(name))
+        if name in gate.modes.bands and name != current:
+            changes.append((time, name))
+            current = name
+    expected = release_of(gate, arrival, arrival - age, changes)
+    decide(memory, PLACE, arrival, arrival - age)
+    row = memory[PLACE:]
+    at_ns = None if row[at.G_AT] == at.NONE else int(row[at.G_AT])
+    slot = None if row[at.G_SLOT] == at.NONE else int(row[at.G_SLOT])
+    found = (at_ns, int(row[at.G_ORIGIN]), slot, int(row[at.G_CYCLES]))
+    assert found == (expected.at_ns, expected.origin_ns, expected.slot, expected.cycles_waited)
+    assert word(1 - row[at.G_BY_STAMP], WORDS["anchor"]) == expected.anchor
+    assert word(row[at.G_TREATED], WORDS["overrun"]) == expected.overrun
+    assert word(row[at.G_MODE], NAMES) == expected.mode
+    memory[at.X_NOW] = arrival + late_by
+    policy = gate.overrun
+    if gate.modes is not None and gate.modes.late != "next-slot":
+        policy = gate.modes.late
+    over = policy == "discard" and missed(gate, expected, arrival + late_by)
+    assert missed_slot(memory, PLACE) == over
+
+
+CHAIN = """
+chain: /in../out
+nodes:
+  source:
+    callbacks:
+      - {timer: 100ms, execution: {constant: EXECUTION}, publishes: [/in]}
+  shaper:
+    core: 2
+    callbacks:
+      - subscription: /in
+        publishes: [/out]
+        gate: {slots: [[30ms, 40ms]], cycle: 100ms, overrun: POLICY, spin: 1ms, pause: 2ms}
+"""
+
+
+@pytest.mark.parametrize(
+    ("execution", "policy", "published"),
+    [
+        ("10ms", "wait", 30),  # early: held
+        ("35ms", "wait", 35),  # in its slot: at once
+        ("50ms", "wait", 30),  # late: that of the cycle before comes in this one
+        ("50ms", "publish", 50),
+        ("50ms", "discard", None),
+    ],
+)
+def test_a_gate_holds_messages_until_their_slot_and_treats_overruns(
+    tmp_path: Path, execution: str, policy: str, published: float | None
+) -> None:
+    text = CHAIN.replace("EXECUTION", execution).replace("POLICY", policy)
+    recording = simulated(tmp_path, application(text))
+    table = recording.events["rmw_publish"]
+    gates_own = recording.events["gate_release"]
+    out = table.filter(pl.col("pid") == gates_own["pid"][0])["time"]
+    found = [(time - BEGIN) / 1e6 for time in out if time < BEGIN + 100_000_000]
+    assert found == ([] if published is None else [published])
+    assert (gates_own["release"].null_count() > 0) == (published is None)
+
+
+def test_a_gate_watches_the_clock_before_its_slot_and_pauses_behind_it(tmp_path: Path) -> None:
+    text = CHAIN.replace("EXECUTION", "10ms").replace("POLICY", "wait")
+    costs = {"wake_up": {"constant": "500us"}, "publish": {"constant": "100us"}}
+    recording = simulated(tmp_path, application(text, **costs))
+    release = recording.events["gate_release"].row(0, named=True)
+    assert release["time"] == release["release"]  # it woke 0.5 ms before, and watched
+    (end,) = (
+        recording.events["callback_end"].filter(pl.col("pid") == release["pid"])["time"].to_list()
+    )
+    # Published at 30 (after the origin), pause until 32.1, awake again half a millisecond later.
+    assert (end - release["origin"]) / 1e6 == pytest.approx(30 + 0.1 + 2 + 0.5)
+
+
+def test_modes_that_are_announced_choose_the_slot(tmp_path: Path) -> None:
+    described = application(
+        """
+        chain: /in../out
+        nodes:
+          source: {callbacks: [{timer: 100ms, execution: {constant: 5ms}, publishes: [/in]}]}
+          driver:
+            callbacks:
+              - {timer: 100ms, phase: 60ms, publishes: [/mode], announces: [fast, slow, unknown]}
+          shaper:
+            core: 2
+            callbacks:
+              - subscription: /in
+                publishes: [/out]
+                gate:
+                  slots: [[10ms, 20ms], [30ms, 40ms]]
+                  cycle: 100ms
+                  modes: {topic: /mode, bands: {fast: 0, slow: 1}, default: slow}
+        """
+    )
+    recording = simulated(tmp_path, described, cycles=4)
+    releases = recording.events["gate_release"]
+    # Announced 60 ms into each cycle: fast, slow, unknown, fast, slow | unknown, fast, slow, …
+    assert releases["mode"].to_list() == ["slow", "slow", "fast", "slow"]
+    held = ((releases["time"] - releases["origin"]) / 1e6).to_list()
+    assert held == [30, 30, 10, 30]
+    assert events.table(recording.events, "gate_release")["overrun"].null_count() == 4

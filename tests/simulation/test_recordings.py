@@ -1,0 +1,185 @@
+"""Simulated recordings: like live ones, readable by everything downstream, whole or absent."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import called, refused
+from schedules import application, simulated
+from small_chain import small_chain
+
+from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
+from chainshaper.errors import InputError, OperationError
+from chainshaper.planning import Plan
+from chainshaper.recording import Recording, open_recording
+from chainshaper.simulation import arrays, simulate, simulate_latencies
+from chainshaper.simulation.samples import measured_costs, with_recorded_times
+from chainshaper.steps import measure_latency, plan_recording
+from chainshaper.workload.description import Application, load_application
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+@pytest.fixture
+def chain() -> Application:
+    return load_application(EXAMPLES / "synthetic_chain.yaml")
+
+
+def test_tables_and_columns_are_those_of_a_live_recording(
+    tmp_path: Path, unshaped: Recording, shaped: Recording, plan: Plan
+) -> None:
+    ours = simulate(small_chain(tmp_path), tmp_path / "ours", plan, cycles=12)
+    for theirs in (unshaped, shaped):
+        for name in theirs.events:
+            if name == "machine_stall":  # the simulated machine has none
+                continue
+            assert ours.events[name].schema == theirs.events[name].schema, name
+    assert ours.events.keys() <= {*shaped.events, "machine_stall"}
+
+
+def test_the_same_seed_draws_the_execution_times_of_the_live_workload(
+    tmp_path: Path, unshaped: Recording
+) -> None:
+    """A live callback used what was drawn for it, and a little for publishing; never less."""
+    described = small_chain(tmp_path)
+    costs = {name: {"constant_ns": 0} for name in ("wake_up", "take", "publish", "delivery")}
+    free = described.simulation.model_validate({**costs, "interrupts": 0.0})
+    ours = simulate(described.model_copy(update={"simulation": free}), tmp_path / "ours", cycles=12)
+    chains = [analyse_latency(recording, "/t1../t3") for recording in (ours, unshaped)]
+    drawn, used = (
+        _execution_times(analysis, recording)
+        for analysis, recording in zip(chains, (ours, unshaped), strict=True)
+    )
+    assert len(drawn) == len(used) == 12 * 3
+    assert (used >= drawn).all()
+    assert np.corrcoef(drawn, used)[0, 1] > 0.8
+
+
+def _execution_times(
+    analysis: LatencyAnalysis, recording: Recording
+) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    """CPU times in the chain's instances, by traversal and hop."""
+    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    times = analysis.hops.select("traversal", "hop", "instance").join(
+        flow.instances.select("instance", "execution_ns"), on="instance"
+    )
+    return times.sort("traversal", "hop")["execution_ns"].to_numpy()
+
+
+def test_verbs_take_it_like_a_live_one(tmp_path: Path, chain: Application) -> None:
+    before = simulate(chain, tmp_path / "before", cycles=300)
+    planned = plan_recording(before)
+    after = simulate(chain, tmp_path / "after", planned, cycles=300, seed=7)
+    unshaped, shaped = (
+        measure_latency(recording).analysis.statistics for recording in (before, after)
+    )
+    assert unshaped.count == shaped.count == 300
+    assert (unshaped.jitter_ns or 0) > 100 * (shaped.jitter_ns or 0)
+    assert shaped.max_ns == pytest.approx(planned.predicted.max_ns, abs=2_000_000)
+    assert after.info.source == "simulated"
+    assert after.info.plan is not None
+
+
+@pytest.mark.parametrize("name", ["synthetic_chain", "asynchronous_chain"])
+@pytest.mark.parametrize("planned", [False, True])
+def test_latencies_only_are_those_that_the_analysis_finds(
+    tmp_path: Path, name: str, planned: bool
+) -> None:
+    described = load_application(EXAMPLES / f"{name}.yaml")
+    plan = None
+    if planned:
+        plan = plan_recording(simulate(described, tmp_path / "profile", cycles=200))
+    recording = simulate(described, tmp_path / "recording", plan, cycles=500)
+    analysis = analyse_latency(recording, described.chain)
+    found = analysis.traversals.sort("start")["latency_ns"].fill_null(-1).to_list()
+    assert simulate_latencies(described, plan, cycles=500).tolist() == found
+
+
+def test_a_long_simulation_is_written_in_parts_that_read_as_one(
+    tmp_path: Path, chain: Application, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = simulate(chain, tmp_path / "whole", cycles=2000)
+    monkeypatch.setattr(arrays, "LOG_ENTRIES", 4096)
+    parts = simulate(chain, tmp_path / "parts", cycles=2000)
+    assert len(list((parts.path / "rmw_take.parquet").iterdir())) > 3
+    assert parts.events.keys() == whole.events.keys()
+    assert all(parts.events[name].equals(whole.events[name]) for name in whole.events)
+
+
+def test_recorded_execution_times_are_drawn_in_stretches_of_the_same_cycles(
+    tmp_path: Path, chain: Application
+) -> None:
+    profile = simulate(chain, tmp_path / "profile", cycles=200)
+    resampled = with_recorded_times(chain, profile, block=50)
+    one, two = (resampled.nodes[name].callbacks[0].execution for name in ("node1", "node2"))
+    assert one.samples_ns is not None
+    assert len(one.samples_ns) == 200
+    assert one.block == two.block == 50
+    latencies = simulate_latencies(resampled, cycles=2000)
+    original = simulate_latencies(chain, cycles=200)
+    # Stretches of the same cycles for all callbacks: whole latencies of the profile come again.
+    # (Interrupts, which are part of what was recorded, come on top once more: 1.5 per cent.)
+    nearest = np.abs(latencies[:, None] / 1.015 - original[None, :]).min(axis=1)
+    independent = np.abs(
+        simulate_latencies(with_recorded_times(chain, profile), cycles=2000)[:, None] / 1.015
+        - original[None, :]
+    ).min(axis=1)
+    assert np.median(nearest) <= np.median(independent)
+
+
+def test_costs_are_found_again_in_a_recording(tmp_path: Path, chain: Application) -> None:
+    costs = measured_costs(simulate(chain, tmp_path / "profile", cycles=50))
+    assert set(costs.wake_up.samples_ns or ()) == {100_000}
+    assert set(costs.take.samples_ns or ()) == {40_000}
+    assert set(costs.publish.samples_ns or ()) == {80_000}
+
+
+def test_a_recording_without_the_applications_callbacks_is_no_source_of_times(
+    tmp_path: Path, chain: Application, unshaped: Recording
+) -> None:
+    with pytest.raises(InputError, match="has no CPU times of /node1's callback"):
+        with_recorded_times(chain, unshaped)
+
+
+def test_what_piles_up_without_end_is_reported(tmp_path: Path) -> None:
+    described = application(
+        """
+        chain: source
+        nodes:
+          source: {core: 2, callbacks: [{timer: 1ms, publishes: [/a]}]}
+          node: {callbacks: [{subscription: /a}]}
+        """,
+        delivery={"constant": "10s"},
+    )
+    with pytest.raises(OperationError, match="messages pile up without end"):
+        simulated(tmp_path, described, cycles=20_000)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_simulate_writes_a_recording_that_latency_reads(tmp_path: Path) -> None:
+    recording = tmp_path / "recording"
+    called("simulate", EXAMPLES / "synthetic_chain.yaml", "-o", recording, "--cycles", "50")
+    printed = called("latency", recording, "--json")
+    assert json.loads(printed.out)["count"] == 50
+    assert open_recording(recording).info.source == "simulated"
+    assert "exists already" in refused(
+        2, "simulate", EXAMPLES / "synthetic_chain.yaml", "-o", recording
+    )
+
+
+def test_a_synchronised_chain_is_followed_to_its_end(tmp_path: Path) -> None:
+    described = application(
+        """
+        chain: /front../fused
+        nodes:
+          front: {core: 2, callbacks: [{timer: 100ms, publishes: [/front]}]}
+          rear: {core: 3, callbacks: [{timer: 100ms, phase: 7ms, publishes: [/rear]}]}
+          fusion:
+            callbacks:
+              - {synchronises: [/front, /rear], execution: {constant: 2ms}, publishes: [/fused]}
+        """
+    )
+    assert set(simulate_latencies(described, cycles=20)) == {9_000_000}
+    analysis = analyse_latency(simulated(tmp_path, described, cycles=20), "/front../fused")
+    assert set(analysis.traversals["latency_ns"].drop_nulls()) == {9_000_000}

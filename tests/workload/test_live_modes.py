@@ -1,0 +1,108 @@
+"""Modes in a real run: a node announces them, and the shaping node changes its slot."""
+
+from pathlib import Path
+
+import polars as pl
+import pytest
+from small_chain import EXECUTOR_CORE, small_chain_text
+
+from chainshaper import measure_latency, shape_application
+from chainshaper.errors import InputError
+from chainshaper.planning import Modes, Plan
+from chainshaper.planning.plan import revised
+from chainshaper.recording import Recording
+from chainshaper.splicing.application import splice_application
+from chainshaper.workload.description import Application, load_application
+
+MS = 1_000_000
+SLOTS = ((20 * MS, 21 * MS), (35 * MS, 36 * MS))
+BANDS = {"city": 2, "highway": 1}
+ANNOUNCED = ("highway", "city")
+# The driver's timer expires in the middle of a cycle, once in three.
+DRIVER = f"""\
+  driver:
+    core: {EXECUTOR_CORE}
+    callbacks:
+      - {{timer: 150ms, phase: 25ms, announces: [{", ".join(ANNOUNCED)}], publishes: [/mode]}}
+topics:
+"""
+
+
+def with_driver(folder: Path, driver: str = DRIVER) -> Application:
+    path = folder / "with_driver.yaml"
+    path.write_text(small_chain_text().replace("topics:\n", driver))
+    return load_application(path)
+
+
+def with_modes(plan: Plan) -> Plan:
+    """The plan of the small chain, with a second slot before its own."""
+    servers = tuple(
+        server.model_copy(update={"slots": SLOTS}) if server.name == "output" else server
+        for server in plan.servers
+    )
+    return revised(plan, servers=servers, modes=Modes(topic="/mode", default="city", bands=BANDS))
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> Recording:
+    folder = tmp_path_factory.mktemp("modes")
+    return shape_application(with_driver(folder), with_modes(plan), folder / "rec", cycles=24)
+
+
+def test_each_output_leaves_in_the_slot_of_its_mode(recording: Recording) -> None:
+    releases = recording.events["gate_release"].filter(pl.col("overrun").is_null())
+    assert set(releases["mode"]) == set(BANDS)
+    for mode, band in BANDS.items():
+        own = releases.filter(pl.col("mode") == mode)
+        assert set(own["slot"]) == {band - 1}
+        since_start = own["release"] - own["origin"]
+        start, end = SLOTS[band - 1]
+        assert since_start.is_between(start, end - 1).all()
+    measured = measure_latency(recording)
+    assert measured.analysis.chain.topics == ("/t1", "/t2", "/t3_tmp", "/t3")
+    assert measured.analysis.statistics.incomplete == 0
+
+
+def test_a_change_is_in_force_from_the_next_cycle_on(recording: Recording) -> None:
+    listening = recording.events["rcl_subscription_init"].filter(pl.col("topic_name") == "/mode")
+    taken = recording.events["rmw_take"].join(
+        listening.select("pid", rmw_subscription_handle="rmw_subscription_handle"),
+        on=["pid", "rmw_subscription_handle"],
+        how="semi",
+    )
+    modes = {"highway": 0, "city": 1}
+    heard = taken["time"].to_list()
+    releases = recording.events["gate_release"]
+    in_force = [modes[mode] for mode in releases["mode"]]
+    changes = [i for i in range(1, len(in_force)) if in_force[i] != in_force[i - 1]]
+    assert len(changes) >= len(heard) - 2 > 2, "each announcement is another mode"
+    for change in changes:
+        before, after = (releases["origin"][i] for i in (change - 1, change))
+        # It was heard after the last cycle of the old mode began, and before the new one's did.
+        assert any(before - MS <= time <= after + MS for time in heard)
+
+
+def test_modes_that_nobody_announces_are_refused(tmp_path: Path, plan: Plan) -> None:
+    silent = with_driver(tmp_path, DRIVER.replace(f"announces: [{', '.join(ANNOUNCED)}], ", ""))
+    with pytest.raises(InputError, match=r"named on /mode, but no callback .*`announces`"):
+        splice_application(silent, with_modes(plan))
+
+
+@pytest.mark.parametrize(
+    ("gate", "reason"),
+    [
+        ("bands: {city: 1}, default: sea", r"gate\.modes: the default mode 'sea' has no band"),
+        ("bands: {city: 5}, default: city", r"gate\.modes: mode 'city' has the band 5"),
+        ("bands: {city: 0}, default: city", r"gate\.modes\.topic: no callback `announces`"),
+    ],
+)
+def test_a_described_gate_has_modes_that_exist(tmp_path: Path, gate: str, reason: str) -> None:
+    gated = f"""\
+  shaper:
+    callbacks:
+      - subscription: /t3
+        publishes: [/shaped]
+        gate: {{slots: [[20ms, 21ms]], cycle: 50ms, modes: {{topic: /other, {gate}}}}}
+"""
+    with pytest.raises(InputError, match=reason):
+        with_driver(tmp_path, gated + DRIVER)
