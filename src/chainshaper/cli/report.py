@@ -1,0 +1,75 @@
+"""`chainshaper report`: everything about a chain in one HTML page."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from chainshaper.cli.options import ChainOption
+
+__all__ = ["report"]
+
+
+def report(
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="REC...", help="Recordings' or LTTng traces' folders.", show_default=False
+        ),
+    ],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE.html",
+            help="File to write; must not exist.",
+            show_default=False,
+        ),
+    ],
+    chain: ChainOption = None,
+    plan: Annotated[
+        Path | None,
+        typer.Option(
+            "--plan",
+            metavar="plan.yaml",
+            help="The plan that the last recording was made with, where it does not say so.",
+            show_default=False,
+        ),
+    ] = None,
+    cycles: Annotated[
+        list[int] | None,
+        typer.Option(
+            "--cycle",
+            metavar="N",
+            min=0,
+            help="A cycle that the timeline has to show, where there are too many to show all. "
+            "May be given several times.",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Write one self-contained HTML page about a chain, usually before and after shaping.
+
+    It has the figures, latency over time, histogram and distribution, the hops, the callbacks, a
+    timeline of single cycles, overruns, stalls, the plan, and how all of it was recorded. The page
+    needs no network.
+    """
+    from chainshaper.cli.output import late_progress, show_line
+    from chainshaper.planning import load_plan
+    from chainshaper.reporting.html.page import ENDINGS, write_report
+    from chainshaper.reporting.whole_file import new_file
+    from chainshaper.sources import open_source
+    from chainshaper.steps import measure_latency
+
+    new_file(output, ENDINGS)
+    in_force = None if plan is None else load_plan(plan)
+    measurements = []
+    with late_progress("report") as progress:
+        for number, path in enumerate(recordings, start=1):
+            progress((number - 1) / (len(recordings) + 1), f"analysing {path}")
+            used = in_force if number == len(recordings) else None
+            measurements.append(measure_latency(open_source(path), chain, used))
+        progress(len(recordings) / (len(recordings) + 1), "drawing")
+        written = write_report(measurements, output, cycles or ())
+    show_line(str(written.absolute()))

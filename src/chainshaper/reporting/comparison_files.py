@@ -1,0 +1,26 @@
+"""A comparison as files beside its recordings: the figures as JSON, and drawn."""
+
+import json
+from pathlib import Path
+
+from chainshaper.errors import OperationError
+from chainshaper.reporting.figures import draw_comparison
+from chainshaper.reporting.tables import comparison_json
+from chainshaper.steps import Comparison
+
+__all__ = ["write_comparison"]
+
+
+def write_comparison(comparison: Comparison, folder: Path) -> None:
+    """Write `comparison.json`, `latency.png` and `distribution.png` into a folder.
+
+    Raises:
+        OperationError: they cannot be written.
+    """
+    draw_comparison(comparison.measurements, folder)
+    text = json.dumps(comparison_json(comparison), indent=2) + "\n"
+    path = folder / "comparison.json"
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise OperationError(f"{path}: cannot be written: {error}") from error

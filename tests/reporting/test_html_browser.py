@@ -1,0 +1,191 @@
+"""The page in a headless Chromium: it draws without complaint, loads nothing, and can be used.
+
+No assertion depends on how fast the browser is. Where there is none, these tests are skipped.
+"""
+
+import io
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chromium import Page, opened
+from matplotlib import image
+from told_run import LATENCY_NS, told_run
+
+from chainshaper import measure_latency, write_report
+from chainshaper.durations import milliseconds
+
+CHARTS = ("over-time", "histogram", "cdf", "breakdown", "timeline", "slots-0")
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run before shaping, told without its plan, and one after it with all that can happen."""
+    folder = tmp_path_factory.mktemp("report")
+    before = told_run(folder / "before", 8, plan=None)
+    evil = "/<script>alert('x')</script>"
+    after = told_run(folder / "after", 8, first=evil, untaken=(6,), overran=(5,))
+    return write_report([measure_latency(before), measure_latency(after)], folder / "report.html")
+
+
+@pytest.fixture(scope="module")
+def page(report: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with opened(report, tmp_path_factory.mktemp("profile")) as page:
+        page.wait_for("document.documentElement.dataset.drawn === 'yes'")
+        yield page
+
+
+@pytest.fixture(autouse=True)
+def silence(page: Page) -> Iterator[None]:
+    """After every test: nothing was complained about, and nothing but the page asked for."""
+    yield
+    page.run("scrollTo(0, 0)")
+    assert page.complaints == []
+    assert len(page.requests) == 1, page.requests
+
+
+def _open(page: Page, recording: int, cycle: int) -> str:
+    """Choose a recording and a cycle with the page's controls; what is said about it."""
+    page.run(
+        "for (const [control, key, value] of"
+        f" [['select', 'selectedIndex', {recording}], ['input', 'value', {cycle}]]) {{"
+        " const one = document.querySelector(`#timeline ${control}`); one[key] = value;"
+        " one.dispatchEvent(new Event('change')); }"
+    )
+    return str(page.run("document.querySelector('#timeline .about').innerText"))
+
+
+def _middle(page: Page, selector: str) -> tuple[float, float]:
+    """The middle of an element on the screen, after scrolling there."""
+    found = page.run(
+        f"(() => {{ const one = document.querySelector('{selector}');"
+        " one.scrollIntoView({block: 'center'}); const box = one.getBoundingClientRect();"
+        " return [box.x + box.width / 2, box.y + box.height / 2]; })()"
+    )
+    return found[0], found[1]
+
+
+@pytest.mark.parametrize("chart", CHARTS)
+def test_every_chart_is_drawn(page: Page, chart: str) -> None:
+    assert page.run(f"document.querySelectorAll('#{chart} svg').length") == 1
+    assert page.run(f"document.querySelectorAll('#{chart} svg :is(rect, path)').length") > 2
+    assert page.run(f"document.querySelector('#{chart} .waiting')") is None
+    broken = "[...document.querySelectorAll('svg *')].filter((one) => "
+    broken += "[...one.attributes].some(({value}) => /NaN|undefined|Infinity/.test(value))).length"
+    assert page.run(broken) == 0
+
+
+def test_a_name_that_looks_like_a_script_is_text(page: Page) -> None:
+    assert page.run("document.scripts.length") == 2
+    _open(page, 1, 0)
+    titles = "[...document.querySelectorAll('#timeline title')].map((one) => one.textContent)"
+    assert any("<script>" in title for title in page.run(titles))
+
+
+def test_arrow_keys_walk_through_the_cycles_and_enter_opens_one(page: Page) -> None:
+    page.run("document.querySelector('#over-time .chart').focus()")
+    for _ in range(3):
+        page.press("ArrowRight")
+    said = page.run("document.getElementById('tip').innerText")
+    number = re.search(r"cycle (\d+)\n([\d.]+) ms", said)
+    assert number is not None, said
+    assert number[2] == milliseconds(LATENCY_NS)
+    page.press("Enter")
+    assert page.run("document.querySelector('#timeline input').value") == number[1]
+    about = page.run("document.querySelector('#timeline .about').innerText")
+    assert about.startswith(f"Cycle {number[1]}: {number[2]} ms")
+
+
+def test_pointing_at_a_cycle_shows_its_latency(page: Page) -> None:
+    x, y = _middle(page, "#over-time svg")
+    for shift in range(0, 200, 10):
+        page.point_at(x + shift, y - 60)
+        if not page.run("document.getElementById('tip').hidden"):
+            break
+    assert "cycle" in page.run("document.getElementById('tip').innerText")
+    page.point_at(2, 2)
+    assert page.run("document.getElementById('tip').hidden")
+
+
+def test_a_cycle_is_chosen_by_number_and_its_hops_are_the_librarys(page: Page) -> None:
+    _open(page, 1, 2)
+    cells = "[...document.querySelectorAll('#timeline tbody tr')]"
+    cells += ".map((row) => [...row.children].slice(1).map((one) => one.textContent))"
+    assert page.run(cells) == [
+        ["–", "0.000", "4.000", "–", "4.000"],
+        ["5.000", "5.000", "15.000", "1.000", "10.000"],
+        ["16.000", "16.000", "30.020", "1.000", "14.020"],
+    ]
+
+
+def test_an_incomplete_cycle_says_why(page: Page) -> None:
+    assert _open(page, 1, 6).startswith("Cycle 6: incomplete: lost (/t1)")
+    assert _open(page, 0, 6).startswith("Cycle 6: 30.020 ms; 31.020 ms at the subscriber")
+
+
+def test_another_recording_can_be_chosen(page: Page) -> None:
+    _open(page, 0, 0)
+    labels = "[...document.querySelectorAll('#timeline svg .label')].map((one) => one.textContent)"
+    assert not [label for label in page.run(labels) if "server" in label], "no plan was in force"
+    _open(page, 1, 0)
+    assert [label for label in page.run(labels) if "server output" in label]
+
+
+def _ticks(page: Page, chart: str) -> list[float]:
+    texts = page.run(
+        f"[...document.querySelectorAll('#{chart} text[text-anchor=middle]')]"
+        ".map((one) => one.textContent)"
+    )
+    return [float(text) for text in texts if re.fullmatch(r"[\d.]+", text)]
+
+
+def test_dragging_zooms_and_escape_goes_back(page: Page) -> None:
+    before = _ticks(page, "cdf")
+    x, y = _middle(page, "#cdf svg")
+    page.drag((x - 100, y), (x + 100, y))
+    zoomed = _ticks(page, "cdf")
+    assert max(zoomed) - min(zoomed) < max(before) - min(before)
+    page.run("document.querySelector('#cdf .chart').focus()")
+    page.press("Escape")
+    assert _ticks(page, "cdf") == before
+
+
+def test_moving_and_zooming_the_timeline_redraws_it(page: Page) -> None:
+    page.run("[...document.querySelectorAll('#timeline button')].at(-1).click()")
+    whole = _ticks(page, "timeline")
+    page.run("document.querySelector('#timeline button[title=\"zoom in\"]').click()")
+    zoomed = _ticks(page, "timeline")
+    assert max(zoomed) - min(zoomed) < max(whole) - min(whole)
+    page.run("document.querySelector('#timeline .chart').focus()")
+    page.press("ArrowRight")
+    assert min(_ticks(page, "timeline")) > min(zoomed)
+    page.press("Escape")
+    assert _ticks(page, "timeline") == whole
+
+
+@pytest.mark.parametrize("width", [360, 1200, 2000])
+def test_the_page_never_needs_to_be_scrolled_sideways(page: Page, width: int) -> None:
+    page.look(width, 900)
+    needed = "document.documentElement.scrollWidth <= document.documentElement.clientWidth"
+    page.wait_for(needed)
+    page.look(1200, 900)
+
+
+def test_light_and_dark_and_paper_look_as_they_should(page: Page) -> None:
+    def brightness() -> tuple[float, float]:
+        shot = image.imread(io.BytesIO(page.picture()))[..., :3]
+        return float(np.median(shot)), float(shot.std())
+
+    light, contrast = brightness()
+    page.look(1200, 900, dark=True)
+    dark, dark_contrast = brightness()
+    page.look(1200, 900)
+    assert light > 0.95
+    assert dark < 0.15
+    assert min(contrast, dark_contrast) > 0.05, "something is on it"
+    page.ask("Emulation.setEmulatedMedia", media="print")
+    assert page.run("getComputedStyle(document.querySelector('.controls')).display") == "none"
+    assert page.ask("Page.printToPDF")["data"].startswith("JVBERi0"), "a PDF"
+    page.ask("Emulation.setEmulatedMedia", media="")

@@ -1,0 +1,296 @@
+"""The page says what the library computes, carries everything it needs, and trusts no recording."""
+
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+from command_line import called, refused
+from told_run import LATENCY_NS, MS, PERIOD_NS, told_plan, told_run
+
+from chainshaper import compare_recordings, hop_breakdown, measure_latency, save_plan, write_report
+from chainshaper.durations import milliseconds
+from chainshaper.errors import OperationError
+from chainshaper.recording import Recording
+from chainshaper.reporting.html.page import distinct_names, report_page
+from chainshaper.steps import Measurement
+
+
+class _Reader(HTMLParser):
+    """Sections with the rows of their tables, the scripts, and every address of the page."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rows: dict[str, list[list[str]]] = {}
+        self.scripts: list[str] = []
+        self.addresses: list[str] = []
+        self.text: list[str] = []
+        self._section, self._cell, self._script = "header", False, False
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        about = dict(attrs)
+        self.addresses += [
+            value or "" for name, value in attrs if name in ("src", "href", "action")
+        ]
+        assert not [name for name in about if name.startswith("on")], "a handler as an attribute"
+        if tag == "section":
+            self._section = about["id"] or ""
+        elif tag == "tr":
+            self.rows.setdefault(self._section, []).append([])
+        elif tag in ("td", "th"):
+            self._cell = True
+            self.rows[self._section][-1].append("")
+        elif tag == "script":
+            self._script = True
+            self.scripts.append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag in ("td", "th"):
+            self._cell = False
+        elif tag == "script":
+            self._script = False
+
+    def handle_data(self, data: str) -> None:
+        if self._script:
+            self.scripts[-1] += data
+        elif self._cell:
+            self.rows[self._section][-1][-1] += data
+        else:
+            self.text.append(data)
+
+
+def _read(page: str) -> _Reader:
+    reader = _Reader()
+    reader.feed(page)
+    return reader
+
+
+def _report(*measurements: Measurement) -> _Reader:
+    return _read(report_page(measurements))
+
+
+def _data(reader: _Reader) -> Any:
+    return json.loads(reader.scripts[0])
+
+
+def test_figures_of_a_run_known_by_hand(tmp_path: Path) -> None:
+    page = _report(measure_latency(told_run(tmp_path / "told")))
+    assert ["told", "0.000", "30.020", "30.020", "3"] in page.rows["header"]
+    figures = page.rows["figures"]
+    assert ["average", "30.020"] in figures
+    assert ["disturbed by the machine", "0"] in figures
+    assert ["longest stall of the machine [ms]", "2.000"] in figures
+    first, second, gate, _ = [row[1:] for row in page.rows["hops"][1:]]
+    assert first == ["3", "–", "–", "–", "–", "4.000", "4.000", "4.000", "13.3%"]
+    assert second[:5] == ["3", "1.000", "1.000", "1.000", "3.3%"]
+    assert gate[5:8] == ["14.020", "14.020", "14.020"]
+    assert ["core 1", "1", "2.000", "2.000", "30"] in page.rows["stalls"]
+    assert ["/second", "subscription /t1", "", "2", "3", "10.001", "10.001", "10.001"] in (
+        page.rows["callbacks"]
+    )
+
+
+def test_every_figure_before_and_after_is_the_librarys(
+    unshaped: Recording, shaped: Recording
+) -> None:
+    compared = compare_recordings([unshaped, shaped])
+    page = _read(report_page(compared.measurements))
+    analyses = [measurement.analysis for measurement in compared.measurements]
+    groups: dict[str, dict[str, list[str]]] = {}
+    for row in page.rows["figures"][1:]:
+        if len(row) == 1:
+            latest = groups.setdefault(row[0], {})
+        elif len(row) == 3:
+            latest.setdefault(row[0], row[1:])
+    names = {
+        "average": "mean_ns",
+        "minimum": "min_ns",
+        "maximum": "max_ns",
+        "jitter (max − min)": "jitter_ns",
+        "spread p0.5–p99.5": "spread_ns",
+    }
+    for place, field in (("publication", ""), ("the subscriber's callback", "subscriber")):
+        calm = [getattr(a, f"{field}_undisturbed".strip("_")) for a in analyses]
+        every = [getattr(a, field or "statistics") for a in analyses]
+        for kind, found in (("undisturbed", calm), ("all complete", every)):
+            rows = groups[f"at {place}, {kind} cycles [ms]"]
+            assert rows["cycles"] == [str(one.count) for one in found]
+            for title, name in names.items():
+                assert rows[title] == [
+                    "–" if getattr(one, name) is None else milliseconds(getattr(one, name))
+                    for one in found
+                ], (place, kind, title)
+    assert groups["cycles"]["incomplete"][0].startswith(str(analyses[0].statistics.incomplete))
+
+
+def test_shares_of_the_hops_are_the_breakdowns(shaped: Recording) -> None:
+    measured = measure_latency(shaped)
+    page = _report(measured)
+    expected = hop_breakdown(measured.analysis)
+    rows = page.rows["hops"][1:-1]
+    for row, (count, share) in zip(
+        rows, expected.select("count", "computation_share").iter_rows(), strict=True
+    ):
+        assert (row[1], row[-1]) == (str(count), f"{share:.1%}")
+
+
+def test_a_prediction_stands_beside_the_measurement(tmp_path: Path) -> None:
+    page = _report(measure_latency(told_run(tmp_path / "told")))
+    assert ["maximum", "30.000 … 31.000", "30.020", "as predicted"] in page.rows["figures"]
+
+
+def test_the_plan_is_there_in_rows_in_yaml_and_drawn(tmp_path: Path) -> None:
+    page = _report(measure_latency(told_run(tmp_path / "told")))
+    assert ["output", "1", "1", "[30.000, 31.000)", "/chainshaper_t2"] in page.rows["plan-0"]
+    assert "shaping_node:" in "".join(page.text)
+    (drawn,) = _data(page)["plans"]
+    assert drawn["cycle"] == PERIOD_NS
+    assert [server["slots"] for server in drawn["servers"] if server["output"]] == [
+        [[30 * MS, 31 * MS]]
+    ]
+
+
+def test_a_plan_that_several_recordings_share_is_shown_once(tmp_path: Path) -> None:
+    one, two = told_run(tmp_path / "one"), told_run(tmp_path / "two")
+    page = _report(measure_latency(one), measure_latency(two))
+    assert "plan-1" not in page.rows
+    assert "The plan of one, two" in "".join(page.text)
+
+
+def test_how_it_was_recorded_is_said(tmp_path: Path) -> None:
+    told = told_run(
+        tmp_path / "told",
+        command=("ros2", "launch", "robot"),
+        rmw="rmw_cyclonedds_cpp",
+        lost={"discarded_events": 7},
+        notes=("the first 5 cycles warmed up",),
+    )
+    page = _report(measure_latency(told))
+    said = {row[0]: row[1] for row in page.rows["conditions"] if len(row) == 2}
+    assert said["host"] == "robot"
+    assert said["RMW"] == "rmw_cyclonedds_cpp"
+    assert said["command"] == "ros2 launch robot"
+    assert said["events lost"] == "7 discarded events"
+    assert said["first cycle"] == "1970-01-01 00:00:00 UTC, 3 cycles in 0.2 s"
+    assert said["scheduling in force"] == "executor: SCHED_FIFO 80, core 1 (1)"
+    assert said["plan in force"] == "shaped, for /t1../t2"
+    assert "told: the first 5 cycles warmed up" in page.text
+    assert ["/second", "second", "executor", "2", "2", "SCHED_FIFO 80", "1"] in (
+        page.rows["conditions"]
+    )
+
+
+def test_incomplete_cycles_and_overruns_have_numbers_and_reasons(tmp_path: Path) -> None:
+    page = _report(measure_latency(told_run(tmp_path / "told", 6, untaken=(2, 3), overran=(4,))))
+    rows = page.rows["overruns"]
+    assert ["4", "31.000", "publish", "31.000"] in rows
+    (lost,) = [row for row in rows if row[0] == "told"]
+    assert lost[1].startswith("lost: published, but never taken")
+    assert lost[2:] == ["/t1", "2", "2, 3"]
+    assert ["incomplete", "2 (2 lost)"] in page.rows["figures"]
+    assert ["too late for their slot", "1"] in page.rows["figures"]
+
+
+def test_where_nobody_watched_no_cycle_is_called_undisturbed(tmp_path: Path) -> None:
+    page = _report(measure_latency(told_run(tmp_path / "told", stall_meter=None, plan=None)))
+    titles = [row[0] for row in page.rows["figures"] if len(row) == 1]
+    assert not [title for title in titles if "undisturbed" in title]
+    assert "told: nobody watched the machine, so its stalls are not known." in page.text
+    assert not _data(page)["recordings"][0]["timeline"]["watched"]
+
+
+def test_a_chain_without_any_complete_cycle_makes_a_page_all_the_same(tmp_path: Path) -> None:
+    told = told_run(tmp_path / "told", 3, untaken=(0, 1), plan=None)
+    tables = dict(told.events)
+    tables["rmw_publish"] = told.events["rmw_publish"].filter(
+        told.events["rmw_publish"]["pid"] != 3
+    )
+    late = tables["rmw_publish"].filter(tables["rmw_publish"]["pid"] == 2)["time"].max()
+    tables["callback_end"] = tables["callback_end"].filter(tables["callback_end"]["time"] < late)
+    measured = measure_latency(Recording(told.path, told.info, tables), "/t1../t2_tmp")
+    page = _report(measured)
+    assert page.rows["figures"]
+    assert measure_latency(told, "/t1../t2_tmp").analysis.statistics.count == 1
+
+
+def test_nothing_that_a_recording_says_becomes_markup(tmp_path: Path) -> None:
+    evil = "/<script>alert('x')</script><img src=x onerror=alert(2)>&amp;\"'"
+    told = told_run(
+        tmp_path / "<b>told",
+        first=evil,
+        command=("</script><script>alert(3)</script>",),
+        host="<h1>host</h1>",
+        notes=("<!-- ", "</pre><iframe>"),
+        processes={1: "<u>"},
+    )
+    text = report_page([measure_latency(told)])
+    page = _read(text)
+    assert len(page.scripts) == 2, "the data, and the page's own script"
+    assert page.addresses == []
+    assert not re.search(r"<(img|iframe|h1>host|u>|b>|!-- )", text)
+    assert evil in [row[0] for row in page.rows["callbacks"]]
+    assert _data(page)["recordings"][0]["timeline"]["threads"][0][0] == evil
+    assert ["host", "<h1>host</h1>"] in page.rows["conditions"]
+
+
+def test_the_page_asks_for_nothing(tmp_path: Path) -> None:
+    text = report_page([measure_latency(told_run(tmp_path / "told"))])
+    assert _read(text).addresses == []
+    assert "default-src 'none'" in text
+    foreign = re.findall(r"(?:https?:)?//[\w.]+\.\w+|url\((?!#)|@import|fetch\(|import\(", text)
+    assert set(foreign) <= {"http://www.w3.org"}, "the name of SVG, which nobody loads"
+
+
+def test_recordings_of_one_name_are_told_apart() -> None:
+    paths = [Path("/data/one/trace"), Path("/data/two/trace")]
+    assert distinct_names(paths) == ["one/trace", "two/trace"]
+    assert distinct_names([Path("before"), Path("after")]) == ["before", "after"]
+    assert distinct_names([Path("/a"), Path("/a")]) == ["/a (1)", "/a (2)"]
+
+
+def test_the_command_writes_the_report_and_never_over_another(tmp_path: Path) -> None:
+    told = told_run(tmp_path / "told")
+    file = tmp_path / "report.html"
+    finished = called("report", told.path, "-o", file)
+    assert (finished.code, finished.out) == (0, f"{file}\n")
+    written = file.read_text()
+    assert written == report_page([measure_latency(told)])
+    again = refused(2, "report", told.path, "-o", file)
+    assert "exists already and is not overwritten" in again
+    assert file.read_text() == written
+    wrong = refused(2, "report", told.path, "-o", tmp_path / "report.pdf")
+    assert "ends in .html or .htm" in wrong
+    absent = refused(2, "report", told.path, "-o", tmp_path / "r.html", "--cycle", "3")
+    assert "there is no cycle 3: the recordings have 3 at most, numbered from 0" in absent
+    assert not (tmp_path / "r.html").exists()
+    chain = refused(2, "report", told.path, "-o", tmp_path / "r.html", "--chain", "/t9../t2")
+    assert "/t9" in chain
+
+
+def test_a_plan_can_be_named_for_a_recording_that_does_not_know_it(tmp_path: Path) -> None:
+    told = told_run(tmp_path / "told", plan=None)
+    save_plan(told_plan(), tmp_path / "plan.yaml")
+    file = tmp_path / "r.html"
+    assert called("report", told.path, "-o", file, "--plan", tmp_path / "plan.yaml").code == 0
+    assert _data(_read(file.read_text()))["recordings"][0]["slots"] == [[30 * MS, 31 * MS]]
+
+
+def test_a_copied_recording_makes_the_same_figures(tmp_path: Path) -> None:
+    told = told_run(tmp_path / "told")
+    shutil.copytree(told.path, tmp_path / "copy" / "told")
+    one, two = (
+        _data(_read(report_page([measure_latency(path)])))
+        for path in (told.path, tmp_path / "copy" / "told")
+    )
+    assert one == two
+    assert one["recordings"][0]["points"]["latency"] == [LATENCY_NS] * 3
+
+
+def test_a_report_on_a_full_disk_leaves_nothing(tmp_path: Path, full_disk: Path) -> None:
+    path = full_disk / "report.html"
+    with pytest.raises(OperationError, match=f"{path}: the file cannot be written.*No space"):
+        write_report([measure_latency(told_run(tmp_path / "told"))], path)
+    assert not [file for file in full_disk.iterdir() if "report" in file.name]
