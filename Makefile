@@ -21,6 +21,7 @@ lint: .venv/.ready-dev
 benchmark: .venv/.ready-dev
 	.venv/bin/python benchmarks/shaping_jitter.py
 	.venv/bin/python benchmarks/band_placement.py
+	.venv/bin/python benchmarks/simulator.py
 	.venv/bin/python benchmarks/ctf_decode.py
 	.venv/bin/python benchmarks/trace_to_latency.py
 	.venv/bin/python benchmarks/enforcement/enter_exit.py

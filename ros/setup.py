@@ -20,10 +20,12 @@ VERSION = re.search(r'^version = "(.+)"$', PROJECT.read_text(), re.MULTILINE)
 assert VERSION is not None  # noqa: S101 - pyproject.toml is ours
 
 PACKAGE = Path(SOURCES, NAME)
-DATA = [
+DATA = [  # modules are found by setuptools; nodes that are written out for ROS 2 are no modules
     str(path.relative_to(PACKAGE))
     for path in PACKAGE.rglob("*")
-    if path.is_file() and path.suffix not in {".py", ".pyc"}
+    if path.is_file()
+    and path.suffix != ".pyc"
+    and not (path.suffix == ".py" and path.with_name("__init__.py").exists())
 ]
 
 setup(

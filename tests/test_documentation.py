@@ -35,7 +35,8 @@ def shortened(command: str) -> str:
     command = re.sub(r"^make ", "make --dry-run ", command)
     if not command.startswith("chainshaper apply"):  # a run that is governed needs time to be
         command = re.sub(r"--cycles \d+", f"--cycles {SHORT}", command)
-    if re.match(r"chainshaper (run|shape|demo)\b", command) and "--cycles" not in command:
+    runs = re.match(r"chainshaper (run|shape|demo)\b(?!.*--help)", command)
+    if runs and "--cycles" not in command:
         command += f" --cycles {SHORT}"
     if command.startswith("chainshaper doctor") and "--watch" not in command:
         command += " --watch 300ms"

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
         event_counts,
         list_chains,
     )
+    from chainshaper.launch_shaping import ShapedLaunch, shape_launch
+    from chainshaper.launch_splicing import Splicing, splice_launch_files, undo_splice
     from chainshaper.planning import (
         Plan,
         PlanRequest,
@@ -48,11 +50,18 @@ if TYPE_CHECKING:
         plan_shaping,
         save_plan,
     )
+    from chainshaper.profiling import profiling_condition
+    from chainshaper.record import Recorded, record_command
     from chainshaper.recording import Recording, open_recording
     from chainshaper.reporting.application_graph import write_picture
     from chainshaper.reporting.breakdown import hop_breakdown
     from chainshaper.reporting.figures import draw_distribution, draw_latency
+    from chainshaper.reporting.html import write_report
+    from chainshaper.reporting.perfetto import export_perfetto
+    from chainshaper.simulation import simulate, simulate_latencies
     from chainshaper.sources import open_source
+    from chainshaper.splicing.gate_log import read_gate_log
+    from chainshaper.splicing.shaping_process import write_shaping_process, write_throttler
     from chainshaper.steps import (
         Comparison,
         Measurement,
@@ -88,6 +97,8 @@ _HOMES = {
         "list_chains",
     ),
     "chainshaper.dry_run": ("planned_changes",),
+    "chainshaper.launch_shaping": ("ShapedLaunch", "shape_launch"),
+    "chainshaper.launch_splicing": ("Splicing", "splice_launch_files", "undo_splice"),
     "chainshaper.planning": (
         "Plan",
         "PlanRequest",
@@ -98,11 +109,18 @@ _HOMES = {
         "plan_shaping",
         "save_plan",
     ),
+    "chainshaper.profiling": ("profiling_condition",),
+    "chainshaper.record": ("Recorded", "record_command"),
     "chainshaper.recording": ("Recording", "open_recording"),
     "chainshaper.reporting.application_graph": ("write_picture",),
     "chainshaper.reporting.breakdown": ("hop_breakdown",),
     "chainshaper.reporting.figures": ("draw_distribution", "draw_latency"),
+    "chainshaper.reporting.html": ("write_report",),
+    "chainshaper.reporting.perfetto": ("export_perfetto",),
+    "chainshaper.simulation": ("simulate", "simulate_latencies"),
     "chainshaper.sources": ("open_source",),
+    "chainshaper.splicing.gate_log": ("read_gate_log",),
+    "chainshaper.splicing.shaping_process": ("write_shaping_process", "write_throttler"),
     "chainshaper.steps": (
         "Comparison",
         "Measurement",
@@ -131,7 +149,10 @@ __all__ = [
     "PlanRequest",
     "PlatformError",
     "Profile",
+    "Recorded",
     "Recording",
+    "ShapedLaunch",
+    "Splicing",
     "analyse_latency",
     "application_graph",
     "apply_plan",
@@ -145,6 +166,7 @@ __all__ = [
     "end_run",
     "event_counts",
     "examine_machine",
+    "export_perfetto",
     "find_chain",
     "find_runs",
     "find_threads",
@@ -162,10 +184,21 @@ __all__ = [
     "plan_shaping",
     "planned_changes",
     "profile_chains",
+    "profiling_condition",
+    "read_gate_log",
+    "record_command",
     "run_application",
     "save_plan",
     "shape_application",
+    "shape_launch",
+    "simulate",
+    "simulate_latencies",
+    "splice_launch_files",
+    "undo_splice",
     "write_picture",
+    "write_report",
+    "write_shaping_process",
+    "write_throttler",
 ]
 
 

@@ -9,7 +9,6 @@ DIR/distribution.png   their distributions, with the publish slot
 DIR/comparison.json    every figure of the printed table
 """
 
-import json
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -23,8 +22,7 @@ from chainshaper.analysis import callback_statistics, data_flow
 from chainshaper.errors import OperationError
 from chainshaper.planning import Plan, plan_warnings, save_plan
 from chainshaper.recording import refuse_existing
-from chainshaper.reporting.figures import draw_comparison
-from chainshaper.reporting.tables import comparison_json
+from chainshaper.reporting.comparison_files import write_comparison
 from chainshaper.steps import (
     Comparison,
     compare_recordings,
@@ -97,8 +95,7 @@ def run_demo(
     if progress is not None:
         progress(0.98, "comparing")
     comparison = compare_recordings([before, after])
-    draw_comparison(comparison.measurements, folder)
-    _write_figures(comparison, folder / "comparison.json")
+    write_comparison(comparison, folder)
     return DemoResult(
         folder=folder,
         callbacks=callback_statistics(data_flow(before.events, before.info.clock_offset_ns)),
@@ -124,14 +121,6 @@ def _prepared(folder: Path, application: Path) -> Iterator[None]:
             copy.unlink(missing_ok=True)
             if made and folder.exists():
                 folder.rmdir()
-
-
-def _write_figures(comparison: Comparison, path: Path) -> None:
-    text = json.dumps(comparison_json(comparison), indent=2) + "\n"
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OperationError(f"{path}: cannot be written: {error}") from error
 
 
 def _part(progress: Progress | None, start: float, share: float, title: str) -> Progress | None:

@@ -22,7 +22,7 @@ from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.publisher_threads import publisher_servers
 from chainshaper.recording import Recording
 
-__all__ = ["BandHeld", "FigureHeld", "PredictionHeld", "hold_prediction"]
+__all__ = ["BandHeld", "FigureHeld", "PredictionHeld", "hold_prediction", "lateness_in_cycle"]
 
 WAKE_UP_NS = 250_000
 STANDARD_ERRORS = 3  # beyond so many, an average is not what was predicted
@@ -165,7 +165,7 @@ def _outputs(
             in_time = pl.col("overrun").is_null() & pl.col("slot").is_not_null()
             return joined.select("latency_ns", "slot", place="latency_ns", in_time=in_time)
     starts = [start for start, _ in slots]
-    late = _lateness(chosen["start"], plan.cycle_ns) if any(publisher_servers(plan)) else 0
+    late = lateness_in_cycle(chosen["start"], plan.cycle_ns) if any(publisher_servers(plan)) else 0
     return chosen.select("latency_ns", place=pl.col("latency_ns") + late).with_columns(
         slot=sum((pl.col("place") >= start).cast(pl.Int32) for start in starts)
         + pl.lit(-1, dtype=pl.Int32),
@@ -173,7 +173,7 @@ def _outputs(
     )
 
 
-def _lateness(starts: pl.Series, cycle_ns: int) -> pl.Series:
+def lateness_in_cycle(starts: pl.Series, cycle_ns: int) -> pl.Series:
     """How long after the start of the cycle each chain began (ns).
 
     When cycles started is not recorded. The earliest beginning stands for it, which is the one

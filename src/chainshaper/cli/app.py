@@ -11,14 +11,20 @@ from chainshaper.cli.compare import compare
 from chainshaper.cli.convert import convert
 from chainshaper.cli.demo import demo
 from chainshaper.cli.doctor import doctor
+from chainshaper.cli.export import export
 from chainshaper.cli.graph import graph
 from chainshaper.cli.info import info
 from chainshaper.cli.latency import latency
 from chainshaper.cli.offsets import offsets
 from chainshaper.cli.plan import plan
+from chainshaper.cli.profile import profile
+from chainshaper.cli.record import record
 from chainshaper.cli.release import release
+from chainshaper.cli.report import report
 from chainshaper.cli.run import run
 from chainshaper.cli.shape import shape
+from chainshaper.cli.simulate import simulate
+from chainshaper.cli.splice import splice
 from chainshaper.cli.status import status
 from chainshaper.cli.threads import threads
 
@@ -36,6 +42,9 @@ app = typer.Typer(
 VERBS: tuple[Callable[..., None], ...] = (
     demo,
     run,
+    simulate,
+    record,
+    profile,
     info,
     graph,
     callbacks,
@@ -44,8 +53,11 @@ VERBS: tuple[Callable[..., None], ...] = (
     convert,
     plan,
     offsets,
+    splice,
     shape,
     compare,
+    report,
+    export,
     threads,
     apply,
     status,

@@ -1,34 +1,106 @@
-"""`chainshaper shape`: run an application with the plan's shaping node spliced in."""
+"""`chainshaper shape`: run an application with its output shaped, live or launched by ROS 2."""
 
 import sys
+import threading
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from chainshaper.cli.options import (
-    ApplicationArgument,
+    ChainOption,
     CyclesOption,
+    JsonOption,
     RealtimeOption,
-    RecordingOutput,
+    duration_option,
 )
+from chainshaper.cli.plan_options import BandsOption, EpsilonOption
+from chainshaper.cli.record import Source, SourceOption
+from chainshaper.cli.splice import NodeKind
+from chainshaper.errors import InputError
+
+if TYPE_CHECKING:
+    from chainshaper.analysis import ChainEnumeration
+    from chainshaper.app import ApplicationGraph
+    from chainshaper.launch_shaping import ShapedLaunch
 
 __all__ = ["shape"]
 
+DESCRIPTIONS = (".yaml", ".yml")
+DURATION_NS = 40_000_000_000
+
 
 def shape(
-    application: ApplicationArgument,
-    plan: Annotated[
-        Path, typer.Argument(metavar="plan.yaml", help="The plan in force.", show_default=False)
+    words: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="APP.yaml plan.yaml | -- ros2 launch ...",
+            help="A described application and the plan in force; or what launches a real one, "
+            "which is then measured and planned first.",
+            show_default=False,
+        ),
     ],
-    output: RecordingOutput,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="REC",
+            help="Folder for the recording; of a launched application, for everything.",
+            show_default=False,
+        ),
+    ],
     cycles: CyclesOption = 320,
     realtime: RealtimeOption = None,
+    chain: ChainOption = None,
+    duration: Annotated[
+        int | None,
+        duration_option("--duration", "How long to measure, before and after. Default: 40s."),
+    ] = None,
+    source: SourceOption = Source.LTTNG,
+    node: Annotated[
+        NodeKind,
+        typer.Option(help="A script; a package for all types; or one generated for the type."),
+    ] = NodeKind.PYTHON,
+    backend: Annotated[
+        str, typer.Option("--backend", metavar="NAME", help="As for `chainshaper apply`.")
+    ] = "auto",
+    bands: BandsOption = "1",
+    epsilon: EpsilonOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Run an application with its output shaped as planned, and record it.
 
     The publisher's output topic is remapped, and the shaping node republishes it in its slots.
+    Behind `--`, `ros2 launch` does the whole flow: record, choose a chain, profile, plan, splice,
+    apply, record again, compare. Every file in between is kept; --chain, --duration, --source,
+    --node, --backend, --bands and --epsilon are for this.
     """
+    if len(words) == 2 and words[0].endswith(DESCRIPTIONS):
+        _shape_described(Path(words[0]), Path(words[1]), output, cycles, realtime)
+        return
+    if Path(words[0]).suffix in DESCRIPTIONS:
+        raise InputError(
+            "a described application is shaped with its plan, and nothing else: `chainshaper shape "
+            "APP.yaml plan.yaml -o REC`"
+        )
+    _shape_launched(
+        words,
+        output,
+        chain=chain,
+        duration_ns=duration or DURATION_NS,
+        source=source,
+        node=node,
+        back_end=backend,
+        bands=bands,
+        epsilon_ns=epsilon,
+        json=json,
+    )
+
+
+def _shape_described(
+    application: Path, plan: Path, output: Path, cycles: int, realtime: bool | None
+) -> None:
     from chainshaper.cli.output import notes, progress, show_line
     from chainshaper.overruns import overruns_in, overruns_text
     from chainshaper.planning import load_plan
@@ -51,3 +123,68 @@ def shape(
         notes([overruns_text(overruns)])
     notes(recording.info.notes)
     show_line(str(recording.path))
+
+
+def _shape_launched(
+    command: list[str],
+    folder: Path,
+    *,
+    chain: str | None,
+    duration_ns: int,
+    source: Source,
+    node: NodeKind,
+    back_end: str,
+    bands: str,
+    epsilon_ns: int | None,
+    json: bool,
+) -> None:
+    from chainshaper.cli.output import print_json, stage_lines
+    from chainshaper.cli.signals import stop_on_signals
+    from chainshaper.launch_shaping import shape_launch
+    from chainshaper.planning import PlanRequest
+    from chainshaper.reporting.tables import comparison_json
+
+    stop = threading.Event()
+    with stop_on_signals(stop):
+        shaped = shape_launch(
+            command,
+            folder,
+            chain=chain,
+            choose=_ask if sys.stdin.isatty() and not json else None,
+            request=PlanRequest(
+                bands="auto" if bands == "auto" else int(bands), epsilon_ns=epsilon_ns
+            ),
+            duration_ns=duration_ns,
+            source=source.value,
+            node=node.value,
+            back_end=back_end,
+            stop=stop,
+            progress=stage_lines("shape"),
+        )
+    if json:
+        print_json(comparison_json(shaped.comparison) | {"folder": str(shaped.folder)})
+    else:
+        _show(shaped)
+
+
+def _show(shaped: "ShapedLaunch") -> None:
+    from chainshaper.cli.output import notes, show, show_line
+    from chainshaper.reporting.predictions import prediction_table
+    from chainshaper.reporting.tables import comparison_table
+
+    held = [one.held for one in shaped.comparison.measurements]
+    show(
+        comparison_table(shaped.comparison),
+        *(prediction_table(one) for one in held if one is not None),
+    )
+    notes(shaped.notes)
+    show_line(str(shaped.folder))
+
+
+def _ask(graph: "ApplicationGraph", found: "ChainEnumeration") -> str:
+    from chainshaper.cli.output import show
+    from chainshaper.reporting.chain_list import chain_table
+
+    show(chain_table(graph, found))
+    default = (found.heaviest or found.chains[0]).spec
+    return str(typer.prompt("Which chain, FIRST..LAST?", default=default, err=True))

@@ -1,0 +1,148 @@
+"""The simulator's speed, alone and against SimPy and SimSo on the same task set.
+
+    python benchmarks/simulator.py [--cycles 200000] [--peers PYTHON...]
+
+The five-node chain of examples/synthetic_chain.yaml on one core, with every event written and with
+latencies only; CPU time of one process, compilation left out. Peers run in interpreters of their
+own, such as those of throwaway virtual environments, since SimSo wants an old SimPy:
+
+    python -m venv /tmp/simpy && /tmp/simpy/bin/pip install "simpy>=4,<5"
+    python -m venv /tmp/simso && /tmp/simso/bin/pip install simso
+    python benchmarks/simulator.py --peers /tmp/simpy/bin/python /tmp/simso/bin/python
+
+The same task set is: five callbacks that trigger each other, their subscriber, and a timer that
+interferes, fixed priorities with pre-emption on one core. SimSo knows no such chain: there it is
+seven periodic tasks of the same demand. It needs `imp`, so a Python before 3.12.
+"""
+
+import argparse
+import os
+import resource
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from chainshaper import load_application, simulate, simulate_latencies
+
+os.environ.setdefault("POLARS_MAX_THREADS", "1")
+
+EXAMPLE = Path(__file__).parents[1] / "examples/synthetic_chain.yaml"
+PEER_CYCLES = 2000
+
+SIMPY = """
+import random, simpy, time
+def work(env, core, priority, duration):
+    left = duration
+    while left > 0:
+        with core.request(priority=priority) as turn:
+            yield turn
+            began = env.now
+            try:
+                yield env.timeout(left)
+                left = 0
+            except simpy.Interrupt:
+                left -= env.now - began
+def stage(env, core, source, target, low, high):
+    while True:
+        start = yield source.get()
+        yield env.process(work(env, core, 1, random.uniform(low, high)))
+        if target is not None:
+            target.put(start)
+def source(env, target):
+    while True:
+        target.put(env.now)
+        yield env.timeout(100)
+def interference(env, core):
+    yield env.timeout(5)
+    while True:
+        env.process(work(env, core, 2, random.uniform(10, 20)))
+        yield env.timeout(100)
+env = simpy.Environment()
+core = simpy.PreemptiveResource(env, capacity=1)
+topics = [simpy.Store(env) for _ in range(6)]
+env.process(source(env, topics[0]))
+for place in range(5):
+    env.process(stage(env, core, topics[place], topics[place + 1], 5, 15))
+env.process(stage(env, core, topics[5], None, 0.1, 0.1))
+env.process(interference(env, core))
+began = time.process_time()
+env.run(until=100 * CYCLES)
+print("SimPy", simpy.__version__, CYCLES / (time.process_time() - began), sep=";")
+"""
+
+SIMSO = """
+import time
+from simso.configuration import Configuration
+from simso.core import Model
+config = Configuration()
+config.duration = 100 * CYCLES * config.cycles_per_ms
+for place, wcet in enumerate([10, 10, 10, 10, 10, 0.1, 15]):
+    config.add_task(name=f"T{place}", identifier=place + 1, period=100,
+                    activation_date=5 if place == 6 else 0, wcet=wcet, deadline=100)
+config.add_processor(name="core", identifier=1)
+config.scheduler_info.clas = "simso.schedulers.FP"
+for place, task in enumerate(config.task_info_list):
+    task.data["priority"] = 7 - place
+config.check_all()
+model = Model(config)
+began = time.process_time()
+model.run_model()
+import importlib.metadata
+version = importlib.metadata.version("simso")
+print("SimSo", version, CYCLES / (time.process_time() - began), sep=";")
+"""
+
+
+def rate(run: Callable[[int], object], cycles: int) -> float:
+    """Chain instances per second of CPU time; the first, short run compiles."""
+    run(10)
+    began = time.process_time()
+    run(cycles)
+    return cycles / (time.process_time() - began)
+
+
+def peer(python: str) -> tuple[str, float] | None:
+    """What a peer in another interpreter reaches: its name and version, and its rate."""
+    for program in (SIMPY, SIMSO):
+        code = f"CYCLES = {PEER_CYCLES}\n{program}"
+        result = subprocess.run(
+            [python, "-c", code], capture_output=True, text=True, check=False, timeout=600
+        )
+        if result.returncode == 0:
+            name, version, reached = result.stdout.strip().split("\n")[-1].split(";")
+            return f"{name} {version}", float(reached)
+        print(f"({python}: {result.stderr.strip().splitlines()[-1]})")
+    return None
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--cycles", type=int, default=200_000)
+    parser.add_argument("--peers", nargs="*", default=[])
+    options = parser.parse_args()
+    application = load_application(EXAMPLE)
+    with tempfile.TemporaryDirectory() as folder:
+
+        def recorded(cycles: int) -> None:
+            simulate(application, Path(folder) / str(cycles), cycles=cycles)
+
+        with_events = rate(recorded, options.cycles)
+        events_memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    latencies = rate(lambda cycles: simulate_latencies(application, cycles=cycles), options.cycles)
+    print(f"{'':<24}{'chain instances/s':>18}{'ratio':>10}")
+    print(f"{'every event written':<24}{with_events:>18,.0f}{'1':>10}   ({events_memory:.0f} MB)")
+    print(f"{'latencies only':<24}{latencies:>18,.0f}{latencies / with_events:>10.1f}")
+    for python in options.peers:
+        if (found := peer(python)) is not None:
+            name, reached = found
+            print(
+                f"{name:<24}{reached:>18,.0f}"
+                f"   ours, with events and without: {with_events / reached:.0f},"
+                f" {latencies / reached:.0f} times as fast"
+            )
+
+
+if __name__ == "__main__":
+    main()
