@@ -38,6 +38,7 @@ from chainshaper.errors import OperationError
 from chainshaper.planning import Plan
 from chainshaper.planning.publication import publication_warnings
 from chainshaper.recording import Recording
+from chainshaper.shaping_phase import tell_phase
 from chainshaper.thread_search import find_threads
 
 __all__ = ["Applied", "apply_plan"]
@@ -230,6 +231,8 @@ def _arm(  # noqa: PLR0917 - the parts of a run, each used once
                 "it is started by something less regular than a timer",
             )
     anchor = (phase_ns + LEAD_NS) % run.plan.cycle_ns
+    # Held back by a server, the chain begins as its slot opens, otherwise with its timer.
+    notes += tell_phase(run.plan, found, anchor if gates(run.choice.name) else phase_ns)
     threads = _assign(run.plan, found, servers, {server.name: () for server in run.plan.servers})
     servers.arm(anchor)
     return replace(

@@ -50,7 +50,8 @@ from chainshaper.recording import (
     refuse_existing,
     write_recording,
 )
-from chainshaper.sources.snapshot import ask_graph, environment_of
+from chainshaper.sources.ros_python import environment_of
+from chainshaper.sources.snapshot import ask_graph
 from chainshaper.sources.tracer import Tracer
 from chainshaper.splicing.gate_log import with_gate_logs
 from chainshaper.workload.stall_watch import StallWatch, stalls_watched

@@ -1,11 +1,13 @@
 """The shaping node and the throttler in a real ROS 2 environment, all three kinds."""
 
 import json
+import os
 import shutil
 import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,8 @@ from ros2 import ros2_environment
 
 from chainshaper.planning import Modes, Plan
 from chainshaper.planning.plan import revised
+from chainshaper.sources import ros_parameter
+from chainshaper.sources.ros_python import run_with_rclpy
 from chainshaper.splicing.gate_log import read_gate_log
 from chainshaper.splicing.generated_package import build_package
 from chainshaper.splicing.shaping_process import (
@@ -93,10 +97,10 @@ def started(
         child.wait()
 
 
-def exchanged(quality: str) -> list[dict[str, Any]]:
+def exchanged(quality: str, count: int = COUNT) -> list[dict[str, Any]]:
     """What the counterpart saw of the output: its quality of service, then each message."""
     run = subprocess.run(
-        ["python3", COUNTERPART, str(COUNT), quality],
+        ["python3", COUNTERPART, str(count), quality],
         capture_output=True,
         text=True,
         check=True,
@@ -143,6 +147,29 @@ def test_messages_come_back_in_the_slot_of_their_mode(
         assert (own["release"] - own["origin"]).is_between(start, end - 1).all()
     assert (releases["time"] >= releases["release"]).all()
     assert (releases["published"] >= releases["time"]).all()
+
+
+@pytest.mark.parametrize("kind", ["python", "cpp"])
+def test_a_running_node_is_told_where_cycles_begin(
+    tmp_path: Path, plan: Plan, kind: NodeKind, request: pytest.FixtureRequest
+) -> None:
+    workspace = None if kind == "python" else request.getfixturevalue("workspace")
+    plan, log = revised(plan, anchor="cycle"), tmp_path / "gate.csv"
+    assert plan.shaping_node is not None
+    process = write_shaping_process(plan, plan.shaping_node, kind, tmp_path, log=log)
+    node = f"/{process.name}"
+    phase = 12_345_678
+    with started(process, workspace), ThreadPoolExecutor() as beside:
+        coming = beside.submit(exchanged, "best_effort", 200)
+        arguments = (ros_parameter.__file__, node, "phase_ns", str(phase))
+        said = run_with_rclpy(os.environ, *arguments, within_s=30)
+        refused = run_with_rclpy(os.environ, arguments[0], "/nobody", "x", "1", "1", within_s=30)
+        coming.result()
+    assert said == ("", None)
+    assert refused == ("", "/nobody offers no parameters")
+    origins = read_gate_log(log)["origin"]
+    assert origins[-1] % plan.cycle_ns == phase
+    assert set(origins % plan.cycle_ns) <= {0, phase}
 
 
 @pytest.mark.parametrize("kind", ["python", "cpp"])

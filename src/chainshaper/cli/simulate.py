@@ -16,7 +16,7 @@ def simulate(
     output: RecordingOutput,
     plan: Annotated[
         Path | None,
-        typer.Argument(metavar="[plan.yaml]", help="The plan in force.", show_default=False),
+        typer.Argument(metavar="plan.yaml", help="The plan in force.", show_default=False),
     ] = None,
     cycles: CyclesOption = 320,
     seed: Annotated[

@@ -53,7 +53,7 @@ def timeline_of(
 ) -> Timeline:
     """The timeline of a recording; cycles and slots are those of ``analysis`` and ``plan``."""
     slices = _slices(flow)
-    holds = _holds(recording, flow, analysis, plan)
+    holds = _holds(recording, analysis, plan)
     origins = _origins(analysis, plan, holds)
     stalls = events.table(recording.events, "machine_stall", ["cpu"])
     return Timeline(
@@ -109,19 +109,23 @@ def _threads(
 
 
 def _holds(
-    recording: Recording, flow: DataFlow, analysis: LatencyAnalysis | None, plan: Plan | None
+    recording: Recording, analysis: LatencyAnalysis | None, plan: Plan | None
 ) -> pl.DataFrame:
     if analysis is None:
         return pl.DataFrame(schema={**_HELD, "traversal": pl.UInt32(), "hop": pl.UInt8()})
-    gates = flow.objects.callbacks.select("pid", "callback_id", callback="handle").unique()
+    # A gate in a Python node has no callback that events know: process and message say which it is.
     decided = (
         gate_releases(recording, plan)
-        .join(gates, on=["pid", "callback"], how="inner")
-        .select("callback_id", "source_timestamp", *_HELD_FROM)
-        .unique(["callback_id", "source_timestamp"], keep="last", maintain_order=True)
+        .select("pid", "source_timestamp", *_HELD_FROM)
+        .unique(["pid", "source_timestamp"], keep="last", maintain_order=True)
     )
-    reached = analysis.hops.select("traversal", "hop", "callback_id", "source_timestamp")
-    held = reached.join(decided, on=["callback_id", "source_timestamp"], how="inner")
+    processes = pl.DataFrame(
+        [(callback.id, callback.pid) for callback in analysis.graph.callbacks],
+        schema={"callback_id": pl.UInt32(), "pid": pl.Int32()},
+        orient="row",
+    )
+    reached = analysis.hops.join(processes, on="callback_id")
+    held = reached.join(decided, on=["pid", "source_timestamp"], how="inner")
     return held.select("traversal", "hop", *_HELD).sort("traversal", "hop")
 
 

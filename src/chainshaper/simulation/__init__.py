@@ -5,7 +5,7 @@ everything downstream cannot tell a simulated recording from a live one, but for
 :func:`simulate` writes a recording, :func:`simulate_latencies` gives the chain's latencies only.
 
     system       what runs, in words: processes, threads, entities, publishers
-    arrays       the same in integers (layout: their columns)
+    arrays       the same in integers (layout: their columns, memory: all in one array)
     streams      execution times, costs and delays, drawn in blocks
     engine       cores and the order of events        \\
     executor     ROS 2's executors, step by step        compiled by Numba

@@ -23,7 +23,7 @@ function plotTimeline(host, recordings) {
   const frame = make(host, "div", { className: "chart", tabIndex: 0 });
   frame.setAttribute("role", "group");
   caption(host, "Orange: what the cycle itself ran; pale: transport, and waiting; grey: other "
-    + "callbacks; blue: slots; hatched: held by the gate; red: stalls. Drag, or the arrow keys, move; "
+    + "callbacks; blue: slots; hatched: held by the gate; red: stalls. A callback is pale where its end was not recorded. Drag, or the arrow keys, move; "
     + "+ and − or Ctrl with the wheel zoom. " + recordings.map((one) => kept(one)).join(" "));
   const hopTable = make(host, "div", { className: "scroll" });
 
@@ -181,7 +181,7 @@ function plotTimeline(host, recordings) {
           if (where !== lane || !inView(start, length)) return;
           const mine = own.has(`${lane} ${start}`), used = current.used[n];
           bar(layer, scale, top, start, start + length,
-            { fill: mine ? "var(--series-0)" : "var(--idle)" },
+            { fill: mine ? "var(--series-0)" : "var(--idle)", opacity: unended.has(n) ? 0.4 : 1 },
             `${current.callbacks[current.callback[n]]}\n${ms(length)} ms response`
             + `${used === null ? "" : `, ${ms(used)} ms execution`}`
             + `${unended.has(n) ? "\nits end was not recorded" : ""}`);
@@ -234,7 +234,7 @@ function plotTimeline(host, recordings) {
   function path(layer, scale, rows) {
     const middle = (lane) => rows.find((row) => row.lane === lane).top + 8.5;
     cycle.hops.forEach(([lane, , start, publish, end], n) => {
-      if (publish !== null && publish > end) { // another callback of the node published for it
+      if (publish !== null && end !== null && publish > end) { // another callback of the node published for it
         bar(layer, scale, middle(lane) - 8.5, cycle.start + end, cycle.start + publish,
           { fill: "var(--series-0)", opacity: 0.4 },
           `${ms(publish - end)} ms until another callback of the node published`, 5);
