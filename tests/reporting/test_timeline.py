@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import polars as pl
 from told_run import MS, PERIOD_NS, told_plan, told_run
 
 from chainshaper import data_flow, measure_latency
@@ -42,6 +43,19 @@ def test_what_the_gate_held_lies_between_arrival_and_release(tmp_path: Path) -> 
     rows = held.select("traversal", "arrival", "let_go", "slot", "overrun").rows()
     late = PERIOD_NS + MS + 31 * MS
     assert rows == [(0, 17 * MS, 31 * MS + 20_000, 0, None), (1, late, late, None, "publish")]
+
+
+def test_a_gate_without_callback_events_is_known_by_its_process_and_message(
+    tmp_path: Path,
+) -> None:
+    """A Python node's gate names no callback that any other event names."""
+    recording = told_run(tmp_path / "told", cycles=2)
+    tables = {name: recording.events[name] for name in recording.events}
+    nameless = tables["gate_release"].with_columns(callback=pl.lit(0, dtype=pl.UInt64))
+    tables["gate_release"] = nameless
+    timeline = _timeline(Recording(recording.path, recording.info, tables))
+    assert timeline.holds["arrival"].to_list() == [17 * MS, PERIOD_NS + 17 * MS]
+    assert not timeline.origins["assumed"].any()
 
 
 def test_a_cycle_whose_output_never_reached_the_gate_counts_from_its_stamp(tmp_path: Path) -> None:

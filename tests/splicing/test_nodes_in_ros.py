@@ -91,6 +91,9 @@ def started(
     try:
         yield child
         child.send_signal(signal.SIGINT)
+        if child.poll() is None:
+            time.sleep(0.002)
+            child.send_signal(signal.SIGINT)  # `ros2 launch` hands on what it got itself
         assert child.wait(20) == exit_code
     finally:
         child.kill()

@@ -23,7 +23,8 @@ function plotTimeline(host, recordings) {
   const frame = make(host, "div", { className: "chart", tabIndex: 0 });
   frame.setAttribute("role", "group");
   caption(host, "Orange: what the cycle itself ran; pale: transport, and waiting; grey: other "
-    + "callbacks; blue: slots; hatched: held by the gate; red: stalls. A callback is pale where its end was not recorded. Drag, or the arrow keys, move; "
+    + "callbacks; blue: slots; hatched: held by the gate; red: stalls. A callback is pale where its "
+    + "end was not recorded. Drag, or the arrow keys, move; "
     + "+ and − or Ctrl with the wheel zoom. " + recordings.map((one) => kept(one)).join(" "));
   const hopTable = make(host, "div", { className: "scroll" });
 

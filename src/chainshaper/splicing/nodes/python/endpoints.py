@@ -8,6 +8,7 @@ import ctypes
 import gc
 import importlib
 import os
+import signal
 import sys
 import time
 from collections.abc import Callable
@@ -167,5 +168,7 @@ def run(name: str, set_up: Callable[[Node], None]) -> None:
         node.get_logger().fatal(str(error))
         sys.exit(1)
     finally:
+        # Ctrl-C reaches a node from its terminal, and then again from `ros2 launch`.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         node.destroy_node()
         rclpy.try_shutdown()
