@@ -32,7 +32,9 @@ from chainshaper.profiling import chain_nodes, profiling_condition
 from chainshaper.record import record_command
 from chainshaper.recording import Recording, refuse_existing
 from chainshaper.reporting.comparison_files import write_comparison
+from chainshaper.splicing.generated_package import build_package, check_build_tools
 from chainshaper.splicing.launch_command import LaunchCommand, parse_launch_command
+from chainshaper.splicing.launch_folder import NODES
 from chainshaper.splicing.shaping_process import NodeKind
 from chainshaper.steps import Comparison, compare_recordings, plan_recording
 
@@ -83,6 +85,8 @@ def shape_launch(
         PlatformError, OperationError: a step failed; what the steps before it left is kept.
     """
     launch = parse_launch_command(command)
+    if node != "python":
+        check_build_tools()
     folder, stop = refuse_existing(folder), stop or threading.Event()
     folder.mkdir(exist_ok=True)
 
@@ -174,9 +178,6 @@ def _with_shaping_node(launch: LaunchCommand, splicing: Splicing) -> list[str]:
     words = launch.with_file(next(iter(splicing.launch.values())))
     if all(process.package is None for process in splicing.processes):
         return words
-    from chainshaper.splicing.generated_package import build_package
-    from chainshaper.splicing.launch_folder import NODES
-
     setup = build_package(splicing.folder / NODES)
     return ["bash", "-c", 'source "$0" && exec "$@"', str(setup), *words]
 

@@ -20,6 +20,7 @@ __all__ = [
     "GENERIC_PACKAGE",
     "MessageType",
     "build_package",
+    "check_build_tools",
     "generic_package",
     "message_type_named",
     "typed_package",
@@ -123,14 +124,11 @@ def typed_package(message_type: MessageType) -> dict[str, str]:
     }
 
 
-def build_package(folder: Path) -> Path:
-    """Build the packages in a folder with colcon, into ``build`` and ``install`` beside them.
-
-    Returns the file to source before the launch, ``install/setup.bash``.
+def check_build_tools() -> None:
+    """See that a package can be built, before anything is done for it.
 
     Raises:
         PlatformError: colcon, CMake, a compiler or the ROS 2 environment is missing.
-        OperationError: the build failed; the end of what it said is in the message.
     """
     compiler = os.environ.get("CXX", "c++").split()[0]
     for program, package in (
@@ -148,6 +146,18 @@ def build_package(folder: Path) -> Path:
             "building the shaping node needs a ROS 2 environment, and none is sourced: "
             "`source /opt/ros/DISTRIBUTION/setup.bash` first, or choose `--node python`"
         )
+
+
+def build_package(folder: Path) -> Path:
+    """Build the packages in a folder with colcon, into ``build`` and ``install`` beside them.
+
+    Returns the file to source before the launch, ``install/setup.bash``.
+
+    Raises:
+        PlatformError: see :func:`check_build_tools`.
+        OperationError: the build failed; the end of what it said is in the message.
+    """
+    check_build_tools()
     build = subprocess.run(
         ["colcon", "--log-base", "log", "build", "--base-paths", ".", "--merge-install"],
         cwd=folder,
