@@ -9,6 +9,7 @@
 #include <sys/mman.h>
 
 #include <chrono>
+#include <csignal>
 #include <cstring>
 #include <memory>
 #include <optional>
@@ -265,6 +266,9 @@ private:
 template<typename SetUp>
 int run(int argc, char ** argv, const std::string & name, SetUp && set_up)
 {
+  // Ctrl-C reaches a node from its terminal, and then again from `ros2 launch`. When rclcpp has
+  // seen the first it gives the signal back, as it was before: ignored.
+  std::signal(SIGINT, SIG_IGN);
   rclcpp::init(argc, argv);
   auto node = make_node(name);
   int code = 0;
