@@ -30,7 +30,7 @@ from chainshaper.errors import OperationError, PlatformError
 from chainshaper.recording import Recording
 from chainshaper.sources import open_source
 
-__all__ = ["chain_nodes", "profiling_condition"]
+__all__ = ["chain_nodes", "check_profiling", "profiling_condition"]
 
 START_NS = 30_000_000_000
 """The nodes have this long to appear."""
@@ -53,13 +53,7 @@ def profiling_condition(
         OperationError: `apply` governs one of the nodes, or the core; not all could be put back.
             And where it is called: a node does not appear, or the kernel refuses something.
     """
-    if not may_use_fifo():
-        raise PlatformError(
-            "profiling needs SCHED_FIFO: run as root, or give your user an rtprio limit of 98 in "
-            "/etc/security/limits.conf; without, `chainshaper record` records as things are"
-        )
-    core = available_cores()[-1] if core is None else core
-    check_cores({core: "the chain"})
+    core = check_profiling(core)
     journal = claim_run({core}, nodes, folder)
     watcher = None
     try:
@@ -70,6 +64,22 @@ def profiling_condition(
         if watcher is not None:
             watcher.kill()
             watcher.wait()
+
+
+def check_profiling(core: int | None = None) -> int:
+    """The core on which executors will run, once it is sure that they may.
+
+    Raises:
+        PlatformError: no such core, or SCHED_FIFO is not permitted.
+    """
+    if not may_use_fifo():
+        raise PlatformError(
+            "profiling needs SCHED_FIFO: run as root, or give your user an rtprio limit of 98 in "
+            "/etc/security/limits.conf; without, `chainshaper record` records as things are"
+        )
+    core = available_cores()[-1] if core is None else core
+    check_cores({core: "the chain"})
+    return core
 
 
 def chain_nodes(recording: Recording | str | Path, chain: str) -> tuple[str, ...]:

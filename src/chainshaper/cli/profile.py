@@ -69,7 +69,7 @@ def profile(
     threads are as before. What happened before the priorities were in force is left out.
     """
     from chainshaper.command_process import check_command
-    from chainshaper.profiling import chain_nodes, profiling_condition
+    from chainshaper.profiling import chain_nodes, check_profiling, profiling_condition
     from chainshaper.recording import refuse_existing
 
     if not command:
@@ -83,6 +83,7 @@ def profile(
         raise InputError(f"--like {like} is about the nodes of a chain: name it with --chain")
     refuse_existing(output)
     check_command(command)
+    core = check_profiling(core)
     names = [f"/{name.strip('/')}" for name in node or ()]
     if like is not None and chain is not None:
         names += chain_nodes(like, chain)
