@@ -61,7 +61,8 @@ class Stamping:
         return max(tid for tid in tids if tid != self.tid)
 
     def windows(self, after_ns: int, before_ns: int) -> list[tuple[int, int]]:
-        """Once it has ended: when its main thread ran, between two instants."""
+        """When its main thread ran, between two instants; ends it."""
+        self.process.terminate()
         assert self.process.wait(timeout=60) == 0
         found = json.loads(self.output.read_text())
         return [(start, end) for start, end in found if after_ns <= start and end <= before_ns]

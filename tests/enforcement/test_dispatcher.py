@@ -94,7 +94,7 @@ def test_without_the_class_it_gates_as_well_as_it_can_and_says_so(tmp_path: Path
     def drop() -> None:  # PR_CAPBSET_DROP: root does not get it back with the exec
         libc.prctl(24, CAP_SYS_NICE, 0, 0, 0)
 
-    with stamping(tmp_path, 6) as spinner:
+    with stamping(tmp_path, 30) as spinner:
         script = Path(__file__).with_name("freezer_owner.py")
         arguments = [tmp_path / "run", CORE, 40, 20, spinner.tid]
         owner = subprocess.Popen(
@@ -121,7 +121,7 @@ def test_without_the_class_it_gates_as_well_as_it_can_and_says_so(tmp_path: Path
 
 def test_after_a_stall_what_should_be_open_by_then_counts(tmp_path: Path) -> None:
     slots = ((5 * MS, 12 * MS),)
-    with stamping(tmp_path, 5) as spinner, freezer(tmp_path, CYCLE, slots) as back_end:
+    with stamping(tmp_path, 30) as spinner, freezer(tmp_path, CYCLE, slots) as back_end:
         back_end.assign(spinner.tid, "server-0")
         back_end.arm(0)
         wait_for(lambda: (back_end.counters()["server-0"].slots or 0) >= 20, "20 slots")

@@ -68,7 +68,7 @@ def begun(back_end: Freezer) -> int:
 
 
 def test_a_gated_thread_runs_inside_its_slots_only_and_its_siblings_run_on(tmp_path: Path) -> None:
-    with stamping(tmp_path, 4) as spinner, freezer(tmp_path, server("a", (5, 12))) as back_end:
+    with stamping(tmp_path, 30) as spinner, freezer(tmp_path, server("a", (5, 12))) as back_end:
         back_end.assign(spinner.tid, "a")
         back_end.arm(0)
         begin = begun(back_end)
@@ -94,8 +94,8 @@ def test_a_gated_thread_runs_inside_its_slots_only_and_its_siblings_run_on(tmp_p
 def test_two_servers_take_turns_on_one_core(tmp_path: Path) -> None:
     slots = {"a": ((0 * MS, 8 * MS),), "b": ((8 * MS, 14 * MS),)}
     with (
-        stamping(tmp_path, 4) as first,
-        stamping(tmp_path, 4) as second,
+        stamping(tmp_path, 30) as first,
+        stamping(tmp_path, 30) as second,
         freezer(tmp_path, server("a", (0, 8)), server("b", (8, 14))) as back_end,
     ):
         back_end.assign(first.tid, "a")
@@ -115,8 +115,8 @@ def test_two_servers_take_turns_on_one_core(tmp_path: Path) -> None:
 def test_processes_of_one_server_are_opened_and_closed_together(tmp_path: Path) -> None:
     with (
         own_cgroup("unit") as home,
-        stamping(tmp_path, 4) as inside,
-        stamping(tmp_path, 4, OTHER_CORE) as outside,
+        stamping(tmp_path, 30) as inside,
+        stamping(tmp_path, 30, OTHER_CORE) as outside,
     ):
         # One lives in a unit of its own, the other in the group that this test is in.
         (home / "cgroup.procs").write_text(str(inside.tid))
@@ -144,7 +144,7 @@ def test_processes_of_one_server_are_opened_and_closed_together(tmp_path: Path) 
 def test_another_anchor_moves_the_slots_and_lets_nothing_slip_between(
     tmp_path: Path, shift: int
 ) -> None:
-    with stamping(tmp_path, 5) as spinner, freezer(tmp_path, server("a", (5, 12))) as back_end:
+    with stamping(tmp_path, 30) as spinner, freezer(tmp_path, server("a", (5, 12))) as back_end:
         back_end.assign(spinner.tid, "a")
         back_end.arm(0)
         begin = begun(back_end)
@@ -216,8 +216,8 @@ def test_where_servers_overlap_the_better_priority_runs(tmp_path: Path) -> None:
         pytest.skip("SCHED_FIFO is not permitted (CAP_SYS_NICE)")
     servers = (server("chain", (0, 12), priority=2), server("output", (4, 8), priority=1))
     with (
-        stamping(tmp_path, 4) as chain,
-        stamping(tmp_path, 4) as output,
+        stamping(tmp_path, 30) as chain,
+        stamping(tmp_path, 30) as output,
         freezer(tmp_path, *servers) as back_end,
     ):
         back_end.assign(chain.tid, "chain")
