@@ -1,6 +1,6 @@
 # `make demo` and `make test` need nothing but Python 3.10 or newer; see scripts/setup.
 
-.PHONY: demo test test-kernel lint benchmark docs clean
+.PHONY: demo test test-kernel lint benchmark experiments docs clean
 
 demo: .venv/.ready
 	.venv/bin/chainshaper demo
@@ -22,10 +22,15 @@ benchmark: .venv/.ready-dev
 	.venv/bin/python benchmarks/shaping_jitter.py
 	.venv/bin/python benchmarks/band_placement.py
 	.venv/bin/python benchmarks/simulator.py
+	.venv/bin/python benchmarks/sweep.py
 	.venv/bin/python benchmarks/ctf_decode.py
 	.venv/bin/python benchmarks/trace_to_latency.py
 	.venv/bin/python benchmarks/enforcement/enter_exit.py
-	.venv/bin/python benchmarks/enforcement/configurations.py
+
+# The paper's tables and figures, ours beside them, in experiments/RESULTS.md. Half an hour on a quiet
+# machine; LIVE=0 only simulates, which takes a minute or two.
+experiments: .venv/.ready-dev
+	.venv/bin/python experiments/render.py $(if $(filter 0,$(LIVE)),--simulated)
 
 docs: .venv/.ready-dev
 	.venv/bin/mkdocs build --strict

@@ -2,14 +2,22 @@
 
     python experiments/validate_simulator.py [APP.yaml] [--cycles 1000] [--keep FOLDER]
 
-The application runs live, and is simulated twice: with what waking up, taking and publishing cost
-by default, and with what they cost here, measured in a short run before with another seed, so that
-nothing is taken over from the run that is compared with. Execution times are the same ones in all.
-Cycles that the machine disturbed are left out. Recordings that are in FOLDER already are used.
+The application runs live, with and without the nodes that only interfere, and each is simulated
+twice: with what waking up, taking and publishing cost by default, and with what they cost here,
+measured in a short run before with another seed, so that nothing is taken over from the runs that
+are compared with. Execution times are the same ones in all. Recordings that are in FOLDER already
+are used.
+
+Cycles that the machine disturbed are left out, on the stall meters' evidence and no other: those
+that it stalled, and then those in which one of the cores ran at another pace than in the short
+run, by a factor of 1.5 or more. (What a simulation does not know, hops, publications, interrupts,
+takes some 2.3 ms of a cycle of the example; at 1.5 times that it is off by more than 1 ms.)
+Figures with both kinds left out are judged; those without stalled cycles only stand beside them.
 """
 
 import argparse
 import tempfile
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +25,7 @@ import polars as pl
 
 from chainshaper import load_application, open_recording, run_application, simulate
 from chainshaper.analysis import analyse_latency
+from chainshaper.analysis.pace import ordinary_pace, relative_pace
 from chainshaper.recording import Recording
 from chainshaper.simulation.samples import measured_costs
 from chainshaper.workload.description import Application
@@ -27,6 +36,7 @@ MEDIAN_MS, P99_MS, MAXIMA = 0.3, 1.5, 0.03
 
 CALIBRATION_SEED = 1_000_003
 CALIBRATION_CYCLES = 100
+OFF_PACE = 1.5
 
 
 def live(application: Application, path: Path, cycles: int) -> Recording:
@@ -37,20 +47,47 @@ def live(application: Application, path: Path, cycles: int) -> Recording:
     return run_application(application, path, cycles=cycles)
 
 
+def with_and_without_interference(application: Application) -> Iterator[tuple[str, Application]]:
+    """The application, and without nodes that exchange no messages with others if it has any."""
+    yield "live", application
+    nodes = {
+        name: node
+        for name, node in application.nodes.items()
+        if any(callback.publishes or callback.subscriptions for callback in node.callbacks)
+    }
+    if len(nodes) < len(application.nodes):
+        yield "alone", application.model_copy(update={"nodes": nodes})
+
+
 def by_cycle(recording: Recording, period_ns: int) -> pl.DataFrame:
-    """Latency and disturbance by the number of the cycle."""
+    """Start, end, latency and disturbance by the number of the cycle."""
     frame = analyse_latency(recording, recording.info.chain or "").traversals
     first = frame["start"].min()
     return frame.drop_nulls("latency_ns").select(
         ((pl.col("start") - first) / period_ns).round().cast(pl.Int64).alias("cycle"),
+        "start",
+        "end",
         "latency_ns",
         "disturbed",
     )
 
 
+def off_pace(
+    recording: Recording, cycles: pl.DataFrame, ordinary: Mapping[int, float]
+) -> pl.Series:
+    """Whether a core ran faster or slower in a cycle than it ordinarily does."""
+    start, end = (cycles[column].to_numpy() for column in ("start", "end"))
+    pace = relative_pace(recording.events, start, end, ordinary)
+    usual = (pace > 1 / OFF_PACE) & (pace < OFF_PACE)
+    return pl.Series("off_pace", ~usual.all(axis=0))
+
+
 def compare(name: str, measured: pl.DataFrame, simulated: pl.DataFrame) -> None:
     """Print how far apart the two are."""
-    both = measured.join(simulated, on="cycle", suffix="_simulated").filter(~pl.col("disturbed"))
+    both = measured.join(simulated, on="cycle", suffix="_simulated")
+    if both.is_empty():
+        print(f"{name:<28}{0:>7}  the machine's pace has changed: nothing to compare")
+        return
     ours = both["latency_ns_simulated"].to_numpy() / MS
     theirs = both["latency_ns"].to_numpy() / MS
     apart = np.abs(ours - theirs)
@@ -58,7 +95,7 @@ def compare(name: str, measured: pl.DataFrame, simulated: pl.DataFrame) -> None:
     median, p99 = np.percentile(apart, [50, 99])
     met = median <= MEDIAN_MS and p99 <= P99_MS and maxima <= MAXIMA
     print(
-        f"{name:<18}{len(both):>7}{median:>9.3f}{p99:>9.3f}{apart.max():>9.3f}"
+        f"{name:<28}{len(both):>7}{median:>9.3f}{p99:>9.3f}{apart.max():>9.3f}"
         f"{(ours - theirs).mean():>9.3f}{theirs.max():>10.3f}{ours.max():>10.3f}{maxima:>8.2%}"
         f"  {'met' if met else 'missed'}"
     )
@@ -76,17 +113,28 @@ def main() -> None:
         folder = options.keep or Path(scratch)
         folder.mkdir(exist_ok=True)
         other_seed = application.model_copy(update={"seed": CALIBRATION_SEED})
-        costs = measured_costs(live(other_seed, folder / "calibration", CALIBRATION_CYCLES))
-        measured = by_cycle(live(application, folder / "live", options.cycles), period)
-        calibrated = application.model_copy(update={"simulation": costs})
-        print(
-            f"{'|simulated − live|':<18}{'cycles':>7}{'median':>9}{'p99':>9}{'max':>9}"
-            f"{'bias':>9}{'max live':>10}{'max sim.':>10}{'apart':>8}   (ms)"
-        )
-        for name, described in (("default costs", application), ("measured costs", calibrated)):
-            recording = simulate(described, Path(scratch) / name.split()[0], cycles=options.cycles)
-            compare(name, measured, by_cycle(recording, period))
-        print(f"{'goal':<18}{'':>7}{MEDIAN_MS:>9.3f}{P99_MS:>9.3f}{'':>38}{MAXIMA:>8.2%}")
+        calibration = live(other_seed, folder / "calibration", CALIBRATION_CYCLES)
+        costs = measured_costs(calibration)
+        ordinary = ordinary_pace(calibration.events)
+        if not ordinary:
+            raise SystemExit("nobody watched the machine's pace: run it with real-time scheduling")
+        for which, described in with_and_without_interference(application):
+            recording = live(described, folder / which, options.cycles)
+            measured = by_cycle(recording, period)
+            not_stalled = measured.filter(~pl.col("disturbed"))
+            at_pace = not_stalled.filter(~off_pace(recording, not_stalled, ordinary))
+            print(
+                f"\n{', '.join(described.nodes)}\n"
+                f"{'|simulated − live|':<28}{'cycles':>7}{'median':>9}{'p99':>9}{'max':>9}"
+                f"{'bias':>9}{'max live':>10}{'max sim.':>10}{'apart':>8}   (ms)"
+            )
+            calibrated = described.model_copy(update={"simulation": costs})
+            for name, simulated in (("default costs", described), ("measured costs", calibrated)):
+                path = Path(scratch) / f"{which} {name}"
+                cycles = by_cycle(simulate(simulated, path, cycles=options.cycles), period)
+                compare(f"{name}, not stalled", not_stalled, cycles)
+                compare(f"{name}, at pace too", at_pace, cycles)
+            print(f"{'goal':<28}{'':>7}{MEDIAN_MS:>9.3f}{P99_MS:>9.3f}{'':>38}{MAXIMA:>8.2%}")
 
 
 if __name__ == "__main__":

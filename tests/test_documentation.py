@@ -38,6 +38,8 @@ def shortened(command: str) -> str:
     runs = re.match(r"chainshaper (run|shape|demo)\b(?!.*--help)", command)
     if runs and "--cycles" not in command:
         command += f" --cycles {SHORT}"
+    if command.startswith("chainshaper sweep"):
+        command += " --workers 1"  # starting more would take longer than so few cycles do
     if command.startswith("chainshaper doctor") and "--watch" not in command:
         command += " --watch 300ms"
     return command

@@ -12,6 +12,7 @@ from story import OFFSET, Callback, Publisher, Story
 from chainshaper import events
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning import PlanRequest, Profile, plan_chain, plan_warnings
+from chainshaper.planning.plan import revised
 from chainshaper.recording import Recording, RecordingInfo, ThreadInfo
 from chainshaper.steps import plan_recording, profile_chains
 
@@ -157,6 +158,21 @@ def test_a_further_sink_gets_a_slot_of_its_own() -> None:
         plan_recording(
             _recorded(), CHAIN, PlanRequest(policy="server-per-chain"), sinks=["/rear_raw../small"]
         )
+
+
+def test_who_subscribes_to_the_output_and_is_not_in_the_chain_receives_it() -> None:
+    recording = _recorded()
+    plan = plan_recording(recording, "/rear_raw../fused")
+    assert plan.shaping_node is not None
+    assert plan.shaping_node.receivers == ("/voxel",)
+    left = plan_recording(recording, "/rear_raw../fused", PlanRequest(with_receivers=False))
+    assert left == revised(
+        plan, shaping_node=plan.shaping_node.model_copy(update={"receivers": ()})
+    )
+    both = plan_recording(recording, CHAIN, sinks=("/rear_raw../fused",))
+    assert [node.receivers for node in both.further_shaping_nodes] == [("/voxel",)]
+    assert both.shaping_node is not None
+    assert both.shaping_node.receivers == (), "nobody takes /pose"
 
 
 def test_asynchronous_publication_gates_the_last_nodes_thread() -> None:

@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,11 +13,12 @@ from lttng_node import chain_command, required_node
 from processes import wait_for
 
 from chainshaper import InputError, OperationError, PlatformError, open_recording, profiling
+from chainshaper.enforcement.allocation import RecordedProcess, RecordedThread, allocate
 from chainshaper.enforcement.processes import list_processes
 from chainshaper.enforcement.realtime import available_cores, may_use_fifo
 from chainshaper.enforcement.scheduling_state import SchedulingState, state_of
 from chainshaper.enforcement.threads import Thread, list_threads
-from chainshaper.profiling import chain_nodes, profiling_condition
+from chainshaper.profiling import chain_nodes, executors_of, profiling_condition
 
 pytestmark = pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here")
 
@@ -67,7 +69,8 @@ def test_the_chains_threads_are_high_and_apart_and_afterwards_as_before(
         assert (executor.policy, executor.priority) == ("SCHED_FIFO", 87)
         assert executor.cores == (core,)
         for thread in _dds(nodes["/front"]):
-            assert (thread.policy, thread.priority) == ("SCHED_FIFO", 90)
+            assert thread.priority == (91 if thread.kind == "receive" else 90)
+            assert thread.policy == "SCHED_FIFO"
             assert list(thread.cores) == (others or [core])
         rear = {t.tid: state_of(t.tid) for t in list_threads(nodes["/rear"])}
         assert rear == {tid: before[tid] for tid in rear}
@@ -125,6 +128,22 @@ def test_a_node_that_does_not_appear_is_named(
         see_to_it(list_processes(nodes.values()))
 
 
+def test_an_executor_that_had_several_threads_has_them_again() -> None:
+    program = "import threading; threading.Thread(target=input, daemon=True).start(); input()"
+    command = [sys.executable, "-c", program, "--ros-args", "-r", "__node:=box"]
+    threads = tuple(RecordedThread(number, "executor", ("/part",)) for number in (1, 2))
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+        wait_for(lambda: len(list_threads(process.pid)) == 2, "the threads")
+        running = list_processes([process.pid])
+        for count in (1, 2):
+            earlier = [RecordedProcess(1, ("/box", "/part"), threads[:count], seen_ns=0)]
+            found = allocate(running, earlier)
+            for nodes in (frozenset(["/part"]), frozenset[str]()):
+                assert len(executors_of(found, nodes, running, earlier)) == count
+        assert executors_of(found, frozenset(["/other"]), running, earlier) == []
+        process.communicate(b"\n\n")
+
+
 def test_a_core_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with (
         pytest.raises(PlatformError, match="core 4000, which the chain asks for"),
@@ -137,9 +156,9 @@ def test_profile_records_the_chain_under_its_condition(node: Path, tmp_path: Pat
     first, second = tmp_path / "first", tmp_path / "second"
     command = chain_command(node, 100_000)
     assert called("record", "-o", first, "--duration", "1s", "--", *command).code == 0
-    assert chain_nodes(first, "/x../y") == ("/source", "/relay")
+    assert chain_nodes(open_recording(first), "/x../y") == ("/source", "/relay")
     with pytest.raises(InputError, match="/nowhere"):
-        chain_nodes(first, "/x../nowhere")
+        chain_nodes(open_recording(first), "/x../nowhere")
     chain: tuple[str | Path, ...] = ("--chain", "/x../y", "--like", first)
     arguments = ("-o", second, *chain, "--duration", "3s", "--", *command)
     assert called("profile", *arguments).code == 0
@@ -161,8 +180,6 @@ def test_profile_says_what_it_needs(tmp_path: Path) -> None:
     assert "no command given" in refused(2, "profile", "-o", path)
     said = refused(2, "profile", "-o", path, "--chain", "/a../b", *command)
     assert "an earlier recording knows: name it with --like" in said
-    said = refused(2, "profile", "-o", path, "--like", tmp_path, *command)
-    assert "name it with --chain" in said
     assert "no such folder" in refused(
         2, "profile", "-o", path, "--chain", "/a../b", "--like", tmp_path / "no", *command
     )

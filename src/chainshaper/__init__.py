@@ -14,6 +14,7 @@ Names are imported when they are first used, so that importing the package costs
 """
 
 import importlib
+import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -39,7 +40,13 @@ if TYPE_CHECKING:
         list_chains,
     )
     from chainshaper.launch_shaping import ShapedLaunch, shape_launch
-    from chainshaper.launch_splicing import Splicing, splice_launch_files, undo_splice
+    from chainshaper.launch_splicing import (
+        Splicing,
+        ThrottledInput,
+        splice_launch_files,
+        splice_throttlers,
+        undo_splice,
+    )
     from chainshaper.planning import (
         Plan,
         PlanRequest,
@@ -71,9 +78,17 @@ if TYPE_CHECKING:
         profile_chains,
         shape_application,
     )
+    from chainshaper.sweeping import sweep
     from chainshaper.thread_search import find_threads
     from chainshaper.workload.description import Application, load_application
     from chainshaper.workload.live import run_application
+
+# Memory that one step of an analysis lets go of is kept for the next: given back, the kernel would
+# have to clear every page of it again, which costs more than the work on it. Polars' allocator
+# reads this once, when Polars is imported.
+os.environ.setdefault(
+    "_RJEM_MALLOC_CONF", "oversize_threshold:0,narenas:1,dirty_decay_ms:-1,muzzy_decay_ms:-1"
+)
 
 _HOMES = {
     "chainshaper.analysis": (
@@ -98,7 +113,13 @@ _HOMES = {
     ),
     "chainshaper.dry_run": ("planned_changes",),
     "chainshaper.launch_shaping": ("ShapedLaunch", "shape_launch"),
-    "chainshaper.launch_splicing": ("Splicing", "splice_launch_files", "undo_splice"),
+    "chainshaper.launch_splicing": (
+        "Splicing",
+        "ThrottledInput",
+        "splice_launch_files",
+        "splice_throttlers",
+        "undo_splice",
+    ),
     "chainshaper.planning": (
         "Plan",
         "PlanRequest",
@@ -130,6 +151,7 @@ _HOMES = {
         "profile_chains",
         "shape_application",
     ),
+    "chainshaper.sweeping": ("sweep",),
     "chainshaper.thread_search": ("find_threads",),
     "chainshaper.workload.description": ("Application", "load_application"),
     "chainshaper.workload.live": ("run_application",),
@@ -153,6 +175,7 @@ __all__ = [
     "Recording",
     "ShapedLaunch",
     "Splicing",
+    "ThrottledInput",
     "analyse_latency",
     "application_graph",
     "apply_plan",
@@ -194,6 +217,8 @@ __all__ = [
     "simulate",
     "simulate_latencies",
     "splice_launch_files",
+    "splice_throttlers",
+    "sweep",
     "undo_splice",
     "write_picture",
     "write_report",

@@ -23,7 +23,7 @@ from pathlib import Path
 from chainshaper.command_process import end_command, start_command
 from chainshaper.dry_run import LEAD_NS, first_thread, server_table, shaping_nodes
 from chainshaper.durations import format_duration
-from chainshaper.enforcement.allocation import Allocation, new_and_ended
+from chainshaper.enforcement.allocation import Allocation, RecordedProcess, new_and_ended
 from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, make_back_end
 from chainshaper.enforcement.claims import claim_run
 from chainshaper.enforcement.journal import Journal
@@ -46,6 +46,10 @@ __all__ = ["Applied", "apply_plan"]
 START_NS = 30_000_000_000
 """A command has this long to start all nodes of the plan."""
 
+PHASE_BOUND_NS = 250_000
+"""Shaping nodes are told again where cycles begin when that has moved by more. Watching a thread
+from outside tells nothing finer (:data:`chainshaper.enforcement.phase.POLL_NS`)."""
+
 _LOOK_S = 1.0
 _NOTHING = ServerCounters(None, None, None, None)
 
@@ -65,7 +69,7 @@ class _Run:
     plan: Plan
     choice: Choice
     journal: Journal
-    recording: Recording | None
+    recorded: tuple[RecordedProcess, ...]
     stop: threading.Event
     watcher: subprocess.Popen[bytes] | None = None
     command: subprocess.Popen[bytes] | None = None
@@ -115,8 +119,10 @@ def apply_plan(
     check_cores({server.core: f"server {server.name}" for server in plan.servers})
     choice = choose_back_end(back_end)
     nodes = {thread.node for server in plan.servers for thread in server.threads}
+    nodes.update(receiver for node in shaping_nodes(plan) for receiver in node.receivers)
+    recorded = _seen_in(recording)
     journal = claim_run({server.core for server in plan.servers}, nodes, folder)
-    run = _Run(plan, choice, journal, recording, stop or threading.Event())
+    run = _Run(plan, choice, journal, recorded, stop or threading.Event())
     try:
         run.watcher = start_watching(run.folder)
         if command:
@@ -139,9 +145,21 @@ def apply_plan(
     return Applied(state, run.command.returncode if run.command else None)
 
 
+def _seen_in(recording: Recording | None) -> tuple[RecordedProcess, ...]:
+    """What a recording says about processes, looked up once: it takes longer than looking at them.
+
+    Reading events is slow to import: only who has a recording pays for it.
+    """
+    if recording is None:
+        return ()
+    from chainshaper.recorded_threads import recorded_processes
+
+    return recorded_processes(recording)[0]
+
+
 def _await_nodes(run: _Run, wait_ns: int, progress: Callable[[float, str], None]) -> Allocation:
     """Look until all nodes of the plan run, and their threads have stopped becoming more."""
-    begun, found = time.monotonic_ns(), find_threads(run.plan, run.recording)
+    begun, found = time.monotonic_ns(), find_threads(run.plan, recorded=run.recorded)
     while True:
         waited, complete = time.monotonic_ns() - begun, True
         try:
@@ -158,7 +176,7 @@ def _await_nodes(run: _Run, wait_ns: int, progress: Callable[[float, str], None]
         progress(min(1.0, waited / max(1, wait_ns)), "finding the nodes")
         if wait_ns:
             run.stop.wait(_LOOK_S)
-        now = find_threads(run.plan, run.recording)
+        now = find_threads(run.plan, recorded=run.recorded)
         if complete and not any(new_and_ended(found, now)):
             return now
         found = now
@@ -272,7 +290,12 @@ def _keep(
     origin, gated = first_thread(run.plan, found), gates(run.choice.name)
     begins = (state.anchor_ns or 0) - (0 if gated else LEAD_NS)
     slots = next((s.slots for s in state.servers if gated and origin.tid in s.threads), ())
-    drift = DriftWatch(origin.pid, origin.tid, run.plan.cycle_ns, begins, slots)
+    governed = {server.core for server in run.plan.servers}
+    drift = DriftWatch(
+        *(origin.pid, origin.tid, run.plan.cycle_ns, begins, slots),
+        cores=set(available_cores()) - governed,
+    )
+    told_ns, notes = 0, state.notes
     while True:
         is_over = run.command_ended or run.stop.is_set()
         counters = servers.counters()
@@ -281,24 +304,36 @@ def _keep(
             servers=tuple(
                 replace(one, counters=counters.get(one.name, _NOTHING)) for one in state.servers
             ),
-            drift_ns=drift.latest_ns,
+            drift_ns=(drifted_ns := drift.latest_ns),
             failure=_failure(run, servers, state),
         )
         save_run_state(run.folder, state)
         watch(state)
         if state.failure is not None or is_over:
             return state
+        if drifted_ns is not None and abs(drifted_ns - told_ns) > PHASE_BOUND_NS:
+            told_ns = drifted_ns
+            state = replace(state, notes=notes + _told_again(run, found, begins, drifted_ns))
         if run.stop.wait(_LOOK_S):
             continue
         if run.watcher is not None and run.watcher.poll() is not None:  # somebody killed it
             run.watcher = start_watching(run.folder)
-        now = find_threads(run.plan, run.recording)
+        now = find_threads(run.plan, recorded=run.recorded)
         new, _ = new_and_ended(found, now)
         state = _with_threads(state, _living(now, state))
         with contextlib.suppress(OperationError):  # a node is on its way up: at the next look
             if new:
                 state = _taken_in(run, servers, now, state)
             found = now
+
+
+def _told_again(run: _Run, found: Allocation, begins: int, drifted_ns: int) -> tuple[str, ...]:
+    """The shaping nodes follow the chain's beginning; what to know about that."""
+    moved = (
+        f"the chain's beginning has moved by {format_duration(drifted_ns)} since the plan was put "
+        "in force; shaping nodes were told, and outputs without a stamp follow from the next cycle"
+    )
+    return (moved, *tell_phase(run.plan, found, begins + drifted_ns))
 
 
 def _failure(run: _Run, servers: BackEnd, state: RunState) -> str | None:

@@ -167,6 +167,12 @@ FIELDS: dict[str, dict[str, pl.DataType]] = {
     "machine_stall": {  # `time` is when the sleeper should have woken, `cpu` where it sleeps
         "duration": _NANOSECONDS,  # how late it woke
     },
+    "machine_pace": {  # `time` is when a stretch of the sleeper's wake-ups began, on `cpu`
+        "duration": _NANOSECONDS,  # of the stretch
+        # CPU time of one wake-up in it. The work is the same each time: where it takes longer,
+        # the core runs at a slower pace.
+        "cpu_time": _NANOSECONDS,
+    },
 }
 
 OPTIONAL_FIELDS: dict[str, dict[str, pl.DataType]] = {

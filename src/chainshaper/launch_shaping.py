@@ -14,13 +14,14 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 from chainshaper.analysis import ChainEnumeration, data_flow, graph_of
 from chainshaper.app import ApplicationGraph
 from chainshaper.applying import START_NS, apply_plan
+from chainshaper.durations import format_duration
 from chainshaper.enforcement.processes import Process
 from chainshaper.enforcement.realtime import may_use_fifo
 from chainshaper.enforcement.runs import RunState
@@ -29,7 +30,7 @@ from chainshaper.exploration import list_chains
 from chainshaper.launch_splicing import Splicing, splice_launch_files
 from chainshaper.planning import Plan, PlanRequest, plan_warnings, save_plan
 from chainshaper.profiling import chain_nodes, profiling_condition
-from chainshaper.record import record_command
+from chainshaper.record import Scheduling, record_command
 from chainshaper.recording import Recording, refuse_existing
 from chainshaper.reporting.comparison_files import write_comparison
 from chainshaper.splicing.generated_package import build_package, check_build_tools
@@ -38,10 +39,14 @@ from chainshaper.splicing.launch_folder import NODES
 from chainshaper.splicing.shaping_process import NodeKind
 from chainshaper.steps import Comparison, compare_recordings, plan_recording
 
-__all__ = ["ShapedLaunch", "shape_launch"]
+__all__ = ["ShapedLaunch", "plan_launched", "shape_launch"]
 
 FIRST_LOOK_NS = 10_000_000_000
 """How long the first recording takes: long enough for everything to have started and run."""
+
+OVERRUN_PROBABILITY = 1e-5
+"""A run of a minute at 100 ms has 600 cycles: none of them is to be too late. The margin for that
+is added to every cycle's latency."""
 
 Choose: TypeAlias = Callable[[ApplicationGraph, ChainEnumeration], str]
 """Asked which of the chains that were found is meant."""
@@ -117,10 +122,10 @@ def shape_launch(
         duration_ns,
         chain=chain,
         watch_stalls=True,
-        scheduling=profiling_condition(chain_nodes(first, chain)) if may_use_fifo() else None,
+        scheduling=_profiled(first, chain),
     )
     progress(0.0, "planning")
-    plan = plan_recording(before, chain, request or PlanRequest())
+    plan, about_margin = plan_launched(before, chain, request or PlanRequest())
     save_plan(plan, folder / "plan.yaml")
     splicing = _spliced(plan, launch, folder / "launch", node, first)
     after = record(
@@ -129,17 +134,28 @@ def shape_launch(
         duration_ns,
         chain=chain,
         watch_stalls=True,
-        scheduling=_in_force(plan, back_end),
+        scheduling=_in_force(plan, back_end, first),
         plan=plan,
         gate_logs=splicing.logs,
     )
     progress(0.0, "comparing")
     comparison = compare_recordings([before, after], chain)
     write_comparison(comparison, folder)
-    found = [*before.info.notes, *plan_warnings(plan), *splicing.notes, *after.info.notes]
+    found = [
+        *before.info.notes,
+        *about_margin,
+        *plan_warnings(plan),
+        *splicing.notes,
+        *after.info.notes,
+    ]
     if not may_use_fifo():
         found.insert(0, "measured under ordinary scheduling: SCHED_FIFO is not permitted.")
     return ShapedLaunch(folder, chain, plan, splicing, comparison, tuple(dict.fromkeys(found)))
+
+
+def _profiled(first: Recording, chain: str) -> Scheduling | None:
+    """The paper's profiling condition, if we may."""
+    return profiling_condition(chain_nodes(first, chain), like=first) if may_use_fifo() else None
 
 
 def _chain(first: Recording, chain: str | None, choose: Choose | None) -> str:
@@ -158,6 +174,32 @@ def _chain(first: Recording, chain: str | None, choose: Choose | None) -> str:
             + ", ".join(one.spec for one in found.chains[:5])
         )
     return choose(graph_of(flow), found)
+
+
+def plan_launched(
+    recording: Recording, chain: str, request: PlanRequest
+) -> tuple[Plan, tuple[str, ...]]:
+    """The plan, and what to know about its margin where nobody said anything about that.
+
+    It is then as long as the tail of the latencies demands (:data:`OVERRUN_PROBABILITY`), and not
+    shorter than the standard: the way from the chain to the shaping node is not in what was
+    measured. Where the tail tells nothing it is the standard.
+
+    Raises: as :func:`chainshaper.steps.plan_recording`.
+    """
+    standard = plan_recording(recording, chain, request)
+    if request.epsilon_ns is not None or request.overrun_probability is not None:
+        return standard, ()
+    derived = replace(request, overrun_probability=OVERRUN_PROBABILITY)
+    try:
+        plan = plan_recording(recording, chain, derived)
+    except OperationError as error:
+        return standard, (
+            f"the margin is the standard {format_duration(standard.margin.epsilon_ns)}, since "
+            f"none can be derived: {error}",
+        )
+    longer = plan.margin.epsilon_ns > standard.margin.epsilon_ns
+    return (plan if longer else standard), ()
 
 
 def _spliced(
@@ -183,7 +225,9 @@ def _with_shaping_node(launch: LaunchCommand, splicing: Splicing) -> list[str]:
 
 
 @contextmanager
-def _in_force(plan: Plan, back_end: str) -> Iterator[Callable[[Sequence[Process]], bool]]:
+def _in_force(
+    plan: Plan, back_end: str, recording: Recording
+) -> Iterator[Callable[[Sequence[Process]], bool]]:
     """The plan in force on what runs; what it gives says whether all servers have opened.
 
     A thread of its own does what `chainshaper apply` does, until the context ends.
@@ -194,7 +238,14 @@ def _in_force(plan: Plan, back_end: str) -> Iterator[Callable[[Sequence[Process]
 
     def apply() -> None:
         try:
-            apply_plan(plan, back_end=back_end, wait_ns=START_NS, stop=stop, watch=states.append)
+            apply_plan(
+                plan,
+                back_end=back_end,
+                recording=recording,
+                wait_ns=START_NS,
+                stop=stop,
+                watch=states.append,
+            )
         except ChainshaperError as error:
             failures.append(error)
         finally:

@@ -5,6 +5,7 @@ section 2.3). Whoever plans slots for its callbacks has to plan for those branch
 are followed backwards here, from every input of a synchronising callback to what starts it.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,6 +66,7 @@ def profile_of(
         nodes=tuple(graph.callbacks[number].node for number in chain.callbacks),
         topics=chain.topics,
         core_of=core_of,
+        receivers=_receivers(graph, chain, nodes),
         callbacks=tuple(_times(flow, calm, stage, core_of[stage.node]) for stage in stages),
         fifo_priority=min(97, priority.get(stages[-1].node, DEFAULT_PRIORITY) + 5),
         recording=str(recording.path),
@@ -74,6 +76,7 @@ def profile_of(
         longest_stall_ns=longest_stall_ns,
         utilisation=_utilisation(flow, graph, core_of),
         longest_send_ns=_longest_send(flow),
+        lost_events=sum(recording.info.lost.values()) or None,
         output_depth=_output_depth(flow, stages[-1].node, chain.topics[-1]),
     )
 
@@ -240,6 +243,18 @@ def _inside(
     span = np.searchsorted(began, instants, side="right") - 1
     result: NDArray[np.bool_] = (span >= 0) & (instants <= latest_end[np.maximum(span, 0)])
     return result
+
+
+def _receivers(graph: ApplicationGraph, chain: Chain, nodes: Collection[str]) -> tuple[str, ...]:
+    """Who subscribes to the chain's output, and has no part in the chain.
+
+    Nodes with a hidden name are tools such as `ros2 topic echo`, which come and go.
+    """
+    return tuple(
+        node
+        for node in graph.subscribers.get(chain.topics[-1], ())
+        if node not in nodes and not node.rpartition("/")[2].startswith("_")
+    )
 
 
 def _executors(

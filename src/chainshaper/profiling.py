@@ -17,7 +17,12 @@ from pathlib import Path
 
 from chainshaper.analysis import data_flow, find_chain, graph_of
 from chainshaper.durations import format_duration
-from chainshaper.enforcement.allocation import Allocation, NodeThread, allocate
+from chainshaper.enforcement.allocation import (
+    Allocation,
+    NodeThread,
+    RecordedProcess,
+    allocate,
+)
 from chainshaper.enforcement.claims import claim_run
 from chainshaper.enforcement.journal import Journal
 from chainshaper.enforcement.processes import Process
@@ -27,10 +32,10 @@ from chainshaper.enforcement.runs import remove_run
 from chainshaper.enforcement.scheduling_memory import change_scheduling, restore_scheduling
 from chainshaper.enforcement.server_threads import scheduling_around
 from chainshaper.errors import OperationError, PlatformError
+from chainshaper.recorded_threads import recorded_processes
 from chainshaper.recording import Recording
-from chainshaper.sources import open_source
 
-__all__ = ["chain_nodes", "check_profiling", "profiling_condition"]
+__all__ = ["chain_nodes", "check_profiling", "executors_of", "profiling_condition"]
 
 START_NS = 30_000_000_000
 """The nodes have this long to appear."""
@@ -40,13 +45,18 @@ _SERVER = "the chain"
 
 @contextmanager
 def profiling_condition(
-    nodes: Collection[str] = (), core: int | None = None, folder: Path | None = None
+    nodes: Collection[str] = (),
+    core: int | None = None,
+    folder: Path | None = None,
+    like: Recording | None = None,
 ) -> Iterator[Callable[[Sequence[Process]], bool]]:
     """Have the threads of ``nodes`` (default: of all) run as the paper profiles a chain.
 
     It gives what :func:`chainshaper.record.record_command` wants for its ``scheduling``. ``core``
     is where the executors run; by default the last that we may use. ``folder`` is where runs keep
-    their journals (default: `/run/chainshaper`).
+    their journals (default: `/run/chainshaper`). ``like`` is an earlier recording of the
+    application: it tells what a container's components are, and which executors have several
+    threads.
 
     Raises:
         PlatformError: no such core, or SCHED_FIFO is not permitted.
@@ -58,7 +68,8 @@ def profiling_condition(
     watcher = None
     try:
         watcher = start_watching(journal.path.parent)
-        yield _Condition(frozenset(nodes), core, journal).see_to_it
+        recorded = recorded_processes(like)[0] if like is not None else ()
+        yield _Condition(frozenset(nodes), core, journal, recorded).see_to_it
     finally:
         _put_back(journal)
         if watcher is not None:
@@ -82,14 +93,12 @@ def check_profiling(core: int | None = None) -> int:
     return core
 
 
-def chain_nodes(recording: Recording | str | Path, chain: str) -> tuple[str, ...]:
+def chain_nodes(recording: Recording, chain: str) -> tuple[str, ...]:
     """The nodes of a chain in an earlier recording of the application, in its order.
 
     Raises:
-        InputError: no such recording or chain.
+        InputError: no such chain.
     """
-    if not isinstance(recording, Recording):
-        recording = open_source(recording)
     graph = graph_of(data_flow(recording.events, recording.info.clock_offset_ns))
     found = find_chain(graph, chain)
     return tuple(dict.fromkeys(graph.callbacks[number].node for number in found.callbacks))
@@ -102,14 +111,15 @@ class _Condition:
     nodes: frozenset[str]
     core: int
     journal: Journal
+    recorded: Sequence[RecordedProcess]
     begun_ns: int = field(default_factory=time.monotonic_ns)
     done: set[tuple[int, int]] = field(default_factory=set)
 
     def see_to_it(self, processes: Sequence[Process]) -> bool:
         """Give new threads what they shall have; whether all nodes have it, and nothing was new."""
-        found = allocate(processes)
+        found = allocate(processes, self.recorded)
         there = {node for one in found.threads for node in one.nodes}
-        members = _executors(found, self.nodes, processes)
+        members = executors_of(found, self.nodes, processes, self.recorded)
         if not members or not self.nodes <= there:
             if time.monotonic_ns() - self.begun_ns > START_NS:
                 raise OperationError(
@@ -129,19 +139,38 @@ class _Condition:
         return not new
 
 
-def _executors(
-    found: Allocation, nodes: frozenset[str], processes: Sequence[Process]
+def executors_of(
+    found: Allocation,
+    nodes: frozenset[str],
+    processes: Sequence[Process],
+    recorded: Sequence[RecordedProcess],
 ) -> list[NodeThread]:
     """The threads that execute these nodes, or publish for them; of all nodes if none are named.
 
     `ros2 launch` is a node as well, and nobody's chain: what has started other nodes is left out.
+    Where several threads of a process executed before, those that nobody has named are taken for
+    such: they do not differ from others that do next to nothing, as the one that waits for signals.
     """
     owners = {one.thread.pid for one in found.threads if one.nodes}
     launchers = {one.parent for one in processes if one.pid in owners}
+    names = {one.pid: one.threads[0].comm for one in processes if one.threads}
+    several = {
+        node
+        for seen in recorded
+        if sum(thread.role == "executor" for thread in seen.threads) > 1
+        for node in seen.nodes
+    }
     return [
         one
         for one in found.threads
-        if one.thread.role in ("executor", "publisher")
+        if (
+            one.thread.role in ("executor", "publisher")
+            or (
+                one.thread.role == "unknown"
+                and one.thread.comm == names[one.thread.pid]
+                and not several.isdisjoint(one.nodes)
+            )
+        )
         and (nodes & set(one.nodes) if nodes else one.nodes and one.thread.pid not in launchers)
     ]
 

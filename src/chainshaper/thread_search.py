@@ -4,6 +4,7 @@ The function behind `chainshaper threads`. It joins what /proc shows with what a
 same processes saw, as far as they are still the same.
 """
 
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -24,19 +25,22 @@ __all__ = ["find_threads"]
 
 
 def find_threads(
-    where: "int | Plan | None" = None, recording: "Recording | None" = None
+    where: "int | Plan | None" = None,
+    recording: "Recording | None" = None,
+    *,
+    recorded: Sequence[RecordedProcess] = (),
 ) -> Allocation:
     """Find the threads of an application and what each of them does.
 
     ``where`` is a process, which stands for its descendants too; a plan, for the nodes of its
     servers; or None for all that looks like an application of ROS 2 or DDS. ``recording`` is one
-    of the processes that still run, if there is one.
+    of the processes that still run, if there is one; who looks often gives what it says about them,
+    ``recorded``, instead.
 
     Raises:
         InputError: there is no such process.
     """
     processes = list_processes()
-    recorded: tuple[RecordedProcess, ...] = ()
     notes: tuple[str, ...] = ()
     if recording is not None:
         # Reading events is slow to import: only who has a recording pays for it.
@@ -50,9 +54,10 @@ def find_threads(
             raise InputError(f"no process {where}: it has ended, or is the kernel's own")
     else:
         found = allocate(find_applications(processes), recorded, among=processes)
-        nodes = None if where is None else _planned_nodes(where)
-        chosen = tuple(process for process in processes if _hosts(process, found, nodes))
-        notes += _missing(found, nodes or {})
+        nodes = {} if where is None else _planned_nodes(where)
+        hosted = None if where is None else nodes.keys() | _receivers(where)
+        chosen = tuple(process for process in processes if _hosts(process, found, hosted))
+        notes += _missing(found, nodes)
         if where is None and not chosen:
             notes += ("no process looks like an application of ROS 2 or DDS",)
     found = allocate(chosen, recorded, among=processes)
@@ -66,7 +71,13 @@ def _planned_nodes(plan: "Plan") -> dict[str, str]:
     return {thread.node: server.name for server in plan.servers for thread in server.threads}
 
 
-def _hosts(process: Process, found: Allocation, nodes: dict[str, str] | None) -> bool:
+def _receivers(plan: "Plan") -> set[str]:
+    """The nodes that receive what a plan's shaping nodes publish; they need not run."""
+    nodes = (plan.shaping_node, *plan.further_shaping_nodes)
+    return {receiver for node in nodes if node is not None for receiver in node.receivers}
+
+
+def _hosts(process: Process, found: Allocation, nodes: Collection[str] | None) -> bool:
     """Whether a process has one of these nodes; if None, any node, or takes part in DDS."""
     own = {node for one in found.threads if one.thread.pid == process.pid for node in one.nodes}
     if nodes is None:

@@ -185,6 +185,13 @@ def test_without_ends_chains_run_from_sources_to_outputs() -> None:
     assert enumerate_chains(graph(idle=[("/x", ())])).chains == ()
 
 
+def test_who_only_logs_ends_a_chain_and_begins_none() -> None:
+    logging = graph(
+        first=[(None, ("/t1",))], sink=[("/t1", ("/rosout",))], watch=[(None, ("/rosout",))]
+    )
+    assert [chain.topics for chain in enumerate_chains(logging).chains] == [("/t1",)]
+
+
 def ladder(rungs: int) -> ApplicationGraph:
     """``rungs`` stages of two parallel ways each: 2 ** rungs paths, no cycle."""
     nodes: dict[str, list[Edges]] = {"source": [(None, ("/s0",))]}

@@ -1,12 +1,12 @@
-"""Ends of starts: the fast walk against the definition."""
+"""Ends of starts: the compiled walk against the definition."""
 
 import itertools
 import random
 
-import numpy as np
+import polars as pl
 import pytest
 
-from chainshaper.analysis.pairing import ends_of_starts
+from chainshaper.analysis.instances import ends_of_starts
 
 
 def by_definition(
@@ -28,12 +28,10 @@ def by_definition(
     return result
 
 
-def as_arrays(events: list[tuple[int, int, int]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    thread, callback, time = zip(*events, strict=True) if events else ((), (), ())
-    return (
-        np.array(thread, dtype=np.int64),
-        np.array(callback, dtype=np.uint64),
-        np.array(time, dtype=np.int64),
+def as_table(events: list[tuple[int, int, int]]) -> pl.DataFrame:
+    types = {"tid": pl.Int32, "callback": pl.UInt64, "time": pl.Int64}
+    return pl.DataFrame(events, schema=types, orient="row").with_columns(
+        pl.lit(7, dtype=pl.Int32).alias("pid")
     )
 
 
@@ -52,12 +50,12 @@ def test_any_order_of_events(seed: int) -> None:
         )
         for _ in range(2)
     )
-    found = ends_of_starts(as_arrays(starts), as_arrays(ends))
-    assert found.tolist() == by_definition(starts, ends)
+    found = ends_of_starts(as_table(starts), as_table(ends)).cast(pl.Int64).fill_null(-1)
+    assert found.to_list() == by_definition(starts, ends)
 
 
 def test_more_callbacks_than_the_table_was_made_for() -> None:
     starts = [(1, callback, 2 * callback) for callback in range(5000)]
     ends = [(1, callback, 2 * callback + 1) for callback in range(5000)]
-    found = ends_of_starts(as_arrays(starts), as_arrays(ends))
-    assert found.tolist() == list(range(5000))
+    found = ends_of_starts(as_table(starts), as_table(ends)).cast(pl.Int64).fill_null(-1)
+    assert found.to_list() == list(range(5000))

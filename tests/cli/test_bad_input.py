@@ -36,7 +36,6 @@ def test_a_chain_that_does_not_exist(verb: str, chain: str, said: str, unshaped:
             ("chain: /t1../t3", "chain: /t1../brake"),
             ":2: chain: no topic or node is called '/brake'",
         ),
-        (("chain: /t1../t3", "chain: /t2../t3"), "no timer callback publishes or belongs to '/t2'"),
         (("timer: 50ms", "timer: 50"), "50 is not a duration: write a number and a unit"),
         (("publishes: [/t3]", "publishes: [/t3, /t1]"), "the topics form a cycle"),
         (("nodes:", "nodes: ["), "not YAML"),

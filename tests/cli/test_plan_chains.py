@@ -1,5 +1,7 @@
 """Plans of recordings: policies, and several chains with their offsets."""
 
+import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 from command_line import called, json_of, refused
 
 from chainshaper import load_plan, plan_shaping, save_plan
+from chainshaper.planning import Modes
 from chainshaper.recording import Recording
 
 MS = 1_000_000
@@ -87,6 +90,39 @@ def test_a_further_sink(unshaped: Recording) -> None:
     assert [node["output"] for node in values["further_shaping_nodes"]] == ["/t2"]
     twice = refused(2, "plan", unshaped.path, "--sink", "/t1../t3")
     assert "the plan shapes /t3 already" in twice
+
+
+def test_a_plan_says_that_events_were_lost(unshaped: Recording, tmp_path: Path) -> None:
+    recording = tmp_path / "lossy"
+    shutil.copytree(unshaped.path, recording)
+    info = json.loads((recording / "recording.json").read_text())
+    (recording / "recording.json").write_text(json.dumps({**info, "lost": {"lost_events": 7}}))
+    values = json_of("plan", recording, "--publish-slot", "100us")
+    assert values["evidence"]["lost_events"] == 7
+    assert any(warning.startswith("7 events were lost") for warning in values["warnings"])
+
+
+def test_modes_get_their_bands(unshaped: Recording, tmp_path: Path) -> None:
+    plan = ("plan", unshaped.path, "--publish-slot", "100us", "--epsilon", "1ms")
+    modes = ("--modes", "/mode:city=2,highway=1")
+    two = (*plan, "--bands", "2", *modes)
+    values = json_of(*two, "--late", "discard", "-o", tmp_path / "plan.yaml")
+    wanted = {"topic": "/mode", "default": "city", "bands": {"city": 2, "highway": 1}}
+    assert values["modes"] == {**wanted, "late": "discard"}
+    assert load_plan(tmp_path / "plan.yaml").modes == Modes.model_validate(values["modes"])
+    assert "from 1 to 1, or add a slot" in refused(2, *plan, *modes)
+    asynchronous = ("--publication", "asynchronous", "--publish-slot", "1ms")
+    assert "no `shaping_node`" in refused(2, *two, *asynchronous, "--bands", "1")
+    assert "--late publish goes with modes" in refused(2, *plan, "--late", "publish")
+    for wrong, reason in {
+        "/mode:city": "a band for each mode once",
+        "/mode:city=1,city=2": "a band for each mode once",
+        "/mode": "a band for each mode once",
+        "mode:city=1": "topic: 'mode' is not a full ROS 2 name",
+        "/mode:1st=1": "'1st' is not a mode's name",
+        "/t3:city=1": "/t3 carries the chain's output",
+    }.items():
+        assert reason in refused(2, *plan, "--modes", wrong)
 
 
 def test_compare_shows_prediction_beside_measurement(

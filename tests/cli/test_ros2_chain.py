@@ -77,6 +77,15 @@ def test_arguments_and_exit_codes_are_the_same(
     assert _ros2("chain", "no-such-verb") == 2
 
 
+def test_what_colcon_did_not_install_is_named(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(sys.modules, "chainshaper.cli.app", raising=False)
+    monkeypatch.setitem(sys.modules, "typer", None)
+    assert _ros2("chain", "info") == 3
+    assert "needs the Python package typer: install" in capsys.readouterr().err
+
+
 def test_the_versions_agree() -> None:
     version = ElementTree.parse(ROOT / "ros" / "package.xml").findtext("version")  # noqa: S314 - our own
     assert f'version = "{version}"' in (ROOT / "pyproject.toml").read_text()

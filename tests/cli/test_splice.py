@@ -37,7 +37,7 @@ def test_its_json_says_the_same(files: tuple[Path, Path, Path]) -> None:
     assert said["folder"] == str(folder)
     assert said["launch"] == {str(robot): copy}
     assert said["originals"] == {copy: str(robot)}
-    assert said["shaping_nodes"] == ["chainshaper_t3"]
+    assert said["nodes"] == ["chainshaper_t3"]
     assert said["logs"] == [str(folder / "logs/chainshaper_t3.csv")]
     assert said["diff"].startswith(f"--- {robot}\n")
     assert (said["notes"], said["setup"]) == ([], None)
@@ -61,6 +61,14 @@ def test_launch_arguments_are_written_as_for_ros2_launch(files: tuple[Path, Path
     assert called("splice", plan, robot, "n:=third", "-o", folder).code == 0
 
 
+def test_a_throttler_needs_no_plan(files: tuple[Path, Path, Path]) -> None:
+    _, robot, folder = files
+    said = json_of("splice", "--throttle", "/third:/t1=100ms", robot, "n:=1", "-o", folder)
+    assert said["nodes"] == ["chainshaper_throttler"]
+    assert '+    <remap from="/t1" to="/t1_throttled"/>\n' in said["diff"]
+    assert called("splice", "--undo", "-o", folder).out == f"{folder} is removed\n"
+
+
 def test_undo_needs_the_folder_only(files: tuple[Path, Path, Path]) -> None:
     plan, robot, folder = files
     assert called("splice", plan, robot, "-o", folder).code == 0
@@ -69,6 +77,16 @@ def test_undo_needs_the_folder_only(files: tuple[Path, Path, Path]) -> None:
     assert called("splice", plan, robot, "-o", folder).code == 0
     assert json_of("splice", plan, robot, "--undo", "-o", folder) == {"removed": str(folder)}
     assert "nothing to undo" in refused(2, "splice", "--undo", "-o", folder)
+
+
+def test_nothing_is_written_where_it_could_not_be_built(
+    files: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan, robot, folder = files
+    monkeypatch.setenv("PATH", "/nowhere")
+    said = refused(3, "splice", plan, robot, "-o", folder, "--node", "cpp", "--build")
+    assert "colcon, which building the shaping node needs, is not on the PATH" in said
+    assert not folder.exists()
 
 
 def test_a_plan_s_own_recording_tells_publishers_where_it_exists(
@@ -100,6 +118,15 @@ def test_a_plan_s_own_recording_tells_publishers_where_it_exists(
         (
             ["{plan}", "{robot}", "-o", "{folder}", "--node", "typed", "--type", "Header"],
             "'Header' is not a message type",
+        ),
+        (["{robot}", "-o", "{folder}", "--throttle", "/t1=100ms"], "--recording REC, or the node"),
+        (["{robot}", "-o", "{folder}", "--throttle", "/third:/t1"], "write a topic and a period"),
+        (["{robot}", "-o", "{folder}", "--throttle", "third:/t1=1s"], "'third' is not a full ROS"),
+        (["{robot}", "-o", "{folder}", "--throttle", "/third:/t1=0ms"], "is zero"),
+        (["-o", "{folder}", "--throttle", "/third:/t1=1s"], "give the launch files"),
+        (
+            ["{robot}", "-o", "{folder}", "--throttle", "/third:/t1=1s", "--node", "typed"],
+            "a throttler is for all types",
         ),
         (["{robot}", "{robot}", "-o", "{folder}"], "robot.launch.xml"),
         (["{plan}", "{plan}", "-o", "{folder}"], "plan.yaml"),

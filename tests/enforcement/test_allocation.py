@@ -136,6 +136,16 @@ def test_a_recording_of_another_process_with_that_id_says_nothing() -> None:
         assert found.threads[1].thread.role == "dds"
 
 
+def test_an_earlier_run_tells_what_a_containers_components_are() -> None:
+    container = _process(70, "container --ros-args -r __node:=box", *CYCLONE)
+    earlier = _seen(30, ("/box", "/first", "/second"), RecordedThread(30, "executor", ("/first",)))
+    found = allocate([container], [earlier]).threads
+    assert found[0].nodes == ("/box", "/first", "/second")
+    assert (found[0].thread.role, found[0].nodes_known_by) == ("executor", "recording")
+    stranger = _seen(31, ("/other", "/third"))
+    assert allocate([container], [stranger]).threads[0].nodes == ("/box",)
+
+
 def test_two_processes_with_one_name_are_a_note_and_nobody_is_chosen() -> None:
     line = "talker --ros-args -r __node:=x"
     found = allocate([_process(100, line, "recv"), _process(200, line, "recv")])

@@ -17,6 +17,21 @@ SECOND = 1_000_000_000
 
 
 @pytest.mark.parametrize(
+    ("phase", "first_ms"),
+    [(13, 113), (93, 193), (0, 200)],  # later than before; earlier, but that has passed; the same
+)
+def test_a_new_phase_is_in_force_from_the_next_cycle_that_begins_there(
+    phase: int, first_ms: int
+) -> None:
+    shaper = Shaper(Gate(((60 * MS, 61 * MS),), 100 * MS, anchor="cycle"))
+    shaper.set_phase(phase * MS, 100 * MS if phase == 13 else 100 * MS + 1)
+    before = shaper.decide(b"", first_ms * MS - 1)
+    assert before.origin_ns == 100 * MS, "what comes until then belongs to a cycle as it was"
+    assert shaper.decide(b"", first_ms * MS).origin_ns == first_ms * MS
+    assert shaper.decide(b"", (first_ms + 100) * MS).origin_ns == (first_ms + 100) * MS
+
+
+@pytest.mark.parametrize(
     ("arrival", "leaves_at", "slot", "cycles_waited"),
     [
         (1000, 1020, 0, 0),  # as early as can be

@@ -21,7 +21,7 @@ from chainshaper.enforcement.server_threads import (
 from chainshaper.enforcement.threads import Scheduling, Thread
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning import Plan, plan_shaping
-from chainshaper.planning.plan import Server, revised
+from chainshaper.planning.plan import Server, ShapingNode, revised
 from chainshaper.planning.plan import Thread as PlannedThread
 
 MS = 1_000_000
@@ -110,6 +110,36 @@ def test_servers_that_are_scheduling_classes_get_ordinary_threads() -> None:
     }
     assert left_by_back_end("freezer", wanted) == wanted
     assert Scheduling(0, None).policy == os.SCHED_OTHER
+
+
+def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() -> None:
+    node = ShapingNode(
+        name="gate",
+        input="/out_tmp",
+        output="/out",
+        core=1,
+        fifo_priority=84,
+        spin_ns=0,
+        pause_ns=0,
+        receivers=("/sink", "/a", "/absent"),
+    )
+    chain = _server("chain", EXECUTOR_A, priority=2)
+    plan = revised(
+        _plan(chain, _server("output", node.thread, priority=1, start=1)), shaping_node=node
+    )
+    gate, sink = _node("/gate", 100, "executor"), _node("/sink", 300, "executor", "dds", "unknown")
+    receiving = replace(sink[1], thread=replace(sink[1].thread, kind="receive"))
+    allocation = _allocation(gate, _node("/a", 200, "executor"), [sink[0], receiving, sink[2]])
+    wanted = plan_scheduling(plan, allocation, (0, 1))
+    assert _by_tid(wanted) == {
+        100: Scheduling(87, (1,)),
+        200: Scheduling(85, (1,)),  # in the chain, and so not below it
+        300: Scheduling(83, (1,)),
+        301: Scheduling(91, (0,)),  # waited for, so above other DDS threads
+    }
+    assert 300 not in _by_tid(left_by_back_end("scx", wanted)), "it would outrank the servers"
+    alone = revised(plan, shaping_node=node.model_copy(update={"receivers": ()}))
+    assert set(_by_tid(plan_scheduling(alone, allocation, (0, 1)))) == {100, 200}
 
 
 def test_several_threads_of_a_server_take_turns() -> None:

@@ -8,12 +8,22 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from command_line import called, refused
+from command_line import called, json_of, refused
+from small_chain import small_chain
 from told_run import LATENCY_NS, MS, PERIOD_NS, told_plan, told_run
 
-from chainshaper import compare_recordings, hop_breakdown, measure_latency, save_plan, write_report
+from chainshaper import (
+    compare_recordings,
+    hop_breakdown,
+    measure_latency,
+    plan_recording,
+    save_plan,
+    simulate,
+    write_report,
+)
 from chainshaper.durations import milliseconds
 from chainshaper.errors import OperationError
+from chainshaper.planning import publish_slots
 from chainshaper.recording import Recording
 from chainshaper.reporting.html.page import distinct_names, report_page
 from chainshaper.steps import Measurement
@@ -268,6 +278,25 @@ def test_the_command_writes_the_report_and_never_over_another(tmp_path: Path) ->
     assert not (tmp_path / "r.html").exists()
     chain = refused(2, "report", told.path, "-o", tmp_path / "r.html", "--chain", "/t9../t2")
     assert "/t9" in chain
+
+
+def test_the_command_prints_the_figures_as_compare_has_them(tmp_path: Path) -> None:
+    told = told_run(tmp_path / "told")
+    file = tmp_path / "report.html"
+    printed = json_of("report", told.path, told.path, "-o", file)
+    assert printed.pop("report") == str(file)
+    assert file.exists()
+    assert printed == json_of("compare", told.path, told.path)
+
+
+def test_a_simulated_recording_has_a_report(tmp_path: Path) -> None:
+    described = small_chain(tmp_path)
+    profile = simulate(described, tmp_path / "profile", cycles=20)
+    plan = plan_recording(profile)
+    shaped = simulate(described, tmp_path / "shaped", plan, cycles=20)
+    data = _data(_read(report_page([measure_latency(profile), measure_latency(shaped)])))
+    before, after = data["recordings"]
+    assert (before["slots"], after["slots"]) == ([], [list(slot) for slot in publish_slots(plan)])
 
 
 def test_a_plan_can_be_named_for_a_recording_that_does_not_know_it(tmp_path: Path) -> None:

@@ -7,11 +7,15 @@ import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from schedules import application, simulated
+from schedules import application, begin_of, simulated
 
-from chainshaper import events
+from chainshaper import events, plan_recording, simulate
+from chainshaper.analysis import analyse_latency
 from chainshaper.enforcement.gate import Gate, Modes, missed, release_of
+from chainshaper.planning import PlanRequest
+from chainshaper.recording import Recording
 from chainshaper.simulation import layout as at
+from chainshaper.simulation import simulate_latencies
 from chainshaper.simulation.gate_kernel import decide, missed_slot, switch_mode
 from chainshaper.workload.event_log import WORDS
 
@@ -183,3 +187,48 @@ def test_modes_that_are_announced_choose_the_slot(tmp_path: Path) -> None:
     held = ((releases["time"] - releases["origin"]) / 1e6).to_list()
     assert held == [30, 30, 10, 30]
     assert events.table(recording.events, "gate_release")["overrun"].null_count() == 4
+
+
+TWO_SINKS = """
+chain: /in../left
+nodes:
+  source: {callbacks: [{timer: 40ms, execution: {constant: 2ms}, publishes: [/in]}]}
+  left: {callbacks: [{subscription: /in, execution: {constant: 3ms}, publishes: [/left]}]}
+  right:
+    core: 2
+    callbacks: [{subscription: /in, execution: {constant: 7ms}, publishes: [/right]}]
+"""
+
+
+def published(recording: Recording, node: str) -> list[float]:
+    (pid,) = (pid for pid, name in recording.info.processes.items() if name == node)
+    times = recording.events["rmw_publish"].filter(pid=pid)["time"]
+    return [(time - begin_of(recording)) / 1e6 for time in times]
+
+
+def test_every_sink_of_a_plan_has_its_shaping_node(tmp_path: Path) -> None:
+    described = application(TWO_SINKS)
+    profile = simulate(described, tmp_path / "profile", cycles=5)
+    planned = plan_recording(profile, sinks=["/in../right"])  # longest 5 ms and 9 ms, margin 1 ms
+    recording = simulated(tmp_path, described, planned, cycles=2)
+    assert published(recording, "/left") == [5, 45]
+    assert published(recording, "/chainshaper_left") == [6, 46]
+    assert published(recording, "/right") == [9, 49]
+    assert published(recording, "/chainshaper_right") == [10, 50]
+
+
+def test_under_let_per_callback_every_output_waits_for_the_next_cycle(tmp_path: Path) -> None:
+    described = application(TWO_SINKS)
+    profile = simulate(described, tmp_path / "profile", cycles=5)
+    planned = plan_recording(profile, request=PlanRequest(policy="let-per-callback"))
+    recording = simulated(tmp_path, described, planned, cycles=3)
+    # The nodes share core 1. Before its slot [1, 2) that of /in watches the clock for 0.3 ms while
+    # the source computes; /left comes in the slot [0, 1) of the cycle after that.
+    assert published(recording, "/source") == [2.3, 42.3, 82.3]
+    assert published(recording, "/chainshaper_in") == [1, 41, 81, 121]
+    assert published(recording, "/left") == [5.3, 45.3, 85.3, 124]
+    assert published(recording, "/chainshaper_left") == [0, 40, 80, 120, 160]
+    # The chain starts where it did before /in was shaped.
+    analysis = analyse_latency(recording, recording.info.chain or "")
+    assert analysis.traversals["latency_ns"].to_list() == [80_000_000] * 3
+    assert simulate_latencies(described, planned, cycles=3).tolist() == [80_000_000] * 3

@@ -57,6 +57,8 @@ def test_running_nodes_get_their_names_topics_and_callbacks(
     reader = found["/traced/listener", "subscription", "/traced/chatter"]
     assert 0 < reader["execution_ns"]["mean"] <= reader["response_ns"]["mean"]
     assert abs(reader["count"] - timer["count"]) <= 1
+    functions = {one["kind"]: one["symbol"] for one in json_of("graph", recording)["callbacks"]}
+    assert "Talker" in functions["timer"]
     contents = json_of("info", recording, "--json")
     assert sorted(contents["processes"].values()) == ["/traced/listener", "/traced/talker"]
     assert contents["lost"] == {"lost_events": 0}

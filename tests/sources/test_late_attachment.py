@@ -7,10 +7,11 @@ import polars as pl
 
 from chainshaper import events
 from chainshaper.analysis.flow import data_flow
+from chainshaper.analysis.graph import application_graph
 from chainshaper.enforcement.processes import Process
 from chainshaper.recording import EndpointInfo, RecordingInfo
 from chainshaper.sources.found_nodes import with_found_nodes
-from chainshaper.sources.late_attachment import with_found_objects
+from chainshaper.sources.late_attachment import with_found_objects, with_functions
 
 PID, THREAD, OTHER = 10, 10, 11
 TIMER, READER, LAMBDA = 0x7A, 0x7B, 0x7C
@@ -112,6 +113,18 @@ def test_what_was_seen_being_created_is_left_as_it_is() -> None:
     )
     assert topics == {0x100: "/x", 0x200: "/b"}
     assert tables["rclcpp_timer_callback_added"].height == 1
+
+
+def test_functions_belong_to_callbacks_from_when_these_were_added() -> None:
+    added = ("rclcpp_timer_callback_added", {"time": 70 * MS, "timer_handle": 1, "callback": TIMER})
+    tables = {**chain(), **tables_of([added])}
+    functions = {(PID, TIMER): "Source::tick()", (PID, READER): "Relay::on_x()"}
+    named = with_functions(tables, functions, 50 * MS)
+    rows = named["rclcpp_callback_register"].select("time", "callback", "symbol").rows()
+    assert rows == [(50 * MS, READER, "Relay::on_x()"), (70 * MS, TIMER, "Source::tick()")]
+    symbols = {one.handle: one.symbol for one in application_graph(named).callbacks}
+    assert symbols[TIMER] == "Source::tick()"
+    assert with_functions(tables, {}, 50 * MS) is tables
 
 
 def test_the_rmws_own_topics_and_recordings_without_handles_change_nothing() -> None:

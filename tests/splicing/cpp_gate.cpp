@@ -117,11 +117,32 @@ void write_log(const std::string & path)
   log.write(shaper.gate(), late, std::numeric_limits<std::int64_t>::max(), std::nullopt);
 }
 
+// Where cycles of 100 ms begin that are to begin 7 ms later, before and after that is in force.
+void moved_phase()
+{
+  Gate gate;
+  gate.slots = {{0, 100'000'000}};
+  gate.cycle_ns = 100'000'000;
+  gate.anchor = Anchor::cycle;
+  Shaper shaper(gate, 0);
+  const std::int64_t begins = shaper.hold(std::nullopt).release.origin_ns + 200'000'000;
+  sleep_until(begins);
+  shaper.set_phase(7'000'000, begins + 8'000'000);
+  for (const std::int64_t at : {106'000'000, 108'000'000}) {
+    sleep_until(begins + at);
+    std::cout << (shaper.hold(std::nullopt).release.origin_ns - begins) / 1'000'000 << "\n";
+  }
+}
+
 }  // namespace
 
 int main(int argc, char ** argv)
 {
   const std::string what = argc > 1 ? argv[1] : "";
+  if (what == "--phase") {
+    moved_phase();
+    return 0;
+  }
   if (what == "--origins") {
     show_origins();
     return 0;

@@ -18,10 +18,24 @@ import yaml
 from chainshaper.launch_splicing import Splicing, splice_launch_files
 from chainshaper.planning import Plan, plan_shaping
 
-__all__ = ["CASES", "PACKAGES", "Case", "plan_for", "splice_case", "texts_of"]
+__all__ = ["CASES", "PACKAGES", "ROBOTS", "Case", "plan_for", "splice_case", "texts_of"]
 
 LAUNCH_FILES = Path(__file__).parent / "launch_files"
 PACKAGES = LAUNCH_FILES / "_packages"
+ROBOTS = {
+    "robot.launch.xml": '<launch>\n  <node pkg="l" exec="n" name="player"/>\n'
+    '  <node pkg="l" exec="n" name="fusion"/>\n</launch>\n',
+    "robot.launch.yaml": "launch:\n- node: {pkg: l, exec: n, name: player}\n"
+    "- node: {pkg: l, exec: n, name: fusion}\n",
+    "robot.launch.py": "from launch import LaunchDescription\n"
+    "from launch_ros.actions import Node\n"
+    "def generate_launch_description():\n"
+    "    return LaunchDescription([\n"
+    "        Node(package='l', executable='n', name='player'),\n"
+    "        Node(package='l', executable='n', name='fusion'),\n"
+    "    ])\n",
+}
+"""One robot in three languages: a player of data, and a node that takes them."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from small_chain import EXECUTOR_CORE, small_chain
 
 from chainshaper import shape_application
 from chainshaper.errors import InputError
-from chainshaper.planning import Plan, let_per_chain, plan_shaping, publish_slots
+from chainshaper.planning import Plan, let_per_callback, let_per_chain, plan_shaping, publish_slots
 from chainshaper.planning.plan import revised
 from chainshaper.planning.publication import Writer
 from chainshaper.splicing.application import splice_application, writers_of
@@ -145,12 +145,30 @@ def test_who_writes_what_is_read_off_the_description(application: Application) -
     ]
 
 
-def test_a_plan_with_more_shaping_nodes_than_can_run_is_refused(
+def test_every_topic_of_let_per_callback_gets_a_gate_of_its_own(
     application: Application, plan: Plan
 ) -> None:
+    spliced = splice_application(application, let_per_callback(plan, ["/t1", "/t2", "/t3"]))
+    gates = {
+        callback.publishes[0]: callback.gate
+        for _, callback in spliced.callbacks()
+        if callback.gate is not None
+    }
+    due = {topic: (gate.due_cycles, gate.slots) for topic, gate in gates.items()}
+    ms = 1_000_000
+    assert due == {
+        "/t1": (1, ((2 * ms, 3 * ms),)),
+        "/t2": (2, ((1 * ms, 2 * ms),)),
+        "/t3": (3, ((0, 1 * ms),)),
+    }
+    published = [topic for _, callback in spliced.callbacks() for topic in callback.publishes]
+    assert sorted(published) == ["/t1", "/t1_tmp", "/t2", "/t2_tmp", "/t3", "/t3_tmp"]
+
+
+def test_a_shaping_node_is_spliced_once(application: Application, plan: Plan) -> None:
     assert plan.shaping_node is not None
     more = plan.model_copy(update={"further_shaping_nodes": (plan.shaping_node,)})
-    with pytest.raises(InputError, match="remove them from the plan"):
+    with pytest.raises(InputError, match=r"has a node .* already"):
         splice_application(application, more)
 
 

@@ -165,3 +165,10 @@ def test_the_log_of_the_cpp_node_is_read(driver: Path, tmp_path: Path) -> None:
     assert second["mode"] == "city"
     assert (late["release"], late["slot"], late["published"]) == (None, None, None)
     assert (late["overrun"], late["source_timestamp"]) == ("discard", 2**63 - 1)
+
+
+def test_a_new_phase_is_in_force_from_the_next_cycle_that_begins_there(driver: Path) -> None:
+    run = subprocess.run(
+        [driver, "--phase"], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert run.stdout.split() == ["100", "107"], "in ms from a cycle as it was"

@@ -145,6 +145,20 @@ def test_all_shaping_nodes_of_a_plan_are_spliced(tmp_path: Path) -> None:
     assert second["node"]["remap"] == [{"from": "/t2", "to": "/t2_tmp"}]
 
 
+def test_a_plan_that_names_its_publishers_needs_no_recording(tmp_path: Path) -> None:
+    robot = tmp_path / "robot.launch.yaml"
+    robot.write_text(
+        "launch:\n- node: {pkg: a, exec: a, name: first}\n- node: {pkg: a, exec: a, name: second}\n"
+    )
+    plan = _with_further_node(plan_for("/second", "/t2"), "/t1", publisher="/first")
+
+    splice_launch_files(plan, [robot], tmp_path / "out")
+
+    *_, first, second = yaml.safe_load((tmp_path / "out/robot.launch.yaml").read_text())["launch"]
+    assert first["node"]["remap"] == [{"from": "/t1", "to": "/t1_tmp"}]
+    assert second["node"]["remap"] == [{"from": "/t2", "to": "/t2_tmp"}]
+
+
 def test_one_node_may_publish_two_of_the_topics(tmp_path: Path) -> None:
     robot = tmp_path / "robot.launch.py"
     robot.write_text(
@@ -239,12 +253,17 @@ def test_a_folder_with_spaces_is_one_word_on_the_command_line(tmp_path: Path, su
     assert f"'{script}'" in text
 
 
-def _with_further_node(plan: Plan, output: str) -> Plan:
+def _with_further_node(plan: Plan, output: str, publisher: str | None = None) -> Plan:
     """The plan with a shaping node for another topic, in slots of its own."""
     assert plan.shaping_node is not None
     name = "chainshaper" + output.replace("/", "_")
     node = plan.shaping_node.model_copy(
-        update={"name": name, "output": output, "input": f"{output}_tmp"}
+        update={
+            "name": name,
+            "output": output,
+            "input": f"{output}_tmp",
+            "publisher": publisher,
+        }
     )
     server = plan.servers[-1].model_copy(
         update={"name": name, "slots": ((90_000_000, 91_000_000),), "threads": (node.thread,)}

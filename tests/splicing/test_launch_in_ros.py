@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from launch_cases import CASES, PACKAGES, Case, splice_case
+from launch_cases import CASES, PACKAGES, ROBOTS, Case, splice_case
 from ros2 import ros2_environment
+
+from chainshaper import ThrottledInput, splice_throttlers
 
 pytestmark = pytest.mark.ros2
 
@@ -36,6 +38,13 @@ def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
             more = {"arguments": arguments, "topics": [case.output, *NAMES]}
             jobs += [{"file": str(file), **more} for file in (original, copy)]
             names.append(case.name)
+    found = _asked(jobs, environment)
+    pairs = list(zip(names, zip(found[::2], found[1::2], strict=True), strict=True))
+    return {name: [pair for other, pair in pairs if other == name] for name in names}
+
+
+def _asked(jobs: list[dict[str, Any]], environment: dict[str, str]) -> list[Any]:
+    """What ROS 2 says: for each job pairs of a node and its names of the topics."""
     run = subprocess.run(
         ["env", "python3", str(ASKED)],
         env=environment,
@@ -45,9 +54,26 @@ def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
         check=False,
     )
     assert run.returncode == 0, run.stderr
-    found = json.loads(run.stdout.splitlines()[-1])  # before it stands what `launch` logs
-    pairs = list(zip(names, zip(found[::2], found[1::2], strict=True), strict=True))
-    return {name: [pair for other, pair in pairs if other == name] for name in names}
+    answers: list[Any] = json.loads(run.stdout.splitlines()[-1])  # before it stands what is logged
+    return answers
+
+
+def test_ros_2_remaps_who_listens_to_a_throttler_and_nobody_else(tmp_path: Path) -> None:
+    topics = ["/rear", "/front"]
+    jobs = []
+    for name, text in ROBOTS.items():
+        (tmp_path / name).write_text(text)
+        inputs = [ThrottledInput(topic="/rear", period_ns=1, subscriber="/fusion")]
+        out = tmp_path / f"{name}.throttled"
+        (copy,) = splice_throttlers(inputs, [tmp_path / name], out).launch.values()
+        jobs.append({"file": str(copy), "arguments": {}, "topics": topics})
+    same = {topic: topic for topic in topics}
+    for nodes in _asked(jobs, ros2_environment()):
+        assert dict(nodes) == {
+            "/chainshaper_throttler": same,
+            "/player": same,
+            "/fusion": {**same, "/rear": "/rear_throttled"},
+        }
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)

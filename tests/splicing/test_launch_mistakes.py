@@ -160,7 +160,9 @@ def test_a_mistake_in_an_included_file_is_named_there(splice: Splice, tmp_path: 
 
 def test_a_publisher_that_publishes_elsewhere_is_refused(splice: Splice) -> None:
     node = '<node pkg="l" exec="n" name="ndt"><remap from="/pose" to="/other"/></node>'
-    with pytest.raises(InputError, match=r"a\.launch\.xml:1: /ndt sends /pose to /other, so it"):
+    with pytest.raises(
+        InputError, match=r"a\.launch\.xml:1: /ndt has /other in place of /pose, so it"
+    ):
         splice("a.launch.xml", f"<launch>{node}</launch>")
 
 

@@ -3,12 +3,15 @@
 import ast
 import os
 import signal
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 from node_run import RELIABLE, running_node, stamped
+from processes import wait_for
 from small_chain import EXECUTOR_CORE
 
 from chainshaper.enforcement import gate
@@ -25,6 +28,7 @@ from chainshaper.splicing.shaping_process import (
 MS = 1_000_000
 # Wide enough that a busy machine wakes the node within them.
 SLOTS = ((15 * MS, 25 * MS), (30 * MS, 45 * MS))
+LATENCY = Path("/dev/cpu_dma_latency")
 PUBLISHERS = {"/t3_tmp": [{"type": "sensor_msgs/msg/Image", "qos": RELIABLE}]}
 
 
@@ -32,6 +36,11 @@ PUBLISHERS = {"/t3_tmp": [{"type": "sensor_msgs/msg/Image", "qos": RELIABLE}]}
 def node(plan: Plan) -> ShapingNode:
     assert plan.shaping_node is not None
     return plan.shaping_node
+
+
+def allowed_latency() -> int:
+    """How long cores may take to wake up (us): what all who ask for it agree on."""
+    return int.from_bytes(LATENCY.read_bytes()[:4], sys.byteorder, signed=True)
 
 
 def banded(plan: Plan) -> Plan:
@@ -307,6 +316,7 @@ def test_the_phase_of_the_cycle_can_be_set_while_it_runs(
     with running_node(process, tmp_path, PUBLISHERS) as run:
         for phase in (0, 13 * MS):
             run.tell(set=["phase_ns", phase])
+            time.sleep(0.15)  # it is in force from the next cycle on
             run.tell(topic="/t3_tmp", payload=stamped().hex(), source=1)
             run.hear(lambda words: "published" in words)
         run.end()
@@ -359,6 +369,24 @@ def test_without_the_privilege_it_works_on(tmp_path: Path, plan: Plan, node: Sha
         run.tell(topic="/t3_tmp", payload=stamped().hex(), source=1)
         run.hear(lambda words: "published" in words)
     assert any("core 1023 is refused" in words.get("log", "") for words in run.said)
+
+
+def test_cores_stay_awake_from_before_the_slot_until_the_message_is_delivered(
+    tmp_path: Path, plan: Plan, node: ShapingNode
+) -> None:
+    if not os.access(LATENCY, os.R_OK | os.W_OK) or allowed_latency() == 0:
+        pytest.skip(f"{LATENCY} may not be used, or somebody keeps all cores awake")
+    resting = node.model_copy(update={"pause_ns": 500 * MS})
+    process = write_shaping_process(
+        revised(plan, shaping_node=resting), resting, "python", tmp_path
+    )
+    with running_node(process, tmp_path, PUBLISHERS) as run:
+        run.hear(lambda words: words.get("event") == "spinning")
+        usual = allowed_latency()
+        run.tell(topic="/t3_tmp", payload=stamped().hex(), source=1)
+        run.hear(lambda words: "published" in words)
+        assert (usual > 0, allowed_latency()) == (True, 0)
+        wait_for(lambda: allowed_latency() == usual, "cores to be allowed to sleep")
 
 
 # The throttler --------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """The event log: what a process records is what the tables hold."""
 
+from array import array
 from typing import Any
 
 import polars as pl
@@ -8,7 +9,8 @@ import pytest
 from chainshaper import events
 from chainshaper.enforcement.gate import ANCHORS, LATE
 from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS, EventLog, number_of
-from chainshaper.workload.event_reading import ProcessLog, event_tables, stall_table
+from chainshaper.workload.event_reading import ProcessLog, event_tables, meter_tables
+from chainshaper.workload.stall_meter import NO_PACE
 
 
 def _process(log: EventLog, pid: int = 100, core: int | None = 1) -> ProcessLog:
@@ -119,8 +121,14 @@ def test_stalls_come_from_meters_and_gates() -> None:
     log = EventLog()
     log.point("machine_stall")(150, 9)
     seen = event_tables([_process(log)], from_ns=0)["machine_stall"]
-    meters = EventLog()
-    meters.rows.extend((100, 7, 200, 8))
-    table = stall_table([(11, 0, meters.rows.tobytes()), (12, 1, b"")], seen)
-    assert table.select("time", "cpu", "duration").rows() == [(100, 0, 7), (150, 1, 9), (200, 0, 8)]
-    assert stall_table([]).schema == events.empty("machine_stall").schema
+    rows = array("q", (100, 7, NO_PACE, 50, 90, 12, 200, 8, NO_PACE))
+    tables = meter_tables([(11, 0, rows.tobytes()), (12, 1, b"")], seen)
+    stalls, paces = tables["machine_stall"], tables["machine_pace"]
+    assert stalls.select("time", "cpu", "duration").rows() == [
+        (100, 0, 7),
+        (150, 1, 9),
+        (200, 0, 8),
+    ]
+    assert paces.rows() == [(50, 11, 11, 0, 90, 12)]
+    for name, table in meter_tables([]).items():
+        assert table.schema == events.empty(name).schema

@@ -30,10 +30,10 @@ nodes:
 
 def test_a_set_is_the_oldest_message_of_every_input() -> None:
     synchroniser = Synchroniser[str]([2, 2])
-    assert [synchroniser.add(0, message) for message in ("a1", "a2", "a3")] == [None, None, None]
-    assert synchroniser.add(1, "b1") == "a2"  # a1 was more than the history keeps
-    assert synchroniser.add(1, "b2") == "a3"
-    assert synchroniser.add(1, "b3") is None
+    assert [synchroniser.add(0, message) for message in ("a1", "a2", "a3")] == [(), (), ()]
+    assert synchroniser.add(1, "b1") == ("a2", "b1")  # a1 was more than the history keeps
+    assert synchroniser.add(1, "b2") == ("a3", "b2")
+    assert synchroniser.add(1, "b3") == ()
 
 
 def test_a_live_fusion_computes_once_per_set_as_its_simulation_does(tmp_path: Path) -> None:

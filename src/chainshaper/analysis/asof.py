@@ -3,110 +3,119 @@
 Events come sorted by time, so one walk over both tables that remembers the latest row of every key
 is enough. Keys are few (threads, handles) and times many: a lookup stays in the processor's
 nearest cache, and a row costs some ten nanoseconds, a fraction of grouping both tables by key.
+
+Columns are read where they lie (:mod:`chainshaper.compiled.memory`): what a step costs is mostly
+the fresh memory that it touches. A key is a table of three rows (address, bytes per value), of
+which those that are not used have 0 bytes. The table of keys has ``slots`` rows, a power of two, of
+(three numbers, whether it is taken, the latest row), and one more whose first number counts them.
 """
 
-# mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
+# Kernels take many numbers rather than objects, which are slow to pass.
+# ruff: noqa: PLR0917
 
-import numba
+from typing import Any
+
 import numpy as np
-import numpy.typing as npt
 
-__all__ = ["key_table", "latest_rows", "next_rows", "place_of"]
+from chainshaper.compiled.memory import compiled, get, load_half, load_word, put, store_word
 
-Int64s = npt.NDArray[np.int64]
-Keys = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
-"""Two numbers that are a row's key together."""
+__all__ = ["KEY_ROW", "place_of", "walk_backward", "walk_forward"]
 
-_FIRST_SLOTS = 1024
+KEY_ROW = 8 * 5
+LATEST = 4
+NONE = np.uint64(0xFFFFFFFF)
+FULL = -1
 
 
-def latest_rows(left: Keys, at: Int64s, right: Keys, times: Int64s, *, strictly: bool) -> Int64s:
-    """For every row of ``left`` the last row of ``right`` with its key at or before it, else −1.
+@compiled(inline=True)
+def number_at(column: Any, row: Any) -> Any:
+    """A key column's value in a row, whatever its sign."""
+    address, width = get(column, 0), get(column, 1)
+    if width == 8:
+        return np.int64(load_word(address + 8 * row))
+    if width == 4:
+        return np.int64(load_half(address + 4 * row))
+    return np.int64(0)
 
-    ``at`` and ``times`` (ns) ascend; ``strictly`` leaves out rows at the very time.
+
+@compiled()
+def place_of(table: Any, slots: Any, columns: Any, row: Any, add: Any) -> Any:
+    """The address of a row's key in a table; with ``add`` it gets one, 0 once that is half full.
+
+    Without ``add``, 0 for a key that is not there.
     """
-    found: Int64s = np.full(len(at), -1, dtype=np.int64)
-    slots = _FIRST_SLOTS
-    while not _walk_forward((*left, at), (*right, times), strictly, found, slots):
-        slots *= 8
-    return found
-
-
-def next_rows(left: Keys, at: Int64s, right: Keys, times: Int64s, *, strictly: bool) -> Int64s:
-    """For every row of ``left`` the first row of ``right`` with its key at or after it, else −1."""
-    found: Int64s = np.full(len(at), -1, dtype=np.int64)
-    slots = _FIRST_SLOTS
-    while not _walk_backward((*left, at), (*right, times), strictly, found, slots):
-        slots *= 8
-    return found
-
-
-@numba.njit(cache=True, nogil=True)
-def key_table(slots):
-    """An empty open-addressed table of ``slots`` keys, a power of two, for :func:`place_of`."""
-    return (
-        np.zeros(slots, dtype=np.int64),
-        np.zeros(slots, dtype=np.int64),
-        np.zeros(slots + 1, dtype=np.int64),  # which are taken, and in the last how many
-    )
-
-
-@numba.njit(cache=True, nogil=True)
-def place_of(table, first, second, add):
-    """The place of a key in a table; with ``add`` it gets one, −1 once the table is half full.
-
-    Without ``add``, −1 for a key that is not there.
-    """
-    firsts, seconds, taken = table
-    slots = len(firsts)
+    first, second = number_at(columns, row), number_at(columns + 16, row)
+    third = number_at(columns + 32, row)
     mixed = (np.uint64(first) * np.uint64(0x9E3779B97F4A7C15)) ^ (
         np.uint64(second) * np.uint64(0xC2B2AE3D27D4EB4F)
     )
+    mixed = (mixed ^ (mixed >> np.uint64(29))) + np.uint64(third) * np.uint64(0x165667B19E3779F9)
     at = np.int64((mixed >> np.uint64(17)) & np.uint64(slots - 1))
-    while taken[at]:
-        if firsts[at] == first and seconds[at] == second:
-            return at
+    place = table + at * KEY_ROW
+    while get(place, 3) != 0:
+        if get(place, 0) == first and get(place, 1) == second and get(place, 2) == third:
+            return place
         at = (at + 1) & (slots - 1)
-    if not add or 2 * taken[slots] >= slots:
-        return np.int64(-1)
-    taken[slots] += 1
-    firsts[at], seconds[at], taken[at] = first, second, 1
-    return at
+        place = table + at * KEY_ROW
+    count = table + slots * KEY_ROW
+    if add == 0 or 2 * get(count, 0) >= slots:
+        return np.int64(0)
+    put(count, 0, get(count, 0) + 1)
+    put(place, 0, first)
+    put(place, 1, second)
+    put(place, 2, third)
+    put(place, 3, np.int64(1))
+    return place
 
 
-@numba.njit(cache=True, nogil=True)
-def _walk_forward(left, right, strictly, found, slots):
-    """Fill ``found`` in order of time; false where ``slots`` are too few for all keys."""
-    table, latest = key_table(slots), np.zeros(slots, dtype=np.int64)
-    (first, second, at), (its_first, its_second, times) = left, right
-    other = 0
-    for row in range(len(at)):
-        now = at[row]
-        while other < len(times) and (times[other] < now or (times[other] == now and not strictly)):
-            place = place_of(table, its_first[other], its_second[other], True)
-            if place < 0:
-                return False
-            latest[place] = other
+@compiled()
+def walk_forward(
+    left: Any, at: Any, count: Any, right: Any, times: Any, others: Any,
+    strictly: Any, found: Any, table: Any, slots: Any,
+) -> Any:  # fmt: skip
+    """Fill ``found`` (uint32) with the last row of ``right`` at or before each row of ``left``.
+
+    ``at`` and ``times`` (int64, ns) ascend, ``left`` and ``right`` are their keys. Returns how many
+    rows have none, which NONE stands for, or FULL where ``slots`` are too few for all keys.
+    """
+    other, missing = np.int64(0), np.int64(0)
+    for row in range(count):
+        now = get(at, row)
+        while other < others and get(times, other) + strictly <= now:
+            place = place_of(table, slots, right, other, np.int64(1))
+            if place == 0:
+                return np.int64(FULL)
+            put(place, LATEST, other)
             other += 1
-        place = place_of(table, first[row], second[row], False)
-        found[row] = latest[place] if place >= 0 else -1
-    return True
+        place = place_of(table, slots, left, row, np.int64(0))
+        if place == 0:
+            store_word(found + 4 * row, NONE)
+            missing += 1
+        else:
+            store_word(found + 4 * row, np.uint64(get(place, LATEST)))
+    return missing
 
 
-@numba.njit(cache=True, nogil=True)
-def _walk_backward(left, right, strictly, found, slots):
-    """The same from the end, which leaves the earliest row of every key."""
-    table, earliest = key_table(slots), np.zeros(slots, dtype=np.int64)
-    (first, second, at), (its_first, its_second, times) = left, right
-    other = len(times) - 1
-    for row in range(len(at) - 1, -1, -1):
-        now = at[row]
-        while other >= 0 and (times[other] > now or (times[other] == now and not strictly)):
-            place = place_of(table, its_first[other], its_second[other], True)
-            if place < 0:
-                return False
-            earliest[place] = other
+@compiled()
+def walk_backward(
+    left: Any, at: Any, count: Any, right: Any, times: Any, others: Any,
+    strictly: Any, found: Any, table: Any, slots: Any,
+) -> Any:  # fmt: skip
+    """The same from the end: the first row of ``right`` at or after each row of ``left``."""
+    other, missing = others - 1, np.int64(0)
+    for back in range(count):
+        row = count - 1 - back
+        now = get(at, row)
+        while other >= 0 and get(times, other) >= now + strictly:
+            place = place_of(table, slots, right, other, np.int64(1))
+            if place == 0:
+                return np.int64(FULL)
+            put(place, LATEST, other)
             other -= 1
-        place = place_of(table, first[row], second[row], False)
-        found[row] = earliest[place] if place >= 0 else -1
-    return True
+        place = place_of(table, slots, left, row, np.int64(0))
+        if place == 0:
+            store_word(found + 4 * row, NONE)
+            missing += 1
+        else:
+            store_word(found + 4 * row, np.uint64(get(place, LATEST)))
+    return missing

@@ -136,7 +136,7 @@ def _search(
     going_on = {
         callback.topic
         for callback in graph.callbacks
-        if callback.kind == "subscription" and callback.publishes
+        if callback.kind == "subscription" and set(callback.publishes) - INTERNAL_TOPICS
     }
     last = len(stages)
     ends_with_topic = not any_end and all(isinstance(v, str) for v in stages[-1].vertices)
@@ -212,7 +212,7 @@ def _sources(graph: ApplicationGraph) -> set[int]:
     return {
         callback.id
         for callback in graph.callbacks
-        if callback.publishes
+        if set(callback.publishes) - INTERNAL_TOPICS
         and not (callback.kind == "subscription" and callback.topic in published)
     }
 

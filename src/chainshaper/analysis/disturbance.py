@@ -77,6 +77,8 @@ def disturbed(
 ) -> Mask:
     """A mask over the rows of ``traversals.frame``; incomplete traversals are never marked."""
     stalls = _Stalls.of(flow, threshold_ns)
+    if not len(stalls.began):
+        return np.zeros(traversals.frame.height, dtype=np.bool_)
     frame = traversals.frame.join(
         _releases(flow, traversals), on="traversal", how="left", maintain_order="left"
     )

@@ -4,15 +4,17 @@ An instance runs from `callback_start` to `callback_end` of the same callback on
 (paper, section 2.4). Instances of different processes and threads overlap freely.
 """
 
-from typing import Any
-
+import numpy as np
 import polars as pl
 
 from chainshaper import events
-from chainshaper.analysis.matching import key_numbers, latest_before
+from chainshaper.analysis.matching import Keys, key_table, latest_before
+from chainshaper.compiled import kernel
 
-__all__ = ["callback_instances", "cpu_time"]
+__all__ = ["callback_instances", "cpu_time", "ends_of_starts"]
 
+_walk_pairs = kernel("chainshaper.analysis.pairing", "walk_pairs")
+_NONE = 0xFFFFFFFF
 _THREAD = ["pid", "tid", "callback"]
 
 
@@ -33,54 +35,59 @@ def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> p
     * ``intra_process``: whether its message came through a ring buffer;
     * ``assumed``: always false here, see :mod:`~chainshaper.analysis.flow`.
     """
-    paired = _paired(tables)
+    starts = events.table(tables, "callback_start", ["is_intra_process"])
+    ends = events.table(tables, "callback_end")
+    row = ends_of_starts(starts, ends)
     owners = callbacks.filter(pl.col("observed")).select(
         "callback_id", "pid", callback="handle", registered="valid_from"
     )
-    started = paired.select("pid", "callback", "start")  # in order of time, and stays so
-    owned = latest_before(started, owners, ["pid", "callback"], "start", "registered")
-    frame = paired.select(
-        owned["callback_id"],
+    started = starts.select("pid", "callback", "time")  # in order of time, and stays so
+    frame = starts.select(
+        latest_before(started, owners, ["pid", "callback"], "time", "registered")["callback_id"],
         "pid",
         "tid",
-        "start",
-        "end",
-        pl.when(pl.col("used") >= 0).then("used").alias("execution_ns"),
-        "intra_process",
+        pl.col("time").alias("start"),
+        ends["time"].gather(row).alias("end"),
+        _used(starts, ends, row),
+        pl.col("is_intra_process").fill_null(0).ne(0).alias("intra_process"),
         pl.lit(False).alias("assumed"),
-    ).drop_nulls("callback_id")
+    )
+    if frame["callback_id"].null_count():
+        frame = frame.drop_nulls("callback_id")
     if frame["execution_ns"].null_count() == frame.height and "sched_switch" in tables:
         frame = _plausible(frame.with_columns(cpu_time(tables, frame).alias("execution_ns")))
     return frame.with_row_index("instance")
 
 
-def _paired(tables: events.EventTables) -> pl.DataFrame:
-    """Starts with the end that follows them in their (process, thread, callback).
+def ends_of_starts(starts: pl.DataFrame, ends: pl.DataFrame) -> pl.Series:
+    """For every row of `callback_start` the row of its `callback_end`, null for none.
 
-    Columns: ``pid, tid, callback, start, end, used, intra_process``; ``used`` is the thread's
-    CPU time between start and end where the source tells it.
+    Both are sorted by time. An end is the next event of its process, thread and callback.
     """
-    # Numba takes a moment to import: only who asks for instances pays for it.
-    from chainshaper.analysis.pairing import ends_of_starts
+    keys = Keys.of(starts, _THREAD), Keys.of(ends, _THREAD)
+    if keys[0] is None or keys[1] is None:
+        raise TypeError("pid, tid and callback are integers")
+    began, ended = (frame["time"].rechunk().to_numpy() for frame in (starts, ends))
+    slots, status = 1024, -1
+    while status < 0:
+        found = np.full(len(began), _NONE, np.uint32)
+        table, states = key_table(slots), np.zeros((slots, 4), np.int64)
+        status = _walk_pairs(
+            keys[0].table.ctypes.data, began.ctypes.data, len(began),
+            keys[1].table.ctypes.data, ended.ctypes.data, len(ended),
+            found.ctypes.data, table.ctypes.data, states.ctypes.data, slots,
+        )  # fmt: skip
+        slots *= 8
+    row = pl.Series(found)
+    return row.set(row == _NONE, None) if (found == _NONE).any() else row
 
-    starts = events.table(tables, "callback_start", ["is_intra_process", "thread_time"])
-    ends = events.table(tables, "callback_end", ["thread_time"])
-    found = ends_of_starts(_keyed(starts), _keyed(ends))
-    row = pl.Series(found, dtype=pl.Int64)
-    row = row.set(row < 0, None) if (found < 0).any() else row
-    return starts.select(
-        *_THREAD,
-        pl.col("time").alias("start"),
-        ends["time"].gather(row).alias("end"),
-        (ends["thread_time"].gather(row) - starts["thread_time"]).alias("used"),
-        pl.col("is_intra_process").fill_null(0).ne(0).alias("intra_process"),
-    )
 
-
-def _keyed(table: pl.DataFrame) -> tuple[Any, Any, Any]:
-    """Thread, callback and time of a table's rows as arrays; both pid and tid in one number."""
-    callback, thread = key_numbers(table, ["callback", "pid", "tid"])
-    return thread, callback, table["time"].to_numpy()
+def _used(starts: pl.DataFrame, ends: pl.DataFrame, row: pl.Series) -> pl.Expr:
+    """``execution_ns`` by the thread's CPU time at start and end, where the source tells it."""
+    if "thread_time" not in starts.columns or "thread_time" not in ends.columns:
+        return pl.lit(None, dtype=pl.Int64).alias("execution_ns")
+    used = ends["thread_time"].gather(row) - starts["thread_time"]
+    return pl.lit(used.set(used < 0, None)).alias("execution_ns")
 
 
 def cpu_time(tables: events.EventTables, spans: pl.DataFrame) -> pl.Series:

@@ -86,16 +86,19 @@ def analyse_latency(
         flow, frame["end"].fill_null(0).to_numpy(), frame["received"].fill_null(-1).to_numpy()
     )
     frame = frame.with_columns(reception_disturbed=pl.col("disturbed") | pl.Series(on_its_way))
-    reasons = frame.drop_nulls("reason").group_by("reason").len().sort("reason")
+    reasons = frame.select("reason").drop_nulls().group_by("reason").len().sort("reason")
+    measured = frame.select("latency_ns", "reception_ns", "disturbed", "reception_disturbed")
     return LatencyAnalysis(
         chain=chain,
         graph=graph,
         traversals=frame,
         hops=found.hops,
-        statistics=_statistics(frame, "latency_ns"),
-        undisturbed=_statistics(frame.filter(~pl.col("disturbed")), "latency_ns"),
-        subscriber=_subscriber(frame, frame),
-        subscriber_undisturbed=_subscriber(frame, frame.filter(~pl.col("reception_disturbed"))),
+        statistics=_statistics(measured, "latency_ns"),
+        undisturbed=_statistics(measured.filter(~pl.col("disturbed")), "latency_ns"),
+        subscriber=_subscriber(measured, measured),
+        subscriber_undisturbed=_subscriber(
+            measured, measured.filter(~pl.col("reception_disturbed"))
+        ),
         incomplete=dict(reasons.iter_rows()),
         silent=found.silent,
         notes=(*notes, *flow.notes, *found.notes),
@@ -105,7 +108,7 @@ def analyse_latency(
 def _statistics(
     frame: pl.DataFrame, column: str, disturbed_by: str = "disturbed"
 ) -> LatencyStatistics:
-    measured = frame.drop_nulls(column)
+    measured = frame.select(column, disturbed_by).drop_nulls(column)
     return latency_statistics(
         measured[column].to_numpy(),
         measured[disturbed_by].to_numpy(),

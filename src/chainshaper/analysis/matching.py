@@ -6,14 +6,32 @@ created there, or it belongs to whatever its thread was doing at that moment. Bo
 cost is linear in the rows once both sides are sorted by time.
 """
 
-from itertools import zip_longest
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-__all__ = ["by_number", "first_after", "in_order", "key_numbers", "latest_before", "nearest"]
+from chainshaper.compiled import kernel
+
+__all__ = [
+    "Keys",
+    "by_number",
+    "first_after",
+    "grows",
+    "in_order",
+    "key_table",
+    "latest_before",
+    "nearest",
+]
+
+_walk_forward = kernel("chainshaper.analysis.asof", "walk_forward")
+_walk_backward = kernel("chainshaper.analysis.asof", "walk_backward")
+_FIRST_SLOTS = 1024
+_MOST_KEYS = 3
+_NONE = 0xFFFFFFFF
 
 
 def latest_before(
@@ -69,30 +87,46 @@ def _asof(
     strategy: Literal["backward", "forward"],
     strictly: bool,
 ) -> pl.DataFrame:
-    # Numba takes a moment to import: only who matches events pays for it.
-    from chainshaper.analysis.asof import latest_rows, next_rows
-
     right = right.drop_nulls([*by, right_on])
     left, right = _in_order(left, left_on), _in_order(right, right_on)
-    keys = key_numbers(left, by), key_numbers(right, by)
-    if len(keys[0]) != 2 or any(left.schema[key] != right.schema[key] for key in by):
+    keys = Keys.of(left, by), Keys.of(right, by)
+    if keys[0] is None or keys[1] is None or any(left.schema[k] != right.schema[k] for k in by):
         return _by_polars(left, right, by, left_on, right_on, strategy=strategy, strictly=strictly)
-    timeless = left[left_on].null_count()  # sorted, they come first, and match nothing
-    found = (latest_rows if strategy == "backward" else next_rows)(
-        (keys[0][0][timeless:], keys[0][1][timeless:]),
-        left[left_on][timeless:].to_numpy(),
-        (keys[1][0], keys[1][1]),
-        right[right_on].to_numpy(),
-        strictly=strictly,
-    )
-    index = pl.repeat(None, timeless, dtype=pl.Int64, eager=True).append(pl.Series(found))
-    unknown = (index < 0).fill_null(True)
+    walk = _walk_forward if strategy == "backward" else _walk_backward
+    index = _rows((left[left_on], keys[0]), (right[right_on], keys[1]), walk, strictly=strictly)
     for key in by:
-        unknown |= left[key].is_null()
-    if unknown.any():
-        index = index.set(unknown, None)
+        if left[key].null_count():
+            index = index.set(left[key].is_null(), None)
     columns = right.drop(by).select(pl.all().gather(index))
     return left.hstack(columns.rename({n: f"{n}_right" for n in columns.columns if n in left}))
+
+
+def _rows(
+    left: tuple[pl.Series, "Keys"],
+    right: tuple[pl.Series, "Keys"],
+    walk: Callable[..., int],
+    *,
+    strictly: bool,
+) -> pl.Series:
+    """For every row of ``left`` that of ``right`` which matches it, or null; both in order."""
+    (at, left_keys), (times, right_keys) = left, right
+    timeless = at.null_count()  # sorted, they come first, and match nothing
+    own, its, keys = _as_array(at[timeless:]), _as_array(times), left_keys.beyond(timeless)
+    found = np.empty(len(own), np.uint32)
+    slots, missing = _FIRST_SLOTS, -1
+    while missing < 0:
+        table = key_table(slots)
+        missing = walk(
+            keys.ctypes.data, own.ctypes.data, len(own), right_keys.table.ctypes.data,
+            its.ctypes.data, len(its), strictly, found.ctypes.data, table.ctypes.data, slots,
+        )  # fmt: skip
+        slots *= 8
+    index = pl.Series(found)
+    if missing:
+        index = index.set(index == _NONE, None)
+    if timeless:
+        index = pl.repeat(None, timeless, dtype=pl.UInt32, eager=True).append(index)
+    return index
 
 
 def _by_polars(
@@ -117,29 +151,49 @@ def _by_polars(
     )
 
 
-def key_numbers(frame: pl.DataFrame, by: list[str]) -> list[npt.NDArray[np.int64]]:
-    """The key columns as two 64-bit numbers per row; empty where they do not fit into those."""
-    whole: list[npt.NDArray[Any]] = []
-    halves: list[npt.NDArray[Any]] = []
-    for key in by:
-        column = frame[key].to_physical().fill_null(0).to_numpy()
-        if column.dtype.kind not in "iu":
-            return []
-        (whole if column.dtype.itemsize == 8 else halves).append(column)
-    for first, second in zip_longest(halves[::2], halves[1::2]):
-        whole.append(_paired(first, first if second is None else second))
-    if not whole:
-        whole.append(np.zeros(frame.height, np.int64))
-    if len(whole) == 1:
-        whole.append(whole[0])
-    return [column.view(np.int64) for column in whole]
+def key_table(slots: int) -> npt.NDArray[np.int64]:
+    """An empty table of keys, as compiled walks want it (:mod:`~chainshaper.analysis.asof`)."""
+    return np.zeros((slots + 1, 5), np.int64)
 
 
-def _paired(first: npt.NDArray[Any], second: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-    """Two columns of 32 bits as one of 64, without a third in between."""
-    both = np.empty((len(first), 2), np.int32)
-    both[:, 0], both[:, 1] = first, second
-    return both.view(np.int64)[:, 0]
+@dataclass(frozen=True)
+class Keys:
+    """Key columns as compiled walks read them: where they lie, without a copy.
+
+    ``table`` has a row (address, bytes per value) for each, ``columns`` keep the memory alive.
+    """
+
+    table: npt.NDArray[np.int64]
+    columns: tuple[npt.NDArray[Any], ...]
+
+    @classmethod
+    def of(cls, frame: pl.DataFrame, by: list[str]) -> "Keys | None":
+        """The keys of a frame; None where they are not up to three columns of integers."""
+        columns = []
+        for key in by:
+            column = frame[key].to_physical()
+            if not column.dtype.is_integer() or len(by) > _MOST_KEYS:
+                return None
+            values = _as_array(column)
+            columns.append(values if values.itemsize >= 4 else values.astype(np.uint32))
+        table = np.zeros((_MOST_KEYS, 2), np.int64)
+        for row, values in zip(table, columns, strict=False):
+            row[:] = values.ctypes.data, values.itemsize
+        return cls(table, tuple(columns))
+
+    def beyond(self, rows: int) -> npt.NDArray[np.int64]:
+        """The table without the first ``rows`` rows of the frame."""
+        table: npt.NDArray[np.int64] = self.table.copy()
+        table[:, 0] += rows * table[:, 1]
+        return table
+
+
+def _as_array(column: pl.Series) -> npt.NDArray[Any]:
+    """A column of integers as an array, nulls as 0; a copy only where there are any."""
+    if column.null_count():
+        column = column.fill_null(0)
+    values: npt.NDArray[Any] = column.rechunk().to_numpy()
+    return values
 
 
 def _in_order(frame: pl.DataFrame, time: str) -> pl.DataFrame:
@@ -152,9 +206,14 @@ def in_order(frame: pl.DataFrame, time: str, *ties: str, nulls_last: bool = Fals
 
     Looking whether all times grow costs a fraction of what sorting by several columns does.
     """
-    if bool((frame[time].diff().drop_nulls() > 0).all()):
+    if grows(frame[time]):
         return frame
     return frame.sort(time, *ties, nulls_last=nulls_last, maintain_order=True)
+
+
+def grows(times: pl.Series) -> bool:
+    """Whether every time is later than the one before it; nulls say nothing."""
+    return bool((times.slice(1) > times.head(max(len(times) - 1, 0))).all())
 
 
 def by_number(rows: pl.DataFrame, number: str, column: str, height: int) -> pl.Series:

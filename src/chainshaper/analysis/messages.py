@@ -22,7 +22,13 @@ Publications and takes under handles that nobody initialised are left out
 import polars as pl
 
 from chainshaper import events
-from chainshaper.analysis.matching import by_number, first_after, in_order, latest_before
+from chainshaper.analysis.matching import (
+    by_number,
+    first_after,
+    grows,
+    in_order,
+    latest_before,
+)
 from chainshaper.analysis.objects import Objects
 
 __all__ = ["link_takes", "overwritten_in", "publications", "takes"]
@@ -79,7 +85,8 @@ def _written(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
             latest_before(nameless, by_rcl, ["pid", "publisher_handle"], "time", "created")
         )
     columns = ["time", "pid", "tid", *_PUBLISHER, "source_timestamp"]
-    return pl.concat([frame.select(columns) for frame in found]).drop_nulls("publisher")
+    every = pl.concat([frame.select(columns) for frame in found])
+    return every.drop_nulls("publisher") if every["publisher"].null_count() else every
 
 
 def _writes(tables: events.EventTables) -> pl.DataFrame:
@@ -151,7 +158,9 @@ def takes(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     subscriptions = objects.subscriptions.join(owner, on="subscription", how="left").select(
         "pid", "callback_id", "node", "topic", "rmw_handle", created="valid_from"
     )
-    taken = events.table(tables, "rmw_take", ["taken"]).filter(pl.col("taken").fill_null(1) != 0)
+    taken = events.table(tables, "rmw_take", ["taken"])
+    if (taken["taken"] == 0).any():
+        taken = taken.filter(pl.col("taken").fill_null(1) != 0)
     from_dds = latest_before(
         taken.rename({"rmw_subscription_handle": "rmw_handle"}),
         subscriptions,
@@ -159,10 +168,11 @@ def takes(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
         "time",
         "created",
     )
-    parts = [from_dds.drop_nulls("topic")]
+    parts = [from_dds.drop_nulls("topic") if from_dds["topic"].null_count() else from_dds]
     if taken.is_empty():
         parts.append(_dispatched(tables, objects))
     parts.append(_dequeued(tables, objects))
+    parts = [part for part in parts if part.height] or parts[:1]
     every = pl.concat(
         [
             part.select(
@@ -248,13 +258,15 @@ def _with_same_stamp(taken: pl.DataFrame, published: pl.DataFrame) -> pl.DataFra
     whatever the stamps are. Should two publications of a topic share one, the first is taken.
     """
     stamp = "source_timestamp"
-    wanted = taken.select("topic", stamp, "take").filter(pl.col(stamp).is_not_null())
-    stamped = (
-        published.select("topic", "publication", stamped=stamp)
-        .filter(pl.col("stamped").is_not_null())
-        .sort("stamped", "publication", descending=[False, True])
-    )
-    found = latest_before(wanted.sort(stamp), stamped, ["topic"], stamp, "stamped")
+    wanted = taken.select("topic", stamp, "take")
+    if wanted[stamp].null_count():
+        wanted = wanted.drop_nulls(stamp)
+    stamped = published.select("topic", "publication", stamped=stamp)
+    if stamped["stamped"].null_count():
+        stamped = stamped.drop_nulls("stamped")
+    if not grows(stamped["stamped"]):  # among equals the first comes last
+        stamped = stamped.reverse().sort("stamped", maintain_order=True)
+    found = latest_before(wanted, stamped, ["topic"], stamp, "stamped")
     return found.filter(pl.col(stamp) == pl.col("stamped")).select("take", "publication")
 
 

@@ -4,79 +4,93 @@ An instance ends with the next event of the same callback on the same thread, if
 Sorting millions of events by thread and callback to see that would be the most expensive step of
 the whole analysis. They come sorted by time, so one walk that remembers the open instance of each
 (process, thread, callback) is enough, and takes some ten nanoseconds per event.
+
+Clocks tick coarsely and simulators exactly, so an instance may begin in the very nanosecond in
+which the one before ended (end first), or last no time at all (start first): it is the former when
+one was open before that nanosecond.
 """
 
-# mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
+# Kernels take many numbers rather than objects, which are slow to pass.
+# ruff: noqa: PLR0917
 
-import numba
+from typing import Any
+
 import numpy as np
-import numpy.typing as npt
 
-from chainshaper.analysis.asof import key_table, place_of
+from chainshaper.analysis.asof import KEY_ROW, place_of
+from chainshaper.compiled.memory import compiled, get, put, store_word
 
-__all__ = ["ends_of_starts"]
+__all__ = ["walk_pairs"]
 
-Int64s = npt.NDArray[np.int64]
+# What is kept per key: 1 + the open start, or 0; starts minus ends; the moment of its latest end,
+# and whether it was open before that.
+OPEN, DEPTH, MOMENT, WAS_OPEN = 0, 1, 2, 3
+STATE_ROW = 8 * 4
+FULL = -1
 
 
-def ends_of_starts(
-    starts: tuple[Int64s, Int64s, Int64s], ends: tuple[Int64s, Int64s, Int64s]
-) -> Int64s:
-    """For every start the row of its end, −1 for none.
+@compiled(inline=True)
+def end_at(place: Any, moment: Any, early: Any, row: Any, found: Any) -> None:
+    """Note an end: the ``early`` ones close what was open before this moment, others the rest."""
+    if get(place, MOMENT) != moment:
+        put(place, MOMENT, moment)
+        put(place, WAS_OPEN, np.int64(1) if get(place, DEPTH) > 0 else np.int64(0))
+    if get(place, WAS_OPEN) == early:
+        if get(place, OPEN) > 0:
+            store_word(found + 4 * (get(place, OPEN) - 1), np.uint64(row))
+        put(place, OPEN, np.int64(0))
+        put(place, DEPTH, get(place, DEPTH) - 1)
 
-    Both are given as (thread, callback, time), sorted by time; a thread number stands for a
-    (process, thread). Clocks tick coarsely and simulators exactly, so an instance may begin in
-    the very nanosecond in which the one before ended (end first), or last no time at all (start
-    first): it is the former when one was open before that nanosecond.
+
+@compiled()
+def walk_ends(
+    ends: Any, first: Any, last: Any, moment: Any, early: Any, found: Any,
+    table: Any, states: Any, slots: Any,
+) -> Any:  # fmt: skip
+    """Note the ends [first, last) of a moment; 0, or FULL."""
+    for row in range(first, last):
+        key = place_of(table, slots, ends, row, np.int64(1))
+        if key == 0:
+            return np.int64(FULL)
+        end_at(states + (key - table) // KEY_ROW * STATE_ROW, moment, early, row, found)
+    return np.int64(0)
+
+
+@compiled()
+def walk_pairs(
+    starts: Any, began: Any, start_count: Any, ends: Any, ended: Any, end_count: Any,
+    found: Any, table: Any, states: Any, slots: Any,
+) -> Any:  # fmt: skip
+    """For every start write the row of its end to ``found`` (uint32; other rows are left alone).
+
+    ``starts`` and ``ends`` are keys as in :mod:`~chainshaper.analysis.asof`, ``began`` and
+    ``ended`` their ascending times; ``states`` has four zeros for each of the ``slots``. Returns
+    0, or FULL where those are too few for all keys.
     """
-    slots = 1024
-    result = np.full(len(starts[2]), -1, dtype=np.int64)
-    while not _walk(starts, ends, result, slots):
-        slots *= 8
-        result[:] = -1
-    return result
-
-
-@numba.njit(cache=True, nogil=True)
-def _walk(starts, ends, result, slots):  # noqa: PLR0912 - one compiled loop
-    """Fill ``result``; false where ``slots`` are too few for all keys."""
-    keys = key_table(slots)
-    latest = np.full(slots, -1, dtype=np.int64)  # the open start; −1: the last event was an end
-    opened = np.zeros(slots, dtype=np.int64)  # starts minus ends
-    seen = np.full(slots, -1, dtype=np.int64)  # the moment for which `was_open` holds
-    was_open = np.zeros(slots, dtype=np.bool_)
-    start_count, end_count = len(starts[2]), len(ends[2])
-    i = j = moment = 0
+    i = j = moment = np.int64(0)
     while i < start_count or j < end_count:
-        now = starts[2][i] if i < start_count else ends[2][j]
-        if j < end_count and ends[2][j] < now:
-            now = ends[2][j]
+        now = get(began, i) if i < start_count else get(ended, j)
+        if j < end_count and get(ended, j) < now:
+            now = get(ended, j)
         next_i, next_j = i, j
-        while next_i < start_count and starts[2][next_i] == now:
+        while next_i < start_count and get(began, next_i) == now:
             next_i += 1
-        while next_j < end_count and ends[2][next_j] == now:
+        while next_j < end_count and get(ended, next_j) == now:
             next_j += 1
         moment += 1
         # First the ends of what was open before this moment, then starts, then other ends.
-        for step in range(3):
-            if step == 1:
-                for row in range(i, next_i):
-                    at = place_of(keys, starts[0][row], starts[1][row], True)
-                    if at < 0:
-                        return False
-                    latest[at] = row
-                    opened[at] += 1
-                continue
-            for row in range(j, next_j):
-                at = place_of(keys, ends[0][row], ends[1][row], True)
-                if at < 0:
-                    return False
-                if seen[at] != moment:
-                    seen[at], was_open[at] = moment, opened[at] > 0
-                if was_open[at] == (step == 0):
-                    if latest[at] >= 0:
-                        result[latest[at]] = row
-                    latest[at] = -1
-                    opened[at] -= 1
+        status = walk_ends(ends, j, next_j, moment, np.int64(1), found, table, states, slots)
+        if status < 0:
+            return status
+        for row in range(i, next_i):
+            key = place_of(table, slots, starts, row, np.int64(1))
+            if key == 0:
+                return np.int64(FULL)
+            place = states + (key - table) // KEY_ROW * STATE_ROW
+            put(place, OPEN, row + 1)
+            put(place, DEPTH, get(place, DEPTH) + 1)
+        status = walk_ends(ends, j, next_j, moment, np.int64(0), found, table, states, slots)
+        if status < 0:
+            return status
         i, j = next_i, next_j
-    return True
+    return np.int64(0)

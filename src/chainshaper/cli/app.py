@@ -26,6 +26,7 @@ from chainshaper.cli.shape import shape
 from chainshaper.cli.simulate import simulate
 from chainshaper.cli.splice import splice
 from chainshaper.cli.status import status
+from chainshaper.cli.sweep import sweep
 from chainshaper.cli.threads import threads
 
 __all__ = ["app"]
@@ -43,6 +44,7 @@ VERBS: tuple[Callable[..., None], ...] = (
     demo,
     run,
     simulate,
+    sweep,
     record,
     profile,
     info,

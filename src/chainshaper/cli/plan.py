@@ -44,6 +44,15 @@ def plan(
         options.Solver, typer.Option(help="What places bands.", rich_help_panel="Latency bands")
     ] = options.Solver.EXACT,
     grid: options.GridOption = "1us",  # type: ignore[assignment]
+    modes: options.ModesOption = None,
+    late: Annotated[
+        options.LateForMode,
+        typer.Option(
+            help="With --modes, an output behind its mode's slot: wait for the next cycle's, or"
+            " not, or at once, or in the cycle's next slot.",
+            rich_help_panel="Latency bands",
+        ),
+    ] = options.LateForMode.WAIT,
     max_gap: options.MaxGapOption = None,
     max_share: options.MaxShareOption = None,
     minimise: Annotated[
@@ -69,6 +78,7 @@ def plan(
     pause: Annotated[
         int, duration_option("--pause", "How long the gate rests after publishing.")
     ] = "500us",  # type: ignore[assignment]
+    receivers: options.ReceiversOption = True,
     json: JsonOption = False,
 ) -> None:
     """Plan the reservation servers of a chain: by default one publish slot behind its longest
@@ -99,10 +109,12 @@ def plan(
         seed=seed,
         slot_start_ns=slot_start,
         first_slot_ns=first_slot,
+        modes=options.modes_of(modes, late),
         anchor=anchor.value,
         overrun=overrun.value,
         spin_ns=spin,
         pause_ns=pause,
+        with_receivers=receivers,
     )
     wanted: list[str | None] = [*chain] if chain else [None]
     profiles = _profiles(recording, latencies, period, [*wanted, *(sink or [])])

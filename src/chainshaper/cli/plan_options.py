@@ -2,11 +2,15 @@
 
 from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from chainshaper.cli.options import duration_option
+from chainshaper.errors import InputError
+
+if TYPE_CHECKING:
+    from chainshaper.planning import Modes
 
 __all__ = [
     "Anchor",
@@ -16,22 +20,26 @@ __all__ = [
     "EpsilonOption",
     "FirstSlotOption",
     "GridOption",
+    "LateForMode",
     "LatenciesOption",
     "LeastGainOption",
     "MaxGapOption",
     "MaxShareOption",
     "MeanAtMostOption",
     "Minimise",
+    "ModesOption",
     "Overrun",
     "PeriodOption",
     "PlanOutput",
     "Policy",
     "ProbabilityOption",
     "Publication",
+    "ReceiversOption",
     "SeedOption",
     "SinksOption",
     "SlotStartOption",
     "Solver",
+    "modes_of",
 ]
 
 
@@ -82,6 +90,40 @@ class Minimise(str, Enum):
     MEAN = "mean"
     JITTER = "jitter"
     GAP = "gap"
+
+
+class LateForMode(str, Enum):
+    """What becomes of an output that comes behind the slot of its mode."""
+
+    WAIT = "wait"
+    DISCARD = "discard"
+    PUBLISH = "publish"
+    NEXT_SLOT = "next-slot"
+
+
+def modes_of(text: str | None, late: LateForMode) -> "Modes | None":
+    """The modes that `--modes` names, such as ``/mode:city=2,highway=1``; the first is the default.
+
+    Raises:
+        InputError: it is not of this form, or names what no mode or topic may be called.
+    """
+    if text is None:
+        if late is not LateForMode.WAIT:
+            raise InputError(f"--late {late.value} goes with modes: add --modes, or leave it out")
+        return None
+    from chainshaper.planning import Modes
+    from chainshaper.planning.plan import wrong_values_refused
+
+    topic, _, listed = text.partition(":")
+    pairs = [pair.partition("=") for pair in listed.split(",")]
+    bands = {mode: int(band) for mode, _, band in pairs if band.isdecimal()}
+    if len(bands) != len(pairs):
+        raise InputError(
+            f"--modes {text}: write the topic, and a band for each mode once, such as"
+            " /driving_mode:city=2,highway=1"
+        )
+    with wrong_values_refused(Modes):
+        return Modes(topic=topic, default=pairs[0][0], bands=bands, late=late.value)
 
 
 def _bands(text: str) -> str:
@@ -158,6 +200,25 @@ BandsOption = Annotated[
         parser=_bands,
         help="Number of bands; auto: as many as are worth it.",
         rich_help_panel=_BANDS,
+    ),
+]
+ModesOption = Annotated[
+    str | None,
+    typer.Option(
+        "--modes",
+        metavar="TOPIC:MODE=BAND,…",
+        help="Each mode's band, 1 is the first; the first mode named is in force until the topic"
+        " (std_msgs/String) names another. Such as /driving_mode:city=2,highway=1.",
+        rich_help_panel=_BANDS,
+        show_default=False,
+    ),
+]
+ReceiversOption = Annotated[
+    bool,
+    typer.Option(
+        "--receivers/--no-receivers",
+        help="Give nodes that subscribe to the shaped output SCHED_FIFO below all servers, while"
+        " the plan is in force.",
     ),
 ]
 MaxGapOption = Annotated[

@@ -36,7 +36,8 @@ def profile(
         typer.Option(
             "--like",
             metavar="REC",
-            help="An earlier recording of the application, which knows the chain's nodes.",
+            help="An earlier recording of the application: it knows the chain's nodes, components "
+            "of containers, and executors with several threads.",
             show_default=False,
         ),
     ] = None,
@@ -71,6 +72,7 @@ def profile(
     from chainshaper.command_process import check_command
     from chainshaper.profiling import chain_nodes, check_profiling, profiling_condition
     from chainshaper.recording import refuse_existing
+    from chainshaper.sources import open_source
 
     if not command:
         raise InputError("no command given: `chainshaper profile -o REC -- ros2 launch …`")
@@ -79,15 +81,14 @@ def profile(
             f"which nodes {chain} has, an earlier recording knows: name it with --like REC "
             "(`chainshaper record`), or name the nodes with --node"
         )
-    if like is not None and chain is None:
-        raise InputError(f"--like {like} is about the nodes of a chain: name it with --chain")
     refuse_existing(output)
     check_command(command)
     core = check_profiling(core)
     names = [f"/{name.strip('/')}" for name in node or ()]
-    if like is not None and chain is not None:
-        names += chain_nodes(like, chain)
-    condition = profiling_condition(names, core)
+    earlier = None if like is None else open_source(like)
+    if earlier is not None and chain is not None:
+        names += chain_nodes(earlier, chain)
+    condition = profiling_condition(names, core, like=earlier)
     record_and_show(
         *(output, command, source, duration, buffer),
         json=json,

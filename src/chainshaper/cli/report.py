@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from chainshaper.cli.options import ChainOption
+from chainshaper.cli.options import ChainOption, JsonOption
 
 __all__ = ["report"]
 
@@ -48,6 +48,7 @@ def report(
             show_default=False,
         ),
     ] = None,
+    json: JsonOption = False,
 ) -> None:
     """Write one self-contained HTML page about a chain, usually before and after shaping.
 
@@ -55,12 +56,13 @@ def report(
     timeline of single cycles, overruns, stalls, the plan, and how all of it was recorded. The page
     needs no network.
     """
-    from chainshaper.cli.output import late_progress, show_line
+    from chainshaper.cli.output import late_progress, print_json, show_line
     from chainshaper.planning import load_plan
     from chainshaper.reporting.html.page import ENDINGS, write_report
+    from chainshaper.reporting.tables import comparison_json
     from chainshaper.reporting.whole_file import new_file
     from chainshaper.sources import open_source
-    from chainshaper.steps import measure_latency
+    from chainshaper.steps import Comparison, measure_latency
 
     new_file(output, ENDINGS)
     in_force = None if plan is None else load_plan(plan)
@@ -72,4 +74,8 @@ def report(
             measurements.append(measure_latency(open_source(path), chain, used))
         progress(len(recordings) / (len(recordings) + 1), "drawing")
         written = write_report(measurements, output, cycles or ())
+    if json:
+        compared = Comparison(measurements[0].analysis.chain.spec, tuple(measurements))
+        print_json({"report": str(written.absolute()), **comparison_json(compared)})
+        return
     show_line(str(written.absolute()))

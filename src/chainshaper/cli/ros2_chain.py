@@ -6,7 +6,10 @@ lines are the same, help included. Upstream: ros2cli, `ros2cli/command/__init__.
 """
 
 import argparse
+import sys
 from typing import Any
+
+from chainshaper.errors import PlatformError
 
 __all__ = ["ChainCommand"]
 
@@ -36,6 +39,14 @@ def _run(arguments: list[str]) -> int:
 
     try:
         main(arguments, NAME)
+    except ModuleNotFoundError as error:  # built with colcon, which installs no dependencies
+        print(  # noqa: T201 - the last line of a failed command
+            f"error: {NAME} needs the Python package {error.name}: install chainshaper's packages "
+            "from PyPI into the Python that ROS runs with (`python3 -m pip install .` in its "
+            "folder)",
+            file=sys.stderr,
+        )
+        return PlatformError.exit_code
     except SystemExit as ended:
         return ended.code if isinstance(ended.code, int) else int(ended.code is not None)
     return 0

@@ -14,7 +14,14 @@ from chainshaper.cli.options import (
     RealtimeOption,
     duration_option,
 )
-from chainshaper.cli.plan_options import BandsOption, EpsilonOption
+from chainshaper.cli.plan_options import (
+    BandsOption,
+    EpsilonOption,
+    LateForMode,
+    ModesOption,
+    ReceiversOption,
+    modes_of,
+)
 from chainshaper.cli.record import Source, SourceOption
 from chainshaper.cli.splice import NodeKind
 from chainshaper.errors import InputError
@@ -66,7 +73,9 @@ def shape(
         str, typer.Option("--backend", metavar="NAME", help="As for `chainshaper apply`.")
     ] = "auto",
     bands: BandsOption = "1",
+    modes: ModesOption = None,
     epsilon: EpsilonOption = None,
+    receivers: ReceiversOption = True,
     json: JsonOption = False,
 ) -> None:
     """Run an application with its output shaped as planned, and record it.
@@ -74,7 +83,8 @@ def shape(
     The publisher's output topic is remapped, and the shaping node republishes it in its slots.
     Behind `--`, `ros2 launch` does the whole flow: record, choose a chain, profile, plan, splice,
     apply, record again, compare. Every file in between is kept; --chain, --duration, --source,
-    --node, --backend, --bands and --epsilon are for this.
+    --node, --backend, --bands, --modes, --epsilon and --no-receivers are for this. Without
+    --epsilon the margin is derived from the latencies measured, where there are enough.
     """
     if len(words) == 2 and words[0].endswith(DESCRIPTIONS):
         _shape_described(Path(words[0]), Path(words[1]), output, cycles, realtime)
@@ -93,7 +103,9 @@ def shape(
         node=node,
         back_end=backend,
         bands=bands,
+        modes=modes,
         epsilon_ns=epsilon,
+        receivers=receivers,
         json=json,
     )
 
@@ -135,7 +147,9 @@ def _shape_launched(
     node: NodeKind,
     back_end: str,
     bands: str,
+    modes: str | None,
     epsilon_ns: int | None,
+    receivers: bool,
     json: bool,
 ) -> None:
     from chainshaper.cli.output import print_json, stage_lines
@@ -152,7 +166,10 @@ def _shape_launched(
             chain=chain,
             choose=_ask if sys.stdin.isatty() and not json else None,
             request=PlanRequest(
-                bands="auto" if bands == "auto" else int(bands), epsilon_ns=epsilon_ns
+                bands="auto" if bands == "auto" else int(bands),
+                modes=modes_of(modes, LateForMode.WAIT),
+                epsilon_ns=epsilon_ns,
+                with_receivers=receivers,
             ),
             duration_ns=duration_ns,
             source=source.value,

@@ -1,4 +1,4 @@
-"""`chainshaper splice`: put a plan's shaping nodes into copies of launch files."""
+"""`chainshaper splice`: put shaping nodes, or throttlers, into copies of launch files."""
 
 from enum import Enum
 from pathlib import Path
@@ -10,7 +10,7 @@ from chainshaper.cli.options import JsonOption
 from chainshaper.errors import InputError
 
 if TYPE_CHECKING:
-    from chainshaper.launch_splicing import Splicing
+    from chainshaper.launch_splicing import Splicing, ThrottledInput
     from chainshaper.planning import Plan
     from chainshaper.recording import Recording
 
@@ -28,7 +28,9 @@ class NodeKind(str, Enum):
 def splice(
     plan: Annotated[
         Path | None,
-        typer.Argument(metavar="plan.yaml", help="The plan.", show_default=False),
+        typer.Argument(
+            metavar="plan.yaml", help="The plan; none with --throttle.", show_default=False
+        ),
     ] = None,
     launch: Annotated[
         list[str] | None,
@@ -46,6 +48,16 @@ def splice(
             "--output", "-o", metavar="DIR", help="Folder for the copies.", show_default=False
         ),
     ],
+    throttle: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--throttle",
+            metavar="[NODE:]TOPIC=PERIOD",
+            help="Instead of a plan: a throttler before an input that is not quite periodic, for "
+            "NODE or whoever subscribes in the recording (may be repeated).",
+            show_default=False,
+        ),
+    ] = None,
     node: Annotated[
         NodeKind,
         typer.Option(help="A script; a package for all types; or one generated for the type."),
@@ -64,8 +76,8 @@ def splice(
         typer.Option(
             "--recording",
             metavar="REC",
-            help="A recording of the application: it tells publishers and types. Default: the "
-            "plan's own, where it exists.",
+            help="A recording of the application: it tells publishers, subscribers and types. "
+            "Default: the plan's own, where it exists.",
             show_default=False,
         ),
     ] = None,
@@ -79,11 +91,13 @@ def splice(
 ) -> None:
     """Edit copies of launch files: the output is remapped, and a shaping node republishes it.
 
-    Shows a diff. Launch the copy that it names; the originals stay as they are.
+    With --throttle an input is, and a throttler republishes it once a period; do this first, then
+    record and plan, and splice the plan into the copy. Shows a diff. Launch the copy that it names;
+    the originals stay as they are.
     """
     from chainshaper.cli.output import print_json, show_line
-    from chainshaper.launch_splicing import splice_launch_files, undo_splice
-    from chainshaper.planning import load_plan
+    from chainshaper.launch_splicing import undo_splice
+    from chainshaper.splicing.generated_package import check_build_tools
 
     if undo:
         undo_splice(output)
@@ -92,32 +106,94 @@ def splice(
         else:
             show_line(f"{output} is removed")
         return
-    arguments = dict(word.split(":=", 1) for word in launch or [] if ":=" in word)
-    files = [word for word in launch or [] if ":=" not in word]
-    if plan is None or not files:
-        raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
     if build and node is NodeKind.PYTHON:
         raise InputError("--node python needs no building: leave out --build, or choose another")
-    planned = load_plan(plan)
-    splicing = splice_launch_files(
-        planned,
-        files,
-        output,
-        node=node.value,
-        arguments=arguments,
-        message_type=message_type,
-        recording=_opened(planned, recording),
-    )
+    if build:
+        check_build_tools()  # before anything is written
+    words = launch or []
+    if throttle:
+        words = [*([] if plan is None else [str(plan)]), *words]
+    arguments = dict(word.split(":=", 1) for word in words if ":=" in word)
+    files = [word for word in words if ":=" not in word]
+    if throttle:
+        splicing = _throttled(throttle, files, output, node, message_type, arguments, recording)
+    elif plan is None or not files:
+        raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
+    else:
+        splicing = _shaped(plan, files, output, node, message_type, arguments, recording)
     setup = _built(splicing) if build else None
     _print(splicing, setup, json)
 
 
-def _opened(plan: "Plan", recording: Path | None) -> "Recording | None":
+def _shaped(
+    plan: Path,
+    files: list[str],
+    output: Path,
+    node: NodeKind,
+    message_type: str | None,
+    arguments: dict[str, str],
+    recording: Path | None,
+) -> "Splicing":
+    from chainshaper.launch_splicing import splice_launch_files
+    from chainshaper.planning import load_plan
+
+    planned = load_plan(plan)
+    return splice_launch_files(
+        *(planned, files, output),
+        node=node.value,
+        arguments=arguments,
+        message_type=message_type,
+        recording=_opened(recording or _own_recording(planned)),
+    )
+
+
+def _throttled(
+    inputs: list[str],
+    files: list[str],
+    output: Path,
+    node: NodeKind,
+    message_type: str | None,
+    arguments: dict[str, str],
+    recording: Path | None,
+) -> "Splicing":
+    from chainshaper.launch_splicing import splice_throttlers
+
+    if node is NodeKind.TYPED or message_type is not None:
+        raise InputError("a throttler is for all types: choose --node python or cpp, and no --type")
+    if not files:
+        raise InputError("give the launch files: `splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`")
+    return splice_throttlers(
+        *([_input(text) for text in inputs], files, output),
+        node=node.value,
+        arguments=arguments,
+        recording=_opened(recording),
+    )
+
+
+def _input(text: str) -> "ThrottledInput":
+    """One input to be throttled, as it is written: ``/fusion:/points_raw=100ms``."""
+    from chainshaper.durations import parse_duration
+    from chainshaper.launch_splicing import ThrottledInput
+    from chainshaper.planning.plan import wrong_values_refused
+
+    where, equals, period = text.rpartition("=")
+    if not equals:
+        raise InputError(f"--throttle {text}: write a topic and a period: /points_raw=100ms")
+    node, _, topic = where.rpartition(":")
+    with wrong_values_refused(ThrottledInput):
+        return ThrottledInput(
+            topic=topic, period_ns=parse_duration(period), subscriber=node or None
+        )
+
+
+def _own_recording(plan: "Plan") -> Path | None:
+    own = Path(plan.evidence.recording or "")
+    return own if plan.evidence.recording and own.is_dir() else None
+
+
+def _opened(recording: Path | None) -> "Recording | None":
     if recording is None:
-        own = Path(plan.evidence.recording or "")
-        if not plan.evidence.recording or not own.is_dir():
-            return None
-        recording = own
+        return None
     from chainshaper.sources import open_source
 
     return open_source(recording)
@@ -149,7 +225,7 @@ def _values(splicing: "Splicing", setup: Path | None) -> dict[str, Any]:
         "folder": str(splicing.folder),
         "launch": {str(file): str(copy) for file, copy in splicing.launch.items()},
         "originals": {str(copy): str(file) for copy, file in splicing.originals.items()},
-        "shaping_nodes": [process.name for process in splicing.processes],
+        "nodes": [process.name for process in splicing.processes],
         "logs": [str(log) for log in splicing.logs],
         "setup": None if setup is None else str(setup),
         "diff": splicing.diff,

@@ -6,8 +6,9 @@ What is known of a thread, the stronger evidence first:
 2. its name, which DDS implementations choose (:mod:`chainshaper.enforcement.dds_threads`);
 3. its place: executors spin on the main thread, unless the program arranges it otherwise.
 
-What no evidence covers stays unknown. Which nodes a process has, a recording says, or the remap
-rules of its command line; the name of its program is a guess, and called one.
+What no evidence covers stays unknown. Which nodes a process has, a recording says (also one of an
+earlier run, where the command line names one of them), or the remap rules of its command line; the
+name of its program is a guess, and called one.
 
 Everything here is a function of what was seen at one instant (:mod:`.processes`). Threads that
 appear later are found by looking again and comparing (:func:`new_and_ended`).
@@ -123,7 +124,10 @@ def _identify(process: Process, recorded: Sequence[RecordedProcess]) -> _Identif
     if match is not None and match.nodes:
         return _Identified(process, match.nodes, "recording", match)
     if named:
-        return _Identified(process, named, "command line", match)
+        # A container's command line names the container only; an earlier run tells its components.
+        earlier = next((seen.nodes for seen in recorded if set(named) < set(seen.nodes)), None)
+        known_by = "command line" if earlier is None else "recording"
+        return _Identified(process, earlier or named, known_by, match)
     guess = guessed_name(process.command)
     looks_like_a_node = process.participates or takes_ros_arguments(process.command)
     if guess is not None and looks_like_a_node:

@@ -36,7 +36,7 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 __all__ = [
@@ -335,18 +335,29 @@ class Shaper:
 
     One shaper belongs to one thread, which does nothing else at the time of a release. That makes
     it a witness of the machine's own stalls (:meth:`time_lost`).
+
+    ``on_waking`` is called when it wakes ``spin_ns`` before a release, to watch the clock from
+    there.
     """
 
     STEP_NS = 500_000  # slewing moves the clock by at most 50 us in a cycle of 100 ms
 
-    def __init__(self, gate: Gate, spin_ns: int = 0) -> None:
+    def __init__(
+        self, gate: Gate, spin_ns: int = 0, on_waking: Callable[[], None] = lambda: None
+    ) -> None:
         self.gate = gate
         self.spin_ns = spin_ns
+        self._on_waking = on_waking
         self._offset = clock_offset()
         self._waiting = _WaitingTime()
         self._waited = 0
         # So many changes reach back further than the oldest stamp that is of use.
         self._changes: deque[tuple[int, str]] = deque(maxlen=64)
+        self._next_phase: tuple[int, int] | None = None  # from when on, and which
+
+    def set_phase(self, phase_ns: int, now_ns: int) -> None:
+        """Cycles begin elsewhere, from the first such beginning after ``now_ns`` on."""
+        self._next_phase = (now_ns + (phase_ns - now_ns) % self.gate.cycle_ns, phase_ns)
 
     @property
     def mode(self) -> str | None:
@@ -370,6 +381,9 @@ class Shaper:
         self._offset = offset
         stamp = None if stepped else origin_of(payload)
         origin = None if stamp is None else stamp - offset
+        if self._next_phase is not None and arrival_ns >= self._next_phase[0]:
+            self.gate = replace(self.gate, phase_ns=self._next_phase[1])
+            self._next_phase = None
         release = release_of(self.gate, arrival_ns, origin, self._changes)
         if release.anchor == "stamp":
             phase = release.origin_ns % self.gate.cycle_ns
@@ -389,6 +403,7 @@ class Shaper:
         self._waited = self._waiting.so_far()
         if release.at_ns > arrival:
             sleep_until(release.at_ns - self.spin_ns)
+            self._on_waking()
             if time.monotonic_ns() < release.at_ns:
                 # Awake in time: what other threads took before is of no consequence.
                 self._waited = self._waiting.so_far()

@@ -13,7 +13,7 @@ import contextlib
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -190,6 +190,7 @@ class DriftWatch:
     ``latest_ns`` is how far that is from ``expected_ns`` (None: not seen yet). Held back by a
     server, a thread begins with its slot; once its timer expires inside the slot, it begins so
     much later, and that is the drift. Where nothing holds it, its beginning is seen to move.
+    Looking is done on ``cores``, if there are any: it would delay what runs in slots.
     """
 
     EVERY_S = 10.0
@@ -202,13 +203,17 @@ class DriftWatch:
         cycle_ns: int,
         expected_ns: int,
         slots: Sequence[tuple[int, int]] = (),
+        *,
+        cores: Collection[int] = (),
     ) -> None:
         self.latest_ns: int | None = None
         self._thread, self._cycle_ns, self._expected_ns = (pid, tid), cycle_ns, expected_ns
-        self._slots = slots
+        self._slots, self._cores = slots, cores
         threading.Thread(target=self._look_again, name="drift-watch", daemon=True).start()
 
     def _look_again(self) -> None:
+        if self._cores:
+            os.sched_setaffinity(0, self._cores)  # the calling thread's alone
         with contextlib.suppress(OperationError):  # the thread has ended
             while True:
                 time.sleep(self.EVERY_S)

@@ -4,7 +4,10 @@ On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DES
 
 * DDS threads of the application stand above all servers, on other cores where there are any:
   what they deliver must not wait for what it is delivered to;
+* those of them that receive stand above the others, since they are waited for;
 * servers stand below 88 in the order of their own priority, smaller first;
+* who receives what a shaping node publishes stands below all servers, on the shaping node's core:
+  idle then, and just awake. It may take as long as it likes, and delays no chain;
 * several threads of one server share a priority under SCHED_RR, so that they take turns;
 * an asynchronous publisher stands below every other thread of its process on its core. It shares
   the writer's lock with them and spins on it: above them, it would never let them release it;
@@ -15,6 +18,7 @@ The result is a list that can be looked at before anything is done.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain as joined
 
 from chainshaper.enforcement.allocation import Allocation, NodeThread
 from chainshaper.enforcement.threads import Scheduling
@@ -35,7 +39,9 @@ __all__ = [
 ]
 
 DDS_PRIORITY = 90
+DDS_RECEIVE_PRIORITY = 91
 BEST_SERVER_PRIORITY = 87
+RECEIVES = "receives the output"
 STEP = 2
 """Between two servers there is room for a publisher below the better one's threads."""
 
@@ -99,7 +105,9 @@ def server_priorities(priorities: Iterable[int]) -> dict[int, int]:
 def plan_scheduling(
     plan: Plan, allocation: Allocation, available_cores: Sequence[int]
 ) -> tuple[WantedScheduling, ...]:
-    """What every thread concerned by a plan shall get: servers' threads first, then DDS threads.
+    """What every thread concerned by a plan shall get: servers' threads first, then the others.
+
+    Receivers that do not run are left out: not everybody who subscribes is always there.
 
     Raises:
         OperationError: see :func:`server_members`.
@@ -108,7 +116,10 @@ def plan_scheduling(
     members = server_members(plan, allocation)
     cores = {server.name: server.core for server in plan.servers}
     priorities = {server.name: server.priority for server in plan.servers}
-    return scheduling_around(members, cores, priorities, allocation, available_cores)
+    receiving = _receiving(plan, members, allocation)
+    return scheduling_around(
+        members, cores, priorities, allocation, available_cores, receiving=receiving
+    )
 
 
 def scheduling_around(
@@ -117,18 +128,22 @@ def scheduling_around(
     priorities: Mapping[str, int],
     allocation: Allocation,
     available_cores: Sequence[int],
+    *,
+    receiving: Sequence[WantedScheduling] = (),
 ) -> tuple[WantedScheduling, ...]:
     """What the threads of servers, and the others of their processes, shall get.
 
-    ``members``, ``cores`` and ``priorities`` are by server's name.
+    ``members``, ``cores`` and ``priorities`` are by server's name. ``receiving`` is what threads
+    that receive an output shall get, whose processes are treated alike.
 
     Raises:
         OperationError: a thread cannot leave the core of a publisher that would outrank it.
         InputError: see :func:`server_priorities`.
     """
     own = wanted_of_members(members, cores, priorities)
-    pids = {member.thread.pid for group in members.values() for member in group}
-    planned = {member.thread.identity for group in members.values() for member in group}
+    ours = [*joined.from_iterable(members.values()), *(one.thread for one in receiving)]
+    pids = {member.thread.pid for member in ours}
+    planned = {member.thread.identity for member in ours}
     others = [
         thread
         for thread in allocation.threads
@@ -136,7 +151,7 @@ def scheduling_around(
     ]
     free_cores = tuple(sorted(set(available_cores) - set(cores.values())))
     beside = _dds_threads(others, free_cores)
-    return below_their_siblings((*own, *beside, *_out_of_the_way(own, others)))
+    return below_their_siblings((*own, *receiving, *beside, *_out_of_the_way(own, others)))
 
 
 def left_by_back_end(
@@ -146,9 +161,11 @@ def left_by_back_end(
 
     Under sched_ext and LITMUS^RT servers are scheduling classes of their own: their threads need
     no priority, and sched_ext's may have none, since the kernel runs real-time threads above it.
+    A receiver would stand above the servers then, instead of below: it is left as it is.
     """
     if back_end not in ("scx", "litmus"):
         return tuple(wanted)
+    wanted = (one for one in wanted if one.reason != RECEIVES)
     return tuple(
         one
         if one.server is None
@@ -233,11 +250,38 @@ def _threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThr
     return found
 
 
+def _receiving(
+    plan: Plan, members: Mapping[str, Sequence[NodeThread]], allocation: Allocation
+) -> list[WantedScheduling]:
+    """The executors of nodes that receive an output, unless they are in a server themselves."""
+    planned = {one.thread.identity for group in members.values() for one in group}
+    below = min(server_priorities(server.priority for server in plan.servers).values()) - STEP
+    cores = {
+        receiver: node.core
+        for node in (plan.shaping_node, *plan.further_shaping_nodes)
+        if node is not None
+        for receiver in node.receivers
+    }
+    return [
+        WantedScheduling(one, Scheduling(max(1, below), (core,)), None, RECEIVES)
+        for one in allocation.threads
+        if one.thread.role == "executor" and one.thread.identity not in planned
+        for core in [cores[node] for node in one.nodes if node in cores][:1]
+    ]
+
+
 def _dds_threads(others: Sequence[NodeThread], cores: tuple[int, ...]) -> list[WantedScheduling]:
     """DDS threads above all servers; on machines without a free core they stay where they are."""
-    wanted = Scheduling(DDS_PRIORITY, cores or None)
     return [
-        WantedScheduling(thread, wanted, None, "DDS threads deliver for the servers")
+        WantedScheduling(
+            thread,
+            Scheduling(
+                DDS_RECEIVE_PRIORITY if thread.thread.kind == "receive" else DDS_PRIORITY,
+                cores or None,
+            ),
+            None,
+            "DDS threads deliver for the servers",
+        )
         for thread in others
         if thread.thread.role == "dds"
     ]

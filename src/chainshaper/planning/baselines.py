@@ -7,6 +7,7 @@ output in a slot is represented by the slot's end.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 
 from chainshaper.durations import format_duration
 from chainshaper.errors import InputError, OperationError
@@ -151,12 +152,13 @@ def let_per_chain(plan: Plan) -> Plan:
     )
 
 
-def let_per_callback(plan: Plan, topics: Sequence[str]) -> Plan:
+def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str] = ()) -> Plan:
     """Logical execution time for every callback: each one's output waits for the next cycle.
 
-    ``topics`` are the outputs of the chain's callbacks in order, the chain's own last. Behind
-    each a shaping node republishes at the beginning of the next cycle, so the latency is as
-    many periods as there are callbacks (section 5.3, table 5).
+    ``topics`` are the outputs of the chain's callbacks in order, the chain's own last;
+    ``publishers`` are the nodes that publish them, where they are known. Behind each topic
+    a shaping node republishes at the beginning of the next cycle, so the latency is as many
+    periods as there are callbacks (section 5.3, table 5).
 
     Raises:
         InputError: a plan without a shaping node, topics that do not end with the chain's
@@ -170,7 +172,10 @@ def let_per_callback(plan: Plan, topics: Sequence[str]) -> Plan:
             " output last"
         )
     with wrong_values_refused():
-        inside = tuple(shaping_node_like(last, topic) for topic in topics[:-1])
+        inside = tuple(
+            shaping_node_like(last, topic, publisher)
+            for topic, publisher in zip_longest(topics[:-1], publishers[: len(topics) - 1])
+        )
         threads = [node.thread for node in (*inside, last)]
         return revised(_let_per_thread(plan, threads), further_shaping_nodes=inside)
 

@@ -5,7 +5,7 @@ Each step takes a shaped plan and returns one that covers more of the graph (sec
 server per core while the graph runs, one publish slot per sink.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,12 +89,18 @@ def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int) -> Plan:
 
 
 def with_sink(
-    plan: Plan, latencies_ns: NDArray[np.int64], output: str, *, publisher: str | None = None
+    plan: Plan,
+    latencies_ns: NDArray[np.int64],
+    output: str,
+    *,
+    publisher: str | None = None,
+    receivers: Sequence[str] = (),
 ) -> Plan:
     """A shaped plan with one more shaped output: another sink of the same graph (end of 5.4).
 
-    The sink gets a shaping node of its own, or, where the plan's output is published
-    asynchronously, its ``publisher`` is the node whose publisher thread is gated.
+    The sink gets a shaping node of its own, behind its ``publisher`` and before its ``receivers``;
+    where the plan's output is published asynchronously, that node's publisher thread is gated
+    instead.
 
     ``latencies_ns`` are those from the start of the graph to this sink. Its publish slot starts
     the plan's margin after the longest of them, or where a publish slot that is in the way on
@@ -131,7 +137,7 @@ def with_sink(
             " shorter slot, or another core for one of the outputs"
         )
     with wrong_values_refused():
-        added, thread = _gate_like(node, output, publisher)
+        added, thread = _gate_like(node, output, publisher, receivers)
         server = Server(
             name=f"output_{thread.node.strip('/')}",
             core=publishing.core,
@@ -147,17 +153,16 @@ def with_sink(
 
 
 def _gate_like(
-    node: ShapingNode | None, output: str, publisher: str | None
+    node: ShapingNode | None, output: str, publisher: str | None, receivers: Sequence[str]
 ) -> tuple[tuple[ShapingNode, ...], Thread]:
     """The shaping node that a further sink needs, if any, and the thread that publishes it."""
-    if node is not None and publisher is None:
-        added = shaping_node_like(node, output)
+    if node is not None:
+        added = shaping_node_like(node, output, publisher, receivers)
         return (added,), added.thread
-    if node is None and publisher is not None:
+    if publisher is not None:
         return (), Thread(node=publisher, role="publisher")
     raise InputError(
-        "the sinks of one plan are published alike: name the publisher of a sink where the plan"
-        " gates publishers' threads, and only there"
+        f"the plan gates publishers' threads, and who publishes {output} is not known: name it"
     )
 
 

@@ -9,13 +9,19 @@ has expired when the thread may run again.
 from itertools import pairwise
 
 from chainshaper.planning.plan import Plan, publish_slots, server_of
-from chainshaper.planning.plan_parts import Thread
+from chainshaper.planning.plan_parts import ShapingNode, Thread
 
 __all__ = ["cycles_until_output", "output_lifespan"]
 
 
-def cycles_until_output(plan: Plan) -> int:
-    """How many cycles after its own an output is due: 0, and more under LET."""
+def cycles_until_output(plan: Plan, node: ShapingNode | None = None) -> int:
+    """How many cycles after its own an output is due: 0, and more under LET.
+
+    It is the chain's output, or what ``node`` republishes: under LET per callback, each topic
+    inside the chain is due a cycle after the one before it.
+    """
+    if plan.policy == "let-per-callback" and node in plan.further_shaping_nodes:
+        return plan.further_shaping_nodes.index(node) + 1
     return (plan.predicted.max_ns - 1) // plan.cycle_ns
 
 

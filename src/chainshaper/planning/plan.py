@@ -179,15 +179,16 @@ def revised(plan: Plan, **changes: object) -> Plan:
 
 
 @contextmanager
-def wrong_values_refused() -> Iterator[None]:
+def wrong_values_refused(model: type[Part] | None = None) -> Iterator[None]:
     """Inside, a value that no plan may have ends in an InputError that names it.
 
-    For code that builds plans from what a caller gave.
+    For code that builds plans, or a ``model`` that is a part of one, from what a caller gave.
     """
     try:
         yield
     except ValidationError as error:
-        problems = [f"{key_text(where)}: {reason}" for where, reason in explanations(error, Plan)]
+        found = explanations(error, model or Plan)
+        problems = [f"{key_text(where)}: {reason}" for where, reason in found]
         raise InputError("; ".join(problems)) from error
 
 

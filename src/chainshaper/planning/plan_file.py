@@ -32,7 +32,7 @@ _SECTION_COMMENTS = {
     "anchor": "what starts a cycle: the message's origin stamp (stamp), or the servers (cycle)",
     "overrun": "an output that missed its last slot: wait for the next, discard, publish at once",
     "servers": "a thread runs only in its server's slots; a smaller priority is better",
-    "shaping_node": "republishes the chain's output in the slots of its server",
+    "shaping_node": "republishes the output in its slots; receivers get SCHED_FIFO below servers",
     "modes": "each mode's band, 1 is the first slot; the topic (std_msgs/String) names the mode",
     "predicted": "for the slots as planned; not updated when they are edited",
 }
@@ -56,6 +56,9 @@ def dump_plan(plan: Plan) -> str:
         server["threads"] = [_InlineMapping(thread) for thread in server["threads"]]
     if plan.offset_ns == 0:
         del values["offset"]
+    for node in (values.get("shaping_node"), *values["further_shaping_nodes"]):
+        if node is not None:
+            node["receivers"] = _Inline(node["receivers"])
     if not values["further_shaping_nodes"]:
         del values["further_shaping_nodes"]
     if "modes" in values:

@@ -92,6 +92,7 @@ class Evidence(Part):
     ``incomplete`` counts traversals without an end, ``disturbed`` those that a stall of the
     machine hit, ``utilisation`` is the share of its core that the chain's execution takes,
     ``longest_send_ns`` how long the output's asynchronous publisher took to send one message.
+    ``lost_events`` counts what the tracer lost, if it lost anything.
     ``None`` is: not known.
     """
 
@@ -106,6 +107,7 @@ class Evidence(Part):
     longest_stall_ns: Duration | None = None
     utilisation: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
     longest_send_ns: Duration | None = None
+    lost_events: Annotated[int, Field(ge=1)] | None = None
 
     @model_validator(mode="after")
     def _ordered(self) -> "Evidence":
@@ -177,15 +179,21 @@ class ShapingNode(Part):
     It publishes in the slots of the server that holds its thread. ``core`` and ``fifo_priority``
     are those of its executor; it sleeps until ``spin_ns`` before the slot and spins from there,
     and pauses for ``pause_ns`` after a publication so that delivery is not delayed by it.
+    ``publisher`` is the node whose output it takes, of a node that stands elsewhere than behind
+    the chain's own output (`chain.publisher`), where it is known. ``receivers`` are nodes that
+    subscribe to the output: while the plan is in force their executors run under SCHED_FIFO below
+    all servers, so that what comes in time is taken in time.
     """
 
     name: Annotated[str, AfterValidator(_node_name)]
     input: FullName
     output: FullName
+    publisher: FullName | None = None
     core: Annotated[int, Field(ge=0)]
     fifo_priority: Annotated[int, Field(ge=1, le=98)]
     spin_ns: Duration
     pause_ns: Duration
+    receivers: tuple[FullName, ...] = ()
 
     @property
     def thread(self) -> Thread:

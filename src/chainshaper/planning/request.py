@@ -39,6 +39,7 @@ from chainshaper.planning.plan import (
     Anchor,
     Evidence,
     Margin,
+    Modes,
     Overrun,
     Plan,
     Policy,
@@ -63,6 +64,7 @@ class Profile:
     ``latencies_ns`` are in the order of time. ``nodes`` are those of the chain's callbacks, one
     per callback, ``topics`` what each of these publishes for the chain. ``core_of`` names the
     core of every node whose executor takes part, also on branches that the chain waits for.
+    ``receivers`` are the nodes that subscribe to the chain's output and are none of these.
     ``callbacks`` are those of the chain and its branches, see
     :func:`~chainshaper.planning.baselines.server_per_callback`. ``output_depth`` is the history
     of the output's writer, ``longest_send_ns`` how long its asynchronous publisher took to send.
@@ -75,6 +77,7 @@ class Profile:
     nodes: tuple[str, ...] = ()
     topics: tuple[str, ...] = ()
     core_of: Mapping[str, int] = field(default_factory=dict)
+    receivers: tuple[str, ...] = ()
     callbacks: tuple[CallbackTimes, ...] = ()
     fifo_priority: int = 84
     recording: str | None = None
@@ -84,6 +87,7 @@ class Profile:
     longest_stall_ns: int | None = None
     utilisation: float | None = None
     longest_send_ns: int | None = None
+    lost_events: int | None = None
     output_depth: int | None = None
 
 
@@ -94,7 +98,8 @@ class PlanRequest:
     ``epsilon_ns`` is given (None: 1 ms), or derived for ``overrun_probability``. ``bands`` to
     ``seed`` are those of :func:`~chainshaper.planning.placement.with_bands` and go with the
     policy ``shaped``, ``slot_start_ns`` goes with ``one-long-slot``. ``first_slot_ns`` puts the
-    chain's first node into a server of its own that ends there.
+    chain's first node into a server of its own that ends there. ``modes`` give each mode of the
+    system one of the bands. Without ``with_receivers`` those of the output are left alone.
     """
 
     policy: Policy = "shaped"
@@ -113,10 +118,12 @@ class PlanRequest:
     seed: int = 0
     slot_start_ns: int | None = None
     first_slot_ns: int | None = None
+    modes: Modes | None = None
     anchor: Anchor = "stamp"
     overrun: Overrun = "wait"
     spin_ns: int = 300_000
     pause_ns: int = 500_000
+    with_receivers: bool = True
 
 
 _STANDARD = PlanRequest()
@@ -147,9 +154,15 @@ def plan_chain(
     else:
         plan = _with_policy(_shaped(profile, request, margin, sinks), profile, request)
     for sink in sinks:
-        publisher = sink.nodes[-1] if request.publication == "asynchronous" else None
-        plan = with_sink(plan, sink.latencies_ns, _output(sink), publisher=publisher)
-    return plan
+        publisher = sink.nodes[-1] if sink.nodes else None
+        plan = with_sink(
+            plan,
+            sink.latencies_ns,
+            _output(sink),
+            publisher=publisher,
+            receivers=sink.receivers if request.with_receivers else (),
+        )
+    return plan if request.modes is None else revised(plan, modes=request.modes)
 
 
 def band_choice(plan: Plan, profile: Profile, request: PlanRequest) -> BandChoice:
@@ -212,6 +225,7 @@ def _shaped(
         longest_stall_ns=profile.longest_stall_ns,
         utilisation=profile.utilisation,
         longest_send_ns=profile.longest_send_ns if asynchronous else None,
+        lost_events=profile.lost_events,
         output_depth=profile.output_depth if asynchronous else None,
         core=profile.core_of.get(last or "", DEFAULT_CORE),
         anchor=request.anchor,
@@ -219,6 +233,7 @@ def _shaped(
         fifo_priority=profile.fifo_priority,
         spin_ns=request.spin_ns,
         pause_ns=request.pause_ns,
+        receivers=profile.receivers if request.with_receivers else (),
     )
     core_of = dict(joined.from_iterable(one.core_of.items() for one in (profile, *sinks)))
     if request.first_slot_ns is not None:
@@ -274,7 +289,7 @@ def _per_callback(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
         return server_per_callback(plan, profile.callbacks, margin_ns=plan.margin.epsilon_ns)
     if request.publication == "asynchronous":
         return let_per_callback_asynchronous(plan, profile.nodes)
-    return let_per_callback(plan, profile.topics)
+    return let_per_callback(plan, profile.topics, profile.nodes)
 
 
 def _refuse_contradictions(request: PlanRequest, sinks: bool) -> None:

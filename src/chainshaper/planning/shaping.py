@@ -59,6 +59,7 @@ def plan_shaping(
     longest_stall_ns: int | None = None,
     utilisation: float | None = None,
     longest_send_ns: int | None = None,
+    lost_events: int | None = None,
     output_depth: int | None = None,
     core: int = 1,
     output_core: int | None = None,
@@ -67,6 +68,7 @@ def plan_shaping(
     fifo_priority: int = 84,
     spin_ns: int = 300_000,
     pause_ns: int = 500_000,
+    receivers: Sequence[str] = (),
 ) -> Plan:
     """Plan single-band shaping: one publish slot right behind the longest latency measured.
 
@@ -88,11 +90,11 @@ def plan_shaping(
         publication: ``synchronous`` splices a shaping node behind the output; ``asynchronous``
             puts the publisher's own thread into R_m°.
         recording, incomplete, disturbed, realtime, longest_stall_ns, utilisation,
-            longest_send_ns: where the latencies come from and how they were taken, for the
-            plan's evidence.
+            longest_send_ns, lost_events: where the latencies come from and how they were taken, for
+            the plan's evidence.
         output_depth: history of the output's writer (keep last).
         core, output_core: cores of the two servers.
-        anchor, fifo_priority, spin_ns, pause_ns: for the shaping node.
+        anchor, fifo_priority, spin_ns, pause_ns, receivers: for the shaping node.
         overrun: what becomes of an output that missed its slot.
 
     Raises:
@@ -126,6 +128,7 @@ def plan_shaping(
                 fifo_priority=fifo_priority,
                 spin_ns=spin_ns,
                 pause_ns=pause_ns,
+                receivers=tuple(receivers),
             )
         publishing = [node.thread] if node is not None else []
         if publication == "asynchronous" and publisher is not None:
@@ -147,6 +150,7 @@ def plan_shaping(
                 longest_stall_ns=longest_stall_ns,
                 utilisation=utilisation,
                 longest_send_ns=longest_send_ns,
+                lost_events=lost_events,
             ),
             margin=margin or Margin(epsilon_ns=epsilon_ns),
             policy="shaped",
@@ -174,9 +178,12 @@ def plan_shaping(
         )
 
 
-def shaping_node_like(node: ShapingNode, output: str) -> ShapingNode:
+def shaping_node_like(
+    node: ShapingNode, output: str, publisher: str | None, receivers: Sequence[str] = ()
+) -> ShapingNode:
     """A shaping node for another topic, with the core, priority and waiting of a given one."""
-    return ShapingNode.model_validate({**node.model_dump(), **_names(output)})
+    others = {**_names(output), "publisher": publisher, "receivers": tuple(receivers)}
+    return ShapingNode.model_validate({**node.model_dump(), **others})
 
 
 def evidence_of(
@@ -189,6 +196,7 @@ def evidence_of(
     longest_stall_ns: int | None = None,
     utilisation: float | None = None,
     longest_send_ns: int | None = None,
+    lost_events: int | None = None,
 ) -> Evidence:
     """The latencies' statistics together with the conditions they were taken under."""
     return Evidence(
@@ -203,6 +211,7 @@ def evidence_of(
         longest_stall_ns=longest_stall_ns,
         utilisation=utilisation,
         longest_send_ns=longest_send_ns,
+        lost_events=lost_events,
     )
 
 
@@ -257,6 +266,11 @@ def plan_warnings(plan: Plan) -> list[str]:
             "the latencies were taken without real-time scheduling: other programs are in them,"
             " and the chain's slot is longer than it needs to be. Record again with the privilege"
             " to use SCHED_FIFO."
+        )
+    if evidence.lost_events:
+        warnings.append(
+            f"{evidence.lost_events} events were lost while recording: cycles are missing, and the"
+            " longest latency may be among them. Record again, see the recording's notes."
         )
     if evidence.disturbed:
         stalled = evidence.longest_stall_ns

@@ -199,7 +199,7 @@ def _sampled(
             " application that is described, with its threads' CPU times or sched_switch"
         )
     samples = _samples(times[node, trigger]).model_copy(update={"block": block})
-    return callback.model_copy(update={"execution": samples})
+    return callback.model_copy(update={"execution": samples, "computes": None})
 
 
 def _samples(values: pl.Series) -> ExecutionTime:

@@ -26,7 +26,7 @@ from chainshaper.simulation.system import System, build_system
 from chainshaper.simulation.tables import Names, created_objects, event_frames, name_objects
 from chainshaper.splicing.application import splice_application
 from chainshaper.workload.description import Application, application_as_written
-from chainshaper.workload.live import WARM_UP_CYCLES, origin_timer
+from chainshaper.workload.live import WARM_UP_CYCLES, completion_ns, origin_timer
 
 __all__ = ["simulate", "simulate_latencies"]
 
@@ -54,8 +54,8 @@ def simulate(
     grow with ``cycles``. As in a live run, a few cycles before the recorded ones are left out.
 
     Raises:
-        InputError: ``output`` exists, the plan does not fit the application, or its chain has no
-            timer to count cycles by.
+        InputError: ``output`` exists, the plan does not fit the application, or a callback of it
+            computes, so that its execution times are not known.
         OperationError: messages pile up without end, or the recording cannot be written.
     """
     output = refuse_existing(output)
@@ -70,7 +70,7 @@ def simulate(
         threads=_thread_infos(simulation.system, simulation.names),
         realtime=True,
         notes=(f"simulated; the first {WARM_UP_CYCLES} cycles were not recorded",),
-        chain=application.chain,
+        chain=simulation.system.application.chain,
         application=application_as_written(simulation.system.application),
         plan=None if plan is None else plan.model_dump(mode="json"),
     )
@@ -96,6 +96,16 @@ def simulate_latencies(
     for _ in _run(simulation):
         pass
     return simulation.machine.latencies
+
+
+def _refuse_functions(application: Application) -> None:
+    for name, callback in application.callbacks():
+        if callback.computes is not None:
+            raise InputError(
+                f"node {name} computes {callback.computes}, and how long that takes is not known "
+                "before it has run: measure it (`chainshaper run APP.yaml -o REC`), and simulate "
+                "with the times that were recorded (--execution-times REC)"
+            )
 
 
 @dataclass(frozen=True)
@@ -148,6 +158,7 @@ def _prepare(
 ) -> _Simulation:
     if cycles < 1:
         raise InputError(f"{cycles} cycles cannot be simulated: ask for at least 1")
+    _refuse_functions(application)
     if seed is not None:
         application = application.model_copy(update={"seed": seed})
     timer = origin_timer(application)
@@ -169,7 +180,7 @@ def _prepare(
         anchor_ns=START_NS + timer.phase_ns,
         record_from_ns=first - apart,
         last_timer_ns=end - apart,
-        stop_ns=end + max(2 * period, 200_000_000),
+        stop_ns=end + completion_ns(application, period),
     )
     streams = Streams(application.seed)
     machine, cores = build_machine(

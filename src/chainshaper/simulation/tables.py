@@ -123,7 +123,8 @@ def name_objects(system: System, machine: Machine, cores: Sequence[int]) -> Name
                 subscription=rclcpp,
                 callback=callback,
             )
-        symbol = f"{system.processes[owner].node}::callback{entity.index}"
+        filtered = "message_filters::" if entity.described.synchronises else ""
+        symbol = f"{filtered}{system.processes[owner].node}::callback{entity.index}"
         note("rclcpp_callback_register", owner, callback=callback, symbol=symbol)
     by_entity = np.array(entities, dtype=np.uint64).reshape(-1, 3)
     by_publisher = np.array(publishers, dtype=np.uint64).reshape(-1, 2)

@@ -17,13 +17,14 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
 import polars as pl
 
+from chainshaper import events
 from chainshaper.enforcement.gate import clock_offset
 from chainshaper.enforcement.processes import descendants
 from chainshaper.enforcement.realtime import interrupted_with_parent
@@ -31,9 +32,10 @@ from chainshaper.enforcement.threads import parents
 from chainshaper.errors import InputError, OperationError, PlatformError
 from chainshaper.events import EventTables
 from chainshaper.recording import RecordingInfo
+from chainshaper.sources.callback_functions import callback_functions
 from chainshaper.sources.ebpf_output import HEADER, Printed, lost_events, read_printed
 from chainshaper.sources.ebpf_script import TEXT_BYTES, bpftrace_script
-from chainshaper.sources.late_attachment import with_found_objects
+from chainshaper.sources.late_attachment import ADDED, with_found_objects, with_functions
 from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids
 from chainshaper.sources.trace_points import TracePoint, trace_points
 from chainshaper.sources.tracing_libraries import (
@@ -79,6 +81,8 @@ class EbpfTracer:
         self._ahead_ns = 0
         self._clock_offset_ns = 0
         self._notes: list[str] = []
+        self._printed: Printed | None = None
+        self._functions: dict[tuple[int, int], str] = {}
 
     def start(self) -> Mapping[str, str]:
         """Find the libraries, write the script, and wait until its probes are in place."""
@@ -122,6 +126,10 @@ class EbpfTracer:
                 f"bpftrace (process {self._bpftrace.pid}) did not end within {_STOP_S:.0f} s and "
                 "is killed: the last events are missing"
             ) from None
+        with suppress(OSError, pl.exceptions.PolarsError):  # `recording` says what is wrong
+            self._printed = self._read()
+            # As long as the application runs: its memory tells.
+            self._functions = callback_functions(_callbacks(self._printed.tables))
 
     def remove(self) -> None:
         """End bpftrace if it still runs; the kernel removes its probes with it."""
@@ -133,7 +141,7 @@ class EbpfTracer:
         """The events that bpftrace printed, and what is known of a system that ran already."""
         output = self._folder / _EVENTS
         try:
-            printed = read_printed(output, self._points, self._ahead_ns)
+            printed = self._printed or self._read()
             lost = lost_events(output, self._folder / _SAID)
         except (OSError, pl.exceptions.PolarsError) as error:
             raise OperationError(
@@ -144,6 +152,7 @@ class EbpfTracer:
         if self._attached:
             tables, found = with_found_objects(tables, printed.handles, self._began_ns)
             notes += found
+        tables = with_functions(tables, self._functions, self._began_ns)
         info = RecordingInfo(
             source="ebpf",
             distribution=distribution_of(_started_with(self._points), {}),
@@ -154,6 +163,9 @@ class EbpfTracer:
             notes=tuple(notes),
         )
         return tables, info
+
+    def _read(self) -> Printed:
+        return read_printed(self._folder / _EVENTS, self._points, self._ahead_ns)
 
     def _libraries(self) -> tuple[TracingLibrary, ...]:
         """The libraries to set probes on; at least one that exports trace points."""
@@ -208,16 +220,16 @@ class EbpfTracer:
     def _launched(self) -> "subprocess.Popen[bytes]":
         command = ["bpftrace", "-B", "full", str(self._folder / _SCRIPT)]
         with (
-            (self._folder / _EVENTS).open("wb") as events,
+            (self._folder / _EVENTS).open("wb") as printed,
             (self._folder / _SAID).open("wb") as said,
         ):
-            events.write(HEADER.encode())
-            events.flush()
+            printed.write(HEADER.encode())
+            printed.flush()
             return subprocess.Popen(
                 command,
                 env={**_SETTINGS, **os.environ},
                 stdin=subprocess.DEVNULL,
-                stdout=events,
+                stdout=printed,
                 stderr=said,
                 start_new_session=True,  # Ctrl-C is ours to react to
                 preexec_fn=partial(_in_the_background, os.getpid()),  # noqa: PLW1509
@@ -267,8 +279,13 @@ class EbpfTracer:
             notes.append(
                 f"no event was traced: nothing that ran has called {', '.join(libraries)}."
             )
-        if "callback_start" in tables and "rclcpp_callback_register" not in tables:
-            notes.append("names of functions are unknown: only LTTng is told them.")
+        if "rclcpp_callback_register" not in tables and (
+            unknown := set(_callbacks(tables)) - self._functions.keys()
+        ):
+            notes.append(
+                f"{len(unknown)} callbacks' functions have no name: the application had ended, or"
+                " its files were stripped."
+            )
         if lost:
             pages = os.environ.get("BPFTRACE_PERF_RB_PAGES", _SETTINGS["BPFTRACE_PERF_RB_PAGES"])
             notes.append(
@@ -290,6 +307,12 @@ def _in_the_background(parent_pid: int) -> None:
     interrupted_with_parent(parent_pid)
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     os.nice(_NICE)
+
+
+def _callbacks(tables: EventTables) -> Iterator[tuple[int, int]]:
+    """Processes and handles of all callbacks that were added or started."""
+    for name in (*ADDED, "callback_start"):
+        yield from events.table(tables, name).select("pid", "callback").unique().iter_rows()
 
 
 def _family(pids: Iterable[int]) -> set[int]:

@@ -23,7 +23,14 @@ import polars as pl
 
 from chainshaper import events
 
-__all__ = ["added_rows", "with_found_objects"]
+__all__ = ["ADDED", "added_rows", "with_found_objects", "with_functions"]
+
+ADDED = (
+    "rclcpp_subscription_callback_added",
+    "rclcpp_timer_callback_added",
+    "rclcpp_service_callback_added",
+)
+"""The events that make callbacks known."""
 
 _NEARLY_ALWAYS = 0.9
 _MOSTLY = 0.5
@@ -76,6 +83,32 @@ def with_found_objects(
         "measured). Services, and what neither published nor took meanwhile, cannot be known."
     )
     return {**tables, **added_rows(tables, found, began_ns)}, (note,)
+
+
+def with_functions(
+    tables: events.EventTables, functions: Mapping[tuple[int, int], str], began_ns: int
+) -> events.EventTables:
+    """Add what `rclcpp_callback_register` would have told: (process, callback) → its function.
+
+    Callbacks were registered when they were added, or before ``began_ns``.
+    """
+    named = pl.DataFrame(
+        [(*callback, symbol) for callback, symbol in functions.items()],
+        schema={"pid": pl.Int32, "callback": pl.UInt64, "symbol": pl.String},
+        orient="row",
+    )
+    added = pl.concat([events.table(tables, name).select("time", *_CALLBACK) for name in ADDED])
+    latest = added.group_by(_CALLBACK).agg(pl.col("time").max())
+    rows = named.join(latest, on=_CALLBACK, how="left").with_columns(
+        pl.col("time").fill_null(began_ns), tid=pl.col("pid")
+    )
+    if not rows.height:
+        return tables
+    known = events.table(tables, "rclcpp_callback_register")
+    both = pl.concat(
+        [rows.select(c for c in known.columns if c in rows.columns), known], how="diagonal"
+    )
+    return {**tables, "rclcpp_callback_register": both.select(known.columns).sort("time")}
 
 
 def added_rows(
@@ -152,14 +185,7 @@ def _unregistered_starts(tables: events.EventTables) -> pl.DataFrame:
     ]
     rows = pl.concat(marks, how="diagonal").sort("time", maintain_order=True)
     rows = rows.with_columns(taken=pl.col("handle").shift(1).over("pid", "tid"))
-    registered = [
-        events.table(tables, name).select(_CALLBACK)
-        for name in (
-            "rclcpp_subscription_callback_added",
-            "rclcpp_timer_callback_added",
-            "rclcpp_service_callback_added",
-        )
-    ]
+    registered = [events.table(tables, name).select(_CALLBACK) for name in ADDED]
     return (
         rows.drop_nulls("callback")
         .filter(pl.col("is_intra_process").fill_null(0) == 0)

@@ -5,30 +5,24 @@ environment that ROS 2's set-up files make. Applications that run already have m
 mapped is reached through `/proc/PID/root` where they run in a container. The same file found twice
 counts once, because uprobes belong to the file.
 
-Distributions differ in what they trace, so what a library exports is read from its symbol table
-(ELF-64, section `.dynsym`), and its version from the `package.xml` that is installed with it.
+Distributions differ in what they trace, so what a library exports is read from its symbol table,
+and its version from the `package.xml` that is installed with it.
 
-Upstream: elf(5); proc(5).
+Upstream: proc(5).
 """
 
 import re
-import struct
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = [
-    "LIBRARY",
-    "TracingLibrary",
-    "exported_functions",
-    "installed_libraries",
-    "mapped_libraries",
-]
+from chainshaper.sources.elf_symbols import exported_functions
+
+__all__ = ["LIBRARY", "TracingLibrary", "installed_libraries", "mapped_libraries"]
 
 LIBRARY = "libtracetools.so"
 _INSTALLATIONS = Path("/opt/ros")
-_DYNSYM, _FUNCTION = 11, 2  # elf.h: SHT_DYNSYM, STT_FUNC
 _VERSION = re.compile(r"<version>\s*((\d+)[^<\s]*)\s*</version>")
 
 
@@ -110,31 +104,3 @@ def _version(library: Path) -> str | None:
             if found is not None:
                 return found[1]
     return None
-
-
-def exported_functions(path: Path) -> frozenset[str]:
-    """The functions in an ELF-64 file's dynamic symbol table; none if it is no such file."""
-    try:
-        content = path.read_bytes()
-        order = {1: "<", 2: ">"}[content[5]] if content[:5] == b"\x7fELF\x02" else None
-        return frozenset() if order is None else frozenset(_functions(content, order))
-    except (OSError, LookupError, struct.error, ValueError):
-        return frozenset()
-
-
-def _functions(content: bytes, order: str) -> Iterator[str]:
-    (sections_at,) = struct.unpack_from(f"{order}Q", content, 40)
-    size, count = struct.unpack_from(f"{order}HH", content, 58)
-    sections = [
-        struct.unpack_from(f"{order}IIQQQQIIQQ", content, sections_at + size * number)
-        for number in range(count)
-    ]
-    for _, kind, _, _, start, length, names, *_ in sections:
-        if kind != _DYNSYM:
-            continue
-        names_at = sections[names][4]
-        for at in range(start, start + length, 24):
-            name, info, _, section = struct.unpack_from(f"{order}IBBH", content, at)
-            if info & 0xF == _FUNCTION and section:  # of section 0: imported, not exported
-                begin = names_at + name
-                yield content[begin : content.index(b"\0", begin)].decode()

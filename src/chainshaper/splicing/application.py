@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from chainshaper.errors import InputError
 from chainshaper.planning.overruns import cycles_until_output, output_lifespan
-from chainshaper.planning.plan import Modes, Plan, ShapingNode, publish_slots
+from chainshaper.planning.plan import Modes, Plan, ShapingNode, server_of
 from chainshaper.planning.publication import Writer, check_publication
 from chainshaper.planning.publisher_threads import publisher_servers
 from chainshaper.workload.description import (
@@ -31,8 +31,8 @@ __all__ = ["splice_application", "writers_of"]
 def splice_application(application: Application, plan: Plan) -> Application:
     """The application as the plan wants it to run; the given one is left as it is.
 
-    It is extended by the plan's shaping node or, where the plan gates the publisher's thread, given
-    the lifespan that the plan's treatment of overruns needs.
+    It is extended by the plan's shaping nodes or, where the plan gates the publisher's thread,
+    given the lifespan that the plan's treatment of overruns needs.
 
     Raises:
         InputError: the plan shapes nothing, or does not fit the application.
@@ -46,11 +46,18 @@ def splice_application(application: Application, plan: Plan) -> Application:
             "the plan has no `shaping_node`, so there is nothing to splice: plan again with "
             "`chainshaper plan REC --chain FIRST..LAST -o plan.yaml`"
         )
-    if plan.further_shaping_nodes:
+    if plan.modes is not None and plan.modes.topic not in application.announced():
         raise InputError(
-            "the plan has `further_shaping_nodes`, but one can be spliced into a live workload: "
-            "remove them from the plan"
+            f"the plan's modes are named on {plan.modes.topic}, but no callback of the application "
+            "`announces` modes there: describe one, or remove `modes` from the plan"
         )
+    for node in (shaping, *plan.further_shaping_nodes):
+        application = _spliced(application, plan, node)
+    return application
+
+
+def _spliced(application: Application, plan: Plan, shaping: ShapingNode) -> Application:
+    """The application with one shaping node behind the publisher of its output."""
     if shaping.name in {name.strip("/") for name in application.nodes}:
         raise InputError(
             f"the application has a node {shaping.name!r} already, the name that the plan gives to "
@@ -68,11 +75,6 @@ def splice_application(application: Application, plan: Plan) -> Application:
             f"the application publishes {shaping.input} already, the name that the plan gives to "
             "the unshaped output: change `shaping_node.input` in the plan"
         )
-    if plan.modes is not None and plan.modes.topic not in application.announced():
-        raise InputError(
-            f"the plan's modes are named on {plan.modes.topic}, but no callback of the application "
-            "`announces` modes there: describe one, or remove `modes` from the plan"
-        )
     nodes = {
         name: _remapped(node, shaping.output, shaping.input) if name == publishers[0] else node
         for name, node in application.nodes.items()
@@ -81,7 +83,16 @@ def splice_application(application: Application, plan: Plan) -> Application:
     topics = dict(application.topics)
     if shaping.output in topics:
         topics[shaping.input] = topics[shaping.output]  # the same quality of service
-    return application.model_copy(update={"nodes": nodes, "topics": topics})
+    chain = _from_its_publisher(application.chain, shaping)
+    return application.model_copy(update={"nodes": nodes, "topics": topics, "chain": chain})
+
+
+def _from_its_publisher(chain: str, shaping: ShapingNode) -> str:
+    """A chain whose first topic is shaped starts where it did, not at the shaping node."""
+    first, *others = chain.split("..")
+    if not others or first.strip() != shaping.output:
+        return chain
+    return "..".join([shaping.input, *others])
 
 
 def writers_of(application: Application) -> list[Writer]:
@@ -110,6 +121,7 @@ def _with_lifespan(
 
 
 def _described(plan: Plan, shaping: ShapingNode) -> NodeDescription:
+    server = server_of(plan, shaping.thread)  # a plan without one for a shaping node is refused
     try:
         return NodeDescription(
             core=shaping.core,
@@ -119,12 +131,14 @@ def _described(plan: Plan, shaping: ShapingNode) -> NodeDescription:
                     subscription=shaping.input,
                     publishes=(shaping.output,),
                     gate=GateDescription(
-                        slots=publish_slots(plan),
+                        slots=server.slots if server else (),
                         cycle_ns=plan.cycle_ns,
                         anchor=plan.anchor,
                         overrun=plan.overrun,
-                        due_cycles=cycles_until_output(plan),
-                        modes=_described_modes(plan.modes),
+                        due_cycles=cycles_until_output(plan, shaping),
+                        modes=_described_modes(plan.modes)
+                        if shaping == plan.shaping_node
+                        else None,
                         spin_ns=shaping.spin_ns,
                         pause_ns=shaping.pause_ns,
                     ),

@@ -66,7 +66,7 @@ class Copies:
 class _Work:
     """Edits per instance of a launch file, and remaps for nodes, each with the node's place.
 
-    For launch files themselves also the rules and shaping nodes that are to stand at their start.
+    For launch files themselves also the rules and nodes that are to stand at their start.
     """
 
     edits: dict[int, list[Edit]] = field(default_factory=lambda: defaultdict(list))
@@ -81,12 +81,12 @@ class _Work:
 def edited_copies(
     walk: Walk, wanted: Sequence[tuple[Wanted, ShapingProcess]], folder: Path
 ) -> Copies:
-    """Copies of launch files that start the shaping nodes and remap what these listen to.
+    """Copies of launch files that start these nodes, and remap what these stand behind or before.
 
-    ``folder`` is where the copies will stand.
+    ``folder`` is where the copies will stand. A process that several remaps are for starts once.
 
     Raises:
-        InputError: a publisher is not there, or twice, or remapped otherwise.
+        InputError: a node is not there, or twice, or remapped otherwise.
         OperationError: a remap can only be changed by hand.
     """
     work = _Work()
@@ -94,7 +94,8 @@ def edited_copies(
         _refuse_taken_name(walk, process)
         remedies, notes = remedies_for(walk, want)
         work.notes += notes
-        work.starts[_root(walk, remedies[0].instance)].append(process)
+        if not any(process in started for started in work.starts.values()):
+            work.starts[_root(walk, remedies[0].instance)].append(process)
         for remedy in remedies:
             _apply(walk, work, remedy)
     _edits_of_nodes(walk, work)
@@ -111,8 +112,7 @@ def _refuse_taken_name(walk: Walk, process: ShapingProcess) -> None:
         if node.name == process.name and node.namespace in ("", process.namespace):
             raise InputError(
                 f"{walk.instances[node.instance].file.path}:{node.action.line}: a node"
-                f" {process.name} is there already, the name that the plan gives to the shaping"
-                " node: change it in the plan"
+                f" {process.name} is there already, the name of the one to be added: rename it"
             )
 
 

@@ -28,10 +28,14 @@ _AWKWARD = "\"'\\$&<>#\n\r\t"
 
 @dataclass(frozen=True)
 class Manifest:
-    """What was written: the original of each copy, and the hash of each file (SHA-256)."""
+    """What was written: the original of each copy, and the hash of each file (SHA-256).
+
+    Into copies that have a throttler, ``throttled``, a plan is spliced as into any other file.
+    """
 
     copies: Mapping[str, str]
     files: Mapping[str, str]
+    throttled: bool = False
 
 
 def usable(folder: Path) -> Path:
@@ -75,7 +79,8 @@ def _manifest(folder: Path) -> Manifest | None:
     try:
         values = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
         if values["format"] == _FORMAT:
-            return Manifest(dict(values["copies"]), dict(values["files"]))
+            throttled = bool(values.get("throttled"))
+            return Manifest(dict(values["copies"]), dict(values["files"]), throttled)
     except (OSError, ValueError, KeyError, TypeError):
         pass
     return None
@@ -92,16 +97,19 @@ def _hashes(folder: Path) -> dict[str, str]:
     return found
 
 
-def original_of(file: Path) -> Path:
-    """The launch file that a copy of ours was made from; any other file is its own original."""
+def original_of(file: Path, *, throttled: bool = False) -> Path:
+    """The launch file that a copy of ours was made from; any other file is its own original.
+
+    With ``throttled`` a copy that has a throttler is an original too.
+    """
     manifest = _manifest(file.absolute().parent)
-    if manifest is None or file.name not in manifest.copies:
+    if manifest is None or file.name not in manifest.copies or (throttled and manifest.throttled):
         return file
-    return Path(manifest.copies[file.name])
+    return original_of(Path(manifest.copies[file.name]), throttled=throttled)
 
 
 @contextmanager
-def new_folder(folder: Path, copies: dict[str, str]) -> Iterator[Path]:
+def new_folder(folder: Path, copies: dict[str, str], *, throttled: bool = False) -> Iterator[Path]:
     """A folder to fill, which takes the place of ``folder`` when all went well.
 
     ``copies`` is to be filled as well: the original of each copy of a launch file.
@@ -115,7 +123,12 @@ def new_folder(folder: Path, copies: dict[str, str]) -> Iterator[Path]:
         yield partial
         (partial / LOGS).mkdir()
         files = _hashes(partial)
-        manifest = {"format": _FORMAT, "copies": copies, "files": files}
+        manifest = {
+            "format": _FORMAT,
+            "throttled": throttled,
+            "copies": copies,
+            "files": files,
+        }
         (partial / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
         partial.chmod(0o755)
         older = _manifest(folder)

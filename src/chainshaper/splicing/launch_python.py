@@ -101,7 +101,7 @@ def add_set_remaps(file: LaunchFile, place: object, rules: Rules) -> list[Edit] 
 def add_at_start(
     file: LaunchFile, rules: Rules, processes: Sequence[ShapingProcess]
 ) -> list[Edit] | None:
-    """Let the launch description begin with shaping nodes, and with remaps for all that follows.
+    """Let the launch description begin with added nodes, and with remaps for all that follows.
 
     None where there is not exactly one launch description.
     """

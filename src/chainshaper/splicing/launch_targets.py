@@ -1,4 +1,4 @@
-"""Which node of the launch files publishes a topic, and what makes it publish on another.
+"""Which node of the launch files has a topic, and what gives it another in its place.
 
 The node is known by its full name. Where it is found, its rule that leads to the topic changes
 its target, or a rule is added. Where it could only be one of several, because the executable
@@ -9,9 +9,9 @@ gives the name or the file cannot be read so far, the rule begins with the node'
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import Literal
 
 from chainshaper.errors import InputError, OperationError
-from chainshaper.planning.plan import ShapingNode
 from chainshaper.splicing.launch_remaps import FullName, PlacedRule, rules_in_force
 from chainshaper.splicing.launch_substitutions import described
 from chainshaper.splicing.launch_walk import PlacedNode, Walk
@@ -23,14 +23,16 @@ _SHOWN = 12
 
 @dataclass(frozen=True)
 class Wanted:
-    """A shaping node, and the full name of the node whose output it takes."""
+    """A node, by its full name, is to publish or subscribe ``target`` where it has ``topic``."""
 
-    shaping: ShapingNode
-    publisher: str
+    node: str
+    does: Literal["publishes", "subscribes to"]
+    topic: str
+    target: str
 
 
 class Sure(Enum):
-    """How well it is known that a node is the publisher."""
+    """How well it is known that a node is the one that is wanted."""
 
     YES = "its name says so"
     IF_NAMED_SO = "the launch file gives it no name, and there is no other"
@@ -56,7 +58,7 @@ class Remedy:
 
     @property
     def sure(self) -> bool:
-        """Whether the node is known to be the publisher."""
+        """Whether the node is known to be the one that is wanted."""
         return self.certainty is Sure.YES
 
     @property
@@ -71,55 +73,55 @@ class Remedy:
 
 
 def remedies_for(walk: Walk, wanted: Wanted) -> tuple[list[Remedy], list[str]]:
-    """The changes that make a publisher publish where the shaping node listens, and notes.
+    """The changes that give a node the topic that is wanted, and notes.
 
-    Where the publisher runs under conditions only, another node may be it when they do not hold.
+    Where the node runs under conditions only, another node may be it when they do not hold.
 
     Raises:
         InputError: no such node, or several; it is remapped already, or elsewhere.
     """
-    publisher, notes = FullName.of(wanted.publisher), []
-    found = _named(walk, publisher)
+    name, notes = FullName.of(wanted.node), []
+    found = _named(walk, name)
     _refuse_several(walk, found, wanted)
     remedies = [
-        remedy for node in found for remedy in _remedies(walk, node, publisher, wanted, Sure.YES)
+        remedy for node in found for remedy in _remedies(walk, node, name, wanted, Sure.YES)
     ]
     if all(node.conditions for node in found):
-        possible = [node for node in walk.nodes if _possible(node, publisher, found)]
+        possible = [node for node in walk.nodes if _possible(node, name, found)]
         alone = len(possible) == 1 and not walk.unreadable and possible[0].action.name is None
         sure = Sure.IF_NAMED_SO if alone else Sure.NO
         for node in possible:
-            remedies += _remedies(walk, node, publisher, wanted, sure)
+            remedies += _remedies(walk, node, name, wanted, sure)
         if possible:
             places = ", ".join(_place(walk, node) for node in possible)
             notes.append(
-                f"{places}: what nobody named in the launch file may be {publisher}, so the remap"
-                f" is bound to the name {publisher.base}"
+                f"{places}: what nobody named in the launch file may be {name}, so the remap"
+                f" is bound to the name {name.base}"
             )
         for number, action in walk.unreadable:
-            remedies.append(_for_all(number, publisher, wanted.shaping))
+            remedies.append(_for_all(number, name, wanted))
             notes.append(
                 f"{walk.instances[number].file.path}:{action.line}: not known before launch, may"
-                f" start {publisher}: {action.reason}"
+                f" start {name}: {action.reason}"
             )
     if not remedies:
         raise InputError(_nobody(walk, wanted))
     return remedies, notes
 
 
-def _named(walk: Walk, publisher: FullName) -> list[PlacedNode]:
+def _named(walk: Walk, name: FullName) -> list[PlacedNode]:
     return [
         node
         for node in walk.nodes
-        if node.name == publisher.base and (node.namespace or "/") == publisher.namespace
+        if node.name == name.base and (node.namespace or "/") == name.namespace
         if node.namespace is not None
     ]
 
 
-def _possible(node: PlacedNode, publisher: FullName, known: Sequence[PlacedNode]) -> bool:
-    """Whether a node without a known name or namespace may turn out to be the publisher."""
-    namespaces = (None, "", publisher.namespace)
-    named_so = node.name in (None, publisher.base) and node.namespace in namespaces
+def _possible(node: PlacedNode, name: FullName, known: Sequence[PlacedNode]) -> bool:
+    """Whether a node without a known name or namespace may turn out to be this one."""
+    namespaces = (None, "", name.namespace)
+    named_so = node.name in (None, name.base) and node.namespace in namespaces
     return named_so and node not in known
 
 
@@ -134,37 +136,37 @@ def _refuse_several(walk: Walk, found: Sequence[PlacedNode], wanted: Wanted) -> 
             together = one.conditions <= other.conditions or other.conditions <= one.conditions
             if together:
                 raise InputError(
-                    f"the name {wanted.publisher} matches twice: {_place(walk, one)} and"
+                    f"the name {wanted.node} matches twice: {_place(walk, one)} and"
                     f" {_place(walk, other)}. ROS 2 wants it once: rename one, or give the launch"
                     " file of one alone"
                 )
 
 
 def _remedies(
-    walk: Walk, node: PlacedNode, publisher: FullName, wanted: Wanted, certainty: Sure
+    walk: Walk, node: PlacedNode, name: FullName, wanted: Wanted, certainty: Sure
 ) -> list[Remedy]:
-    shaping, sure = wanted.shaping, certainty is Sure.YES
-    rules = rules_in_force(node.rules, publisher)
+    sure = certainty is Sure.YES
+    rules = rules_in_force(node.rules, name)
     for rule in rules:
-        if rule.target == shaping.input:
+        if rule.target == wanted.target:
             raise InputError(
-                f"{_place(walk, node)}: {publisher} is remapped to {shaping.input} already, where"
-                " the shaping node listens: give the launch file as it was before"
+                f"{_place(walk, node)}: {name} is remapped to {wanted.target} already, which is for"
+                " the node that is to be added: give the launch file as it was before"
             )
-    leading = [rule for rule in rules if rule.target == shaping.output]
-    elsewhere = [rule for rule in rules if rule.match == shaping.output and rule not in leading]
+    leading = [rule for rule in rules if rule.target == wanted.topic]
+    elsewhere = [rule for rule in rules if rule.match == wanted.topic and rule not in leading]
     if sure and not leading and elsewhere:
         raise InputError(
-            f"{_place(walk, node)}: {publisher} sends {shaping.output} to"
-            f" {elsewhere[0].target or 'another topic'}, so it does not publish {shaping.output},"
-            " as the plan says: plan with a recording of this application"
+            f"{_place(walk, node)}: {name} has {elsewhere[0].target or 'another topic'} in place of"
+            f" {wanted.topic}, so it is not the one that {wanted.does} it: give a recording of this"
+            " application, or a plan made from one"
         )
     found = [
         Remedy(
             instance=rule.scope[0] if rule.scope else node.instance,
-            match=rule.match or shaping.output,
-            target=shaping.input,
-            owner=publisher.base,
+            match=rule.match or wanted.topic,
+            target=wanted.target,
+            owner=name.base,
             node=node,
             rule=rule,
             certainty=certainty,
@@ -175,9 +177,9 @@ def _remedies(
         return found
     direct = Remedy(
         instance=node.instance,
-        match=shaping.output,
-        target=shaping.input,
-        owner=publisher.base,
+        match=wanted.topic,
+        target=wanted.target,
+        owner=name.base,
         node=node,
         rule=None,
         certainty=certainty,
@@ -185,12 +187,12 @@ def _remedies(
     return [*found, *([] if elsewhere else [direct])]
 
 
-def _for_all(number: int, publisher: FullName, shaping: ShapingNode) -> Remedy:
+def _for_all(number: int, name: FullName, wanted: Wanted) -> Remedy:
     return Remedy(
         instance=number,
-        match=shaping.output,
-        target=shaping.input,
-        owner=publisher.base,
+        match=wanted.topic,
+        target=wanted.target,
+        owner=name.base,
         node=None,
         rule=None,
         certainty=Sure.NO,
@@ -203,8 +205,8 @@ def _nobody(walk: Walk, wanted: Wanted) -> str:
     )
     shown = ", ".join(names[:_SHOWN]) + (", …" if len(names) > _SHOWN else "")
     message = (
-        f"nobody publishes {wanted.shaping.output}: the launch files start no node"
-        f" {wanted.publisher}, only {shown or 'none with a name'}"
+        f"nobody {wanted.does} {wanted.topic}: the launch files start no node {wanted.node}, only"
+        f" {shown or 'none with a name'}"
     )
     unresolved = [
         f"{walk.instances[number].file.path}:{include.line} ({described(include.path)})"
@@ -215,7 +217,12 @@ def _nobody(walk: Walk, wanted: Wanted) -> str:
             f"{message}. Not found were the files included at {', '.join(unresolved)}: source the"
             " workspace they are in, or give them as well"
         )
-    return f"{message}: give the launch file that starts it, or correct `chain.publisher`"
+    if wanted.does == "publishes":
+        return f"{message}: give the launch file that starts it, or correct `chain.publisher`"
+    return (
+        f"{message}: give the launch file that starts it, or name those that are meant, each with"
+        f" --throttle NODE:{wanted.topic}=PERIOD"
+    )
 
 
 def heard_by_owner(walk: Walk, remedy: Remedy) -> None:

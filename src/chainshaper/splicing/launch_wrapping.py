@@ -49,7 +49,7 @@ def wrapper_text(
     ]
     inside = "".join(f"            {action},\n" for action in actions)
     return (
-        f'"""Starts {included.name} with its output shaped; written by `chainshaper splice`."""\n\n'
+        f'"""Starts {included.name} with nodes added; written by `chainshaper splice`."""\n\n'
         + "\n".join(imports)
         + "\n\n\ndef generate_launch_description():\n"
         + f"    return LaunchDescription(\n        [\n{inside}        ]\n    )\n"

@@ -132,7 +132,7 @@ def add_set_remaps(file: LaunchFile, place: object, rules: Rules) -> list[Edit]:
 
 
 def add_at_start(file: LaunchFile, rules: Rules, processes: Sequence[ShapingProcess]) -> list[Edit]:
-    """Let the launch file begin with shaping nodes, and with remaps for all that follows."""
+    """Let the launch file begin with added nodes, and with remaps for all that follows."""
     added = [_process(process) for process in processes]
     added += [_rule("set_remap", rule) for rule in rules]
     return [_child_edit(file, cast(_Tag, file.syntax), added)]

@@ -158,7 +158,7 @@ def add_set_remaps(file: LaunchFile, place: object, rules: Rules) -> list[Edit]:
 
 
 def add_at_start(file: LaunchFile, rules: Rules, processes: Sequence[ShapingProcess]) -> list[Edit]:
-    """Let the launch file begin with shaping nodes, and with remaps for all that follows."""
+    """Let the launch file begin with added nodes, and with remaps for all that follows."""
     items = cast(yaml.SequenceNode, file.syntax)
     added = [_process(process) for process in processes] + _set_remaps(rules)
     return [_items_edit(file.text, items, items.value[0], added)]

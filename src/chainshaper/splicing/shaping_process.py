@@ -135,7 +135,7 @@ def shaping_parameters(plan: Plan, node: ShapingNode, log: Path | None) -> dict[
         "anchor": plan.anchor,
         "phase_ns": plan.offset_ns,
         "overrun": plan.overrun,
-        "due_cycles": _due_cycles(plan, node),
+        "due_cycles": cycles_until_output(plan, node),
         "spin_ns": node.spin_ns,
         "pause_ns": node.pause_ns,
         "core": node.core,
@@ -152,13 +152,6 @@ def shaping_parameters(plan: Plan, node: ShapingNode, log: Path | None) -> dict[
             "mode_late": plan.modes.late,
         }
     return parameters
-
-
-def _due_cycles(plan: Plan, node: ShapingNode) -> int:
-    # Under LET per callback each topic inside the chain is due a cycle after the one before it.
-    if plan.policy == "let-per-callback" and node in plan.further_shaping_nodes:
-        return plan.further_shaping_nodes.index(node) + 1
-    return cycles_until_output(plan)
 
 
 def python_node(executable: str) -> str:

@@ -9,6 +9,7 @@ other process of this machine uses, so a robot's own topics are never touched.
 
 import random
 import socket
+import struct
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,12 +45,18 @@ __all__ = [
     "Subscription",
     "WaitSet",
     "closed_domain_configuration",
+    "data_message",
+    "data_of",
     "free_domain",
     "join_domain",
     "message_template",
+    "number_in",
     "stamp_message",
     "text_message",
 ]
+
+_DATA_HEAD = struct.Struct("<4siII4xQI")  # encapsulation, stamp, an empty frame id, number, length
+_LITTLE_ENDIAN = b"\0\1\0\0"
 
 _ANY = SampleState.Any | ViewState.Any | InstanceState.Any
 
@@ -143,6 +150,28 @@ def stamp_message(template: bytearray, stamp_ns: int) -> bytes:
     template[4:8] = seconds.to_bytes(4, order, signed=True)  # type: ignore[arg-type]
     template[8:12] = nanoseconds.to_bytes(4, order)  # type: ignore[arg-type]
     return bytes(template)
+
+
+def data_message(data: bytes | memoryview, stamp_ns: int, number: int = 0) -> bytes:
+    """A message that carries a number and ``data`` behind a header.
+
+    ``stamp_ns`` is the header's stamp (ns of CLOCK_REALTIME).
+    """
+    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    size = memoryview(data).nbytes
+    head = _DATA_HEAD.pack(_LITTLE_ENDIAN, seconds, nanoseconds, 1, number, size)
+    return b"".join((head, data, bytes(-size % 4)))
+
+
+def data_of(message: bytes) -> memoryview:
+    """What :func:`data_message` put into a message: bytes that begin on a multiple of 32."""
+    size = _DATA_HEAD.unpack_from(message)[-1]
+    return memoryview(message)[_DATA_HEAD.size : _DATA_HEAD.size + size]
+
+
+def number_in(message: bytes) -> int:
+    """The number that :func:`data_message` put into a message."""
+    return int(_DATA_HEAD.unpack_from(message)[-2])
 
 
 def text_message(text: str) -> bytes:

@@ -49,6 +49,7 @@ __all__ = [
     "load_application",
 ]
 
+_FUNCTION = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", re.ASCII)
 _NODE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 
 
@@ -104,7 +105,8 @@ class CallbackDescription(Part):
     ``synchronises`` has the inputs of a synchronising callback, which executes and publishes when
     a message of every input has come, with the stamp of the first input's. Executors look at
     callbacks of the ``kind`` service and client, whose subscription carries requests or
-    responses, behind those of topics.
+    responses, behind those of topics. One that ``computes`` calls a Python function instead of
+    spending time (:mod:`chainshaper.workload.computing`).
     """
 
     timer_ns: PositiveDuration | None = None
@@ -113,6 +115,7 @@ class CallbackDescription(Part):
     synchronises: tuple[FullName, ...] = ()
     kind: Literal["subscription", "service", "client"] = "subscription"
     execution: ExecutionTime = ExecutionTime(constant_ns=0)
+    computes: str | None = None
     publishes: tuple[FullName, ...] = ()
     announces: tuple[str, ...] = ()
     gate: GateDescription | None = None
@@ -140,6 +143,14 @@ class CallbackDescription(Part):
             )
         if self.gate is not None and (self.subscription is None or len(self.publishes) != 1):
             raise wrong_value("a gate forwards one subscription to exactly one topic", "gate")
+        if self.computes is not None:
+            if not _FUNCTION.fullmatch(self.computes):
+                raise wrong_value("write MODULE:FUNCTION, such as robot.nodes:filter", "computes")
+            if {"execution", "gate", "announces"} & self.model_fields_set:
+                raise wrong_value(
+                    "a callback that computes has no execution, gate or announces: keep one",
+                    "computes",
+                )
         if self.announces and len(self.publishes) != 1:
             raise wrong_value("modes are announced on exactly one topic", "announces")
         return self

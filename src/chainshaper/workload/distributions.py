@@ -70,17 +70,18 @@ class SimulationDescription(Part):
     stall meter take away from callbacks (it counts as their CPU time), ``drift`` how much faster
     the clocks of nodes are (ppm of a period).
 
-    The costs that stand here were measured in the live workload on a virtual machine of two cores.
+    The costs that stand here are medians of several runs of the live workload on a virtual machine
+    of two cores. Other machines, and other hours, have others.
     """
 
     executor: Literal["single-threaded", "static", "events"] = "single-threaded"
-    wake_up: ExecutionTime = _constant(100_000)
-    take: ExecutionTime = _constant(40_000)
-    publish: ExecutionTime = _constant(80_000)
+    wake_up: ExecutionTime = _constant(110_000)
+    take: ExecutionTime = _constant(42_000)
+    publish: ExecutionTime = _constant(95_000)
     delivery: ExecutionTime = _constant(30_000)
     receive: ExecutionTime | None = None
     context_switch_ns: Duration = 0
     preemption_ns: Duration = 0
     quantum_ns: PositiveDuration = 1_000_000
-    interrupts: Annotated[float, Field(ge=0, lt=1)] = 0.015
+    interrupts: Annotated[float, Field(ge=0, lt=1)] = 0.016
     drift: dict[str, Annotated[float, Field(gt=-100_000, lt=100_000)]] = Field(default_factory=dict)

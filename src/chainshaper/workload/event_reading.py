@@ -9,8 +9,9 @@ import polars as pl
 
 from chainshaper import events
 from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS
+from chainshaper.workload.stall_meter import NO_PACE
 
-__all__ = ["ProcessLog", "event_tables", "stall_table"]
+__all__ = ["ProcessLog", "event_tables", "meter_tables"]
 
 
 _MAY_BE_ABSENT = {"gate_release": ("release", "slot")}
@@ -73,23 +74,28 @@ def _typed(name: str, frame: pl.DataFrame, log: ProcessLog) -> pl.DataFrame:
     )
 
 
-def stall_table(
-    stalls: Sequence[tuple[int, int, bytes]], seen_by_gates: pl.DataFrame | None = None
-) -> pl.DataFrame:
-    """The `machine_stall` table from (pid, core, pairs of due time and lateness) per sleeper.
+def meter_tables(
+    seen: Sequence[tuple[int, int, bytes]], seen_by_gates: pl.DataFrame | None = None
+) -> dict[str, pl.DataFrame]:
+    """`machine_stall` and `machine_pace` from (pid, core, rows of `stall_meter.watch`) per meter.
 
-    What a gate noticed while it watched the clock is added to it.
+    What a gate noticed while it watched the clock is added to the stalls.
     """
-    frames = [events.empty("machine_stall") if seen_by_gates is None else seen_by_gates]
-    for pid, core, rows in stalls:
-        pairs = np.frombuffer(rows, dtype=np.int64).reshape(-1, 2)
-        frames.append(
-            pl.DataFrame({"time": pairs[:, 0], "duration": pairs[:, 1]}).select(
-                "time",
-                pl.lit(pid, dtype=pl.Int32).alias("pid"),
-                pl.lit(pid, dtype=pl.Int32).alias("tid"),
-                pl.lit(core, dtype=pl.Int32).alias("cpu"),
-                "duration",
-            )
-        )
-    return pl.concat(frames).sort("time", maintain_order=True)
+    rows = [
+        pl.DataFrame(
+            np.frombuffer(block, dtype=np.int64).reshape(-1, 3),
+            schema=["time", "duration", "cpu_time"],
+        ).with_columns(pl.lit(pid, pl.Int32()).alias("pid"), pl.lit(core, pl.Int32()).alias("cpu"))
+        for pid, core, block in seen
+    ]
+    by_meters = pl.concat([events.empty("machine_pace").drop("tid"), *rows], how="diagonal")
+    by_meters = by_meters.with_columns(tid=pl.col("pid"))
+    is_stall = pl.col("cpu_time") == NO_PACE
+    stalls = by_meters.filter(is_stall).select(events.empty("machine_stall").columns)
+    paces = by_meters.filter(~is_stall).select(events.empty("machine_pace").columns)
+    if seen_by_gates is not None:
+        stalls = pl.concat([seen_by_gates, stalls])
+    return {
+        "machine_stall": stalls.sort("time", maintain_order=True),
+        "machine_pace": paces.sort("time", maintain_order=True),
+    }

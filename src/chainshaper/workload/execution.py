@@ -77,9 +77,12 @@ class ExecutionTimes:
         return self._values.pop()
 
 
-def spend(cpu_ns: int) -> None:
-    """Compute until this thread has used ``cpu_ns`` more CPU time: pre-emption does not count."""
+def spend(cpu_ns: int, since_ns: int) -> None:
+    """Compute until this thread has used ``cpu_ns`` since its CPU clock showed ``since_ns``.
+
+    Pre-emption does not count.
+    """
     clock = time.thread_time_ns
-    until = clock() + cpu_ns
+    until = since_ns + cpu_ns
     while clock() < until:
         pass

@@ -37,7 +37,7 @@ from chainshaper.workload.description import (
     CallbackDescription,
     application_as_written,
 )
-from chainshaper.workload.event_reading import ProcessLog, event_tables, stall_table
+from chainshaper.workload.event_reading import ProcessLog, event_tables, meter_tables
 from chainshaper.workload.launcher import Child, end_all, first_casualty, start_child
 from chainshaper.workload.stall_watch import promote_meters, read_meters, start_meters
 
@@ -70,6 +70,8 @@ DISCOVERY_NS = 20_000_000_000
 ANSWER_S = 60.0
 """A process that is silent for longer, discovery included, hangs."""
 METER_BEHIND_NS = 500_000
+SINGLE_THREADED = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+"""What a callback computes, it computes on its executor's thread."""
 NODE_MODULE = "chainshaper.workload.node_process"
 
 
@@ -93,7 +95,7 @@ def run_application(
     any node is asked to leave: a thread that is kept from running could not.
 
     Raises:
-        InputError: ``output`` exists, or the chain has no timer to count cycles by.
+        InputError: ``output`` exists.
         PlatformError: a core is missing, DDS does not load.
         OperationError: a node died, discovery failed, the recording cannot be written. In every
             case all processes are gone and no recording is left.
@@ -133,12 +135,12 @@ def run_application(
             threads = _watch(nodes, meters, timing, progress)
         progress(1.0, "collecting events")
         logs = [_read_log(name, child, application) for name, child in nodes.items()]
-        stalls, meter_info = read_meters(meters, realtime) if meters else ([], None)
+        seen, meter_info = read_meters(meters, realtime) if meters else ([], None)
         finished = True
     finally:
         end_all([*nodes.values(), *meters.values()], patience_s=3.0 if finished else 0.0)
     tables = event_tables(logs, timing.record_from_ns)
-    tables["machine_stall"] = stall_table(stalls, tables.get("machine_stall"))
+    tables |= meter_tables(seen, tables.get("machine_stall"))
     notes = _notes(None if realtime else reason, memory_locked, clock_offset() - offset_before)
     info = RecordingInfo(
         source="live",
@@ -167,21 +169,25 @@ def node_name(name: str) -> str:
 
 
 def origin_timer(application: Application) -> CallbackDescription:
-    """The timer callback that starts the application's chain.
-
-    Raises:
-        InputError: the chain's first topic or node has no timer.
-    """
+    """The timer callback that starts the application's chain, or leads to its first callback."""
     first = application.chain.split("..")[0].strip()
-    for name, callback in application.callbacks():
-        starts_here = first in callback.publishes or first.strip("/") == name.strip("/")
-        if starts_here and callback.timer_ns is not None:
-            return callback
-    timers = [f"node {name}" for name, cb in application.callbacks() if cb.timer_ns is not None]
-    raise InputError(
-        f"chain {application.chain}: no timer callback publishes or belongs to {first!r}, so there "
-        f"is nothing to count cycles by; timers are in {', '.join(timers) or 'no node'}"
-    )
+    starts = [
+        callback
+        for name, callback in application.callbacks()
+        if first in callback.publishes or first.strip("/") == name.strip("/")
+    ]
+    # Every topic has a publisher, and topics form no cycle: a timer is found.
+    while all(callback.timer_ns is None for callback in starts):
+        inputs = {topic for callback in starts for topic in callback.subscriptions}
+        starts = [cb for _, cb in application.callbacks() if inputs.intersection(cb.publishes)]
+    return next(callback for callback in starts if callback.timer_ns is not None)
+
+
+def completion_ns(application: Application, period_ns: int) -> int:
+    """How long a run goes on behind its last cycle, so that what has begun is completed."""
+    gates = [callback.gate for _, callback in application.callbacks() if callback.gate is not None]
+    held = max((gate.due_cycles for gate in gates), default=0)
+    return max(2 * period_ns, 200_000_000) + held * period_ns
 
 
 @dataclass(frozen=True)
@@ -211,7 +217,7 @@ class _Timing:
             # Just before the first recorded expiry: instances are not cut in two.
             record_from_ns=first - min(1_000_000, period // 10),
             last_timer_ns=end - min(1_000_000, period // 10),
-            stop_ns=end + max(2 * period, 200_000_000),  # what has begun is completed
+            stop_ns=end + completion_ns(application, period),
             # The stall meter's grid keeps away from the planned releases: what happens there the
             # gate sees more exactly, as long as no other thread's wake-up comes in between.
             meter_from_ns=start + timer.phase_ns + grid,
@@ -242,7 +248,7 @@ def _start_nodes(
     from chainshaper.workload.dds import closed_domain_configuration, free_domain
 
     domain = free_domain()
-    environment = {"CYCLONEDDS_URI": closed_domain_configuration()}
+    environment = {"CYCLONEDDS_URI": closed_domain_configuration(), **SINGLE_THREADED}
     for name in application.nodes:
         nodes[name] = start_child(f"node {name}", NODE_MODULE, environment, _ros_arguments(name))
         nodes[name].tell(**_spec(application, name, timer, domain))

@@ -10,10 +10,9 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import cycle
 from typing import Any
 
-from chainshaper.enforcement.gate import Gate, Modes, Shaper, origin_of, sleep_until, text_of
+from chainshaper.enforcement.gate import Gate, Modes, Shaper, sleep_until, text_of
 from chainshaper.enforcement.realtime import (
     die_with_parent,
     lock_memory,
@@ -22,8 +21,9 @@ from chainshaper.enforcement.realtime import (
 )
 from chainshaper.workload import dds, protocol
 from chainshaper.workload.asynchronous import AsynchronousWriter, PublisherThread, noting_sends
+from chainshaper.workload.computing import Work, computing, load_function, spending
 from chainshaper.workload.event_log import ABSENT, EventLog, number_of
-from chainshaper.workload.execution import ExecutionTimes, spend
+from chainshaper.workload.execution import ExecutionTimes
 from chainshaper.workload.executor import Executor, SubscriptionEntity, Timer
 from chainshaper.workload.synchronising import Synchroniser
 
@@ -129,15 +129,11 @@ class NodeProcess:
             if callback["gate"]["modes"] is not None:  # before the messages that it concerns
                 self._add_modes(callback["gate"]["modes"]["topic"], shaper)
         else:
-            times = ExecutionTimes(
-                callback["execution"], self.spec["seed"], self.spec["node"], index
-            )
-            self.execution_times.append(times)
-            announced = [dds.text_message(mode) for mode in callback["announces"]]
+            work = self._work(index, callback, publishers)
             if callback["synchronises"]:
-                self._add_inputs(index, callback["synchronises"], times, publishers)
+                self._add_inputs(index, callback["synchronises"], work, publishers)
                 return
-            body = self._computing_body(handle, times, publishers, announced)
+            body = self._working_body(handle, work, publishers)
         if subscription is None:
             self._add_timer(handle, callback, body)
         else:
@@ -145,11 +141,23 @@ class NodeProcess:
         symbol = f"{self.spec['node']}::callback{index}"
         self.log.init("rclcpp_callback_register", callback=handle, symbol=symbol)
 
+    def _work(
+        self, index: int, callback: dict[str, Any], publishers: list["TracedPublisher"]
+    ) -> Work:
+        """What the callback does: compute as a function of somebody's, or spend drawn times."""
+        if callback["computes"] is not None:
+            function = load_function(callback["computes"])
+            return computing(callback["computes"], function, len(publishers))
+        times = ExecutionTimes(callback["execution"], self.spec["seed"], self.spec["node"], index)
+        self.execution_times.append(times)
+        announced = [dds.text_message(mode) for mode in callback["announces"]]
+        return spending(times, [publisher.template for publisher in publishers], announced)
+
     def _add_inputs(
         self,
         index: int,
         topics: Sequence[str],
-        times: ExecutionTimes,
+        work: Work,
         publishers: list["TracedPublisher"],
     ) -> None:
         """The subscriptions of a synchronising callback, each with a callback of its own."""
@@ -158,9 +166,10 @@ class NodeProcess:
         for number, topic in enumerate(topics):
             handle = self.new_handle()
             complete = partial(synchroniser.add, number)
-            body = self._computing_body(handle, times, publishers, [], complete)
+            body = self._working_body(handle, work, publishers, complete)
             self._add_subscription(handle, topic, self._subscription(topic), body)
-            symbol = f"{self.spec['node']}::callback{index}.{number}"
+            # As in ROS 2, by which the analysis knows the inputs of one synchroniser.
+            symbol = f"message_filters::{self.spec['node']}::callback{index}.{number}"
             self.log.init("rclcpp_callback_register", callback=handle, symbol=symbol)
 
     def _add_timer(
@@ -276,35 +285,28 @@ class NodeProcess:
         writer = AsynchronousWriter(write, qos["depth"], qos["lifespan_ns"], note)
         return partial(self.publisher_thread.publish, writer)
 
-    def _computing_body(
+    def _working_body(
         self,
         handle: int,
-        times: ExecutionTimes,
+        work: Work,
         publishers: list["TracedPublisher"],
-        announced: list[bytes],
-        complete: Callable[[dds.Message], dds.Message | None] | None = None,
+        complete: Callable[[dds.Message], tuple[dds.Message, ...]] | None = None,
     ) -> Callable[[dds.Message | None], None]:
-        """An ordinary callback: compute, then publish; the origin's stamp is passed on.
+        """An ordinary callback: work, then publish.
 
-        What is ``announced`` is published in turn instead. With ``complete`` nothing is done
-        until a message completes a set, for the message of it that is given then.
+        With ``complete`` nothing is done until a message completes a set, for which it is then.
         """
         start, end = self._point["callback_start"], self._point["callback_end"]
-        announcements = cycle(announced)
 
         def body(message: dds.Message | None) -> None:
-            now, wall = time.monotonic_ns(), time.time_ns()
-            start(now, handle, time.thread_time_ns(), 0)
+            now, wall, used = time.monotonic_ns(), time.time_ns(), time.thread_time_ns()
+            start(now, handle, used, 0)
+            messages: tuple[dds.Message, ...] = () if message is None else (message,)
             if complete is not None and message is not None:
-                message = complete(message)
-                if message is None:
-                    end(time.monotonic_ns(), handle, time.thread_time_ns())
-                    return
-            stamp = wall if message is None else origin_of(message.payload) or 0
-            spend(times.next())
-            for publisher in publishers:
-                payload = next(announcements, None) or dds.stamp_message(publisher.template, stamp)
-                publisher.record(payload, *publisher.send(payload))
+                messages = complete(message)
+            if messages or complete is None:
+                for payload, publisher in zip(work(messages, wall, used), publishers, strict=False):
+                    publisher.record(payload, *publisher.send(payload))
             end(time.monotonic_ns(), handle, time.thread_time_ns())
 
         return body

@@ -2,7 +2,9 @@
 
 Virtual machines and firmware stop all threads of a core for milliseconds now and then. A thread
 at the highest priority that only sleeps and looks at the clock wakes late exactly then; the
-figures of a run can only be judged beside what it saw. One process per core:
+figures of a run can only be judged beside what it saw. They run at half their pace as well while
+others keep their hardware busy; then the sleeper's wake-ups, which are the same work each time,
+take it twice as much CPU time. One process per core:
 ``python -m chainshaper.workload.stall_meter`` speaks the launcher's protocol. Where nobody knows
 beforehand how long a run takes, :data:`ENOUGH` ends the watch early.
 """
@@ -21,7 +23,7 @@ from chainshaper.enforcement.realtime import (
 )
 from chainshaper.workload import protocol
 
-__all__ = ["ENOUGH", "PERIOD_NS", "PRIORITY", "THRESHOLD_NS", "main", "watch"]
+__all__ = ["ENOUGH", "NO_PACE", "PERIOD_NS", "PRIORITY", "THRESHOLD_NS", "main", "watch"]
 
 PERIOD_NS = 1_000_000
 """A wake-up costs some 20 us on a virtual machine: more of them would disturb what they watch."""
@@ -30,6 +32,9 @@ THRESHOLD_NS = 100_000
 PRIORITY = 98
 """Above everything it watches, so that none of it looks like a stall."""
 ENOUGH = signal.SIGUSR1
+WAKEUPS_PER_PACE = 10
+"""Wake-ups whose CPU time is taken together: reading that clock is a call of the kernel."""
+NO_PACE = -1
 ORDINARY = 1_000_000
 """So many ordinary wake-ups are enough to know their median, however long a run takes."""
 
@@ -45,27 +50,33 @@ def watch(
 
     It is over as well when ``enough`` says so.
 
-    Returns the stalls as pairs (when it should have woken, how late it was), the number of
-    wake-ups, and the median lateness of the ordinary ones (all ns).
+    Returns what was seen as rows of three, the number of wake-ups, and the median lateness of
+    the ordinary ones (all ns). A row is a stall (when it should have woken, how late it was,
+    NO_PACE) or the pace of some wake-ups (their beginning, how long they lasted, the CPU time of
+    one).
     """
-    stalls = array("q")
+    seen = array("q")
     lateness = array("q")
-    clock = time.monotonic_ns
-    due = start_ns
-    wakeups = 0
+    clock, cpu_clock = time.monotonic_ns, time.thread_time_ns
+    due = since = start_ns
+    wakeups, used = 0, cpu_clock()
     while due < stop_ns and not enough():
         sleep_until(due)
         now = clock()
         late = now - due
         wakeups += 1
         if late >= threshold_ns:
-            stalls.extend((due, late))
+            seen.extend((due, late, NO_PACE))
             due += late // period_ns * period_ns  # stay on the grid
         elif len(lateness) < ORDINARY:
             lateness.append(late)
         due += period_ns
+        if wakeups % WAKEUPS_PER_PACE == 0:
+            used_before, used = used, cpu_clock()
+            seen.extend((since, now - since, (used - used_before) // WAKEUPS_PER_PACE))
+            since = now
     ordinary = sorted(lateness)
-    return stalls, wakeups, ordinary[len(ordinary) // 2] if ordinary else 0
+    return seen, wakeups, ordinary[len(ordinary) // 2] if ordinary else 0
 
 
 def main() -> None:
@@ -78,10 +89,10 @@ def main() -> None:
     protocol.send(missing=[], memory_locked=lock_memory())
     times = protocol.receive()
     stop_garbage_collection()
-    stalls, wakeups, ordinary = watch(
+    seen, wakeups, ordinary = watch(
         times["meter_from_ns"], times["stop_ns"], enough=lambda: bool(signals)
     )
-    protocol.send_events(stalls.tobytes(), wakeups=wakeups, median_lateness_ns=ordinary)
+    protocol.send_events(seen.tobytes(), wakeups=wakeups, median_lateness_ns=ordinary)
     protocol.wait_for_leave()
 
 

@@ -16,7 +16,7 @@ import polars as pl
 from chainshaper.enforcement.threads import Scheduling, apply_scheduling, list_threads
 from chainshaper.recording import StallMeterInfo
 from chainshaper.workload import stall_meter
-from chainshaper.workload.event_reading import stall_table
+from chainshaper.workload.event_reading import meter_tables
 from chainshaper.workload.launcher import Child, end_all, start_child
 
 __all__ = [
@@ -50,11 +50,11 @@ def promote_meters(meters: Mapping[int, Child], realtime: bool) -> None:
 def read_meters(
     meters: Mapping[int, Child], realtime: bool
 ) -> tuple[list[tuple[int, int, bytes]], StallMeterInfo]:
-    """What the meters saw: (pid, core, pairs of due time and lateness), and how they watched."""
-    stalls, wakeups, lateness = [], 0, []
+    """What the meters saw: (pid, core, rows of `stall_meter.watch`), and how they watched."""
+    seen, wakeups, lateness = [], 0, []
     for core, child in meters.items():
         answer = child.hear()
-        stalls.append((child.pid, core, child.hear_bytes(answer["bytes"])))
+        seen.append((child.pid, core, child.hear_bytes(answer["bytes"])))
         wakeups += answer["wakeups"]
         lateness.append(answer["median_lateness_ns"])
     info = StallMeterInfo(
@@ -65,7 +65,7 @@ def read_meters(
         median_lateness_ns=tuple(lateness),
         realtime=realtime,
     )
-    return stalls, info
+    return seen, info
 
 
 @dataclass
@@ -96,8 +96,8 @@ def stalls_watched(cores: Iterable[int], realtime: bool) -> Iterator[StallWatch]
         yield watch
         for child in meters.values():
             child.process.send_signal(stall_meter.ENOUGH)
-        stalls, watch.info = read_meters(meters, realtime)
-        watch.table, finished = stall_table(stalls), True
+        seen, watch.info = read_meters(meters, realtime)
+        watch.table, finished = meter_tables(seen)["machine_stall"], True
     finally:
         end_all(meters.values(), patience_s=2.0 if finished else 0.0)
 

@@ -19,10 +19,9 @@ class Synchroniser(Generic[Message]):
     def __init__(self, depths: Sequence[int]) -> None:
         self._waiting: list[deque[Message]] = [deque(maxlen=depth) for depth in depths]
 
-    def add(self, number: int, message: Message) -> Message | None:
-        """A message of an input; the first input's of the set that is complete now, else None."""
+    def add(self, number: int, message: Message) -> tuple[Message, ...]:
+        """A message of an input; the set that is complete now, or nothing."""
         self._waiting[number].append(message)
         if not all(self._waiting):
-            return None
-        first, *_ = [waiting.popleft() for waiting in self._waiting]
-        return first
+            return ()
+        return tuple(waiting.popleft() for waiting in self._waiting)

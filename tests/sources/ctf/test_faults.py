@@ -231,21 +231,6 @@ def test_numba_is_imported_only_to_decode() -> None:
     )
 
 
-def test_kernels_compile_without_a_folder_for_their_cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    from numba.core.dispatcher import Dispatcher
-
-    from chainshaper.sources.ctf import memory
-
-    def refuse(_: Any) -> Any:
-        raise RuntimeError("cannot cache function: no locator available")
-
-    def twice(number: Any) -> Any:
-        return 2 * number
-
-    monkeypatch.setattr(Dispatcher, "enable_caching", refuse)
-    assert memory.compiled("int64(int64)")(twice)(21) == 42
-
-
 SECONDS = 7
 
 

@@ -17,10 +17,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from chainshaper.compiled import kernel
 from chainshaper.sources.ctf.assembly import Assembly
 from chainshaper.sources.ctf.errors import CtfError
-from chainshaper.sources.ctf.filling import fill_columns
-from chainshaper.sources.ctf.kernels import walk_events
 from chainshaper.sources.ctf.machine import AHEAD, NEVER, Failure, State
 from chainshaper.sources.ctf.streams import MappedFile, Scratch
 from chainshaper.sources.ctf.tables import AheadColumn, Cursor, FileColumn, PacketColumn
@@ -28,6 +27,8 @@ from chainshaper.sources.ctf.trace import CtfStream
 
 __all__ = ["LARGE_BYTES", "Stream", "Walk", "default_threads", "fill", "span_borders", "walk"]
 
+_walk_events = kernel("chainshaper.sources.ctf.kernels", "walk_events")
+_fill_columns = kernel("chainshaper.sources.ctf.filling", "fill_columns")
 _CHUNK_BYTES = 128 << 20
 _SMALL_BYTES = 4 << 20
 LARGE_BYTES = 512 << 20
@@ -102,7 +103,7 @@ def walk(stream: Stream, assembly: Assembly, borders: NDArray[np.int64], lean: b
     border = first = 0
     while first < len(packets):
         last = _chunk(packets, first)
-        border = walk_events(
+        border = _walk_events(
             scratch.address, scratch.registers.ctypes.data, stream.file.address,
             stream.file.size, packets.ctypes.data, first, last, counts.ctypes.data,
             borders.ctypes.data, border, len(borders), marks.ctypes.data,
@@ -162,7 +163,7 @@ def fill(
     tree = np.full((2 * leaves, 2), NEVER, np.int64)
     tree[0] = 0
     while True:
-        status = fill_columns(
+        status = _fill_columns(
             scratch.address, files.ctypes.data, count, cursors.ctypes.data, ahead.ctypes.data,
             tree.ctypes.data, leaves, packets.ctypes.data, scratch.registers.ctypes.data,
             assembly.registers, len(assembly.event_rows),

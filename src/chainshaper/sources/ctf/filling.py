@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from chainshaper.compiled.memory import compiled, get, put, store_long, store_word
 from chainshaper.sources.ctf.interpreter import execute, move_batch
 from chainshaper.sources.ctf.kernels import (
     copy_numbers,
@@ -21,7 +22,6 @@ from chainshaper.sources.ctf.kernels import (
     step_over,
 )
 from chainshaper.sources.ctf.machine import AHEAD, BATCH, NEVER, Failure, Machine, State
-from chainshaper.sources.ctf.memory import compiled, get, put, store_long, store_word
 from chainshaper.sources.ctf.tables import (
     A_ADDRESS,
     A_EVENT,
@@ -255,7 +255,7 @@ def play(tree: Any, leaf: Any, time: Any, file: Any) -> None:
         put(tree, 2 * node + 1, file)
 
 
-@compiled("int64(int64, int64, int64, int64, int64, int64, int64, int64, int64, int64, int64)")
+@compiled()
 def fill_columns(
     machine: Any,
     files: Any,

@@ -15,6 +15,18 @@ from typing import Any
 
 import numpy as np
 
+from chainshaper.compiled.memory import (
+    compiled,
+    get,
+    load_byte,
+    load_word,
+    put,
+    store_byte,
+    store_half,
+    store_long,
+    store_word,
+    swap_bytes,
+)
 from chainshaper.sources.ctf.machine import (
     ADDRESS,
     AGAIN,
@@ -59,18 +71,6 @@ from chainshaper.sources.ctf.machine import (
     U64,
     UNTERMINATED,
     WIDTH,
-)
-from chainshaper.sources.ctf.memory import (
-    compiled,
-    get,
-    load_byte,
-    load_word,
-    put,
-    store_byte,
-    store_half,
-    store_long,
-    store_word,
-    swap_bytes,
 )
 from chainshaper.sources.ctf.texts import digest_text, digest_whole, intern, word_at
 

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from chainshaper.compiled.memory import compiled, get, load_word, put
 from chainshaper.sources.ctf.interpreter import advance_clock, execute
 from chainshaper.sources.ctf.machine import Failure, Machine, State
-from chainshaper.sources.ctf.memory import compiled, get, load_word, put
 from chainshaper.sources.ctf.tables import (
     BAD_HEADER,
     BAD_MAGIC,
@@ -147,32 +147,30 @@ def note_packet(
     put(packet, P_ERROR, np.int64(0))
 
 
-@compiled(
-    "Tuple((int64, int64, int64))"
-    "(int64, int64, int64, int64, int64, int64, int64, int64, int64, int64)"
-)
+@compiled()
 def scan_packets(
     machine: Any,
     regs: Any,
     base: Any,
     size: Any,
-    offset: Any,
     packets: Any,
     room: Any,
-    found: Any,
+    reached: Any,
     first: Any,
     last: Any,
 ) -> Any:
-    """Find the packets of a file from byte ``offset`` on (section 5).
+    """Find the packets of a file from where an earlier call stopped (section 5).
 
-    The folder's stream classes are the rows [first, last).  Returns (status, offset reached,
-    packets found); a packet that the file cuts short is listed with status CUT.
+    ``reached`` are two numbers that advance: the offset in the file and the packets found.  The
+    folder's stream classes are the rows [first, last).  Returns the status; a packet that the
+    file cuts short is listed with status CUT.
     """
     streams = get(machine, M_STREAMS)
     leading = streams + first * S_ROW
-    while offset < size:
+    while get(reached, 0) < size:
+        offset, found = get(reached, 0), get(reached, 1)
         if found >= room:
-            return np.int64(FULL), offset, found
+            return np.int64(FULL)
         start, mapped = base + offset, size - offset
         known = get(leading, S_KNOWN)
         put(regs, R_STREAM, get(leading, S_ID))
@@ -181,37 +179,37 @@ def scan_packets(
             start, mapped, mapped * 8, np.int64(0), regs, np.int64(0),
         )  # fmt: skip
         if position < 0:
-            return np.int64(BAD_HEADER), offset, found
+            return np.int64(BAD_HEADER)
         if known >> R_MAGIC & 1 and get(regs, R_MAGIC) != MAGIC:
-            return np.int64(BAD_MAGIC), offset, found
+            return np.int64(BAD_MAGIC)
         if known >> R_UUID_LOW & 1 and (
             get(regs, R_UUID_LOW) != get(leading, S_UUID_LOW)
             or get(regs, R_UUID_HIGH) != get(leading, S_UUID_HIGH)
         ):
-            return np.int64(BAD_UUID), offset, found
+            return np.int64(BAD_UUID)
         stream = first
         while stream < last and get(streams + stream * S_ROW, S_ID) != get(regs, R_STREAM):
             stream += 1
         if stream == last:
-            return np.int64(BAD_STREAM), offset, found
+            return np.int64(BAD_STREAM)
         row = streams + stream * S_ROW
         position = execute(
             machine, get(row, S_CONTEXT), get(row, S_CONTEXT_STOP),
             start, mapped, mapped * 8, position, regs, np.int64(0),
         )  # fmt: skip
         if position < 0:
-            return np.int64(BAD_HEADER), offset, found
+            return np.int64(BAD_HEADER)
         known = get(row, S_KNOWN)
         bits = known_or(known, R_PACKET, regs, mapped * 8)
         content = known_or(known, R_CONTENT, regs, bits)
         if bits <= 0 or bits & 7 or content < position or content > bits:
-            return np.int64(BAD_SIZE), offset, found
+            return np.int64(BAD_SIZE)
         note_packet(packets + found * P_ROW, offset, mapped, stream, known, regs, content)
-        found += 1
+        put(reached, 1, found + 1)
         if bits >> 3 > mapped:
-            return np.int64(CUT), offset, found
-        offset += bits >> 3
-    return np.int64(DONE), offset, found
+            return np.int64(CUT)
+        put(reached, 0, offset + (bits >> 3))
+    return np.int64(DONE)
 
 
 @compiled()
@@ -305,9 +303,7 @@ def copy_numbers(target: Any, source: Any, count: Any) -> None:
         put(target, index, get(source, index))
 
 
-@compiled(
-    "int64(int64, int64, int64, int64, int64, int64, int64, int64, int64, int64, int64, int64)"
-)
+@compiled()
 def walk_events(
     machine: Any,
     regs: Any,

@@ -8,15 +8,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from chainshaper.compiled import kernel
 from chainshaper.sources.ctf.assembly import Assembly
 from chainshaper.sources.ctf.errors import CtfError
-from chainshaper.sources.ctf.kernels import scan_packets
 from chainshaper.sources.ctf.machine import BATCH, STATE_SIZE, Machine, State
 from chainshaper.sources.ctf.tables import PacketColumn, ScanStatus
-from chainshaper.sources.ctf.texts import rehash
 
 __all__ = ["MappedFile", "Scratch", "packet_table", "stream_paths"]
 
+_scan_packets = kernel("chainshaper.sources.ctf.kernels", "scan_packets")
+_rehash = kernel("chainshaper.sources.ctf.texts", "rehash")
 _REASONS = {
     ScanStatus.BAD_MAGIC: "packet does not begin with the CTF magic number",
     ScanStatus.BAD_UUID: "packet belongs to another trace (uuid differs from the metadata's)",
@@ -80,7 +81,7 @@ class Scratch:
         self.entries = entries
         self.slots = np.zeros(4 * (len(self.slots) - 1) + 1, np.int32)
         self._place_dictionary()
-        rehash(self.address, int(self.state[State.STRINGS]))
+        _rehash(self.address, int(self.state[State.STRINGS]))
 
 
 class MappedFile:
@@ -131,17 +132,16 @@ def packet_table(
     scratch = Scratch(assembly)
     packets = np.zeros((256, len(PacketColumn)), np.int64)
     first, last = assembly.folders[folder]
-    offset = found = 0
+    reached = np.zeros(2, np.int64)
     status = ScanStatus.FULL
     while status == ScanStatus.FULL:
-        code, offset, found = scan_packets(
-            scratch.address, scratch.registers.ctypes.data, file.address, file.size, offset,
-            packets.ctypes.data, len(packets), found, first, last,
-        )  # fmt: skip
-        status = ScanStatus(code)
+        status = ScanStatus(_scan_packets(
+            scratch.address, scratch.registers.ctypes.data, file.address, file.size,
+            packets.ctypes.data, len(packets), reached.ctypes.data, first, last,
+        ))  # fmt: skip
         if status == ScanStatus.FULL:
             packets = np.concatenate([packets, np.zeros_like(packets)])
-    size = file.size
+    size, (offset, found) = file.size, reached.tolist()
     file.close()
     if status == ScanStatus.DONE:
         return packets[:found].copy(), []

@@ -9,6 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from chainshaper.compiled.memory import (
+    compiled,
+    get,
+    load_byte,
+    load_word,
+    put,
+    store_word,
+    trailing_zeros,
+)
 from chainshaper.sources.ctf.machine import (
     FACTOR,
     HIGHS,
@@ -24,15 +33,6 @@ from chainshaper.sources.ctf.machine import (
     U1,
     U29,
     U32,
-)
-from chainshaper.sources.ctf.memory import (
-    compiled,
-    get,
-    load_byte,
-    load_word,
-    put,
-    store_word,
-    trailing_zeros,
 )
 
 __all__ = ["digest_text", "digest_whole", "intern", "rehash", "word_at"]
@@ -136,12 +136,13 @@ def intern(machine: Any, place: Any, length: Any, digest: Any, word: Any) -> Any
     return code
 
 
-@compiled("void(int64, int64)")
-def rehash(machine: Any, count: Any) -> None:
-    """Fill the zeroed hash table with the first ``count`` entries."""
+@compiled()
+def rehash(machine: Any, count: Any) -> Any:
+    """Fill the zeroed hash table with the first ``count`` entries; returns their number."""
     slots, mask, entries = get(machine, M_SLOTS), get(machine, M_MASK), get(machine, M_ENTRIES)
     for code in range(count):
         place = np.int64(np.uint64(get(entries + 32 * code, 2)) >> U32) & mask
         while slot_at(slots, place) != 0:
             place = (place + 1) & mask
         store_word(slots + 4 * place, np.uint64(code + 1))
+    return count

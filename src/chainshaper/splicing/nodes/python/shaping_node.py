@@ -10,7 +10,6 @@ import os
 import threading
 import time
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any
 
 import rclpy
@@ -22,6 +21,7 @@ from std_msgs.msg import String
 
 from chainshaper.enforcement.gate import Gate, Modes, Release, Shaper, sleep_until
 from chainshaper.splicing.nodes.python.endpoints import (
+    AwakeCores,
     asked_of,
     message_class,
     offered_by,
@@ -118,12 +118,15 @@ def listen_to_modes(node: Node, shaper: Shaper) -> None:
 
 
 def change_phase_with(node: Node, shaper: Shaper) -> None:
-    """Let the parameter ``phase_ns`` be set while the node runs."""
+    """Let the parameter ``phase_ns`` be set while the node runs.
+
+    It is in force from the next cycle on; the log shows it as the origin of what comes then.
+    """
 
     def changed(parameters: Any) -> Any:
         for changed_one in parameters:
             if changed_one.name == "phase_ns":
-                shaper.gate = replace(shaper.gate, phase_ns=changed_one.value)
+                shaper.set_phase(changed_one.value, time.monotonic_ns())
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(changed)
@@ -131,7 +134,8 @@ def change_phase_with(node: Node, shaper: Shaper) -> None:
 
 def set_up(node: Node) -> None:
     """Make the node's endpoints."""
-    shaper = Shaper(gate_from(node), parameter(node, "spin_ns", 0))
+    cores = AwakeCores(node)
+    shaper = Shaper(gate_from(node), parameter(node, "spin_ns", 0), cores.keep_awake)
     log, pause_ns = GateLog(node, parameter(node, "log", "")), parameter(node, "pause_ns", 0)
     change_phase_with(node, shaper)
     info = wait_for_publisher(node, "input")
@@ -153,6 +157,7 @@ def set_up(node: Node) -> None:
             published = time.monotonic_ns()
             if release.overrun is None:  # else the next message may be waiting already
                 sleep_until(published + pause_ns)
+        cores.let_sleep()
         log.write(release, woke, source_timestamp, arrival, published)
         gc.collect()  # here is time for it; all that is older is frozen
 

@@ -1,4 +1,4 @@
-"""Starts included_robot.launch.py with its output shaped; written by `chainshaper splice`."""
+"""Starts included_robot.launch.py with nodes added; written by `chainshaper splice`."""
 
 from launch import LaunchDescription
 from launch.actions import ExecuteProcess, IncludeLaunchDescription

@@ -1,4 +1,4 @@
-"""Starts robot.launch.py with its output shaped; written by `chainshaper splice`."""
+"""Starts robot.launch.py with nodes added; written by `chainshaper splice`."""
 
 from launch import LaunchDescription
 from launch.actions import ExecuteProcess, IncludeLaunchDescription

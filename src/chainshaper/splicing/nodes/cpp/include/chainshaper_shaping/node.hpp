@@ -21,6 +21,7 @@
 #include "rclcpp/rclcpp.hpp"
 #include "std_msgs/msg/string.hpp"
 
+#include "awake_cores.hpp"
 #include "gate.hpp"
 #include "gate_log.hpp"
 #include "shaper.hpp"
@@ -181,9 +182,17 @@ class Shaping
 {
 public:
   explicit Shaping(rclcpp::Node & node)
-  : node_(node), shaper_(gate_from(node), parameter<std::int64_t>(node, "spin_ns", 0)),
+  : node_(node),
+    shaper_(
+      gate_from(node), parameter<std::int64_t>(node, "spin_ns", 0), [this] {cores_.keep_awake();}),
     pause_ns_(parameter<std::int64_t>(node, "pause_ns", 0))
   {
+    if (cores_.refused() != 0) {
+      RCLCPP_WARN(
+        node.get_logger(), "/dev/cpu_dma_latency: %s: idle cores sleep, and deliver less "
+        "regularly; run as root, or give the user the right to write it",
+        std::strerror(cores_.refused()));
+    }
     const auto log = parameter<std::string>(node, "log", "");
     if (!log.empty() && !log_.open_file(log)) {
       RCLCPP_WARN(
@@ -193,7 +202,7 @@ public:
       [this](const std::vector<rclcpp::Parameter> & changed) {
         for (const auto & parameter : changed) {
           if (parameter.get_name() == "phase_ns") {
-            shaper_.set_phase(parameter.as_int());
+            shaper_.set_phase(parameter.as_int(), monotonic_ns());
           }
         }
         rcl_interfaces::msg::SetParametersResult result;
@@ -249,11 +258,13 @@ public:
         sleep_until(*published_ns + pause_ns_);
       }
     }
+    cores_.let_sleep();
     log_.write(shaper_.gate(), held, source_timestamp, published_ns);
   }
 
 private:
   rclcpp::Node & node_;
+  AwakeCores cores_;
   Shaper shaper_;
   GateLog log_;
   std::int64_t pause_ns_;

@@ -13,6 +13,7 @@
 #include <cstdint>
 #include <cstdlib>
 #include <deque>
+#include <functional>
 #include <limits>
 #include <optional>
 #include <string>
@@ -83,13 +84,21 @@ struct Held
 class Shaper
 {
 public:
-  Shaper(Gate gate, std::int64_t spin_ns)
-  : gate_(std::move(gate)), spin_ns_(spin_ns), offset_(clock_offset())
+  // `on_waking` is called when it wakes `spin_ns` before a release, to watch the clock from there.
+  Shaper(Gate gate, std::int64_t spin_ns, std::function<void()> on_waking = [] {})
+  : gate_(std::move(gate)), spin_ns_(spin_ns), on_waking_(std::move(on_waking)),
+    offset_(clock_offset())
   {
     check(gate_);
   }
 
-  void set_phase(std::int64_t phase_ns) {gate_.phase_ns = phase_ns;}
+  // Cycles begin elsewhere, from the first such beginning after `now_ns` on.
+  void set_phase(std::int64_t phase_ns, std::int64_t now_ns)
+  {
+    const std::int64_t rest = (phase_ns - now_ns) % gate_.cycle_ns;
+    const std::int64_t from_ns = now_ns + (rest < 0 ? rest + gate_.cycle_ns : rest);
+    next_phase_ = {from_ns, phase_ns};
+  }
 
   const Gate & gate() const {return gate_;}
 
@@ -120,7 +129,10 @@ public:
       held.awake_ns = held.arrival_ns;
       return held;
     }
-    sleep_until(*held.release.at_ns - spin_ns_);
+    if (*held.release.at_ns > held.arrival_ns) {
+      sleep_until(*held.release.at_ns - spin_ns_);
+      on_waking_();
+    }
     held.awake_ns = watch_until(*held.release.at_ns);
     if (policy_of(gate_) == Policy::discard && missed(gate_, held.release, held.awake_ns)) {
       held.release.at_ns.reset();
@@ -141,6 +153,10 @@ private:
     if (stamp_ns && !stepped) {
       origin = *stamp_ns - offset;
     }
+    if (next_phase_ && arrival_ns >= next_phase_->first) {
+      gate_.phase_ns = next_phase_->second;
+      next_phase_.reset();
+    }
     const Release release = release_of(gate_, arrival_ns, origin, changes_);
     if (release.anchor == Anchor::stamp) {
       gate_.phase_ns = release.origin_ns % gate_.cycle_ns;
@@ -150,8 +166,10 @@ private:
 
   Gate gate_;
   std::int64_t spin_ns_;
+  std::function<void()> on_waking_;
   std::int64_t offset_;
   std::deque<Change> changes_;
+  std::optional<std::pair<std::int64_t, std::int64_t>> next_phase_;  // from when on, and which
 };
 
 }  // namespace chainshaper

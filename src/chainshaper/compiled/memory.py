@@ -7,10 +7,7 @@ nothing here does.  The machine is taken to be little-endian, as all are that ru
 
 from __future__ import annotations
 
-import functools
-import hashlib
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from llvmlite import ir  # type: ignore[import-untyped]
@@ -21,6 +18,7 @@ __all__ = [
     "compiled",
     "get",
     "load_byte",
+    "load_half",
     "load_word",
     "put",
     "store_byte",
@@ -32,60 +30,17 @@ __all__ = [
 ]
 
 
-def compiled(signature: str = "", *, inline: bool = False) -> Callable[[Callable[..., Any]], Any]:
-    """``njit`` without Python's lock, for one ``signature`` where given.
+def compiled(*, inline: bool = False) -> Callable[[Callable[..., Any]], Any]:
+    """``njit`` for functions of numbers, as they are called by each other.
 
     ``inline`` has the compiler put the function into its callers, where a call would cost more
-    than what it does.
-
-    The result is kept on disk where a folder can be written; without one it is compiled anew
-    in every process.
+    than what it does. Python calls them by way of :func:`~chainshaper.compiled.loading.kernel`.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
-        dispatcher = njit(nogil=True, forceinline=inline)(function)
-        try:
-            dispatcher.enable_caching()
-        except RuntimeError:
-            pass
-        else:
-            _stamp(dispatcher)
-        if signature:
-            dispatcher.compile(signature)
-            dispatcher.disable_compile()
-        return dispatcher
+        return njit(nogil=True, forceinline=inline, error_model="numpy")(function)
 
     return decorate
-
-
-@functools.cache
-def _sources() -> str:
-    """A digest of every source that the kernels are made of."""
-    digest = hashlib.sha256()
-    for name in (
-        "memory",
-        "layout",
-        "program",
-        "machine",
-        "texts",
-        "interpreter",
-        "tables",
-        "kernels",
-        "filling",
-    ):
-        digest.update(Path(__file__).with_name(f"{name}.py").read_bytes())
-    return digest.hexdigest()
-
-
-def _stamp(dispatcher: Any) -> None:
-    """Have a cached kernel belong to all of its sources.
-
-    Numba looks at the age of the function's own file only, and would go on using a kernel that
-    was compiled with an older version of what it calls.
-    """
-    file: Any = getattr(getattr(dispatcher, "_cache", None), "_cache_file", None)
-    if hasattr(file, "_source_stamp"):
-        file._source_stamp = (file._source_stamp, _sources())
 
 
 def _pointer(builder: ir.IRBuilder, address: ir.Value, bits: int) -> ir.Value:
@@ -97,6 +52,16 @@ def _load_word(_typing: Any, _address: Any) -> Any:
 
     def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, args: Any) -> Any:
         return builder.load(_pointer(builder, args[0], 64), align=1)
+
+    return types.uint64(types.int64), generate
+
+
+def _load_half(_typing: Any, _address: Any) -> Any:
+    """The 4 bytes at an address, little-endian, as uint64."""
+
+    def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, args: Any) -> Any:
+        value = builder.load(_pointer(builder, args[0], 32), align=1)
+        return builder.zext(value, ir.IntType(64))
 
     return types.uint64(types.int64), generate
 
@@ -181,6 +146,7 @@ def _put(_typing: Any, _table: Any, _index: Any, _value: Any) -> Any:
 # Numba calls the generators above with types; what kernels call takes numbers.
 load_word: Any = intrinsic(_load_word)
 load_byte: Any = intrinsic(_load_byte)
+load_half: Any = intrinsic(_load_half)
 store_byte: Any = intrinsic(_store_byte)
 store_half: Any = intrinsic(_store_half)
 store_word: Any = intrinsic(_store_word)

@@ -1,0 +1,244 @@
+"""One configuration of an experiment, simulated or live, as latencies; and drawing them.
+
+A configuration is an application and a plan, or none. Without a plan the application runs under
+SCHED_FIFO. A plan that shapes is carried out by its shaping nodes, or by gating the thread of the
+asynchronous publisher, as `chainshaper shape` does it: the executors' priorities isolate the chain.
+A plan that has servers only, or one that is to have all its servers in force (``servers``), is
+carried out by freezing the application's threads, as `chainshaper apply` does it.
+
+    with ExitStack() as until:
+        options = parse_options(__doc__, cycles=200, until=until)
+        runs = [simulated("FIFO", application, cycles=options.simulated_cycles)]
+        if options.live:
+            runs += [live("FIFO", application, cycles=options.cycles, folder=options.keep)]
+            plan = plan_recording(options.keep / "FIFO")
+            runs += [live("1 band", application, plan, cycles=options.cycles, folder=options.keep)]
+"""
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import yaml
+from results import MS, Run
+
+from chainshaper import apply_plan, open_recording, run_application, shape_application, simulate
+from chainshaper.analysis import analyse_latency
+from chainshaper.enforcement.realtime import available_cores, may_use_fifo
+from chainshaper.enforcement.runs import RunState
+from chainshaper.errors import OperationError
+from chainshaper.planning import Plan, Slot
+from chainshaper.planning.publisher_threads import publisher_servers
+from chainshaper.recording import Recording
+from chainshaper.splicing.application import splice_application
+from chainshaper.workload.description import Application, application_as_written
+
+__all__ = [
+    "Options",
+    "Panel",
+    "draw_latencies",
+    "latencies_of",
+    "live",
+    "parse_options",
+    "simulated",
+]
+
+BEFORE_IN_FORCE = 80
+"""Cycles that a command runs longer: finding the nodes and measuring their phase takes a while."""
+
+COLOURS = ("#d95f02", "#1b6ca8", "#4d9221", "#7b3294")
+
+
+@dataclass(frozen=True)
+class Options:
+    """How an experiment is run; ``keep`` is where recordings and plans of live runs are."""
+
+    live: bool
+    cycles: int
+    simulated_cycles: int
+    keep: Path
+
+
+def parse_options(
+    about: str, *, cycles: int, simulated_cycles: int = 10_000, until: ExitStack
+) -> Options:
+    """The command line that every experiment has; the reason is printed where live runs cannot be.
+
+    Recordings are removed as ``until`` ends, unless `--keep FOLDER` says where they stay: those
+    that are there already are used, and not measured again.
+    """
+    parser = argparse.ArgumentParser(description=about.partition("\n")[0])
+    parser.add_argument("--simulated", action="store_true", help="nothing is run live")
+    parser.add_argument("--cycles", type=int, default=cycles, help="of every live run")
+    parser.add_argument("--simulated-cycles", type=int, default=simulated_cycles)
+    parser.add_argument("--keep", type=Path, help="keep recordings here, and use those there")
+    given = parser.parse_args()
+    missing = _missing_for_live()
+    if missing and not given.simulated:
+        print(f"simulated only: {missing}")
+    keep = given.keep or Path(until.enter_context(tempfile.TemporaryDirectory()))
+    keep.mkdir(parents=True, exist_ok=True)
+    return Options(not (given.simulated or missing), given.cycles, given.simulated_cycles, keep)
+
+
+def _missing_for_live() -> str:
+    if len(available_cores()) < 2:
+        return "a live run needs two cores, one of them for the threads of DDS"
+    if not may_use_fifo():
+        return "a live run needs SCHED_FIFO: run as root, or with an rtprio limit of 98"
+    return ""
+
+
+def simulated(
+    name: str,
+    application: Application,
+    plan: Plan | None = None,
+    *,
+    cycles: int,
+    chain: str | None = None,
+) -> Run:
+    """Simulate a configuration; the latencies of its chain, or of ``chain``, cycle by cycle.
+
+    Raises: as :func:`chainshaper.simulate`.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        recording = simulate(application, Path(folder) / "simulated", plan, cycles=cycles)
+        return latencies_of(name, recording, chain)
+
+
+def live(
+    name: str,
+    application: Application,
+    plan: Plan | None = None,
+    *,
+    cycles: int,
+    folder: Path,
+    chain: str | None = None,
+    servers: bool = False,
+) -> Run:
+    """Run a configuration; its recording is `FOLDER/NAME`, and is used if it is there already.
+
+    ``chain`` as in :func:`simulated`. ``servers`` puts all servers of a plan in force by freezing,
+    also where its shaping node could do without.
+
+    Raises:
+        PlatformError: SCHED_FIFO, freezing threads or a core is not to be had here.
+        OperationError: a run failed, or the servers were not in force before it ended.
+    """
+    output = folder / name.replace(" ", "_")
+    in_force = output.with_name(f"{output.name}.in_force")
+    if not output.exists():
+        print(f"{application.name}, {name}: {cycles} cycles live", flush=True)
+        if plan is None:
+            run_application(application, output, cycles=cycles, realtime=True)
+        elif servers or not _shapes(plan):
+            in_force.write_text(str(_apply(application, plan, output, cycles)))
+        else:
+            shape_application(application, plan, output, cycles=cycles, realtime=True)
+    since = int(in_force.read_text()) if in_force.exists() else 0
+    found = latencies_of(name, open_recording(output), chain, since_ns=since)
+    return replace(found, latency_ns=found.latency_ns[:cycles], disturbed=found.disturbed[:cycles])
+
+
+def latencies_of(
+    name: str, recording: Recording, chain: str | None = None, *, since_ns: int = 0
+) -> Run:
+    """The latencies of a recorded chain, of the cycles that began at ``since_ns`` or later."""
+    frame = analyse_latency(recording, chain or recording.info.chain or "").traversals
+    frame = frame.filter(pl.col("start") >= since_ns).sort("start")
+    return Run(
+        name,
+        live=recording.info.source == "live",
+        latency_ns=frame["latency_ns"].fill_null(-1).to_numpy(),
+        disturbed=frame["disturbed"].to_numpy(),
+    )
+
+
+def _shapes(plan: Plan) -> bool:
+    return plan.shaping_node is not None or any(publisher_servers(plan))
+
+
+def _apply(application: Application, plan: Plan, output: Path, cycles: int) -> int:
+    """Put a plan in force on `chainshaper run`; since when (CLOCK_MONOTONIC, ns) all of it is."""
+    described = output.with_name(f"{output.name}_application.yaml")
+    spliced = splice_application(application, plan) if _shapes(plan) else application
+    described.write_text(yaml.safe_dump(application_as_written(spliced), sort_keys=False))
+    seen: list[int] = []
+
+    def watch(state: RunState) -> None:
+        gated = [server for server in state.servers if server.kept_by != "gate"]
+        if not seen and all(server.counters.slots for server in gated):
+            seen.append(time.monotonic_ns())
+
+    run = [sys.executable, "-m", "chainshaper", "run", str(described), "-o", str(output)]
+    command = [*run, "--cycles", str(cycles + BEFORE_IN_FORCE)]
+    done = apply_plan(plan, command, back_end="freezer", watch=watch)
+    if done.exit_code or not seen:
+        raise OperationError(
+            f"{output.name}: the servers were not in force before the run ended, which was with"
+            f" exit code {done.exit_code}: run the experiment again"
+        )
+    return seen[0]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One picture of latencies over cycles; the times at which ``slots`` are open are shaded."""
+
+    title: str
+    runs: Sequence[Run]
+    slots: Sequence[Slot] = ()
+
+
+def draw_latencies(
+    path: Path, panels: Sequence[Panel], *, columns: int = 1, most: int = 400
+) -> Path:
+    """Latencies over cycles, one panel beside the other; ``most`` cycles of a run are drawn.
+
+    Crosses are cycles that the machine disturbed; the longest undisturbed one ends the axis.
+    """
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
+
+    rows = -(-len(panels) // columns)
+    figure, grid = plt.subplots(
+        rows,
+        columns,
+        figsize=(4.6 * max(columns, 1.6), 2.9 * rows),
+        layout="constrained",
+        squeeze=False,
+        sharey=True,
+    )
+    highest = max(int(run.undisturbed_ns.max()) for panel in panels for run in panel.runs)
+    for axes, panel in zip(grid.flat, panels, strict=False):
+        for start, end in panel.slots:
+            axes.axhspan(start / MS, end / MS, color="0.8", zorder=0)
+        for run, colour in zip(panel.runs, COLOURS, strict=False):
+            cycles, latency = np.arange(run.latency_ns.size)[:most], run.latency_ns[:most] / MS
+            calm, hit = (  # what came to no end is not drawn
+                (latency >= 0) & marks for marks in (~run.disturbed[:most], run.disturbed[:most])
+            )
+            axes.plot(cycles[calm], latency[calm], ".", markersize=3, color=colour, label=run.name)
+            axes.plot(cycles[hit], latency[hit], "x", markersize=4, color=colour, alpha=0.6)
+        axes.set_title(panel.title, loc="left", fontsize=9)
+        axes.set_ylim(0, highest / MS * 1.1)
+        axes.grid(alpha=0.3)
+        if len(panel.runs) > 1:
+            axes.legend(loc="lower right", fontsize=8)
+    for axes in grid[-1]:
+        axes.set_xlabel("cycle")
+    for row in grid:
+        row[0].set_ylabel("latency [ms]")
+    path.parent.mkdir(exist_ok=True)
+    figure.savefig(path, dpi=90)
+    plt.close(figure)
+    return path

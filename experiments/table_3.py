@@ -1,0 +1,249 @@
+"""Table 3 and figure 6: valet parking under six schedules (section 5.1).
+
+    python experiments/table_3.py [--simulated] [--cycles 280] [--keep FOLDER]
+
+Simulated is the graph with drawn execution times (`avp_drawn.yaml`), calibrated on the paper's
+first row, under the slots of table 4. Live is the localisation that really computes
+(`avp/avp.yaml`): measured under SCHED_FIFO first, then under plans made from that measurement.
+Servers hold threads by freezing them; bands are made by the shaping node alone, whose chain runs at
+a high priority as in the first row.
+"""
+
+import os
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from avp_drawn import APPLICATION as DRAWN
+from configurations import Options, Panel, draw_latencies, live, parse_options, simulated
+from results import HERE, MS, PICTURES, Line, Run, Value, lines_of, save
+from table_4 import MARGIN_NS, MWCETS_US, plans
+
+from chainshaper import load_application
+from chainshaper.errors import ChainshaperError
+from chainshaper.planning import Plan, PlanRequest, plan_chain, publish_slots
+from chainshaper.simulation.samples import with_recorded_times
+from chainshaper.steps import profile_chains
+from chainshaper.workload.description import Application
+
+__all__ = ["FIFO", "PERIOD_NS", "run_under_fifo"]
+
+PERIOD_NS = 100 * MS
+FIRST_SLOT_NS = 3 * MS
+"""The throttler's: its two callbacks copy a cloud of half a megabyte each."""
+
+FIFO = "SCHED_FIFO"
+RESAMPLED = "SCHED_FIFO, execution times from the live run"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A schedule: the paper's figures (ms), the row of table 4, and what is asked of the plan."""
+
+    average: float
+    maximum: float
+    jitter: float | str
+    slots: str
+    request: PlanRequest
+    why: str
+
+
+WHY_LIVE = "live is another localizer on another machine: compare with its own first row"
+WHY_AGAIN = "the simulator delivers and takes clouds as fast as small messages"
+WHY_LATE = (
+    "late are outputs of cycles in which something took longer than ever in the profile and its"
+    " margin, and those behind them; " + WHY_LIVE
+)
+WHY_BANDS = "outputs leave as their slot opens, or at once while it is open; " + WHY_LATE
+
+ROWS = {
+    "1 server per callback": Row(
+        *(72.8, 95.7, 48.6, "1 server per callback"),
+        PlanRequest(policy="server-per-callback", epsilon_ns=MARGIN_NS),
+        "the localizer's slot opens at 47 ms, live at 46 ms, then comes its execution time; "
+        + WHY_LATE,
+    ),
+    "1 server per chain": Row(
+        *(64.2, 84.4, 51.6, "2 server per chain"),
+        PlanRequest(policy="server-per-chain", first_slot_ns=FIRST_SLOT_NS),
+        "the chain waits for its server behind the throttler's slot; " + WHY_LATE,
+    ),
+    "1-band": Row(86.6, 86.7, "≈ 0.2", "3 1-band", PlanRequest(), WHY_BANDS),
+    "3-band, random": Row(
+        *(76.4, 86.6, "≈ 0.2 per band", "4 3-band, random"),
+        PlanRequest(bands=3, solver="random", grid_ns=MS, seed=1),
+        "random places are others; " + WHY_BANDS,
+    ),
+    "3-band, PSO": Row(
+        *(71.3, 86.5, "≈ 0.2 per band", "5 3-band, PSO"),
+        PlanRequest(bands=3, solver="pso", grid_ns=MS, seed=1),
+        WHY_BANDS,
+    ),
+}
+
+
+def real_application() -> Application:
+    """The localisation that computes; its functions are found wherever this is started."""
+    from avp.drive import recorded_drive
+
+    recorded_drive()  # made now, if there is none yet
+    path = [str(HERE.parent), *os.environ.get("PYTHONPATH", "").split(os.pathsep)]
+    os.environ["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(filter(None, path)))
+    return load_application(HERE / "avp" / "avp.yaml")
+
+
+def run_under_fifo(options: Options) -> tuple[Run, Path]:
+    """The first row, live, and its recording; poses' errors are beside it, in `FOLDER/errors`."""
+    os.environ["AVP_ERRORS"] = str(options.keep / "errors")
+    run = live(FIFO, real_application(), cycles=options.cycles, folder=options.keep)
+    del os.environ["AVP_ERRORS"]
+    return run, options.keep / FIFO
+
+
+def live_plan(recording: Path, request: PlanRequest) -> Plan:
+    """The plan of a row from the live recording of the first.
+
+    Callbacks are in the order of table 4: both of the throttler's before all others. The player,
+    which the throttler waits for, is no part of the system, and stays outside its servers.
+    """
+    (profile,) = profile_chains(recording, period_ns=PERIOD_NS)
+    times = {node: [one for one in profile.callbacks if one.node == node] for node, *_ in MWCETS_US}
+    callbacks = [replace(times[node].pop(0), after=after) for node, _, _, after in MWCETS_US]
+    core_of = {node: core for node, core in profile.core_of.items() if node in times}
+    return plan_chain(replace(profile, callbacks=tuple(callbacks), core_of=core_of), request)
+
+
+def run_live(options: Options) -> tuple[list[Run], dict[str, Plan], list[str]]:
+    """All rows live: their latencies, the plans, and what could not be run, with the reason."""
+    fifo, recording = run_under_fifo(options)
+    application, runs, planned, failed = real_application(), [fifo], dict[str, Plan](), list[str]()
+    for name, row in ROWS.items():
+        try:
+            planned[name] = live_plan(recording, row.request)
+            run = live(name, application, planned[name], cycles=options.cycles, folder=options.keep)
+            runs.append(run)
+        except ChainshaperError as error:
+            failed.append(f"{name}: {error}")
+            print(failed[-1])
+    return runs, planned, failed
+
+
+def run_simulated(cycles: int) -> tuple[list[Run], dict[str, Plan]]:
+    """All rows by simulation, with the slots of table 4."""
+    application = load_application(DRAWN)
+    runs = [simulated(FIFO, application, cycles=cycles)]
+    of_table_4 = plans(runs[0].undisturbed_ns)
+    planned = {name: of_table_4[row.slots] for name, row in ROWS.items()}
+    runs += [simulated(name, application, plan, cycles=cycles) for name, plan in planned.items()]
+    return runs, planned
+
+
+def resampled(options: Options) -> list[Line]:
+    """The first row of what was measured live, beside its simulation with the recorded times.
+
+    These are drawn in stretches of consecutive cycles, the same of all callbacks, so that what
+    belongs together in the drive stays together.
+    """
+    measured, recording = run_under_fifo(options)
+    described = with_recorded_times(real_application(), recording, block=20)
+    again = simulated(RESAMPLED, described, cycles=options.simulated_cycles)
+    figures: dict[str, Value] = dict.fromkeys(("average", "maximum", "jitter"))
+    return lines_of(RESAMPLED, [again, replace(measured, name=RESAMPLED)], figures, why=WHY_AGAIN)
+
+
+def widest_band(run: Run, plan: Plan) -> float:
+    """The largest jitter within a band (ms): of the latencies next to the same slot's start."""
+    latencies = run.undisturbed_ns[run.undisturbed_ns < PERIOD_NS]
+    starts = np.array([start for start, _ in publish_slots(plan)])
+    band = np.abs(latencies[:, None] - starts).argmin(axis=1)
+    widths = [np.ptp(latencies[band == one]) for one in np.unique(band)]
+    return float(max(widths)) / MS
+
+
+def lines(
+    runs: Sequence[Run], drawn_plans: dict[str, Plan], live_plans: dict[str, Plan]
+) -> list[Line]:
+    """Average, maximum and jitter of every row; what was late; what a band's jitter is."""
+    paper: dict[str, Value] = {"average": 67.4, "maximum": 84.7, "jitter": 51.8}
+    made = lines_of(FIFO, runs, paper, why=WHY_LIVE)
+    for name, row in ROWS.items():
+        banded = publish_slots(drawn_plans[name]) if drawn_plans[name].shaping_node else ()
+        paper = {"average": row.average, "maximum": row.maximum, "late": None}
+        if len(banded) <= 1:
+            paper["jitter"] = row.jitter
+        made += lines_of(name, runs, paper, late_from_ns=PERIOD_NS, why=row.why)
+        if len(banded) > 1:
+            widths = {
+                run.live: widest_band(run, (live_plans if run.live else drawn_plans)[name])
+                for run in runs
+                if run.name == name
+            }
+            made.append(
+                Line(
+                    f"{name}: jitter within a band",
+                    "ms",
+                    row.jitter,
+                    widths.get(False),
+                    widths.get(True),
+                    row.why,
+                )
+            )
+    return made
+
+
+def picture(runs: Sequence[Run], planned: dict[str, Plan], name: str) -> Path:
+    """Figure 6, (a) to (f)."""
+    panels = [
+        Panel(
+            f"({letter}) {run.name}",
+            [run],
+            publish_slots(planned[run.name])
+            if run.name in planned and planned[run.name].shaping_node
+            else (),
+        )
+        for letter, run in zip("abcdef", runs, strict=False)
+    ]
+    return draw_latencies(PICTURES / name, panels, columns=3)
+
+
+def notes_of(keep: Path, failed: Sequence[str]) -> str:
+    """How well the localizer knew where it was, and what could not be run live."""
+    from avp.checking import root_mean_square_error
+
+    notes = [f"Not run live: {reason}" for reason in failed]
+    if (keep / "errors").exists():
+        mean, worst = (1000 * error for error in root_mean_square_error(keep / "errors"))
+        notes.append(
+            f"The localizer's error under SCHED_FIFO was {mean:.1f} mm (root mean square) and at"
+            f" most {worst:.1f} mm."
+        )
+    return "\n\n".join(notes)
+
+
+def main() -> None:
+    with ExitStack() as until:
+        options = parse_options(__doc__, cycles=280, until=until)
+        runs, drawn_plans = run_simulated(options.simulated_cycles)
+        pictures = [picture(runs, drawn_plans, "figure_6_simulated.png")]
+        live_plans: dict[str, Plan] = {}
+        notes, again = "", list[Line]()
+        if options.live:
+            real, live_plans, failed = run_live(options)
+            pictures.append(picture(real, live_plans, "figure_6_live.png"))
+            notes = notes_of(options.keep, failed)
+            runs += real
+            again = resampled(options)
+        save(
+            "table_3",
+            "Table 3 and figure 6: valet parking under six schedules",
+            lines(runs, drawn_plans, live_plans) + again,
+            runs=runs,
+            pictures=pictures,
+            notes=notes,
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,249 @@
+"""Who computes the points of a sweep: processes of this machine, or a Dask cluster.
+
+Points that differ in nothing that was measured share a profile: it is simulated once, and goes to
+whoever computes one of them. Rows come in any order, but do not depend on it, nor on who else
+computes: a point's row is a function of the point.
+"""
+
+import asyncio
+import importlib.metadata
+import json
+import multiprocessing
+import os
+import re
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+from chainshaper.errors import ChainshaperError, InputError, OperationError
+from chainshaper.planning import Profile
+from chainshaper.planning.extras import extra_library
+from chainshaper.sweeping.grid import Grid, Values, changes_application, request_at
+from chainshaper.sweeping.points import profile_at, row_at
+
+__all__ = ["Group", "groups_of", "rows_from_cluster", "rows_from_here"]
+
+CONNECT_S = 10
+WITHOUT_WORKERS_S = 60
+LOOK_S = 0.5
+_ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?[^/]+:\d+")
+WARM_UP_CYCLES = 10
+SAME = ("chainshaper", "numpy", "distributed")
+"""Packages whose versions rows depend on: NumPy's generators may draw differently."""
+
+Rows: TypeAlias = Generator[tuple[int, dict[str, Any]], None, None]
+
+
+@dataclass(frozen=True)
+class Group:
+    """Points, by their numbers, that share a profile; ``profiled``: or need none."""
+
+    profiled: bool
+    points: tuple[tuple[int, Values], ...]
+
+
+def groups_of(grid: Grid, points: Iterable[tuple[int, Values]]) -> list[Group]:
+    """Points in groups of one profile each, in their order."""
+    groups: dict[str, list[tuple[int, Values]]] = {}
+    for number, values in points:
+        profiled = request_at(grid, values) is not None
+        application = {name: value for name, value in values.items() if changes_application(name)}
+        per_callback = values.get("policy") == "server-per-callback"
+        key = json.dumps([profiled, profiled and per_callback, application])
+        groups.setdefault(key, []).append((number, values))
+    return [Group(json.loads(key)[0], tuple(points)) for key, points in groups.items()]
+
+
+def rows_from_here(grid: Grid, groups: Sequence[Group], workers: int) -> Rows:
+    """Rows by the numbers of their points, computed by ``workers`` processes (1: by this one).
+
+    Raises:
+        OperationError: a process was killed.
+    """
+    if workers > 1:
+        yield from _rows_from_processes(grid, groups, workers)
+        return
+    for group in groups:
+        profile = _profile_of(grid, group)
+        for number, values in group.points:
+            yield number, row_at(grid, values, profile)
+
+
+def _profile_of(grid: Grid, group: Group) -> Profile | str | None:
+    return profile_at(grid, group.points[0][1]) if group.profiled else None
+
+
+def _rows_from_processes(grid: Grid, groups: Sequence[Group], workers: int) -> Rows:
+    # What has to be compiled is compiled once, here, and found in Numba's cache by the others.
+    _, values = groups[0].points[0]
+    warm = replace(grid, cycles=WARM_UP_CYCLES)
+    row_at(warm, values, _profile_of(warm, groups[0]))
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(
+        workers, multiprocessing.get_context("spawn"), initializer=_end_with_parent
+    )
+    try:
+        yield from _rows_from_pool(pool, grid, groups, 2 * workers)
+    except BrokenProcessPool as error:
+        raise OperationError(
+            "a process that computed points was killed; finished rows are kept: free memory, or"
+            " ask for fewer with --workers, and the same command goes on"
+        ) from error
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in set(multiprocessing.active_children()) - others:
+            process.terminate()
+
+
+def _rows_from_pool(
+    pool: ProcessPoolExecutor, grid: Grid, groups: Sequence[Group], at_once: int
+) -> Rows:
+    """Points whose profile is there come first, so that few profiles are held at a time."""
+    coming = iter(groups)
+    ready: deque[tuple[tuple[int, Values], Profile | str | None]] = deque()
+    pending: dict[Future[Any], Group | int] = {}
+    while True:
+        with _interrupts_later():
+            while len(pending) < at_once:
+                if ready:
+                    (number, values), profile = ready.popleft()
+                    pending[pool.submit(row_at, grid, values, profile)] = number
+                elif (group := next(coming, None)) is not None:
+                    pending[pool.submit(_profile_of, grid, group)] = group
+                else:
+                    break
+        if not pending:
+            return
+        for future in wait(pending, return_when=FIRST_COMPLETED).done:
+            of = pending.pop(future)
+            if isinstance(of, Group):
+                ready.extend((point, future.result()) for point in of.points)
+            else:
+                yield of, future.result()
+
+
+@contextmanager
+def _interrupts_later() -> Iterator[None]:
+    """Ctrl-C is for us: the processes that are started in here inherit that it is blocked."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end_with_parent() -> None:
+    """A process whose parent was killed would wait for work for ever."""
+    parent = multiprocessing.parent_process()
+
+    def watch() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def rows_from_cluster(grid: Grid, groups: Sequence[Group], address: str) -> Rows:
+    """The same, computed by the workers of the Dask cluster whose scheduler is at ``address``.
+
+    Points of a worker that dies are computed by others.
+
+    Raises:
+        InputError: that is no address.
+        PlatformError: `distributed` is not installed.
+        OperationError: no scheduler is there, or it is gone; there are no workers, or one has
+            other versions of what rows depend on; or a point killed one worker after another.
+    """
+    distributed = extra_library("distributed", "a sweep on a Dask cluster")
+    with _connected(distributed, address) as client:
+        here = _versions()
+        numbers: dict[Any, int] = {}
+        for group in groups:
+            profile = client.submit(_profile_for, here, grid, group, pure=False)
+            for number, values in group.points:
+                numbers[client.submit(_row_for, here, grid, values, profile, pure=False)] = number
+        completed = distributed.as_completed(list(numbers), loop=client.loop)
+        while numbers:
+            with _failures_named(address):
+                _wait_for_one(completed, client)
+                future = next(completed)
+                row = future.result()
+            yield numbers.pop(future), row
+
+
+def _connected(distributed: Any, address: str) -> Any:
+    if not _ADDRESS.fullmatch(address):
+        raise InputError(f"{address!r} is no scheduler's address: write one like tcp://HOST:8786")
+    try:
+        return distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, asyncio.TimeoutError) as error:  # from Python 3.11 on they are one
+        raise OperationError(
+            f"no Dask scheduler answers at {address} ({error}): start one with `dask scheduler`,"
+            " and give the address that it prints, such as --scheduler tcp://HOST:8786"
+        ) from error
+
+
+def _wait_for_one(completed: Any, client: Any) -> None:
+    """Wait for a row. Workers may come and go, but somebody has to be there now and then."""
+    seen = looked = time.monotonic()
+    while not completed.has_ready():
+        time.sleep(0.02)
+        if time.monotonic() - looked > LOOK_S:
+            looked = time.monotonic()
+            seen = looked if client.nthreads() else seen
+            if looked - seen > WITHOUT_WORKERS_S:
+                raise TimeoutError(f"it has had no workers for {WITHOUT_WORKERS_S} s")
+
+
+@contextmanager
+def _failures_named(address: str) -> Iterator[None]:
+    """Dask has many errors of its own for what happens to its parts: lost, killed, unable to load.
+
+    All of them leave the sweep where it is, and the user with the same things to look at.
+    """
+    try:
+        yield
+    except ChainshaperError:
+        raise
+    except Exception as error:
+        raise OperationError(
+            f"the Dask cluster at {address} failed ({type(error).__name__}: {error}); finished"
+            " rows are kept. See that its workers run, that chainshaper is installed on each, and"
+            " that they have memory; then the same command goes on"
+        ) from error
+
+
+def _versions() -> dict[str, str]:
+    return {name: importlib.metadata.version(name) for name in SAME}
+
+
+def _profile_for(client: dict[str, str], grid: Grid, group: Group) -> Profile | str | None:
+    _refuse_other_versions(client)
+    return _profile_of(grid, group)
+
+
+def _row_for(
+    client: dict[str, str], grid: Grid, values: Values, profile: Profile | str | None
+) -> dict[str, Any]:
+    _refuse_other_versions(client)
+    return row_at(grid, values, profile)
+
+
+def _refuse_other_versions(client: dict[str, str]) -> None:
+    """On a worker, which may have come later than the rest: rows must not depend on who it is."""
+    own = _versions()
+    different = [f"{n} {own[n]}, not {client[n]}" for n in SAME if own[n] != client[n]]
+    if different:
+        worker = importlib.import_module("distributed").get_worker().address
+        raise OperationError(
+            f"the Dask worker at {worker} has {' and '.join(different)}: install the same versions"
+            " there as here"
+        )

@@ -1,0 +1,121 @@
+"""The experiments come to the paper's values in simulation, where the paper's setting is known."""
+
+from pathlib import Path
+
+import figure_8
+import figure_9
+import numpy as np
+import pytest
+import table_1
+import table_5
+from configurations import Options, simulated
+from results import MS, Run
+
+from chainshaper import load_application
+from chainshaper.workload.description import Application
+from chainshaper.workload.distributions import ExecutionTime, SimulationDescription
+
+NOTHING = ExecutionTime(constant_ns=0)
+
+
+def within(share: float, run: Run, paper_ms: float) -> bool:
+    return bool(abs(run.undisturbed_ns.max() / MS / paper_ms - 1) <= share)
+
+
+def test_time_driven_servers_have_the_papers_maximum_and_jitter_whatever_the_load() -> None:
+    for load in (0, 40):
+        application = table_1.application(load)
+        fifo = simulated("fifo", application, cycles=300)
+        plan = table_1.five_servers(fifo.undisturbed_ns)
+        slots = [server.slots for server in plan.servers]
+        assert slots == [((16 * n * MS, 16 * (n + 1) * MS),) for n in range(5)]
+        servers = simulated("servers", application, plan, cycles=300)
+        assert within(0.01, servers, 80)
+        assert abs(np.ptp(servers.latency_ns) / MS - 10) < 0.5
+        assert within(0.15, fifo, 69) and np.ptp(fifo.latency_ns) > 3 * np.ptp(servers.latency_ns)
+
+
+def test_callbacks_of_up_to_12_ms_have_the_papers_maximum_under_fixed_priorities() -> None:
+    assert within(0.03, simulated("", table_1.application(0, longest_ms=12), cycles=300), 57.3)
+
+
+def test_an_asynchronous_publisher_sends_at_the_papers_time() -> None:
+    application = load_application(figure_8.APPLICATION)
+    unshaped = simulated("", application, cycles=300)
+    assert within(0.03, unshaped, 58.5)
+    plan = figure_8.plan_with_slot(unshaped.undisturbed_ns, 1)
+    shaped = simulated("", application, plan, cycles=300)
+    assert within(0.02, shaped, 59.6)
+    assert np.ptp(shaped.latency_ns) < 0.3 * MS
+
+
+def test_logical_execution_times_take_as_many_periods_as_the_paper_says(tmp_path: Path) -> None:
+    runs = table_5.measured("synthetic", table_5.synthetic(), 300, tmp_path, is_live=False)
+    for run, paper, share in zip(runs[1:], (59.2, 500, 100), (0.05, 0.005, 0.005), strict=True):
+        assert run.latency_ns.size == 300 and run.latency_ns.min() > 0
+        assert within(share, run, paper), run.name
+        assert np.ptp(run.latency_ns) < 0.3 * MS
+
+
+@pytest.fixture
+def graph() -> Application:
+    return load_application(figure_9.APPLICATION)
+
+
+def test_the_graphs_longest_path_on_its_two_cores_is_560_ms(graph: Application) -> None:
+    """Worst cases, each callback behind its inputs and behind what its core is busy with."""
+    vertices = {n: node for n, node in graph.nodes.items() if n.startswith("vertex")}
+    published = {node.callbacks[0].publishes[0]: name for name, node in vertices.items()}
+    inputs = {
+        name: [published[topic] for topic in node.callbacks[0].subscriptions]
+        for name, node in vertices.items()
+    }
+    ancestors: dict[str, set[str]] = {}
+    ends: dict[str, int] = {}
+    free = {0: 0, 1: 0}
+    while len(ends) < 18:
+        name = next(n for n in vertices if n not in ends and all(i in ends for i in inputs[n]))
+        core = graph.scheduling_of(name).core
+        ancestors[name] = set(inputs[name]).union(*(ancestors[i] for i in inputs[name]))
+        before = {other for other in ends if graph.scheduling_of(other).core == core}
+        assert before <= ancestors[name], "the graph orders the callbacks of each core"
+        times = vertices[name].callbacks[0].execution.uniform_ns
+        assert times is not None and times[0] * 2 == times[1]
+        start = max([free[core], *(ends[i] for i in inputs[name])])
+        free[core] = ends[name] = start + times[1]
+    sinks = set(vertices) - {i for some in inputs.values() for i in some}
+    assert sinks == {"vertex1"}
+    assert ends["vertex1"] == max(ends.values()) == 560 * MS
+    assert sum(len(some) > 1 for some in inputs.values()) == 6
+
+
+def test_worst_cases_take_560_ms_in_simulation(graph: Application) -> None:
+    nodes = {}
+    for name, node in graph.nodes.items():
+        callback = node.callbacks[0]
+        times = callback.execution.uniform_ns or (0, 0)
+        longest = callback.model_copy(update={"execution": ExecutionTime(constant_ns=times[1])})
+        nodes[name] = node.model_copy(update={"callbacks": (longest,)})
+    free = SimulationDescription(
+        wake_up=NOTHING, take=NOTHING, publish=NOTHING, delivery=NOTHING, interrupts=0
+    )
+    worst = graph.model_copy(update={"nodes": nodes, "simulation": free})
+    assert set(simulated("", worst, cycles=3).latency_ns) == {560 * MS}
+
+
+def test_the_graph_is_constant_at_its_sink_and_at_each_of_three(
+    graph: Application, tmp_path: Path
+) -> None:
+    options = Options(live=False, cycles=0, simulated_cycles=300, keep=tmp_path)
+    unshaped, *shaped = figure_9.measured(graph, options, is_live=False)
+    assert np.ptp(unshaped.latency_ns) > 100 * MS
+    assert len(shaped) == 4
+    for run in shaped:
+        # Gates of other sinks watch the clock on the same core: the longest cycle may overrun.
+        late = run.latency_ns >= figure_9.PERIOD_NS
+        assert run.latency_ns.min() > 0 and late.sum() <= 3, run.name
+        assert np.ptp(run.latency_ns[~late]) < 0.3 * MS, run.name
+    longest = unshaped.latency_ns.max()
+    one, three = (run.latency_ns.min() for run in shaped[:2])
+    assert longest < one < longest + 3 * MS
+    assert one == three, "the same sink"

@@ -1,0 +1,141 @@
+"""Callbacks that compute: real functions on real messages, over DDS, and what can go wrong."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from small_chain import DDS_CORE, EXECUTOR_CORE
+
+from chainshaper import run_application, simulate
+from chainshaper.analysis import analyse_latency
+from chainshaper.errors import InputError, OperationError
+from chainshaper.simulation.samples import with_recorded_times
+from chainshaper.workload import dds
+from chainshaper.workload.computing import computing, load_function
+from chainshaper.workload.description import Application, load_application
+
+TEXT = f"""\
+name: sums
+chain: /squares../sum
+scheduling:
+  executors: {{core: {EXECUTOR_CORE}, priority: 80}}
+  dds: {{core: {DDS_CORE}, priority: 90}}
+nodes:
+  source:
+    callbacks: [{{timer: 50ms, computes: "sums:numbers", publishes: [/numbers]}}]
+  squares:
+    callbacks: [{{subscription: /numbers, computes: "sums:squares", publishes: [/squares]}}]
+  total:
+    callbacks: [{{synchronises: [/numbers, /squares], computes: "sums:total", publishes: [/sum]}}]
+  check:
+    callbacks: [{{subscription: /sum, computes: "sums:check"}}]
+"""
+
+FUNCTIONS = """\
+import itertools, time
+import numpy as np
+from chainshaper.workload.dds import data_message, data_of, number_in
+from chainshaper.enforcement.gate import origin_of
+
+COUNT = itertools.count()
+
+def numbers():
+    values = np.arange(250_000, dtype=np.float32) % 7 + next(COUNT)
+    return data_message(values.data, time.time_ns())
+
+def squares(message):
+    values = np.frombuffer(data_of(message), dtype=np.float32)
+    if int(values[0]) % 4 == 3:  # one in four is held back
+        return None
+    return data_message((values ** 2).data, origin_of(message))
+
+def total(numbers, squares):
+    pair = [np.frombuffer(data_of(one), dtype=np.float32) for one in (numbers, squares)]
+    lengths = np.array([len(one) for one in pair], np.float32)
+    return data_message(lengths.data, origin_of(squares), number=5)
+
+def check(message):
+    assert number_in(message) == 5
+    assert 0 < time.time_ns() - origin_of(message) < 10**9
+    assert np.frombuffer(data_of(message), np.float32).tolist() == [250_000, 250_000]
+"""
+
+
+def _application(folder: Path, monkeypatch: pytest.MonkeyPatch, **change: str) -> Application:
+    """The application, its functions in the working directory; what is named is replaced."""
+    text = TEXT
+    for old, new in change.items():
+        text = text.replace(f'"sums:{old}"', f'"{new}"')
+    (folder / "sums.yaml").write_text(text)
+    (folder / "sums.py").write_text(FUNCTIONS)
+    monkeypatch.chdir(folder)
+    return load_application(folder / "sums.yaml")
+
+
+def test_a_data_message_is_the_message_that_topics_carry() -> None:
+    data = bytes(range(37))
+    template = dds.message_template(len(data))
+    template[32 : 32 + len(data)] = data
+    message = dds.data_message(data, 12_345_678_901)
+    assert message == dds.stamp_message(template, 12_345_678_901)
+    assert bytes(dds.data_of(message)) == data
+
+
+def test_megabytes_are_computed_on_and_what_returns_nothing_publishes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    application = _application(tmp_path, monkeypatch)
+    recording = run_application(application, tmp_path / "rec", cycles=12)
+    analysis = analyse_latency(recording, application.chain)
+    # Three in four of the squares begin the chain with a message; the first five cycles warm up.
+    assert analysis.statistics.count == 9
+    with pytest.raises(InputError, match=r"node source computes sums:numbers.*--execution-times"):
+        simulate(application, tmp_path / "simulated")
+    simulated = simulate(with_recorded_times(application, recording), tmp_path / "sim", cycles=10)
+    assert analyse_latency(simulated, application.chain).statistics.count == 10
+
+
+def test_a_function_that_fails_ends_the_run_with_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    application = _application(tmp_path, monkeypatch, numbers="sums:squares")
+    with pytest.raises(OperationError, match=r"sums:squares failed at .*computing.py:\d+: TypeErr"):
+        run_application(application, tmp_path / "rec", cycles=3, realtime=False)
+    assert not (tmp_path / "rec").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("nowhere:numbers", "nowhere:numbers cannot be loaded: ModuleNotFoundError"),
+        ("broken:numbers", r"broken:numbers cannot be loaded: ZeroDivisionError.*broken.py:1\)"),
+        ("sums:digits", r"sums:digits cannot be loaded: .*/sums.py has no digits"),
+        ("sums:COUNT", "sums:COUNT cannot be called: name a function"),
+        ("itertools:count", "itertools:count returned count: return the message to publish"),
+    ],
+)
+def test_what_is_no_function_for_callbacks_is_named_with_the_reason(
+    name: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _application(tmp_path, monkeypatch)
+    (tmp_path / "broken.py").write_text("1 / 0")
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.delitem(sys.modules, "sums", raising=False)
+    with pytest.raises(SystemExit, match=said):
+        computing(name, load_function(name), 1)((), 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ('computes: "sums"', "write MODULE:FUNCTION"),
+        ('computes: "sums:numbers", execution: {constant: 1ms}', "keep one"),
+    ],
+)
+def test_a_description_says_one_thing_about_what_a_callback_does(
+    change: str, said: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "sums.yaml"
+    path.write_text(TEXT.replace('computes: "sums:numbers"', change))
+    with pytest.raises(InputError, match=said):
+        load_application(path)
