@@ -5,8 +5,9 @@
 demo: .venv/.ready
 	.venv/bin/chainshaper demo
 
+# Two processes: what only computes runs beside what needs the machine (tests/conftest.py).
 test: lint
-	.venv/bin/python -m pytest
+	.venv/bin/python -m pytest -n 2 --dist loadgroup
 
 # The sched_ext back end on Debian's kernels, in QEMU. Fetches about 50 MB once; ten minutes or so.
 test-kernel: .venv/.ready-dev

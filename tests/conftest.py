@@ -21,6 +21,22 @@ settings.register_profile("chainshaper", deadline=None)
 settings.load_profile("chainshaper")
 
 
+# Folders whose tests only compute: `make test` runs them beside all others, which follow each other
+# in one process, because they need the machine's cores or tracers for themselves.
+COMPUTING = ("analysis", "compiled", "experiments", "planning", "reporting", "simulation")
+COMPUTING += ("sources/ctf", "splicing", "sweeping")
+LIVE_RUNS = {"unshaped", "shaped"}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Group the tests that must not run beside each other."""
+    for item in items:
+        folder = item.path.parent.relative_to(Path(__file__).parent).as_posix()
+        live = LIVE_RUNS & set(getattr(item, "fixturenames", ()))
+        if folder not in COMPUTING or live or item.get_closest_marker("ros2"):
+            item.add_marker(pytest.mark.xdist_group("machine"))
+
+
 @pytest.fixture
 def application_file(tmp_path: Path) -> Path:
     """The small chain as a person would have it on disk."""

@@ -14,7 +14,6 @@ Names are imported when they are first used, so that importing the package costs
 """
 
 import importlib
-import os
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -82,13 +81,6 @@ if TYPE_CHECKING:
     from chainshaper.thread_search import find_threads
     from chainshaper.workload.description import Application, load_application
     from chainshaper.workload.live import run_application
-
-# Memory that one step of an analysis lets go of is kept for the next: given back, the kernel would
-# have to clear every page of it again, which costs more than the work on it. Polars' allocator
-# reads this once, when Polars is imported.
-os.environ.setdefault(
-    "_RJEM_MALLOC_CONF", "oversize_threshold:0,narenas:1,dirty_decay_ms:-1,muzzy_decay_ms:-1"
-)
 
 _HOMES = {
     "chainshaper.analysis": (
