@@ -23,8 +23,8 @@ settings.load_profile("chainshaper")
 
 # Folders whose tests only compute: `make test` runs them beside all others, which follow each other
 # in one process, because they need the machine's cores or tracers for themselves.
-COMPUTING = ("analysis", "compiled", "experiments", "planning", "reporting", "simulation")
-COMPUTING += ("sources/ctf", "splicing", "sweeping")
+COMPUTING = {"analysis", "compiled", "experiments", "planning", "reporting", "simulation"}
+COMPUTING |= {"sources/ctf", "splicing", "sweeping"}
 LIVE_RUNS = {"unshaped", "shaped"}
 
 
