@@ -28,6 +28,7 @@ COMPUTING |= {"sources/ctf", "splicing", "sweeping"}
 LIVE_RUNS = {"unshaped", "shaped"}
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist looks for groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Group the tests that must not run beside each other."""
     for item in items:
