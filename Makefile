@@ -1,13 +1,19 @@
 # `make demo` and `make test` need nothing but Python 3.10 or newer; see scripts/setup.
 
-.PHONY: demo test test-kernel lint benchmark experiments docs clean
+.PHONY: demo test test-computing test-machine test-kernel lint benchmark experiments docs clean
 
 demo: .venv/.ready
 	.venv/bin/chainshaper demo
 
-# Two processes: what only computes runs beside what needs the machine (tests/conftest.py).
+# What only computes runs beside what needs the machine (tests/conftest.py).
 test: lint
-	.venv/bin/python -m pytest -n 2 --dist loadgroup
+	$(MAKE) --jobs=2 --output-sync=line test-computing test-machine
+
+test-computing:
+	.venv/bin/python -m pytest -m computing
+
+test-machine:
+	.venv/bin/python -m pytest -m "not computing"
 
 # The sched_ext back end on Debian's kernels, in QEMU. Fetches about 50 MB once; ten minutes or so.
 test-kernel: .venv/.ready-dev

@@ -28,14 +28,14 @@ COMPUTING |= {"sources/ctf", "splicing", "sweeping"}
 LIVE_RUNS = {"unshaped", "shaped"}
 
 
-@pytest.hookimpl(tryfirst=True)  # before pytest-xdist looks for groups
+@pytest.hookimpl(tryfirst=True)  # before the command line's choice of marks is looked at
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Group the tests that must not run beside each other."""
+    """Mark the tests that may run beside others."""
     for item in items:
         folder = item.path.parent.relative_to(Path(__file__).parent).as_posix()
         live = LIVE_RUNS & set(getattr(item, "fixturenames", ()))
-        if folder not in COMPUTING or live or item.get_closest_marker("ros2"):
-            item.add_marker(pytest.mark.xdist_group("machine"))
+        if folder in COMPUTING and not live and not item.get_closest_marker("ros2"):
+            item.add_marker("computing")
 
 
 @pytest.fixture
