@@ -37,9 +37,9 @@ WHY = {
     "throttler, rear": "",
     "throttler, front": "",
     "rear filter": "live: its time is that of outlier removal, so of how many points are seen",
-    "front filter": "live: as the rear filter; slots for denser scans would not fit into 100 ms",
+    "front filter": "live: as the rear filter; denser scans leave a slow machine no room in 100 ms",
     "fusion": "live: NumPy moves and joins arrays; Autoware iterates over messages",
-    "voxel grid": "live: sorting the points by cell takes longest where cars are near",
+    "voxel grid": "live: NumPy sorts the points by cell, in one go",
     "localizer": "live: generalised ICP of small_gicp, at most 12 iterations; the paper's is NDT",
 }
 

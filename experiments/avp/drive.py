@@ -21,7 +21,7 @@ from .scene import SCANS, drive, moving_boxes, parked_boxes
 __all__ = ["Drive", "recorded_drive"]
 
 SEED = 1
-VERSION = 2
+VERSION = 3
 MAP_EVERY = 8
 MAP_CELL_M = 0.25
 LOST = (0.02, 0.45)

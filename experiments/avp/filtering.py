@@ -73,8 +73,9 @@ def without_outliers(points: Cloud) -> Cloud:
 
 def voxel_centroids(points: Cloud, size: float = VOXEL_M) -> Cloud:
     """The centroid of the points in every cube of ``size`` metres that has any."""
-    cells = np.floor(points / size)
-    _, voxel, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    cells = np.floor(points / size).astype(np.int64)
+    keys = (cells - cells.min(axis=0, initial=0)) @ np.array([1 << 40, 1 << 20, 1])
+    _, voxel, count = np.unique(keys, return_inverse=True, return_counts=True)
     sums = [np.bincount(voxel, points[:, axis], len(count)) for axis in range(3)]
     centroids: Cloud = (np.stack(sums, axis=1) / count[:, None]).astype(np.float32)
     return centroids

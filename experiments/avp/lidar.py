@@ -34,8 +34,8 @@ class Lidar:
         )
 
 
-FRONT = Lidar(x=3.4, yaw=0.0, width=np.deg2rad(220.0), azimuths=600)
-REAR = Lidar(x=-0.8, yaw=np.pi, width=np.deg2rad(150.0), azimuths=800)
+FRONT = Lidar(x=3.4, yaw=0.0, width=np.deg2rad(220.0), azimuths=500)
+REAR = Lidar(x=-0.8, yaw=np.pi, width=np.deg2rad(150.0), azimuths=660)
 
 
 def directions(lidar: Lidar) -> NDArray[np.float32]:
