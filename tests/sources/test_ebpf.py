@@ -345,7 +345,7 @@ def test_tracing_that_was_compiled_out_is_named_with_the_library(
 ) -> None:
     skip_without_bpftrace()
     disabled = build(tmp_path / "prefix", "-DDISABLED")
-    monkeypatch.setenv("LD_LIBRARY_PATH", str(disabled.library.parent))
+    monkeypatch.setenv("LD_LIBRARY_PATH", str(disabled.tracetools.parent))
     monkeypatch.setattr("chainshaper.sources.tracing_libraries._INSTALLATIONS", tmp_path)
     with pytest.raises(PlatformError, match=r"libtracetools.so: exports no trace point.*DISABLED"):
         EbpfTracer(tmp_path, ("any",), ()).start()

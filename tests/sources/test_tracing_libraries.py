@@ -16,7 +16,7 @@ from chainshaper.sources.tracing_libraries import installed_libraries, mapped_li
 def test_exported_functions_are_those_that_nm_shows(tmp_path: Path) -> None:
     if shutil.which("nm") is None:
         pytest.skip("no nm to compare with")
-    library = build(tmp_path / "prefix").library
+    library = build(tmp_path / "prefix").tracetools
     run = subprocess.run(
         ["nm", "-D", "--defined-only", str(library)], capture_output=True, text=True, check=True
     )
@@ -34,7 +34,7 @@ def test_what_is_no_library_exports_nothing(tmp_path: Path) -> None:
 
 
 def test_a_truncated_library_exports_nothing(tmp_path: Path) -> None:
-    library = build(tmp_path / "prefix").library
+    library = build(tmp_path / "prefix").tracetools
     library.write_bytes(library.read_bytes()[: library.stat().st_size // 2])
     assert exported_functions(library) == frozenset()
 
@@ -52,8 +52,8 @@ def test_every_prefix_of_the_environment_is_searched_and_a_file_counts_once(
         }
     )
     assert [(one.path, one.version, one.major) for one in found] == [
-        (jazzy.library, "8.2.3", 8),
-        (humble.library, "4.1.1", 4),
+        (jazzy.tracetools, "8.2.3", 8),
+        (humble.tracetools, "4.1.1", 4),
     ]
 
 
@@ -63,7 +63,7 @@ def test_running_processes_show_the_library_that_they_have_mapped(tmp_path: Path
     found = mapped_libraries([process.pid, os.getpid(), 2**22 + 1])
     process.communicate("go\n", timeout=60)
     ((pid, (library,)),) = found.items()
-    assert (pid, library.path, library.version) == (process.pid, program.library, "8.2.3")
+    assert (pid, library.path, library.version) == (process.pid, program.tracetools, "8.2.3")
 
 
 def test_a_library_in_a_containers_file_system_is_reached_through_its_process(

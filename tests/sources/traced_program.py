@@ -30,7 +30,7 @@ class Program:
         return self.prefix / "lib/application"
 
     @property
-    def library(self) -> Path:
+    def tracetools(self) -> Path:
         return self.prefix / "lib/libtracetools.so"
 
     def command(self, *arguments: str) -> tuple[str, ...]:
@@ -85,15 +85,15 @@ def build(prefix: Path, *flags: str, version: str = "8.2.3") -> Program:
     """Compile library and program; ``version`` is what the library's package says."""
     skip_without_gcc()
     program = Program(prefix)
-    program.library.parent.mkdir(parents=True)
+    program.tracetools.parent.mkdir(parents=True)
     package = prefix / "share/tracetools/package.xml"
     package.parent.mkdir(parents=True)
     package.write_text(_PACKAGE.format(version))
     gcc = ["gcc", "-O1", *flags]
-    library = [str(_SOURCES / "tracetools.c"), "-shared", "-fPIC", "-o", str(program.library)]
+    library = [str(_SOURCES / "tracetools.c"), "-shared", "-fPIC", "-o", str(program.tracetools)]
     subprocess.run([*gcc, *library], check=True)
     if "-DDISABLED" not in flags:
-        here = ["-L" + str(program.library.parent), "-ltracetools", "-Wl,-rpath,$ORIGIN"]
+        here = ["-L" + str(program.tracetools.parent), "-ltracetools", "-Wl,-rpath,$ORIGIN"]
         application = [str(_SOURCES / "application.c"), *here, "-pthread"]
         subprocess.run([*gcc, *application, "-o", str(program.executable)], check=True)
     return program

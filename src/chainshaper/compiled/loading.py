@@ -44,7 +44,7 @@ def kernel(module: str, name: str) -> Callable[..., int]:
     @functools.cache
     def address() -> int:
         path, symbol = _module_file(module), f"{module}.{name}"
-        digest = _digest(path.parent, symbol)
+        digest = _digest(path.parent)
         for folder in _folders(path.parent):
             file = folder / f"{symbol}-{digest}.o"
             if file.is_file():
@@ -70,8 +70,8 @@ def _module_file(module: str) -> Path:
 
 
 @functools.cache
-def _digest(folder: Path, symbol: str) -> str:
-    digest = hashlib.sha256(symbol.encode())
+def _digest(folder: Path) -> str:
+    digest = hashlib.sha256()
     for source in sorted([*folder.glob("*.py"), *Path(__file__).parent.glob("*.py")]):
         digest.update(source.read_bytes())
     made_by = [version("numba"), version("llvmlite"), llvm.get_process_triple()]

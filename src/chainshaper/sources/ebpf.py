@@ -275,7 +275,7 @@ class EbpfTracer:
         """What a reader of the tables must know."""
         notes = []
         if not tables:
-            libraries = dict.fromkeys(str(point.library) for point in self._points)
+            libraries = dict.fromkeys(str(point.file) for point in self._points)
             notes.append(
                 f"no event was traced: nothing that ran has called {', '.join(libraries)}."
             )

@@ -84,7 +84,7 @@ def bpftrace_script(
         probes.append(_block("tracepoint:sched:sched_process_fork /@traced[pid]/", new))
     probes += [
         _block(
-            f"uprobe:{_quoted(point.library)}:{FUNCTION_PREFIX}{point.event}{restriction}",
+            f"uprobe:{_quoted(point.file)}:{FUNCTION_PREFIX}{point.event}{restriction}",
             _statements(point, code, attached),
         )
         for code, point in enumerate(points, FIRST_POINT)

@@ -41,14 +41,14 @@ class Argument:
 
 @dataclass(frozen=True)
 class TracePoint:
-    """One event's function in one library.
+    """One event's function in one library, which is ``file``.
 
     ``handles_at_rmw`` is whether `rmw_publish` of this version names its publisher;
     ``version`` is that of the library, None if unknown.
     """
 
     event: str
-    library: Path
+    file: Path
     arguments: tuple[Argument, ...]
     version: str | None
     handles_at_rmw: bool
@@ -59,7 +59,7 @@ def trace_points(libraries: Sequence[TracingLibrary]) -> tuple[TracePoint, ...]:
     return tuple(
         TracePoint(
             event=event,
-            library=library.path,
+            file=library.path,
             arguments=_arguments(event, library),
             version=library.version,
             handles_at_rmw=_handles_at_rmw(library),
