@@ -14,7 +14,7 @@ from typing import Any
 import polars as pl
 
 from chainshaper import events
-from chainshaper.sources.lttng_writing import write_lttng_trace
+from chainshaper.sources.lttng.writing import write_lttng_trace
 
 CYCLES = 40
 PERIOD_NS = 50_000_000

@@ -32,7 +32,7 @@ from results import MS, Run
 from chainshaper import apply_plan, open_recording, run_application, shape_application, simulate
 from chainshaper.analysis import analyse_latency
 from chainshaper.enforcement.realtime import available_cores, may_use_fifo
-from chainshaper.enforcement.runs import RunState
+from chainshaper.enforcement.runs.state import RunState
 from chainshaper.errors import OperationError
 from chainshaper.planning import Plan, Slot
 from chainshaper.planning.publisher_threads import publisher_servers

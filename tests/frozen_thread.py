@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from chainshaper.enforcement.gate import sleep_until
-from chainshaper.enforcement.threads import list_threads
+from chainshaper.enforcement.threads.listing import list_threads
 from chainshaper.workload.live import Enforcement, StartedNodes
 
 __all__ = ["freezing_publisher_of", "need_threaded_cgroups"]

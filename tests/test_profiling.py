@@ -13,11 +13,11 @@ from lttng_node import chain_command, required_node
 from processes import wait_for
 
 from chainshaper import InputError, OperationError, PlatformError, open_recording, profiling
-from chainshaper.enforcement.allocation import RecordedProcess, RecordedThread, allocate
-from chainshaper.enforcement.processes import list_processes
 from chainshaper.enforcement.realtime import available_cores, may_use_fifo
-from chainshaper.enforcement.scheduling_state import SchedulingState, state_of
-from chainshaper.enforcement.threads import Thread, list_threads
+from chainshaper.enforcement.runs.scheduling_state import SchedulingState, state_of
+from chainshaper.enforcement.threads.allocation import RecordedProcess, RecordedThread, allocate
+from chainshaper.enforcement.threads.listing import Thread, list_threads
+from chainshaper.enforcement.threads.processes import list_processes
 from chainshaper.profiling import chain_nodes, executors_of, profiling_condition
 
 pytestmark = pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here")

@@ -3,9 +3,9 @@
     find the threads ─► priorities and cores ─► servers ─► anchor ─► arm ─► watch ─► all as before
 
 Nothing of the application is changed but where and when its threads run, and everything that is
-changed stands in a journal first (:mod:`chainshaper.enforcement.journal`): whatever ends the run,
-this function, a signal or a crash, puts it back. Servers are armed only when all nodes run, and
-released before a command of ours is told to end, since a stopped thread cannot.
+changed stands in a journal first (:mod:`chainshaper.enforcement.runs.journal`): whatever ends
+the run, this function, a signal or a crash, puts it back. Servers are armed only when all nodes
+run, and released before a command of ours is told to end, since a stopped thread cannot.
 
 The shaping node is its own server: it holds messages back by itself, so its thread gets a
 priority and a core, and no slots from a back end.
@@ -23,17 +23,21 @@ from pathlib import Path
 from chainshaper.command_process import end_command, start_command
 from chainshaper.dry_run import LEAD_NS, first_thread, server_table, shaping_nodes
 from chainshaper.durations import format_duration
-from chainshaper.enforcement.allocation import Allocation, RecordedProcess, new_and_ended
 from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, make_back_end
-from chainshaper.enforcement.claims import claim_run
-from chainshaper.enforcement.journal import Journal
 from chainshaper.enforcement.phase import DriftWatch, measure_phase
 from chainshaper.enforcement.realtime import available_cores, check_cores
-from chainshaper.enforcement.release_after import start_watching
-from chainshaper.enforcement.runs import RunState, ServerState, remove_run, save_run_state
-from chainshaper.enforcement.scheduling_memory import change_scheduling, restore_scheduling
-from chainshaper.enforcement.server_threads import left_by_back_end, plan_scheduling, server_members
+from chainshaper.enforcement.runs.claims import claim_run
+from chainshaper.enforcement.runs.journal import Journal
+from chainshaper.enforcement.runs.release_after import start_watching
+from chainshaper.enforcement.runs.scheduling_memory import change_scheduling, restore_scheduling
+from chainshaper.enforcement.runs.state import RunState, ServerState, remove_run, save_run_state
 from chainshaper.enforcement.servers import BackEnd, ServerCounters, ServerTable
+from chainshaper.enforcement.threads.allocation import Allocation, RecordedProcess, new_and_ended
+from chainshaper.enforcement.threads.server_threads import (
+    left_by_back_end,
+    plan_scheduling,
+    server_members,
+)
 from chainshaper.errors import OperationError
 from chainshaper.planning import Plan
 from chainshaper.planning.publication import publication_warnings

@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 
 from chainshaper.enforcement.realtime import interrupted_with_parent
-from chainshaper.enforcement.threads import read_proc
+from chainshaper.enforcement.threads.listing import read_proc
 from chainshaper.errors import InputError, OperationError
 
 __all__ = ["check_command", "end_command", "end_in_words", "start_command"]

@@ -16,7 +16,7 @@ import polars as pl
 
 from chainshaper.enforcement.back_ends import offered_back_ends
 from chainshaper.enforcement.realtime import available_cores, may_use_fifo, throttle_fraction
-from chainshaper.enforcement.threads import foreign_realtime_processes
+from chainshaper.enforcement.threads.listing import foreign_realtime_processes
 from chainshaper.recording import StallMeterInfo
 
 __all__ = ["Check", "MachineReport", "examine_machine"]

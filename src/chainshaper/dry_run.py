@@ -6,19 +6,19 @@ end, and the thread with which the chain begins.
 
 from dataclasses import dataclass
 
-from chainshaper.enforcement.allocation import Allocation
 from chainshaper.enforcement.back_ends import choose_back_end
+from chainshaper.enforcement.litmus.resctl import litmus_commands
 from chainshaper.enforcement.phase import measure_phase
 from chainshaper.enforcement.realtime import available_cores
-from chainshaper.enforcement.resctl import litmus_commands
-from chainshaper.enforcement.server_threads import (
+from chainshaper.enforcement.servers import ReservationServer, ServerTable
+from chainshaper.enforcement.threads.allocation import Allocation
+from chainshaper.enforcement.threads.listing import Thread
+from chainshaper.enforcement.threads.server_threads import (
     WantedScheduling,
     left_by_back_end,
     plan_scheduling,
     server_members,
 )
-from chainshaper.enforcement.servers import ReservationServer, ServerTable
-from chainshaper.enforcement.threads import Thread
 from chainshaper.errors import OperationError
 from chainshaper.planning import Plan
 from chainshaper.planning.plan_parts import ShapingNode

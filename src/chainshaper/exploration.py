@@ -26,7 +26,7 @@ from chainshaper.app import ApplicationGraph
 from chainshaper.errors import InputError
 from chainshaper.recording import Recording, RecordingInfo, write_recording
 from chainshaper.sources import open_source
-from chainshaper.sources.event_fields import table_name
+from chainshaper.sources.lttng.event_fields import table_name
 
 __all__ = [
     "ApplicationDescription",

@@ -22,9 +22,9 @@ from chainshaper.analysis import ChainEnumeration, data_flow, graph_of
 from chainshaper.app import ApplicationGraph
 from chainshaper.applying import START_NS, apply_plan
 from chainshaper.durations import format_duration
-from chainshaper.enforcement.processes import Process
 from chainshaper.enforcement.realtime import may_use_fifo
-from chainshaper.enforcement.runs import RunState
+from chainshaper.enforcement.runs.state import RunState
+from chainshaper.enforcement.threads.processes import Process
 from chainshaper.errors import ChainshaperError, InputError, OperationError
 from chainshaper.exploration import list_chains
 from chainshaper.launch_splicing import Splicing, splice_launch_files
@@ -34,8 +34,8 @@ from chainshaper.record import Scheduling, record_command
 from chainshaper.recording import Recording, refuse_existing
 from chainshaper.reporting.comparison_files import write_comparison
 from chainshaper.splicing.generated_package import build_package, check_build_tools
-from chainshaper.splicing.launch_command import LaunchCommand, parse_launch_command
-from chainshaper.splicing.launch_folder import NODES
+from chainshaper.splicing.launch.command import LaunchCommand, parse_launch_command
+from chainshaper.splicing.launch.folder import NODES
 from chainshaper.splicing.shaping_process import NodeKind
 from chainshaper.steps import Comparison, compare_recordings, plan_recording
 

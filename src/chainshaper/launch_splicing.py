@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from chainshaper.errors import InputError
 from chainshaper.planning.plan import Plan, ShapingNode
-from chainshaper.splicing.launch_edit import Copies, edited_copies, unified_diff
-from chainshaper.splicing.launch_file import read_launch_file
-from chainshaper.splicing.launch_folder import (
+from chainshaper.splicing.launch.edit import Copies, edited_copies, unified_diff
+from chainshaper.splicing.launch.file import read_launch_file
+from chainshaper.splicing.launch.folder import (
     LOGS,
     NODES,
     new_folder,
@@ -26,8 +26,8 @@ from chainshaper.splicing.launch_folder import (
     remove_folder,
     usable,
 )
-from chainshaper.splicing.launch_targets import Wanted
-from chainshaper.splicing.launch_walk import follow
+from chainshaper.splicing.launch.targets import Wanted
+from chainshaper.splicing.launch.walk import follow
 from chainshaper.splicing.shaping_process import (
     NodeKind,
     ShapingProcess,

@@ -17,20 +17,20 @@ from pathlib import Path
 
 from chainshaper.analysis import data_flow, find_chain, graph_of
 from chainshaper.durations import format_duration
-from chainshaper.enforcement.allocation import (
+from chainshaper.enforcement.realtime import available_cores, check_cores, may_use_fifo
+from chainshaper.enforcement.runs.claims import claim_run
+from chainshaper.enforcement.runs.journal import Journal
+from chainshaper.enforcement.runs.release_after import start_watching
+from chainshaper.enforcement.runs.scheduling_memory import change_scheduling, restore_scheduling
+from chainshaper.enforcement.runs.state import remove_run
+from chainshaper.enforcement.threads.allocation import (
     Allocation,
     NodeThread,
     RecordedProcess,
     allocate,
 )
-from chainshaper.enforcement.claims import claim_run
-from chainshaper.enforcement.journal import Journal
-from chainshaper.enforcement.processes import Process
-from chainshaper.enforcement.realtime import available_cores, check_cores, may_use_fifo
-from chainshaper.enforcement.release_after import start_watching
-from chainshaper.enforcement.runs import remove_run
-from chainshaper.enforcement.scheduling_memory import change_scheduling, restore_scheduling
-from chainshaper.enforcement.server_threads import scheduling_around
+from chainshaper.enforcement.threads.processes import Process
+from chainshaper.enforcement.threads.server_threads import scheduling_around
 from chainshaper.errors import OperationError, PlatformError
 from chainshaper.recorded_threads import recorded_processes
 from chainshaper.recording import Recording

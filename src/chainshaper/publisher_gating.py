@@ -10,11 +10,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from chainshaper.enforcement.back_ends import choose_back_end, make_back_end
-from chainshaper.enforcement.claims import claim_run
-from chainshaper.enforcement.release_after import start_watching
-from chainshaper.enforcement.runs import remove_run
+from chainshaper.enforcement.runs.claims import claim_run
+from chainshaper.enforcement.runs.release_after import start_watching
+from chainshaper.enforcement.runs.state import remove_run
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
-from chainshaper.enforcement.threads import list_threads
+from chainshaper.enforcement.threads.listing import list_threads
 from chainshaper.errors import OperationError
 from chainshaper.planning import Plan
 from chainshaper.planning.publisher_threads import publisher_servers

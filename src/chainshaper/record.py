@@ -27,14 +27,14 @@ import polars as pl
 
 from chainshaper.command_process import check_command, end_command, end_in_words, start_command
 from chainshaper.durations import format_duration
-from chainshaper.enforcement.processes import (
+from chainshaper.enforcement.realtime import available_cores, may_use_fifo
+from chainshaper.enforcement.threads.listing import parents
+from chainshaper.enforcement.threads.processes import (
     Process,
     descendants,
     find_applications,
     list_processes,
 )
-from chainshaper.enforcement.realtime import available_cores, may_use_fifo
-from chainshaper.enforcement.threads import parents
 from chainshaper.errors import ChainshaperError, InputError, OperationError
 from chainshaper.events import EventTables
 from chainshaper.exploration import with_trace_events
@@ -50,8 +50,8 @@ from chainshaper.recording import (
     refuse_existing,
     write_recording,
 )
-from chainshaper.sources.ros_python import environment_of
-from chainshaper.sources.snapshot import ask_graph
+from chainshaper.sources.ros.interpreter import environment_of
+from chainshaper.sources.ros.snapshot import ask_graph
 from chainshaper.sources.tracer import Tracer
 from chainshaper.splicing.gate_log import with_gate_logs
 from chainshaper.workload.stall_watch import StallWatch, stalls_watched
@@ -176,14 +176,14 @@ def _tracer(
     source: str, folder: Path, command: Sequence[str], pids: Sequence[int], buffer: int | None
 ) -> Tracer:
     if source == "lttng":
-        from chainshaper.sources.lttng_session import LttngSession
+        from chainshaper.sources.lttng.session import LttngSession
 
         return LttngSession(folder, command, pids, buffer)
     if source != "ebpf":
         raise InputError(f"{source!r} is no source of events: name lttng or ebpf")
     if buffer is not None:
         raise InputError("--buffer is about LTTng's buffers: leave it out with `--source ebpf`")
-    from chainshaper.sources.ebpf import EbpfTracer
+    from chainshaper.sources.ebpf.session import EbpfTracer
 
     return EbpfTracer(folder, command, pids)
 
@@ -288,7 +288,7 @@ def _written(  # noqa: PLR0917 - what is known of the run, put together once
     tables, missing = with_gate_logs(tables, gate_logs)
     run.notes += missing
     if run.command is None:  # its nodes were created before tracing began
-        from chainshaper.sources.found_nodes import with_found_nodes
+        from chainshaper.sources.ebpf.found_nodes import with_found_nodes
 
         tables, info = with_found_nodes(tables, info, run.endpoints, run.processes)
     recording = Recording(output, info, tables)
@@ -317,7 +317,7 @@ def _written(  # noqa: PLR0917 - what is known of the run, put together once
 
 def _from_in_force(tables: EventTables, run: _Run) -> tuple[EventTables, str]:
     """The events of what happened under the scheduling, and those of all objects' creation."""
-    from chainshaper.sources.lttng_trace import CREATION
+    from chainshaper.sources.lttng.trace import CREATION
 
     since = run.in_force_ns
     if since is None:

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 
 from chainshaper import events
 from chainshaper.analysis.objects import resolve_objects
-from chainshaper.enforcement.allocation import allocate
-from chainshaper.enforcement.processes import Process
+from chainshaper.enforcement.threads.allocation import allocate
+from chainshaper.enforcement.threads.processes import Process
 from chainshaper.recorded_threads import recorded_processes
 from chainshaper.recording import EndpointInfo, Recording, ThreadInfo
 

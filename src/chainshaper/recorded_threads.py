@@ -11,8 +11,8 @@ import polars as pl
 
 from chainshaper import events
 from chainshaper.analysis import callback_statistics, data_flow
-from chainshaper.enforcement.allocation import RecordedProcess, RecordedThread
-from chainshaper.enforcement.dds_threads import ThreadRole
+from chainshaper.enforcement.threads.allocation import RecordedProcess, RecordedThread
+from chainshaper.enforcement.threads.dds_names import ThreadRole
 from chainshaper.recording import Recording
 
 __all__ = ["recorded_processes"]

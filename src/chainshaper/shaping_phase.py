@@ -5,10 +5,10 @@ message tells. It is measured when a plan is put in force, and told to the node 
 """
 
 from chainshaper.dry_run import shaping_nodes
-from chainshaper.enforcement.allocation import Allocation
+from chainshaper.enforcement.threads.allocation import Allocation
 from chainshaper.planning import Plan
-from chainshaper.sources import ros_parameter
-from chainshaper.sources.ros_python import environment_of, run_with_rclpy
+from chainshaper.sources.ros import parameter as ros_parameter
+from chainshaper.sources.ros.interpreter import environment_of, run_with_rclpy
 
 __all__ = ["tell_phase"]
 

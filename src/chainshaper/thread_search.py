@@ -8,8 +8,8 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from chainshaper.enforcement.allocation import Allocation, RecordedProcess, allocate
-from chainshaper.enforcement.processes import (
+from chainshaper.enforcement.threads.allocation import Allocation, RecordedProcess, allocate
+from chainshaper.enforcement.threads.processes import (
     Process,
     descendants,
     find_applications,

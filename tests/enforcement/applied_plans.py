@@ -11,10 +11,10 @@ import pytest
 from gated import cpu_ns, groups_left, own_cgroup
 from processes import children_of, wait_for
 
-from chainshaper.enforcement import cgroups
-from chainshaper.enforcement.journal import journals_folder
+from chainshaper.enforcement.freezer import cgroups
 from chainshaper.enforcement.realtime import available_cores, may_use_fifo
-from chainshaper.enforcement.threads import list_threads
+from chainshaper.enforcement.runs.journal import journals_folder
+from chainshaper.enforcement.threads.listing import list_threads
 from chainshaper.planning import Plan, save_plan
 from chainshaper.planning.plan_parts import (
     ChainOfPlan,
@@ -33,9 +33,9 @@ needs_fifo = pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not pe
 
 
 MODULES = {
-    "supervisor": "chainshaper.enforcement.freezer_supervisor",
-    "dispatcher": "chainshaper.enforcement.slot_dispatcher",
-    "watcher": "chainshaper.enforcement.release_after",
+    "supervisor": "chainshaper.enforcement.freezer.supervisor",
+    "dispatcher": "chainshaper.enforcement.freezer.slot_dispatcher",
+    "watcher": "chainshaper.enforcement.runs.release_after",
 }
 FREEZER = ("--backend", "freezer", "--phase", "0ms")
 

@@ -11,7 +11,7 @@ import sys
 import time
 from pathlib import Path
 
-from chainshaper.enforcement.freezer import create
+from chainshaper.enforcement.freezer.back_end import create
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 
 MS = 1_000_000

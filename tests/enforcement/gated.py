@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from processes import wait_for
 
-from chainshaper.enforcement.cgroups import cgroup_of, mount_point
+from chainshaper.enforcement.freezer.cgroups import cgroup_of, mount_point
 from chainshaper.enforcement.realtime import available_cores, may_use_fifo
 from chainshaper.errors import PlatformError
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from actors import acting
 
-from chainshaper.enforcement.allocation import (
+from chainshaper.enforcement.threads.allocation import (
     Allocation,
     NodeThread,
     RecordedProcess,
@@ -14,9 +14,9 @@ from chainshaper.enforcement.allocation import (
     allocate,
     new_and_ended,
 )
-from chainshaper.enforcement.dds_threads import dds_kind, role_of
-from chainshaper.enforcement.processes import Process, read_process
-from chainshaper.enforcement.threads import Thread
+from chainshaper.enforcement.threads.dds_names import dds_kind, role_of
+from chainshaper.enforcement.threads.listing import Thread
+from chainshaper.enforcement.threads.processes import Process, read_process
 
 CYCLONE = ("gc", "dq.builtins", "dq.user", "tev", "recv")
 

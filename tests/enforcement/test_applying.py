@@ -26,7 +26,7 @@ from gated import needs_cgroups
 from processes import wait_for
 
 from chainshaper.enforcement.realtime import available_cores
-from chainshaper.enforcement.threads import list_threads
+from chainshaper.enforcement.threads.listing import list_threads
 from chainshaper.planning import save_plan
 
 

@@ -39,7 +39,8 @@ from applied_plans import (
 from gated import cpu_ns, kill, needs_cgroups
 from processes import wait_for
 
-from chainshaper.enforcement import cgroups
+from chainshaper import enforcement
+from chainshaper.enforcement.freezer import cgroups
 from chainshaper.planning import save_plan
 
 pytestmark = [needs_fifo, needs_cgroups]
@@ -269,9 +270,9 @@ def test_steps_of_the_wall_clock_are_not_seen() -> None:
 
     `gate.py` alone reads the wall clock, since messages are stamped with it; its tests step it.
     """
-    package = Path(cgroups.__file__).parent
+    package = Path(enforcement.__file__).parent
     sources = [
-        *package.glob("*.py"),
+        *package.rglob("*.py"),
         *(package.parent / name for name in ("applying.py", "publisher_gating.py")),
     ]
     wall_clock = re.compile(

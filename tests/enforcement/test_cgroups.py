@@ -9,7 +9,7 @@ import pytest
 from gated import cpu_ns, needs_cgroups, own_cgroup, sleeping, stamping
 from processes import children_of, wait_for
 
-from chainshaper.enforcement import cgroups
+from chainshaper.enforcement.freezer import cgroups
 from chainshaper.errors import OperationError, PlatformError
 
 pytestmark = needs_cgroups

@@ -24,12 +24,12 @@ from gated import (
 )
 from processes import children_of, wait_for
 
-from chainshaper.enforcement import cgroups
-from chainshaper.enforcement.freezer import Freezer, create
+from chainshaper.enforcement.freezer import cgroups
+from chainshaper.enforcement.freezer.back_end import Freezer, create
+from chainshaper.enforcement.freezer.slot_dispatcher import PRIORITY, overrun
 from chainshaper.enforcement.realtime import may_use_fifo
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
-from chainshaper.enforcement.slot_dispatcher import PRIORITY, overrun
-from chainshaper.enforcement.threads import list_threads
+from chainshaper.enforcement.threads.listing import list_threads
 
 pytestmark = needs_cgroups
 

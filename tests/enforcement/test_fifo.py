@@ -9,12 +9,12 @@ from actors import Actor, acting
 
 from chainshaper.enforcement import fifo
 from chainshaper.enforcement.fifo import create
-from chainshaper.enforcement.journal import Journal, find_journals, open_journal
 from chainshaper.enforcement.realtime import available_cores, may_use_fifo
-from chainshaper.enforcement.scheduling_memory import change_scheduling
-from chainshaper.enforcement.scheduling_state import state_of
+from chainshaper.enforcement.runs.journal import Journal, find_journals, open_journal
+from chainshaper.enforcement.runs.scheduling_memory import change_scheduling
+from chainshaper.enforcement.runs.scheduling_state import state_of
 from chainshaper.enforcement.servers import BackEnd, ReservationServer, ServerTable
-from chainshaper.enforcement.threads import Scheduling
+from chainshaper.enforcement.threads.listing import Scheduling
 from chainshaper.errors import InputError
 
 pytestmark = pytest.mark.skipif(

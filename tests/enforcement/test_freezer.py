@@ -23,8 +23,8 @@ from gated import (
 )
 from processes import children_of, wait_for
 
-from chainshaper.enforcement.cgroups import cgroup_of
-from chainshaper.enforcement.freezer import Freezer, create
+from chainshaper.enforcement.freezer.back_end import Freezer, create
+from chainshaper.enforcement.freezer.cgroups import cgroup_of
 from chainshaper.enforcement.realtime import may_use_fifo
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.errors import InputError, OperationError, PlatformError

@@ -6,7 +6,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chainshaper.enforcement.node_names import guessed_name, named_nodes, takes_ros_arguments
+from chainshaper.enforcement.threads.node_names import (
+    guessed_name,
+    named_nodes,
+    takes_ros_arguments,
+)
 
 CASES = {
     "talker": (),

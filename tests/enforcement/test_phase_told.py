@@ -14,9 +14,9 @@ from applied_plans import CYCLE, MS, needs_fifo, plan_for, running_node, server
 from processes import wait_for
 
 from chainshaper import applying
-from chainshaper.enforcement.allocation import Allocation
 from chainshaper.enforcement.phase import DriftWatch
-from chainshaper.enforcement.runs import RunState
+from chainshaper.enforcement.runs.state import RunState
+from chainshaper.enforcement.threads.allocation import Allocation
 from chainshaper.planning import Plan
 
 

@@ -5,13 +5,13 @@ from pathlib import Path
 
 from actors import acting
 
-from chainshaper.enforcement.processes import (
+from chainshaper.enforcement.threads.listing import parents
+from chainshaper.enforcement.threads.processes import (
     descendants,
     find_applications,
     list_processes,
     read_process,
 )
-from chainshaper.enforcement.threads import parents
 
 CYCLONE = ("gc", "dq.builtins", "dq.user", "tev", "recv")
 

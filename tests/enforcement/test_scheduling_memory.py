@@ -14,17 +14,17 @@ import pytest
 from actors import Actor, acting
 from processes import wait_for
 
-from chainshaper.enforcement import journal as journal_module
-from chainshaper.enforcement.journal import Journal, find_journals, open_journal
 from chainshaper.enforcement.realtime import available_cores, may_use_fifo
-from chainshaper.enforcement.scheduling_memory import (
+from chainshaper.enforcement.runs import journal as journal_module
+from chainshaper.enforcement.runs.journal import Journal, find_journals, open_journal
+from chainshaper.enforcement.runs.scheduling_memory import (
     Outcome,
     change_scheduling,
     restore_inherited,
     restore_scheduling,
 )
-from chainshaper.enforcement.scheduling_state import SchedulingState, set_state, state_of
-from chainshaper.enforcement.threads import RESET_ON_FORK, Scheduling
+from chainshaper.enforcement.runs.scheduling_state import SchedulingState, set_state, state_of
+from chainshaper.enforcement.threads.listing import RESET_ON_FORK, Scheduling
 from chainshaper.errors import OperationError
 
 pytestmark = pytest.mark.skipif(
@@ -181,10 +181,10 @@ def test_a_new_thread_of_a_class_of_its_own_is_left_alone(tmp_path: Path, journa
 
 _APPLIER = """
 import random, sys, time
-from chainshaper.enforcement.journal import open_journal
+from chainshaper.enforcement.runs.journal import open_journal
 from chainshaper.enforcement.realtime import available_cores
-from chainshaper.enforcement.scheduling_memory import change_scheduling
-from chainshaper.enforcement.threads import Scheduling, list_threads
+from chainshaper.enforcement.runs.scheduling_memory import change_scheduling
+from chainshaper.enforcement.threads.listing import Scheduling, list_threads
 
 journal = open_journal(sys.argv[2])
 cores = available_cores()

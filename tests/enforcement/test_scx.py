@@ -12,9 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper.enforcement import libbpf, scx, scx_requirements
-from chainshaper.enforcement.scx_kicker import what_happened
-from chainshaper.enforcement.scx_loading import POLICY
+from chainshaper.enforcement.scx import back_end as scx
+from chainshaper.enforcement.scx import libbpf
+from chainshaper.enforcement.scx import requirements as scx_requirements
+from chainshaper.enforcement.scx.kicker import what_happened
+from chainshaper.enforcement.scx.loading import POLICY
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.errors import InputError, OperationError, PlatformError
 

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chainshaper.enforcement import scx_table
-from chainshaper.enforcement.scx_table import (
+from chainshaper.enforcement.scx import table as scx_table
+from chainshaper.enforcement.scx.table import (
     change_word,
     check_table,
     number_servers,
@@ -23,7 +23,7 @@ from chainshaper.enforcement.scx_table import (
 from chainshaper.enforcement.servers import ReservationServer, ServerCounters, ServerTable
 from chainshaper.errors import InputError
 
-ABI = Path(scx_table.__file__).with_name("scx_policy") / "table_abi.h"
+ABI = Path(scx_table.__file__).with_name("policy") / "table_abi.h"
 MS = 1_000_000
 
 

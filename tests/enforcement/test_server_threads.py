@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chainshaper.enforcement.allocation import Allocation, NodeThread
-from chainshaper.enforcement.dds_threads import ThreadRole
-from chainshaper.enforcement.server_threads import (
+from chainshaper.enforcement.threads.allocation import Allocation, NodeThread
+from chainshaper.enforcement.threads.dds_names import ThreadRole
+from chainshaper.enforcement.threads.listing import Scheduling, Thread
+from chainshaper.enforcement.threads.server_threads import (
     DDS_PRIORITY,
     WantedScheduling,
     left_by_back_end,
@@ -18,7 +19,6 @@ from chainshaper.enforcement.server_threads import (
     server_members,
     server_priorities,
 )
-from chainshaper.enforcement.threads import Scheduling, Thread
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning import Plan, plan_shaping
 from chainshaper.planning.plan import Server, ShapingNode, revised

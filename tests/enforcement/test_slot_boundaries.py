@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chainshaper.enforcement.slot_boundaries import (
+from chainshaper.enforcement.freezer.slot_boundaries import (
     Anchoring,
     Boundary,
     boundaries_of,

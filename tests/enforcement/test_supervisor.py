@@ -19,8 +19,8 @@ import pytest
 from gated import CORE, MS, Stamping, cpu_ns, groups_left, kill, needs_cgroups, stamping
 from processes import children_of, wait_for
 
-from chainshaper.enforcement.cgroups import cgroup_of
-from chainshaper.enforcement.freezer_state import clean_up, load_state
+from chainshaper.enforcement.freezer.cgroups import cgroup_of
+from chainshaper.enforcement.freezer.state import clean_up, load_state
 from chainshaper.errors import OperationError
 
 pytestmark = needs_cgroups

@@ -15,7 +15,7 @@ from chainshaper.enforcement.realtime import (
     set_thread_name,
     throttle_fraction,
 )
-from chainshaper.enforcement.threads import (
+from chainshaper.enforcement.threads.listing import (
     Scheduling,
     Thread,
     apply_scheduling,

@@ -19,8 +19,8 @@ from chainshaper import events
 from chainshaper.analysis.flow import DataFlow, data_flow
 from chainshaper.errors import InputError, OperationError, PlatformError
 from chainshaper.recording import EndpointInfo, open_recording
-from chainshaper.sources.ebpf import EbpfTracer
-from chainshaper.sources.found_nodes import with_found_nodes
+from chainshaper.sources.ebpf.found_nodes import with_found_nodes
+from chainshaper.sources.ebpf.session import EbpfTracer
 
 CYCLES, PERIOD_NS = 20, 50_000_000
 TOPICS = ("/ebpf1", "/ebpf2")
@@ -287,7 +287,7 @@ def bpftrace_of(parent: int) -> int:
 def test_bpftrace_ends_when_the_tracer_is_killed(program: Program, tmp_path: Path) -> None:
     code = (
         "import sys, time, pathlib\n"
-        "from chainshaper.sources.ebpf import EbpfTracer\n"
+        "from chainshaper.sources.ebpf.session import EbpfTracer\n"
         f"EbpfTracer(pathlib.Path({str(folder_in(tmp_path))!r}), ('any',), ()).start()\n"
         "print('ready', flush=True)\n"
         "time.sleep(60)\n"
@@ -307,7 +307,7 @@ def test_without_privileges_the_error_names_them_and_what_to_do(tmp_path: Path) 
     code = (
         "import os, pathlib\n"
         "from chainshaper.errors import PlatformError\n"
-        "from chainshaper.sources.ebpf import EbpfTracer\n"
+        "from chainshaper.sources.ebpf.session import EbpfTracer\n"
         "os.setuid(65534)\n"
         "try:\n"
         "    EbpfTracer(pathlib.Path('.'), ('any',), ()).start()\n"
@@ -335,7 +335,7 @@ def test_a_machine_without_ros_2_is_told_to_set_it_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     skip_without_bpftrace()
-    monkeypatch.setattr("chainshaper.sources.tracing_libraries._INSTALLATIONS", tmp_path)
+    monkeypatch.setattr("chainshaper.sources.ebpf.tracing_libraries._INSTALLATIONS", tmp_path)
     with pytest.raises(PlatformError, match=r"no libtracetools.so in AMENT_PREFIX_PATH"):
         EbpfTracer(tmp_path, ("any",), ()).start()
 
@@ -346,7 +346,7 @@ def test_tracing_that_was_compiled_out_is_named_with_the_library(
     skip_without_bpftrace()
     disabled = build(tmp_path / "prefix", "-DDISABLED")
     monkeypatch.setenv("LD_LIBRARY_PATH", str(disabled.tracetools.parent))
-    monkeypatch.setattr("chainshaper.sources.tracing_libraries._INSTALLATIONS", tmp_path)
+    monkeypatch.setattr("chainshaper.sources.ebpf.tracing_libraries._INSTALLATIONS", tmp_path)
     with pytest.raises(PlatformError, match=r"libtracetools.so: exports no trace point.*DISABLED"):
         EbpfTracer(tmp_path, ("any",), ()).start()
 
@@ -361,7 +361,7 @@ def test_without_any_node_there_is_nothing_to_attach_to(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     skip_without_bpftrace()
-    monkeypatch.setattr("chainshaper.sources.ebpf.mapped_libraries", lambda _: {})
+    monkeypatch.setattr("chainshaper.sources.ebpf.session.mapped_libraries", lambda _: {})
     with pytest.raises(OperationError, match="no ROS 2 node to attach to"):
         EbpfTracer(tmp_path, (), ()).start()
 

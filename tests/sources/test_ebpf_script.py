@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from traced_program import build, skip_without_bpftrace
 
 from chainshaper import events
-from chainshaper.sources.ebpf_output import HEADER, lost_events, read_printed
-from chainshaper.sources.ebpf_script import (
+from chainshaper.sources.ebpf.output import HEADER, lost_events, read_printed
+from chainshaper.sources.ebpf.script import (
     FIRST_POINT,
     NAME_PLACE,
     RMW_PLACE,
@@ -20,8 +20,8 @@ from chainshaper.sources.ebpf_script import (
     TEXT_LINES,
     bpftrace_script,
 )
-from chainshaper.sources.trace_points import FUNCTION_PREFIX, TracePoint, trace_points
-from chainshaper.sources.tracing_libraries import TracingLibrary, installed_libraries
+from chainshaper.sources.ebpf.trace_points import FUNCTION_PREFIX, TracePoint, trace_points
+from chainshaper.sources.ebpf.tracing_libraries import TracingLibrary, installed_libraries
 
 ALL = frozenset(FUNCTION_PREFIX + event for event in events.FIELDS)
 

@@ -9,8 +9,8 @@ from test_lttng_trace import chain_story, shifted, written
 
 from chainshaper.analysis import analyse_latency, application_graph
 from chainshaper.sources import open_source
-from chainshaper.sources.lttng_trace import NEXT_HOST
-from chainshaper.sources.lttng_writing import write_lttng_trace
+from chainshaper.sources.lttng.trace import NEXT_HOST
+from chainshaper.sources.lttng.writing import write_lttng_trace
 
 
 def container(folder: Path, host: str, names: tuple[str, str], shift: int) -> None:

@@ -8,10 +8,10 @@ import polars as pl
 from chainshaper import events
 from chainshaper.analysis.flow import data_flow
 from chainshaper.analysis.graph import application_graph
-from chainshaper.enforcement.processes import Process
+from chainshaper.enforcement.threads.processes import Process
 from chainshaper.recording import EndpointInfo, RecordingInfo
-from chainshaper.sources.found_nodes import with_found_nodes
-from chainshaper.sources.late_attachment import with_found_objects, with_functions
+from chainshaper.sources.ebpf.found_nodes import with_found_nodes
+from chainshaper.sources.ebpf.late_attachment import with_found_objects, with_functions
 
 PID, THREAD, OTHER = 10, 10, 11
 TIMER, READER, LAMBDA = 0x7A, 0x7B, 0x7C

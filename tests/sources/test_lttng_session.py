@@ -15,8 +15,8 @@ from processes import wait_for
 from chainshaper.errors import InputError, OperationError, PlatformError
 from chainshaper.events import EventTables
 from chainshaper.recording import RecordingInfo
-from chainshaper.sources.lttng_commands import connect
-from chainshaper.sources.lttng_session import MIB, LttngSession, buffer_size
+from chainshaper.sources.lttng.commands import connect
+from chainshaper.sources.lttng.session import MIB, LttngSession, buffer_size
 
 DEPTH = 7  # of every queue in chain_node.c
 

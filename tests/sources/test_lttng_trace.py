@@ -15,7 +15,7 @@ from chainshaper.errors import InputError
 from chainshaper.sources import open_source
 from chainshaper.sources.ctf.lttng_text import lttng_metadata
 from chainshaper.sources.ctf.writer import write_trace
-from chainshaper.sources.lttng_writing import write_lttng_trace
+from chainshaper.sources.lttng.writing import write_lttng_trace
 
 START = 1 << 40  # a machine has been running for a while when its trace begins
 SECOND = 1_000_000_000

@@ -9,8 +9,8 @@ import pytest
 from processes import wait_for
 
 from chainshaper.recording import EndpointInfo
-from chainshaper.sources.ros_python import environment_of
-from chainshaper.sources.snapshot import ask_graph
+from chainshaper.sources.ros.interpreter import environment_of
+from chainshaper.sources.ros.snapshot import ask_graph
 
 RCLPY = '''
 """As much of rclpy 7.1 (Jazzy) as is used, telling what two nodes over Cyclone DDS told."""

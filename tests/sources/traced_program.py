@@ -11,7 +11,7 @@ import pytest
 
 from chainshaper.events import EventTables
 from chainshaper.recording import RecordingInfo
-from chainshaper.sources.ebpf import EbpfTracer
+from chainshaper.sources.ebpf.session import EbpfTracer
 
 __all__ = ["Program", "Traced", "build", "skip_without_bpftrace", "skip_without_gcc", "traced"]
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from chainshaper.errors import InputError
-from chainshaper.splicing.launch_command import parse_launch_command
+from chainshaper.splicing.launch.command import parse_launch_command
 
 ROS2 = "/opt/ros/jazzy/bin/ros2"
 

@@ -14,8 +14,8 @@ from chainshaper import Plan, splice_launch_files
 from chainshaper.errors import InputError
 from chainshaper.planning.plan import revised
 from chainshaper.recording import open_recording
-from chainshaper.splicing.launch_actions import NodeAction, SetRemap, flattened
-from chainshaper.splicing.launch_file import read_launch_file, read_text
+from chainshaper.splicing.launch.actions import NodeAction, SetRemap, flattened
+from chainshaper.splicing.launch.file import read_launch_file, read_text
 
 LAUNCH = Path(__file__).parent / "launch_files"
 

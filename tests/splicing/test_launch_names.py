@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from launch_cases import PACKAGES
 
-from chainshaper.splicing.launch_actions import RemapRule, Substitution
-from chainshaper.splicing.launch_remaps import FullName, PlacedRule, expanded, rules_in_force
-from chainshaper.splicing.launch_substitutions import (
+from chainshaper.splicing.launch.actions import RemapRule, Substitution
+from chainshaper.splicing.launch.remaps import FullName, PlacedRule, expanded, rules_in_force
+from chainshaper.splicing.launch.substitutions import (
     Surroundings,
     described,
     parse_template,

@@ -18,8 +18,8 @@ from ros2 import ros2_environment
 
 from chainshaper.planning import Modes, Plan
 from chainshaper.planning.plan import revised
-from chainshaper.sources import ros_parameter
-from chainshaper.sources.ros_python import run_with_rclpy
+from chainshaper.sources.ros import parameter as ros_parameter
+from chainshaper.sources.ros.interpreter import run_with_rclpy
 from chainshaper.splicing.gate_log import read_gate_log
 from chainshaper.splicing.generated_package import build_package
 from chainshaper.splicing.shaping_process import (

@@ -13,7 +13,7 @@ from chainshaper.cli.options import JsonOption, duration_option
 from chainshaper.cli.signals import stop_on_signals
 
 if TYPE_CHECKING:
-    from chainshaper.enforcement.runs import RunState
+    from chainshaper.enforcement.runs.state import RunState
     from chainshaper.planning import Plan
     from chainshaper.recording import Recording
 

@@ -19,7 +19,7 @@ def release(
 ) -> None:
     """End plans in force, and put back what crashed runs have left changed."""
     from chainshaper.cli.output import show_line
-    from chainshaper.enforcement.runs import end_run, find_runs
+    from chainshaper.enforcement.runs.state import end_run, find_runs
     from chainshaper.errors import InputError, OperationError
 
     runs = [journal for journal, _ in find_runs()]

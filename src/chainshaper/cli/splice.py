@@ -201,7 +201,7 @@ def _opened(recording: Path | None) -> "Recording | None":
 
 def _built(splicing: "Splicing") -> Path:
     from chainshaper.splicing.generated_package import build_package
-    from chainshaper.splicing.launch_folder import NODES
+    from chainshaper.splicing.launch.folder import NODES
 
     return build_package(splicing.folder / NODES)
 

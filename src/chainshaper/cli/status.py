@@ -8,7 +8,7 @@ __all__ = ["status"]
 def status(json: JsonOption = False) -> None:
     """Show the plans in force: back end, servers, counters, and runs that crashed."""
     from chainshaper.cli.output import print_json, show, show_line
-    from chainshaper.enforcement.runs import find_runs, runs_as_json
+    from chainshaper.enforcement.runs.state import find_runs, runs_as_json
     from chainshaper.reporting.servers import runs_table, servers_table
 
     if json:

@@ -10,9 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from chainshaper.enforcement import cgroups, fifo, freezer, litmus, scx
-from chainshaper.enforcement.journal import Journal
+from chainshaper.enforcement import fifo
+from chainshaper.enforcement.freezer import back_end as freezer
+from chainshaper.enforcement.freezer import cgroups
+from chainshaper.enforcement.litmus import back_end as litmus
 from chainshaper.enforcement.realtime import may_use_fifo
+from chainshaper.enforcement.runs.journal import Journal
+from chainshaper.enforcement.scx import back_end as scx
 from chainshaper.enforcement.servers import BackEnd, ServerTable
 from chainshaper.errors import InputError, PlatformError
 

@@ -11,20 +11,20 @@ a shaping node. Threads that stand in the journal by then are left as they are.
 
 from collections.abc import Mapping
 
-from chainshaper.enforcement.allocation import NodeThread
-from chainshaper.enforcement.journal import Journal, discard_journal, open_journal
-from chainshaper.enforcement.scheduling_memory import (
+from chainshaper.enforcement.runs.journal import Journal, discard_journal, open_journal
+from chainshaper.enforcement.runs.scheduling_memory import (
     change_scheduling,
     is_remembered,
     restore_scheduling,
 )
-from chainshaper.enforcement.server_threads import (
+from chainshaper.enforcement.servers import ServerCounters, ServerTable
+from chainshaper.enforcement.threads.allocation import NodeThread
+from chainshaper.enforcement.threads.listing import find_thread
+from chainshaper.enforcement.threads.server_threads import (
     below_their_siblings,
     server_priorities,
     wanted_of_members,
 )
-from chainshaper.enforcement.servers import ServerCounters, ServerTable
-from chainshaper.enforcement.threads import find_thread
 from chainshaper.errors import InputError, OperationError
 
 __all__ = ["Fifo", "create"]

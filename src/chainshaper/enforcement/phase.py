@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from chainshaper.durations import format_duration
-from chainshaper.enforcement.cgroups import has_ended, started_at
+from chainshaper.enforcement.freezer.cgroups import has_ended, started_at
 from chainshaper.errors import OperationError
 
 __all__ = [

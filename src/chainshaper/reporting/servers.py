@@ -7,10 +7,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from chainshaper.durations import format_duration
-from chainshaper.enforcement.journal import Journal
-from chainshaper.enforcement.runs import RunState, ServerState
-from chainshaper.enforcement.server_threads import WantedScheduling
-from chainshaper.enforcement.threads import POLICIES, Scheduling
+from chainshaper.enforcement.runs.journal import Journal
+from chainshaper.enforcement.runs.state import RunState, ServerState
+from chainshaper.enforcement.threads.listing import POLICIES, Scheduling
+from chainshaper.enforcement.threads.server_threads import WantedScheduling
 from chainshaper.planning.plan_parts import slot_text
 
 __all__ = ["changes_table", "run_line", "runs_table", "servers_table"]

@@ -5,7 +5,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from chainshaper.enforcement.allocation import Allocation, NodeThread
+from chainshaper.enforcement.threads.allocation import Allocation, NodeThread
 
 __all__ = ["threads_json", "threads_table"]
 

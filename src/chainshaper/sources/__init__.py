@@ -36,7 +36,7 @@ def open_source(
         if (folder / INFO_FILE).is_file():
             raise InputError(f"{folder} is a recording, which cannot be opened beside others")
     # The decoder is slow to import: only who opens a trace pays for it.
-    from chainshaper.sources.lttng_trace import open_lttng_trace
+    from chainshaper.sources.lttng.trace import open_lttng_trace
 
     return open_lttng_trace(folders, progress, overview=overview)
 

@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 from chainshaper.durations import format_duration
 from chainshaper.enforcement.gate import clock_offset
 from chainshaper.enforcement.realtime import check_cores, may_use_fifo
-from chainshaper.enforcement.threads import (
+from chainshaper.enforcement.threads.listing import (
     Scheduling,
     Thread,
     apply_scheduling,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from chainshaper.enforcement.threads import Scheduling, apply_scheduling, list_threads
+from chainshaper.enforcement.threads.listing import Scheduling, apply_scheduling, list_threads
 from chainshaper.recording import StallMeterInfo
 from chainshaper.workload import stall_meter
 from chainshaper.workload.event_reading import meter_tables

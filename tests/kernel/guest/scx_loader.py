@@ -9,7 +9,7 @@ import sys
 from dataclasses import asdict
 from typing import Any
 
-from chainshaper.enforcement.scx import create
+from chainshaper.enforcement.scx.back_end import create
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.errors import ChainshaperError
 

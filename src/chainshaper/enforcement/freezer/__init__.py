@@ -1,0 +1,1 @@
+"""Servers by `cgroup.freeze`: threads stopped outside their slots by a dispatcher per core."""

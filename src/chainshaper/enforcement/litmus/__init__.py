@@ -1,0 +1,1 @@
+"""Servers of LITMUS^RT: the paper's own back end."""

@@ -1,0 +1,232 @@
+"""The back end `litmus`: the paper's own servers, where the kernel is LITMUS^RT.
+
+The P-RES plugin implements table-driven reservations (paper, section 2.2.1): threads of one server
+take turns, a smaller priority is better, and the kernel does the gating. All is done by the tools
+that come with LITMUS^RT, with the commands of :mod:`.resctl`, which can be printed instead.
+
+A reservation cannot be changed. Another anchor makes new reservations, and each thread moves by
+itself: for the two milliseconds that a command takes, it runs freely. Threads that are created by
+one in a reservation run in it as well, so threads are attached one by one, after those of DDS
+exist.
+"""
+
+import os
+import shutil
+import subprocess
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from chainshaper.enforcement.litmus.resctl import (
+    NO_PLUGIN,
+    PLUGIN,
+    Command,
+    attach_command,
+    create_command,
+    litmus_commands,
+    plugin_command,
+    reservation_ids,
+)
+from chainshaper.enforcement.runs.journal import Journal, discard_journal, open_journal
+from chainshaper.enforcement.runs.scheduling_memory import note_scheduling, restore_scheduling
+from chainshaper.enforcement.runs.scheduling_state import SchedulingClass, state_of
+from chainshaper.enforcement.servers import ServerCounters, ServerTable
+from chainshaper.enforcement.threads.listing import find_thread
+from chainshaper.errors import InputError, OperationError, PlatformError
+
+__all__ = ["Litmus", "create", "restore_plugin"]
+
+SCHED_LITMUS = 7
+PROC = Path("/proc/litmus")
+NOTE = "litmus-plugin"
+COMMAND_S = 10.0
+
+
+def create(table: ServerTable, journal: Journal | None = None, proc: Path = PROC) -> "Litmus":
+    """Prepare servers; nothing is changed before :meth:`Litmus.arm`.
+
+    What was there is kept in ``journal``; without one, in a journal of its own that is discarded
+    with the release. ``proc`` is where LITMUS^RT shows itself.
+
+    Raises:
+        PlatformError: the kernel is not LITMUS^RT, or its tools are not installed.
+        OperationError: somebody else uses the plugin.
+        InputError: the table has what LITMUS^RT cannot do.
+    """
+    if not proc.is_dir():
+        raise PlatformError(
+            f"this kernel ({os.uname().release}) is not LITMUS^RT, there is no {proc}: boot one, "
+            "or use another back end (`--backend auto`); `--dry-run` prints the commands"
+        )
+    for tool in ("setsched", "resctl"):
+        if shutil.which(tool) is None:
+            raise PlatformError(
+                f"{tool} is not on $PATH: build liblitmus (github.com/LITMUS-RT/liblitmus) and "
+                "add its folder"
+            )
+    if _active_plugin(proc) == PLUGIN:
+        raise OperationError(
+            f"the plugin {PLUGIN} is active already, and may hold reservations of others, which "
+            f"LITMUS^RT cannot tell from ours or delete alone: when they are not needed, "
+            f"`setsched {NO_PLUGIN}`"
+        )
+    litmus_commands(table, {}, anchor_ns=0)
+    return Litmus(table, journal, proc)
+
+
+class Litmus:
+    """A table of servers in force as reservations; see :class:`.servers.BackEnd`."""
+
+    name = "litmus"
+
+    def __init__(self, table: ServerTable, journal: Journal | None, proc: Path) -> None:
+        self._table = table
+        self._journal = journal
+        self._owns_journal = journal is None
+        self._proc = proc
+        self._members: dict[int, str] = {}
+        self._ids: dict[str, int] = {}
+        self._generation = 0
+
+    def assign(self, tid: int, server: str) -> None:
+        """Put a thread into a server; one that has ended is passed over.
+
+        Raises:
+            InputError: no such server.
+            OperationError: LITMUS^RT refuses.
+        """
+        names = [one.name for one in self._table.servers]
+        if server not in names:
+            raise InputError(f"no server {server!r}: choose of {', '.join(names)}")
+        self._members[tid] = server
+        if self._ids:
+            self._attach(tid)
+
+    def arm(self, anchor_ns: int) -> None:
+        """Create the reservations, and move all threads into them.
+
+        Raises:
+            OperationError: LITMUS^RT refuses; what was done before stays until the release.
+        """
+        if self._journal is None:
+            self._journal = open_journal()
+        if not self._ids:
+            self._journal.note(NOTE, previous=_active_plugin(self._proc), proc=str(self._proc))
+            _run(plugin_command(PLUGIN))
+        ids = reservation_ids(self._table, self._generation)
+        self._generation += 1
+        for server in self._table.servers:
+            _run(create_command(ids[server.name], server, self._table.cycle_ns, anchor_ns))
+        moving, self._ids = bool(self._ids), ids
+        for tid in self._members:
+            if moving:
+                _leave_reservation(tid)
+            self._attach(tid)
+
+    def counters(self) -> dict[str, ServerCounters]:
+        """Nothing is counted: LITMUS^RT does not tell."""
+        nothing = ServerCounters(None, None, None, None)
+        return {server.name: nothing for server in self._table.servers}
+
+    def failure(self) -> str | None:
+        """Whether somebody has changed the plugin."""
+        if not self._ids or (active := _active_plugin(self._proc)) == PLUGIN:
+            return None
+        return f"somebody has changed the scheduler plugin from {PLUGIN} to {active}"
+
+    def release(self) -> None:
+        """Threads as they were, no reservations, the plugin that was active.
+
+        Raises:
+            OperationError: the kernel refuses; the message says what is left.
+        """
+        if self._journal is None:
+            return
+        outcomes = restore_scheduling(self._journal)
+        self._ids = {}
+        failed = [
+            f"{one.tid} ({one.comm}): {one.reason}" for one in outcomes if one.fate == "failed"
+        ]
+        if failed:
+            raise OperationError(
+                f"threads that could not be put back: {'; '.join(failed)}; {self._journal.path} "
+                "says what they had"
+            )
+        restore_plugin(self._journal)
+        if self._owns_journal:
+            discard_journal(self._journal)
+            self._journal = None
+
+    def _attach(self, tid: int) -> None:
+        assert self._journal is not None  # noqa: S101 - armed
+        thread = find_thread(tid)
+        if thread is None:
+            return
+        name = self._members[tid]
+        core = next(server.core for server in self._table.servers if server.name == name)
+        try:
+            target = replace(
+                state_of(tid),
+                scheduling_class=SchedulingClass(SCHED_LITMUS, 0, reset_on_fork=False),
+                cores=(core,),
+            )
+            if note_scheduling(self._journal, thread, target):
+                _run(attach_command(tid, self._ids[name], core))
+        except (ProcessLookupError, OperationError):
+            if find_thread(tid) is not None:
+                raise
+
+
+def restore_plugin(journal: Journal) -> None:
+    """Activate the plugin that was active before ours, from any process; harmless when repeated.
+
+    To be called when the threads are restored: the kernel changes no plugin that has threads.
+
+    Raises:
+        OperationError: it refuses.
+    """
+    notes = journal.entries(NOTE)
+    if not notes or journal.outdated:
+        return
+    previous, proc = notes[0]["previous"], Path(notes[0]["proc"])
+    if _active_plugin(proc) == PLUGIN:
+        _run(plugin_command(NO_PLUGIN))
+        if previous != NO_PLUGIN:
+            _run(plugin_command(previous))
+
+
+def _leave_reservation(tid: int) -> None:
+    try:
+        os.sched_setscheduler(tid, os.SCHED_OTHER, os.sched_param(0))
+    except ProcessLookupError:
+        return
+    except OSError as error:
+        raise OperationError(
+            f"thread {tid} cannot be taken out of its reservation: {error.strerror}"
+        ) from error
+
+
+def _active_plugin(proc: Path) -> str:
+    try:
+        return (proc / "active_plugin").read_text().strip()
+    except OSError as error:
+        raise PlatformError(
+            f"{proc / 'active_plugin'} cannot be read ({error.strerror}): is this kernel LITMUS^RT?"
+        ) from error
+
+
+def _run(command: Command | Sequence[str]) -> None:
+    """Run a command of LITMUS^RT's; its complaint becomes ours."""
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, check=False, timeout=COMMAND_S
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise OperationError(f"`{' '.join(command)}` cannot be run: {error}") from error
+    if done.returncode:
+        said = (done.stderr + done.stdout).strip().splitlines()
+        reason = said[0] if said else f"exit code {done.returncode}"
+        raise OperationError(
+            f"`{' '.join(command)}`: {reason}; LITMUS^RT's own words are in the kernel's log "
+            "(`dmesg`)"
+        )

@@ -1,0 +1,1 @@
+"""Threads of an application: finding them, naming them, giving them to servers."""

@@ -1,0 +1,1 @@
+"""eBPF: the events of `libtracetools.so` by uprobes, without LTTng."""

@@ -1,0 +1,228 @@
+"""Who exists in an application that ran before tracing began, as far as it can be found out.
+
+Objects tell who they are when they are created. Where nobody listened then, the same tables are
+filled with what is known otherwise, so that the analysis does with it what it always does:
+
+* **Topics**: what a tracer read from the objects behind the handles of `rmw_publish`, `rmw_take`
+  and `rcl_publish`. This is certain.
+* **Subscriptions' callbacks**: an executor takes a message and at once starts the callback that it
+  is for, on the same thread. A callback that nearly always starts like that is its subscription's.
+* **Timers**: callbacks that start without a message, at regular distances. Services' callbacks
+  rarely are regular, and stay unknown, like everything that gets its messages within its process.
+
+Which node each belongs to is found out in :mod:`~chainshaper.sources.ebpf.found_nodes`. All are
+taken to exist from the beginning of the recording. Their handles are the real ones where events
+carry them, and addresses of other things of the same object where not.
+
+This is about rclcpp: rclpy emits no callback events, its endpoints are found all the same.
+"""
+
+from collections.abc import Mapping
+
+import polars as pl
+
+from chainshaper import events
+
+__all__ = ["ADDED", "added_rows", "with_found_objects", "with_functions"]
+
+ADDED = (
+    "rclcpp_subscription_callback_added",
+    "rclcpp_timer_callback_added",
+    "rclcpp_service_callback_added",
+)
+"""The events that make callbacks known."""
+
+_NEARLY_ALWAYS = 0.9
+_MOSTLY = 0.5
+_REGULAR = 0.25
+"""Distances of a timer's starts: by this share of the usual one they are off at most, mostly."""
+_FEWEST_STARTS = 4
+_PERIOD_GRID_NS = 100_000
+
+_CALLBACK = ["pid", "callback"]
+
+
+def with_found_objects(
+    tables: events.EventTables, handles: pl.DataFrame, began_ns: int
+) -> tuple[events.EventTables, tuple[str, ...]]:
+    """Add publishers, subscriptions and callbacks that were there at ``began_ns``.
+
+    ``handles`` has the columns ``pid, event, handle, topic``, as
+    :class:`~chainshaper.sources.ebpf.output.Printed` has them.
+
+    Returns:
+        The tables, and in words what was found and how.
+    """
+    handles = handles.filter(pl.col("topic").str.starts_with("/"))  # others are the RMW's own
+    publishers, subscriptions = _publishers(tables, handles), _subscriptions(tables, handles)
+    starts = _unregistered_starts(tables)
+    readers = _readers(starts).join(
+        subscriptions.select("pid", "rmw_subscription_handle"),
+        on=["pid", "rmw_subscription_handle"],
+        how="semi",
+    )
+    timers = _timers(starts.join(readers, on=_CALLBACK, how="anti"))
+    handle = pl.col("rmw_subscription_handle").alias("subscription_handle")
+    object_ = pl.col("callback").alias("subscription")
+    timer = pl.col("callback").alias("timer_handle")
+    found = {
+        "rcl_publisher_init": publishers,
+        "rcl_subscription_init": subscriptions.with_columns(handle),
+        "rclcpp_subscription_init": readers.select("pid", handle, object_),
+        "rclcpp_subscription_callback_added": readers.select("pid", object_, "callback"),
+        "rcl_timer_init": timers.select("pid", timer, "period"),
+        "rclcpp_timer_callback_added": timers.select("pid", timer, "callback"),
+    }
+    if not any(rows.height for rows in found.values()):
+        return tables, ()
+    note = (
+        "tracing began while the application ran; found were publishers "
+        f"({publishers.height}) and subscriptions ({subscriptions.height}) by the topics in their "
+        f"memory, callbacks of subscriptions ({readers.height}) by the messages taken just before "
+        f"they start, and timers ({timers.height}) by their regularity (their periods are "
+        "measured). Services, and what neither published nor took meanwhile, cannot be known."
+    )
+    return {**tables, **added_rows(tables, found, began_ns)}, (note,)
+
+
+def with_functions(
+    tables: events.EventTables, functions: Mapping[tuple[int, int], str], began_ns: int
+) -> events.EventTables:
+    """Add what `rclcpp_callback_register` would have told: (process, callback) → its function.
+
+    Callbacks were registered when they were added, or before ``began_ns``.
+    """
+    named = pl.DataFrame(
+        [(*callback, symbol) for callback, symbol in functions.items()],
+        schema={"pid": pl.Int32, "callback": pl.UInt64, "symbol": pl.String},
+        orient="row",
+    )
+    added = pl.concat([events.table(tables, name).select("time", *_CALLBACK) for name in ADDED])
+    latest = added.group_by(_CALLBACK).agg(pl.col("time").max())
+    rows = named.join(latest, on=_CALLBACK, how="left").with_columns(
+        pl.col("time").fill_null(began_ns), tid=pl.col("pid")
+    )
+    if not rows.height:
+        return tables
+    known = events.table(tables, "rclcpp_callback_register")
+    both = pl.concat(
+        [rows.select(c for c in known.columns if c in rows.columns), known], how="diagonal"
+    )
+    return {**tables, "rclcpp_callback_register": both.select(known.columns).sort("time")}
+
+
+def added_rows(
+    tables: events.EventTables, rows: Mapping[str, pl.DataFrame], began_ns: int
+) -> dict[str, pl.DataFrame]:
+    """The tables with new rows in front, as events of ``began_ns``; empty ones are left out."""
+    added = {}
+    for name, found in rows.items():
+        if found.height:
+            new = found.with_columns(time=pl.lit(began_ns, dtype=pl.Int64), tid=pl.col("pid"))
+            known = events.table(tables, name)
+            added[name] = pl.concat(
+                [new.select(c for c in known.columns if c in new.columns), known], how="diagonal"
+            ).select(known.columns)
+    return added
+
+
+def _of(handles: pl.DataFrame, event: str, column: str) -> pl.DataFrame:
+    """``pid, <column>, topic_name`` of the handles that were read at an event."""
+    return handles.filter(event=event).select(
+        "pid", pl.col("handle").alias(column), topic_name="topic"
+    )
+
+
+def _publishers(tables: events.EventTables, handles: pl.DataFrame) -> pl.DataFrame:
+    """``pid, publisher_handle, rmw_publisher_handle, topic_name`` of those created before.
+
+    From `rcl_publish` to the `rmw_publish` of the same message lead both handles of a publisher.
+    """
+    key = ["pid", "rmw_publisher_handle"]
+    known = events.table(tables, "rcl_publisher_init")
+    by_rmw = _of(handles, "rmw_publish", key[1]).join(known, on=key, how="anti")
+    written = events.table(tables, "rmw_publish", [key[1], "timestamp"])
+    both = (
+        pl.concat(
+            [
+                events.table(tables, "rcl_publish").select(
+                    "time", "pid", "tid", "message", "publisher_handle"
+                ),
+                written.select("time", "pid", "tid", "message", key[1]),
+            ],
+            how="diagonal",
+        )
+        .sort("time", maintain_order=True)
+        .with_columns(pl.col("publisher_handle").shift(1).over("pid", "tid", "message"))
+        .drop_nulls([key[1], "publisher_handle"])
+        .group_by(key)
+        .agg(pl.col("publisher_handle").mode().first())
+    )
+    by_rmw = by_rmw.join(both, on=key, how="left")
+    by_rcl = _of(handles, "rcl_publish", "publisher_handle")
+    by_rcl = by_rcl.join(known, on=["pid", "publisher_handle"], how="anti")
+    return pl.concat([by_rmw, by_rcl], how="diagonal")
+
+
+def _subscriptions(tables: events.EventTables, handles: pl.DataFrame) -> pl.DataFrame:
+    key = ["pid", "rmw_subscription_handle"]
+    known = events.table(tables, "rcl_subscription_init")
+    return _of(handles, "rmw_take", key[1]).join(known, on=key, how="anti")
+
+
+def _unregistered_starts(tables: events.EventTables) -> pl.DataFrame:
+    """Starts of callbacks that nobody registered: ``time, pid, callback, taken``.
+
+    ``taken`` is the subscription from which the thread had just taken a message, null if it did
+    something else before.
+    """
+    takes = events.table(tables, "rmw_take", ["taken"]).filter(pl.col("taken").fill_null(1) != 0)
+    starts = events.table(tables, "callback_start", ["is_intra_process"])
+    marks = [
+        takes.select("time", "pid", "tid", handle="rmw_subscription_handle"),
+        starts.select("time", "pid", "tid", "callback", "is_intra_process"),
+        events.table(tables, "callback_end").select("time", "pid", "tid"),
+    ]
+    rows = pl.concat(marks, how="diagonal").sort("time", maintain_order=True)
+    rows = rows.with_columns(taken=pl.col("handle").shift(1).over("pid", "tid"))
+    registered = [events.table(tables, name).select(_CALLBACK) for name in ADDED]
+    return (
+        rows.drop_nulls("callback")
+        .filter(pl.col("is_intra_process").fill_null(0) == 0)
+        .join(pl.concat(registered), on=_CALLBACK, how="anti")
+        .select("time", *_CALLBACK, "taken")
+    )
+
+
+def _readers(starts: pl.DataFrame) -> pl.DataFrame:
+    """``pid, callback, rmw_subscription_handle`` of callbacks that start with what was taken."""
+    usual = starts.group_by(_CALLBACK).agg(
+        pl.col("taken").drop_nulls().mode().first().alias("rmw_subscription_handle"),
+        pl.len().alias("starts"),
+    )
+    with_it = pl.col("taken") == pl.col("rmw_subscription_handle")
+    share = (
+        starts.join(usual, on=_CALLBACK)
+        .group_by([*_CALLBACK, "rmw_subscription_handle"])
+        .agg(with_it.fill_null(False).mean().alias("share"))
+    )
+    return share.filter(pl.col("share") >= _NEARLY_ALWAYS).drop("share")
+
+
+def _timers(starts: pl.DataFrame) -> pl.DataFrame:
+    """``pid, callback, period`` of callbacks that start regularly without a message."""
+    gaps = starts.sort("time").with_columns(gap=pl.col("time").diff().over(_CALLBACK))
+    usual = pl.col("gap").median()
+    regular = (pl.col("gap") - usual).abs() <= _REGULAR * usual
+    found = gaps.group_by(_CALLBACK).agg(
+        pl.len().alias("starts"),
+        pl.col("taken").count().alias("taken"),
+        regular.mean().alias("share"),
+        usual.alias("period"),
+    )
+    period = (pl.col("period") / _PERIOD_GRID_NS).round() * _PERIOD_GRID_NS
+    return found.filter(
+        (pl.col("starts") >= _FEWEST_STARTS)
+        & (pl.col("taken") <= (1 - _NEARLY_ALWAYS) * pl.col("starts"))
+        & (pl.col("share") >= _MOSTLY)
+    ).select(*_CALLBACK, period=pl.when(period > 0).then(period).otherwise("period").cast(pl.Int64))

@@ -1,0 +1,385 @@
+"""Tracing with eBPF: uprobes on the library that every ROS 2 node has, set by bpftrace.
+
+No LTTng and no session daemon are needed, only bpftrace and the privilege to use it. Uprobes belong
+to a file, so they are there before the first process maps it, and they reach processes that run
+already. What they cost a thread, and what cannot be seen by them, is in `docs/record_ebpf.md`.
+
+bpftrace writes into a file, and we read it when all is over. It says on its own output when all
+probes are in place. Probes are set, and removed, one after the other: what comes before the last
+one was set or after the first one was removed is left out, because instances and messages would
+be incomplete there.
+
+Upstream: bpftrace(8); `src/bpftrace.cpp` of bpftrace 0.17 to 0.26.
+"""
+
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+
+import polars as pl
+
+from chainshaper import events
+from chainshaper.enforcement.gate import clock_offset
+from chainshaper.enforcement.realtime import interrupted_with_parent
+from chainshaper.enforcement.threads.listing import parents
+from chainshaper.enforcement.threads.processes import descendants
+from chainshaper.errors import InputError, OperationError, PlatformError
+from chainshaper.events import EventTables
+from chainshaper.recording import RecordingInfo
+from chainshaper.sources.ebpf.callback_functions import callback_functions
+from chainshaper.sources.ebpf.late_attachment import ADDED, with_found_objects, with_functions
+from chainshaper.sources.ebpf.output import HEADER, Printed, lost_events, read_printed
+from chainshaper.sources.ebpf.script import TEXT_BYTES, bpftrace_script
+from chainshaper.sources.ebpf.trace_points import TracePoint, trace_points
+from chainshaper.sources.ebpf.tracing_libraries import (
+    LIBRARY,
+    TracingLibrary,
+    installed_libraries,
+    mapped_libraries,
+)
+from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids
+
+__all__ = ["EbpfTracer"]
+
+_SCRIPT, _EVENTS, _SAID = "events.bt", "events.txt", "bpftrace.log"
+_ATTACHED = "__BPFTRACE_NOTIFY_PROBES_ATTACHED"
+_SETTINGS = {
+    _ATTACHED: "1",
+    "BPFTRACE_PERF_RB_PAGES": "1024",  # 4 MiB (a core, before 0.21): some 50,000 events
+    "BPFTRACE_MAP_KEYS_MAX": "65536",  # until 0.18; its name since then:
+    "BPFTRACE_MAX_MAP_KEYS": "65536",
+    "BPFTRACE_MAX_PROBES": "4096",
+    "BPFTRACE_MAX_BPF_PROGS": "4096",
+    "BPFTRACE_CACHE_USER_SYMBOLS": "0",
+}
+_NICE = 10
+_SHORTEST_SUSPENSION_NS = 1_000_000
+_START_S = 120.0
+_READ_S = 10.0
+_STOP_S = 60.0
+_CAP_SYS_ADMIN, _CAP_PERFMON, _CAP_BPF = 21, 38, 39
+_FIRST_PID_NAMESPACE = "pid:[4026531836]"  # linux/proc_ns.h: PROC_PID_INIT_INO
+
+
+class EbpfTracer:
+    """Records with bpftrace: a :class:`~chainshaper.sources.tracer.Tracer`."""
+
+    def __init__(self, folder: Path, command: Sequence[str], pids: Sequence[int]) -> None:
+        self._folder = folder.absolute()
+        self._attached = not command
+        self._pids = tuple(pids)
+        self._points: tuple[TracePoint, ...] = ()
+        self._bpftrace: subprocess.Popen[bytes] | None = None
+        self._began_ns = 0
+        self._ended_ns: int | None = None
+        self._ahead_ns = 0
+        self._clock_offset_ns = 0
+        self._notes: list[str] = []
+        self._printed: Printed | None = None
+        self._functions: dict[tuple[int, int], str] = {}
+
+    def start(self) -> Mapping[str, str]:
+        """Find the libraries, write the script, and wait until its probes are in place."""
+        _check_privileges()
+        if shutil.which("bpftrace") is None:
+            raise PlatformError(
+                "bpftrace is not installed: install it (Debian and Ubuntu: `apt-get install "
+                "bpftrace`; 0.17 or later), or record with `--source lttng`"
+            )
+        self._points = trace_points(self._libraries())
+        script = bpftrace_script(self._points, self._traced(), attached=self._attached)
+        (self._folder / _SCRIPT).write_text(script)
+        self._clock_offset_ns, self._ahead_ns = clock_offset(), _boot_time_ahead()
+        self._bpftrace = self._launched()
+        self._wait_until_attached(self._bpftrace)
+        self._began_ns = time.monotonic_ns()
+        return {}
+
+    def failure(self) -> str | None:
+        """Look whether bpftrace is there."""
+        if self._bpftrace is None or self._bpftrace.poll() is None:
+            return None
+        return f"bpftrace ended with code {self._bpftrace.returncode}: {self._complaint()}"
+
+    def stop(self) -> None:
+        """Have bpftrace remove its probes and write down what it holds."""
+        if self._bpftrace is None or self._ended_ns is not None:
+            return
+        self._ended_ns = time.monotonic_ns()
+        if _boot_time_ahead() - self._ahead_ns > _SHORTEST_SUSPENSION_NS:
+            self._notes.append(
+                "the machine was suspended during the recording: times after that are too late by "
+                "as long as it slept."
+            )
+        _wait_until_idle(self._bpftrace.pid)
+        self._bpftrace.send_signal(signal.SIGINT)
+        try:
+            self._bpftrace.wait(_STOP_S)
+        except subprocess.TimeoutExpired:
+            raise OperationError(
+                f"bpftrace (process {self._bpftrace.pid}) did not end within {_STOP_S:.0f} s and "
+                "is killed: the last events are missing"
+            ) from None
+        with suppress(OSError, pl.exceptions.PolarsError):  # `recording` says what is wrong
+            self._printed = self._read()
+            # As long as the application runs: its memory tells.
+            self._functions = callback_functions(_callbacks(self._printed.tables))
+
+    def remove(self) -> None:
+        """End bpftrace if it still runs; the kernel removes its probes with it."""
+        if self._bpftrace is not None and self._bpftrace.poll() is None:
+            self._bpftrace.kill()
+            self._bpftrace.wait()
+
+    def recording(self) -> tuple[EventTables, RecordingInfo]:
+        """The events that bpftrace printed, and what is known of a system that ran already."""
+        output = self._folder / _EVENTS
+        try:
+            printed = self._printed or self._read()
+            lost = lost_events(output, self._folder / _SAID)
+        except (OSError, pl.exceptions.PolarsError) as error:
+            raise OperationError(
+                f"{output}: what bpftrace wrote cannot be read: {error}"
+            ) from error
+        tables: EventTables = self._whole(printed.tables)
+        notes = [*self._notes, *self._about(tables, printed, lost)]
+        if self._attached:
+            tables, found = with_found_objects(tables, printed.handles, self._began_ns)
+            notes += found
+        tables = with_functions(tables, self._functions, self._began_ns)
+        info = RecordingInfo(
+            source="ebpf",
+            distribution=distribution_of(_started_with(self._points), {}),
+            rmw=printed.rmw or rmw_of_gids(tables),
+            clock_offset_ns=self._clock_offset_ns,
+            processes=processes_of(tables, _commands(tables)),
+            lost={"lost_events": lost},
+            notes=tuple(notes),
+        )
+        return tables, info
+
+    def _read(self) -> Printed:
+        return read_printed(self._folder / _EVENTS, self._points, self._ahead_ns)
+
+    def _libraries(self) -> tuple[TracingLibrary, ...]:
+        """The libraries to set probes on; at least one that exports trace points."""
+        if not self._attached:
+            libraries = installed_libraries(os.environ)
+            if not libraries:
+                raise PlatformError(
+                    f"no {LIBRARY} in AMENT_PREFIX_PATH, LD_LIBRARY_PATH or /opt/ros: set ROS 2 up "
+                    "first (`source /opt/ros/DISTRIBUTION/setup.bash`); an application in a "
+                    "container is started first, then attached to (no COMMAND)"
+                )
+        else:
+            mapped = mapped_libraries(parents())
+            strangers = [pid for pid in self._pids if not _family((pid,)) & mapped.keys()]
+            if strangers:
+                raise InputError(
+                    f"process {', '.join(map(str, strangers))} neither uses {LIBRARY}, as every "
+                    "ROS 2 node does, nor has started one that does: give processes of nodes "
+                    "(`chainshaper threads` lists them)"
+                )
+            if self._pids:
+                mapped = {pid: mapped[pid] for pid in _family(self._pids) & mapped.keys()}
+            libraries = tuple(dict.fromkeys(one for found in mapped.values() for one in found))
+            if not libraries:
+                raise OperationError(
+                    f"no process that runs uses {LIBRARY}, so there is no ROS 2 node to attach to: "
+                    "start the application first, or give the COMMAND that does behind `--`"
+                )
+        if not trace_points(libraries):
+            paths = ", ".join(str(library.path) for library in libraries)
+            raise PlatformError(
+                f"{paths}: exports no trace point, because this ROS 2 was built without tracing "
+                "(TRACETOOLS_DISABLED): build tracetools with it, or install ROS 2's packages"
+            )
+        return libraries
+
+    def _traced(self) -> tuple[int, ...]:
+        """The processes that events are limited to, with all that they start; empty: to none."""
+        if self._attached and not self._pids:
+            return ()
+        # What we start is ours: the application, which does not run yet.
+        wanted = self._pids or (os.getpid(),)
+        if Path("/proc/self/ns/pid").readlink() != Path(_FIRST_PID_NAMESPACE):
+            self._notes.append(
+                "inside a container bpftrace cannot tell which process is which: everything on "
+                "this machine that uses the same libraries was recorded, under the machine's "
+                "process numbers."
+            )
+            return ()
+        return tuple(sorted(_family(wanted)))
+
+    def _launched(self) -> "subprocess.Popen[bytes]":
+        command = ["bpftrace", "-B", "full", str(self._folder / _SCRIPT)]
+        with (
+            (self._folder / _EVENTS).open("wb") as printed,
+            (self._folder / _SAID).open("wb") as said,
+        ):
+            printed.write(HEADER.encode())
+            printed.flush()
+            return subprocess.Popen(
+                command,
+                env={**_SETTINGS, **os.environ},
+                stdin=subprocess.DEVNULL,
+                stdout=printed,
+                stderr=said,
+                start_new_session=True,  # Ctrl-C is ours to react to
+                preexec_fn=partial(_in_the_background, os.getpid()),  # noqa: PLW1509
+            )
+
+    def _wait_until_attached(self, bpftrace: "subprocess.Popen[bytes]") -> None:
+        until = time.monotonic() + _START_S
+        while not self._has_attached():
+            if bpftrace.poll() is not None:
+                raise PlatformError(
+                    f"bpftrace cannot trace here: {self._complaint()}; it needs a kernel with BPF, "
+                    "uprobes and tracefs, and CAP_BPF, CAP_PERFMON and CAP_SYS_ADMIN (in a "
+                    "container: `docker run --privileged --pid host`)"
+                )
+            if time.monotonic() > until:
+                raise OperationError(
+                    f"bpftrace did not set its probes within {_START_S:.0f} s: {self._complaint()}"
+                )
+            time.sleep(0.02)
+
+    def _has_attached(self) -> bool:
+        """Whether bpftrace says so; to its standard output since 0.23."""
+        files = (self._folder / _SAID, self._folder / _EVENTS)
+        return any(_ATTACHED.encode() in file.read_bytes() for file in files)
+
+    def _complaint(self) -> str:
+        """What bpftrace says is wrong, in one line."""
+        said = (self._folder / _SAID).read_text(errors="replace").splitlines()
+        lines = [line.strip() for line in said if line.strip() and _ATTACHED not in line]
+        wrong = [line for line in lines if "ERROR" in line and "RLIMIT_MEMLOCK" not in line]
+        return "; ".join(wrong or lines[-1:]).replace("ERROR: ", "") or "it does not say why"
+
+    def _whole(self, tables: Mapping[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
+        """The tables without what happened while not all probes were in place."""
+        ended = self._ended_ns or time.monotonic_ns()
+        within = {
+            name: t.filter(pl.col("time").is_between(self._began_ns, ended))
+            for name, t in tables.items()
+        }
+        return {name: table for name, table in within.items() if table.height}
+
+    def _about(self, tables: EventTables, printed: Printed, lost: int) -> list[str]:
+        """What a reader of the tables must know."""
+        notes = []
+        if not tables:
+            libraries = dict.fromkeys(str(point.file) for point in self._points)
+            notes.append(
+                f"no event was traced: nothing that ran has called {', '.join(libraries)}."
+            )
+        if "rclcpp_callback_register" not in tables and (
+            unknown := set(_callbacks(tables)) - self._functions.keys()
+        ):
+            notes.append(
+                f"{len(unknown)} callbacks' functions have no name: the application had ended, or"
+                " its files were stripped."
+            )
+        if lost:
+            pages = os.environ.get("BPFTRACE_PERF_RB_PAGES", _SETTINGS["BPFTRACE_PERF_RB_PAGES"])
+            notes.append(
+                f"{lost} events were lost: bpftrace could not keep up. Record again with larger "
+                f"buffers (environment variable BPFTRACE_PERF_RB_PAGES, a power of two above "
+                f"{pages}), or leave it a core that is less busy."
+            )
+        if printed.cut_names:
+            notes.append(f"{printed.cut_names} names are longer than {TEXT_BYTES} bytes and cut.")
+        return notes
+
+
+def _in_the_background(parent_pid: int) -> None:
+    """Have a new process end with its parent, and disturb the threads little that it watches.
+
+    Every event wakes it. If it pre-empted the thread then, as ordinary processes do, these were two
+    switches, thus two events, and so on: ten times as many events as there were to be recorded.
+    """
+    interrupted_with_parent(parent_pid)
+    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    os.nice(_NICE)
+
+
+def _callbacks(tables: EventTables) -> Iterator[tuple[int, int]]:
+    """Processes and handles of all callbacks that were added or started."""
+    for name in (*ADDED, "callback_start"):
+        yield from events.table(tables, name).select("pid", "callback").unique().iter_rows()
+
+
+def _family(pids: Iterable[int]) -> set[int]:
+    """These processes, and all that they have started."""
+    parent_of = parents()
+    return set().union(*(descendants(parent_of, pid) for pid in pids))
+
+
+def _wait_until_idle(bpftrace: int) -> None:
+    """Wait until bpftrace has printed all that there was: then it sleeps.
+
+    What it has not read when it is told to end, it throws away.
+    """
+    until = time.monotonic() + _READ_S
+    with suppress(OSError):  # it has ended
+        while time.monotonic() < until:
+            time.sleep(0.02)
+            state = Path(f"/proc/{bpftrace}/stat").read_text().rpartition(")")[2].split()[0]
+            if state != "R":
+                return
+
+
+def _check_privileges() -> None:
+    """bpftrace would say it as well, but not what else can be done."""
+    status = Path("/proc/self/status").read_text()
+    line = next(line for line in status.splitlines() if line.startswith("CapEff:"))
+    held = int(line.split()[1], 16)
+    enough = all(held >> capability & 1 for capability in (_CAP_BPF, _CAP_PERFMON))
+    if not (enough or held >> _CAP_SYS_ADMIN & 1):
+        raise PlatformError(
+            "tracing with eBPF needs root, or bpftrace 0.25 and the capabilities CAP_BPF, "
+            "CAP_PERFMON, CAP_DAC_READ_SEARCH and CAP_DAC_OVERRIDE: start the application as "
+            "yourself, then attach to it with `sudo chainshaper record --source ebpf -o REC "
+            "--duration 30s`; or record with `--source lttng`, which needs neither"
+        )
+
+
+def _boot_time_ahead() -> int:
+    """CLOCK_BOOTTIME minus CLOCK_MONOTONIC in ns: how long the machine has been suspended.
+
+    The narrowest of several brackets counts, because we may be pre-empted within one. Suspensions
+    are longer than a millisecond; without one the two are the same clock.
+    """
+    brackets = []
+    for _ in range(10):
+        before = time.monotonic_ns()
+        boot_time = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        after = time.monotonic_ns()
+        brackets.append((after - before, boot_time - (before + after) // 2))
+    _, ahead = min(brackets)
+    return ahead if ahead > _SHORTEST_SUSPENSION_NS else 0
+
+
+def _started_with(points: Sequence[TracePoint]) -> EventTables:
+    """What `rcl_init` says of each library's version, whether or not it was traced."""
+    return {"rcl_init": pl.DataFrame({"version": [point.version for point in points[:1]]})}
+
+
+def _commands(tables: EventTables) -> dict[int, str]:
+    """Process → the name of its main thread as `sched_switch` has it, empty if unknown."""
+    names = {}
+    if "sched_switch" in tables:
+        switches = (
+            tables["sched_switch"].select("next_tid", "next_comm").unique("next_tid", keep="last")
+        )
+        names = dict(switches.iter_rows())
+    pids = {
+        pid for name, t in tables.items() if name != "sched_switch" for pid in t["pid"].unique()
+    }
+    return {pid: names.get(pid) or "" for pid in sorted(pids)}

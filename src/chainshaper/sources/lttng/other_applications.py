@@ -1,0 +1,60 @@
+"""Telling the command's processes from others that the same session daemon traces.
+
+A process is the command's if it descends from us, or has a mark of ours in its environment: a
+daemon, whose parent is gone, keeps that, and what `sudo` starts, which has lost it, descends.
+Everybody else's events are left out of the tables.
+"""
+
+import os
+from collections.abc import Collection
+
+import polars as pl
+
+from chainshaper.enforcement.threads.listing import parents, read_proc
+from chainshaper.enforcement.threads.processes import descendants
+from chainshaper.events import EventTables
+from chainshaper.recording import RecordingInfo
+
+__all__ = ["processes_apart", "without_processes"]
+
+
+def processes_apart(mark: str) -> tuple[set[int], set[int]]:
+    """The living processes that somebody else has started, and those that we have."""
+    parent_of = parents()
+    unrelated = set(parent_of) - descendants(parent_of, os.getpid())
+    others = {pid for pid in unrelated if not _is_marked(pid, mark)}
+    return others, set(parent_of) - others
+
+
+def _is_marked(pid: int, mark: str) -> bool:
+    try:
+        return mark.encode() in read_proc(f"/proc/{pid}/environ").split(b"\0")
+    except OSError:  # it has ended, or is another user's
+        return False
+
+
+def without_processes(
+    strangers: Collection[int], tables: EventTables, info: RecordingInfo
+) -> tuple[EventTables, RecordingInfo]:
+    """The events without those of processes that are none of the command's, if there are any."""
+    traced = (frame["pid"].drop_nulls().unique() for frame in tables.values())
+    foreign = sorted({pid for pids in traced for pid in pids} & set(strangers))
+    if not foreign:
+        return tables, info
+    own = {
+        name: frame.filter(~pl.col("pid").is_in(foreign).fill_null(False))
+        for name, frame in tables.items()
+    }
+    names = ", ".join(f"{pid} {info.processes.get(pid, '')}".strip() for pid in foreign)
+    facts = {
+        "processes": {pid: name for pid, name in info.processes.items() if pid not in foreign},
+        "notes": (
+            *info.notes,
+            f"processes that the command has not started are left out: {names}.",
+        ),
+        "trace_events": {
+            name if name == "sched_switch" else f"ros2:{name}": frame.height
+            for name, frame in own.items()
+        },
+    }
+    return own, info.model_copy(update=facts)

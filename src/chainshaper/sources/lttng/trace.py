@@ -1,0 +1,333 @@
+"""LTTng traces as recordings: the folders that `ros2 trace` writes.
+
+Events keep their names without the provider (``ros2:callback_start`` → ``callback_start``) and get
+the columns and types of :mod:`chainshaper.events`; what the analysis does not know is left out
+(:mod:`~chainshaper.sources.lttng.event_fields`). Tables are decoded in groups that are used
+together, because one pass over a trace costs nearly the same for one table as for twenty: those
+of the objects' creation, of callbacks and of messages at once, since every analysis needs them
+(an overview only creation); what the upper layers say about the same messages, `sched_switch` and
+the executor's when somebody asks for them.
+
+Times stay what the tracer wrote, ns of CLOCK_MONOTONIC. Process numbers do too, with one exception:
+containers number their processes independently of each other, so folders of several hosts are
+read host by host, and where two of them use the same number, the later host's are moved
+(:data:`NEXT_HOST`).
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from threading import Lock
+from typing import TypeAlias
+
+import polars as pl
+
+from chainshaper import events
+from chainshaper.errors import InputError, OperationError
+from chainshaper.recording import Recording, RecordingInfo
+from chainshaper.sources.ctf import CtfError, CtfTrace, count_events, open_trace, read_events
+from chainshaper.sources.ctf.read import Events
+from chainshaper.sources.ctf.types import ArrayType
+from chainshaper.sources.lttng.event_fields import (
+    CARET_INIT,
+    declared_fields,
+    event_table,
+    merged,
+    missing_fields,
+    table_name,
+)
+from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids, rmw_of_threads
+
+__all__ = ["CREATION", "NEXT_HOST", "Progress", "TraceTables", "open_lttng_trace"]
+
+Progress: TypeAlias = Callable[[float, str], None]
+"""Told the share of the work that is done, from 0 to 1, and what is being done."""
+
+NEXT_HOST = 10_000_000
+"""Added to the process and thread numbers of the next host; Linux goes up to 4,194,304."""
+
+_EXECUTOR = frozenset(name for name in events.FIELDS if name.startswith("rclcpp_executor_"))
+_SWITCHES = frozenset(("sched_switch",))
+CREATION = frozenset(
+    name
+    for name in events.FIELDS
+    if name.endswith(("_init", "_added", "_register", "_link_node", "_to_ipb", "_to_subscription"))
+) | {"rmw_implementation", "rclcpp_construct_ring_buffer"}
+"""The events of objects' creation, which say what all others are about."""
+_UPPER_LAYERS = frozenset(("rclcpp_publish", "rcl_publish", "rcl_take", "rclcpp_take"))
+_MESSAGES = frozenset(events.FIELDS) - _EXECUTOR - _SWITCHES - CREATION - _UPPER_LAYERS
+_GROUPS = (CREATION, _MESSAGES, _UPPER_LAYERS, _EXECUTOR, _SWITCHES)
+_ALSO = frozenset((CARET_INIT,))  # read with the creation
+_WHO_RUNS = ("callback_start", "rmw_publish", "rmw_take", "rclcpp_publish")
+
+
+class TraceTables(Mapping[str, pl.DataFrame]):
+    """The event tables of an open trace, decoded on first use.
+
+    ``counts`` are the events per full name, provider included. Only events that happened are in
+    the mapping.
+    """
+
+    def __init__(self, trace: CtfTrace, progress: Progress, overview: bool) -> None:
+        self._trace = trace
+        self._hosts = _by_host(trace)
+        self._fields = declared_fields(trace)
+        self._progress = progress
+        self._read: dict[str, pl.DataFrame] = {}
+        self._decoding = Lock()  # the analysis asks for tables from two threads
+        self._sources: dict[str, list[str]] = {}
+        for full_name in trace.event_names:
+            name = table_name(full_name)
+            if name is not None:
+                self._sources.setdefault(name, []).append(full_name)
+        self.counts: dict[str, int] = {}
+        self.warnings: tuple[str, ...] = ()
+        self._names: dict[int, str] = {}
+        self._anonymous = 0
+        self._pids: set[int] = set()
+        self._moved: dict[str, int] = {}
+        # Where numbers may collide, everybody's have to be seen first.
+        everything = not overview or len(self._hosts) > 1
+        self._decode(CREATION | _ALSO | (_MESSAGES if everything else frozenset()))
+
+    def creation(self) -> events.EventTables:
+        """The tables of the objects' creation, and CARET's `caret_init`; empty ones included."""
+        return {name: self._read[name] for name in CREATION | _ALSO if name in self._read}
+
+    def commands(self) -> dict[int, str]:
+        """Process → its name, as far as the tracer recorded it with the objects' creation.
+
+        Where nothing was created during the recording, everything that ran is looked at.
+        """
+        tables = [self._read[name] for name in CREATION if name in self._read]
+        if not any(self._counted(name) for name in ("rcl_node_init", "rcl_init")):
+            tables += [self[name] for name in _WHO_RUNS if name in self]
+        return {
+            pid: self._names.get(pid, "")
+            for table in tables
+            for pid in table["pid"].unique().drop_nulls().to_list()
+        }
+
+    def thread_names(self) -> set[str]:
+        """Names of threads that the tracer recorded, the kernel's view included."""
+        names = set(self._names.values())
+        if "sched_switch" in self and "next_comm" in self["sched_switch"].columns:
+            names |= set(self["sched_switch"]["next_comm"].unique().drop_nulls())
+        return names
+
+    def __getitem__(self, name: str) -> pl.DataFrame:
+        if name not in self:
+            raise KeyError(name)
+        with self._decoding:
+            if name not in self._read:
+                self._decode(next(group for group in _GROUPS if name in group))
+        return self._read[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in events.FIELDS and self._counted(str(name)) > 0
+
+    def __iter__(self) -> Iterator[str]:
+        return (name for name in sorted(self._sources) if name in self)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+    def _counted(self, name: str) -> int:
+        return sum(self.counts.get(source, 0) for source in self._sources.get(name, ()))
+
+    def notes(self) -> tuple[str, ...]:
+        """What a reader of the tables must know: damage, absent fields, numbers that were moved."""
+        moved = [
+            f"processes and threads of host {host} have {by} added to their numbers, which another "
+            "host's processes have as well."
+            for host, by in self._moved.items()
+            if by
+        ]
+        anonymous = (
+            f"{self._anonymous} events say no process or thread and cannot be used: record with "
+            "`ros2 trace`, or `lttng add-context --userspace --type=vpid --type=vtid`."
+        )
+        return (
+            *self.warnings,
+            *missing_fields(self._fields, self.counts),
+            *moved,
+            *([anonymous] if self._anonymous else ()),
+        )
+
+    def _decode(self, group: frozenset[str]) -> None:
+        parts: dict[str, list[pl.DataFrame]] = {}
+        first, nameless = not self.counts, not self._names
+        for place, (host, trace) in enumerate(self._hosts.items()):
+            found = self._decoded(trace, group, place)
+            if first:
+                self._take_stock(trace, found)
+                self._settle_numbers(host, found)
+            if nameless:
+                self._note_names(host, trace, found)
+            for name in group:
+                for full in self._sources.get(name, ()):
+                    decoded = found.pop(full)  # let go of what is in no table
+                    table = event_table(decoded, name, trace.clock_offset_ns)
+                    self._anonymous += (decoded.height - table.height) * first
+                    parts.setdefault(name, []).append(self._with_moved_numbers(table, host))
+        for name, tables in parts.items():
+            self._read[name] = tables[0] if len(tables) == 1 else merged(tables)
+
+    def _decoded(self, trace: CtfTrace, group: frozenset[str], place: int) -> Events:
+        wanted = [full for name in group for full in self._sources.get(name, ())]
+        what, hosts = "decoding events", len(self._hosts)
+        self._progress(place / hosts, what)
+        with _as_our_errors():
+            return read_events(
+                trace,
+                wanted,
+                nameless=[full for full in wanted if table_name(full) not in CREATION],
+                progress=lambda share: self._progress((place + share) / hosts, what),
+            )
+
+    def _take_stock(self, trace: CtfTrace, found: Events) -> None:
+        """Counts of all events, those of streams included in which nothing was asked for."""
+        with _as_our_errors():
+            others = count_events(replace(trace, streams=found.unread))
+        for name, count in found.counts.items():
+            self.counts[name] = self.counts.get(name, 0) + count + others.get(name, 0)
+        self.warnings += found.warnings
+
+    def _settle_numbers(self, host: str, found: Events) -> None:
+        """Move the host's process numbers out of the way if another host has one of them."""
+        if len(self._hosts) == 1:
+            self._moved[host] = 0
+            return
+        known = [frame for frame in found.values() if frame.schema["pid"].is_integer()]
+        pids = {pid for frame in known for pid in frame["pid"].unique().drop_nulls().to_list()}
+        beyond = max(self._moved.values(), default=0) + NEXT_HOST
+        self._moved[host] = beyond if pids & self._pids else 0
+        self._pids |= pids
+
+    def _note_names(self, host: str, trace: CtfTrace, found: Events) -> None:
+        """What processes are called, from their objects' creation if it was traced."""
+        names = _process_names(found)
+        if not names and not any(name in self for name in CREATION):
+            ran = [full for name in _WHO_RUNS for full in self._sources.get(name, ())]
+            with _as_our_errors():
+                names = _process_names(read_events(trace, ran))
+        self._names |= {pid + self._moved[host]: name for pid, name in names.items()}
+
+    def _with_moved_numbers(self, table: pl.DataFrame, host: str) -> pl.DataFrame:
+        moved = self._moved[host]
+        return table.with_columns(pl.col("pid", "tid") + moved) if moved else table
+
+
+def open_lttng_trace(
+    paths: Sequence[str | Path], progress: Progress | None = None, *, overview: bool = False
+) -> Recording:
+    """Open the LTTng trace in ``paths``: folders of one recording, searched recursively.
+
+    Kernel and user space, users (per-uid) and processes (per-pid) have a folder each; all are
+    merged by time. ``overview`` leaves callbacks and messages undecoded until they are asked for;
+    ``progress`` is told about this, and about decoding later on.
+
+    Raises:
+        InputError: no trace there, metadata that cannot be understood, or traces taken by
+            different clocks (other machines, other boots), whose times cannot be compared.
+    """
+    progress = progress or _untold
+    progress(0.0, "opening the trace (the first time on a machine, its decoder is compiled)")
+    with _as_our_errors():
+        trace = open_trace(*paths)
+    _refuse_different_clocks(trace)
+    tables = TraceTables(trace, progress, overview)
+    creation = tables.creation()
+    hosts = sorted({str(folder.declared.env.get("hostname", "")) for folder in trace.folders})
+    info = RecordingInfo(
+        source="lttng",
+        host=", ".join(host for host in hosts if host),
+        kernel=_kernel(trace),
+        distribution=distribution_of(creation, _field_lengths(trace)),
+        rmw=rmw_of_gids(creation) or rmw_of_threads(tables.thread_names()),
+        clock_offset_ns=trace.clock_offset_ns,
+        processes=processes_of(creation, tables.commands()),
+        lost={
+            "discarded_events": trace.discarded_events,
+            "lost_packets": trace.lost_packets,
+        },
+        notes=(*trace.warnings, *tables.notes()),
+    )
+    return Recording(Path(paths[0]), info, tables)
+
+
+class _as_our_errors:  # noqa: N801 - reads like a function where it is used
+    """What the decoder raises inside becomes an error of the project."""
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, CtfError):
+            raise InputError(str(error)) from error
+        if isinstance(error, PermissionError):
+            raise InputError(
+                f"{error.filename}: no permission to read it: copy the trace, or run as its owner"
+            ) from error
+        if isinstance(error, OSError):
+            raise OperationError(f"the trace cannot be read: {error}") from error
+
+
+def _untold(*_: object) -> None:
+    """Progress that nobody watches."""
+
+
+def _by_host(trace: CtfTrace) -> dict[str, CtfTrace]:
+    """The trace in parts, one per host whose processes were traced.
+
+    The kernel's folder goes with its own host, or with the first one: containers run on its
+    kernel, but their threads have other numbers there.
+    """
+    hosts = [str(folder.declared.env.get("hostname", "")) for folder in trace.folders]
+    kernel = [folder.declared.env.get("domain") == "kernel" for folder in trace.folders]
+    traced = list(dict.fromkeys(h for h, k in zip(hosts, kernel, strict=True) if not k))
+    if len(traced) < 2:
+        return {"": trace}
+    owners = [host if host in traced else traced[0] for host in hosts]
+    return {
+        host: replace(trace, streams=tuple(s for s in trace.streams if owners[s.folder] == host))
+        for host in traced
+    }
+
+
+def _process_names(frames: Mapping[str, pl.DataFrame]) -> dict[int, str]:
+    """Process → name of its main thread, or of any thread where that was not seen."""
+    names: dict[int, str] = {}
+    for frame in frames.values():
+        numbers = all(frame.schema[column].is_integer() for column in ("pid", "tid"))
+        if numbers and "procname" in frame.columns:
+            seen = frame.select("pid", "tid", "procname").unique().drop_nulls()
+            for pid, tid, name in seen.iter_rows():
+                if pid == tid or pid not in names:
+                    names[pid] = str(name)
+    return names
+
+
+def _field_lengths(trace: CtfTrace) -> dict[str, dict[str, int]]:
+    """Event → its fields, with the length of those that are arrays."""
+    return {
+        name: {f: t.length if isinstance(t, ArrayType) else 0 for f, t in fields.items()}
+        for name, fields in declared_fields(trace).items()
+    }
+
+
+def _kernel(trace: CtfTrace) -> str:
+    releases = [folder.declared.env.get("kernel_release") for folder in trace.folders]
+    return next((str(release) for release in releases if release), "unknown")
+
+
+def _refuse_different_clocks(trace: CtfTrace) -> None:
+    first = trace.folders[0]
+    for folder in trace.folders[1:]:
+        clocks = {first.clock.uuid, folder.clock.uuid}
+        if None not in clocks and len(clocks) == 2:
+            raise InputError(
+                f"{folder.path} was taken by another clock than {first.path} (another machine, or "
+                "another boot of this one): their times cannot be compared; give the folders of "
+                "one recording"
+            )

@@ -1,0 +1,1 @@
+"""Launch files in their three languages: reading, following and editing copies of them."""

@@ -1,0 +1,1 @@
+"""Python launch files: read without being run, edited where it is safe."""

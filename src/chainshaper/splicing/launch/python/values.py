@@ -1,0 +1,146 @@
+"""What expressions in a Python launch file stand for, as far as reading it can tell.
+
+Texts, numbers, lists, tuples and dictionaries stand for themselves, and so do the actions of
+:mod:`chainshaper.splicing.launch.actions`. Paths are texts. The rest is here; above all
+:class:`Unknown`, which whatever is not understood turns into.
+"""
+
+import ast
+from collections import ChainMap
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+from chainshaper.splicing.launch.actions import (
+    Action,
+    Condition,
+    Group,
+    Include,
+    NodeAction,
+    PushNamespace,
+    SetConfiguration,
+    SetRemap,
+    Span,
+    Substitution,
+    Template,
+    Unreadable,
+)
+from chainshaper.splicing.launch.substitutions import UNKNOWN
+
+__all__ = [
+    "Bound",
+    "Description",
+    "Function",
+    "Named",
+    "Source",
+    "Text",
+    "Unknown",
+    "When",
+    "actions_in",
+    "joined_path",
+    "template_of",
+]
+
+Names: TypeAlias = "ChainMap[str, Any]"
+
+_ACTIONS = (
+    NodeAction,
+    SetRemap,
+    PushNamespace,
+    SetConfiguration,
+    Group,
+    Include,
+    Unreadable,
+)
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """A value that only running the file would tell."""
+
+    line: int
+    source: str
+
+
+@dataclass(frozen=True)
+class Text:
+    """A text that is known at launch: a substitution, or several."""
+
+    template: Template
+
+
+@dataclass(frozen=True)
+class Named:
+    """Something imported, or built in, by its full name: ``launch_ros.actions.Node``."""
+
+    name: str
+
+    @property
+    def last(self) -> str:
+        return self.name.rpartition(".")[2]
+
+
+@dataclass(frozen=True, eq=False)
+class Function:
+    """A function of the file, with the names that it sees."""
+
+    definition: ast.FunctionDef
+    names: Names
+
+
+@dataclass(frozen=True)
+class Bound:
+    """An attribute of a value, which is about to be called."""
+
+    value: Any
+    attribute: str
+
+
+@dataclass(frozen=True, eq=False)
+class Description:
+    """A launch description that is being filled; ``condition`` of a container's own."""
+
+    actions: list[Any] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where an include takes its launch description from."""
+
+    path: Template
+    span: Span | None
+
+
+@dataclass(frozen=True)
+class When:
+    """An IfCondition or UnlessCondition."""
+
+    condition: Condition
+
+
+def template_of(value: Any) -> Template:
+    """A value where launch wants a text: lists are concatenated."""
+    if isinstance(value, Text):
+        return value.template
+    if isinstance(value, bool | int | float | str):
+        return (str(value),)
+    if isinstance(value, list | tuple):
+        return tuple(part for item in value for part in template_of(item))
+    return UNKNOWN
+
+
+def joined_path(parts: list[Any]) -> Text:
+    """``os.path.join``, as a text that is known at launch."""
+    return Text((Substitution("join", tuple(template_of(part) for part in parts)),))
+
+
+def actions_in(value: Any, line: int) -> list[Action]:
+    """The actions that a value holds where launch wants some."""
+    if isinstance(value, Unknown):
+        return [Unreadable(value.line, value.source)]
+    if isinstance(value, _ACTIONS):
+        return [value]
+    if isinstance(value, Description):
+        return actions_in(value.actions, line)
+    if isinstance(value, list | tuple):
+        return [action for item in value for action in actions_in(item, line)]
+    return []
