@@ -189,6 +189,9 @@ OPTIONAL_FIELDS: dict[str, dict[str, pl.DataType]] = {
         "overrun": pl.String(),
         "mode": pl.String(),  # of the message's cycle; null: the gate knows no modes
         "published": _NANOSECONDS,  # when publishing returned, in the log of a ROS 2 node
+        # For how long behind the release neither the gate nor any other thread ran on its core,
+        # in the same log: what the machine itself took.
+        "stalled": _NANOSECONDS,
     },
 }
 

@@ -29,6 +29,7 @@ from chainshaper.errors import ChainshaperError, InputError, OperationError
 from chainshaper.exploration import list_chains
 from chainshaper.launch_splicing import Splicing, splice_launch_files
 from chainshaper.planning import Plan, PlanRequest, plan_warnings, save_plan
+from chainshaper.planning.overruns import with_room_for_overruns
 from chainshaper.profiling import chain_nodes, profiling_condition
 from chainshaper.record import Scheduling, record_command
 from chainshaper.recording import Recording, refuse_existing
@@ -181,6 +182,8 @@ def plan_launched(
 ) -> tuple[Plan, tuple[str, ...]]:
     """The plan, and what to know about its margin where nobody said anything about that.
 
+    Outputs that come somewhat late have room (:func:`with_room_for_overruns`).
+
     It is then as long as the tail of the latencies demands (:data:`OVERRUN_PROBABILITY`), and not
     shorter than the standard: the way from the chain to the shaping node is not in what was
     measured. Where the tail tells nothing it is the standard.
@@ -189,17 +192,17 @@ def plan_launched(
     """
     standard = plan_recording(recording, chain, request)
     if request.epsilon_ns is not None or request.overrun_probability is not None:
-        return standard, ()
+        return with_room_for_overruns(standard), ()
     derived = replace(request, overrun_probability=OVERRUN_PROBABILITY)
     try:
         plan = plan_recording(recording, chain, derived)
     except OperationError as error:
-        return standard, (
+        return with_room_for_overruns(standard), (
             f"the margin is the standard {format_duration(standard.margin.epsilon_ns)}, since "
             f"none can be derived: {error}",
         )
     longer = plan.margin.epsilon_ns > standard.margin.epsilon_ns
-    return (plan if longer else standard), ()
+    return with_room_for_overruns(plan if longer else standard), ()
 
 
 def _spliced(

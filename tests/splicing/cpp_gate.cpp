@@ -109,12 +109,13 @@ void write_log(const std::string & path)
   }
   const auto stamp = [] {return clock_ns(CLOCK_REALTIME);};
   const Held first = shaper.hold(stamp());
-  log.write(shaper.gate(), first, 5, monotonic_ns());
+  log.write(shaper.gate(), first, 5, monotonic_ns(), shaper.time_lost(first));
   shaper.announce("city", monotonic_ns());
   const Held second = shaper.hold(stamp());
-  log.write(shaper.gate(), second, std::nullopt, monotonic_ns());
+  log.write(shaper.gate(), second, std::nullopt, monotonic_ns(), shaper.time_lost(second));
   const Held late = shaper.hold(stamp() - 50'000'000);
-  log.write(shaper.gate(), late, std::numeric_limits<std::int64_t>::max(), std::nullopt);
+  log.write(
+    shaper.gate(), late, std::numeric_limits<std::int64_t>::max(), std::nullopt, std::nullopt);
 }
 
 // Where cycles of 100 ms begin that are to begin 7 ms later, before and after that is in force.

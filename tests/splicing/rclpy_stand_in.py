@@ -18,6 +18,9 @@ from typing import Any
 
 import yaml
 
+# Addresses of rcl's objects: the last one fits into no 32 bits.
+NODE, SUBSCRIPTION, TIMER = 0x1000, 0x2000, 0x7F0000003000
+
 _state = {"ok": False, "stopped": False}
 
 
@@ -76,6 +79,10 @@ class Subscription:
 
 class Image:
     """Of sensor_msgs.msg."""
+
+
+class Empty:
+    """Of std_msgs.msg."""
 
 
 class String(SimpleNamespace):
@@ -139,11 +146,11 @@ class Logger:
 
 
 class Publisher:
-    def __init__(self, topic: str) -> None:
-        self._topic = topic
+    def __init__(self, topic: str, word: str = "published") -> None:
+        self._topic, self._word = topic, word
 
     def publish(self, payload: bytes) -> None:
-        _say(published=self._topic, payload=payload.hex(), time=time.monotonic_ns())
+        _say(**{self._word: self._topic}, payload=payload.hex(), time=time.monotonic_ns())
 
 
 class Node:
@@ -159,6 +166,7 @@ class Node:
         self._looks = 0
         self.subscriptions: dict[str, tuple[Callable[..., None], bool]] = {}
         self.timers: list[Callable[[], None]] = []
+        self.handle = SimpleNamespace(pointer=NODE)
         self.on_set: Callable[[list[Parameter]], object] = lambda _: None
 
     def get_parameter_or(self, name: str, otherwise: Parameter) -> Parameter:
@@ -184,8 +192,10 @@ class Node:
             for info in self._publishers.get(self.resolve_topic_name(topic), [])
         ]
 
-    def create_publisher(self, message_type: type, topic: str, qos: QoSProfile) -> Publisher:
+    def create_publisher(self, message_type: type, topic: str, qos: QoSProfile | int) -> Publisher:
         topic = self.resolve_topic_name(topic)
+        if topic.startswith("~/_"):
+            return Publisher(topic, "rehearsed")
         _say(publisher=topic, type=message_type.__name__, qos=vars(qos))
         return Publisher(topic)
 
@@ -197,14 +207,18 @@ class Node:
         qos: QoSProfile,
         *,
         raw: bool = False,
-    ) -> None:
+    ) -> SimpleNamespace:
         topic = self.resolve_topic_name(topic)
         _say(subscription=topic, type=message_type.__name__, qos=vars(qos), raw=raw)
         self.subscriptions[topic] = (callback, raw)
+        return SimpleNamespace(handle=SimpleNamespace(pointer=SUBSCRIPTION))
 
-    def create_timer(self, seconds: float, callback: Callable[[], None], clock: Clock) -> None:
+    def create_timer(
+        self, seconds: float, callback: Callable[[], None], clock: Clock
+    ) -> SimpleNamespace:
         _say(timer=seconds, clock=clock.clock_type, time=time.monotonic_ns())
         self.timers.append(callback)
+        return SimpleNamespace(handle=SimpleNamespace(pointer=TIMER))
 
     def add_on_set_parameters_callback(self, callback: Callable[..., object]) -> None:
         self.on_set = callback

@@ -163,7 +163,8 @@ def test_the_log_of_the_cpp_node_is_read(driver: Path, tmp_path: Path) -> None:
     assert first["arrival"] < first["release"] <= first["time"] <= first["published"]
     assert (first["source_timestamp"], second["source_timestamp"]) == (5, None)
     assert second["mode"] == "city"
-    assert (late["release"], late["slot"], late["published"]) == (None, None, None)
+    assert 0 <= first["stalled"] <= first["time"] - first["release"]
+    assert (late["release"], late["slot"], late["published"], late["stalled"]) == (None,) * 4
     assert (late["overrun"], late["source_timestamp"]) == ("discard", 2**63 - 1)
 
 

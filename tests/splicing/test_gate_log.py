@@ -7,14 +7,14 @@ import pytest
 
 from chainshaper import events
 from chainshaper.errors import InputError
-from chainshaper.splicing.gate_log import read_gate_log
+from chainshaper.splicing.gate_log import read_gate_log, with_gate_logs
 
 HEADER = (
     "time,pid,tid,cpu,source_timestamp,arrival,origin,release,slot,cycles_waited,anchor,overrun,"
-    "mode,published\n"
+    "mode,published,stalled\n"
 )
-LATE = "2000,7,8,1,1700000000000000001,1900,1000,,,0,stamp,discard,city,\n"
-EARLY = "1060,7,8,1,,1010,1000,1060,2,0,cycle,,,1071\n"
+LATE = "2000,7,8,1,1700000000000000001,1900,1000,,,0,stamp,discard,city,,\n"
+EARLY = "1060,7,8,1,,1010,1000,1060,2,0,cycle,,,1071,0\n"
 
 
 def test_each_line_is_a_row_of_gate_release(tmp_path: Path) -> None:
@@ -78,3 +78,33 @@ def test_a_table_of_it_can_stand_beside_another_source(tmp_path: Path) -> None:
     log.write_text(HEADER + EARLY)
     both = pl.concat([events.empty("gate_release"), read_gate_log(log)], how="diagonal")
     assert both.height == 1
+
+
+def test_only_cycles_of_the_recording_itself_count(tmp_path: Path) -> None:
+    """The node was there before the plan was in force, and goes on when tracing has ended."""
+    log, gone = tmp_path / "gate.csv", tmp_path / "gone.csv"
+    cycles = [
+        (f"{cycle + 60},7,8,1,,{cycle + 10},{cycle},{cycle + 60},2,0,cycle,,,,\n")
+        for cycle in range(1000, 1500, 100)
+    ]
+    log.write_text(HEADER + "".join(cycles))
+    tables, missing = with_gate_logs({}, [log, gone], since_ns=1050, until_ns=1360)
+    assert tables["gate_release"]["origin"].to_list() == [1100, 1200]
+    (note,) = missing
+    assert f"{gone} is not there" in note
+
+
+def test_stalls_that_a_gate_saw_are_the_machines(tmp_path: Path) -> None:
+    """It watches the clock at its release: what comes between is no thread's, but the machine's."""
+    log = tmp_path / "gate.csv"
+    late = "1200060,7,8,1,,1010,1000,1000060,2,0,cycle,,,1200071,200000\n"
+    log.write_text(HEADER + EARLY + late)
+    seen = events.empty("machine_stall").vstack(
+        pl.DataFrame(
+            {"time": 500, "pid": 3, "tid": 3, "cpu": 0, "duration": 150_000},
+            schema=events.empty("machine_stall").schema,
+        )
+    )
+    tables, _ = with_gate_logs({"machine_stall": seen}, [log], since_ns=0, until_ns=2_000_000)
+    stalls = tables["machine_stall"].select("time", "cpu", "duration").rows()
+    assert stalls == [(500, 0, 150_000), (1_000_060, 1, 200_000)]

@@ -206,6 +206,11 @@ def test_messages_leave_unchanged_inside_their_slot(
     assert (releases["published"] >= releases["time"]).all()
     times = [words["time"] for words in run.said if "published" in words]
     assert all(a <= b for a, b in zip(releases["time"], times, strict=True))
+    rehearsed = [words for words in run.said if "rehearsed" in words]
+    assert {words["payload"] for words in rehearsed} == {"0001000000"}
+    assert {words["rehearsed"] for words in rehearsed} == {"~/_rehearsal"}
+    for before, release in zip([0, *times], releases["release"], strict=False):
+        assert any(before < words["time"] < release for words in rehearsed)
 
 
 @pytest.mark.parametrize(
@@ -406,7 +411,9 @@ def test_the_throttler_publishes_what_is_newest_and_counts_the_rest(tmp_path: Pa
         run.tell(topic="/front/raw", payload="dd", source=1)
         run.tell(tick=2)
         assert run.end() == 0
-    published = [(words["published"], words["payload"]) for words in run.said if "payload" in words]
+    published = [
+        (words["published"], words["payload"]) for words in run.said if "published" in words
+    ]
     assert published == [("/rear", "bb"), ("/front", "cc"), ("/front", "dd")]
     texts = [words["text"] for words in run.said if "text" in words]
     assert texts == [

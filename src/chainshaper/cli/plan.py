@@ -18,21 +18,16 @@ __all__ = ["plan"]
 
 def plan(
     recording: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="[REC]", help="A recording's or a trace's folder.", show_default=False
-        ),
+        Path | None, typer.Argument(metavar="[REC]", help="A recording's or a trace's folder.")
     ] = None,
     chain: options.ChainsOption = None,
     output: options.PlanOutput = None,
     latencies: options.LatenciesOption = None,
     period: options.PeriodOption = None,
-    policy: Annotated[options.Policy, typer.Option(help="How it is scheduled.")] = (
-        options.Policy.SHAPED
-    ),
+    policy: Annotated[options.Policy, typer.Option(help="How it is scheduled.")] = ("shaped"),
     publication: Annotated[
         options.Publication, typer.Option(help="By a shaping node, or the publisher's own thread.")
-    ] = options.Publication.SYNCHRONOUS,
+    ] = "synchronous",
     publish_slot: Annotated[
         int, duration_option("--publish-slot", "Length of the publish slot.")
     ] = "1ms",  # type: ignore[assignment]
@@ -42,7 +37,7 @@ def plan(
     bands: options.BandsOption = "1",
     solver: Annotated[
         options.Solver, typer.Option(help="What places bands.", rich_help_panel="Latency bands")
-    ] = options.Solver.EXACT,
+    ] = "exact",
     grid: options.GridOption = "1us",  # type: ignore[assignment]
     modes: options.ModesOption = None,
     late: Annotated[
@@ -52,12 +47,12 @@ def plan(
             " not, or at once, or in the cycle's next slot.",
             rich_help_panel="Latency bands",
         ),
-    ] = options.LateForMode.WAIT,
+    ] = "wait",
     max_gap: options.MaxGapOption = None,
     max_share: options.MaxShareOption = None,
     minimise: Annotated[
         options.Minimise, typer.Option(help="What to make small.", rich_help_panel="Latency bands")
-    ] = options.Minimise.MEAN,
+    ] = "mean",
     mean_at_most: options.MeanAtMostOption = None,
     least_gain: options.LeastGainOption = "2%",  # type: ignore[assignment]
     curve: options.CurveOption = None,
@@ -67,14 +62,14 @@ def plan(
     anchor: Annotated[
         options.Anchor,
         typer.Option(help="What slots count from: the message's stamp, or the cycle."),
-    ] = options.Anchor.STAMP,
+    ] = "stamp",
     overrun: Annotated[
         options.Overrun,
         typer.Option(help="An output that missed its slot: wait for the next, or not, or at once."),
-    ] = options.Overrun.WAIT,
+    ] = "wait",
     spin: Annotated[
         int, duration_option("--spin", "How long the gate watches the clock before its slot.")
-    ] = "300us",  # type: ignore[assignment]
+    ] = "1ms",  # type: ignore[assignment]
     pause: Annotated[
         int, duration_option("--pause", "How long the gate rests after publishing.")
     ] = "500us",  # type: ignore[assignment]
@@ -93,25 +88,25 @@ def plan(
     if curve is not None and bands != "auto":
         raise InputError("--curve draws what --bands auto looked at: add --bands auto")
     request = PlanRequest(
-        policy=policy.value,
-        publication=publication.value,
+        policy=policy,
+        publication=publication,
         epsilon_ns=epsilon,
         overrun_probability=overrun_probability,
         publish_slot_ns=publish_slot,
         bands="auto" if bands == "auto" else int(bands),
-        solver=solver.value,
+        solver=solver,
         grid_ns=grid,
         max_gap_ns=max_gap,
         max_share=max_share,
-        minimise=minimise.value,
+        minimise=minimise,
         mean_at_most_ns=mean_at_most,
         least_gain=least_gain,
         seed=seed,
         slot_start_ns=slot_start,
         first_slot_ns=first_slot,
         modes=options.modes_of(modes, late),
-        anchor=anchor.value,
-        overrun=overrun.value,
+        anchor=anchor,
+        overrun=overrun,
         spin_ns=spin,
         pause_ns=pause,
         with_receivers=receivers,
@@ -127,10 +122,7 @@ def plan(
 
 
 def _profiles(
-    recording: Path | None,
-    latencies: Path | None,
-    period: int | None,
-    chains: Sequence[str | None],
+    recording: Path | None, latencies: Path | None, period: int | None, chains: Sequence[str | None]
 ) -> "tuple[Profile, ...]":
     from chainshaper.planning import Profile, read_latencies
     from chainshaper.steps import profile_chains

@@ -43,6 +43,7 @@ __all__ = [
     "ANCHORS",
     "LATE",
     "OVERRUNS",
+    "STALL_NS",
     "Gate",
     "Modes",
     "Release",
@@ -59,6 +60,9 @@ __all__ = [
 ANCHORS = ("stamp", "cycle")
 OVERRUNS = ("wait", "discard", "publish")
 LATE = (*OVERRUNS, "next-slot")
+
+STALL_NS = 100_000
+"""A thread may wake up so late on a machine that does not stall."""
 
 
 @dataclass(frozen=True)
@@ -336,14 +340,14 @@ class Shaper:
     One shaper belongs to one thread, which does nothing else at the time of a release. That makes
     it a witness of the machine's own stalls (:meth:`time_lost`).
 
-    ``on_waking`` is called when it wakes ``spin_ns`` before a release, to watch the clock from
-    there.
+    ``on_waking`` is called with the time of a release when it wakes ``spin_ns`` before that, to
+    watch the clock from there; what it does there should be over in time.
     """
 
     STEP_NS = 500_000  # slewing moves the clock by at most 50 us in a cycle of 100 ms
 
     def __init__(
-        self, gate: Gate, spin_ns: int = 0, on_waking: Callable[[], None] = lambda: None
+        self, gate: Gate, spin_ns: int = 0, on_waking: Callable[[int], None] = lambda _: None
     ) -> None:
         self.gate = gate
         self.spin_ns = spin_ns
@@ -403,7 +407,7 @@ class Shaper:
         self._waited = self._waiting.so_far()
         if release.at_ns > arrival:
             sleep_until(release.at_ns - self.spin_ns)
-            self._on_waking()
+            self._on_waking(release.at_ns)
             if time.monotonic_ns() < release.at_ns:
                 # Awake in time: what other threads took before is of no consequence.
                 self._waited = self._waiting.so_far()
@@ -412,16 +416,17 @@ class Shaper:
             release = replace(release, at_ns=None, slot=None, overrun="discard")
         return release, arrival, awake
 
-    def time_lost(self, release: Release, published_ns: int) -> int:
-        """How much of the delay between a release and its publication the machine itself took (ns).
+    def time_lost(self, release: Release, until_ns: int) -> int:
+        """How much of the delay from a release until then the machine itself took (ns).
 
-        The kernel counts for how long a thread was ready but others ran. What is left of the
-        delay, besides the microseconds that publishing takes, nobody used: interrupts, or a core
-        that was taken away from the whole system. To be called right after publishing.
+        The kernel counts for how long a thread was ready but others ran. What is left of the delay
+        until the thread was awake nobody used: interrupts, or a core that was taken away from the
+        whole system; until it had published, that takes microseconds besides. To be called right
+        after publishing.
         """
         if release.at_ns is None:
             return 0
-        return max(0, published_ns - release.at_ns - (self._waiting.so_far() - self._waited))
+        return max(0, until_ns - release.at_ns - (self._waiting.so_far() - self._waited))
 
 
 class _WaitingTime:

@@ -1,81 +1,110 @@
-"""The inner loops of exact band placement, compiled by Numba.
+"""The inner loops of exact band placement, compiled (:mod:`chainshaper.compiled`).
 
-Importing this module needs Numba; :mod:`chainshaper.planning.bands`, where the equations and the
-proof are, does so when it first places bands. Everything here is about positions on a grid:
-position k is the instant ``ends[k]``, and ``counts[k]`` latencies are not longer.
+:mod:`chainshaper.planning.bands`, where the equations and the proof are, calls them. Everything
+here is about positions on a grid: position k is the instant ``ends[k]``, and ``counts[k]``
+latencies are not longer. Tables are of int64, given by their addresses.
 """
 
-from collections.abc import Callable
-from typing import Any
+# mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
+# Kernels take many numbers rather than objects, which are slow to pass.
+# ruff: noqa: PLR0917
 
 import numpy as np
-from numpy.typing import NDArray
 
+from chainshaper.compiled.memory import compiled, store_word, table_at
 from chainshaper.planning.bands import UNREACHABLE
-from chainshaper.planning.extras import extra_library
 
-__all__ = ["costs_behind"]
-
-_Ints = NDArray[np.int64]
+__all__ = ["fill_costs"]
 
 
-def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    numba = extra_library("numba", "exact placement of latency bands")
-    try:
-        return numba.njit(cache=True)(function)  # type: ignore[no-any-return]
-    except RuntimeError:  # no folder to keep the machine code in: compile in every process
-        return numba.njit(function)  # type: ignore[no-any-return]
+@compiled()
+def fill_costs(grid, windows, costs, successors, work, positions, layers):
+    """For every position, the cost of 2, 3, … ``layers`` bands behind it, and the next of them.
+
+    ``grid`` are two rows, counts and ends. ``windows`` are two rows that ascend: a band at i may
+    be followed by one at j from the first (at most ``positions``) to the second. Row 0 of
+    ``costs`` is given: when only the last band is behind position i, ``UNREACHABLE`` where it
+    cannot be. Row m becomes the smallest ``(counts[j] − counts[i])·ends[j]`` plus row m − 1 at j,
+    and that of ``successors`` (int32) this j; both stay as they are where there is none. ``work``
+    has 12 rows of ``positions`` + 1. Returns 0.
+    """
+    row = 8 * (positions + 1)
+    column_of, row_of, best = table_at(work), table_at(work + 3 * row), table_at(work + 9 * row)
+    least = table_at(work + 8 * row)
+    for layer in range(1, layers):
+        before = costs + 8 * (layer - 1) * positions
+        height = _compress(grid, windows, before, work, positions)
+        _least_lines(work, height, positions)
+        after, chosen = table_at(before + 8 * positions), successors + 4 * layer * positions
+        for r in range(height):
+            after[row_of[r]] = least[r]
+            store_word(chosen + 4 * row_of[r], np.uint64(column_of[best[r]]))
+    return 0
 
 
-def _compress(grid: _Ints, windows: _Ints, costs: _Ints, work: _Ints) -> tuple[int, int]:
+@compiled()
+def _compress(grid, windows, costs, work, positions):
     """Columns from which the bands behind can be placed, and rows that have such a column.
 
     Only these are left, so that a row's columns are one run of those that remain and each of
-    them counts. ``work`` holds, per remaining column, its position, intercept and slope, and
-    per remaining row its position, count, first and last column; the result says how many.
+    them counts. ``work`` gets, per remaining column, its position, intercept and slope, and
+    per remaining row its position, count, first and last column; returned is how many rows.
     """
-    counts, ends = grid[0], grid[1]
-    nearest, farthest = windows[0], windows[1]
-    width = 0
-    for k in range(costs.size):
-        work[7, k] = width  # remaining columns before position k
-        if costs[k] != UNREACHABLE:
-            work[0, width] = k
-            work[1, width] = costs[k] + counts[k] * ends[k]
-            work[2, width] = ends[k]
+    row = 8 * (positions + 1)
+    counts, ends = table_at(grid), table_at(grid + 8 * positions)
+    nearest, farthest = table_at(windows), table_at(windows + 8 * positions)
+    cost, column_of, base = table_at(costs), table_at(work), table_at(work + row)
+    slope, row_of, count_of = (
+        table_at(work + 2 * row),
+        table_at(work + 3 * row),
+        table_at(work + 4 * row),
+    )
+    first, last = table_at(work + 5 * row), table_at(work + 6 * row)
+    remaining = table_at(work + 7 * row)  # columns before a position
+    width = height = 0
+    for k in range(positions):
+        remaining[k] = width
+        if cost[k] != UNREACHABLE:
+            column_of[width] = k
+            base[width] = cost[k] + counts[k] * ends[k]
+            slope[width] = ends[k]
             width += 1
-    work[7, costs.size] = width
-    height = 0
-    for i in range(costs.size):
+    remaining[positions] = width
+    for i in range(positions):
         if nearest[i] <= farthest[i]:
-            low, high = work[7, nearest[i]], work[7, farthest[i] + 1] - 1
+            low, high = remaining[nearest[i]], remaining[farthest[i] + 1] - 1
             if low <= high:
-                work[3, height], work[4, height] = i, counts[i]
-                work[5, height], work[6, height] = low, high
+                row_of[height], count_of[height] = i, counts[i]
+                first[height], last[height] = low, high
                 height += 1
-    return width, height
+    return height
 
 
-def _least_lines(lines: _Ints, rows: _Ints, least: _Ints, best: _Ints) -> None:
+@compiled()
+def _least_lines(work, height, positions):
     """Per row r, the least ``base[q] − count[r]·slope[q]`` for q in ``low[r] … high[r]``, and q.
 
-    ``lines`` are base and slope, which ascends strictly; ``rows`` are count, low and high, which
-    ascend, and no row's run of q is empty.
+    ``work`` is what :func:`_compress` has left: slopes ascend strictly; counts, low and high
+    ascend, and no row's run of q is empty. Its rows 8 and 9 get the least and q.
 
     The least of lines is found on their lower envelope, in constant time per row and line as
     long as lines are only added. Windows that move lose lines too, so rows are taken in blocks
     whose windows share a column, the pivot: left of it windows only grow from the last row to
     the first, right of it they only grow from the first to the last.
     """
-    base, slope = lines[0], lines[1]
-    counts, low, high = rows[0], rows[1], rows[2]
-    least[:] = UNREACHABLE
-    envelope = np.empty(base.size, np.int64)
-    takes_over = np.empty(base.size, np.int64)  # the count from which a line beats its forerunner
+    row_bytes = 8 * (positions + 1)
+    base, slope = table_at(work + row_bytes), table_at(work + 2 * row_bytes)
+    counts, low = table_at(work + 4 * row_bytes), table_at(work + 5 * row_bytes)
+    high, least = table_at(work + 6 * row_bytes), table_at(work + 8 * row_bytes)
+    best, envelope = table_at(work + 9 * row_bytes), table_at(work + 10 * row_bytes)
+    # The count from which a line of the envelope beats its forerunner:
+    takes_over = table_at(work + 11 * row_bytes)
+    for row in range(height):
+        least[row] = UNREACHABLE
     block = 0
-    while block < counts.size:
+    while block < height:
         pivot, stop = high[block], block
-        while stop < counts.size and low[stop] <= pivot:
+        while stop < height and low[stop] <= pivot:
             stop += 1
         for step in (-1, 1):
             left = step < 0
@@ -105,44 +134,3 @@ def _least_lines(lines: _Ints, rows: _Ints, least: _Ints, best: _Ints) -> None:
                         best[row] = envelope[front]
                 row += step
         block = stop
-
-
-_compress_fast = _compiled(_compress)
-_least_lines_fast = _compiled(_least_lines)
-
-
-def _costs_behind(
-    grid: _Ints, windows: _Ints, last: _Ints, layers: int
-) -> tuple[_Ints, NDArray[np.int32]]:
-    positions = last.size
-    costs = np.full((layers, positions), UNREACHABLE)
-    successors = np.full((layers, positions), -1, np.int32)
-    costs[0] = last
-    work = np.empty((8, positions + 1), np.int64)
-    least = np.empty(positions, np.int64)
-    best = np.zeros(positions, np.int64)
-    for layer in range(1, layers):
-        width, height = _compress_fast(grid, windows, costs[layer - 1], work)
-        _least_lines_fast(work[1:3, :width], work[4:7, :height], least[:height], best[:height])
-        for r in range(height):
-            costs[layer, work[3, r]] = least[r]
-            successors[layer, work[3, r]] = work[0, best[r]]
-    return costs, successors
-
-
-_costs_behind_fast = _compiled(_costs_behind)
-
-
-def costs_behind(
-    grid: _Ints, windows: _Ints, last: _Ints, layers: int
-) -> tuple[_Ints, NDArray[np.int32]]:
-    """For every position, the cost of 1, 2, … ``layers`` bands behind it, and the next of them.
-
-    ``grid`` are two rows, counts and ends. ``windows`` are two rows that ascend: a band at i may
-    be followed by one at j from ``windows[0, i]`` (at most the number of positions) to
-    ``windows[1, i]``. ``last[i]`` is the cost when only the last band is behind position i,
-    ``UNREACHABLE`` where it cannot be. Row m of the result holds the smallest
-    ``(counts[j] − counts[i])·ends[j]`` plus row m − 1 at j, and that j (−1: none).
-    """
-    result: tuple[_Ints, NDArray[np.int32]] = _costs_behind_fast(grid, windows, last, layers)
-    return result

@@ -273,13 +273,19 @@ def _solve(problem: BandProblem, bands: int) -> _Tables:
         reachable &= last - ends <= problem.max_gap_ns
         farthest = np.minimum(farthest, positions + problem.max_gap_ns // grid)
     costs = np.where(reachable, behind * last, UNREACHABLE)[np.newaxis, :]
-    successors = np.full((1, size), -1, dtype=np.int32)
+    costs = np.vstack([costs, np.full((max(0, layers - 2), size), UNREACHABLE)])
+    successors = np.full(costs.shape, -1, dtype=np.int32)
     if layers > 2:
-        # Numba takes a moment to import, and two bands do without it.
-        from chainshaper.planning.band_kernel import costs_behind
+        # What loads machine code takes a moment to import, and two bands do without it.
+        from chainshaper.compiled import kernel
 
+        fill_costs = kernel("chainshaper.planning.band_kernel", "fill_costs")
         grid_rows, windows = np.stack([counts, ends]), np.stack([nearest, farthest])
-        costs, successors = costs_behind(grid_rows, windows, costs[0], layers - 1)
+        work = np.empty((12, size + 1), dtype=np.int64)
+        fill_costs(
+            grid_rows.ctypes.data, windows.ctypes.data, costs.ctypes.data,
+            successors.ctypes.data, work.ctypes.data, size, layers - 1,
+        )  # fmt: skip
     return _Tables(problem, ends, counts, costs, successors)
 
 

@@ -32,7 +32,6 @@ from numpy.typing import NDArray
 
 from chainshaper.durations import format_duration
 from chainshaper.errors import InputError, OperationError
-from chainshaper.planning.extras import extra_library
 from chainshaper.planning.latency_file import check_latencies
 from chainshaper.planning.plan import Margin
 
@@ -105,7 +104,6 @@ def fit_tail(latencies_ns: NDArray[np.int64], probability: float, seed: int = 0)
         InputError: latencies that cannot be planned with, or a probability outside the tail.
         OperationError: the data do not allow an answer: too few, not stationary, not
             independent, no generalised Pareto tail, or an answer too vague to plan with.
-        PlatformError: SciPy is not installed.
     """
     latencies = check_latencies(latencies_ns)
     if not 0 < probability < MOST_PROBABLE:
@@ -154,19 +152,20 @@ def _thresholds(latencies: NDArray[np.int64]) -> list[int]:
 def _fit_above(
     latencies: NDArray[np.int64], threshold: int, probability: float, random: np.random.Generator
 ) -> TailFit:
-    pareto = extra_library("scipy.stats", "a margin from extreme value theory").genpareto
+    from scipy.stats import genpareto  # SciPy takes a moment to import
+
     excesses = np.sort(latencies[latencies > threshold] - threshold).astype(float)[np.newaxis, :]
     shape, scale = _l_moment_fit(excesses)
-    goodness_of_fit = _anderson_darling(pareto, excesses, shape, scale)[0]
+    goodness_of_fit = _anderson_darling(excesses, shape, scale)[0]
     share = excesses.size / latencies.size
     quantile = float(_quantile(shape, scale, share, probability)[0])
 
-    drawn = pareto.rvs(
+    drawn = genpareto.rvs(
         shape[0], scale=scale[0], size=(BOOTSTRAPS, excesses.size), random_state=random
     )
     drawn.sort(axis=1)
     shapes, scales = _l_moment_fit(drawn)
-    statistics = _anderson_darling(pareto, drawn, shapes, scales)
+    statistics = _anderson_darling(drawn, shapes, scales)
     shares = random.binomial(latencies.size, share, BOOTSTRAPS) / latencies.size
     quantiles = _quantile(shapes, scales, shares, probability)
     low, high = np.quantile(quantiles, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
@@ -207,12 +206,14 @@ def _quantile(
     return result
 
 
-def _anderson_darling(pareto: object, ordered: _Floats, shape: _Floats, scale: _Floats) -> _Floats:
+def _anderson_darling(ordered: _Floats, shape: _Floats, scale: _Floats) -> _Floats:
     """A² of each row of ascending excesses."""
+    from scipy.stats import genpareto
+
     size = ordered.shape[1]
     parameters = {"c": shape[:, np.newaxis], "scale": scale[:, np.newaxis]}
-    below = pareto.logcdf(ordered, **parameters)  # type: ignore[attr-defined]
-    above = pareto.logsf(ordered, **parameters)[:, ::-1]  # type: ignore[attr-defined]
+    below = genpareto.logcdf(ordered, **parameters)
+    above = genpareto.logsf(ordered, **parameters)[:, ::-1]
     weights = (2 * np.arange(1, size + 1) - 1) / size
     logarithms = np.maximum(below, LEAST_LOG) + np.maximum(above, LEAST_LOG)
     result: _Floats = -size - (logarithms * weights).sum(axis=1)
@@ -220,7 +221,8 @@ def _anderson_darling(pareto: object, ordered: _Floats, shape: _Floats, scale: _
 
 
 def _refuse_not_stationary(latencies: NDArray[np.int64]) -> None:
-    stats = extra_library("scipy.stats", "a margin from extreme value theory")
+    from scipy import stats
+
     half = latencies.size // 2
     halves = stats.ks_2samp(latencies[:half], latencies[half:], method="asymp").pvalue
     trend = stats.kendalltau(np.arange(latencies.size), latencies).pvalue
@@ -234,7 +236,8 @@ def _refuse_not_stationary(latencies: NDArray[np.int64]) -> None:
 
 
 def _refuse_clusters(latencies: NDArray[np.int64], threshold: int) -> None:
-    stats = extra_library("scipy.stats", "a margin from extreme value theory")
+    from scipy import stats
+
     above = latencies > threshold
     share = float(above.mean())
     long, followed = int(above[:-1].sum()), int(np.count_nonzero(above[:-1] & above[1:]))

@@ -122,7 +122,10 @@ def with_offsets(
         if len(group) <= MOST_SEARCHED:
             solution = _search(plans, allowed, group, {group[0]: 0})
         else:
-            solution = _decide(plans, allowed, group, time_limit_s)
+            deadline = time.monotonic() + time_limit_s
+            solution = _fitted(plans, allowed, group, deadline)
+            if solution is None:
+                solution = _solve(plans, allowed, group, max(0.0, deadline - time.monotonic()))
         if solution is None:
             raise OperationError(
                 f"there are no offsets at which {', '.join(_name(plans[k]) for k in group)} keep"
@@ -222,16 +225,6 @@ def _candidates(
             repeats = np.arange(0, cycle, common, dtype=np.int64)
             found.append(np.add.outer((base + ends) % common, repeats).ravel())
     return np.unique(np.concatenate(found))
-
-
-def _decide(
-    plans: Sequence[Plan], allowed: _Allowed, group: list[int], time_limit_s: float
-) -> dict[int, int] | None:
-    deadline = time.monotonic() + time_limit_s
-    solution = _fitted(plans, allowed, group, deadline)
-    if solution is None:
-        solution = _solve(plans, allowed, group, max(0.0, deadline - time.monotonic()))
-    return solution
 
 
 def _fitted(

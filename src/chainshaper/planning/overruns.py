@@ -8,10 +8,11 @@ has expired when the thread may run again.
 
 from itertools import pairwise
 
-from chainshaper.planning.plan import Plan, publish_slots, server_of
+from chainshaper.errors import InputError
+from chainshaper.planning.plan import Plan, output_server, publish_slots, revised, server_of
 from chainshaper.planning.plan_parts import ShapingNode, Thread
 
-__all__ = ["cycles_until_output", "output_lifespan"]
+__all__ = ["cycles_until_output", "output_lifespan", "with_room_for_overruns"]
 
 
 def cycles_until_output(plan: Plan, node: ShapingNode | None = None) -> int:
@@ -43,3 +44,29 @@ def output_lifespan(plan: Plan) -> int | None:
     slots = publish_slots(plan)
     waits = [after[1] - before[1] for before, after in pairwise(slots)]
     return max([slots[0][1], *waits])
+
+
+def with_room_for_overruns(plan: Plan) -> Plan:
+    """The plan with its last publish slot a tenth of the cycle long, where there is room for it.
+
+    A gate publishes at a slot's start, so its width does not move the output. But what comes late
+    by less than the width then leaves at once, instead of a whole cycle later. The chain's servers
+    go on until the end of that slot, so that it can finish (section 6), and a back end that stops
+    its threads does not do so in the very moment of the publication. Predictions stay: they are
+    for outputs in time.
+    """
+    output = output_server(plan)
+    if output is None or plan.overrun != "wait" or plan.policy != "shaped":
+        return plan
+    start, end = output.slots[-1]
+    until = min(plan.cycle_ns, max(end, start + plan.cycle_ns // 10))
+    servers = tuple(
+        server.model_copy(update={"slots": (*server.slots[:-1], (server.slots[-1][0], until))})
+        if server is output or server.slots[-1][1] == start
+        else server
+        for server in plan.servers
+    )
+    try:
+        return revised(plan, servers=servers)
+    except InputError:  # somebody else has a slot there
+        return plan

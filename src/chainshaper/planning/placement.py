@@ -6,7 +6,7 @@ average (sections 3.3 and 4.1), without touching the longest latency.
 """
 
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from chainshaper.durations import format_duration
 from chainshaper.errors import InputError
 from chainshaper.planning.bands import (
+    BandProblem,
     Goal,
     Placement,
     band_problem,
@@ -47,37 +48,27 @@ def with_bands(
     bands: int | Literal["auto"],
     *,
     solver: Solver = "exact",
-    grid_ns: int = 1_000,
-    max_gap_ns: int | None = None,
-    max_share: float | None = None,
     minimise: Goal = "mean",
     mean_at_most_ns: int | None = None,
     least_gain: float = 0.02,
     seed: int | None = None,
+    **limits: Any,
 ) -> Plan:
     """A shaped plan with ``bands`` publish slots; the last stays where the plan has it.
 
     The slots are as long as the plan's own (Δ). ``exact`` finds the best placement on the grid;
     ``pso`` and ``random`` are for comparison and take a ``seed``. ``auto`` takes as many bands
-    as each lower the average by ``least_gain`` of it at least. ``max_gap_ns`` is LV, the longest
-    distance of neighbouring bands; ``max_share`` the largest share of executions in one band;
-    with ``mean_at_most_ns`` the exact solver can ``minimise`` the ``jitter`` or the largest
-    ``gap`` instead of the average.
+    as each lower the average by ``least_gain`` of it at least. With ``mean_at_most_ns`` the exact
+    solver can ``minimise`` the ``jitter`` or the largest ``gap`` instead of the average.
+    ``limits`` are those of :func:`~chainshaper.planning.bands.band_problem`: ``grid_ns``,
+    ``max_gap_ns`` (LV) and ``max_share``.
 
     Raises:
         InputError: a plan without a publish slot, or values that make no sense together.
         OperationError: no such placement exists; the message names the binding constraint.
     """
-    start, end = _last_publish_slot(plan)
-    latencies = check_latencies(latencies_ns)
-    problem = band_problem(
-        latencies,
-        end,
-        publish_slot_ns=end - start,
-        grid_ns=grid_ns,
-        max_gap_ns=max_gap_ns,
-        max_share=max_share,
-    )
+    problem = _problem(plan, latencies_ns, limits)
+    length = problem.publish_slot_ns
     if (bands == "auto" or solver != "exact") and (
         minimise != "mean" or mean_at_most_ns is not None
     ):
@@ -85,22 +76,15 @@ def with_bands(
     if bands == "auto":
         if solver != "exact":
             raise InputError("only the exact solver chooses the number of bands by itself")
-        placement = choose_bands(
-            plan,
-            latencies,
-            grid_ns=grid_ns,
-            max_gap_ns=max_gap_ns,
-            max_share=max_share,
-            least_gain=least_gain,
-        ).chosen
+        placement = choose_bands(plan, latencies_ns, least_gain=least_gain, **limits).chosen
     elif solver == "pso":
         placement = place_by_swarm(problem, bands, seed)
     elif solver == "random":
         placement = place_randomly(problem, bands, seed)
     else:
         placement = place_bands(problem, bands, minimise=minimise, mean_at_most_ns=mean_at_most_ns)
-    slots = tuple((x - (end - start), x) for x in placement.slot_ends_ns)
-    predicted = predict_bands(latencies, placement.slot_ends_ns, end - start)
+    slots = tuple((end - length, end) for end in placement.slot_ends_ns)
+    predicted = predict_bands(problem.latencies_ns, placement.slot_ends_ns, length)
     return _with_publish_slots(plan, slots, predicted)
 
 
@@ -108,10 +92,7 @@ def figure7_curve(
     plan: Plan,
     latencies_ns: NDArray[np.int64],
     most_bands: int = MOST_BANDS,
-    *,
-    grid_ns: int = 1_000,
-    max_gap_ns: int | None = None,
-    max_share: float | None = None,
+    **limits: Any,
 ) -> list[Placement]:
     """The best placement for 1, 2, … bands: average over number of bands is figure 7.
 
@@ -119,16 +100,7 @@ def figure7_curve(
         InputError: a plan without a publish slot.
         OperationError: no number of bands can be placed.
     """
-    start, end = _last_publish_slot(plan)
-    problem = band_problem(
-        latencies_ns,
-        end,
-        publish_slot_ns=end - start,
-        grid_ns=grid_ns,
-        max_gap_ns=max_gap_ns,
-        max_share=max_share,
-    )
-    return placement_curve(problem, most_bands)
+    return placement_curve(_problem(plan, latencies_ns, limits), most_bands)
 
 
 @dataclass(frozen=True)
@@ -144,10 +116,8 @@ def choose_bands(
     plan: Plan,
     latencies_ns: NDArray[np.int64],
     *,
-    grid_ns: int = 1_000,
-    max_gap_ns: int | None = None,
-    max_share: float | None = None,
     least_gain: float = 0.02,
+    **limits: Any,
 ) -> BandChoice:
     """What :func:`with_bands` takes for ``auto``, with its grounds.
 
@@ -161,9 +131,7 @@ def choose_bands(
         raise InputError(
             f"the least gain is a share of the average, such as 0.02: not {least_gain}"
         )
-    curve = figure7_curve(
-        plan, latencies_ns, grid_ns=grid_ns, max_gap_ns=max_gap_ns, max_share=max_share
-    )
+    curve = figure7_curve(plan, latencies_ns, **limits)
     chosen = enough_bands(curve, least_gain)
     bands, longest = len(chosen.slot_ends_ns), len(curve[-1].slot_ends_ns)
     if chosen is not curve[-1]:
@@ -205,6 +173,11 @@ def with_long_slot(plan: Plan, latencies_ns: NDArray[np.int64], slot_start_ns: i
     )
     slots = ((slot_start_ns, end),)
     return revised(_with_publish_slots(plan, slots, predicted), policy="one-long-slot")
+
+
+def _problem(plan: Plan, latencies_ns: NDArray[np.int64], limits: dict[str, Any]) -> BandProblem:
+    start, end = _last_publish_slot(plan)
+    return band_problem(latencies_ns, end, publish_slot_ns=end - start, **limits)
 
 
 def _last_publish_slot(plan: Plan) -> Slot:

@@ -68,6 +68,7 @@ __all__ = [
     "publishing_servers",
     "revised",
     "server_of",
+    "shaping_nodes",
     "wrong_values_refused",
 ]
 
@@ -106,7 +107,7 @@ class Plan(Part):
         _check_cycle(self)
         _check_servers(self)
         _check_overlaps(self)
-        for where, node in _shaping_nodes(self):
+        for where, node in _placed_nodes(self):
             _check_shaping_node(self, node, where)
         _check_modes(self)
         check_publisher_threads(self)
@@ -116,6 +117,11 @@ class Plan(Part):
 def server_of(plan: Plan, thread: Thread) -> Server | None:
     """The server that a thread is assigned to, or None when it runs outside all servers."""
     return next((server for server in plan.servers if thread in server.threads), None)
+
+
+def shaping_nodes(plan: Plan) -> list[ShapingNode]:
+    """All shaping nodes of a plan, that of the chain's output first."""
+    return [node for _, node in _placed_nodes(plan)]
 
 
 def output_server(plan: Plan) -> Server | None:
@@ -157,7 +163,7 @@ def publishing_servers(plan: Plan) -> tuple[Server, ...]:
 
     They hold shaping nodes' threads or publishers' threads; the others run the chain.
     """
-    nodes = {node.thread for _, node in _shaping_nodes(plan)}
+    nodes = {node.thread for node in shaping_nodes(plan)}
     output = output_server(plan)
     return tuple(
         server
@@ -192,7 +198,8 @@ def wrong_values_refused(model: type[Part] | None = None) -> Iterator[None]:
         raise InputError("; ".join(problems)) from error
 
 
-def _shaping_nodes(plan: Plan) -> Iterator[tuple[tuple[str | int, ...], ShapingNode]]:
+def _placed_nodes(plan: Plan) -> Iterator[tuple[tuple[str | int, ...], ShapingNode]]:
+    """The shaping nodes with their places in the file."""
     if plan.shaping_node is not None:
         yield ("shaping_node",), plan.shaping_node
     for number, node in enumerate(plan.further_shaping_nodes):
@@ -258,7 +265,7 @@ def _check_overlaps(plan: Plan) -> None:
 
 
 def _check_shaping_node(plan: Plan, node: ShapingNode, where: tuple[Any, ...]) -> None:
-    others = [other for place, other in _shaping_nodes(plan) if place != where]
+    others = [other for place, other in _placed_nodes(plan) if place != where]
     if any(node.name == other.name or node.output == other.output for other in others):
         raise wrong_value(
             f"another shaping node has the name {node.name} or the output {node.output} too:"

@@ -5,8 +5,6 @@ or block style) and refuses whatever would not run: each wrong value is named wi
 line, key, the reason and what to write instead.
 """
 
-import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ import yaml
 
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.plan import Plan, band_predictions, publish_slots
+from chainshaper.whole_file import new_file, write_whole
 from chainshaper.yaml_file import AS_YAML, read_model
 
 __all__ = ["Plan", "dump_plan", "load_plan", "plan_json", "save_plan", "save_plans"]
@@ -83,29 +82,9 @@ def save_plan(plan: Plan, path: str | Path, *, overwrite: bool = False) -> None:
         OperationError: it cannot be written; nothing is left behind, an existing file stays.
     """
     path = Path(path)
-    if path.exists() and (path.is_dir() or not overwrite):
-        raise InputError(
-            f"{path} exists already and is not overwritten: name another, or remove it"
-        )
-    folder = path.absolute().parent
-    if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder to write {path.name} into")
-    text = dump_plan(plan)
-    partial: Path | None = None
-    try:
-        descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.partial-", dir=folder)
-        partial = Path(name)
-        with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
-        partial.chmod(0o644)
-        partial.replace(path)
-    except OSError as error:
-        raise OperationError(f"{path}: the plan cannot be written: {error}") from error
-    finally:
-        if partial is not None:
-            partial.unlink(missing_ok=True)
+    if not (overwrite and path.is_file()):
+        new_file(path)
+    write_whole(path, [dump_plan(plan).encode()])
 
 
 def save_plans(plans: Sequence[Plan], folder: str | Path) -> list[Path]:

@@ -8,7 +8,7 @@ bare latencies and a period; a policy that needs more says so.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain as joined
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,7 +121,7 @@ class PlanRequest:
     modes: Modes | None = None
     anchor: Anchor = "stamp"
     overrun: Overrun = "wait"
-    spin_ns: int = 300_000
+    spin_ns: int = 1_000_000
     pause_ns: int = 500_000
     with_receivers: bool = True
 
@@ -167,14 +167,8 @@ def plan_chain(
 
 def band_choice(plan: Plan, profile: Profile, request: PlanRequest) -> BandChoice:
     """The curve of figure 7 for a plan, and the number of bands that ``auto`` takes from it."""
-    return choose_bands(
-        plan,
-        profile.latencies_ns,
-        grid_ns=request.grid_ns,
-        max_gap_ns=request.max_gap_ns,
-        max_share=request.max_share,
-        least_gain=request.least_gain,
-    )
+    values = _placement(request, "least_gain")
+    return choose_bands(plan, profile.latencies_ns, **values)
 
 
 def _shortened(profile: Profile, request: PlanRequest, margin: Margin) -> Profile:
@@ -208,6 +202,9 @@ def _shaped(
 ) -> Plan:
     last = profile.nodes[-1] if profile.nodes else None
     asynchronous = request.publication == "asynchronous"
+    conditions = {n: getattr(profile, n) for n in Evidence.model_fields if hasattr(profile, n)}
+    if not asynchronous:  # how long sends take is no evidence for it
+        del conditions["longest_send_ns"]
     plan = plan_shaping(
         profile.latencies_ns,
         profile.period_ns,
@@ -218,14 +215,6 @@ def _shaped(
         margin=margin,
         publish_slot_ns=request.publish_slot_ns,
         publication=request.publication,
-        recording=profile.recording,
-        incomplete=profile.incomplete,
-        disturbed=profile.disturbed,
-        realtime=profile.realtime,
-        longest_stall_ns=profile.longest_stall_ns,
-        utilisation=profile.utilisation,
-        longest_send_ns=profile.longest_send_ns if asynchronous else None,
-        lost_events=profile.lost_events,
         output_depth=profile.output_depth if asynchronous else None,
         core=profile.core_of.get(last or "", DEFAULT_CORE),
         anchor=request.anchor,
@@ -234,6 +223,7 @@ def _shaped(
         spin_ns=request.spin_ns,
         pause_ns=request.pause_ns,
         receivers=profile.receivers if request.with_receivers else (),
+        **conditions,
     )
     core_of = dict(joined.from_iterable(one.core_of.items() for one in (profile, *sinks)))
     if request.first_slot_ns is not None:
@@ -255,19 +245,8 @@ def _margin(profile: Profile, request: PlanRequest) -> Margin:
 
 def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
     if request.policy == "shaped":
-        return with_bands(
-            plan,
-            profile.latencies_ns,
-            request.bands,
-            solver=request.solver,
-            grid_ns=request.grid_ns,
-            max_gap_ns=request.max_gap_ns,
-            max_share=request.max_share,
-            minimise=request.minimise,
-            mean_at_most_ns=request.mean_at_most_ns,
-            least_gain=request.least_gain,
-            seed=request.seed,
-        )
+        values = _placement(request, "solver", "minimise", "mean_at_most_ns", "least_gain", "seed")
+        return with_bands(plan, profile.latencies_ns, request.bands, **values)
     if request.policy == "one-long-slot":
         if request.slot_start_ns is None:
             raise InputError("one long slot needs its start: add --slot-start, such as 62ms")
@@ -277,6 +256,11 @@ def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
     if request.policy == "let-per-chain":
         return let_per_chain(plan)
     return _per_callback(plan, profile, request)
+
+
+def _placement(request: PlanRequest, *names: str) -> dict[str, Any]:
+    """What a request says about placing bands: the limits, and what else is named."""
+    return {n: getattr(request, n) for n in ("grid_ns", "max_gap_ns", "max_share", *names)}
 
 
 def _per_callback(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:

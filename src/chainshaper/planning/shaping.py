@@ -7,7 +7,7 @@ cycles, but at the same time in all of them (paper, sections 3.1 and 3.2).
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,23 +52,16 @@ def plan_shaping(
     margin: Margin | None = None,
     publish_slot_ns: int = 1_000_000,
     publication: Literal["synchronous", "asynchronous"] = "synchronous",
-    recording: str | None = None,
-    incomplete: int = 0,
-    disturbed: int = 0,
-    realtime: bool | None = None,
-    longest_stall_ns: int | None = None,
-    utilisation: float | None = None,
-    longest_send_ns: int | None = None,
-    lost_events: int | None = None,
     output_depth: int | None = None,
     core: int = 1,
     output_core: int | None = None,
     anchor: Anchor = "stamp",
     overrun: Overrun = "wait",
     fifo_priority: int = 84,
-    spin_ns: int = 300_000,
+    spin_ns: int = 1_000_000,
     pause_ns: int = 500_000,
     receivers: Sequence[str] = (),
+    **conditions: Any,
 ) -> Plan:
     """Plan single-band shaping: one publish slot right behind the longest latency measured.
 
@@ -89,13 +82,12 @@ def plan_shaping(
         margin: a margin that was derived from the latencies, in place of ``epsilon_ns``.
         publication: ``synchronous`` splices a shaping node behind the output; ``asynchronous``
             puts the publisher's own thread into R_m°.
-        recording, incomplete, disturbed, realtime, longest_stall_ns, utilisation,
-            longest_send_ns, lost_events: where the latencies come from and how they were taken, for
-            the plan's evidence.
         output_depth: history of the output's writer (keep last).
         core, output_core: cores of the two servers.
         anchor, fifo_priority, spin_ns, pause_ns, receivers: for the shaping node.
         overrun: what becomes of an output that missed its slot.
+        conditions: how the latencies were taken: the other fields of
+            :class:`~chainshaper.planning.plan_parts.Evidence`.
 
     Raises:
         InputError: latencies or values that no plan may have.
@@ -141,17 +133,7 @@ def plan_shaping(
                 output_depth=output_depth,
                 period_ns=period_ns,
             ),
-            evidence=evidence_of(
-                latencies,
-                recording=recording,
-                incomplete=incomplete,
-                disturbed=disturbed,
-                realtime=realtime,
-                longest_stall_ns=longest_stall_ns,
-                utilisation=utilisation,
-                longest_send_ns=longest_send_ns,
-                lost_events=lost_events,
-            ),
+            evidence=evidence_of(latencies, **conditions),
             margin=margin or Margin(epsilon_ns=epsilon_ns),
             policy="shaped",
             cycle_ns=period_ns,
@@ -186,32 +168,14 @@ def shaping_node_like(
     return ShapingNode.model_validate({**node.model_dump(), **others})
 
 
-def evidence_of(
-    latencies_ns: NDArray[np.int64],
-    *,
-    recording: str | None = None,
-    incomplete: int = 0,
-    disturbed: int = 0,
-    realtime: bool | None = None,
-    longest_stall_ns: int | None = None,
-    utilisation: float | None = None,
-    longest_send_ns: int | None = None,
-    lost_events: int | None = None,
-) -> Evidence:
-    """The latencies' statistics together with the conditions they were taken under."""
+def evidence_of(latencies_ns: NDArray[np.int64], **conditions: Any) -> Evidence:
+    """The latencies' statistics, with the conditions they were taken under: Evidence's fields."""
     return Evidence(
-        recording=recording,
         samples=int(latencies_ns.size),
         min_latency_ns=int(latencies_ns.min()),
         mean_latency_ns=round(int(latencies_ns.sum()) / latencies_ns.size),
         max_latency_ns=int(latencies_ns.max()),
-        incomplete=incomplete,
-        disturbed=disturbed,
-        realtime=realtime,
-        longest_stall_ns=longest_stall_ns,
-        utilisation=utilisation,
-        longest_send_ns=longest_send_ns,
-        lost_events=lost_events,
+        **conditions,
     )
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import polars as pl
 
 from chainshaper import events
+from chainshaper.enforcement.gate import STALL_NS
 from chainshaper.errors import InputError
 
 __all__ = ["read_gate_log", "with_gate_logs"]
@@ -50,9 +51,13 @@ def read_gate_log(path: str | Path) -> pl.DataFrame:
 
 
 def with_gate_logs(
-    tables: events.EventTables, logs: Sequence[Path]
+    tables: events.EventTables, logs: Sequence[Path], since_ns: int, until_ns: int
 ) -> tuple[events.EventTables, tuple[str, ...]]:
     """Event tables with `gate_release` from the logs of shaping nodes, and which are not there.
+
+    A node writes its log for as long as it runs. Of that, the cycles count that began at
+    ``since_ns`` or later, and whose message was let go before ``until_ns``: those are in the other
+    tables too (both CLOCK_MONOTONIC).
 
     Raises:
         InputError: a file is no shaping node's log.
@@ -66,4 +71,13 @@ def with_gate_logs(
     if not there:
         return tables, missing
     releases = pl.concat([read_gate_log(log) for log in there]).sort("time", maintain_order=True)
-    return {**tables, "gate_release": releases}, missing
+    releases = releases.filter(pl.col("origin") >= since_ns, pl.col("time") < until_ns)
+    stalls = pl.concat([events.table(tables, "machine_stall"), _stalls(releases)], how="diagonal")
+    stalls = stalls.sort("time", maintain_order=True)
+    return {**tables, "gate_release": releases, "machine_stall": stalls}, missing
+
+
+def _stalls(releases: pl.DataFrame) -> pl.DataFrame:
+    """The rows of `machine_stall` that gates saw: each watches the clock at its releases."""
+    seen = releases.filter(pl.col("stalled") >= STALL_NS)
+    return seen.select("pid", "tid", "cpu", time="release", duration="stalled")

@@ -23,6 +23,7 @@ from chainshaper.splicing.generated_package import (
     message_type_named,
     typed_package,
 )
+from chainshaper.whole_file import write_whole
 
 __all__ = [
     "NodeKind",
@@ -53,6 +54,14 @@ class ShapingProcess:
     executable: str | None
     parameters_file: Path
     remappings: tuple[tuple[str, str], ...]
+
+    @property
+    def command_line(self) -> list[str]:
+        """The command with name, remaps and parameters as ROS arguments behind it."""
+        rules = [("__node", self.name), ("__ns", self.namespace), *self.remappings]
+        remaps = [word for match, target in rules for word in ("-r", f"{match}:={target}")]
+        parameters = ["--params-file", str(self.parameters_file)]
+        return [*(self.command or ()), "--ros-args", *remaps, *parameters]
 
 
 def write_shaping_process(
@@ -161,7 +170,10 @@ def python_node(executable: str) -> str:
     """
     parts = [
         Path(gate.__file__),
+        _PYTHON_NODES / "message_events.py",
+        _PYTHON_NODES / "callback_events.py",
         _PYTHON_NODES / "endpoints.py",
+        _PYTHON_NODES / "readiness.py",
         _PYTHON_NODES / f"{executable}.py",
     ]
     texts = [_without_own_imports(part.read_text(encoding="utf-8")) for part in parts]
@@ -228,8 +240,6 @@ def _write(folder: Path, files: dict[str, str]) -> None:
         for name, text in files.items():
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
-            partial = path.with_name(f".{path.name}.partial")
-            partial.write_text(text, encoding="utf-8")
-            partial.replace(path)
+            write_whole(path, [text.encode()])
     except OSError as error:
         raise OperationError(f"{error.filename}: cannot be written: {error.strerror}") from error

@@ -6,42 +6,33 @@ it is locked into memory.
 """
 
 import os
+import signal
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 from typing import Any
 
-from chainshaper.enforcement.gate import Gate, Modes, Shaper, sleep_until, text_of
+from chainshaper.enforcement.gate import STALL_NS, Gate, Modes, Shaper, sleep_until, text_of
 from chainshaper.enforcement.realtime import (
-    die_with_parent,
     lock_memory,
     set_thread_name,
+    signalled_with_parent,
     stop_garbage_collection,
 )
 from chainshaper.workload import dds, protocol
 from chainshaper.workload.asynchronous import AsynchronousWriter, PublisherThread, noting_sends
 from chainshaper.workload.computing import Work, computing, load_function, spending
-from chainshaper.workload.event_log import ABSENT, EventLog, number_of
+from chainshaper.workload.event_log import ABSENT, LAYOUT, EventLog, number_of
 from chainshaper.workload.execution import ExecutionTimes
 from chainshaper.workload.executor import Executor, SubscriptionEntity, Timer
 from chainshaper.workload.synchronising import Synchroniser
 
 __all__ = ["NodeProcess", "main"]
 
-STALL_NS = 100_000
-"""As the stall meter's threshold."""
-
-
-class Handles:
-    """Addresses for objects: like real ones, unique in this process and reused by the others."""
-
-    def __init__(self) -> None:
-        self._last = 0x55D0_0000_0000
-
-    def __call__(self) -> int:
-        self._last += 0x100
-        return self._last
+FIRST_HANDLE = 0x55D0_0000_0100
+"""Handles are like real addresses: unique in this process and reused by the others."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +69,7 @@ class NodeProcess:
     def __init__(self, spec: dict[str, Any]) -> None:
         self.spec = spec
         self.log = EventLog()
-        self.new_handle = Handles()
+        self.new_handle = partial(next, count(FIRST_HANDLE, 0x100))
         self.participant = dds.join_domain(spec["domain"])
         self.executor = Executor(self.participant, self.log)
         self.publishers: dict[str, dds.Publisher] = {}
@@ -87,19 +78,7 @@ class NodeProcess:
         self.shapers: list[Shaper] = []
         self.first_due: list[tuple[Timer, int]] = []
         self.execution_times: list[ExecutionTimes] = []
-        self._point = {
-            name: self.log.point(name)
-            for name in (
-                "callback_start",
-                "callback_end",
-                "rclcpp_publish",
-                "rcl_publish",
-                "rmw_publish",
-                "gate_release",
-                "asynchronous_send",
-                "machine_stall",
-            )
-        }
+        self._point = {name: self.log.point(name) for name, _ in LAYOUT}
         self.node_handle = self.new_handle()
         self.log.init("rcl_init", context_handle=self.new_handle(), version="live workload")
         namespace, _, name = spec["node"].rpartition("/")
@@ -416,7 +395,7 @@ class NodeProcess:
 def main() -> None:
     """Run one node as the launcher says."""
     spec = protocol.receive()
-    die_with_parent(spec["parent"])
+    signalled_with_parent(spec["parent"], signal.SIGKILL)
     set_thread_name(spec["node"].strip("/").replace("/", "."))
     node = NodeProcess(spec)
     missing = node.wait_for_counterparts(time.monotonic_ns() + spec["discovery_ns"])

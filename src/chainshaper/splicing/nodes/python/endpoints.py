@@ -27,7 +27,6 @@ from rclpy.qos import (
 )
 
 __all__ = [
-    "AwakeCores",
     "asked_of",
     "become_realtime",
     "message_class",
@@ -152,40 +151,6 @@ def become_realtime(node: Node) -> None:
     gc.collect()
     gc.freeze()
     gc.disable()
-
-
-class AwakeCores:
-    """Keeps idle cores from sleeping while a message is about to be delivered.
-
-    A core that sleeps takes tens of microseconds to wake up, on virtual machines more, and never
-    the same: most of what a subscriber sees of an output's jitter. While `/dev/cpu_dma_latency` is
-    held open, cores wake up within the microseconds written there, 0 at best
-    (Documentation/power/pm_qos_interface.rst). What is written ends with the process.
-    """
-
-    AWAKE, AS_USUAL = (value.to_bytes(4, sys.byteorder, signed=True) for value in (0, -1))
-
-    def __init__(self, node: Node) -> None:
-        self._file = None
-        try:
-            self._file = os.open("/dev/cpu_dma_latency", os.O_WRONLY | os.O_CLOEXEC)
-        except OSError as error:
-            node.get_logger().warning(
-                f"/dev/cpu_dma_latency: {error.strerror}: idle cores sleep, and deliver less "
-                "regularly; run as root, or give the user the right to write it"
-            )
-
-    def keep_awake(self) -> None:
-        """From now on, until :meth:`let_sleep`."""
-        self._write(self.AWAKE)
-
-    def let_sleep(self) -> None:
-        """As if nothing had been asked for."""
-        self._write(self.AS_USUAL)
-
-    def _write(self, latency: bytes) -> None:
-        if self._file is not None:
-            os.write(self._file, latency)
 
 
 def run(name: str, set_up: Callable[[Node], None]) -> None:

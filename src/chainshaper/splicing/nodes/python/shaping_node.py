@@ -20,8 +20,8 @@ from rclpy.subscription import Subscription
 from std_msgs.msg import String
 
 from chainshaper.enforcement.gate import Gate, Modes, Release, Shaper, sleep_until
+from chainshaper.splicing.nodes.python.callback_events import create_subscription
 from chainshaper.splicing.nodes.python.endpoints import (
-    AwakeCores,
     asked_of,
     message_class,
     offered_by,
@@ -29,10 +29,12 @@ from chainshaper.splicing.nodes.python.endpoints import (
     run,
     wait_for_publisher,
 )
+from chainshaper.splicing.nodes.python.message_events import publish_function
+from chainshaper.splicing.nodes.python.readiness import Readiness
 
 LOG_HEADER = (
     "time,pid,tid,cpu,source_timestamp,arrival,origin,release,slot,cycles_waited,anchor,overrun,"
-    "mode,published\n"
+    "mode,published,stalled\n"
 )
 
 
@@ -56,14 +58,16 @@ class GateLog:
         self._process = f"{os.getpid()},{threading.get_native_id()}"
 
     def write(self, release: Release, *times: int | None) -> None:
-        """Note a decision: woke at, source time stamp, arrival, published (ns, None: not known)."""
+        """Note a decision: woke at, source time stamp, arrival, published, and for how long the
+        machine stood still behind the release (ns, None: not known)."""
         if self._file is None:
             return
-        woke, source_timestamp, arrival, published = times
+        woke, source_timestamp, arrival, published, stalled = times
         core = next(iter(os.sched_getaffinity(0)))
         before = (source_timestamp, arrival, release.origin_ns, release.at_ns, release.slot)
-        after = (release.cycles_waited, release.anchor, release.overrun, release.mode, published)
-        texts = ["" if field is None else str(field) for field in (*before, *after)]
+        after = (release.cycles_waited, release.anchor, release.overrun, release.mode)
+        fields = (*before, *after, published, stalled)
+        texts = ["" if field is None else str(field) for field in fields]
         # A full disk must not stop the output: a line that cannot be written is missing.
         with suppress(OSError):
             os.write(self._file, f"{woke},{self._process},{core},{','.join(texts)}\n".encode())
@@ -114,7 +118,7 @@ def listen_to_modes(node: Node, shaper: Shaper) -> None:
         else:
             logger.warning(f"there is no mode {message.data!r}")
 
-    node.create_subscription(String, topic, announced, qos)
+    create_subscription(node, String, topic, announced, qos)
 
 
 def change_phase_with(node: Node, shaper: Shaper) -> None:
@@ -134,31 +138,33 @@ def change_phase_with(node: Node, shaper: Shaper) -> None:
 
 def set_up(node: Node) -> None:
     """Make the node's endpoints."""
-    cores = AwakeCores(node)
-    shaper = Shaper(gate_from(node), parameter(node, "spin_ns", 0), cores.keep_awake)
+    readiness = Readiness(node)
+    shaper = Shaper(gate_from(node), parameter(node, "spin_ns", 0), readiness.get_ready)
     log, pause_ns = GateLog(node, parameter(node, "log", "")), parameter(node, "pause_ns", 0)
     change_phase_with(node, shaper)
     info = wait_for_publisher(node, "input")
     offered = offered_by(info, parameter(node, "output_depth", 10))
     message_type = message_class(info.topic_type)
     publisher = node.create_publisher(message_type, "output", offered)
+    publish = publish_function(publisher)
     listen_to_modes(node, shaper)
 
     def shape(payload: bytes, source_timestamp: int | None) -> None:
         release, arrival, woke = shaper.hold(payload)
-        published = None
+        published = stalled = None
         if release.at_ns is not None:
             try:
-                publisher.publish(payload)
+                publish(payload)
             except RuntimeError:  # rclpy's RCLError is one
                 if rclpy.ok():
                     raise
                 return  # it was interrupted meanwhile; to ask before publishing would cost time
             published = time.monotonic_ns()
+            stalled = shaper.time_lost(release, woke)
             if release.overrun is None:  # else the next message may be waiting already
                 sleep_until(published + pause_ns)
-        cores.let_sleep()
-        log.write(release, woke, source_timestamp, arrival, published)
+        readiness.relax()
+        log.write(release, woke, source_timestamp, arrival, published, stalled)
         gc.collect()  # here is time for it; all that is older is frozen
 
     def with_info(payload: bytes, message_info: Any) -> None:
@@ -169,7 +175,7 @@ def set_up(node: Node) -> None:
 
     # Humble gives a callback the message only: the log lacks its source time stamp.
     callback = with_info if hasattr(Subscription, "CallbackType") else without_info
-    node.create_subscription(message_type, "input", callback, asked_of(offered), raw=True)
+    create_subscription(node, message_type, "input", callback, asked_of(offered), raw=True)
 
 
 if __name__ == "__main__":

@@ -5,10 +5,17 @@ Each topic of ``inputs`` is republished on the topic of ``outputs`` in the same 
 ``period_ns``, at ``phase_ns`` after multiples of it on CLOCK_MONOTONIC: the newest message that
 came since the last time. Where none came nothing is published, and where several came the older
 ones are dropped; both are counted, and said at the end.
+
+The paper's is triggered by its input: it republishes what comes, and blocks what comes too soon
+after that. It is its server, a slot of 2 ms in every cycle, that makes the output periodic; where
+nothing holds the thread back, the output is as irregular as the input. Here a timer does what the
+slot does there, on every kernel. As the first message of a period would have become old by then,
+the newest is published.
 """
 
 import atexit
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +23,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from chainshaper.enforcement.gate import sleep_until
+from chainshaper.splicing.nodes.python.callback_events import create_subscription, create_timer
 from chainshaper.splicing.nodes.python.endpoints import (
     asked_of,
     message_class,
@@ -24,6 +32,7 @@ from chainshaper.splicing.nodes.python.endpoints import (
     run,
     wait_for_publisher,
 )
+from chainshaper.splicing.nodes.python.message_events import publish_function
 
 
 @dataclass
@@ -31,7 +40,7 @@ class Channel:
     """One topic on its way through, and what became of its messages."""
 
     output: str
-    publisher: Any
+    send: Callable[[bytes], None]
     logger: Any
     newest: bytes | None = None
     published: int = 0
@@ -52,7 +61,7 @@ class Channel:
                 throttle_duration_sec=10.0,
             )
             return
-        self.publisher.publish(self.newest)
+        self.send(self.newest)
         self.newest = None
         self.published += 1
 
@@ -76,16 +85,16 @@ def set_up(node: Node) -> None:
         offered = offered_by(info, parameter(node, "output_depth", 10))
         message_type = message_class(info.topic_type)
         publisher = node.create_publisher(message_type, target, offered)
-        channel = Channel(target, publisher, node.get_logger())
-        node.create_subscription(message_type, source, channel.take, asked_of(offered), raw=True)
+        channel = Channel(target, publish_function(publisher), node.get_logger())
+        asked = asked_of(offered)
+        create_subscription(node, message_type, source, channel.take, asked, raw=True)
         channels.append(channel)
     # A timer keeps the phase at which it was made, on the same clock.
     since = time.monotonic_ns() - phase
     sleep_until(phase + (since // period + 1) * period)
     steady = Clock(clock_type=ClockType.STEADY_TIME)
     for channel in channels:
-        # rclpy takes seconds and cuts off behind the nanosecond.
-        node.create_timer((period + 0.5) / 1e9, channel.publish, clock=steady)
+        create_timer(node, period, channel.publish, steady)
 
 
 if __name__ == "__main__":

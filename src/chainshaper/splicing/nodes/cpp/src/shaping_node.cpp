@@ -5,31 +5,14 @@
 #include <memory>
 #include <optional>
 
-#include "rclcpp/version.h"
-
 #include "chainshaper_shaping/node.hpp"
+#include "chainshaper_shaping/serialized.hpp"
 
-namespace
-{
-
-using chainshaper::Shaping;
 using Message = rclcpp::SerializedMessage;
-
-void shape(
-  Shaping & shaping, rclcpp::GenericPublisher & publisher, const Message & message,
-  std::optional<std::int64_t> source_timestamp)
-{
-  const auto & bytes = message.get_rcl_serialized_message();
-  shaping.shape(
-    chainshaper::origin_of(bytes.buffer, bytes.buffer_length), source_timestamp,
-    [&] {publisher.publish(message);});
-}
-
-}  // namespace
 
 int main(int argc, char ** argv)
 {
-  std::optional<Shaping> shaping;
+  std::optional<chainshaper::Shaping> shaping;
   rclcpp::GenericPublisher::SharedPtr publisher;
   rclcpp::GenericSubscription::SharedPtr subscription;
   return chainshaper::run(
@@ -43,20 +26,14 @@ int main(int argc, char ** argv)
       }
       publisher = node.create_generic_publisher("output", offer->type, offer->publisher);
       shaping->listen_to_modes();
-#if RCLCPP_VERSION_GTE(25, 0, 0)
-      subscription = node.create_generic_subscription(
-        "input", offer->type, offer->subscription,
-        [&](std::shared_ptr<const Message> message, const rclcpp::MessageInfo & info) {
-          shape(*shaping, *publisher, *message, info.get_rmw_message_info().source_timestamp);
+      subscription = chainshaper::subscribe_serialized(
+        node, "input", offer->type, offer->subscription,
+        [&](std::shared_ptr<const Message> message, std::int64_t source_timestamp) {
+          const auto & bytes = message->get_rcl_serialized_message();
+          shaping->shape(
+            chainshaper::origin_of(bytes.buffer, bytes.buffer_length), source_timestamp,
+            [&] {chainshaper::publish_serialized(*publisher, *message);});
         });
-#else
-      // Up to Iron the callback is given the message only (rclcpp issue 1604): the log lacks its
-      // source timestamp.
-      subscription = node.create_generic_subscription(
-        "input", offer->type, offer->subscription, [&](std::shared_ptr<Message> message) {
-          shape(*shaping, *publisher, *message, std::nullopt);
-        });
-#endif
       return true;
     });
 }

@@ -27,7 +27,7 @@ namespace chainshaper
 
 inline constexpr const char * log_header =
   "time,pid,tid,cpu,source_timestamp,arrival,origin,release,slot,cycles_waited,anchor,overrun,"
-  "mode,published\n";
+  "mode,published,stalled\n";
 
 class GateLog
 {
@@ -54,10 +54,11 @@ public:
     }
   }
 
-  // `published_ns` is when publishing returned; none for a message that was discarded.
+  // `published_ns` is when publishing returned, `stalled_ns` for how long the machine stood still
+  // behind the release; none for a message that was discarded.
   void write(
     const Gate & gate, const Held & held, std::optional<std::int64_t> source_timestamp,
-    std::optional<std::int64_t> published_ns)
+    std::optional<std::int64_t> published_ns, std::optional<std::int64_t> stalled_ns)
   {
     if (file_ < 0) {
       return;
@@ -82,6 +83,7 @@ public:
     text(release.overrun ? policy_names[static_cast<std::size_t>(*release.overrun)] : "");
     text(release.mode ? gate.modes->names[*release.mode].c_str() : "");
     number(published_ns);
+    number(stalled_ns);
     line_[size_ - 1] = '\n';  // in place of the last comma
     put(line_.data(), size_);
   }

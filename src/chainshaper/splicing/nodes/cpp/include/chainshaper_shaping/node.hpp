@@ -21,9 +21,9 @@
 #include "rclcpp/rclcpp.hpp"
 #include "std_msgs/msg/string.hpp"
 
-#include "awake_cores.hpp"
 #include "gate.hpp"
 #include "gate_log.hpp"
+#include "readiness.hpp"
 #include "shaper.hpp"
 
 namespace chainshaper
@@ -182,17 +182,12 @@ class Shaping
 {
 public:
   explicit Shaping(rclcpp::Node & node)
-  : node_(node),
+  : node_(node), readiness_(node),
     shaper_(
-      gate_from(node), parameter<std::int64_t>(node, "spin_ns", 0), [this] {cores_.keep_awake();}),
+      gate_from(node), parameter<std::int64_t>(node, "spin_ns", 0),
+      [this](std::int64_t release_ns) {readiness_.get_ready(release_ns);}),
     pause_ns_(parameter<std::int64_t>(node, "pause_ns", 0))
   {
-    if (cores_.refused() != 0) {
-      RCLCPP_WARN(
-        node.get_logger(), "/dev/cpu_dma_latency: %s: idle cores sleep, and deliver less "
-        "regularly; run as root, or give the user the right to write it",
-        std::strerror(cores_.refused()));
-    }
     const auto log = parameter<std::string>(node, "log", "");
     if (!log.empty() && !log_.open_file(log)) {
       RCLCPP_WARN(
@@ -244,6 +239,7 @@ public:
   {
     const Held held = shaper_.hold(stamp_ns);
     std::optional<std::int64_t> published_ns;
+    std::optional<std::int64_t> stalled_ns;
     if (held.release.at_ns) {
       try {
         publish();
@@ -254,17 +250,18 @@ public:
         return;  // it was interrupted meanwhile; to ask before publishing would cost time
       }
       published_ns = monotonic_ns();
+      stalled_ns = shaper_.time_lost(held);
       if (!held.release.overrun) {
         sleep_until(*published_ns + pause_ns_);
       }
     }
-    cores_.let_sleep();
-    log_.write(shaper_.gate(), held, source_timestamp, published_ns);
+    readiness_.relax();
+    log_.write(shaper_.gate(), held, source_timestamp, published_ns, stalled_ns);
   }
 
 private:
   rclcpp::Node & node_;
-  AwakeCores cores_;
+  Readiness readiness_;
   Shaper shaper_;
   GateLog log_;
   std::int64_t pause_ns_;

@@ -8,8 +8,12 @@
 #define CHAINSHAPER_SHAPING__SHAPER_HPP_
 
 #include <errno.h>
+#include <fcntl.h>
+#include <sys/syscall.h>
 #include <time.h>
+#include <unistd.h>
 
+#include <algorithm>
 #include <cstdint>
 #include <cstdlib>
 #include <deque>
@@ -73,6 +77,49 @@ inline std::int64_t clock_offset()
   return best;
 }
 
+// For how long the calling thread has been ready while others ran, by the kernel's account: the
+// second number of /proc/thread-self/schedstat (Documentation/scheduler/sched-stats.rst). Where the
+// kernel has none, all delay is taken to be other threads', and none the machine's.
+class WaitingTime
+{
+public:
+  WaitingTime() = default;
+  WaitingTime(const WaitingTime &) = delete;
+  WaitingTime & operator=(const WaitingTime &) = delete;
+
+  ~WaitingTime()
+  {
+    if (file_ >= 0) {
+      close(file_);
+    }
+  }
+
+  std::int64_t so_far()
+  {
+    const auto thread = static_cast<pid_t>(syscall(SYS_gettid));
+    if (thread != thread_) {  // the file is bound to who opened it
+      if (file_ >= 0) {
+        close(file_);
+      }
+      file_ = open("/proc/thread-self/schedstat", O_RDONLY | O_CLOEXEC);
+      thread_ = thread;
+    }
+    char text[128];
+    const auto size = file_ < 0 ? -1 : pread(file_, text, sizeof(text) - 1, 0);
+    if (size <= 0) {
+      return monotonic_ns();
+    }
+    text[size] = '\0';
+    char * second = nullptr;
+    std::strtoll(text, &second, 10);
+    return std::strtoll(second, nullptr, 10);
+  }
+
+private:
+  int file_{-1};
+  pid_t thread_{-1};
+};
+
 // What became of one message.
 struct Held
 {
@@ -84,8 +131,11 @@ struct Held
 class Shaper
 {
 public:
-  // `on_waking` is called when it wakes `spin_ns` before a release, to watch the clock from there.
-  Shaper(Gate gate, std::int64_t spin_ns, std::function<void()> on_waking = [] {})
+  // `on_waking` is called with the time of a release when it wakes `spin_ns` before that, to watch
+  // the clock from there; what it does there should be over in time.
+  Shaper(
+    Gate gate, std::int64_t spin_ns,
+    std::function<void(std::int64_t)> on_waking = [](std::int64_t) {})
   : gate_(std::move(gate)), spin_ns_(spin_ns), on_waking_(std::move(on_waking)),
     offset_(clock_offset())
   {
@@ -129,9 +179,14 @@ public:
       held.awake_ns = held.arrival_ns;
       return held;
     }
+    waited_ns_ = waiting_.so_far();
     if (*held.release.at_ns > held.arrival_ns) {
       sleep_until(*held.release.at_ns - spin_ns_);
-      on_waking_();
+      on_waking_(*held.release.at_ns);
+      if (monotonic_ns() < *held.release.at_ns) {
+        // Awake in time: what other threads took before is of no consequence.
+        waited_ns_ = waiting_.so_far();
+      }
     }
     held.awake_ns = watch_until(*held.release.at_ns);
     if (policy_of(gate_) == Policy::discard && missed(gate_, held.release, held.awake_ns)) {
@@ -140,6 +195,18 @@ public:
       held.release.overrun = Policy::discard;
     }
     return held;
+  }
+
+  // How much of the delay between a release and the time when the thread was awake the machine
+  // itself took: what the kernel does not say that other threads ran. To be called right after
+  // publishing.
+  std::int64_t time_lost(const Held & held)
+  {
+    if (!held.release.at_ns) {
+      return 0;
+    }
+    const std::int64_t others = waiting_.so_far() - waited_ns_;
+    return std::max<std::int64_t>(0, held.awake_ns - *held.release.at_ns - others);
   }
 
 private:
@@ -166,9 +233,11 @@ private:
 
   Gate gate_;
   std::int64_t spin_ns_;
-  std::function<void()> on_waking_;
+  std::function<void(std::int64_t)> on_waking_;
   std::int64_t offset_;
   std::deque<Change> changes_;
+  WaitingTime waiting_;
+  std::int64_t waited_ns_{0};
   std::optional<std::pair<std::int64_t, std::int64_t>> next_phase_;  // from when on, and which
 };
 

@@ -1,0 +1,115 @@
+// Making what follows a release take the same time in every cycle.
+//
+// Publishing is fast when its code and data are in the processor's caches, and slow, never equally
+// slow, when the chain has run there since the last time. So it is rehearsed shortly before each
+// release: a message that nobody receives goes the way of the real one, through the same layers of
+// ROS 2 and DDS, and a datagram to ourselves the way through the network stack.
+//
+// A core that sleeps takes tens of microseconds to wake up, on virtual machines more, and never the
+// same: most of what a subscriber sees of an output's jitter. While /dev/cpu_dma_latency is held
+// open, cores wake up within the microseconds written there, 0 at best
+// (Documentation/power/pm_qos_interface.rst). What is written ends with the process.
+
+#ifndef CHAINSHAPER_SHAPING__READINESS_HPP_
+#define CHAINSHAPER_SHAPING__READINESS_HPP_
+
+#include <arpa/inet.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <netinet/in.h>
+#include <sys/socket.h>
+#include <unistd.h>
+
+#include <array>
+#include <cstdint>
+#include <cstring>
+
+#include "rclcpp/rclcpp.hpp"
+
+#include "shaper.hpp"
+
+namespace chainshaper
+{
+
+class Readiness
+{
+public:
+  explicit Readiness(rclcpp::Node & node)
+  : rehearsal_(node.create_generic_publisher(  // a hidden topic: it begins with an underscore
+        "~/_rehearsal", "std_msgs/msg/Empty", rclcpp::QoS(1))),
+    empty_(serialized_empty.size()),
+    to_itself_(socket(AF_INET, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0)),
+    latency_(open("/dev/cpu_dma_latency", O_WRONLY | O_CLOEXEC))
+  {
+    if (latency_ < 0) {
+      RCLCPP_WARN(
+        node.get_logger(), "/dev/cpu_dma_latency: %s: idle cores sleep, and deliver less "
+        "regularly; run as root, or give the user the right to write it", std::strerror(errno));
+    }
+    auto & message = empty_.get_rcl_serialized_message();
+    std::memcpy(message.buffer, serialized_empty.data(), serialized_empty.size());
+    message.buffer_length = serialized_empty.size();
+    sockaddr_in address{};
+    address.sin_family = AF_INET;
+    address.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+    socklen_t length = sizeof(address);
+    auto * const general = reinterpret_cast<sockaddr *>(&address);
+    connected_ = bind(to_itself_, general, length) == 0 &&
+      getsockname(to_itself_, general, &length) == 0 && connect(to_itself_, general, length) == 0;
+  }
+
+  Readiness(const Readiness &) = delete;
+  Readiness & operator=(const Readiness &) = delete;
+
+  ~Readiness()
+  {
+    for (const int file : {to_itself_, latency_}) {
+      if (file >= 0) {
+        close(file);
+      }
+    }
+  }
+
+  // For a release at that time of CLOCK_MONOTONIC, as far as there is time left for it.
+  void get_ready(std::int64_t release_ns)
+  {
+    ask_for(0);
+    for (int time = 0; time < 2; ++time) {  // the second finds in order what the first has loaded
+      if (monotonic_ns() > release_ns - rehearsal_ns) {
+        return;
+      }
+      rehearsal_->publish(empty_);
+      if (connected_) {
+        std::array<std::uint8_t, serialized_empty.size()> back;
+        [[maybe_unused]] auto bytes =
+          send(to_itself_, serialized_empty.data(), serialized_empty.size(), 0);
+        bytes = recv(to_itself_, back.data(), back.size(), 0);
+      }
+    }
+  }
+
+  // The message is delivered: cores may sleep, as if nothing had been asked for.
+  void relax() const {ask_for(-1);}
+
+private:
+  static constexpr std::array<std::uint8_t, 5> serialized_empty{0, 1, 0, 0, 0};
+  // A rehearsal is not begun later before a release than this: the first may take most of it.
+  static constexpr std::int64_t rehearsal_ns = 400'000;
+
+  void ask_for(std::int32_t latency_us) const
+  {
+    if (latency_ >= 0) {
+      [[maybe_unused]] const auto written = write(latency_, &latency_us, sizeof(latency_us));
+    }
+  }
+
+  rclcpp::GenericPublisher::SharedPtr rehearsal_;
+  rclcpp::SerializedMessage empty_;
+  int to_itself_;
+  bool connected_ = false;
+  int latency_;
+};
+
+}  // namespace chainshaper
+
+#endif  // CHAINSHAPER_SHAPING__READINESS_HPP_
