@@ -15,7 +15,8 @@ test-computing:
 test-machine:
 	.venv/bin/python -m pytest -m "not computing"
 
-# The sched_ext back end on Debian's kernels, in QEMU. Fetches about 50 MB once; ten minutes or so.
+# In QEMU, what needs another kernel than this machine's: the sched_ext back end, LTTng's kernel
+# tracer. Fetches about 130 MB once; a quarter of an hour or so.
 test-kernel: .venv/.ready-dev
 	.venv/bin/python tests/kernel/run_kernel_checks.py
 

@@ -19,13 +19,13 @@ import numpy as np
 from avp_drawn import APPLICATION as DRAWN
 from configurations import Options, Panel, draw_latencies, live, parse_options, simulated
 from results import HERE, MS, PICTURES, Line, Run, Value, lines_of, save
-from table_4 import MWCETS_US, plans
+from table_4 import plans
 
 from chainshaper import load_application
 from chainshaper.errors import ChainshaperError
-from chainshaper.planning import Plan, PlanRequest, plan_chain, publish_slots
+from chainshaper.planning import Plan, PlanRequest, publish_slots
 from chainshaper.simulation.samples import with_recorded_times
-from chainshaper.steps import profile_chains
+from chainshaper.steps import plan_recording
 from chainshaper.workload.description import Application
 
 __all__ = ["FIFO", "PERIOD_NS", "run_under_fifo"]
@@ -111,16 +111,8 @@ def run_under_fifo(options: Options) -> tuple[Run, Path]:
 
 
 def live_plan(recording: Path, request: PlanRequest) -> Plan:
-    """The plan of a row from the live recording of the first.
-
-    Callbacks are in the order of table 4: both of the throttler's before all others. The player,
-    which the throttler waits for, is no part of the system, and stays outside its servers.
-    """
-    (profile,) = profile_chains(recording, period_ns=PERIOD_NS)
-    times = {node: [one for one in profile.callbacks if one.node == node] for node, *_ in MWCETS_US}
-    callbacks = [replace(times[node].pop(0), after=after) for node, _, _, after in MWCETS_US]
-    core_of = {node: core for node, core in profile.core_of.items() if node in times}
-    return plan_chain(replace(profile, callbacks=tuple(callbacks), core_of=core_of), request)
+    """The plan of a row from the live recording of the first."""
+    return plan_recording(recording, request=request, period_ns=PERIOD_NS)
 
 
 def run_live(options: Options) -> tuple[list[Run], dict[str, Plan], list[str]]:

@@ -12,9 +12,9 @@ from processes import wait_for
 from chainshaper.command_process import (
     check_command,
     end_command,
-    end_in_words,
     start_command,
 )
+from chainshaper.enforcement.own_processes import end_in_words
 from chainshaper.errors import InputError
 
 IGNORING = "trap '' INT; echo ready; exec sleep 60"

@@ -1,16 +1,19 @@
 """Prediction beside measurement: known answers, and a live run with three bands."""
 
+import io
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
+from rich.console import Console
 from small_chain import small_chain
 
 from chainshaper import compare_recordings, measure_latency, plan_recording, shape_application
 from chainshaper.analysis import LatencyAnalysis, latency_statistics
 from chainshaper.planning import (
+    Modes,
     Plan,
     PlanRequest,
     Profile,
@@ -18,9 +21,10 @@ from chainshaper.planning import (
     publish_slots,
 )
 from chainshaper.planning.overruns import cycles_until_output
+from chainshaper.planning.plan import revised
 from chainshaper.predictions import hold_prediction
 from chainshaper.recording import Recording
-from chainshaper.reporting.predictions import prediction_json
+from chainshaper.reporting.predictions import prediction_json, prediction_table
 
 MS = 1_000_000
 PROFILE = Profile(np.array([40, 50, 60, 61, 69, 84]) * MS, 100 * MS)
@@ -110,6 +114,49 @@ def test_policies_without_slots_predict_one_figure(
         plan = plan_chain(PROFILE, request)
         held = hold_prediction(plan, unshaped, _measured([63 * MS, 85 * MS], like))
         assert held.mean.at_start_ns == held.mean.at_end_ns == plan.predicted.mean_ns
+
+
+def test_each_mode_is_held_by_its_own_band(unshaped: Recording, like: LatencyAnalysis) -> None:
+    """Two of the six latencies are behind the slot of the mode `fast`: one such output waits."""
+    chain = replace(PROFILE, nodes=("/a", "/b"), topics=("/x", "/y"))
+    plan = revised(
+        plan_chain(chain, PlanRequest(bands=2, publish_slot_ns=MS)),
+        modes=Modes(topic="/m", default="slow", bands={"slow": 2, "fast": 1}),
+    )
+    (first, _), (last, _) = publish_slots(plan)
+    outputs = [
+        ("slow", 1, None, last + 10),
+        ("slow", 1, None, last + 40),
+        ("fast", 0, None, first + 20),
+        ("fast", 0, "wait", first + 100 * MS),
+    ]
+    stamps = range(1, 5)
+    analysis = _measured([latency for *_, latency in outputs], like)
+    last_hop = len(like.chain.callbacks) - 1
+    hops = pl.DataFrame({"traversal": range(4), "hop": [last_hop] * 4, "source_timestamp": stamps})
+    releases = pl.DataFrame(
+        {
+            "source_timestamp": stamps,
+            **{
+                name: [output[place] for output in outputs]
+                for place, name in enumerate(("mode", "slot", "overrun"))
+            },
+        }
+    )
+    recording = replace(unshaped, events={**unshaped.events, "gate_release": releases})
+    held = hold_prediction(plan, recording, replace(analysis, hops=hops))
+    slow, fast = held.bands
+    assert (slow.mode, slow.count, slow.inside, slow.late, slow.jitter_ns) == ("slow", 2, 2, 0, 30)
+    assert (fast.mode, fast.count, fast.inside, fast.late, fast.jitter_ns) == ("fast", 1, 1, 1, 0)
+    assert (slow.share, fast.share) == (1, 0.5)
+    assert (slow.predicted_share, fast.predicted_share) == (1, plan.predicted.shares[0])
+    assert (slow.slot_start_ns, fast.slot_start_ns) == (last, first)
+    assert held.late == 1
+    assert {held.mean.holds, held.max.holds, held.jitter.holds} == {None}, "the modes decide"
+    assert [one["mode"] for one in prediction_json(held)["bands"]] == ["slow", "fast"]
+    with io.StringIO() as text:
+        Console(file=text, width=120).print(prediction_table(held))
+        assert "fast, 1 late" in text.getvalue()
 
 
 def test_three_bands_live(tmp_path: Path, unshaped: Recording) -> None:

@@ -111,6 +111,16 @@ def test_branches_that_the_chain_waits_for_are_found() -> None:
     assert profile.latencies_ns.tolist() == [(96 - cycle) * MS - 1 for cycle in range(3)]
 
 
+def test_what_feeds_the_first_node_of_a_chain_that_no_timer_starts_is_left_out() -> None:
+    """The throttler feeds the rear filter, and the front filter's branch is followed so far."""
+    (profile,) = profile_chains(_recorded(), ["/rear_filtered../fused../pose"], period_ns=100 * MS)
+    assert [callback.node for callback in profile.callbacks] == [
+        *("/rear_filter", "/front_filter", "/fusion", "/voxel", "/ndt")
+    ]
+    assert [callback.after for callback in profile.callbacks] == [(), (), (0, 1), (2,), (3,)]
+    assert "/throttler" not in profile.core_of
+
+
 def test_a_server_per_callback_is_the_papers_table_4_row_1() -> None:
     plan = plan_chain(_profile(), PlanRequest(policy="server-per-callback", epsilon_ns=0))
     slots = {server.name: [(a // MS, b // MS) for a, b in server.slots] for server in plan.servers}

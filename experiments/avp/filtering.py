@@ -6,7 +6,7 @@ The functions at the end are the callbacks; what they compute stands before them
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree  # type: ignore[import-untyped]
+from scipy.spatial import cKDTree
 
 from .lidar import FRONT, REAR, Lidar, in_vehicle
 from .messages import cloud_message, cloud_of

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from chainshaper.command_process import end_command, start_command
-from chainshaper.dry_run import LEAD_NS, first_thread, server_table, shaping_nodes
+from chainshaper.dry_run import LEAD_NS, first_thread, server_table
 from chainshaper.durations import format_duration
 from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, make_back_end
 from chainshaper.enforcement.phase import DriftWatch, measure_phase
@@ -40,9 +40,10 @@ from chainshaper.enforcement.threads.server_threads import (
 )
 from chainshaper.errors import OperationError
 from chainshaper.planning import Plan
+from chainshaper.planning.plan import shaping_nodes
 from chainshaper.planning.publication import publication_warnings
 from chainshaper.recording import Recording
-from chainshaper.shaping_phase import tell_phase
+from chainshaper.shaping_phase import NOBODY, Telling, moved_text, tell_phase
 from chainshaper.thread_search import find_threads
 
 __all__ = ["Applied", "apply_plan"]
@@ -78,6 +79,7 @@ class _Run:
     watcher: subprocess.Popen[bytes] | None = None
     command: subprocess.Popen[bytes] | None = None
     servers: BackEnd | None = None
+    telling: Telling = NOBODY
 
     @property
     def folder(self) -> Path:
@@ -241,9 +243,7 @@ def _arm(  # noqa: PLR0917 - the parts of a run, each used once
     if phase_ns is None:
         origin = first_thread(run.plan, found)
         phase = measure_phase(
-            origin.pid,
-            origin.tid,
-            run.plan.cycle_ns,
+            *(origin.pid, origin.tid, run.plan.cycle_ns),
             progress=lambda share: progress(share, "measuring where in a cycle the chain begins"),
         )
         phase_ns, spread = phase.at_ns, phase.spread_ns
@@ -254,7 +254,10 @@ def _arm(  # noqa: PLR0917 - the parts of a run, each used once
             )
     anchor = (phase_ns + LEAD_NS) % run.plan.cycle_ns
     # Held back by a server, the chain begins as its slot opens, otherwise with its timer.
-    notes += tell_phase(run.plan, found, anchor if gates(run.choice.name) else phase_ns)
+    run.telling = tell_phase(run.plan, found, anchor if gates(run.choice.name) else phase_ns)
+    while not (run.telling.is_over() or run.stop.wait(0.05) or run.command_ended):
+        progress(1.0, "telling shaping nodes where cycles begin")
+    notes += _told(run)
     threads = _assign(run.plan, found, servers, {server.name: () for server in run.plan.servers})
     servers.arm(anchor)
     return replace(
@@ -294,10 +297,9 @@ def _keep(
     origin, gated = first_thread(run.plan, found), gates(run.choice.name)
     begins = (state.anchor_ns or 0) - (0 if gated else LEAD_NS)
     slots = next((s.slots for s in state.servers if gated and origin.tid in s.threads), ())
-    governed = {server.core for server in run.plan.servers}
     drift = DriftWatch(
         *(origin.pid, origin.tid, run.plan.cycle_ns, begins, slots),
-        cores=set(available_cores()) - governed,
+        cores=set(available_cores()) - {server.core for server in run.plan.servers},
     )
     told_ns, notes = 0, state.notes
     while True:
@@ -310,14 +312,16 @@ def _keep(
             ),
             drift_ns=(drifted_ns := drift.latest_ns),
             failure=_failure(run, servers, state),
+            notes=(*state.notes, *_told(run)),
         )
         save_run_state(run.folder, state)
         watch(state)
         if state.failure is not None or is_over:
             return state
-        if drifted_ns is not None and abs(drifted_ns - told_ns) > PHASE_BOUND_NS:
-            told_ns = drifted_ns
-            state = replace(state, notes=notes + _told_again(run, found, begins, drifted_ns))
+        moved_ns = drifted_ns or 0
+        if abs(moved_ns - told_ns) > PHASE_BOUND_NS and run.telling is NOBODY:
+            told_ns, run.telling = moved_ns, tell_phase(run.plan, found, begins + moved_ns)
+            state = replace(state, notes=(*notes, moved_text(moved_ns)))
         if run.stop.wait(_LOOK_S):
             continue
         if run.watcher is not None and run.watcher.poll() is not None:  # somebody killed it
@@ -331,13 +335,12 @@ def _keep(
             found = now
 
 
-def _told_again(run: _Run, found: Allocation, begins: int, drifted_ns: int) -> tuple[str, ...]:
-    """The shaping nodes follow the chain's beginning; what to know about that."""
-    moved = (
-        f"the chain's beginning has moved by {format_duration(drifted_ns)} since the plan was put "
-        "in force; shaping nodes were told, and outputs without a stamp follow from the next cycle"
-    )
-    return (moved, *tell_phase(run.plan, found, begins + drifted_ns))
+def _told(run: _Run) -> tuple[str, ...]:
+    """What went wrong with telling the shaping nodes, once that is over."""
+    if not run.telling.is_over():
+        return ()
+    telling, run.telling = run.telling, NOBODY
+    return telling.end()
 
 
 def _failure(run: _Run, servers: BackEnd, state: RunState) -> str | None:
@@ -381,6 +384,7 @@ def _put_back(run: _Run) -> None:
             run.servers.release()
         except OperationError as error:
             problems.append(str(error))
+    run.telling.end()
     if run.command is not None:
         end_command(run.command)
     problems += [

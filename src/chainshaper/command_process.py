@@ -19,11 +19,11 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
-from chainshaper.enforcement.realtime import interrupted_with_parent
+from chainshaper.enforcement.realtime import signalled_with_parent
 from chainshaper.enforcement.threads.listing import read_proc
 from chainshaper.errors import InputError, OperationError
 
-__all__ = ["check_command", "end_command", "end_in_words", "start_command"]
+__all__ = ["check_command", "end_command", "start_command"]
 
 PATIENCE_S = 15.0
 """`ros2 launch` itself gives its nodes 5 s after SIGINT, and 5 s after SIGTERM."""
@@ -77,7 +77,7 @@ def start_command(
 def _as_from_a_terminal(parent: int) -> None:
     for number in (signal.SIGINT, signal.SIGQUIT):
         signal.signal(number, signal.SIG_DFL)
-    interrupted_with_parent(parent)
+    signalled_with_parent(parent, signal.SIGINT)
 
 
 def end_command(started: subprocess.Popen[bytes], patience_s: float = PATIENCE_S) -> None:
@@ -90,15 +90,6 @@ def end_command(started: subprocess.Popen[bytes], patience_s: float = PATIENCE_S
         deadline = time.monotonic() + patience_s
         while not _over(started) and time.monotonic() < deadline:
             time.sleep(_LOOK_S)
-
-
-def end_in_words(code: int) -> str:
-    """How a command ended, from its exit code: ``ended with code 3``, ``was killed by SIGSEGV``."""
-    if code >= 0:
-        return f"ended with code {code}"
-    with contextlib.suppress(ValueError):
-        return f"was killed by {signal.Signals(-code).name}"
-    return f"was killed by signal {-code}"  # most real-time signals have no name of their own
 
 
 def _over(started: subprocess.Popen[bytes]) -> bool:

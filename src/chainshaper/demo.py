@@ -58,7 +58,7 @@ def run_demo(
     cycles: int = 320,
     realtime: bool | None = None,
     command: Sequence[str] = (),
-    progress: Progress | None = None,
+    progress: Progress = lambda *_: None,
 ) -> DemoResult:
     """Run an application, plan, shape, run again and compare.
 
@@ -79,8 +79,7 @@ def run_demo(
             command=command,
             progress=_part(progress, 0.0, 0.48, "unshaped run"),
         )
-    if progress is not None:
-        progress(0.48, "planning")
+    progress(0.48, "planning")
     plan = plan_recording(before)
     save_plan(plan, folder / "plan.yaml")
     after = shape_application(
@@ -92,8 +91,7 @@ def run_demo(
         command=command,
         progress=_part(progress, 0.5, 0.48, "shaped run"),
     )
-    if progress is not None:
-        progress(0.98, "comparing")
+    progress(0.98, "comparing")
     comparison = compare_recordings([before, after])
     write_comparison(comparison, folder)
     return DemoResult(
@@ -123,8 +121,6 @@ def _prepared(folder: Path, application: Path) -> Iterator[None]:
                 folder.rmdir()
 
 
-def _part(progress: Progress | None, start: float, share: float, title: str) -> Progress | None:
+def _part(progress: Progress, start: float, share: float, title: str) -> Progress:
     """Progress of one run as a part of the whole."""
-    if progress is None:
-        return None
     return lambda done, what: progress(start + share * done, f"{title}, {what}")

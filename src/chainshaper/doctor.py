@@ -51,114 +51,77 @@ def examine_machine(watch_ns: int = 5_000_000_000) -> MachineReport:
 
     realtime = may_use_fifo()
     stalls, meter = measure_stalls(available_cores(), watch_ns, realtime)
-    checks = (
-        _cores(),
-        _fifo(realtime),
-        _throttling(),
-        _memory_lock(),
-        _other_realtime(),
-        _dds(),
-        *_back_ends(),
-        _tool("bpftrace", "recording ROS 2 without LTTng", "apt install bpftrace"),
-        _tool("lttng", "recording ROS 2 with LTTng", "apt install lttng-tools"),
-        _tool("ros2", "shaping ROS 2 applications", "install ROS 2, and source its setup.bash"),
-    )
-    return MachineReport(checks, stalls, meter, watch_ns)
+    return MachineReport(tuple(_checks(realtime)), stalls, meter, watch_ns)
 
 
-def _cores() -> Check:
-    cores = available_cores()
-    text = f"{len(cores)} ({', '.join(map(str, cores))}), kernel {platform.release()}"
-    purpose = "DDS threads beside executors"
-    if len(cores) >= 2:
-        return Check("cores", "good", text, purpose)
-    return Check("cores", "limited", text, purpose, "use a machine with two cores or more")
-
-
-def _fifo(realtime: bool) -> Check:
-    purpose = "measuring and shaping with real-time scheduling"
-    if realtime:
-        return Check("SCHED_FIFO", "good", "permitted", purpose)
-    return Check(
-        "SCHED_FIFO",
-        "absent",
-        "not permitted",
-        purpose,
-        "run as root, or give your user an rtprio limit of 98 in /etc/security/limits.conf",
-    )
-
-
-def _throttling() -> Check:
-    share = throttle_fraction()
-    purpose = "cores that real-time threads fill"
-    if share >= 1.0:
-        return Check("real-time throttling", "good", "off", purpose)
-    return Check(
-        "real-time throttling",
-        "limited",
-        f"real-time threads are stopped at {share:.0%} of a core",
-        purpose,
-        "stay below it, or: sysctl kernel.sched_rt_runtime_us=-1",
-    )
-
-
-def _memory_lock() -> Check:
-    soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
-    purpose = "no page faults while a gate waits"
-    if os.geteuid() == 0 or soft == resource.RLIM_INFINITY:
-        return Check("memory locking", "good", "permitted", purpose)
-    return Check(
-        "memory locking",
-        "limited",
-        f"up to {soft // 1024} KiB",
-        purpose,
-        "give your user an unlimited memlock limit in /etc/security/limits.conf",
-    )
-
-
-def _other_realtime() -> Check:
+def _checks(realtime: bool) -> Iterator[Check]:
+    cores, throttled = available_cores(), throttle_fraction()
+    lockable, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     others = foreign_realtime_processes()
-    purpose = "undisturbed measurements"
-    if not others:
-        return Check("other real-time processes", "good", "none", purpose)
-    return Check(
-        "other real-time processes",
-        "limited",
-        ", ".join(others),
-        purpose,
-        "end them while you measure, unless they belong to the application",
+    text = f"{len(cores)} ({', '.join(map(str, cores))}), kernel {platform.release()}"
+    yield _check(
+        "cores",
+        "DDS threads beside executors",
+        text if len(cores) >= 2 else None,
+        ("limited", text, "use a machine with two cores or more"),
     )
+    remedy = "run as root, or give your user an rtprio limit of 98 in /etc/security/limits.conf"
+    yield _check(
+        "SCHED_FIFO",
+        "measuring and shaping with real-time scheduling",
+        "permitted" if realtime else None,
+        ("absent", "not permitted", remedy),
+    )
+    found = f"real-time threads are stopped at {throttled:.0%} of a core"
+    yield _check(
+        "real-time throttling",
+        "cores that real-time threads fill",
+        "off" if throttled >= 1.0 else None,
+        ("limited", found, "stay below it, or: sysctl kernel.sched_rt_runtime_us=-1"),
+    )
+    remedy = "give your user an unlimited memlock limit in /etc/security/limits.conf"
+    yield _check(
+        "memory locking",
+        "no page faults while a gate waits",
+        "permitted" if os.geteuid() == 0 or lockable == resource.RLIM_INFINITY else None,
+        ("limited", f"up to {lockable // 1024} KiB", remedy),
+    )
+    remedy = "end them while you measure, unless they belong to the application"
+    yield _check(
+        "other real-time processes",
+        "undisturbed measurements",
+        None if others else "none",
+        ("limited", ", ".join(others), remedy),
+    )
+    yield _dds()
+    for offer in offered_back_ends():  # what `chainshaper apply` can use here, strongest first
+        found, _, remedy = (offer.missing or "").partition(": ")
+        good = "can be used" if offer.missing is None else None
+        yield _check(f"back end {offer.name}", offer.strength, good, ("absent", found, remedy))
+    for name, purpose, remedy in (
+        ("bpftrace", "recording ROS 2 without LTTng", "apt install bpftrace"),
+        ("lttng", "recording ROS 2 with LTTng", "apt install lttng-tools"),
+        ("ros2", "shaping ROS 2 applications", "install ROS 2, and source its setup.bash"),
+    ):
+        yield _check(name, purpose, shutil.which(name), ("absent", "not found", remedy))
+
+
+def _check(name: str, purpose: str, good: str | None, lacking: tuple[State, str, str]) -> Check:
+    """``good`` is what was found, None where it is ``lacking``: state, what was found, remedy."""
+    if good is not None:
+        return Check(name, "good", good, purpose)
+    state, found, remedy = lacking
+    return Check(name, state, found, purpose, remedy)
 
 
 def _dds() -> Check:
-    purpose = "the live workload and `chainshaper demo`"
+    found: str | None = None
+    problem = ""
     try:
-        version = importlib.metadata.version("cyclonedds")
+        found = importlib.metadata.version("cyclonedds")
         from chainshaper.workload import dds  # noqa: F401 - loading it is the check
     except Exception as error:
-        return Check(
-            "Cyclone DDS for Python",
-            "absent",
-            str(error),
-            purpose,
-            "use Python 3.10 to 3.13 on x86-64, for which a wheel exists",
-        )
-    return Check("Cyclone DDS for Python", "good", version, purpose)
-
-
-def _back_ends() -> Iterator[Check]:
-    """What `chainshaper apply` can use here, strongest first."""
-    for offer in offered_back_ends():
-        name = f"back end {offer.name}"
-        if offer.missing is None:
-            yield Check(name, "good", "can be used", offer.strength)
-        else:
-            found, _, remedy = offer.missing.partition(": ")
-            yield Check(name, "absent", found, offer.strength, remedy)
-
-
-def _tool(name: str, purpose: str, remedy: str) -> Check:
-    path = shutil.which(name)
-    if path is not None:
-        return Check(name, "good", path, purpose)
-    return Check(name, "absent", "not found", purpose, remedy)
+        found, problem = None, str(error)
+    remedy = "use Python 3.10 to 3.13 on x86-64, for which a wheel exists"
+    purpose = "the live workload and `chainshaper demo`"
+    return _check("Cyclone DDS for Python", purpose, found, ("absent", problem, remedy))

@@ -21,7 +21,7 @@ from chainshaper.enforcement.threads.server_threads import (
 )
 from chainshaper.errors import OperationError
 from chainshaper.planning import Plan
-from chainshaper.planning.plan_parts import ShapingNode
+from chainshaper.planning.plan import shaping_nodes
 from chainshaper.recording import Recording
 from chainshaper.thread_search import find_threads
 
@@ -31,7 +31,6 @@ __all__ = [
     "first_thread",
     "planned_changes",
     "server_table",
-    "shaping_nodes",
 ]
 
 LEAD_NS = 2_000_000
@@ -104,12 +103,6 @@ def server_table(plan: Plan) -> ServerTable:
             "plan from a recording (`chainshaper plan REC --chain FIRST..LAST`)"
         )
     return ServerTable(plan.cycle_ns, servers)
-
-
-def shaping_nodes(plan: Plan) -> list[ShapingNode]:
-    """The shaping nodes of a plan, of all its chains."""
-    first = [] if plan.shaping_node is None else [plan.shaping_node]
-    return [*first, *plan.further_shaping_nodes]
 
 
 def first_thread(plan: Plan, found: Allocation) -> Thread:

@@ -22,6 +22,7 @@ from chainshaper.analysis import (
 )
 from chainshaper.analysis.close_names import close_names
 from chainshaper.analysis.matching import latest_before
+from chainshaper.analysis.objects import named_nodes
 from chainshaper.app import ApplicationGraph
 from chainshaper.errors import InputError
 from chainshaper.recording import Recording, RecordingInfo, write_recording
@@ -69,12 +70,7 @@ def lost_text(lost: Mapping[str, int]) -> str:
 
 def services(tables: events.EventTables) -> pl.DataFrame:
     """All services: ``service, role, node, pid``, one row per server and client."""
-    nodes = events.table(tables, "rcl_node_init").select(
-        "pid",
-        "node_handle",
-        created="time",
-        node=pl.col("namespace").fill_null("").str.strip_chars_end("/") + "/" + pl.col("node_name"),
-    )
+    nodes = named_nodes(tables).rename({"handle": "node_handle", "valid_from": "created"})
     found = []
     for role, name in (("server", "rcl_service_init"), ("client", "rcl_client_init")):
         ends = events.table(tables, name).select(

@@ -167,15 +167,7 @@ def splice_throttlers(
             remaps += [(want, process) for want in wanted]
         return remaps
 
-    spliced = _spliced(launch_files, folder, arguments, written, throttled=True)
-    if node == "cpp":
-        return spliced
-    first = next(wanted[0].node for wanted in by_period.values())
-    about = (
-        "a throttler in Python emits no callback events, so a chain begins behind it: plan for"
-        f" {first}../OUTPUT and its --period, or take --node cpp, whose timer begins the chain"
-    )
-    return replace(spliced, notes=(*spliced.notes, about))
+    return _spliced(launch_files, folder, arguments, written, throttled=True)
 
 
 def _spliced(

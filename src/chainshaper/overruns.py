@@ -25,11 +25,11 @@ _DONE = {
 
 
 def gate_releases(recording: Recording, plan: Plan | None) -> pl.DataFrame:
-    """The table `gate_release` with its column ``overrun``, which older recordings lack.
+    """The table `gate_release` with ``overrun`` and ``mode``, which older recordings lack.
 
-    Then a message overran when it left in a later cycle than the ``plan`` in force says.
+    Without the former a message overran when it left in a later cycle than the ``plan`` says.
     """
-    table = events.table(recording.events, "gate_release")
+    table = events.table(recording.events, "gate_release", ["mode"])
     if "overrun" in table.columns:
         return table
     late = pl.col("cycles_waited") > (0 if plan is None else cycles_until_output(plan))

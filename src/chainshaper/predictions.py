@@ -5,12 +5,16 @@ message that waits go when its slot starts, at x_α − Δ; only one that arrive
 leaves later. So every figure is predicted twice: as if each output left at the start of its
 slot, and at its end. A measurement should lie between the two, near the first.
 
+With **modes** an output leaves in the slot of its cycle's mode, and what comes behind that slot is
+late for it although there are others. Each mode is then held by itself against the share of
+latencies that fit; the whole depends on how long each was in force, which no plan knows.
+
 A gate counts its slots from the message's own origin. Where a back end holds back a publisher's
 thread instead, slots count from the cycle, and a chain that began late in it has so much less
 latency: an output's place is its latency plus how late its chain began.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import polars as pl
@@ -32,7 +36,8 @@ STANDARD_ERRORS = 3  # beyond so many, an average is not what was predicted
 class FigureHeld:
     """One figure: predicted with outputs at slot starts and at slot ends, and measured (ns).
 
-    ``holds``: the measured figure lies between the two (None: nothing was measured).
+    ``holds``: the measured figure lies between the two (None: nothing was measured, or the plan has
+    modes, and it depends on them).
     """
 
     at_start_ns: int
@@ -45,7 +50,9 @@ class FigureHeld:
 class BandHeld:
     """One latency band, over undisturbed cycles whose output came in the cycle it was due.
 
-    ``inside`` counts outputs that left while the slot was open.
+    ``inside`` counts outputs that left while the slot was open. Of a plan with modes it is the band
+    of ``mode``: ``late`` counts the mode's outputs that came behind its slot, and the shares are
+    those of its outputs that did not.
     """
 
     slot_start_ns: int
@@ -58,6 +65,8 @@ class BandHeld:
     mean_ns: int | None
     max_ns: int | None
     jitter_ns: int | None
+    mode: str | None = None
+    late: int = 0
 
 
 @dataclass(frozen=True)
@@ -83,23 +92,32 @@ def hold_prediction(plan: Plan, recording: Recording, analysis: LatencyAnalysis)
     in_time = outputs.filter(pl.col("in_time"))
     predicted, measured = plan.predicted, analysis.undisturbed
     shares = predicted.shares if len(predicted.shares) == len(slots) else [None] * len(slots)
-    bands = tuple(
-        _band(slot, share, in_time.filter(pl.col("slot") == number), in_time.height)
-        for number, (slot, share) in enumerate(zip(slots, shares, strict=True))
-    )
+    if plan.modes is None:
+        bands = tuple(
+            _band(slot, share, in_time.filter(pl.col("slot") == number), in_time.height)
+            for number, (slot, share) in enumerate(zip(slots, shares, strict=True))
+        )
+    else:
+        bands = tuple(
+            _band_of_mode(mode, slots[band - 1], sum(predicted.shares[:band]), outputs)
+            for mode, band in plan.modes.bands.items()
+        )
     mean, longest, jitter = predicted.mean_ns, predicted.max_ns, predicted.jitter_ns
     if _represented_by_slot_ends(plan):
-        mean = round(sum((band.predicted_share or 0) * band.slot_start_ns for band in bands))
+        starts = [start for start, _ in slots]
+        mean = round(sum(s * at for s, at in zip(predicted.shares, starts, strict=True)))
         longest, jitter = slots[-1][0], slots[-1][0] - slots[0][0]
     elif slots:
         longest, jitter = min(longest, slots[-1][0]), 0
     errors = STANDARD_ERRORS * _standard_error(plan, slots, analysis)
     began_late = outputs["place"] - outputs["latency_ns"]
     latest, usually = began_late.max() or 0, began_late.mean() or 0
+    # With modes nobody can say beforehand.
+    say = _figure if plan.modes is None else _unsaid
     return PredictionHeld(
-        mean=_figure(mean, predicted.mean_ns, measured.mean_ns, errors + usually, errors),
-        max=_figure(longest, predicted.max_ns, measured.max_ns, latest),
-        jitter=_figure(jitter, predicted.jitter_ns, measured.jitter_ns, 0, latest),
+        mean=say(mean, predicted.mean_ns, measured.mean_ns, errors + usually, errors),
+        max=say(longest, predicted.max_ns, measured.max_ns, latest),
+        jitter=say(jitter, predicted.jitter_ns, measured.jitter_ns, 0, latest),
         bands=bands,
         late=outputs.height - in_time.height,
     )
@@ -110,6 +128,10 @@ def _figure(
 ) -> FigureHeld:
     holds = None if measured is None else at_start - below <= measured <= at_end + above
     return FigureHeld(at_start, at_end, measured, holds)
+
+
+def _unsaid(at_start: int, at_end: int, measured: int | None, *_: Any) -> FigureHeld:
+    return FigureHeld(at_start, at_end, measured, None)
 
 
 def _standard_error(plan: Plan, slots: list[tuple[int, int]], analysis: LatencyAnalysis) -> float:
@@ -144,7 +166,7 @@ def _represented_by_slot_ends(plan: Plan) -> bool:
 def _outputs(
     plan: Plan, slots: list[tuple[int, int]], recording: Recording, analysis: LatencyAnalysis
 ) -> pl.DataFrame:
-    """Undisturbed complete traversals: ``latency_ns``, ``place``, ``slot`` and ``in_time``.
+    """Undisturbed complete traversals: ``latency_ns, place, slot, mode, in_time``.
 
     The slot is the one that the gate says it released the message in. Without a gate's events it
     is the last that had started when the output came, at its ``place`` in the cycle (ns).
@@ -155,7 +177,7 @@ def _outputs(
     if "gate_release" in recording.events:
         released = (
             gate_releases(recording, plan)
-            .select("source_timestamp", "slot", "overrun")
+            .select("source_timestamp", "slot", "overrun", "mode")
             .unique("source_timestamp", keep="first")
         )
         joined = chosen.join(taken, on="traversal", how="left").join(
@@ -163,13 +185,14 @@ def _outputs(
         )
         if joined["slot"].count():
             in_time = pl.col("overrun").is_null() & pl.col("slot").is_not_null()
-            return joined.select("latency_ns", "slot", place="latency_ns", in_time=in_time)
+            return joined.select("latency_ns", "slot", "mode", place="latency_ns", in_time=in_time)
     starts = [start for start, _ in slots]
     late = lateness_in_cycle(chosen["start"], plan.cycle_ns) if any(publisher_servers(plan)) else 0
     return chosen.select("latency_ns", place=pl.col("latency_ns") + late).with_columns(
         slot=sum((pl.col("place") >= start).cast(pl.Int32) for start in starts)
         + pl.lit(-1, dtype=pl.Int32),
         in_time=pl.col("place") < (cycles_until_output(plan) + 1) * plan.cycle_ns,
+        mode=pl.lit(None, dtype=pl.String),
     )
 
 
@@ -205,3 +228,12 @@ def _band(
         max_ns=high,
         jitter_ns=None if low is None or high is None else high - low,
     )
+
+
+def _band_of_mode(
+    mode: str, slot: tuple[int, int], predicted: float, outputs: pl.DataFrame
+) -> BandHeld:
+    own = outputs.filter(pl.col("mode") == mode)
+    in_time = own.filter(pl.col("in_time"))
+    band = _band(slot, predicted or None, in_time, own.height)
+    return replace(band, mode=mode, late=own.height - in_time.height)

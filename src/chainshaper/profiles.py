@@ -2,7 +2,8 @@
 
 A chain in a graph waits at synchronising callbacks for branches that are not part of it (paper,
 section 2.3). Whoever plans slots for its callbacks has to plan for those branches too, so they
-are followed backwards here, from every input of a synchronising callback to what starts it.
+are followed backwards here, from every input of a synchronising callback to what starts it, or to
+the node with which the chain begins: what feeds a subscription there is not planned for.
 """
 
 from collections.abc import Collection
@@ -10,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
 from chainshaper import events
 from chainshaper.analysis import DataFlow, LatencyAnalysis
@@ -120,8 +120,27 @@ _Key = tuple[tuple[int, ...], str]
 
 def _stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
     """The chain and the branches it waits for, along the graph; the chain's last stands last."""
+    outside = _feeding(graph, chain)
+    planned = [callback for callback in graph.callbacks if callback.node not in outside]
     needs: dict[_Key, set[_Key]] = {}
     of_chain: dict[int, _Key] = {}
+
+    def writers_of(number: int, above: set[_Key]) -> set[_Key]:
+        """The stages that publish what a callback reads; new ones are added to ``needs``."""
+        topic, found = graph.callbacks[number].topic, set()
+        for writer in planned:
+            if topic is None or topic not in writer.publishes:
+                continue
+            key = of_chain.get(writer.id) or (_inputs(graph, writer, topic), topic)
+            if key in above:  # a loop in the graph: what feeds back comes from a cycle before
+                continue
+            found.add(key)
+            if key not in needs:
+                needs[key] = set()
+                for member in key[0]:
+                    needs[key] |= writers_of(member, above | {key})
+        return found
+
     previous: _Key | None = None
     for place, (number, topic) in enumerate(zip(chain.callbacks, chain.topics, strict=True)):
         key = (_inputs(graph, graph.callbacks[number], topic) if place else (number,), topic)
@@ -133,22 +152,35 @@ def _stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
         for number in key[0]:
             if number not in chain.callbacks:
                 # What comes from further down the chain feeds back, from a cycle before.
-                needs[key] |= _writers(graph, number, of_chain, needs, {*along[place:]})
+                needs[key] |= writers_of(number, {*along[place:]})
     level: dict[_Key, int] = {}
     for key in needs:
         _level(key, needs, level)
     in_chain = set(of_chain.values())
     order = sorted(needs, key=lambda key: (level[key], key not in in_chain))
-    place_of = {key: place for place, key in enumerate(order)}
     return [
         _Stage(
-            node=graph.callbacks[key[0][0]].node,
-            topic=key[1],
-            members=key[0],
-            after=tuple(sorted(place_of[before] for before in needs[key])),
+            node=graph.callbacks[members[0]].node,
+            topic=topic,
+            members=members,
+            after=tuple(sorted(order.index(before) for before in needs[members, topic])),
         )
-        for key in order
+        for members, topic in order
     ]
+
+
+def _feeding(graph: ApplicationGraph, chain: Chain) -> set[str]:
+    """All nodes that feed the node with which a chain begins, if it begins with a subscription."""
+    first = graph.callbacks[chain.callbacks[0]]
+    own = {graph.callbacks[number].node for number in chain.callbacks}
+    found: set[str] = set()
+    fed = set() if first.topic is None else {first.node}
+    while fed:
+        topics = {callback.topic for callback in graph.callbacks if callback.node in fed}
+        fed = {writer.node for writer in graph.callbacks if topics.intersection(writer.publishes)}
+        fed -= found | own
+        found |= fed
+    return found
 
 
 def _inputs(graph: ApplicationGraph, callback: Callback, topic: str) -> tuple[int, ...]:
@@ -160,30 +192,6 @@ def _inputs(graph: ApplicationGraph, callback: Callback, topic: str) -> tuple[in
         for other in graph.callbacks
         if (other.pid, other.node) == (callback.pid, callback.node) and topic in other.publishes
     )
-
-
-def _writers(
-    graph: ApplicationGraph,
-    number: int,
-    of_chain: dict[int, _Key],
-    needs: dict[_Key, set[_Key]],
-    above: set[_Key],
-) -> set[_Key]:
-    """The stages that publish what a callback reads; new ones are added to ``needs``."""
-    topic = graph.callbacks[number].topic
-    found: set[_Key] = set()
-    for writer in graph.callbacks:
-        if topic is None or topic not in writer.publishes:
-            continue
-        key = of_chain.get(writer.id) or (_inputs(graph, writer, topic), topic)
-        if key in above:  # a loop in the graph: what feeds back comes from a cycle before
-            continue
-        found.add(key)
-        if key not in needs:
-            needs[key] = set()
-            for member in key[0]:
-                needs[key] |= _writers(graph, member, of_chain, needs, above | {key})
-    return found
 
 
 def _level(key: _Key, needs: dict[_Key, set[_Key]], level: dict[_Key, int]) -> int:
@@ -225,24 +233,13 @@ def _times(flow: DataFlow, calm: pl.DataFrame, stage: _Stage, core: int) -> Call
 def _undisturbed_instances(flow: DataFlow, traversals: pl.DataFrame) -> pl.DataFrame:
     """Finished instances, with their response time, that began in no disturbed traversal."""
     seen = flow.instances.filter(pl.col("end").is_not_null() & ~pl.col("assumed"))
-    disturbed = traversals.filter(pl.col("disturbed") & pl.col("complete")).sort("start")
-    began, ended = disturbed["start"].to_numpy(), disturbed["end"].to_numpy()
-    hit = _inside(seen["start"].to_numpy(), began, ended)
+    disturbed = traversals.filter(pl.col("disturbed") & pl.col("complete"))
+    began = seen["start"].to_numpy()
+    # An instance that begins just as a traversal ends is hit by it as well.
+    hit = overlapping(began, began, disturbed["start"].to_numpy(), disturbed["end"].to_numpy() + 1)
     return seen.filter(~pl.Series(hit)).select(
         "instance", "callback_id", response=pl.col("end") - pl.col("start")
     )
-
-
-def _inside(
-    instants: NDArray[np.int64], began: NDArray[np.int64], ended: NDArray[np.int64]
-) -> NDArray[np.bool_]:
-    """Which instants lie in one of the spans, whose beginnings ascend."""
-    if not began.size:
-        return np.zeros(instants.size, dtype=bool)
-    latest_end = np.maximum.accumulate(ended)
-    span = np.searchsorted(began, instants, side="right") - 1
-    result: NDArray[np.bool_] = (span >= 0) & (instants <= latest_end[np.maximum(span, 0)])
-    return result
 
 
 def _receivers(graph: ApplicationGraph, chain: Chain, nodes: Collection[str]) -> tuple[str, ...]:

@@ -18,11 +18,10 @@ from pathlib import Path
 from chainshaper.analysis import data_flow, find_chain, graph_of
 from chainshaper.durations import format_duration
 from chainshaper.enforcement.realtime import available_cores, check_cores, may_use_fifo
-from chainshaper.enforcement.runs.claims import claim_run
 from chainshaper.enforcement.runs.journal import Journal
-from chainshaper.enforcement.runs.release_after import start_watching
-from chainshaper.enforcement.runs.scheduling_memory import change_scheduling, restore_scheduling
-from chainshaper.enforcement.runs.state import remove_run
+from chainshaper.enforcement.runs.release_after import run_claimed
+from chainshaper.enforcement.runs.scheduling_memory import change_scheduling
+from chainshaper.enforcement.servers import ReservationServer
 from chainshaper.enforcement.threads.allocation import (
     Allocation,
     NodeThread,
@@ -39,8 +38,6 @@ __all__ = ["chain_nodes", "check_profiling", "executors_of", "profiling_conditio
 
 START_NS = 30_000_000_000
 """The nodes have this long to appear."""
-
-_SERVER = "the chain"
 
 
 @contextmanager
@@ -64,17 +61,9 @@ def profiling_condition(
             And where it is called: a node does not appear, or the kernel refuses something.
     """
     core = check_profiling(core)
-    journal = claim_run({core}, nodes, folder)
-    watcher = None
-    try:
-        watcher = start_watching(journal.path.parent)
-        recorded = recorded_processes(like)[0] if like is not None else ()
+    recorded = recorded_processes(like)[0] if like is not None else ()
+    with run_claimed({core}, nodes, folder) as journal:
         yield _Condition(frozenset(nodes), core, journal, recorded).see_to_it
-    finally:
-        _put_back(journal)
-        if watcher is not None:
-            watcher.kill()
-            watcher.wait()
 
 
 def check_profiling(core: int | None = None) -> int:
@@ -127,9 +116,8 @@ class _Condition:
                     f"{format_duration(START_NS)}; running: {', '.join(sorted(there)) or 'no node'}"
                 )
             return False
-        wanted = scheduling_around(
-            {_SERVER: members}, {_SERVER: self.core}, {_SERVER: 1}, found, available_cores()
-        )
+        server = ReservationServer("the chain", self.core, 1, ())
+        wanted = scheduling_around({server.name: members}, [server], found, available_cores())
         new = [one for one in wanted if one.thread.thread.identity not in self.done]
         for one in new:
             # One after the other, as under SCHED_FIFO in the paper: no turns.
@@ -177,14 +165,3 @@ def executors_of(
 
 def _missing(nodes: Collection[str]) -> str:
     return f"node {', '.join(sorted(nodes))}" if nodes else "a node"
-
-
-def _put_back(journal: Journal) -> None:
-    left = [one for one in restore_scheduling(journal) if one.fate == "failed"]
-    if left:
-        problems = "; ".join(f"{one.tid} ({one.comm}): {one.reason}" for one in left)
-        raise OperationError(
-            f"not everything could be put back: {problems}; {journal.path} says what was there, "
-            "`chainshaper release` tries again"
-        )
-    remove_run(journal)

@@ -5,14 +5,11 @@ cycles start. So nothing has to be found or measured, and the thread of each pub
 names goes into its server; executors and DDS threads of the same process run on.
 """
 
-import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from chainshaper.enforcement.back_ends import choose_back_end, make_back_end
-from chainshaper.enforcement.runs.claims import claim_run
-from chainshaper.enforcement.runs.release_after import start_watching
-from chainshaper.enforcement.runs.state import remove_run
+from chainshaper.enforcement.runs.release_after import run_claimed
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.enforcement.threads.listing import list_threads
 from chainshaper.errors import OperationError
@@ -38,12 +35,8 @@ def publishers_gated(plan: Plan, nodes: StartedNodes) -> Iterator[None]:
         plan.cycle_ns,
         tuple(ReservationServer(s.name, s.core, s.priority, s.slots) for s, _ in held),
     )
-    journal = claim_run(
-        {server.core for server, _ in held}, {name for _, names in held for name in names}
-    )
-    watcher: subprocess.Popen[bytes] | None = None
-    try:
-        watcher = start_watching(journal.path.parent)
+    cores = {server.core for server, _ in held}
+    with run_claimed(cores, {name for _, names in held for name in names}) as journal:
         servers = make_back_end(choice.name, table, journal.path.parent, journal)
         try:
             for server, names in held:
@@ -55,11 +48,6 @@ def publishers_gated(plan: Plan, nodes: StartedNodes) -> Iterator[None]:
             failure = servers.failure()
         finally:
             servers.release()
-    finally:
-        remove_run(journal)
-        if watcher is not None:
-            watcher.kill()
-            watcher.wait()
     if failure is not None:
         raise OperationError(f"the servers failed while the application ran: {failure}")
 

@@ -17,16 +17,17 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeAlias
 
 import polars as pl
 
-from chainshaper.command_process import check_command, end_command, end_in_words, start_command
+from chainshaper.command_process import check_command, end_command, start_command
 from chainshaper.durations import format_duration
+from chainshaper.enforcement.own_processes import end_in_words
 from chainshaper.enforcement.realtime import available_cores, may_use_fifo
 from chainshaper.enforcement.threads.listing import parents
 from chainshaper.enforcement.threads.processes import (
@@ -99,6 +100,7 @@ class _Run:
     command: "subprocess.Popen[bytes] | None" = None
     schedule: Callable[[Sequence[Process]], bool] | None = None
     begun_ns: int = 0
+    ended_ns: int = 0
     processes: tuple[Process, ...] = ()
     environment: Mapping[str, str] = field(default_factory=dict)
     endpoints: tuple[EndpointInfo, ...] = ()
@@ -149,8 +151,7 @@ def record_command(
     try:
         tracer = _tracer(source, folder, command, pids, buffer)
         run = _Run(tracer, folder, duration_ns, stop or threading.Event(), progress, pids)
-        with _stalls_watched(run) if watch_stalls else nullcontext():
-            _trace(run, command, command_stdout, scheduling)
+        _trace(run, command, command_stdout, scheduling, watch_stalls=watch_stalls)
         progress(1.0, "reading the events")
         try:
             recording = _written(output, run, command, chain, plan, gate_logs)
@@ -188,17 +189,18 @@ def _tracer(
     return EbpfTracer(folder, command, pids)
 
 
-@contextmanager
-def _stalls_watched(run: _Run) -> Iterator[None]:
-    with stalls_watched(available_cores(), may_use_fifo()) as run.stalls:
-        yield
-
-
 def _trace(
-    run: _Run, command: Sequence[str], stdout: int | None, scheduling: Scheduling | None
+    run: _Run,
+    command: Sequence[str],
+    stdout: int | None,
+    scheduling: Scheduling | None,
+    *,
+    watch_stalls: bool,
 ) -> None:
     """The run itself: from the beginning of tracing to the end of the application."""
     with ExitStack() as undo:
+        if watch_stalls:
+            run.stalls = undo.enter_context(stalls_watched(available_cores(), may_use_fifo()))
         undo.callback(run.tracer.remove)
         run.progress(0.0, "starting to trace")
         environment = run.tracer.start()
@@ -210,12 +212,12 @@ def _trace(
             run.schedule = undo.enter_context(scheduling)
         run.begun_ns = time.monotonic_ns()
         _watch(run)
-        lasted = time.monotonic_ns() - run.begun_ns
+        run.ended_ns = time.monotonic_ns()
         run.progress(1.0, "ending")
         run.tracer.stop()
         if run.exit_code:
-            how = end_in_words(run.exit_code)
-            run.notes += (f"the command {how} after {format_duration(round(lasted, -8))}.",)
+            lasted = format_duration(round(run.ended_ns - run.begun_ns, -8))
+            run.notes += (f"the command {end_in_words(run.exit_code)} after {lasted}.",)
         _ask_for_qos(run)
 
 
@@ -285,7 +287,8 @@ def _written(  # noqa: PLR0917 - what is known of the run, put together once
     tables, info = run.tracer.recording()
     if run.stalls.table is not None:
         tables = {**tables, "machine_stall": run.stalls.table}
-    tables, missing = with_gate_logs(tables, gate_logs)
+    since_ns = run.in_force_ns or run.begun_ns
+    tables, missing = with_gate_logs(tables, gate_logs, since_ns, run.ended_ns)
     run.notes += missing
     if run.command is None:  # its nodes were created before tracing began
         from chainshaper.sources.ebpf.found_nodes import with_found_nodes

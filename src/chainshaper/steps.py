@@ -169,7 +169,7 @@ def shape_application(
     realtime: bool | None = None,
     enforcement: Enforcement | None = None,
     command: Sequence[str] = (),
-    progress: Progress | None = None,
+    progress: Progress = lambda *_: None,
 ) -> Recording:
     """Splice the plan's shaping node into an application, run it and record it.
 

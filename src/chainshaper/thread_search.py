@@ -73,8 +73,9 @@ def _planned_nodes(plan: "Plan") -> dict[str, str]:
 
 def _receivers(plan: "Plan") -> set[str]:
     """The nodes that receive what a plan's shaping nodes publish; they need not run."""
-    nodes = (plan.shaping_node, *plan.further_shaping_nodes)
-    return {receiver for node in nodes if node is not None for receiver in node.receivers}
+    from chainshaper.planning.plan import shaping_nodes
+
+    return {receiver for node in shaping_nodes(plan) for receiver in node.receivers}
 
 
 def _hosts(process: Process, found: Allocation, nodes: Collection[str] | None) -> bool:

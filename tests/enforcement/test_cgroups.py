@@ -10,6 +10,7 @@ from gated import cpu_ns, needs_cgroups, own_cgroup, sleeping, stamping
 from processes import children_of, wait_for
 
 from chainshaper.enforcement.freezer import cgroups
+from chainshaper.enforcement.threads.listing import has_ended, start_of
 from chainshaper.errors import OperationError, PlatformError
 
 pytestmark = needs_cgroups
@@ -97,14 +98,14 @@ def test_a_zombie_does_not_keep_its_group() -> None:
         (home / "cgroup.procs").write_text(str(process.pid))
         child = cgroups.make_threaded_child(home, "gated")
         cgroups.move_thread(process.pid, child)
-        born = cgroups.started_at(process.pid)
+        born = start_of(process.pid, process.pid)
         assert born is not None
-        assert not cgroups.has_ended(process.pid, born)
+        assert not has_ended(process.pid, born)
         process.kill()
-        wait_for(lambda: cgroups.has_ended(process.pid, born), "its end")
+        wait_for(lambda: has_ended(process.pid, born), "its end")
         assert cgroups.dissolve(child) is None
         process.wait()
-        assert cgroups.has_ended(process.pid, born)
+        assert has_ended(process.pid, born)
 
 
 def test_controllers_that_rule_threads_out_are_named() -> None:
@@ -163,8 +164,8 @@ def test_threads_that_have_ended_are_told_from_those_that_never_were() -> None:
         assert cgroups.move_thread(process.pid, child) is False
         with pytest.raises(OperationError, match=f"no thread {process.pid}"):
             cgroups.cgroup_of(process.pid)
-        assert cgroups.started_at(process.pid) is None
-        assert cgroups.has_ended(process.pid, 0)
+        assert start_of(process.pid, process.pid) is None
+        assert has_ended(process.pid, 0)
 
 
 def test_a_thread_of_the_kernel_stays_where_it_is() -> None:

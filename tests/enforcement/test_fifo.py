@@ -7,10 +7,9 @@ from pathlib import Path
 import pytest
 from actors import Actor, acting
 
-from chainshaper.enforcement import fifo
 from chainshaper.enforcement.fifo import create
 from chainshaper.enforcement.realtime import available_cores, may_use_fifo
-from chainshaper.enforcement.runs.journal import Journal, find_journals, open_journal
+from chainshaper.enforcement.runs.journal import Journal, open_journal
 from chainshaper.enforcement.runs.scheduling_memory import change_scheduling
 from chainshaper.enforcement.runs.scheduling_state import state_of
 from chainshaper.enforcement.servers import BackEnd, ReservationServer, ServerTable
@@ -109,15 +108,3 @@ def test_more_priorities_than_there_are_are_refused(journal: Journal) -> None:
     with pytest.raises(InputError, match="44 different server priorities do not fit"):
         create(ServerTable(100 * MS, many), journal)
     create(ServerTable(100 * MS, many[:43]), journal)
-
-
-def test_a_journal_of_its_own_is_gone_with_the_release(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, actor: Actor
-) -> None:
-    monkeypatch.setattr(fifo, "open_journal", lambda: open_journal(tmp_path / "own"))
-    servers = create(TABLE)
-    servers.assign(actor.tids["a"], "chain")
-    servers.arm(anchor_ns=0)
-    assert len(find_journals(tmp_path / "own")) == 1
-    servers.release()
-    assert find_journals(tmp_path / "own") == ()

@@ -327,23 +327,6 @@ def test_what_cannot_be_assigned_is_refused_and_changes_nothing(tmp_path: Path) 
         assert groups_left(os.getpid()) == []
 
 
-@pytest.mark.parametrize(
-    ("table", "reason"),
-    [
-        (ServerTable(CYCLE, ()), "at least one server"),
-        (ServerTable(0, (server("a", (0, 1)),)), "a cycle time"),
-        (ServerTable(CYCLE, (server("a", (0, 1)), server("a", (1, 2)))), "named a: rename one"),
-        (ServerTable(CYCLE, (server("a", (0, 21)),)), "server a: slot"),
-    ],
-)
-def test_tables_that_contradict_themselves_are_refused(
-    tmp_path: Path, table: ServerTable, reason: str
-) -> None:
-    with pytest.raises(InputError, match=reason):
-        create(table, tmp_path / "run")
-    assert not (tmp_path / "run").exists()
-
-
 def test_a_core_that_the_machine_lacks_is_named_and_nothing_stays_behind(tmp_path: Path) -> None:
     with pytest.raises(PlatformError, match="core 1000, which a server of the plan asks for"):
         create(ServerTable(CYCLE, (server("a", (0, 1), core=1000),)), tmp_path / "run")

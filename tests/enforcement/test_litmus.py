@@ -11,7 +11,7 @@ from actors import Actor, acting
 from litmus_stand_in import StandIn, install
 
 from chainshaper.enforcement.litmus import back_end as litmus
-from chainshaper.enforcement.litmus.back_end import Litmus, create, restore_plugin
+from chainshaper.enforcement.litmus.back_end import create, restore_plugin
 from chainshaper.enforcement.realtime import available_cores
 from chainshaper.enforcement.runs.journal import Journal, find_journals, open_journal
 from chainshaper.enforcement.runs.scheduling_memory import restore_scheduling
@@ -104,27 +104,29 @@ def test_the_plugin_that_was_active_comes_back(
 
 
 def test_reservations_of_others_are_not_put_at_risk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, journal: Journal
 ) -> None:
     stand_in = install(tmp_path, plugin="P-RES")
     monkeypatch.setenv("PATH", str(stand_in.programs), prepend=os.pathsep)
     with pytest.raises(OperationError, match=r"P-RES is active already.*`setsched Linux`"):
-        create(TABLE, None, stand_in.proc)
+        create(TABLE, journal, stand_in.proc)
     assert stand_in.calls == []
 
 
-def test_a_kernel_that_is_not_litmus_is_named_with_the_remedy(tmp_path: Path) -> None:
+def test_a_kernel_that_is_not_litmus_is_named_with_the_remedy(
+    tmp_path: Path, journal: Journal
+) -> None:
     with pytest.raises(PlatformError, match=r"not LITMUS.RT.*--backend auto.*--dry-run"):
-        create(TABLE, None, tmp_path / "nothing")
+        create(TABLE, journal, tmp_path / "nothing")
 
 
 def test_tools_that_are_not_installed_are_named(
-    stand_in: StandIn, monkeypatch: pytest.MonkeyPatch
+    stand_in: StandIn, monkeypatch: pytest.MonkeyPatch, journal: Journal
 ) -> None:
     (stand_in.programs / "resctl").unlink()
     monkeypatch.setenv("PATH", str(stand_in.programs))
     with pytest.raises(PlatformError, match=r"resctl is not on \$PATH.*liblitmus"):
-        create(TABLE, None, stand_in.proc)
+        create(TABLE, journal, stand_in.proc)
 
 
 def test_a_server_that_does_not_exist_is_refused(stand_in: StandIn, journal: Journal) -> None:
@@ -200,16 +202,3 @@ def test_after_a_crash_another_process_puts_all_back(
         restore_plugin(left)
     assert state_of(actor.tids["a"]) == before
     assert stand_in.plugin == "Linux"
-
-
-def test_a_journal_of_its_own_is_gone_with_the_release(
-    stand_in: StandIn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, actor: Actor
-) -> None:
-    monkeypatch.setattr(litmus, "open_journal", lambda: open_journal(tmp_path / "own"))
-    servers: Litmus = create(TABLE, None, stand_in.proc)
-    servers.assign(actor.tids["a"], "chain")
-    servers.arm(anchor_ns=0)
-    assert len(find_journals(tmp_path / "own")) == 1
-    servers.release()
-    servers.release()
-    assert find_journals(tmp_path / "own") == ()

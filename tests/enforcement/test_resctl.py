@@ -16,7 +16,6 @@ from chainshaper.enforcement.litmus.resctl import (
     interval_text,
     litmus_commands,
     milliseconds_text,
-    release_commands,
     turned,
 )
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
@@ -39,18 +38,6 @@ def test_the_commands_of_a_plan_are_these() -> None:
         "resctl -a 101 -r 1002 -c 1",
         "resctl -a 102 -r 1002 -c 1",
     ]
-
-
-def test_the_end_takes_threads_first_then_the_plugin_and_with_it_the_reservations() -> None:
-    assert [" ".join(command) for command in release_commands([101, 103])] == [
-        "chrt --other --pid 0 101",
-        "chrt --other --pid 0 103",
-        "setsched Linux",
-    ]
-    assert release_commands([], previous="GSN-EDF") == (
-        ("setsched", "Linux"),
-        ("setsched", "GSN-EDF"),
-    )
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from itertools import chain, takewhile
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -10,13 +9,11 @@ from chainshaper.enforcement.freezer.slot_boundaries import (
     Anchoring,
     Boundary,
     boundaries_of,
-    check_slots,
     first_anchoring,
     instants,
     moved,
     next_anchoring,
 )
-from chainshaper.errors import InputError
 
 Slots = tuple[tuple[tuple[int, int], ...], ...]
 
@@ -143,16 +140,3 @@ def test_the_first_cycle_begins_as_soon_as_it_may() -> None:
     assert first_anchoring(30, 100, 950) == Anchoring(1030, 1030)
     assert first_anchoring(30, 100, 1030) == Anchoring(1030, 1030)
     assert first_anchoring(5_030, 100, 950) == Anchoring(1030, 1030), "an anchor yet to come"
-
-
-@pytest.mark.parametrize(
-    "slots",
-    [((5, 5),), ((6, 5),), ((-1, 5),), ((0, 101),), ((0, 50), (40, 60)), ((50, 60), (0, 9))],
-)
-def test_slots_that_no_cycle_could_have_are_refused(slots: tuple[tuple[int, int], ...]) -> None:
-    with pytest.raises(InputError, match="server output: slot"):
-        check_slots("output", slots, 100)
-
-
-def test_slots_that_touch_each_other_and_the_cycles_end_are_fine() -> None:
-    check_slots("output", ((0, 40), (40, 60), (60, 100)), 100)

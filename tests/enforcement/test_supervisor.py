@@ -319,7 +319,7 @@ def test_a_state_that_says_nothing_is_told_what_to_do_about(tmp_path: Path) -> N
     with pytest.raises(OperationError, match=r"freezer.json does not say .* chainshaper-\*"):
         clean_up(tmp_path)
     (tmp_path / "freezer.json").write_text(
-        f'{{"owner": {os.getpid()}, "cycle_ns": 1, "servers": [], '
+        f'{{"owner": {os.getpid()}, "table": {{"cycle_ns": 1, "servers": []}}, '
         '"groups": [{"folder": "/sys/fs/cgroup/chainshaper-not-there", "server": "a"}]}'
     )
     assert clean_up(tmp_path) == ()

@@ -5,16 +5,19 @@ archive's keys are the machine's. What was fetched once is used again without a 
 comparing its digest with the one that was written down. Delete the cache to get newer kernels.
 """
 
+import functools
 import hashlib
 import json
 import os
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 CACHE = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "chainshaper" / "kernels"
 KEYS = Path("/usr/share/keyrings/debian-archive-keyring.gpg")
 MIRROR = "http://deb.debian.org/debian"
 SUITES = ("trixie", "trixie-backports", "sid")
+TRACING_SUITE = "bookworm"  # LTTng 2.13 builds for its kernel
 USERLAND = ("python3.13-minimal", "libpython3.13-stdlib", "libbpf1")
 FLAVOURS = ("cloud-amd64", "rt-amd64")
 """A normal kernel (for virtual machines: small) and a PREEMPT_RT one."""
@@ -24,31 +27,48 @@ class PackageError(Exception):
     """Packages cannot be had; the message ends with what apt said."""
 
 
-def fetch(kernels: list[str]) -> tuple[list[Path], list[Path]]:
-    """Packages of the guests' programs, and of the kernels: the newest of each flavour, or named.
+def fetch_userland() -> list[Path]:
+    """Packages of the guests' programs.
 
     Raises:
         PackageError: they are not in the cache and cannot be downloaded.
     """
+    return _cached("userland", SUITES, lambda apt: apt.download_all(USERLAND))
+
+
+def fetch_kernels(name: str = "newest") -> list[Path]:
+    """The kernel of the named package, or the newest of each flavour.
+
+    Raises:
+        PackageError: as for :func:`fetch_userland`.
+    """
+    return _cached(name, SUITES, lambda apt: apt.download_kernels(name))
+
+
+def fetch_for_tracing() -> list[Path]:
+    """Debian 12's kernel and its headers, the sources of LTTng's modules, and `depmod`.
+
+    Raises:
+        PackageError: as for :func:`fetch_userland`.
+    """
+    return _cached("tracing", (TRACING_SUITE,), _Apt.download_for_tracing)
+
+
+def _cached(
+    key: str, suites: tuple[str, ...], download: Callable[["_Apt"], list[Path]]
+) -> list[Path]:
+    """What was downloaded before under this key, or is now."""
     CACHE.mkdir(parents=True, exist_ok=True)
     manifest = CACHE / "manifest.json"
     known: dict[str, dict[str, str]] = {}
     if manifest.exists():
         known = json.loads(manifest.read_text())
-    wanted = [name for name in kernels or ["newest"] if name not in known]
-    if "userland" not in known or wanted:
-        apt = _Apt(CACHE / "apt")
-        apt.run("apt-get", "update")
-        if "userland" not in known:
-            known["userland"] = _digests(apt.download_all(USERLAND))
-        for name in wanted:
-            names = apt.newest_kernels() if name == "newest" else [name]
-            known[name] = _digests([apt.download(each) for each in names])
+    if key not in known:
+        known[key] = _digests(download(_updated_apt(suites)))
         made = manifest.with_suffix(".new")
         made.write_text(json.dumps(known, indent=1))
         made.rename(manifest)
-    userland = _checked(known["userland"])
-    return userland, [path for name in kernels or ["newest"] for path in _checked(known[name])]
+    return _checked(known[key])
 
 
 def _digests(packages: list[Path]) -> dict[str, str]:
@@ -63,10 +83,17 @@ def _checked(digests: dict[str, str]) -> list[Path]:
     return [Path(name) for name in digests]
 
 
+@functools.cache
+def _updated_apt(suites: tuple[str, ...]) -> "_Apt":
+    apt = _Apt(CACHE / ("apt" if suites == SUITES else f"apt-{suites[0]}"), suites)
+    apt.run("apt-get", "update")
+    return apt
+
+
 class _Apt:
     """apt with folders of its own."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, suites: tuple[str, ...]) -> None:
         if not KEYS.exists():
             raise PackageError(f"no {KEYS}: apt install debian-archive-keyring")
         self._archives = folder / "archives"
@@ -75,7 +102,7 @@ class _Apt:
         (folder / "status").touch()
         sources = folder / "sources.list"
         sources.write_text(
-            "".join(f"deb [signed-by={KEYS}] {MIRROR} {suite} main\n" for suite in SUITES)
+            "".join(f"deb [signed-by={KEYS}] {MIRROR} {suite} main\n" for suite in suites)
         )
         settings = {
             "Dir::Etc::sourcelist": sources,
@@ -87,7 +114,7 @@ class _Apt:
             "Dir::Cache::archives": self._archives,
             "APT::Architecture": "amd64",
             "APT::Architectures": "amd64",
-            "APT::Default-Release": SUITES[0],
+            "APT::Default-Release": suites[0],
             "APT::Install-Recommends": "0",
             "APT::Sandbox::User": "root",
         }
@@ -118,6 +145,22 @@ class _Apt:
         uri = self.run("apt-get", "download", "--print-uris", name).split()
         self.run("apt-get", "download", name)
         return self._archives / uri[1]
+
+    def download_kernels(self, name: str) -> list[Path]:
+        """The named one, or the newest of each flavour."""
+        names = self.newest_kernels() if name == "newest" else [name]
+        return [self.download(each) for each in names]
+
+    def download_for_tracing(self) -> list[Path]:
+        """What :func:`fetch_for_tracing` promises."""
+        (headers,) = self._dependencies("linux-headers-amd64")
+        names = [headers, headers.replace("headers", "image", 1), "lttng-modules-dkms", "kmod"]
+        names += [n for n in self._dependencies(headers) if "-common" in n or "-kbuild-" in n]
+        return [self.download(name) for name in names]
+
+    def _dependencies(self, name: str) -> list[str]:
+        lines = self.run("apt-cache", "depends", name).splitlines()
+        return [line.split()[1] for line in lines if line.lstrip().startswith("Depends:")]
 
     def newest_kernels(self) -> list[str]:
         """One package name per flavour. `linux-binary` is a kernel without its modules."""

@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+from collections.abc import Mapping
 from pathlib import Path
 
 HERE = Path(__file__).parent
@@ -37,10 +38,12 @@ def unpack_kernel(package: Path, folder: Path) -> Path:
     return images[0]
 
 
-def make_image(userland: list[Path], folder: Path) -> Path:
-    """An initramfs in ``folder``; the C program is compiled for it."""
+def make_image(
+    userland: list[Path], folder: Path, files: Mapping[str, bytes] | None = None
+) -> Path:
+    """An initramfs in ``folder``, with ``files`` added; the C program is compiled for it."""
     root = folder / "root"
-    root.mkdir()
+    root.mkdir(parents=True)
     for package in userland:
         subprocess.run(["dpkg-deb", "--extract", package, root], check=True)
     for pattern in _NOT_NEEDED:
@@ -59,9 +62,10 @@ def make_image(userland: list[Path], folder: Path) -> Path:
         ["cc", "-O2", "-Wall", "-static", "-o", root / "checks/spin", HERE / "guest/spin.c"],
         check=True,
     )
-    init = root / "init"
-    init.write_text(_INIT)
-    init.chmod(0o755)
+    for name, data in {"init": _INIT.encode(), **(files or {})}.items():
+        (root / name).parent.mkdir(exist_ok=True)
+        (root / name).write_bytes(data)
+    (root / "init").chmod(0o755)
     return _archive(root, folder / "initramfs.cpio")
 
 

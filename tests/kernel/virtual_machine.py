@@ -10,22 +10,39 @@ import json
 import selectors
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-MEMORY_MB = 768
+MEMORY_MB, MEMORY_WITH_FILES_MB = 768, 2048
 LIMIT_S = 600
+MACHINE, RESULTS = "machine", "results"
+"""Tags under which a guest finds the machine's own files, read-only, and a folder that stays."""
 
 
 def command(
-    kernel: Path, image: Path, results: Path, *, cores: int, checks: list[str]
+    kernel: Path,
+    image: Path,
+    results: Path,
+    *,
+    cores: int,
+    checks: Sequence[str] = (),
+    shared: Path | None = None,
 ) -> list[str]:
-    """How QEMU is started; the console is its output, the second serial port is ``results``."""
+    """How QEMU is started; the console is its output, the second serial port is ``results``.
+
+    With a folder that is ``shared``, the guest has that and can read all of the machine's files.
+    """
     words = ["console=ttyS0", "nokaslr", "panic=-1", "quiet", "PYTHONHASHSEED=0", "rdinit=/init"]
     clock = ["-icount", "shift=0,sleep=off"] if cores == 1 else []
+    memory = str(MEMORY_MB if shared is None else MEMORY_WITH_FILES_MB)
+    local = "local,security_model=none,multidevs=remap"
+    folders = [
+        *("-virtfs", f"{local},path=/,readonly=on,mount_tag={MACHINE}"),
+        *("-virtfs", f"{local},path={shared},mount_tag={RESULTS}"),
+    ]
     return [
-        *("qemu-system-x86_64", "-accel", "tcg", *clock, "-smp", str(cores), "-m", str(MEMORY_MB)),
+        *("qemu-system-x86_64", "-accel", "tcg", *clock, "-smp", str(cores), "-m", memory),
         *("-cpu", "max,-rdrand,-rdseed", "-seed", "1", "-rtc", "base=2026-01-01,clock=vm"),
         *(
             "-kernel",
@@ -37,6 +54,7 @@ def command(
         ),
         *("-nodefaults", "-display", "none", "-no-reboot"),
         *("-serial", "stdio", "-serial", f"file:{results}"),
+        *(folders if shared else ()),
     ]
 
 

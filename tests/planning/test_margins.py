@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy import stats  # type: ignore[import-untyped]
+from scipy import stats
 
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.margins import derive_margin, fit_tail

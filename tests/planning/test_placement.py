@@ -7,7 +7,7 @@ import pytest
 
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.baselines import server_per_chain
-from chainshaper.planning.placement import Solver, figure7_curve, with_bands, with_long_slot
+from chainshaper.planning.placement import Solver, choose_bands, with_bands, with_long_slot
 from chainshaper.planning.plan import Plan, publish_slots
 from chainshaper.planning.shaping import plan_shaping
 
@@ -46,7 +46,7 @@ def test_solvers_agree_in_order() -> None:
 
 
 def test_auto_takes_a_number_of_bands_from_the_curve() -> None:
-    curve = figure7_curve(_plan(), LATENCIES)
+    curve = choose_bands(_plan(), LATENCIES).curve
     auto = with_bands(_plan(), LATENCIES, "auto")
     bands = len(publish_slots(auto))
     assert 2 <= bands <= 6

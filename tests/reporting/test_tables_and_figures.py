@@ -62,6 +62,6 @@ def test_figures_are_drawn_and_never_over_others(comparison: Comparison, tmp_pat
 def test_a_figure_on_a_full_disk_leaves_nothing(comparison: Comparison, full_disk: Path) -> None:
     for draw in (draw_latency, draw_distribution):
         path = full_disk / "figure.png"
-        with pytest.raises(OperationError, match=f"{path}: the figure cannot be written.*No space"):
+        with pytest.raises(OperationError, match=f"{path}: the file cannot be written.*No space"):
             draw(comparison.measurements, path)
         assert not path.exists()

@@ -13,6 +13,7 @@ from schedules import application, simulated
 from small_chain import small_chain
 
 from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
+from chainshaper.durations import parse_duration
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning import Plan
 from chainshaper.recording import Recording, open_recording
@@ -168,6 +169,39 @@ def test_costs_are_found_again_in_a_recording(tmp_path: Path, chain: Application
     costs = measured_costs(simulate(described, tmp_path / "profile", cycles=50))
     for name, ns in COSTS_NS.items():
         assert set(getattr(costs, name).samples_ns) == {ns}
+
+
+def test_costs_of_large_messages_are_told_apart_from_the_dds_threads_that_receive_them(
+    tmp_path: Path,
+) -> None:
+    """A camera below the DDS threads of its core; its images need 1 ms there, and 0.4 ms before."""
+    costs = {"wake_up": "130us", "take": "20us", "publish": "70us"}
+    described = application(
+        """
+        chain: /image../seen
+        nodes:
+          camera:
+            core: 0
+            callbacks:
+              - {timer: 100ms, publishes: [/image]}
+              - {timer: 100ms, execution: {constant: 2ms}, publishes: [/other]}
+          eye:
+            callbacks:
+              - {subscription: /image, execution: {constant: 10ms}, publishes: [/seen]}
+          lid: {callbacks: [{subscription: /image, execution: {constant: 10ms}}]}
+          brain: {callbacks: [{subscription: /seen, execution: {constant: 10ms}}]}
+          ear: {core: 2, callbacks: [{subscription: /other}]}
+        """,
+        **{name: {"constant": cost} for name, cost in costs.items()},
+        delivery={"constant": "400us"},
+        receive={"constant": "1ms"},
+    )
+    found = measured_costs(simulate(described, tmp_path / "profile", cycles=20))
+    for name, text in costs.items():
+        assert set(getattr(found, name).samples_ns) == {parse_duration(text)}, name
+    # Delivery, then a DDS thread wakes up and receives: /image for eye, /other for ear.
+    assert set(found.delivery.samples_ns or ()) == {400_000 + 130_000 + 1_000_000}
+    assert found.interrupts == 0.0, "the camera was interrupted by DDS threads, eye by nobody"
 
 
 def test_a_recording_without_the_applications_callbacks_is_no_source_of_times(

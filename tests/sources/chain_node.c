@@ -3,6 +3,8 @@
  *   chain_node source CYCLES PERIOD_US   timer -> /x; a line on standard output per message
  *   chain_node relay                     /x (lines on standard input) -> /y
  *   chain_node flood COUNT PAUSE_US      callbacks, PAUSE_US apart, as fast as can be with 0
+ *   chain_node busy CYCLES               callbacks that compute, wait and publish; a line with
+ *                                        process and CPU time of each
  *   chain_node exit CODE                 a node that is created, and ends with this code
  *   chain_node deaf                      one that ignores SIGINT and SIGTERM
  *
@@ -130,6 +132,25 @@ static void flood(long count, long pause_us)
 	}
 }
 
+static void busy(long cycles)
+{
+	create_node("busy");
+	create_publisher("/x");
+	create_timer(10000000);
+	for (long i = 0; i < cycles; i++) {
+		usleep(10000);
+		tracepoint(ros2, callback_start, CALLBACK, 0);
+		int64_t before = now(CLOCK_THREAD_CPUTIME_ID), after;
+		while (now(CLOCK_THREAD_CPUTIME_ID) < before + 20000000) {
+		}
+		usleep(5000);
+		publish();
+		after = now(CLOCK_THREAD_CPUTIME_ID);
+		tracepoint(ros2, callback_end, CALLBACK);
+		printf("%d %" PRId64 "\n", getpid(), after - before);
+	}
+}
+
 int main(int argc, char **argv)
 {
 	const char *role = argc > 1 ? argv[1] : "";
@@ -139,6 +160,8 @@ int main(int argc, char **argv)
 		relay();
 	else if (!strcmp(role, "flood"))
 		flood(atol(argv[2]), atol(argv[3]));
+	else if (!strcmp(role, "busy"))
+		busy(atol(argv[2]));
 	else if (!strcmp(role, "exit")) {
 		create_node("short_lived");
 		return atoi(argv[2]);

@@ -124,7 +124,7 @@ def test_functions_belong_to_callbacks_from_when_these_were_added() -> None:
     assert rows == [(50 * MS, READER, "Relay::on_x()"), (70 * MS, TIMER, "Source::tick()")]
     symbols = {one.handle: one.symbol for one in application_graph(named).callbacks}
     assert symbols[TIMER] == "Source::tick()"
-    assert with_functions(tables, {}, 50 * MS) is tables
+    assert with_functions(tables, {}, 50 * MS) == tables
 
 
 def test_the_rmws_own_topics_and_recordings_without_handles_change_nothing() -> None:

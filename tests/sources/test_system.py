@@ -18,7 +18,7 @@ NEW_PUBLISH = {"rmw_publish": {"message": 0, "timestamp": 0}}
         ("6.3.1", "iron"),
         ("8.2.2", "jazzy"),
         ("8.6.0", "kilted"),
-        ("8.9.0", "rolling"),
+        ("8.10.2", "lyrical"),
         ("10.0.0", "rolling"),
     ],
 )

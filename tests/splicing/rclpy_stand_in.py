@@ -19,7 +19,7 @@ from typing import Any
 import yaml
 
 # Addresses of rcl's objects: the last one fits into no 32 bits.
-NODE, SUBSCRIPTION, TIMER = 0x1000, 0x2000, 0x7F0000003000
+NODE, SUBSCRIPTION, PUBLISHER, TIMER = 0x1000, 0x2000, 0x4000, 0x7F0000003000
 
 _state = {"ok": False, "stopped": False}
 
@@ -128,9 +128,9 @@ def spin(node: "Node") -> None:
     raise ExternalShutdownException
 
 
-def _deliver(subscription: tuple[Any, bool], message: dict[str, Any]) -> None:
-    callback, raw = subscription
-    if not raw:
+def _deliver(subscription: SimpleNamespace, message: dict[str, Any]) -> None:
+    callback = subscription.callback
+    if not subscription.raw:
         callback(String(data=message["data"]))
     elif len(inspect.signature(callback).parameters) == 2 and hasattr(Subscription, "CallbackType"):
         callback(bytes.fromhex(message["payload"]), {"source_timestamp": message["source"]})
@@ -148,6 +148,7 @@ class Logger:
 class Publisher:
     def __init__(self, topic: str, word: str = "published") -> None:
         self._topic, self._word = topic, word
+        self.handle = SimpleNamespace(pointer=PUBLISHER)
 
     def publish(self, payload: bytes) -> None:
         _say(**{self._word: self._topic}, payload=payload.hex(), time=time.monotonic_ns())
@@ -164,7 +165,7 @@ class Node:
             self._parameters = yaml.safe_load(stream)["/**"]["ros__parameters"]
         self._publishers = json.loads(os.environ["STAND_IN_PUBLISHERS"])
         self._looks = 0
-        self.subscriptions: dict[str, tuple[Callable[..., None], bool]] = {}
+        self.subscriptions: dict[str, SimpleNamespace] = {}
         self.timers: list[Callable[[], None]] = []
         self.handle = SimpleNamespace(pointer=NODE)
         self.on_set: Callable[[list[Parameter]], object] = lambda _: None
@@ -210,8 +211,10 @@ class Node:
     ) -> SimpleNamespace:
         topic = self.resolve_topic_name(topic)
         _say(subscription=topic, type=message_type.__name__, qos=vars(qos), raw=raw)
-        self.subscriptions[topic] = (callback, raw)
-        return SimpleNamespace(handle=SimpleNamespace(pointer=SUBSCRIPTION))
+        handle = SimpleNamespace(pointer=SUBSCRIPTION)
+        subscription = SimpleNamespace(handle=handle, callback=callback, raw=raw)
+        self.subscriptions[topic] = subscription
+        return subscription
 
     def create_timer(
         self, seconds: float, callback: Callable[[], None], clock: Clock

@@ -1,4 +1,6 @@
-"""Callbacks of the Python nodes, as the library behind the trace points of ROS 2 hears of them."""
+"""The Python nodes' callbacks, and on Humble their messages, as the library behind the trace points
+of ROS 2 hears of them.
+"""
 
 import shutil
 import subprocess
@@ -11,7 +13,8 @@ from chainshaper.planning import Plan
 from chainshaper.splicing.shaping_process import write_shaping_process, write_throttler
 
 IMAGES = [{"type": "sensor_msgs/msg/Image", "qos": RELIABLE}]
-NODE, SUBSCRIPTION, TIMER = 0x1000, 0x2000, 0x7F0000003000  # as the stand-in for rclpy has them
+# As the stand-in for rclpy has them.
+NODE, SUBSCRIPTION, PUBLISHER, TIMER = 0x1000, 0x2000, 0x4000, 0x7F0000003000
 
 LIBRARY = r"""
 #include <stdbool.h>
@@ -38,21 +41,33 @@ void ros_trace_rclcpp_callback_register(const void * callback, const char * symb
 {tell("rclcpp_callback_register", callback, 0, symbol);}
 void ros_trace_callback_start(const void * callback, bool intra)
 {tell("callback_start", callback, intra, "-");}
+TRACE_POINT(rcl_publish)
+void ros_trace_rmw_publish(const void * message) {tell("rmw_publish", message, 0, "-");}
+void ros_trace_rmw_take(const void * handle, const void * message, int64_t stamp, bool taken)
+{tell("rmw_take", handle, (intptr_t)message, stamp > 0 && taken ? "taken" : "-");}
 #ifndef INCOMPLETE
 void ros_trace_callback_end(const void * callback) {tell("callback_end", callback, 0, "-");}
 #endif
 """
 
 
+RCL = """
+const void * rcl_subscription_get_rmw_handle(const char * subscription) {return subscription + 8;}
+"""
+
+
 def preloaded(folder: Path, *flags: str) -> dict[str, str]:
-    """An environment in which the library is loaded, and writes down what it is told."""
+    """An environment in which the libraries are loaded; what they are told is written down."""
     if shutil.which("gcc") is None:
         pytest.skip("no gcc to build the tracing library with")
-    source, library = folder / "tracetools.c", folder / "libtracetools.so"
-    source.write_text(LIBRARY)
-    gcc = ["gcc", "-shared", "-fPIC", "-Wl,-soname,libtracetools.so", *flags]
-    subprocess.run([*gcc, "-o", library, source], check=True)
-    return {"LD_PRELOAD": str(library), "HEARD": str(folder / "heard")}
+    libraries = []
+    for name, text in (("tracetools", LIBRARY), ("rcl", RCL)):
+        source, library = folder / f"{name}.c", folder / f"lib{name}.so"
+        source.write_text(text)
+        gcc = ["gcc", "-shared", "-fPIC", f"-Wl,-soname,lib{name}.so", *flags]
+        subprocess.run([*gcc, "-o", library, source], check=True)
+        libraries.append(str(library))
+    return {"LD_PRELOAD": ":".join(libraries), "HEARD": str(folder / "heard")}
 
 
 def heard(folder: Path) -> list[tuple[str, int, int, str]]:
@@ -105,3 +120,25 @@ def test_a_library_without_all_trace_points_is_left_alone(tmp_path: Path) -> Non
         run.hear(lambda words: "published" in words)
         assert run.end() == 0
     assert not (tmp_path / "heard").exists()
+
+
+def test_on_humble_serialized_messages_are_seen_as_on_later_distributions(
+    tmp_path: Path, plan: Plan
+) -> None:
+    """There neither rcl nor rmw tells of them."""
+    assert plan.shaping_node is not None
+    process = write_shaping_process(plan, plan.shaping_node, "python", tmp_path)
+    humble = {**preloaded(tmp_path), "STAND_IN_HUMBLE": "1"}
+    with running_node(process, tmp_path, {"/t3_tmp": IMAGES}, **humble) as run:
+        run.tell(topic="/t3_tmp", payload=stamped().hex(), source=77)
+        run.hear(lambda words: words.get("published") == "/t3")
+        assert run.end() == 0
+    taken, _, published, written, _ = heard(tmp_path)[-5:]
+    message = taken[2]
+    assert taken == ("rmw_take", SUBSCRIPTION + 8, message, "taken")
+    assert published == ("rcl_publish", PUBLISHER, message, "-")
+    assert written == ("rmw_publish", message, 0, "-")
+    events = [event for event, *_ in heard(tmp_path)]
+    assert events[-5:][::3] == ["rmw_take", "rmw_publish"]
+    assert events[-4] == "callback_start", "as where the executor takes the message"
+    assert events[-1] == "callback_end"

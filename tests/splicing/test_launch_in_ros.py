@@ -82,6 +82,8 @@ def test_ros_2_remaps_the_publisher_and_nobody_else(
 ) -> None:
     shaping, tmp = "/chainshaper" + case.output.replace("/", "_"), f"{case.output}_tmp"
     for before, after in answers[case.name]:
+        if "cannot import name" in str(before):  # PushROSNamespace, before Jazzy
+            pytest.skip(f"this distribution cannot launch the original: {before}")
         assert isinstance(before, list), before
         assert isinstance(after, list), after
         ours = [topics for node, topics in after if node == shaping]

@@ -139,7 +139,8 @@ def test_messages_come_back_in_the_slot_of_their_mode(
 
     releases = read_gate_log(log)
     assert releases.height == len(messages)
-    assert releases["source_timestamp"].null_count() == 0
+    told = kind != "python" or os.environ["ROS_DISTRO"] != "humble"
+    assert releases["source_timestamp"].is_not_null().unique().to_list() == [told]
     assert set(releases["mode"]) == {"city", "highway"}
     in_time = releases.filter(pl.col("overrun").is_null())
     assert in_time.height > 0

@@ -35,8 +35,8 @@ BODIES = {
     ),
     "bound": (
         "import json, time\n"
-        "from chainshaper.enforcement.realtime import die_with_parent\n"
-        "die_with_parent(json.loads(input())['parent'])\n"
+        "import signal\nfrom chainshaper.enforcement.realtime import signalled_with_parent\n"
+        "signalled_with_parent(json.loads(input())['parent'], signal.SIGKILL)\n"
         "print('{}', flush=True)\n"
         "while True:\n"
         "    time.sleep(600)"  # it would never notice that the pipe is closed

@@ -10,16 +10,16 @@ which those that are not used have 0 bytes. The table of keys has ``slots`` rows
 (three numbers, whether it is taken, the latest row), and one more whose first number counts them.
 """
 
+# mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
+
 # Kernels take many numbers rather than objects, which are slow to pass.
 # ruff: noqa: PLR0917
-
-from typing import Any
 
 import numpy as np
 
 from chainshaper.compiled.memory import compiled, get, load_half, load_word, put, store_word
 
-__all__ = ["KEY_ROW", "place_of", "walk_backward", "walk_forward"]
+__all__ = ["KEY_ROW", "place_of", "walk"]
 
 KEY_ROW = 8 * 5
 LATEST = 4
@@ -28,7 +28,7 @@ FULL = -1
 
 
 @compiled(inline=True)
-def number_at(column: Any, row: Any) -> Any:
+def number_at(column, row):
     """A key column's value in a row, whatever its sign."""
     address, width = get(column, 0), get(column, 1)
     if width == 8:
@@ -39,7 +39,7 @@ def number_at(column: Any, row: Any) -> Any:
 
 
 @compiled()
-def place_of(table: Any, slots: Any, columns: Any, row: Any, add: Any) -> Any:
+def place_of(table, slots, columns, row, add):
     """The address of a row's key in a table; with ``add`` it gets one, 0 once that is half full.
 
     Without ``add``, 0 for a key that is not there.
@@ -69,53 +69,29 @@ def place_of(table: Any, slots: Any, columns: Any, row: Any, add: Any) -> Any:
 
 
 @compiled()
-def walk_forward(
-    left: Any, at: Any, count: Any, right: Any, times: Any, others: Any,
-    strictly: Any, found: Any, table: Any, slots: Any,
-) -> Any:  # fmt: skip
-    """Fill ``found`` (uint32) with the last row of ``right`` at or before each row of ``left``.
+def walk(left, at, count, right, times, others, step, strictly, found, table, slots):
+    """Fill ``found`` (uint32) with the row of ``right`` that matches each row of ``left``.
 
-    ``at`` and ``times`` (int64, ns) ascend, ``left`` and ``right`` are their keys. Returns how many
-    rows have none, which NONE stands for, or FULL where ``slots`` are too few for all keys.
+    That is the last one at or before it (``step`` 1), or the first one at or after it (``step``
+    −1: the walk begins at the end). ``at`` and ``times`` (int64, ns) ascend, ``left`` and ``right``
+    are their keys. Returns how many rows have none, which NONE stands for, or FULL where ``slots``
+    are too few for all keys.
     """
-    other, missing = np.int64(0), np.int64(0)
-    for row in range(count):
+    row, other = (0, 0) if step > 0 else (count - 1, others - 1)
+    missing = 0
+    for _ in range(count):
         now = get(at, row)
-        while other < others and get(times, other) + strictly <= now:
-            place = place_of(table, slots, right, other, np.int64(1))
+        while 0 <= other < others and (get(times, other) - now) * step + strictly <= 0:
+            place = place_of(table, slots, right, other, 1)
             if place == 0:
-                return np.int64(FULL)
+                return FULL
             put(place, LATEST, other)
-            other += 1
-        place = place_of(table, slots, left, row, np.int64(0))
+            other += step
+        place = place_of(table, slots, left, row, 0)
         if place == 0:
             store_word(found + 4 * row, NONE)
             missing += 1
         else:
             store_word(found + 4 * row, np.uint64(get(place, LATEST)))
-    return missing
-
-
-@compiled()
-def walk_backward(
-    left: Any, at: Any, count: Any, right: Any, times: Any, others: Any,
-    strictly: Any, found: Any, table: Any, slots: Any,
-) -> Any:  # fmt: skip
-    """The same from the end: the first row of ``right`` at or after each row of ``left``."""
-    other, missing = others - 1, np.int64(0)
-    for back in range(count):
-        row = count - 1 - back
-        now = get(at, row)
-        while other >= 0 and get(times, other) >= now + strictly:
-            place = place_of(table, slots, right, other, np.int64(1))
-            if place == 0:
-                return np.int64(FULL)
-            put(place, LATEST, other)
-            other -= 1
-        place = place_of(table, slots, left, row, np.int64(0))
-        if place == 0:
-            store_word(found + 4 * row, NONE)
-            missing += 1
-        else:
-            store_word(found + 4 * row, np.uint64(get(place, LATEST)))
+        row += step
     return missing

@@ -6,8 +6,8 @@ created there, or it belongs to whatever its thread was doing at that moment. Bo
 cost is linear in the rows once both sides are sorted by time.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -27,43 +27,47 @@ __all__ = [
     "nearest",
 ]
 
-_walk_forward = kernel("chainshaper.analysis.asof", "walk_forward")
-_walk_backward = kernel("chainshaper.analysis.asof", "walk_backward")
+_walk = kernel("chainshaper.analysis.asof", "walk")
 _FIRST_SLOTS = 1024
 _MOST_KEYS = 3
 _NONE = 0xFFFFFFFF
 
 
-def latest_before(
+def _asof(
     left: pl.DataFrame,
     right: pl.DataFrame,
     by: list[str],
     left_on: str,
     right_on: str,
     *,
+    step: Literal[1, -1],
     strictly: bool = False,
 ) -> pl.DataFrame:
-    """``left`` with the columns of the latest row of ``right`` at or before it, else nulls.
+    """``left`` with the columns of the matching row of ``right``, else nulls.
 
-    ``by`` are the key columns that both have (none: time alone decides), ``left_on`` and
-    ``right_on`` their time columns. Of rows of ``right`` with the same time the last counts;
-    ``strictly`` leaves out rows at the very time of the left one. The result is sorted by
-    ``left_on`` and also has ``right_on``. Rows of ``right`` without a time or key match nothing.
+    That is the latest one at or before it (``latest_before``), or the first one at or after it
+    (``first_after``). ``by`` are the key columns that both have (none: time alone decides),
+    ``left_on`` and ``right_on`` their time columns. Of rows of ``right`` with the same time the
+    last counts, or the first; ``strictly`` leaves out rows at the very time of the left one. The
+    result is sorted by ``left_on`` and also has ``right_on``. Rows of ``right`` without a time or
+    key match nothing.
     """
-    return _asof(left, right, by, left_on, right_on, strategy="backward", strictly=strictly)
+    right = right.drop_nulls([*by, right_on])
+    left, right = _in_order(left, left_on), _in_order(right, right_on)
+    keys = Keys.of(left, by), Keys.of(right, by)
+    if keys[0] is None or keys[1] is None or any(left.schema[k] != right.schema[k] for k in by):
+        strategy: Literal["backward", "forward"] = "backward" if step > 0 else "forward"
+        return _by_polars(left, right, by, left_on, right_on, strategy=strategy, strictly=strictly)
+    index = _rows((left[left_on], keys[0]), (right[right_on], keys[1]), step, strictly=strictly)
+    for key in by:
+        if left[key].null_count():
+            index = index.set(left[key].is_null(), None)
+    columns = right.drop(by).select(pl.all().gather(index))
+    return left.hstack(columns.rename({n: f"{n}_right" for n in columns.columns if n in left}))
 
 
-def first_after(
-    left: pl.DataFrame,
-    right: pl.DataFrame,
-    by: list[str],
-    left_on: str,
-    right_on: str,
-    *,
-    strictly: bool = False,
-) -> pl.DataFrame:
-    """As :func:`latest_before`, but the first row of ``right`` at or after each of ``left``."""
-    return _asof(left, right, by, left_on, right_on, strategy="forward", strictly=strictly)
+latest_before = partial(_asof, step=1)
+first_after = partial(_asof, step=-1)
 
 
 def nearest(
@@ -77,34 +81,10 @@ def nearest(
     return _by_polars(left, right, by, left_on, right_on, strategy="nearest", strictly=False)
 
 
-def _asof(
-    left: pl.DataFrame,
-    right: pl.DataFrame,
-    by: list[str],
-    left_on: str,
-    right_on: str,
-    *,
-    strategy: Literal["backward", "forward"],
-    strictly: bool,
-) -> pl.DataFrame:
-    right = right.drop_nulls([*by, right_on])
-    left, right = _in_order(left, left_on), _in_order(right, right_on)
-    keys = Keys.of(left, by), Keys.of(right, by)
-    if keys[0] is None or keys[1] is None or any(left.schema[k] != right.schema[k] for k in by):
-        return _by_polars(left, right, by, left_on, right_on, strategy=strategy, strictly=strictly)
-    walk = _walk_forward if strategy == "backward" else _walk_backward
-    index = _rows((left[left_on], keys[0]), (right[right_on], keys[1]), walk, strictly=strictly)
-    for key in by:
-        if left[key].null_count():
-            index = index.set(left[key].is_null(), None)
-    columns = right.drop(by).select(pl.all().gather(index))
-    return left.hstack(columns.rename({n: f"{n}_right" for n in columns.columns if n in left}))
-
-
 def _rows(
     left: tuple[pl.Series, "Keys"],
     right: tuple[pl.Series, "Keys"],
-    walk: Callable[..., int],
+    step: int,
     *,
     strictly: bool,
 ) -> pl.Series:
@@ -116,9 +96,9 @@ def _rows(
     slots, missing = _FIRST_SLOTS, -1
     while missing < 0:
         table = key_table(slots)
-        missing = walk(
+        missing = _walk(
             keys.ctypes.data, own.ctypes.data, len(own), right_keys.table.ctypes.data,
-            its.ctypes.data, len(its), strictly, found.ctypes.data, table.ctypes.data, slots,
+            its.ctypes.data, len(its), step, strictly, found.ctypes.data, table.ctypes.data, slots,
         )  # fmt: skip
         slots *= 8
     index = pl.Series(found)

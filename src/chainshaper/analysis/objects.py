@@ -21,7 +21,7 @@ from chainshaper import events
 from chainshaper.analysis.identity import numbered
 from chainshaper.analysis.matching import first_after, latest_before, nearest
 
-__all__ = ["CALLBACK_SCHEMA", "INTERNAL_TOPICS", "Objects", "resolve_objects"]
+__all__ = ["CALLBACK_SCHEMA", "INTERNAL_TOPICS", "Objects", "named_nodes", "resolve_objects"]
 
 INTERNAL_TOPICS = frozenset(("/parameter_events", "/rosout", "/clock"))
 """Topics that every node has for itself: they connect no computation."""
@@ -71,7 +71,7 @@ class Objects:
 
 def resolve_objects(tables: events.EventTables) -> Objects:
     """Find all objects of a recording. Cost is linear in the number of events."""
-    nodes = _nodes(tables)
+    nodes = named_nodes(tables)
     publishers = _endpoints(tables, nodes, "publisher")
     subscriptions = _endpoints(tables, nodes, "subscription")
     registered = pl.concat(
@@ -107,7 +107,8 @@ def _name_types(*owners: pl.DataFrame) -> list[pl.Expr]:
     return casts
 
 
-def _nodes(tables: events.EventTables) -> pl.DataFrame:
+def named_nodes(tables: events.EventTables) -> pl.DataFrame:
+    """The frame ``nodes`` of :class:`Objects`."""
     namespace = pl.col("namespace").fill_null("").str.strip_chars_end("/")
     return (
         events.table(tables, "rcl_node_init")

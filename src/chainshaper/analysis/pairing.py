@@ -10,10 +10,10 @@ which the one before ended (end first), or last no time at all (start first): it
 one was open before that nanosecond.
 """
 
+# mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
+
 # Kernels take many numbers rather than objects, which are slow to pass.
 # ruff: noqa: PLR0917
-
-from typing import Any
 
 import numpy as np
 
@@ -30,7 +30,7 @@ FULL = -1
 
 
 @compiled(inline=True)
-def end_at(place: Any, moment: Any, early: Any, row: Any, found: Any) -> None:
+def end_at(place, moment, early, row, found):
     """Note an end: the ``early`` ones close what was open before this moment, others the rest."""
     if get(place, MOMENT) != moment:
         put(place, MOMENT, moment)
@@ -43,10 +43,7 @@ def end_at(place: Any, moment: Any, early: Any, row: Any, found: Any) -> None:
 
 
 @compiled()
-def walk_ends(
-    ends: Any, first: Any, last: Any, moment: Any, early: Any, found: Any,
-    table: Any, states: Any, slots: Any,
-) -> Any:  # fmt: skip
+def walk_ends(ends, first, last, moment, early, found, table, states, slots):
     """Note the ends [first, last) of a moment; 0, or FULL."""
     for row in range(first, last):
         key = place_of(table, slots, ends, row, np.int64(1))
@@ -57,10 +54,7 @@ def walk_ends(
 
 
 @compiled()
-def walk_pairs(
-    starts: Any, began: Any, start_count: Any, ends: Any, ended: Any, end_count: Any,
-    found: Any, table: Any, states: Any, slots: Any,
-) -> Any:  # fmt: skip
+def walk_pairs(starts, began, start_count, ends, ended, end_count, found, table, states, slots):
     """For every start write the row of its end to ``found`` (uint32; other rows are left alone).
 
     ``starts`` and ``ends`` are keys as in :mod:`~chainshaper.analysis.asof`, ``began`` and

@@ -23,22 +23,18 @@ LINE_EVERY = 10
 
 
 def apply(
-    plan: Annotated[
-        Path, typer.Argument(metavar="plan.yaml", help="The plan.", show_default=False)
-    ],
+    plan: Annotated[Path, typer.Argument(metavar="plan.yaml", help="The plan.")],
     command: Annotated[
         list[str] | None,
         typer.Argument(
             metavar="[-- COMMAND…]",
             help="Start this, such as `ros2 launch …`, and end when it ends. Default: attach to "
             "what runs.",
-            show_default=False,
         ),
     ] = None,
     backend: Annotated[
         str,
         typer.Option(
-            "--backend",
             metavar="NAME",
             help="auto (the strongest that works here), scx, litmus, freezer or fifo.",
         ),
@@ -53,10 +49,7 @@ def apply(
     recording: Annotated[
         Path | None,
         typer.Option(
-            "--recording",
-            metavar="REC",
-            help="A recording of these very processes: it tells executors for sure.",
-            show_default=False,
+            metavar="REC", help="A recording of these very processes: it tells executors for sure."
         ),
     ] = None,
     wait: Annotated[

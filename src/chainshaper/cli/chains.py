@@ -17,7 +17,6 @@ def chains(
             "--from",
             metavar="X",
             help="Topic or node where they begin. Default: callbacks that nothing triggers.",
-            show_default=False,
         ),
     ] = None,
     end: Annotated[
@@ -26,10 +25,9 @@ def chains(
             "--to",
             metavar="Y",
             help="Topic or node where they end. Default: topics from which nothing goes on.",
-            show_default=False,
         ),
     ] = None,
-    limit: Annotated[int, typer.Option("--limit", min=1, help="How many to list.")] = 100,
+    limit: Annotated[int, typer.Option(min=1, help="How many to list.")] = 100,
     json: JsonOption = False,
 ) -> None:
     """List the computation chains, count them, and show the heaviest.

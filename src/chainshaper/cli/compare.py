@@ -5,35 +5,21 @@ from typing import Annotated
 
 import typer
 
-from chainshaper.cli.options import ChainOption, JsonOption
+from chainshaper.cli.options import ChainOption, JsonOption, PlanInForceOption
 
 __all__ = ["compare"]
 
 
 def compare(
     recordings: Annotated[
-        list[Path],
-        typer.Argument(metavar="REC REC...", help="Recordings' folders.", show_default=False),
+        list[Path], typer.Argument(metavar="REC REC...", help="Recordings' folders.")
     ],
     chain: ChainOption = None,
     figures: Annotated[
         Path | None,
-        typer.Option(
-            "--figures",
-            metavar="DIR",
-            help="Draw latency.png and distribution.png into this folder.",
-            show_default=False,
-        ),
+        typer.Option(metavar="DIR", help="Draw latency.png and distribution.png into this folder."),
     ] = None,
-    plan: Annotated[
-        Path | None,
-        typer.Option(
-            "--plan",
-            metavar="plan.yaml",
-            help="The plan that the last recording was made with, where it does not say so.",
-            show_default=False,
-        ),
-    ] = None,
+    plan: PlanInForceOption = None,
     json: JsonOption = False,
 ) -> None:
     """Show the same chain in several recordings side by side, usually before and after shaping.

@@ -20,16 +20,12 @@ def demo(
             "-o",
             metavar="DIR",
             help="Folder for everything. Default: chainshaper-demo-DATE-TIME here.",
-            show_default=False,
         ),
     ] = None,
     application: Annotated[
         Path | None,
         typer.Option(
-            "--application",
-            metavar="APP.yaml",
-            help="Another application than the paper's synthetic chain.",
-            show_default=False,
+            metavar="APP.yaml", help="Another application than the paper's synthetic chain."
         ),
     ] = None,
     cycles: CyclesOption = 320,

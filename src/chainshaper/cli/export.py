@@ -20,7 +20,6 @@ def export(
             "-o",
             metavar="FILE",
             help="File to write, such as trace.pftrace; must not exist.",
-            show_default=False,
         ),
     ],
     perfetto: Annotated[
@@ -30,10 +29,7 @@ def export(
     plan: Annotated[
         Path | None,
         typer.Option(
-            "--plan",
-            metavar="plan.yaml",
-            help="The plan in force, where the recording does not say so.",
-            show_default=False,
+            metavar="plan.yaml", help="The plan in force, where the recording does not say so."
         ),
     ] = None,
 ) -> None:
@@ -47,9 +43,9 @@ def export(
     from chainshaper.exploration import lost_events
     from chainshaper.planning import load_plan
     from chainshaper.reporting.perfetto import ENDINGS, export_perfetto
-    from chainshaper.reporting.whole_file import new_file
     from chainshaper.sources import open_source
     from chainshaper.steps import measure_latency
+    from chainshaper.whole_file import new_file
 
     new_file(output, ENDINGS)
     in_force = None if plan is None else load_plan(plan)

@@ -19,7 +19,6 @@ def graph(
             "-o",
             metavar="FILE",
             help="File to write: .svg, .dot or .json; must not exist.",
-            show_default=False,
         ),
     ] = None,
     everything: Annotated[
@@ -36,15 +35,17 @@ def graph(
     from chainshaper.cli.output import late_progress, notes, print_json, show, show_line
     from chainshaper.exploration import describe_application, lost_events
     from chainshaper.reporting.application_graph import (
+        ENDINGS,
         application_json,
         application_table,
-        check_picture,
+        without_internals,
         write_picture,
     )
     from chainshaper.sources import open_source
+    from chainshaper.whole_file import new_file
 
     if output is not None:
-        check_picture(output)
+        new_file(output, ENDINGS)
     with late_progress("graph") as report:
         opened = open_source(*trace, progress=report)
         application = describe_application(opened)
@@ -54,7 +55,7 @@ def graph(
     if json:
         print_json(application_json(application))
     elif output is None:
-        show(application_table(application, everything=everything))
+        show(application_table(application if everything else without_internals(application)))
         show_line(lost_events(opened.info))
         notes(application.notes)
     else:

@@ -17,10 +17,8 @@ def latency(
     chains: Annotated[
         Path | None,
         typer.Option(
-            "--chains",
             metavar="FILE",
             help="A CARET architecture file: --chain then names one of its named_paths.",
-            show_default=False,
         ),
     ] = None,
     json: JsonOption = False,

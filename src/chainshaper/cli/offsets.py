@@ -16,24 +16,16 @@ __all__ = ["offsets", "place_and_print"]
 
 def offsets(
     plans: Annotated[
-        list[Path],
-        typer.Argument(metavar="PLAN PLAN...", help="Plans, one a chain.", show_default=False),
+        list[Path], typer.Argument(metavar="PLAN PLAN...", help="Plans, one a chain.")
     ],
     output: Annotated[
         Path | None,
         typer.Option(
-            "--output",
-            "-o",
-            metavar="DIR",
-            help="Folder to write the plans into; must not exist.",
-            show_default=False,
+            "--output", "-o", metavar="DIR", help="Folder to write the plans into; must not exist."
         ),
     ] = None,
     time_limit: Annotated[
-        float,
-        typer.Option(
-            "--time-limit", metavar="SECONDS", min=0.1, help="How long to search, per group."
-        ),
+        float, typer.Option(metavar="SECONDS", min=0.1, help="How long to search, per group.")
     ] = 60.0,
     json: JsonOption = False,
 ) -> None:

@@ -12,8 +12,8 @@ __all__ = [
     "ChainOption",
     "CyclesOption",
     "JsonOption",
+    "PlanInForceOption",
     "RealtimeOption",
-    "RecordingArgument",
     "RecordingOutput",
     "TraceArgument",
     "duration_option",
@@ -26,13 +26,15 @@ ChainOption = Annotated[
         "--chain",
         metavar="FIRST..LAST",
         help="The chain, by topics or nodes: /t1../t5. Default: the one the recording names.",
-        show_default=False,
     ),
 ]
-
-
-RecordingArgument = Annotated[
-    Path, typer.Argument(metavar="REC", help="A recording's folder.", show_default=False)
+PlanInForceOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--plan",
+        metavar="plan.yaml",
+        help="The plan that the last recording was made with, where it does not say so.",
+    ),
 ]
 TraceArgument = Annotated[
     list[Path],
@@ -40,26 +42,19 @@ TraceArgument = Annotated[
         metavar="TRACE...",
         help="An LTTng trace's folder (several of one trace: kernel and user space), or a "
         "recording's.",
-        show_default=False,
     ),
 ]
 ApplicationArgument = Annotated[
-    Path,
-    typer.Argument(metavar="APP.yaml", help="The application's description.", show_default=False),
+    Path, typer.Argument(metavar="APP.yaml", help="The application's description.")
 ]
 RecordingOutput = Annotated[
-    Path,
-    typer.Option(
-        "--output", "-o", metavar="REC", help="Folder to write; must not exist.", show_default=False
-    ),
+    Path, typer.Option("--output", "-o", metavar="REC", help="Folder to write; must not exist.")
 ]
 CyclesOption = Annotated[int, typer.Option("--cycles", min=1, help="Cycles to record.")]
 RealtimeOption = Annotated[
     bool | None,
     typer.Option(
-        "--realtime/--no-realtime",
-        help="Use SCHED_FIFO. Default: where it is permitted.",
-        show_default=False,
+        "--realtime/--no-realtime", help="Use SCHED_FIFO. Default: where it is permitted."
     ),
 ]
 

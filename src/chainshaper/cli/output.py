@@ -4,7 +4,7 @@ import json
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -57,7 +57,7 @@ def _written() -> Iterator[None]:
         ) from error
 
 
-def notes(lines: Iterator[str] | tuple[str, ...] | list[str]) -> None:
+def notes(lines: Iterable[str]) -> None:
     """What a reader of the figures must know, one line each, on stderr."""
     for line in lines:
         sys.stderr.write(f"note: {line}\n")

@@ -24,7 +24,7 @@ def plan(
     output: options.PlanOutput = None,
     latencies: options.LatenciesOption = None,
     period: options.PeriodOption = None,
-    policy: Annotated[options.Policy, typer.Option(help="How it is scheduled.")] = ("shaped"),
+    policy: Annotated[options.Policy, typer.Option(help="How it is scheduled.")] = "shaped",
     publication: Annotated[
         options.Publication, typer.Option(help="By a shaping node, or the publisher's own thread.")
     ] = "synchronous",

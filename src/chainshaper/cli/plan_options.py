@@ -1,8 +1,10 @@
-"""The options of `chainshaper plan`, and what they are worth in Python."""
+"""The options of `chainshaper plan`, and what they are worth in Python.
 
-from enum import Enum
+Choices are the planner's own types, written once more so that `--help` need not load the planner.
+"""
+
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import typer
 
@@ -43,62 +45,20 @@ __all__ = [
 ]
 
 
-class Anchor(str, Enum):
-    """What starts a cycle for the shaping node."""
-
-    STAMP = "stamp"
-    CYCLE = "cycle"
-
-
-class Overrun(str, Enum):
-    """What becomes of an output that missed its last slot."""
-
-    WAIT = "wait"
-    DISCARD = "discard"
-    PUBLISH = "publish"
-
-
-class Policy(str, Enum):
-    """How the chain is scheduled."""
-
-    SHAPED = "shaped"
-    ONE_LONG_SLOT = "one-long-slot"
-    SERVER_PER_CALLBACK = "server-per-callback"
-    SERVER_PER_CHAIN = "server-per-chain"
-    LET_PER_CALLBACK = "let-per-callback"
-    LET_PER_CHAIN = "let-per-chain"
-
-
-class Publication(str, Enum):
-    """Who publishes the chain's output."""
-
-    SYNCHRONOUS = "synchronous"
-    ASYNCHRONOUS = "asynchronous"
-
-
-class Solver(str, Enum):
-    """What places latency bands."""
-
-    EXACT = "exact"
-    PSO = "pso"
-    RANDOM = "random"
-
-
-class Minimise(str, Enum):
-    """What the placement of bands makes small."""
-
-    MEAN = "mean"
-    JITTER = "jitter"
-    GAP = "gap"
-
-
-class LateForMode(str, Enum):
-    """What becomes of an output that comes behind the slot of its mode."""
-
-    WAIT = "wait"
-    DISCARD = "discard"
-    PUBLISH = "publish"
-    NEXT_SLOT = "next-slot"
+Anchor: TypeAlias = Literal["stamp", "cycle"]
+Overrun: TypeAlias = Literal["wait", "discard", "publish"]
+Policy: TypeAlias = Literal[
+    "shaped",
+    "one-long-slot",
+    "server-per-callback",
+    "server-per-chain",
+    "let-per-callback",
+    "let-per-chain",
+]
+Publication: TypeAlias = Literal["synchronous", "asynchronous"]
+Solver: TypeAlias = Literal["exact", "pso", "random"]
+Minimise: TypeAlias = Literal["mean", "jitter", "gap"]
+LateForMode: TypeAlias = Literal["wait", "discard", "publish", "next-slot"]
 
 
 def modes_of(text: str | None, late: LateForMode) -> "Modes | None":
@@ -108,8 +68,8 @@ def modes_of(text: str | None, late: LateForMode) -> "Modes | None":
         InputError: it is not of this form, or names what no mode or topic may be called.
     """
     if text is None:
-        if late is not LateForMode.WAIT:
-            raise InputError(f"--late {late.value} goes with modes: add --modes, or leave it out")
+        if late != "wait":
+            raise InputError(f"--late {late} goes with modes: add --modes, or leave it out")
         return None
     from chainshaper.planning import Modes
     from chainshaper.planning.plan import wrong_values_refused
@@ -123,7 +83,7 @@ def modes_of(text: str | None, late: LateForMode) -> "Modes | None":
             " /driving_mode:city=2,highway=1"
         )
     with wrong_values_refused(Modes):
-        return Modes(topic=topic, default=pairs[0][0], bands=bands, late=late.value)
+        return Modes(topic=topic, default=pairs[0][0], bands=bands, late=late)
 
 
 def _bands(text: str) -> str:
@@ -151,7 +111,6 @@ ChainsOption = Annotated[
         metavar="FIRST..LAST",
         help="The chain, by topics or nodes: /t1../t5. Default: the one the recording names."
         " Give several to plan chains that share cores: their offsets are found.",
-        show_default=False,
     ),
 ]
 PlanOutput = Annotated[
@@ -161,7 +120,6 @@ PlanOutput = Annotated[
         "-o",
         metavar="plan.yaml",
         help="File to write; for several chains a folder, which must not exist.",
-        show_default=False,
     ),
 ]
 LatenciesOption = Annotated[
@@ -170,7 +128,6 @@ LatenciesOption = Annotated[
         "--latencies",
         metavar="FILE",
         help="Instead of a recording: a duration a line, or .npy in ns.",
-        show_default=False,
     ),
 ]
 PeriodOption = Annotated[
@@ -189,7 +146,6 @@ ProbabilityOption = Annotated[
         help="Derive the margin instead: from the tail of the latencies, so that a cycle overruns"
         " with this probability, such as 1e-6.",
         rich_help_panel=_MARGIN,
-        show_default=False,
     ),
 ]
 BandsOption = Annotated[
@@ -210,7 +166,6 @@ ModesOption = Annotated[
         help="Each mode's band, 1 is the first; the first mode named is in force until the topic"
         " (std_msgs/String) names another. Such as /driving_mode:city=2,highway=1.",
         rich_help_panel=_BANDS,
-        show_default=False,
     ),
 ]
 ReceiversOption = Annotated[
@@ -233,7 +188,6 @@ MaxShareOption = Annotated[
         parser=_share,
         help="Most cycles in one band: 0.4 or 40%.",
         rich_help_panel=_BANDS,
-        show_default=False,
     ),
 ]
 GridOption = Annotated[
@@ -260,7 +214,6 @@ CurveOption = Annotated[
         metavar="FILE.png",
         help="With --bands auto: draw the average over the number of bands.",
         rich_help_panel=_BANDS,
-        show_default=False,
     ),
 ]
 SeedOption = Annotated[
@@ -282,6 +235,5 @@ SinksOption = Annotated[
         metavar="FIRST..LAST",
         help="A chain to a further output of the same graph, to be shaped too.",
         rich_help_panel=_MORE,
-        show_default=False,
     ),
 ]

@@ -10,7 +10,6 @@ from chainshaper.cli.record import (
     BufferOption,
     CommandArgument,
     DurationOption,
-    Source,
     SourceOption,
     record_and_show,
 )
@@ -25,41 +24,33 @@ def profile(
     chain: Annotated[
         str | None,
         typer.Option(
-            "--chain",
             metavar="FIRST..LAST",
             help="The chain whose nodes get the priority; --like tells which those are.",
-            show_default=False,
         ),
     ] = None,
     like: Annotated[
         Path | None,
         typer.Option(
-            "--like",
             metavar="REC",
             help="An earlier recording of the application: it knows the chain's nodes, components "
             "of containers, and executors with several threads.",
-            show_default=False,
         ),
     ] = None,
     node: Annotated[
         list[str] | None,
         typer.Option(
-            "--node",
             metavar="NAME",
             help="A node that gets the priority (may be repeated). Default: the chain's, or all.",
-            show_default=False,
         ),
     ] = None,
     core: Annotated[
         int | None,
         typer.Option(
-            "--core",
             min=0,
             help="Where executors run. Default: the last core. DDS threads run on the others.",
-            show_default=False,
         ),
     ] = None,
-    source: SourceOption = Source.LTTNG,
+    source: SourceOption = "lttng",
     duration: DurationOption = None,
     buffer: BufferOption = None,
     json: JsonOption = False,

@@ -1,9 +1,8 @@
 """`chainshaper record`: trace an application that runs, or that a command starts."""
 
 import threading
-from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import typer
 
@@ -28,19 +27,13 @@ MIB = 1 << 20
 STDERR = 2
 
 
-class Source(str, Enum):
-    """Who records the events."""
-
-    LTTNG = "lttng"
-    EBPF = "ebpf"
-
+Source: TypeAlias = Literal["lttng", "ebpf"]
 
 CommandArgument = Annotated[
     list[str] | None,
     typer.Argument(
         metavar="[-- COMMAND…]",
         help="Starts the application, such as `ros2 launch …`; ended with the recording.",
-        show_default=False,
     ),
 ]
 SourceOption = Annotated[Source, typer.Option("--source", help="Who records the events.")]
@@ -57,7 +50,6 @@ BufferOption = Annotated[
         metavar="MIB",
         min=1,
         help="LTTng's buffer of each core, in MiB, for when events were lost. Default: 4.",
-        show_default=False,
     ),
 ]
 
@@ -65,15 +57,13 @@ BufferOption = Annotated[
 def record(
     output: RecordingOutput,
     command: CommandArgument = None,
-    source: SourceOption = Source.LTTNG,
+    source: SourceOption = "lttng",
     duration: DurationOption = None,
     pid: Annotated[
         list[int] | None,
         typer.Option(
-            "--pid",
             help="Attach to this process and what it has started (ebpf; may be repeated). "
-            "Default, without a COMMAND: everything that looks like ROS 2.",
-            show_default=False,
+            "Default, without a COMMAND: everything that looks like ROS 2."
         ),
     ] = None,
     buffer: BufferOption = None,
@@ -93,7 +83,7 @@ def record(
     """
     if command and pid:
         raise InputError("a COMMAND is started, --pid attaches to what runs: give one of them")
-    if not command and source is Source.LTTNG:
+    if not command and source == "lttng":
         raise InputError(
             "no command given: `chainshaper record -o REC -- ros2 launch …`; to attach to what "
             "runs already, add `--source ebpf`"
@@ -125,7 +115,7 @@ def record_and_show(
         OperationError: the application failed; what was recorded until then is there.
     """
     from chainshaper.cli.output import notes, print_json, show_line, stage_lines
-    from chainshaper.command_process import end_in_words
+    from chainshaper.enforcement.own_processes import end_in_words
     from chainshaper.exploration import event_counts, lost_events
     from chainshaper.record import record_command
 
@@ -134,7 +124,7 @@ def record_and_show(
         recorded = record_command(
             output,
             command,
-            source=source.value,
+            source=source,
             duration_ns=duration_ns,
             pids=pids or (),
             buffer=buffer_mib and buffer_mib * MIB,

@@ -11,9 +11,7 @@ def release(
     run: Annotated[
         str | None,
         typer.Argument(
-            metavar="[RUN]",
-            help="The run, as `chainshaper status` names it. Default: all of them.",
-            show_default=False,
+            metavar="[RUN]", help="The run, as `chainshaper status` names it. Default: all of them."
         ),
     ] = None,
 ) -> None:

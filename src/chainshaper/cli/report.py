@@ -5,38 +5,21 @@ from typing import Annotated
 
 import typer
 
-from chainshaper.cli.options import ChainOption, JsonOption
+from chainshaper.cli.options import ChainOption, JsonOption, PlanInForceOption
 
 __all__ = ["report"]
 
 
 def report(
     recordings: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="REC...", help="Recordings' or LTTng traces' folders.", show_default=False
-        ),
+        list[Path], typer.Argument(metavar="REC...", help="Recordings' or LTTng traces' folders.")
     ],
     output: Annotated[
         Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FILE.html",
-            help="File to write; must not exist.",
-            show_default=False,
-        ),
+        typer.Option("--output", "-o", metavar="FILE.html", help="File to write; must not exist."),
     ],
     chain: ChainOption = None,
-    plan: Annotated[
-        Path | None,
-        typer.Option(
-            "--plan",
-            metavar="plan.yaml",
-            help="The plan that the last recording was made with, where it does not say so.",
-            show_default=False,
-        ),
-    ] = None,
+    plan: PlanInForceOption = None,
     cycles: Annotated[
         list[int] | None,
         typer.Option(
@@ -45,7 +28,6 @@ def report(
             min=0,
             help="A cycle that the timeline has to show, where there are too many to show all. "
             "May be given several times.",
-            show_default=False,
         ),
     ] = None,
     json: JsonOption = False,
@@ -60,9 +42,9 @@ def report(
     from chainshaper.planning import load_plan
     from chainshaper.reporting.html.page import ENDINGS, write_report
     from chainshaper.reporting.tables import comparison_json
-    from chainshaper.reporting.whole_file import new_file
     from chainshaper.sources import open_source
     from chainshaper.steps import Comparison, measure_latency
+    from chainshaper.whole_file import new_file
 
     new_file(output, ENDINGS)
     in_force = None if plan is None else load_plan(plan)

@@ -30,12 +30,7 @@ def run(
     description = load_application(application)
     with progress(f"running {description.name}") as report:
         recording = run_application(
-            description,
-            output,
-            cycles=cycles,
-            realtime=realtime,
-            command=sys.argv,
-            progress=report,
+            description, output, cycles=cycles, realtime=realtime, command=sys.argv, progress=report
         )
     notes(recording.info.notes)
     show_line(str(recording.path))

@@ -17,7 +17,6 @@ from chainshaper.cli.options import (
 from chainshaper.cli.plan_options import (
     BandsOption,
     EpsilonOption,
-    LateForMode,
     ModesOption,
     ReceiversOption,
     modes_of,
@@ -64,11 +63,11 @@ def shape(
         int | None,
         duration_option("--duration", "How long to measure, before and after. Default: 40s."),
     ] = None,
-    source: SourceOption = Source.LTTNG,
+    source: SourceOption = "lttng",
     node: Annotated[
         NodeKind,
         typer.Option(help="A script; a package for all types; or one generated for the type."),
-    ] = NodeKind.PYTHON,
+    ] = "python",
     backend: Annotated[
         str, typer.Option("--backend", metavar="NAME", help="As for `chainshaper apply`.")
     ] = "auto",
@@ -167,13 +166,13 @@ def _shape_launched(
             choose=_ask if sys.stdin.isatty() and not json else None,
             request=PlanRequest(
                 bands="auto" if bands == "auto" else int(bands),
-                modes=modes_of(modes, LateForMode.WAIT),
+                modes=modes_of(modes, "wait"),
                 epsilon_ns=epsilon_ns,
                 with_receivers=receivers,
             ),
             duration_ns=duration_ns,
-            source=source.value,
-            node=node.value,
+            source=source,
+            node=node,
             back_end=back_end,
             stop=stop,
             progress=stage_lines("shape"),

@@ -15,34 +15,19 @@ def simulate(
     application: ApplicationArgument,
     output: RecordingOutput,
     plan: Annotated[
-        Path | None,
-        typer.Argument(metavar="plan.yaml", help="The plan in force.", show_default=False),
+        Path | None, typer.Argument(metavar="plan.yaml", help="The plan in force.")
     ] = None,
     cycles: CyclesOption = 320,
-    seed: Annotated[
-        int | None,
-        typer.Option("--seed", min=0, help="Instead of the description's.", show_default=False),
-    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Instead of the description's.")] = None,
     switches: Annotated[
         bool, typer.Option("--switches", help="Record what ran on which core, too.")
     ] = False,
     execution_times: Annotated[
         Path | None,
-        typer.Option(
-            "--execution-times",
-            metavar="REC",
-            help="Draw execution times from those recorded there.",
-            show_default=False,
-        ),
+        typer.Option(metavar="REC", help="Draw execution times from those recorded there."),
     ] = None,
     block: Annotated[
-        int,
-        typer.Option(
-            "--block",
-            min=1,
-            max=1024,
-            help="So many consecutive ones at a time.",
-        ),
+        int, typer.Option(min=1, max=1024, help="So many consecutive ones at a time.")
     ] = 1,
 ) -> None:
     """Simulate an application, with a plan in force or without, and record its events.

@@ -1,8 +1,7 @@
 """`chainshaper splice`: put shaping nodes, or throttlers, into copies of launch files."""
 
-from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeAlias
 
 import typer
 
@@ -17,12 +16,19 @@ if TYPE_CHECKING:
 __all__ = ["splice"]
 
 
-class NodeKind(str, Enum):
-    """How the shaping node is made."""
+NodeKind: TypeAlias = Literal["python", "cpp", "typed"]
+"""How the shaping node is made."""
 
-    PYTHON = "python"
-    CPP = "cpp"
-    TYPED = "typed"
+
+class _Launched(NamedTuple):
+    """What is launched, and into what its copies are edited, whichever node is put in."""
+
+    files: list[str]
+    arguments: dict[str, str]
+    folder: Path
+    node: NodeKind
+    message_type: str | None
+    recording: Path | None
 
 
 def splice(
@@ -61,7 +67,7 @@ def splice(
     node: Annotated[
         NodeKind,
         typer.Option(help="A script; a package for all types; or one generated for the type."),
-    ] = NodeKind.PYTHON,
+    ] = "python",
     message_type: Annotated[
         str | None,
         typer.Option(
@@ -106,7 +112,7 @@ def splice(
         else:
             show_line(f"{output} is removed")
         return
-    if build and node is NodeKind.PYTHON:
+    if build and node == "python":
         raise InputError("--node python needs no building: leave out --build, or choose another")
     if build:
         check_build_tools()  # before anything is written
@@ -115,58 +121,43 @@ def splice(
         words = [*([] if plan is None else [str(plan)]), *words]
     arguments = dict(word.split(":=", 1) for word in words if ":=" in word)
     files = [word for word in words if ":=" not in word]
+    launched = _Launched(files, arguments, output, node, message_type, recording)
     if throttle:
-        splicing = _throttled(throttle, files, output, node, message_type, arguments, recording)
+        splicing = _throttled(throttle, launched)
     elif plan is None or not files:
         raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
     else:
-        splicing = _shaped(plan, files, output, node, message_type, arguments, recording)
+        splicing = _shaped(plan, launched)
     setup = _built(splicing) if build else None
     _print(splicing, setup, json)
 
 
-def _shaped(
-    plan: Path,
-    files: list[str],
-    output: Path,
-    node: NodeKind,
-    message_type: str | None,
-    arguments: dict[str, str],
-    recording: Path | None,
-) -> "Splicing":
+def _shaped(plan: Path, launched: _Launched) -> "Splicing":
     from chainshaper.launch_splicing import splice_launch_files
     from chainshaper.planning import load_plan
 
     planned = load_plan(plan)
     return splice_launch_files(
-        *(planned, files, output),
-        node=node.value,
-        arguments=arguments,
-        message_type=message_type,
-        recording=_opened(recording or _own_recording(planned)),
+        *(planned, launched.files, launched.folder),
+        node=launched.node,
+        arguments=launched.arguments,
+        message_type=launched.message_type,
+        recording=_opened(launched.recording or _own_recording(planned)),
     )
 
 
-def _throttled(
-    inputs: list[str],
-    files: list[str],
-    output: Path,
-    node: NodeKind,
-    message_type: str | None,
-    arguments: dict[str, str],
-    recording: Path | None,
-) -> "Splicing":
+def _throttled(inputs: list[str], launched: _Launched) -> "Splicing":
     from chainshaper.launch_splicing import splice_throttlers
 
-    if node is NodeKind.TYPED or message_type is not None:
+    if launched.node == "typed" or launched.message_type is not None:
         raise InputError("a throttler is for all types: choose --node python or cpp, and no --type")
-    if not files:
+    if not launched.files:
         raise InputError("give the launch files: `splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`")
     return splice_throttlers(
-        *([_input(text) for text in inputs], files, output),
-        node=node.value,
-        arguments=arguments,
-        recording=_opened(recording),
+        *([_input(text) for text in inputs], launched.files, launched.folder),
+        node=launched.node,
+        arguments=launched.arguments,
+        recording=_opened(launched.recording),
     )
 
 

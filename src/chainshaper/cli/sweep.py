@@ -15,22 +15,16 @@ def sweep(
     vary: Annotated[
         list[str],
         typer.Option(
-            "--vary",
             metavar="NAME=VALUES",
             help="An axis (repeat it for more): a wish for the plan, such as epsilon=0ms,1ms or"
             " bands=1..5; interference=0ms,20ms; or a value of the description by its path, such"
             " as nodes.node3.core=0,1.",
-            show_default=False,
         ),
     ],
     output: Annotated[
         Path,
         typer.Option(
-            "--output",
-            "-o",
-            metavar="FILE.parquet",
-            help="File to write, a row for each point.",
-            show_default=False,
+            "--output", "-o", metavar="FILE.parquet", help="File to write, a row for each point."
         ),
     ],
     plan: Annotated[
@@ -38,42 +32,25 @@ def sweep(
         typer.Argument(
             metavar="plan.yaml",
             help="A plan that is in force at all points. Default: each is planned.",
-            show_default=False,
         ),
     ] = None,
     cycles: Annotated[
-        int, typer.Option("--cycles", min=1, help="Cycles to plan from, and to judge by.")
+        int, typer.Option(min=1, help="Cycles to plan from, and to judge by.")
     ] = 100_000,
-    seed: Annotated[
-        int | None,
-        typer.Option("--seed", min=0, help="Instead of the description's.", show_default=False),
-    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Instead of the description's.")] = None,
     workers: Annotated[
-        int | None,
-        typer.Option(
-            "--workers",
-            min=1,
-            help="Processes that compute. Default: one per core.",
-            show_default=False,
-        ),
+        int | None, typer.Option(min=1, help="Processes that compute. Default: one per core.")
     ] = None,
     scheduler: Annotated[
         str | None,
         typer.Option(
-            "--scheduler",
             metavar="ADDRESS",
             help="Compute on the Dask cluster whose scheduler is there, such as tcp://host:8786.",
-            show_default=False,
         ),
     ] = None,
     draw: Annotated[
         Path | None,
-        typer.Option(
-            "--draw",
-            metavar="FILE.png",
-            help="Draw average and jitter over the first axis.",
-            show_default=False,
-        ),
+        typer.Option(metavar="FILE.png", help="Draw average and jitter over the first axis."),
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -86,9 +63,9 @@ def sweep(
     from chainshaper.errors import InputError
     from chainshaper.planning import load_plan
     from chainshaper.reporting.sweeps import draw_sweep, sweep_table
-    from chainshaper.reporting.whole_file import new_file
     from chainshaper.sweeping import parse_axis, rows_beside
     from chainshaper.sweeping import sweep as run_sweep
+    from chainshaper.whole_file import new_file
     from chainshaper.workload.description import load_application
 
     if workers is not None and scheduler is not None:

@@ -34,6 +34,7 @@ the real one for all code that Numba compiles in this process.
 _loading = Lock()  # LLVM's loader, and the compiler, are for one thread at a time
 
 
+@functools.cache
 def kernel(module: str, name: str) -> Callable[..., int]:
     """The function ``name`` of ``module``, as machine code.
 

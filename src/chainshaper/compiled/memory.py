@@ -5,14 +5,14 @@ types; an address is the one thing that they share.  Whoever calls these has che
 nothing here does.  The machine is taken to be little-endian, as all are that run ROS 2.
 """
 
-from __future__ import annotations
+# mypy: disallow_untyped_calls=False, disallow_untyped_decorators=False
 
 from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import njit, types
-from numba.extending import intrinsic
+from numba.extending import intrinsic as typed_intrinsic
 
 __all__ = [
     "compiled",
@@ -26,8 +26,12 @@ __all__ = [
     "store_long",
     "store_word",
     "swap_bytes",
+    "table_at",
     "trailing_zeros",
 ]
+
+
+intrinsic: Any = typed_intrinsic  # which takes types, where kernels give numbers
 
 
 def compiled(*, inline: bool = False) -> Callable[[Callable[..., Any]], Any]:
@@ -47,65 +51,39 @@ def _pointer(builder: ir.IRBuilder, address: ir.Value, bits: int) -> ir.Value:
     return builder.inttoptr(address, ir.IntType(bits).as_pointer())
 
 
-def _load_word(_typing: Any, _address: Any) -> Any:
-    """The 8 bytes at an address, little-endian, as uint64."""
+def _load(bits: int) -> Any:
+    """So many bits at an address, little-endian, as uint64."""
 
-    def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, args: Any) -> Any:
-        return builder.load(_pointer(builder, args[0], 64), align=1)
+    def load(_typing: Any, _address: Any) -> Any:
+        def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, args: Any) -> Any:
+            value = builder.load(_pointer(builder, args[0], bits), align=1)
+            return value if bits == 64 else builder.zext(value, ir.IntType(64))
 
-    return types.uint64(types.int64), generate
+        return types.uint64(types.int64), generate
 
-
-def _load_half(_typing: Any, _address: Any) -> Any:
-    """The 4 bytes at an address, little-endian, as uint64."""
-
-    def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, args: Any) -> Any:
-        value = builder.load(_pointer(builder, args[0], 32), align=1)
-        return builder.zext(value, ir.IntType(64))
-
-    return types.uint64(types.int64), generate
-
-
-def _load_byte(_typing: Any, _address: Any) -> Any:
-    """The byte at an address as uint64."""
-
-    def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, args: Any) -> Any:
-        value = builder.load(_pointer(builder, args[0], 8), align=1)
-        return builder.zext(value, ir.IntType(64))
-
-    return types.uint64(types.int64), generate
+    return intrinsic(load)
 
 
 def _store(bits: int) -> Any:
-    def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, args: Any) -> Any:
-        value = args[1] if bits == 64 else builder.trunc(args[1], ir.IntType(bits))
-        builder.store(value, _pointer(builder, args[0], bits), align=1)
-        return _context.get_dummy_value()
+    """Write the low bits of a uint64 to an address."""
 
-    return generate
+    def store(_typing: Any, _address: Any, _value: Any) -> Any:
+        def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, args: Any) -> Any:
+            value = args[1] if bits == 64 else builder.trunc(args[1], ir.IntType(bits))
+            builder.store(value, _pointer(builder, args[0], bits), align=1)
+            return _context.get_dummy_value()
 
+        return types.void(types.int64, types.uint64), generate
 
-def _store_byte(_typing: Any, _address: Any, _value: Any) -> Any:
-    """Write the low 8 bits of a uint64."""
-    return types.void(types.int64, types.uint64), _store(8)
-
-
-def _store_half(_typing: Any, _address: Any, _value: Any) -> Any:
-    """Write the low 16 bits of a uint64."""
-    return types.void(types.int64, types.uint64), _store(16)
+    return intrinsic(store)
 
 
-def _store_word(_typing: Any, _address: Any, _value: Any) -> Any:
-    """Write the low 32 bits of a uint64."""
-    return types.void(types.int64, types.uint64), _store(32)
+load_byte, load_half, load_word = _load(8), _load(32), _load(64)
+store_byte, store_half, store_word, store_long = _store(8), _store(16), _store(32), _store(64)
 
 
-def _store_long(_typing: Any, _address: Any, _value: Any) -> Any:
-    """Write a uint64."""
-    return types.void(types.int64, types.uint64), _store(64)
-
-
-def _swap_bytes(_typing: Any, _value: Any) -> Any:
+@intrinsic
+def swap_bytes(_typing: Any, _value: Any) -> Any:
     """A uint64 with its bytes in reverse order."""
 
     def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, args: Any) -> Any:
@@ -114,7 +92,8 @@ def _swap_bytes(_typing: Any, _value: Any) -> Any:
     return types.uint64(types.uint64), generate
 
 
-def _trailing_zeros(_typing: Any, _value: Any) -> Any:
+@intrinsic
+def trailing_zeros(_typing: Any, _value: Any) -> Any:
     """How many low bits of a uint64 are 0 (64 for 0), as int64."""
 
     def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, args: Any) -> Any:
@@ -123,35 +102,23 @@ def _trailing_zeros(_typing: Any, _value: Any) -> Any:
     return types.int64(types.uint64), generate
 
 
-def _get(_typing: Any, _table: Any, _index: Any) -> Any:
+@intrinsic
+def table_at(_typing: Any, _address: Any) -> Any:
+    """The int64 table at an address, for ``table[index]``."""
+
+    def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, args: Any) -> Any:
+        return _pointer(builder, args[0], 64)
+
+    return types.CPointer(types.int64)(types.int64), generate
+
+
+@compiled(inline=True)
+def get(table: Any, index: Any) -> Any:
     """Number ``index`` of the int64 table at an address."""
-
-    def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, args: Any) -> Any:
-        return builder.load(builder.gep(_pointer(builder, args[0], 64), [args[1]]), align=8)
-
-    return types.int64(types.int64, types.int64), generate
+    return table_at(table)[index]
 
 
-def _put(_typing: Any, _table: Any, _index: Any, _value: Any) -> Any:
+@compiled(inline=True)
+def put(table: Any, index: Any, value: Any) -> None:
     """Write number ``index`` of the int64 table at an address."""
-
-    def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, args: Any) -> Any:
-        place = builder.gep(_pointer(builder, args[0], 64), [args[1]])
-        builder.store(args[2], place, align=8)
-        return _context.get_dummy_value()
-
-    return types.void(types.int64, types.int64, types.int64), generate
-
-
-# Numba calls the generators above with types; what kernels call takes numbers.
-load_word: Any = intrinsic(_load_word)
-load_byte: Any = intrinsic(_load_byte)
-load_half: Any = intrinsic(_load_half)
-store_byte: Any = intrinsic(_store_byte)
-store_half: Any = intrinsic(_store_half)
-store_word: Any = intrinsic(_store_word)
-store_long: Any = intrinsic(_store_long)
-swap_bytes: Any = intrinsic(_swap_bytes)
-trailing_zeros: Any = intrinsic(_trailing_zeros)
-get: Any = intrinsic(_get)
-put: Any = intrinsic(_put)
+    table_at(table)[index] = value

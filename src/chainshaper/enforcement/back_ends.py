@@ -30,14 +30,6 @@ __all__ = [
     "offered_back_ends",
 ]
 
-BACK_ENDS = ("scx", "litmus", "freezer", "fifo")
-_STRENGTH = {
-    "scx": "the kernel itself keeps threads inside their slots (sched_ext)",
-    "litmus": "the kernel itself keeps threads inside their slots (LITMUS^RT)",
-    "freezer": "unmodified threads are kept inside their slots by freezing them (cgroup v2)",
-    "fifo": "threads are isolated by SCHED_FIFO priorities; nothing is held back between slots",
-}
-
 
 @dataclass(frozen=True)
 class Offer:
@@ -58,7 +50,7 @@ class Choice:
 
 def offered_back_ends() -> tuple[Offer, ...]:
     """All back ends, strongest first, with what is missing for them on this machine."""
-    return tuple(Offer(name, _STRENGTH[name], _MISSING[name]()) for name in BACK_ENDS)
+    return tuple(Offer(name, strength, missing()) for name, (strength, missing) in _KNOWN.items())
 
 
 def choose_back_end(name: str = "auto") -> Choice:
@@ -141,9 +133,20 @@ def _missing_for_fifo() -> str | None:
     )
 
 
-_MISSING: dict[str, Callable[[], str | None]] = {
-    "scx": scx.missing,
-    "litmus": _missing_for_litmus,
-    "freezer": _missing_for_freezer,
-    "fifo": _missing_for_fifo,
+_KNOWN: dict[str, tuple[str, Callable[[], str | None]]] = {
+    "scx": ("the kernel itself keeps threads inside their slots (sched_ext)", scx.missing),
+    "litmus": (
+        "the kernel itself keeps threads inside their slots (LITMUS^RT)",
+        _missing_for_litmus,
+    ),
+    "freezer": (
+        "unmodified threads are kept inside their slots by freezing them (cgroup v2)",
+        _missing_for_freezer,
+    ),
+    "fifo": (
+        "threads are isolated by SCHED_FIFO priorities; nothing is held back between slots",
+        _missing_for_fifo,
+    ),
 }
+"""Back ends, strongest first: what each does, and what says why it cannot be used here."""
+BACK_ENDS = tuple(_KNOWN)

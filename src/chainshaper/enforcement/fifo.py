@@ -9,13 +9,11 @@ Who carries out a whole plan has given its threads their priorities already
 a shaping node. Threads that stand in the journal by then are left as they are.
 """
 
-from collections.abc import Mapping
-
-from chainshaper.enforcement.runs.journal import Journal, discard_journal, open_journal
+from chainshaper.enforcement.runs.journal import Journal
 from chainshaper.enforcement.runs.scheduling_memory import (
     change_scheduling,
     is_remembered,
-    restore_scheduling,
+    release_threads,
 )
 from chainshaper.enforcement.servers import ServerCounters, ServerTable
 from chainshaper.enforcement.threads.allocation import NodeThread
@@ -25,21 +23,20 @@ from chainshaper.enforcement.threads.server_threads import (
     server_priorities,
     wanted_of_members,
 )
-from chainshaper.errors import InputError, OperationError
+from chainshaper.errors import InputError
 
 __all__ = ["Fifo", "create"]
 
 
-def create(table: ServerTable, journal: Journal | None = None) -> "Fifo":
+def create(table: ServerTable, journal: Journal) -> "Fifo":
     """Prepare servers; nothing is changed before :meth:`Fifo.arm`.
 
-    What was there is kept in ``journal``; without one, in a journal of its own that is discarded
-    with the release.
+    What was there is kept in ``journal``.
 
     Raises:
         InputError: the table has more priorities than there are.
     """
-    server_priorities(_priorities(table).values())
+    server_priorities(server.priority for server in table.servers)
     return Fifo(table, journal)
 
 
@@ -48,10 +45,9 @@ class Fifo:
 
     name = "fifo"
 
-    def __init__(self, table: ServerTable, journal: Journal | None) -> None:
+    def __init__(self, table: ServerTable, journal: Journal) -> None:
         self._table = table
         self._journal = journal
-        self._owns_journal = journal is None
         self._members: dict[str, list[NodeThread]] = {s.name: [] for s in table.servers}
         self._armed = False
 
@@ -65,7 +61,7 @@ class Fifo:
         if server not in self._members:
             raise InputError(f"no server {server!r}: choose of {', '.join(self._members)}")
         thread = find_thread(tid)
-        if thread is None or (self._journal is not None and is_remembered(self._journal, thread)):
+        if thread is None or is_remembered(self._journal, thread):
             return
         self._members[server].append(NodeThread(thread, (), "", ""))
         if self._armed:
@@ -82,8 +78,7 @@ class Fifo:
 
     def counters(self) -> dict[str, ServerCounters]:
         """Nothing is counted: there are no slots."""
-        nothing = ServerCounters(None, None, None, None)
-        return {server.name: nothing for server in self._table.servers}
+        return {server.name: ServerCounters() for server in self._table.servers}
 
     def failure(self) -> str | None:
         """None: there is nothing that could stop."""
@@ -96,30 +91,9 @@ class Fifo:
             OperationError: the kernel refuses for some; the others are as before.
         """
         self._armed = False
-        if self._journal is None:
-            return
-        outcomes = restore_scheduling(self._journal)
-        failed = [
-            f"{one.tid} ({one.comm}): {one.reason}" for one in outcomes if one.fate == "failed"
-        ]
-        if failed:
-            raise OperationError(
-                f"threads that could not be put back: {'; '.join(failed)}; {self._journal.path} "
-                "says what they had"
-            )
-        if self._owns_journal:
-            discard_journal(self._journal)
-            self._journal = None
+        release_threads(self._journal)
 
     def _schedule(self) -> None:
-        if self._journal is None:
-            self._journal = open_journal()
-        cores = {server.name: server.core for server in self._table.servers}
-        for one in below_their_siblings(
-            wanted_of_members(self._members, cores, _priorities(self._table))
-        ):
+        wanted = wanted_of_members(self._members, self._table.servers)
+        for one in below_their_siblings(wanted):
             change_scheduling(self._journal, one.thread.thread, one.wanted)
-
-
-def _priorities(table: ServerTable) -> Mapping[str, int]:
-    return {server.name: server.priority for server in table.servers}

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from chainshaper.durations import format_duration
-from chainshaper.enforcement.freezer.cgroups import has_ended, started_at
+from chainshaper.enforcement.threads.listing import has_ended, start_of
 from chainshaper.errors import OperationError
 
 __all__ = [
@@ -101,7 +101,7 @@ def watch_wake_ups(
     found: list[tuple[int, int]] = []  # when, and how long the thread had run by then
     path = Path(f"/proc/{pid}/task/{tid}/schedstat")
     started = now = time.monotonic_ns()
-    born = started_at(tid)
+    born = start_of(pid, tid)
     try:
         with _undisturbed(), path.open("rb", buffering=0) as file:
             ran, waited, times = map(int, file.read().split())

@@ -16,11 +16,10 @@ from chainshaper.errors import PlatformError
 __all__ = [
     "available_cores",
     "check_cores",
-    "die_with_parent",
-    "interrupted_with_parent",
     "lock_memory",
     "may_use_fifo",
     "set_thread_name",
+    "signalled_with_parent",
     "stop_garbage_collection",
     "throttle_fraction",
 ]
@@ -84,18 +83,11 @@ def stop_garbage_collection() -> None:
     gc.disable()
 
 
-def die_with_parent(parent_pid: int) -> None:
-    """Have the kernel kill this process when its parent dies, however that happens."""
-    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+def signalled_with_parent(parent_pid: int, number: signal.Signals) -> None:
+    """Have the kernel send this process a signal when its parent dies, however that happens."""
+    _libc.prctl(_PR_SET_PDEATHSIG, number, 0, 0, 0)
     if os.getppid() != parent_pid:  # it died before the request was in force
-        os.kill(os.getpid(), signal.SIGKILL)
-
-
-def interrupted_with_parent(parent_pid: int) -> None:
-    """Have the kernel send this process SIGINT when its parent dies, however that happens."""
-    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGINT, 0, 0, 0)
-    if os.getppid() != parent_pid:
-        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), number)
 
 
 def set_thread_name(name: str) -> None:

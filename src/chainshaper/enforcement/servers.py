@@ -48,10 +48,10 @@ class ServerCounters:
     know.
     """
 
-    slots: int | None
-    late_entries: int | None
-    longest_lateness_ns: int | None
-    overruns: int | None
+    slots: int | None = None
+    late_entries: int | None = None
+    longest_lateness_ns: int | None = None
+    overruns: int | None = None
 
 
 class BackEnd(Protocol):

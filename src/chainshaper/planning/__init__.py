@@ -14,17 +14,14 @@ from chainshaper.planning.baselines import (
 )
 from chainshaper.planning.graphs import over_cores, with_first_node_apart, with_sink
 from chainshaper.planning.latency_file import check_latencies, read_latencies
-from chainshaper.planning.margins import derive_margin
-from chainshaper.planning.offsets import place_chains, with_offsets
+from chainshaper.planning.offsets import place_chains
 from chainshaper.planning.placement import (
     BandChoice,
     choose_bands,
-    figure7_curve,
     with_bands,
     with_long_slot,
 )
 from chainshaper.planning.plan import (
-    BandPrediction,
     ChainOfPlan,
     Evidence,
     Margin,
@@ -36,7 +33,6 @@ from chainshaper.planning.plan import (
     Slot,
     Thread,
     band_predictions,
-    output_server,
     publish_slots,
     server_of,
 )
@@ -46,7 +42,6 @@ from chainshaper.planning.shaping import plan_shaping, plan_warnings, predict_ba
 
 __all__ = [
     "BandChoice",
-    "BandPrediction",
     "CallbackTimes",
     "ChainOfPlan",
     "Evidence",
@@ -64,14 +59,11 @@ __all__ = [
     "band_predictions",
     "check_latencies",
     "choose_bands",
-    "derive_margin",
     "dump_plan",
-    "figure7_curve",
     "let_per_callback",
     "let_per_callback_asynchronous",
     "let_per_chain",
     "load_plan",
-    "output_server",
     "over_cores",
     "place_chains",
     "plan_chain",
@@ -89,6 +81,5 @@ __all__ = [
     "with_bands",
     "with_first_node_apart",
     "with_long_slot",
-    "with_offsets",
     "with_sink",
 ]

@@ -35,7 +35,7 @@ from chainshaper.planning.publisher_threads import below_executors
 from chainshaper.planning.shaping import predict_bands
 from chainshaper.planning.swarm import place_by_swarm, place_randomly
 
-__all__ = ["BandChoice", "Solver", "choose_bands", "figure7_curve", "with_bands", "with_long_slot"]
+__all__ = ["BandChoice", "Solver", "choose_bands", "with_bands", "with_long_slot"]
 
 Solver: TypeAlias = Literal["exact", "pso", "random"]
 
@@ -88,21 +88,6 @@ def with_bands(
     return _with_publish_slots(plan, slots, predicted)
 
 
-def figure7_curve(
-    plan: Plan,
-    latencies_ns: NDArray[np.int64],
-    most_bands: int = MOST_BANDS,
-    **limits: Any,
-) -> list[Placement]:
-    """The best placement for 1, 2, … bands: average over number of bands is figure 7.
-
-    Raises:
-        InputError: a plan without a publish slot.
-        OperationError: no number of bands can be placed.
-    """
-    return placement_curve(_problem(plan, latencies_ns, limits), most_bands)
-
-
 @dataclass(frozen=True)
 class BandChoice:
     """A curve of figure 7, the placement that ``auto`` takes from it, and why it stops there."""
@@ -131,7 +116,7 @@ def choose_bands(
         raise InputError(
             f"the least gain is a share of the average, such as 0.02: not {least_gain}"
         )
-    curve = figure7_curve(plan, latencies_ns, **limits)
+    curve = placement_curve(_problem(plan, latencies_ns, limits), MOST_BANDS)
     chosen = enough_bands(curve, least_gain)
     bands, longest = len(chosen.slot_ends_ns), len(curve[-1].slot_ends_ns)
     if chosen is not curve[-1]:

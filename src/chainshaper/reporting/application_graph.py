@@ -5,9 +5,8 @@ an application and is left out of tables and pictures unless asked for; in JSON 
 """
 
 import json
-import os
 import re
-import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +15,25 @@ from rich.table import Table
 
 from chainshaper.app import Callback
 from chainshaper.durations import format_duration
-from chainshaper.errors import InputError, OperationError
 from chainshaper.exploration import ApplicationDescription, lost_text
+from chainshaper.reporting.cells import terminal_table
+from chainshaper.whole_file import new_file, write_whole
 
 __all__ = [
+    "ENDINGS",
     "application_dot",
     "application_json",
     "application_table",
-    "check_picture",
     "is_internal",
     "short_symbol",
+    "without_internals",
     "write_picture",
 ]
 
+ENDINGS = (".svg", ".dot", ".json")
+_CALLBACK_FIELDS = (
+    *("id", "node", "pid", "kind", "topic", "period_ns", "symbol", "publishes", "passes_on"),
+)
 _OWN_TOPICS = frozenset(("/rosout", "/parameter_events"))
 _OWN_SERVICES = frozenset(
     (
@@ -48,6 +53,22 @@ def is_internal(name: str | None) -> bool:
     return name is not None and (name in _OWN_TOPICS or name.rpartition("/")[2] in _OWN_SERVICES)
 
 
+def without_internals(application: ApplicationDescription) -> ApplicationDescription:
+    """The application without what every node has for itself."""
+    graph = application.graph
+    callbacks = [
+        replace(one, publishes=tuple(t for t in one.publishes if not is_internal(t)))
+        for one in graph.callbacks
+        if not is_internal(one.topic)
+    ]
+    publishers = {t: nodes for t, nodes in graph.publishers.items() if not is_internal(t)}
+    subscribers = {t: nodes for t, nodes in graph.subscribers.items() if not is_internal(t)}
+    kept = replace(
+        graph, callbacks=tuple(callbacks), publishers=publishers, subscribers=subscribers
+    )
+    return replace(application, graph=kept)
+
+
 def application_json(application: ApplicationDescription) -> dict[str, Any]:
     """Nodes, callbacks, topics and services as plain data."""
     graph = application.graph
@@ -59,15 +80,7 @@ def application_json(application: ApplicationDescription) -> dict[str, Any]:
         "nodes": [{"name": node.name, "pid": node.pid} for node in graph.nodes],
         "callbacks": [
             {
-                "id": callback.id,
-                "node": callback.node,
-                "pid": callback.pid,
-                "kind": callback.kind,
-                "topic": callback.topic,
-                "period_ns": callback.period_ns,
-                "symbol": callback.symbol,
-                "publishes": list(callback.publishes),
-                "passes_on": list(callback.passes_on),
+                **{name: getattr(callback, name) for name in _CALLBACK_FIELDS},
                 "internal": is_internal(callback.topic),
             }
             for callback in graph.callbacks
@@ -95,21 +108,18 @@ def application_json(application: ApplicationDescription) -> dict[str, Any]:
     }
 
 
-def application_table(application: ApplicationDescription, *, everything: bool = False) -> Table:
+def application_table(application: ApplicationDescription) -> Table:
     """One row per callback, by node."""
-    table = Table(title="Application", title_justify="left")
-    for name in ("node", "process", "callback", "publishes", "function"):
-        table.add_column(name, overflow="fold", justify="right" if name == "process" else "left")
+    names = ("node", "process", "callback", "publishes", "function")
+    table = terminal_table("Application", names)
+    table.columns[1].justify = "right"
     graph = application.graph
     nodes = {(node.name, node.pid) for node in graph.nodes}
-    shown = [c for c in graph.callbacks if everything or not is_internal(c.topic)]
-    idle = nodes - {(callback.node, callback.pid) for callback in shown}
+    idle = nodes - {(callback.node, callback.pid) for callback in graph.callbacks}
     rows: list[tuple[str, int, str, str, str]] = [(name, pid, "", "", "") for name, pid in idle]
-    for callback in shown:
-        publishes = [t for t in callback.publishes if everything or not is_internal(t)]
-        function = short_symbol(callback.symbol)
-        what = callback_text(callback)
-        rows.append((callback.node, callback.pid, what, ", ".join(publishes), function))
+    for callback in graph.callbacks:
+        publishes, function = ", ".join(callback.publishes), short_symbol(callback.symbol)
+        rows.append((callback.node, callback.pid, callback_text(callback), publishes, function))
     for node, pid, *rest in sorted(rows, key=lambda row: row[:2]):
         table.add_row(escape(node), str(pid), *map(escape, rest))
     return table
@@ -155,30 +165,27 @@ def _without_brackets(text: str) -> str:
     return "".join(kept)
 
 
-def application_dot(application: ApplicationDescription, *, everything: bool = False) -> str:
+def application_dot(application: ApplicationDescription) -> str:
     """The graph in the language of Graphviz: a cluster per node, ellipses for topics."""
     graph = application.graph
     lines = ["digraph application {", "  rankdir=LR;", "  node [fontname=Helvetica, fontsize=11];"]
     if any(application.lost.values()):
         lines.append(f"  label={_quoted(lost_text(application.lost))};")
-    shown = [c for c in graph.callbacks if everything or not is_internal(c.topic)]
     number = {(node.name, node.pid): index for index, node in enumerate(graph.nodes)}
-    for callback in shown:
+    for callback in graph.callbacks:
         number.setdefault((callback.node, callback.pid), len(number))
     for (name, pid), index in number.items():
         lines.append(f"  subgraph cluster_{index} {{")
         lines.append(f"    label={_quoted(f'{name} (process {pid})')};")
         lines.append(f'    node_{index} [shape=point, style=invis, label=""];')
-        for callback in shown:
+        for callback in graph.callbacks:
             if (callback.node, callback.pid) == (name, pid):
                 text = callback_text(callback) + "\n" + short_symbol(callback.symbol)
                 label = _quoted(text.strip())
                 lines.append(f"    callback_{callback.id} [shape=box, label={label}];")
         lines.append("  }")
-    for topic in graph.topics:
-        if everything or not is_internal(topic):
-            lines.append(f"  {_quoted(topic)} [shape=ellipse];")
-    for callback in shown:
+    lines += [f"  {_quoted(topic)} [shape=ellipse];" for topic in graph.topics]
+    for callback in graph.callbacks:
         vertex = f"callback_{callback.id}"
         if callback.kind == "subscription" and callback.topic is not None:
             lines.append(f"  {_quoted(callback.topic)} -> {vertex};")
@@ -186,9 +193,8 @@ def application_dot(application: ApplicationDescription, *, everything: bool = F
             lines.append(f"  {_quoted(callback.topic)} [shape=cds];")
             lines.append(f"  {_quoted(callback.topic)} -> {vertex};")
         for topic in callback.publishes:
-            if everything or not is_internal(topic):
-                style = " [style=dashed]" if topic in callback.passes_on else ""
-                lines.append(f"  {vertex} -> {_quoted(topic)}{style};")
+            style = " [style=dashed]" if topic in callback.passes_on else ""
+            lines.append(f"  {vertex} -> {_quoted(topic)}{style};")
     return "\n".join([*lines, "}", ""])
 
 
@@ -197,52 +203,23 @@ def _quoted(text: str) -> str:
     return f'"{escaped}"'
 
 
-def check_picture(path: str | Path) -> Path:
-    """The path, once it is sure that it can be written and what to write there.
-
-    Raises:
-        InputError: it exists, its folder does not, or its ending says no known format.
-    """
-    path = Path(path)
-    if path.suffix not in {".svg", ".dot", ".json"}:
-        raise InputError(f"{path}: write to a file that ends in .svg, .dot or .json")
-    if path.exists():
-        raise InputError(
-            f"{path} exists already and is not overwritten: name another, or remove it"
-        )
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"{path.absolute().parent}: no such folder to write {path.name} into")
-    return path
-
-
 def write_picture(
     application: ApplicationDescription, path: str | Path, *, everything: bool = False
 ) -> Path:
     """Write the graph as .svg, .dot or .json, by the ending of ``path``, whole or not at all.
 
     Raises:
-        InputError: see :func:`check_picture`.
+        InputError: it exists, its folder does not, or its ending says no known format.
         OperationError: it cannot be written.
     """
-    path = check_picture(path)
+    path = new_file(path, ENDINGS)
+    drawn = application if everything else without_internals(application)
     if path.suffix == ".json":
         text = json.dumps(application_json(application), indent=2) + "\n"
     elif path.suffix == ".dot":
-        text = application_dot(application, everything=everything)
+        text = application_dot(drawn)
     else:
         from chainshaper.reporting.graph_drawing import application_svg
 
-        text = application_svg(application, everything=everything)
-    partial: Path | None = None
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.absolute().parent)
-        partial = Path(name)
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            stream.write(text)
-        partial.chmod(0o644)
-        partial.rename(path)
-    except OSError as error:
-        if partial is not None:
-            partial.unlink(missing_ok=True)
-        raise OperationError(f"{path}: the graph cannot be written: {error}") from error
-    return path
+        text = application_svg(drawn)
+    return write_whole(path, [text.encode()])

@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from chainshaper.analysis import LatencyAnalysis
-from chainshaper.durations import milliseconds
+from chainshaper.reporting.cells import ms, percent, terminal_table
 
 __all__ = ["breakdown_json", "breakdown_table", "hop_breakdown"]
 
@@ -49,25 +49,17 @@ def hop_breakdown(analysis: LatencyAnalysis) -> pl.DataFrame:
         schema_overrides={"hop": pl.UInt8, "callback_id": pl.UInt32},
     )
     joined = rows.join(figures, on="hop", how="left", maintain_order="left")
-    mean = pl.lit(latency, dtype=pl.Float64)
+    means = [pl.col(f"{part}_ns").struct.field("mean").alias(f"{part}_share") for part in PARTS]
     return joined.with_columns(
         pl.col("count", "by_sibling").fill_null(0),
-        *(
-            pl.when(pl.col(f"{part}_ns").struct.field("min").is_not_null())
-            .then(pl.col(f"{part}_ns"))
-            .alias(f"{part}_ns")
-            for part in PARTS
-        ),
-        *(
-            (pl.col(f"{part}_ns").struct.field("mean") / mean).alias(f"{part}_share")
-            for part in PARTS
-        ),
+        *(mean / pl.lit(latency, dtype=pl.Float64) for mean in means),
     )
 
 
 def _summary(part: str) -> pl.Expr:
     values = pl.col(f"{part}_ns")
-    return pl.struct(min=values.min(), mean=values.mean(), max=values.max()).alias(f"{part}_ns")
+    summary = pl.struct(min=values.min(), mean=values.mean(), max=values.max())
+    return pl.when(values.count() > 0).then(summary).alias(f"{part}_ns")
 
 
 def breakdown_json(analysis: LatencyAnalysis) -> dict[str, Any]:
@@ -82,28 +74,18 @@ def breakdown_json(analysis: LatencyAnalysis) -> dict[str, Any]:
 
 def breakdown_table(analysis: LatencyAnalysis) -> Table:
     """Every hop's communication and computation, and their shares of the mean latency."""
-    title = escape("Where it goes, hop by hop [ms]")
-    table = Table(title=title, title_justify="left", show_footer=True)
-    table.add_column("callback", "together", overflow="fold")
-    table.add_column("publishes", overflow="fold")
+    table = terminal_table("Where it goes, hop by hop [ms]", ("callback", "publishes"))
+    table.show_footer, table.columns[0].footer = True, "together"
     frame = hop_breakdown(analysis)
     for part in PARTS:
         shares = frame[f"{part}_share"].drop_nulls().to_list()
         table.add_column(f"{part}\nmean", justify="right")
         table.add_column("max", justify="right")
-        table.add_column("share", _percent(sum(shares) if shares else None), justify="right")
+        table.add_column("share", percent(sum(shares) if shares else None), justify="right")
     for row in frame.iter_rows(named=True):
         cells = [row["callback"], row["topic"]]
         for part in PARTS:
-            times = row[f"{part}_ns"]
-            cells += [_time(times, "mean"), _time(times, "max"), _percent(row[f"{part}_share"])]
+            times = row[f"{part}_ns"] or {"mean": None, "max": None}
+            cells += [ms(times["mean"]), ms(times["max"]), percent(row[f"{part}_share"])]
         table.add_row(*map(escape, cells))
     return table
-
-
-def _time(times: dict[str, float] | None, figure: str) -> str:
-    return "–" if times is None else milliseconds(times[figure])
-
-
-def _percent(share: float | None) -> str:
-    return "–" if share is None else f"{share:.1%}"

@@ -8,6 +8,7 @@ from rich.table import Table
 from chainshaper.analysis import ChainEnumeration
 from chainshaper.app import ApplicationGraph, Chain
 from chainshaper.durations import milliseconds
+from chainshaper.reporting.cells import terminal_table
 
 __all__ = ["chain_table", "chains_json", "count_text"]
 
@@ -45,10 +46,8 @@ def count_text(found: ChainEnumeration) -> str:
 
 def chain_table(graph: ApplicationGraph, found: ChainEnumeration) -> Table:
     """One row per chain: where it starts, which topics it passes; the heaviest is marked."""
-    table = Table(title="Computation chains", title_justify="left")
-    table.add_column("starts at", overflow="fold")
-    table.add_column("topics", overflow="fold")
-    table.add_column(escape("heaviest [ms]"), justify="right")
+    heaviest = escape("heaviest [ms]")
+    table = terminal_table("Computation chains", ("starts at", "topics"), [heaviest])
     shown = list(found.chains)
     if found.heaviest is not None and found.heaviest not in shown:
         shown.append(found.heaviest)

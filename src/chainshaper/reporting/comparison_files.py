@@ -3,10 +3,10 @@
 import json
 from pathlib import Path
 
-from chainshaper.errors import OperationError
 from chainshaper.reporting.figures import draw_comparison
 from chainshaper.reporting.tables import comparison_json
 from chainshaper.steps import Comparison
+from chainshaper.whole_file import write_whole
 
 __all__ = ["write_comparison"]
 
@@ -19,8 +19,4 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
     """
     draw_comparison(comparison.measurements, folder)
     text = json.dumps(comparison_json(comparison), indent=2) + "\n"
-    path = folder / "comparison.json"
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise OperationError(f"{path}: cannot be written: {error}") from error
+    write_whole(folder / "comparison.json", [text.encode()])

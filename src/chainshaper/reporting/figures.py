@@ -4,6 +4,7 @@ Both are drawn from recordings alone, so they can be made again at any time. The
 apart for colour-blind readers and in grey print.
 """
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,11 +15,19 @@ import polars as pl
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning import BandChoice, publish_slots
 from chainshaper.steps import Measurement
+from chainshaper.whole_file import new_file, write_whole
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["draw_comparison", "draw_curve", "draw_distribution", "draw_latency"]
+__all__ = [
+    "draw_comparison",
+    "draw_curve",
+    "draw_distribution",
+    "draw_latency",
+    "new_figure",
+    "save_figure",
+]
 
 COLOURS = ("#d95f02", "#1b6ca8", "#4d9221", "#7b3294")
 SIZE_INCHES = (9.0, 4.2)
@@ -48,7 +57,7 @@ def draw_latency(measurements: Sequence[Measurement], path: str | Path) -> Path:
     Crosses mark cycles that the machine disturbed. The picture ends a little above the highest
     undisturbed cycle.
     """
-    figure, axes = _figure()
+    figure, axes = new_figure()
     for index, measurement in enumerate(measurements):
         frame = measurement.analysis.traversals.filter("complete")
         cycles = np.arange(len(frame))
@@ -58,26 +67,19 @@ def draw_latency(measurements: Sequence[Measurement], path: str | Path) -> Path:
         name = measurement.recording.path.name
         jitter = measurement.analysis.undisturbed.jitter_ns
         label = name if jitter is None else f"{name}: jitter {jitter / 1e6:.3f} ms"
-        axes.plot(
-            cycles[~disturbed],
-            latency[~disturbed],
-            ".",
-            markersize=4,
-            color=colour,
-            label=label,
-        )
+        calm = cycles[~disturbed], latency[~disturbed]
+        axes.plot(*calm, ".", markersize=4, color=colour, label=label)
         axes.plot(cycles[disturbed], latency[disturbed], "x", markersize=5, color=colour, alpha=0.7)
     _limit_to_cycle(axes, measurements)
-    axes.set_xlabel("cycle (crosses: disturbed by the machine)")
-    axes.set_ylabel("end-to-end latency [ms]")
+    axes.set(xlabel="cycle (crosses: disturbed by the machine)", ylabel="end-to-end latency [ms]")
     axes.set_title(f"Chain {measurements[0].analysis.chain.spec}", loc="left")
     axes.legend(loc="lower right")
-    return _save(figure, path)
+    return save_figure(figure, path)
 
 
 def draw_distribution(measurements: Sequence[Measurement], path: str | Path) -> Path:
     """Cumulative distribution of the latency over undisturbed cycles, publish slots shaded."""
-    figure, axes = _figure()
+    figure, axes = new_figure()
     for index, measurement in enumerate(measurements):
         frame = measurement.analysis.traversals.filter(pl.col("complete") & ~pl.col("disturbed"))
         latency = np.sort(frame["latency_ns"].to_numpy()) / 1e6
@@ -91,19 +93,13 @@ def draw_distribution(measurements: Sequence[Measurement], path: str | Path) -> 
         )
         if measurement.plan is not None:
             for number, (start, end) in enumerate(publish_slots(measurement.plan)):
-                axes.axvspan(
-                    start / 1e6,
-                    end / 1e6,
-                    color="0.8",
-                    zorder=0,
-                    label="publish slot" if number == 0 else None,
-                )
+                label = "publish slot" if number == 0 else None
+                axes.axvspan(start / 1e6, end / 1e6, color="0.8", zorder=0, label=label)
     _limit_to_cycle(axes, measurements, vertical=False)
-    axes.set_xlabel("end-to-end latency [ms]")
-    axes.set_ylabel("share of cycles")
+    axes.set(xlabel="end-to-end latency [ms]", ylabel="share of cycles")
     axes.set_title(f"Chain {measurements[0].analysis.chain.spec}", loc="left")
     axes.legend(loc="upper left")
-    return _save(figure, path)
+    return save_figure(figure, path)
 
 
 def draw_curve(choice: BandChoice, path: str | Path) -> Path:
@@ -113,10 +109,8 @@ def draw_curve(choice: BandChoice, path: str | Path) -> Path:
         InputError: the file exists already.
         OperationError: it cannot be written.
     """
-    path = Path(path)
-    if path.exists():
-        raise InputError(f"{path} exists already and is not overwritten: name another file")
-    figure, axes = _figure()
+    path = new_file(path)
+    figure, axes = new_figure()
     bands = [len(placement.slot_ends_ns) for placement in choice.curve]
     means = [placement.mean_ns / 1e6 for placement in choice.curve]
     axes.plot(bands, means, "o-", color=COLOURS[1], label="best placement")
@@ -130,20 +124,21 @@ def draw_curve(choice: BandChoice, path: str | Path) -> Path:
         label=choice.reason,
     )
     axes.set_xticks(bands)
-    axes.set_xlabel("number of latency bands")
-    axes.set_ylabel("average latency, eq. 5 [ms]")
+    axes.set(xlabel="number of latency bands", ylabel="average latency, eq. 5 [ms]")
     axes.legend(loc="upper right")
-    return _save(figure, path)
+    return save_figure(figure, path)
 
 
-def _figure() -> tuple[Any, "Axes"]:
+def new_figure(panels: int = 1) -> tuple[Any, Any]:
+    """A figure and its axes; of several panels, beside each other, a sequence of axes."""
     import matplotlib as mpl
 
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 
-    figure, axes = plt.subplots(figsize=SIZE_INCHES, layout="constrained")
-    axes.grid(alpha=0.3)
+    figure, axes = plt.subplots(1, panels, figsize=SIZE_INCHES, layout="constrained")
+    for one in figure.axes:
+        one.grid(alpha=0.3)
     return figure, axes
 
 
@@ -151,23 +146,20 @@ def _limit_to_cycle(
     axes: "Axes", measurements: Sequence[Measurement], *, vertical: bool = True
 ) -> None:
     """Let single cycles that waited for another slot not squeeze all others into a line."""
-    highest = 0.0
-    for measurement in measurements:
-        maximum = measurement.analysis.undisturbed.max_ns
-        highest = max(highest, (maximum or 0) / 1e6)
+    highest = max(measurement.analysis.undisturbed.max_ns or 0 for measurement in measurements)
     if highest:
-        (axes.set_ylim if vertical else axes.set_xlim)(0, highest * 1.15)
+        (axes.set_ylim if vertical else axes.set_xlim)(0, highest / 1e6 * 1.15)
 
 
-def _save(figure: Any, path: str | Path) -> Path:
+def save_figure(figure: Any, path: str | Path) -> Path:
+    """Write a figure, as its file's ending says, whole or not at all.
+
+    Raises:
+        OperationError: it cannot be written.
+    """
     from matplotlib import pyplot as plt
 
-    path = Path(path)
-    try:
-        figure.savefig(path, dpi=130)
-    except OSError as error:
-        path.unlink(missing_ok=True)  # half a picture
-        raise OperationError(f"{path}: the figure cannot be written: {error}") from error
-    finally:
-        plt.close(figure)
-    return path
+    path, picture = Path(path), io.BytesIO()
+    figure.savefig(picture, dpi=130, format=path.suffix.removeprefix(".") or None)
+    plt.close(figure)
+    return write_whole(path, [picture.getvalue()])

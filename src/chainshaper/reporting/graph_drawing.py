@@ -6,12 +6,13 @@ arrow is a message that one callback reads and another callback of the node publ
 callbacks, or for subscriptions without callback events.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from html import escape
 
 from chainshaper.app import Callback
 from chainshaper.exploration import ApplicationDescription, lost_text
-from chainshaper.reporting.application_graph import callback_text, is_internal, short_symbol
+from chainshaper.reporting.application_graph import callback_text, short_symbol
 from chainshaper.reporting.layered_layout import Box, Edge, Layout, lay_out
 
 __all__ = ["application_svg"]
@@ -65,18 +66,14 @@ class _NodeBox:
         return TITLE / 2
 
 
-def application_svg(application: ApplicationDescription, *, everything: bool = False) -> str:
+def application_svg(application: ApplicationDescription) -> str:
     """The picture as the text of an SVG file."""
-    nodes = _nodes(application, everything)
-    topics = [
-        topic
-        for topic in application.graph.topics
-        if (everything or not is_internal(topic)) and not (topic.startswith("ros_") or topic == "")
-    ]
-    edges, styles = _edges(application, nodes, topics)
+    nodes = _nodes(application)
+    topics = [t for t in application.graph.topics if t and not t.startswith("ros_")]
+    arrows = list(_arrows(application, nodes, topics))
     pills = [Box(CHARACTER * len(topic) + 2 * PAD, PILL) for topic in topics]
-    layout = lay_out([*(node.box for node in nodes), *pills], edges)
-    parts = [_arrow(route, style) for route, style in zip(layout.routes, styles, strict=True)]
+    layout = lay_out([*(node.box for node in nodes), *pills], [edge for edge, _ in arrows])
+    parts = [_arrow(route, style) for route, (_, style) in zip(layout.routes, arrows, strict=True)]
     parts += [_node(node, layout.corners[index]) for index, node in enumerate(nodes)]
     parts += [
         _topic(topic, layout.corners[len(nodes) + index], pills[index])
@@ -90,47 +87,38 @@ def application_svg(application: ApplicationDescription, *, everything: bool = F
     return _document(layout, parts)
 
 
-def _nodes(application: ApplicationDescription, everything: bool) -> list[_NodeBox]:
+def _nodes(application: ApplicationDescription) -> list[_NodeBox]:
     rows: dict[tuple[str, int], list[Callback]] = {
         (node.name, node.pid): [] for node in application.graph.nodes
     }
     for callback in application.graph.callbacks:
-        own = rows.setdefault((callback.node, callback.pid), [])
-        if everything or not is_internal(callback.topic):
-            own.append(callback)
+        rows.setdefault((callback.node, callback.pid), []).append(callback)
     return [_NodeBox(name, pid, tuple(own)) for (name, pid), own in rows.items()]
 
 
-def _edges(
+def _arrows(
     application: ApplicationDescription, nodes: list[_NodeBox], topics: list[str]
-) -> tuple[list[Edge], list[str]]:
+) -> Iterator[tuple[Edge, str]]:
     """Arrows and their classes: callbacks and topics, then titles where no callback is known."""
+    graph = application.graph
     place = {topic: len(nodes) + index for index, topic in enumerate(topics)}
-    edges: list[Edge] = []
-    styles: list[str] = []
     for index, node in enumerate(nodes):
         writes: set[str] = set()
         reads: set[str | None] = set()
         for callback in node.callbacks:
             height = node.height_of(callback.id)
             if callback.kind == "subscription" and callback.topic in place:
-                edges.append(Edge(place[callback.topic], index, PILL / 2, height))
-                styles.append("arrow")
+                yield Edge(place[callback.topic], index, PILL / 2, height), "arrow"
                 reads.add(callback.topic)
-            for topic in callback.publishes:
-                if topic in place:
-                    edges.append(Edge(index, place[topic], height, PILL / 2))
-                    styles.append("arrow passes" if topic in callback.passes_on else "arrow")
-                    writes.add(topic)
-        graph = application.graph
+            for topic in filter(place.__contains__, callback.publishes):
+                style = "arrow passes" if topic in callback.passes_on else "arrow"
+                yield Edge(index, place[topic], height, PILL / 2), style
+                writes.add(topic)
         for topic in topics:
             if node.name in graph.publishers.get(topic, ()) and topic not in writes:
-                edges.append(Edge(index, place[topic], TITLE / 2, PILL / 2))
-                styles.append("arrow")
+                yield Edge(index, place[topic], TITLE / 2, PILL / 2), "arrow"
             if node.name in graph.subscribers.get(topic, ()) and topic not in reads:
-                edges.append(Edge(place[topic], index, PILL / 2, TITLE / 2))
-                styles.append("arrow")
-    return edges, styles
+                yield Edge(place[topic], index, PILL / 2, TITLE / 2), "arrow"
 
 
 def _text(callback: Callback) -> str:

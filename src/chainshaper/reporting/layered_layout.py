@@ -13,6 +13,9 @@ Parts that are not connected are laid out one below the other.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from graphlib import TopologicalSorter
+
+import numpy as np
 
 __all__ = ["Box", "Edge", "Layout", "lay_out"]
 
@@ -95,20 +98,12 @@ def lay_out(boxes: Sequence[Box], edges: Sequence[Edge]) -> Layout:
 
 def _components(count: int, edges: Sequence[Edge]) -> list[set[int]]:
     """Connected components, the largest first."""
-    parent = list(range(count))
-
-    def root(vertex: int) -> int:
-        while parent[vertex] != vertex:
-            parent[vertex] = parent[parent[vertex]]
-            vertex = parent[vertex]
-        return vertex
-
+    of = {vertex: {vertex} for vertex in range(count)}
     for edge in edges:
-        parent[root(edge.source)] = root(edge.target)
-    found: dict[int, set[int]] = {}
-    for vertex in range(count):
-        found.setdefault(root(vertex), set()).add(vertex)
-    return sorted(found.values(), key=lambda members: (-len(members), min(members)))
+        joined = of[edge.source] | of[edge.target]
+        of.update(dict.fromkeys(joined, joined))
+    found = {id(members): members for members in of.values()}.values()
+    return sorted(found, key=lambda members: (-len(members), min(members)))
 
 
 def _layered(
@@ -169,25 +164,18 @@ def _turned(chosen: list[int], edges: list[tuple[int, Edge]]) -> set[int]:
 
 def _layers(chosen: list[int], pairs: list[tuple[int, int]]) -> dict[int, int]:
     """Longest path from the sources; sources then move right, next to what they feed."""
-    onward: dict[int, list[int]] = {vertex: [] for vertex in chosen}
-    missing = dict.fromkeys(chosen, 0)
+    before: dict[int, set[int]] = {vertex: set() for vertex in chosen}
+    onward: dict[int, set[int]] = {vertex: set() for vertex in chosen}
     for left, right in pairs:
         if left != right:
-            onward[left].append(right)
-            missing[right] += 1
-    sources = [vertex for vertex in chosen if not missing[vertex]]
+            before[right].add(left)
+            onward[left].add(right)
     layer = dict.fromkeys(chosen, 0)
-    waiting = list(sources)
-    while waiting:
-        vertex = waiting.pop()
-        for after in onward[vertex]:
-            layer[after] = max(layer[after], layer[vertex] + 1)
-            missing[after] -= 1
-            if not missing[after]:
-                waiting.append(after)
-    for vertex in sources:
-        if onward[vertex]:
-            layer[vertex] = min(layer[after] for after in onward[vertex]) - 1
+    for vertex in TopologicalSorter(before).static_order():
+        layer[vertex] = max((layer[left] + 1 for left in before[vertex]), default=0)
+    for vertex in chosen:
+        if onward[vertex] and not before[vertex]:
+            layer[vertex] = min(layer[right] for right in onward[vertex]) - 1
     return layer
 
 
@@ -234,7 +222,7 @@ def _neighbours(graph: _Columns) -> tuple[Beside, Beside]:
 
 
 def _crossings(graph: _Columns) -> int:
-    """How many pairs of segments cross, by counting inversions with a binary indexed tree."""
+    """How many pairs of segments cross: those whose ends are in another order than their begins."""
     place = _positions(graph)
     by_column: dict[int, list[tuple[float, float]]] = {}
     for left, right, leaves, enters in graph.segments:
@@ -244,20 +232,9 @@ def _crossings(graph: _Columns) -> int:
         )
         by_column.setdefault(graph.layer[left], []).append(ends)
     total = 0
-    for ends_of in by_column.values():
-        ranks = {y: rank for rank, y in enumerate(sorted({y for _, y in ends_of}), start=1)}
-        tree = [0] * (len(ranks) + 1)
-        for seen, (_, y) in enumerate(sorted(ends_of)):
-            rank = at = ranks[y]
-            smaller = 0
-            while at:
-                smaller += tree[at]
-                at -= at & -at
-            total += seen - smaller
-            at = rank
-            while at < len(tree):
-                tree[at] += 1
-                at += at & -at
+    for pairs in by_column.values():
+        ends_at = np.array([end for _, end in sorted(pairs)])
+        total += np.count_nonzero(np.triu(ends_at[:, None] > ends_at))
     return total
 
 

@@ -16,8 +16,8 @@ from chainshaper.analysis import DataFlow, LatencyAnalysis, data_flow, graph_of
 from chainshaper.recording import Recording
 from chainshaper.reporting.perfetto_format import Slice, Track, encode_trace
 from chainshaper.reporting.timeline import Timeline, timeline_of
-from chainshaper.reporting.whole_file import new_file, write_whole
 from chainshaper.steps import Measurement
+from chainshaper.whole_file import new_file, write_whole
 
 __all__ = ["ENDINGS", "export_perfetto"]
 
@@ -36,14 +36,12 @@ def export_perfetto(source: Recording | Measurement, path: str | Path) -> Path:
     path = new_file(path, ENDINGS)
     measured = source if isinstance(source, Measurement) else None
     recording = source.recording if isinstance(source, Measurement) else source
+    analysis, plan = (measured.analysis, measured.plan) if measured else (None, None)
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
-    if measured is None:
-        timeline = timeline_of(recording, flow)
-        tracks = _thread_tracks(recording, flow, timeline)
-    else:
-        timeline = timeline_of(recording, flow, measured.analysis, measured.plan)
-        tracks = _thread_tracks(recording, flow, timeline)
-        tracks += [*_chain_track(measured.analysis), *_gate_tracks(measured.analysis, timeline)]
+    timeline = timeline_of(recording, flow, analysis, plan)
+    tracks = _thread_tracks(recording, flow, timeline)
+    if analysis is not None:
+        tracks += [*_chain_track(analysis), *_gate_tracks(analysis, timeline)]
     tracks += [*_server_tracks(timeline), *_stall_tracks(timeline)]
     return write_whole(path, encode_trace(tracks, recording.info.clock_offset_ns))
 

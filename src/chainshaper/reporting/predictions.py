@@ -8,10 +8,10 @@ from rich.table import Table
 from chainshaper.durations import milliseconds
 from chainshaper.planning import BandChoice
 from chainshaper.predictions import BandHeld, FigureHeld, PredictionHeld
+from chainshaper.reporting.cells import ABSENT, ms, percent, slot_ms, terminal_table
 
-__all__ = ["choice_json", "choice_table", "prediction_json", "prediction_table"]
+__all__ = ["band_name", "choice_json", "choice_table", "prediction_json", "prediction_table"]
 
-ABSENT = "–"
 CONVENTION = (
     "at_start: every output leaves as its slot starts, as a gate does it; at_end: at its slot's"
     " end, eq. 5's convention; what is measured should lie between the two"
@@ -20,9 +20,9 @@ CONVENTION = (
 
 def choice_table(choice: BandChoice) -> Table:
     """Figure 7 in rows: the average over the number of bands, and where `auto` stops."""
-    table = Table(title=escape("Average over the number of bands [ms]"), title_justify="left")
-    for name in ("bands", "average", "gain", "slots end at"):
-        table.add_column(name, justify="left" if name == "slots end at" else "right")
+    title = "Average over the number of bands [ms]"
+    table = terminal_table(title, (), ("bands", "average", "gain", "slots end at"))
+    table.columns[-1].justify = "left"
     before: float | None = None
     for placement in choice.curve:
         ends = placement.slot_ends_ns
@@ -55,27 +55,29 @@ def choice_json(choice: BandChoice) -> dict[str, Any]:
 
 def prediction_table(held: PredictionHeld) -> Table:
     """Predicted beside measured: the whole, then band by band."""
-    table = Table(title=escape("Prediction and measurement [ms]"), title_justify="left")
-    for name in ("", "predicted", "measured", "", "jitter", "share predicted", "measured"):
-        table.add_column(name, justify="left" if not name else "right")
+    figures = ("predicted", "measured", "", "jitter", "share predicted", "measured")
+    table = terminal_table("Prediction and measurement [ms]", [""], figures)
+    table.columns[3].justify = "left"
     for title, figure in (
         ("average", held.mean),
         ("maximum", held.max),
         ("jitter (max − min)", held.jitter),
     ):
-        table.add_row(title, _range(figure), _ms(figure.measured_ns), _verdict(figure), "", "", "")
+        table.add_row(title, _range(figure), ms(figure.measured_ns), _verdict(figure), "", "", "")
     table.add_section()
     for number, band in enumerate(held.bands, start=1):
         table.add_row(
-            f"band {number}",
-            escape(f"[{milliseconds(band.slot_start_ns)}, {milliseconds(band.slot_end_ns)})"),
-            _ms(band.mean_ns),
+            escape(band_name(band, number)),
+            escape(slot_ms(band.slot_start_ns, band.slot_end_ns)),
+            ms(band.mean_ns),
             _inside(band),
-            _ms(band.jitter_ns),
-            _share(band.predicted_share),
-            _share(band.share),
+            ms(band.jitter_ns),
+            percent(band.predicted_share),
+            percent(band.share),
         )
-    late = f"; {held.late} outputs came in a later cycle than due" if held.late else ""
+    of_mode = "; shares of a mode: its outputs that were in time for its slot"
+    late = of_mode if any(band.mode for band in held.bands) else ""
+    late += f"; {held.late} outputs came behind the slot they were due in" if held.late else ""
     table.caption = (
         "predicted: outputs at the start … the end of their slots (a gate publishes at the start,"
         f" eq. 5 counts the end); averages may differ by three standard errors more{late}"
@@ -95,6 +97,13 @@ def prediction_json(held: PredictionHeld) -> dict[str, Any]:
     }
 
 
+def band_name(band: BandHeld, number: int) -> str:
+    """``band 2``, or whose it is: ``city, 3 late``."""
+    if band.mode is None:
+        return f"band {number}"
+    return f"{band.mode}, {band.late} late" if band.late else band.mode
+
+
 def _figure_json(figure: FigureHeld) -> dict[str, Any]:
     return {
         "at_start": figure.at_start_ns,
@@ -102,14 +111,6 @@ def _figure_json(figure: FigureHeld) -> dict[str, Any]:
         "measured": figure.measured_ns,
         "holds": figure.holds,
     }
-
-
-def _ms(value: int | None) -> str:
-    return ABSENT if value is None else milliseconds(value)
-
-
-def _share(value: float | None) -> str:
-    return ABSENT if value is None else f"{value:.1%}"
 
 
 def _range(figure: FigureHeld) -> str:

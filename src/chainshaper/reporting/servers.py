@@ -12,17 +12,19 @@ from chainshaper.enforcement.runs.state import RunState, ServerState
 from chainshaper.enforcement.threads.listing import POLICIES, Scheduling
 from chainshaper.enforcement.threads.server_threads import WantedScheduling
 from chainshaper.planning.plan_parts import slot_text
+from chainshaper.reporting.cells import terminal_table
 
 __all__ = ["changes_table", "run_line", "runs_table", "servers_table"]
 
 
 def servers_table(state: RunState) -> Table:
     """The servers of a run, a row each, with what they have done since they were armed."""
-    table = Table(title=escape(_title(state)), title_justify="left", caption=_caption(state))
-    for name in ("server", "core", "priority", "slots", "threads", "kept by"):
-        table.add_column(name, overflow="fold")
-    for name in ("slots opened", "late", "worst", "overruns"):
-        table.add_column(name, justify="right")
+    table = terminal_table(
+        f"{state.plan or 'plan'} in force with {state.back_end}",
+        ("server", "core", "priority", "slots", "threads", "kept by"),
+        ("slots opened", "late", "worst", "overruns"),
+    )
+    table.caption = _caption(state)
     for server in state.servers:
         table.add_row(
             escape(server.name),
@@ -38,9 +40,7 @@ def servers_table(state: RunState) -> Table:
 
 def runs_table(runs: Sequence[tuple[Journal, RunState | None]]) -> Table:
     """Every run on this machine: its plan, back end and owner, and how it is doing."""
-    table = Table(title="Plans in force", title_justify="left")
-    for name in ("run", "plan", "back end", "owner", "state"):
-        table.add_column(name, overflow="fold")
+    table = terminal_table("Plans in force", ("run", "plan", "back end", "owner", "state"))
     for journal, state in runs:
         owner = journal.owner
         table.add_row(
@@ -55,9 +55,8 @@ def runs_table(runs: Sequence[tuple[Journal, RunState | None]]) -> Table:
 
 def changes_table(changes: Sequence[WantedScheduling]) -> Table:
     """What a plan would give to each thread, a row each."""
-    table = Table(title="What threads would get", title_justify="left")
-    for name in ("node", "pid", "tid", "name", "role", "server", "class", "core", "why"):
-        table.add_column(name, overflow="fold")
+    names = ("node", "pid", "tid", "name", "role", "server", "class", "core", "why")
+    table = terminal_table("What threads would get", names)
     for one in changes:
         thread, wanted = one.thread.thread, one.wanted
         table.add_row(
@@ -90,10 +89,6 @@ def run_line(state: RunState) -> str:
         if told:
             parts.append(f"{server.name}: {told}")
     return "; ".join(parts) or f"in force with {state.back_end}"
-
-
-def _title(state: RunState) -> str:
-    return f"{state.plan or 'plan'} in force with {state.back_end}"
 
 
 def _caption(state: RunState) -> str:

@@ -1,6 +1,5 @@
 """What a sweep found: a table for the terminal, and a figure."""
 
-import io
 from pathlib import Path
 from typing import Any
 
@@ -8,15 +7,14 @@ import polars as pl
 from rich.markup import escape
 from rich.table import Table
 
-from chainshaper.durations import format_duration, milliseconds
-from chainshaper.reporting.figures import SIZE_INCHES
-from chainshaper.reporting.whole_file import write_whole
+from chainshaper.durations import format_duration
+from chainshaper.reporting.cells import ABSENT, ms, terminal_table
+from chainshaper.reporting.figures import new_figure, save_figure
 
 __all__ = ["draw_sweep", "sweep_table"]
 
 MOST_ROWS = 50
 MOST_LINES = 12
-ABSENT = "–"
 _FIGURES = {
     "mean_ns": "average",
     "max_ns": "maximum",
@@ -30,9 +28,8 @@ _FIGURES = {
 def sweep_table(frame: pl.DataFrame) -> Table:
     """The axes and the most important figures of each point, those of many only for the first."""
     axes = _axes(frame)
-    table = Table(title=escape("Simulated end-to-end latency [ms]"), title_justify="left")
-    for name in (*axes, *_FIGURES.values()):
-        table.add_column(escape(_name(name)), justify="right")
+    names = [escape(_name(name)) for name in (*axes, *_FIGURES.values())]
+    table = terminal_table("Simulated end-to-end latency [ms]", (), names)
     for row in frame.head(MOST_ROWS).to_dicts():
         values = [escape(_value(name, row[name])) for name in axes]
         if row["error"] is None:
@@ -50,14 +47,9 @@ def draw_sweep(frame: pl.DataFrame, path: Path) -> Path:
     Raises:
         OperationError: the picture cannot be written.
     """
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
     first, *others = _axes(frame)
     places = {value: place for place, value in enumerate(frame[first].unique(maintain_order=True))}
-    figure, panels = plt.subplots(1, 2, figsize=SIZE_INCHES, layout="constrained")
+    figure, panels = new_figure(panels=2)
     lines = frame.partition_by(others, maintain_order=True) if others else [frame]
     for points in lines[:MOST_LINES]:
         name = ", ".join(f"{_name(axis)} {_value(axis, points[axis][0])}" for axis in others)
@@ -67,17 +59,12 @@ def draw_sweep(frame: pl.DataFrame, path: Path) -> Path:
             axes.plot([places[value] for value in points[first]], heights, "o-", label=name)
     for axes, title in zip(panels, ("average latency", "jitter, max − min"), strict=True):
         axes.set_xticks(list(places.values()), [_value(first, value) for value in places])
-        axes.set_xlabel(_name(first))
-        axes.set_ylabel(f"{title} [ms]")
+        axes.set(xlabel=_name(first), ylabel=f"{title} [ms]")
         axes.set_ylim(bottom=0)
-        axes.grid(alpha=0.3)
     if others:
         more = f" (the first {MOST_LINES} of {len(lines)})" if len(lines) > MOST_LINES else ""
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", title=more)
-    picture = io.BytesIO()
-    figure.savefig(picture, dpi=130, format=path.suffix.removeprefix("."))
-    plt.close(figure)
-    return write_whole(path, [picture.getvalue()])
+    return save_figure(figure, path)
 
 
 def _axes(frame: pl.DataFrame) -> list[str]:
@@ -96,6 +83,4 @@ def _value(name: str, value: Any) -> str:
 
 
 def _figure(name: str, value: Any) -> str:
-    if value is None:
-        return ABSENT
-    return milliseconds(value) if name.endswith("_ns") else str(value)
+    return ms(value) if value is None or name.endswith("_ns") else str(value)

@@ -6,6 +6,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from chainshaper.enforcement.threads.allocation import Allocation, NodeThread
+from chainshaper.reporting.cells import terminal_table
 
 __all__ = ["threads_json", "threads_table"]
 
@@ -20,9 +21,8 @@ def threads_json(allocation: Allocation) -> dict[str, Any]:
 
 def threads_table(allocation: Allocation) -> Table:
     """A row per thread; what is as in the row above is left out."""
-    table = Table(title="Threads", title_justify="left")
-    for name in ("node", "pid", "tid", "name", "role", "class", "cores", "known by"):
-        table.add_column(name, overflow="fold")
+    names = ("node", "pid", "tid", "name", "role", "class", "cores", "known by")
+    table = terminal_table("Threads", names)
     above: NodeThread | None = None
     for found in allocation.threads:
         row = _row(found)

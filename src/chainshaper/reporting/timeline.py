@@ -116,7 +116,8 @@ def _holds(
     # A gate in a Python node has no callback that events know: process and message say which it is.
     decided = (
         gate_releases(recording, plan)
-        .select("pid", "source_timestamp", *_HELD_FROM)
+        .rename({"time": "let_go"})
+        .select("pid", "source_timestamp", *_HELD)
         .unique(["pid", "source_timestamp"], keep="last", maintain_order=True)
     )
     processes = pl.DataFrame(
@@ -137,9 +138,6 @@ _HELD = {
     "slot": pl.Int32(),
     "overrun": pl.String(),
 }
-_HELD_FROM = [
-    pl.col("time").alias("let_go") if name == "let_go" else pl.col(name) for name in _HELD
-]
 
 
 def _origins(
@@ -160,17 +158,13 @@ def _origins(
         told.unique("traversal"), on="traversal", how="left", maintain_order="left"
     )
     stamped = plan.shaping_node is not None and plan.anchor == "stamp"
-    gated_thread = any(publisher_servers(plan))
-    late = pl.lit(0) if stamped and not gated_thread else pl.lit(_late(rows["start"], plan))
+    from_cycle = not stamped or any(publisher_servers(plan))
+    late = lateness_in_cycle(rows["start"], plan.cycle_ns) if from_cycle else 0
     return rows.select(
         "traversal",
-        pl.coalesce("told", pl.col("start") - late).alias("origin"),
+        pl.coalesce("told", pl.col("start") - pl.lit(late)).alias("origin"),
         pl.col("told").is_null().alias("assumed"),
     )
-
-
-def _late(starts: pl.Series, plan: Plan) -> pl.Series:
-    return lateness_in_cycle(starts, plan.cycle_ns)
 
 
 def _slots(plan: Plan | None, origins: pl.DataFrame) -> pl.DataFrame:

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from chainshaper.errors import InputError
-from chainshaper.planning.plan import Plan, Server, Thread
+from chainshaper.planning.plan import Plan, Server, Thread, shaping_nodes
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.layout import FOREVER, NONE, Int64s, Machine
 from chainshaper.simulation.memory import Memory, refer_to_places
-from chainshaper.simulation.queues import RESERVE, push_event
 from chainshaper.simulation.streams import AHEAD, Streams
 from chainshaper.simulation.system import Entity, SimulatedThread, System
 from chainshaper.workload.event_log import WORDS
@@ -74,8 +73,8 @@ def build_machine(
     entities = _entities(system, timing, streams, {**gate_rows, **synchroniser_rows}, ring)
     publishers, readers, announced = _publishers(system)
     held = sum(system.application.topic(p.topic).depth for p in system.publishers)
-    pool = POOL + len(rings) + held + RESERVE
-    heap = pool + len(entities) + len(threads) + RESERVE
+    pool = POOL + len(rings) + held + at.RESERVE
+    heap = pool + len(entities) + len(threads) + at.RESERVE
     entries = LOG_ENTRIES if events else 0
     areas = {
         "control": np.zeros((1, at.CONTROL_COLUMNS), dtype=np.int64),
@@ -121,10 +120,15 @@ def build_machine(
     control[at.X_AWAY] = round(1e6 * described.interrupts / (1 - described.interrupts))
     control[at.X_CYCLE] = plan.cycle_ns if plan is not None else 0
     control[at.X_WARM_UP] = warm_up
-    for row, entity in enumerate(system.entities):
-        if entity.kind == "timer":
-            place = memory.place("entities", row)
-            push_event(memory.array, memory["entities"][row, at.E_DUE], at.EXPIRY, place)
+    expiries = sorted(
+        (int(entities[row, at.E_DUE]), row)
+        for row, entity in enumerate(system.entities)
+        if entity.kind == "timer"
+    )
+    for order, (due, row) in enumerate(expiries):  # in order, they are a heap
+        memory["heap"][order] = due, order, at.EXPIRY, memory.place("entities", row)
+    control[at.X_COUNTER] = len(expiries)
+    control[at.X_HEAP_END] = memory.place("heap", len(expiries))
     machine = Machine(
         memory=memory.array,
         threads=memory["threads"],
@@ -166,7 +170,7 @@ def _assigned(system: System, plan: Plan | None) -> dict[int, Server]:
 
 def _always_open(plan: Plan, server: Server) -> bool:
     """A shaping node holds its messages itself: its thread needs no slot to run in."""
-    nodes = [node for node in (plan.shaping_node, *plan.further_shaping_nodes) if node is not None]
+    nodes = shaping_nodes(plan)
     return any(node.thread in server.threads for node in nodes)
 
 
@@ -323,7 +327,7 @@ def _synchronisers(
             rows[key] = len(synchronisers)
             synchronisers.append([len(inputs), len(inputs) + len(entity.described.synchronises)])
         depth = system.application.topic(entity.topic or "").depth
-        inputs.append([ring(depth), depth, int(number in system.chain.callbacks), 0, 0])
+        inputs.append([int(number in system.chain.callbacks), ring(depth), depth, 0, 0])
     return _rows(synchronisers, at.SYNCHRONISER_COLUMNS), _rows(inputs, at.INPUT_COLUMNS), rows
 
 
@@ -361,7 +365,7 @@ def _entities(
             row[at.E_DUE] = timing.start_ns + described.phase_ns
         else:
             topic = system.application.topic(entity.topic)
-            row[at.E_RING], row[at.E_DEPTH] = ring(topic.depth), topic.depth
+            row[at.E_HISTORY], row[at.E_DEPTH] = ring(topic.depth), topic.depth
             if topic.lifespan_ns is not None:
                 row[at.E_LIFESPAN] = topic.lifespan_ns
     return entities

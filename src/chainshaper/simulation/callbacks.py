@@ -6,69 +6,9 @@ CPU time it needs next and what follows (`T_LEFT`, `T_STEP`), or let the thread 
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
 
-from chainshaper.simulation.compiled import compiled
+from chainshaper.compiled.memory import compiled
+from chainshaper.simulation import layout as at
 from chainshaper.simulation.gate_kernel import decide, missed_slot, switch_mode
-from chainshaper.simulation.layout import (
-    A_STRIDE,
-    C_DIRTY,
-    DISCARD,
-    E_BODY,
-    E_BODY_ROW,
-    E_EXECUTION,
-    E_INPUT,
-    E_PUBLISHERS,
-    E_PUBLISHERS_END,
-    E_ROW,
-    E_WAITING,
-    G_ARRIVAL,
-    G_AT,
-    G_MODE,
-    G_PAUSE,
-    G_SLOT,
-    G_SPIN,
-    G_TREATED,
-    GATE,
-    GATE_PAUSED,
-    GATE_PUBLISHED,
-    GATE_WAKE,
-    I_DEPTH,
-    I_HEAD,
-    I_ON_CHAIN,
-    I_RING,
-    I_WAITING,
-    INPUT_COLUMNS,
-    L_END,
-    L_RELEASE,
-    LOG_COLUMNS,
-    M_NUMBER,
-    M_ORIGIN,
-    M_START,
-    MODE_LISTENER,
-    NONE,
-    PUBLISH,
-    PUBLISHER_COLUMNS,
-    S_END,
-    S_FIRST,
-    SLEEP_OVER,
-    SYNCHRONISE,
-    T_BEGAN,
-    T_CORE,
-    T_ENTITY,
-    T_LEFT,
-    T_MODE,
-    T_NUMBER,
-    T_ORIGIN,
-    T_PUBLICATION,
-    T_PUBLISH,
-    T_RUNNABLE,
-    T_SOURCE,
-    T_START,
-    T_STEP,
-    T_USED,
-    X_AWAY,
-    X_LOGS,
-    X_NOW,
-)
 from chainshaper.simulation.messages import publish
 from chainshaper.simulation.queues import (
     begin_entry,
@@ -77,149 +17,141 @@ from chainshaper.simulation.queues import (
     log,
     new_message,
     push_event,
+    put_newest,
+    take_oldest,
 )
 
 __all__ = ["begin_body", "go_on_publishing", "pass_gate", "sleep"]
 
 
-@compiled
+@compiled()
 def begin_body(m, thread):
     """Begin the callback of the thread's entity; false if it has ended already."""
-    entity = m[thread + T_ENTITY]
-    body = m[entity + E_BODY]
-    m[thread + T_PUBLICATION] = m[entity + E_PUBLISHERS]
-    m[thread + T_STEP] = PUBLISH
-    if body == GATE:
+    entity = m[thread + at.T_ENTITY]
+    body = m[entity + at.E_BODY]
+    m[thread + at.T_PUBLICATION] = m[entity + at.E_PUBLISHERS]
+    m[thread + at.T_STEP] = at.PUBLISH
+    if body == at.GATE:
         return _hold(m, thread)
-    if body == MODE_LISTENER:
-        switch_mode(m, m[entity + E_BODY_ROW], m[thread + T_MODE])
+    if body == at.MODE_LISTENER:
+        switch_mode(m, m[entity + at.E_BODY_ROW], m[thread + at.T_MODE])
         return _end(m, thread)
-    if body == SYNCHRONISE and not _complete(m, thread):
+    if body == at.SYNCHRONISE and not _complete(m, thread):
         return _end(m, thread)
-    execution = draw(m, m[entity + E_EXECUTION])
-    m[thread + T_LEFT] = execution + execution * m[X_AWAY] // 1_000_000
+    execution = draw(m, m[entity + at.E_EXECUTION])
+    m[thread + at.T_LEFT] = execution + execution * m[at.X_AWAY] // 1_000_000
     return True
 
 
-@compiled
+@compiled()
 def go_on_publishing(m, thread):
     """Publish on the next topic; false if all have been served and the callback has ended."""
-    publisher = m[thread + T_PUBLICATION]
-    if publisher == m[m[thread + T_ENTITY] + E_PUBLISHERS_END]:
+    publisher = m[thread + at.T_PUBLICATION]
+    if publisher == m[m[thread + at.T_ENTITY] + at.E_PUBLISHERS_END]:
         return _end(m, thread)
-    m[thread + T_PUBLICATION] += PUBLISHER_COLUMNS
+    m[thread + at.T_PUBLICATION] += at.PUBLISHER_COLUMNS
     publish(m, thread, publisher)
-    m[thread + T_LEFT] = draw(m, m[thread + T_PUBLISH])
+    m[thread + at.T_LEFT] = draw(m, m[thread + at.T_PUBLISH])
     return True
 
 
-@compiled
+@compiled()
 def sleep(m, thread, until):
     """A thread waits for an instant, whatever else happens."""
-    m[thread + T_RUNNABLE] = 0
-    m[m[thread + T_CORE] + C_DIRTY] = 1
-    push_event(m, until, SLEEP_OVER, thread)
+    m[thread + at.T_RUNNABLE] = 0
+    m[m[thread + at.T_CORE] + at.C_DIRTY] = 1
+    push_event(m, until, at.SLEEP_OVER, thread)
 
 
-@compiled
+@compiled()
 def pass_gate(m, thread):
     """A thread of a gate goes on: awake, watching the clock, having published or paused.
 
     False if the callback has ended.
     """
-    entity, now = m[thread + T_ENTITY], m[X_NOW]
-    gate = m[entity + E_BODY_ROW]
-    if m[thread + T_STEP] == GATE_WAKE:
-        if now < m[gate + G_AT]:
-            m[thread + T_LEFT] = m[gate + G_AT] - now  # watching the clock
+    entity, now = m[thread + at.T_ENTITY], m[at.X_NOW]
+    gate = m[entity + at.E_BODY_ROW]
+    if m[thread + at.T_STEP] == at.GATE_WAKE:
+        if now < m[gate + at.G_AT]:
+            m[thread + at.T_LEFT] = m[gate + at.G_AT] - now  # watching the clock
             return True
-        m[thread + T_BEGAN] = now
+        m[thread + at.T_BEGAN] = now
         if missed_slot(m, gate):
-            m[gate + G_AT], m[gate + G_SLOT], m[gate + G_TREATED] = NONE, NONE, DISCARD
+            m[gate + at.G_AT] = at.NONE
+            m[gate + at.G_SLOT] = at.NONE
+            m[gate + at.G_TREATED] = at.DISCARD
             return _released(m, thread)
-        m[thread + T_STEP] = GATE_PUBLISHED
-        publish(m, thread, m[entity + E_PUBLISHERS])
-        m[thread + T_LEFT] = draw(m, m[thread + T_PUBLISH])
+        m[thread + at.T_STEP] = at.GATE_PUBLISHED
+        publish(m, thread, m[entity + at.E_PUBLISHERS])
+        m[thread + at.T_LEFT] = draw(m, m[thread + at.T_PUBLISH])
         return True
     # Another message that waits already must not become late by the pause.
-    published = m[thread + T_STEP] == GATE_PUBLISHED
-    if published and m[gate + G_PAUSE] > 0 and m[entity + E_WAITING] == 0:
-        m[thread + T_STEP] = GATE_PAUSED
-        sleep(m, thread, now + m[gate + G_PAUSE])
+    published = m[thread + at.T_STEP] == at.GATE_PUBLISHED
+    if published and m[gate + at.G_PAUSE] > 0 and m[entity + at.E_WAITING] == 0:
+        m[thread + at.T_STEP] = at.GATE_PAUSED
+        sleep(m, thread, now + m[gate + at.G_PAUSE])
         return True
     return _released(m, thread)
 
 
-@compiled
+@compiled()
 def _hold(m, thread):
-    gate, now = m[m[thread + T_ENTITY] + E_BODY_ROW], m[X_NOW]
-    decide(m, gate, now, m[thread + T_ORIGIN])
-    m[thread + T_BEGAN] = now
-    if m[gate + G_AT] == NONE:
+    gate, now = m[m[thread + at.T_ENTITY] + at.E_BODY_ROW], m[at.X_NOW]
+    decide(m, gate, now, m[thread + at.T_ORIGIN])
+    m[thread + at.T_BEGAN] = now
+    if m[gate + at.G_AT] == at.NONE:
         return _released(m, thread)
-    m[thread + T_STEP] = GATE_WAKE
-    if m[gate + G_AT] - m[gate + G_SPIN] > now:
-        sleep(m, thread, m[gate + G_AT] - m[gate + G_SPIN])
+    m[thread + at.T_STEP] = at.GATE_WAKE
+    if m[gate + at.G_AT] - m[gate + at.G_SPIN] > now:
+        sleep(m, thread, m[gate + at.G_AT] - m[gate + at.G_SPIN])
     return True
 
 
-@compiled
+@compiled()
 def _released(m, thread):
-    entity = m[thread + T_ENTITY]
-    gate = m[entity + E_BODY_ROW]
-    place = begin_entry(m, L_RELEASE, m[thread + T_BEGAN], thread)
-    if place != NONE:
-        stride = m[m[X_LOGS] + L_RELEASE * LOG_COLUMNS + A_STRIDE]
-        m[place + 2 * stride] = m[entity + E_ROW]
-        m[place + 3 * stride] = m[thread + T_SOURCE]
-        for field in range(G_MODE - G_ARRIVAL + 1):
-            m[place + (4 + field) * stride] = m[gate + G_ARRIVAL + field]
+    entity = m[thread + at.T_ENTITY]
+    gate = m[entity + at.E_BODY_ROW]
+    place = begin_entry(m, at.L_RELEASE, m[thread + at.T_BEGAN], thread)
+    if place != at.NONE:
+        stride = m[m[at.X_LOGS] + at.L_RELEASE * at.LOG_COLUMNS + at.A_STRIDE]
+        m[place + 2 * stride] = m[entity + at.E_ROW]
+        m[place + 3 * stride] = m[thread + at.T_SOURCE]
+        for field in range(at.G_MODE - at.G_ARRIVAL + 1):
+            m[place + (4 + field) * stride] = m[gate + at.G_ARRIVAL + field]
     return _end(m, thread)
 
 
-@compiled
+@compiled()
 def _complete(m, thread):
     """Add the message to its synchroniser's input; true if that completes a set.
 
     The oldest message of every input makes a set. Its stamp is that of the first input.
     """
-    entity = m[thread + T_ENTITY]
-    synchroniser = m[entity + E_BODY_ROW]
-    first, end = m[synchroniser + S_FIRST], m[synchroniser + S_END]
-    mine = first + m[entity + E_INPUT] * INPUT_COLUMNS
-    if m[mine + I_WAITING] == m[mine + I_DEPTH]:
-        free_message(m, _oldest(m, mine))
+    entity = m[thread + at.T_ENTITY]
+    synchroniser = m[entity + at.E_BODY_ROW]
+    first, end = m[synchroniser + at.S_FIRST], m[synchroniser + at.S_END]
+    mine = first + m[entity + at.E_INPUT] * at.INPUT_COLUMNS
     message = new_message(m)
-    m[message + M_ORIGIN], m[message + M_START] = m[thread + T_ORIGIN], m[thread + T_START]
-    m[message + M_NUMBER] = m[thread + T_NUMBER]
-    place = (m[mine + I_HEAD] + m[mine + I_WAITING]) % m[mine + I_DEPTH]
-    m[m[mine + I_RING] + place] = message
-    m[mine + I_WAITING] += 1
-    for source in range(first, end, INPUT_COLUMNS):
-        if m[source + I_WAITING] == 0:
+    m[message + at.M_ORIGIN] = m[thread + at.T_ORIGIN]
+    m[message + at.M_START] = m[thread + at.T_START]
+    m[message + at.M_NUMBER] = m[thread + at.T_NUMBER]
+    put_newest(m, mine + at.I_RING, message)
+    for source in range(first, end, at.INPUT_COLUMNS):
+        if m[source + at.I_WAITING] == 0:
             return False
-    m[thread + T_START] = NONE
-    for source in range(first, end, INPUT_COLUMNS):
-        message = _oldest(m, source)
+    m[thread + at.T_START] = at.NONE
+    for source in range(first, end, at.INPUT_COLUMNS):
+        message = take_oldest(m, source + at.I_RING)
         if source == first:
-            m[thread + T_ORIGIN] = m[message + M_ORIGIN]
-        if m[source + I_ON_CHAIN] == 1:
-            m[thread + T_START] = m[message + M_START]
-            m[thread + T_NUMBER] = m[message + M_NUMBER]
+            m[thread + at.T_ORIGIN] = m[message + at.M_ORIGIN]
+        if m[source + at.I_ON_CHAIN] == 1:
+            m[thread + at.T_START] = m[message + at.M_START]
+            m[thread + at.T_NUMBER] = m[message + at.M_NUMBER]
         free_message(m, message)
     return True
 
 
-@compiled
-def _oldest(m, source):
-    """The oldest message that waits at an input, taken out."""
-    message = m[m[source + I_RING] + m[source + I_HEAD]]
-    m[source + I_HEAD] = (m[source + I_HEAD] + 1) % m[source + I_DEPTH]
-    m[source + I_WAITING] -= 1
-    return message
-
-
-@compiled
+@compiled()
 def _end(m, thread):
-    log(m, L_END, thread, (m[m[thread + T_ENTITY] + E_ROW], m[thread + T_USED]))
+    log(m, at.L_END, thread, (m[m[thread + at.T_ENTITY] + at.E_ROW], m[thread + at.T_USED]))
     return False

@@ -78,15 +78,15 @@ SEND, SENT, RECEIVE, RECEIVED = range(6, 10)
     E_EXECUTION,  # stream
     E_PUBLISHERS,
     E_PUBLISHERS_END,
-    E_RING,  # its history: places of messages
-    E_DEPTH,
     E_LIFESPAN,
     E_STARTS_CHAIN,
     E_ON_CHAIN,
+    E_HISTORY,  # a ring
+    E_DEPTH,
     # ---
-    E_DUE,
     E_HEAD,
-    E_WAITING,  # messages in the history
+    E_WAITING,
+    E_DUE,
     E_READY,  # in the executor's snapshot
     E_INSTANCES,
     ENTITY_COLUMNS,
@@ -148,8 +148,11 @@ WAIT, DISCARD, PUBLISH_LATE, NEXT_SLOT = range(4)
 CHANGES_KEPT = 64
 
 S_FIRST, S_END, SYNCHRONISER_COLUMNS = range(3)
-# Inputs of synchronisers: a ring of messages each.
-I_RING, I_DEPTH, I_ON_CHAIN, I_HEAD, I_WAITING, INPUT_COLUMNS = range(6)
+# Inputs of synchronisers.
+I_ON_CHAIN, I_RING, I_DEPTH, I_HEAD, I_WAITING, INPUT_COLUMNS = range(6)
+
+# A ring of messages, in entities and inputs: where its places are, and how many messages wait.
+Q_PLACES, Q_DEPTH, Q_HEAD, Q_WAITING = range(4)
 
 (
     C_FIRST,  # a list of threads
@@ -218,6 +221,9 @@ EXPIRY, DELIVERY, SLEEP_OVER = range(3)
     CONTROL_COLUMNS,
 ) = range(25)
 
+RESERVE = 1024
+"""So much of everything is left when the engine pauses: more than one step can use."""
+
 RUNNING, MORE_DRAWS, LOG_FULL, MESSAGES_FULL, OVER = range(5)
 
 # The log, by kind of entry; after time and thread:
@@ -230,7 +236,7 @@ RUNNING, MORE_DRAWS, LOG_FULL, MESSAGES_FULL, OVER = range(5)
     L_EXECUTE,  # entity
     L_SEND,  # publisher, source timestamp, outcome, duration
     L_SWITCH,  # core, previous thread, whether it is still runnable
-    L_RELEASE,  # entity, source, arrival, origin, release, slot, cycles, stamped, overrun, mode
+    L_RELEASE,  # entity, source, arrival, release, origin, slot, cycles, stamped, overrun, mode
     LOG_KINDS,
 ) = range(10)
 LOG_FIELDS = (6, 6, 6, 6, 6, 6, 6, 6, 12)

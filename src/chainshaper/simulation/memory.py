@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.layout import NONE, Int64s
-from chainshaper.simulation.queues import RESERVE
 
 __all__ = ["Memory", "refer_to_places"]
 
@@ -61,7 +60,7 @@ def refer_to_places(memory: Memory) -> None:
     memory.refer("entities", at.E_EXECUTION, "streams")
     memory.refer("entities", at.E_PUBLISHERS, "publishers")
     memory.refer("entities", at.E_PUBLISHERS_END, "publishers")
-    memory.refer("entities", at.E_RING, "rings")
+    memory.refer("entities", at.E_HISTORY, "rings")
     synchronising = memory["entities"][:, at.E_BODY] == at.SYNCHRONISE
     memory.refer("entities", at.E_BODY_ROW, "gates", ~synchronising)
     memory.refer("entities", at.E_BODY_ROW, "synchronisers", synchronising)
@@ -91,7 +90,7 @@ def refer_to_places(memory: Memory) -> None:
     control[at.X_CORES_END] = memory.place("cores", len(memory["cores"]))
     control[at.X_FREE] = memory.place("messages", 0)
     control[at.X_HEAP] = control[at.X_HEAP_END] = memory.place("heap", 0)
-    control[at.X_HEAP_LIMIT] = memory.place("heap", len(memory["heap"]) - RESERVE)
+    control[at.X_HEAP_LIMIT] = memory.place("heap", len(memory["heap"]) - at.RESERVE)
     control[at.X_LOGS] = memory.place("counts", 0)
     control[at.X_LATENCIES] = memory.place("latencies", 0)
     control[at.X_LATENCIES_END] = control[at.X_LATENCIES] + memory["latencies"].shape[1]

@@ -6,49 +6,10 @@ left at the next safe place; limits keep enough in reserve for what happens unti
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
 
-from chainshaper.simulation.compiled import compiled
-from chainshaper.simulation.layout import (
-    A_COUNT,
-    A_FIRST,
-    A_STRIDE,
-    D_CONSTANT,
-    D_LIMIT,
-    D_NEXT,
-    E_DEPTH,
-    E_HEAD,
-    E_LIFESPAN,
-    E_RING,
-    E_WAITING,
-    H_KIND,
-    H_ORDER,
-    H_ROW,
-    H_TIME,
-    HEAP_COLUMNS,
-    LOG_COLUMNS,
-    LOG_FULL,
-    M_ARRIVAL,
-    M_NEXT,
-    MESSAGES_FULL,
-    MORE_DRAWS,
-    NONE,
-    T_HEAD,
-    T_ROW,
-    T_TAIL,
-    X_COUNTER,
-    X_FREE,
-    X_HEAP,
-    X_HEAP_END,
-    X_HEAP_LIMIT,
-    X_LOGGING,
-    X_LOGS,
-    X_NOW,
-    X_PAUSED,
-    X_RECORD_FROM,
-    X_UNUSED,
-)
+from chainshaper.compiled.memory import compiled
+from chainshaper.simulation import layout as at
 
 __all__ = [
-    "RESERVE",
     "append",
     "begin_entry",
     "draw",
@@ -56,92 +17,90 @@ __all__ = [
     "free_message",
     "log",
     "new_message",
-    "oldest_message",
     "pop_event",
     "pop_head",
     "push_event",
+    "put_newest",
+    "take_oldest",
 ]
 
-RESERVE = 1024
-"""So much of everything is left when the engine pauses: more than one step can use."""
 
-
-@compiled
+@compiled()
 def draw(m, stream):
     """The next value of a stream."""
-    constant = m[stream + D_CONSTANT]
-    if constant != NONE:
+    constant = m[stream + at.D_CONSTANT]
+    if constant != at.NONE:
         return constant
-    place = m[stream + D_NEXT]
-    m[stream + D_NEXT] = place + 1
-    if place >= m[stream + D_LIMIT]:
-        m[X_PAUSED] = MORE_DRAWS
+    place = m[stream + at.D_NEXT]
+    m[stream + at.D_NEXT] = place + 1
+    if place >= m[stream + at.D_LIMIT]:
+        m[at.X_PAUSED] = at.MORE_DRAWS
     return m[place]
 
 
-@compiled
+@compiled()
 def begin_entry(m, kind, time, thread):
     """Begin an entry of the log with time and thread; where it stands (NONE: not recorded)."""
-    if m[X_LOGGING] == 0 or time < m[X_RECORD_FROM]:
-        return NONE
-    area = m[X_LOGS] + kind * LOG_COLUMNS
-    count, stride = m[area + A_COUNT], m[area + A_STRIDE]
-    m[area + A_COUNT] = count + 1
-    if count + RESERVE >= stride:
-        m[X_PAUSED] = LOG_FULL
-    place = m[area + A_FIRST] + count
+    if m[at.X_LOGGING] == 0 or time < m[at.X_RECORD_FROM]:
+        return at.NONE
+    area = m[at.X_LOGS] + kind * at.LOG_COLUMNS
+    count, stride = m[area + at.A_COUNT], m[area + at.A_STRIDE]
+    m[area + at.A_COUNT] = count + 1
+    if count + at.RESERVE >= stride:
+        m[at.X_PAUSED] = at.LOG_FULL
+    place = m[area + at.A_FIRST] + count
     m[place] = time
-    m[place + stride] = NONE if thread == NONE else m[thread + T_ROW]
+    m[place + stride] = at.NONE if thread == at.NONE else m[thread + at.T_ROW]
     return place
 
 
-@compiled
+@compiled()
 def log(m, kind, thread, fields):
     """An entry of the log about what happens now."""
-    place = begin_entry(m, kind, m[X_NOW], thread)
-    if place != NONE:
-        stride = m[m[X_LOGS] + kind * LOG_COLUMNS + A_STRIDE]
+    place = begin_entry(m, kind, m[at.X_NOW], thread)
+    if place != at.NONE:
+        stride = m[m[at.X_LOGS] + kind * at.LOG_COLUMNS + at.A_STRIDE]
         place += 2 * stride
         for field in range(len(fields)):
             m[place + field * stride] = fields[field]
 
 
-@compiled
+@compiled()
 def push_event(m, time, kind, row):
     """Something will happen; of what happens at one time, the first pushed comes first."""
-    place = m[X_HEAP_END]
-    m[X_HEAP_END] = place + HEAP_COLUMNS
-    order = m[X_COUNTER]
-    m[X_COUNTER] = order + 1
-    heap = m[X_HEAP]
+    place = m[at.X_HEAP_END]
+    m[at.X_HEAP_END] = place + at.HEAP_COLUMNS
+    order = m[at.X_COUNTER]
+    m[at.X_COUNTER] = order + 1
+    heap = m[at.X_HEAP]
     while place > heap:
-        above = heap + (((place - heap) // HEAP_COLUMNS - 1) >> 1) * HEAP_COLUMNS
-        if m[above + H_TIME] <= time:
+        above = heap + (((place - heap) // at.HEAP_COLUMNS - 1) >> 1) * at.HEAP_COLUMNS
+        if m[above + at.H_TIME] <= time:
             break
         _move(m, above, place)
         place = above
-    m[place + H_TIME] = time
-    m[place + H_ORDER] = order
-    m[place + H_KIND] = kind
-    m[place + H_ROW] = row
-    if m[X_HEAP_END] >= m[X_HEAP_LIMIT]:
-        m[X_PAUSED] = MESSAGES_FULL
+    m[place + at.H_TIME] = time
+    m[place + at.H_ORDER] = order
+    m[place + at.H_KIND] = kind
+    m[place + at.H_ROW] = row
+    if m[at.X_HEAP_END] >= m[at.X_HEAP_LIMIT]:
+        m[at.X_PAUSED] = at.MESSAGES_FULL
 
 
-@compiled
+@compiled()
 def pop_event(m):
     """Kind and row of the next event."""
-    heap = m[X_HEAP]
-    kind, row = m[heap + H_KIND], m[heap + H_ROW]
-    last = m[X_HEAP_END] - HEAP_COLUMNS
-    m[X_HEAP_END] = last
+    heap = m[at.X_HEAP]
+    kind, row = m[heap + at.H_KIND], m[heap + at.H_ROW]
+    last = m[at.X_HEAP_END] - at.HEAP_COLUMNS
+    m[at.X_HEAP_END] = last
     place = heap
     while True:
-        below = 2 * place - heap + HEAP_COLUMNS
+        below = 2 * place - heap + at.HEAP_COLUMNS
         if below >= last:
             break
-        if below + HEAP_COLUMNS < last and _earlier(m, below + HEAP_COLUMNS, below):
-            below += HEAP_COLUMNS
+        if below + at.HEAP_COLUMNS < last and _earlier(m, below + at.HEAP_COLUMNS, below):
+            below += at.HEAP_COLUMNS
         if _earlier(m, last, below):
             break
         _move(m, below, place)
@@ -150,73 +109,83 @@ def pop_event(m):
     return kind, row
 
 
-@compiled
+@compiled()
 def _move(m, source, target):
-    for column in range(HEAP_COLUMNS):
+    for column in range(at.HEAP_COLUMNS):
         m[target + column] = m[source + column]
 
 
-@compiled
+@compiled()
 def _earlier(m, one, other):
-    if m[one + H_TIME] != m[other + H_TIME]:
-        return m[one + H_TIME] < m[other + H_TIME]
-    return m[one + H_ORDER] < m[other + H_ORDER]
+    if m[one + at.H_TIME] != m[other + at.H_TIME]:
+        return m[one + at.H_TIME] < m[other + at.H_TIME]
+    return m[one + at.H_ORDER] < m[other + at.H_ORDER]
 
 
-@compiled
+@compiled()
 def new_message(m):
     """An unused row of the pool."""
-    message = m[X_FREE]
-    m[X_FREE] = m[message + M_NEXT]
-    m[message + M_NEXT] = NONE
-    m[X_UNUSED] -= 1
-    if m[X_UNUSED] <= RESERVE:
-        m[X_PAUSED] = MESSAGES_FULL
+    message = m[at.X_FREE]
+    m[at.X_FREE] = m[message + at.M_NEXT]
+    m[message + at.M_NEXT] = at.NONE
+    m[at.X_UNUSED] -= 1
+    if m[at.X_UNUSED] <= at.RESERVE:
+        m[at.X_PAUSED] = at.MESSAGES_FULL
     return message
 
 
-@compiled
+@compiled()
 def free_message(m, message):
     """Give a row back to the pool."""
-    m[message + M_NEXT] = m[X_FREE]
-    m[X_FREE] = message
-    m[X_UNUSED] += 1
+    m[message + at.M_NEXT] = m[at.X_FREE]
+    m[at.X_FREE] = message
+    m[at.X_UNUSED] += 1
 
 
-@compiled
+@compiled()
 def append(m, thread, message):
     """A message goes to the end of a thread's queue."""
-    m[message + M_NEXT] = NONE
-    if m[thread + T_HEAD] == NONE:
-        m[thread + T_HEAD] = message
+    m[message + at.M_NEXT] = at.NONE
+    if m[thread + at.T_HEAD] == at.NONE:
+        m[thread + at.T_HEAD] = message
     else:
-        m[m[thread + T_TAIL] + M_NEXT] = message
-    m[thread + T_TAIL] = message
+        m[m[thread + at.T_TAIL] + at.M_NEXT] = message
+    m[thread + at.T_TAIL] = message
 
 
-@compiled
+@compiled()
 def pop_head(m, thread):
     """The first message of a thread's queue."""
-    message = m[thread + T_HEAD]
-    m[thread + T_HEAD] = m[message + M_NEXT]
+    message = m[thread + at.T_HEAD]
+    m[thread + at.T_HEAD] = m[message + at.M_NEXT]
     return message
 
 
-@compiled
-def oldest_message(m, entity):
-    """The oldest message of a history that is not empty, taken out."""
-    message = m[m[entity + E_RING] + m[entity + E_HEAD]]
-    m[entity + E_HEAD] = (m[entity + E_HEAD] + 1) % m[entity + E_DEPTH]
-    m[entity + E_WAITING] -= 1
+@compiled()
+def put_newest(m, ring, message):
+    """A message goes to the end of a ring; the oldest one of a full ring is gone."""
+    if m[ring + at.Q_WAITING] == m[ring + at.Q_DEPTH]:
+        free_message(m, take_oldest(m, ring))
+    place = (m[ring + at.Q_HEAD] + m[ring + at.Q_WAITING]) % m[ring + at.Q_DEPTH]
+    m[m[ring + at.Q_PLACES] + place] = message
+    m[ring + at.Q_WAITING] += 1
+
+
+@compiled()
+def take_oldest(m, ring):
+    """The oldest message of a ring that is not empty, taken out."""
+    message = m[m[ring + at.Q_PLACES] + m[ring + at.Q_HEAD]]
+    m[ring + at.Q_HEAD] = (m[ring + at.Q_HEAD] + 1) % m[ring + at.Q_DEPTH]
+    m[ring + at.Q_WAITING] -= 1
     return message
 
 
-@compiled
+@compiled()
 def drop_expired(m, entity):
     """Forget messages that have waited in a history for longer than their lifespan."""
-    lifespan = m[entity + E_LIFESPAN]
-    while lifespan != NONE and m[entity + E_WAITING] > 0:
-        message = m[m[entity + E_RING] + m[entity + E_HEAD]]
-        if m[X_NOW] - m[message + M_ARRIVAL] <= lifespan:
+    lifespan = m[entity + at.E_LIFESPAN]
+    while lifespan != at.NONE and m[entity + at.E_WAITING] > 0:
+        message = m[m[entity + at.E_HISTORY] + m[entity + at.E_HEAD]]
+        if m[at.X_NOW] - m[message + at.M_ARRIVAL] <= lifespan:
             return
-        free_message(m, oldest_message(m, entity))
+        free_message(m, take_oldest(m, entity + at.E_HISTORY))

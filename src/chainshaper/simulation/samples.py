@@ -26,7 +26,7 @@ from chainshaper.workload.distributions import ExecutionTime, SimulationDescript
 __all__ = ["measured_costs", "with_recorded_times"]
 
 DELIVERY_NS = 30_000
-"""A message is taken to be under way for so long: less than its publisher is still busy for."""
+"""A message is taken to be under way for so long where no message shows it."""
 
 COMPUTES_NS = 1_000_000
 """A callback that computes for less is over before an interrupt says much."""
@@ -67,71 +67,86 @@ def with_recorded_times(
 def measured_costs(recording: Recording | str | Path) -> SimulationDescription:
     """What a machine takes besides computing, from a recording of a live run on it.
 
-    Publishing lasts from a callback's last publication to its end; taking from the executor's
-    choice to the callback's start, and waking up from when a message was there, and its core free,
-    to that choice. Messages that waited for a busy executor say nothing about waking up. What the
-    most urgent executors were kept from while they computed, interrupts took.
+    Only executors that nothing of the application out-ranks on their core tell: others wait for
+    more, such as the DDS threads that receive a large message there. Publishing lasts from a
+    callback's last publication to its end; taking from the executor's choice to the callback's
+    start. A message that came while the core was busy was there by the time that it was free, and
+    from then to the choice the executor woke up; one that found it idle was on its way before that.
+    Messages that waited for a busy executor say nothing about either. What executors were kept from
+    while they computed, interrupts took.
 
     Raises:
-        InputError: no message of the recording was taken by an executor that waited for it.
+        InputError: no message of the recording was taken by such an executor that waited for it.
     """
     if not isinstance(recording, Recording):
         recording = open_source(recording)
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
-    cores = {thread.tid: thread.cores for thread in recording.info.threads}
-    instances = flow.instances.select("instance", "tid", "start", "end").with_columns(
-        core=pl.col("tid").replace_strict(
-            {tid: own[0] for tid, own in cores.items() if len(own) == 1}, default=None
-        )
-    )
-    chosen = events.table(recording.events, "rclcpp_executor_get_next_ready")
-    read = (
-        flow.takes.select("publication", "instance")
-        .drop_nulls()
-        .join(flow.publications.select("publication", "sent", writer="instance"), on="publication")
-        .join(instances, on="instance")
-        .join(
-            instances.select(writer="instance", freed="end", writer_core="core"),
-            on="writer",
-            how="left",
-        )
-        .sort("start")
-        .join_asof(
-            chosen.select("tid", chosen="time").sort("chosen"),
-            left_on="start",
-            right_on="chosen",
-            by="tid",
-            check_sortedness=False,
-        )
-        .join_asof(
-            instances.select("tid", before="end").drop_nulls().sort("before"),
-            left_on="start",
-            right_on="before",
-            by="tid",
-            check_sortedness=False,
-        )
-    )
-    same_core = pl.col("core") == pl.col("writer_core")
-    there = pl.max_horizontal(
-        pl.col("sent") + DELIVERY_NS, pl.when(same_core).then("freed").otherwise("sent")
-    )
-    read = read.filter(~pl.Series(_stalled(flow, read["sent"], read["start"])))
-    waited = read.filter(pl.col("before").fill_null(0) <= pl.col("sent")).with_columns(there=there)
+    core = pl.col("tid").replace_strict(_first_executors(recording), default=None)
+    instances = flow.instances.with_columns(core=core).drop_nulls(["core", "end"])
+    read = _read(recording, flow, instances)
+    waited = read.filter(pl.col("before").fill_null(0) <= pl.col("sent"))
     if not waited.height:
         raise InputError(
             f"{recording.path}: no executor waited for a message in it, so nothing says what "
             "waking up costs: record an application whose callbacks are connected by topics"
         )
+    was_busy = waited["freed"].fill_null(0) > waited["sent"]
+    woken = _ordinary((waited["chosen"] - waited["freed"]).filter(was_busy))
+    came = (waited["chosen"] - waited["sent"]).filter(~was_busy)
+    if not woken.len():  # nothing tells waking up and delivery apart
+        woken, came = _ordinary(came - DELIVERY_NS), came.clear()
+    delivery = _ordinary(came) - round(float(woken.median()))  # type: ignore[arg-type]
     last = flow.publications.group_by("instance").agg(pl.col("sent").max(), pl.len())
-    published = instances.join(last.drop_nulls(), on="instance").drop_nulls("end")
+    published = instances.join(last.drop_nulls(), on="instance")
     published = published.filter(~pl.Series(_stalled(flow, published["sent"], published["end"])))
     return SimulationDescription(
-        wake_up=_ordinary(waited["chosen"] - waited["there"]),
-        take=_ordinary(read["start"] - read["chosen"]),
-        publish=_ordinary((published["end"] - published["sent"]) // published["len"]),
-        delivery=ExecutionTime(constant_ns=DELIVERY_NS),
-        interrupts=_share_taken(recording, flow),
+        wake_up=_samples(woken),
+        take=_samples(_ordinary(read["start"] - read["chosen"])),
+        publish=_samples(_ordinary((published["end"] - published["sent"]) // published["len"])),
+        delivery=_samples(delivery) if came.len() else ExecutionTime(constant_ns=DELIVERY_NS),
+        interrupts=_share_taken(instances),
     )
+
+
+def _first_executors(recording: Recording) -> dict[int, int]:
+    """The core of each executor that no thread of the application out-ranks there."""
+    threads = [thread for thread in recording.info.threads if thread.role != "stall-meter"]
+    return {
+        one.tid: one.cores[0]
+        for one in threads
+        if one.role == "executor" and len(one.cores) == 1
+        if not any(
+            one.cores[0] in other.cores and other.priority > one.priority for other in threads
+        )
+    }
+
+
+def _read(recording: Recording, flow: DataFlow, instances: pl.DataFrame) -> pl.DataFrame:
+    """The messages that these instances got, but for those that a stall of the machine hit.
+
+    When each was ``sent``, when the executor had ended its instance ``before`` and its core was
+    ``freed`` by whichever executor, when the message was ``chosen`` and its callback's ``start``.
+    """
+    chosen = events.table(recording.events, "rclcpp_executor_get_next_ready")
+    read = (
+        flow.takes.select("publication", "instance")
+        .drop_nulls()
+        .join(flow.publications.select("publication", "sent"), on="publication")
+        .join(instances.select("instance", "tid", "core", "start"), on="instance")
+    )
+    for by, name, earlier, later in (
+        ("tid", "chosen", chosen.rename({"time": "chosen"}), "start"),
+        ("tid", "before", instances.rename({"end": "before"}), "chosen"),
+        ("core", "freed", instances.rename({"end": "freed"}), "chosen"),
+    ):
+        read = read.sort(later).join_asof(
+            earlier.select(by, name).sort(name),
+            left_on=later,
+            right_on=name,
+            by=by,
+            check_sortedness=False,
+        )
+    return read.filter(~pl.Series(_stalled(flow, read["sent"], read["start"])))
 
 
 def _stalled(flow: DataFlow, start: pl.Series, end: pl.Series) -> npt.NDArray[np.bool_]:
@@ -139,23 +154,20 @@ def _stalled(flow: DataFlow, start: pl.Series, end: pl.Series) -> npt.NDArray[np
     return stalled_after(flow, start.to_numpy(), end.to_numpy())
 
 
-def _share_taken(recording: Recording, flow: DataFlow) -> float:
-    """For which share of its response times the most urgent executors did not run (median)."""
-    executors = [thread for thread in recording.info.threads if thread.role == "executor"]
-    highest = max((thread.priority for thread in executors), default=0)
-    urgent = [thread.tid for thread in executors if thread.priority == highest]
-    lasted = pl.col("end") - pl.col("start")
-    computed = flow.instances.filter(
-        pl.col("tid").is_in(urgent) & (pl.col("execution_ns") > COMPUTES_NS)
-    ).select(share=1 - pl.col("execution_ns") / lasted)
-    median = computed["share"].median()
-    return min(0.5, max(0.0, float(median))) if isinstance(median, float) else 0.0
+def _share_taken(instances: pl.DataFrame) -> float:
+    """For which share of their response times instances did not run: median, or the default."""
+    computed = instances.filter(pl.col("execution_ns") > COMPUTES_NS)
+    lasted = computed["end"] - computed["start"]
+    median = (1 - computed["execution_ns"] / lasted).median()
+    if not isinstance(median, float):
+        return SimulationDescription().interrupts
+    return min(0.5, max(0.0, median))
 
 
-def _ordinary(costs: pl.Series) -> ExecutionTime:
+def _ordinary(costs: pl.Series) -> pl.Series:
     """What costs took, but for those that took so long that they waited for something else."""
     median = costs.median()
-    return _samples(costs.filter(costs <= FAR * median) if isinstance(median, float) else costs)
+    return costs.filter(costs <= FAR * median) if isinstance(median, float) else costs
 
 
 def _computing_times(flow: DataFlow) -> Mapping[tuple[str, str | int], pl.Series]:

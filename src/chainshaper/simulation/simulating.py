@@ -6,6 +6,7 @@ from pathlib import Path
 
 import polars as pl
 
+from chainshaper.compiled import kernel
 from chainshaper.durations import format_duration
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.plan import Plan
@@ -19,7 +20,6 @@ from chainshaper.recording import (
 )
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.arrays import Timing, build_machine
-from chainshaper.simulation.engine import run
 from chainshaper.simulation.layout import Int64s, Machine
 from chainshaper.simulation.streams import Streams
 from chainshaper.simulation.system import System, build_system
@@ -29,6 +29,8 @@ from chainshaper.workload.description import Application, application_as_written
 from chainshaper.workload.live import WARM_UP_CYCLES, completion_ns, origin_timer
 
 __all__ = ["simulate", "simulate_latencies"]
+
+_run_engine = kernel("chainshaper.simulation.engine", "run")
 
 START_NS = 1_000_000_000
 
@@ -124,7 +126,7 @@ def _run(
     """Run to the end; the event tables part by part as they fill up, objects first."""
     machine, control = simulation.machine, simulation.machine.memory
     yield created_objects(simulation.names)
-    while (reason := run(machine.memory)) != at.OVER:
+    while (reason := _run_engine(machine.memory.ctypes.data)) != at.OVER:
         if reason == at.MESSAGES_FULL:
             raise OperationError(
                 "messages pile up without end: an executor or a publisher thread that never gets"

@@ -4,16 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from chainshaper.simulation.layout import (
-    D_CONSTANT,
-    D_LIMIT,
-    D_NEXT,
-    NONE,
-    STREAM_COLUMNS,
-    Int64s,
-    Machine,
-)
-from chainshaper.simulation.queues import RESERVE
+from chainshaper.simulation import layout as at
+from chainshaper.simulation.layout import Int64s, Machine
 from chainshaper.workload.distributions import ExecutionTime
 from chainshaper.workload.execution import BLOCK, blocks
 
@@ -45,7 +37,7 @@ class Streams:
             None if constant is not None else blocks(times.model_dump(), self._seed, node, index)
         )
         self._sources.append(values)
-        self._constants.append(NONE if constant is None else constant)
+        self._constants.append(at.NONE if constant is None else constant)
         return len(self._sources) - 1
 
     def cost(self, times: ExecutionTime, node: str, number: int) -> int:
@@ -57,8 +49,8 @@ class Streams:
 
     def rows(self) -> Int64s:
         """The streams' rows of the engine's array, before any value is drawn."""
-        rows = np.zeros((len(self), STREAM_COLUMNS), dtype=np.int64)
-        rows[:, D_CONSTANT] = self._constants
+        rows = np.zeros((len(self), at.STREAM_COLUMNS), dtype=np.int64)
+        rows[:, at.D_CONSTANT] = self._constants
         return rows
 
     def fill(self, machine: Machine) -> None:
@@ -66,12 +58,12 @@ class Streams:
         first = machine.first_draw
         for stream, source in enumerate(self._sources):
             row, begin = machine.streams[stream], first + stream * AHEAD
-            if source is None or (row[D_NEXT] and row[D_NEXT] < row[D_LIMIT] - BLOCK):
+            if source is None or (row[at.D_NEXT] and row[at.D_NEXT] < row[at.D_LIMIT] - BLOCK):
                 continue
-            used = (int(row[D_NEXT]) - begin) // BLOCK * BLOCK if row[D_NEXT] else AHEAD
+            used = (int(row[at.D_NEXT]) - begin) // BLOCK * BLOCK if row[at.D_NEXT] else AHEAD
             values = machine.draws[stream]
             values[: AHEAD - used] = values[used:].copy()
             for place in range(AHEAD - used, AHEAD, BLOCK):
                 values[place : place + BLOCK] = next(source)
-            row[D_NEXT] = row[D_NEXT] - used if row[D_NEXT] else begin
-            row[D_LIMIT] = begin + AHEAD - RESERVE
+            row[at.D_NEXT] = row[at.D_NEXT] - used if row[at.D_NEXT] else begin
+            row[at.D_LIMIT] = begin + AHEAD - at.RESERVE

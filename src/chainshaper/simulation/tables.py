@@ -160,35 +160,68 @@ def created_objects(names: Names) -> dict[str, pl.DataFrame]:
 
 def event_frames(system: System, names: Names, machine: Machine) -> dict[str, pl.DataFrame]:
     """What is in the log, as event tables; only those in which there is something."""
-    columns = {kind: _entries(names, machine, kind) for kind in range(at.L_RELEASE)}
+    started, (callback, used, *_) = _entries(names, machine, at.L_START)
+    ended, (ended_callback, ended_used, *_) = _entries(names, machine, at.L_END)
+    published, (publisher, address, *_) = _entries(names, machine, at.L_PUBLISH)
+    chosen, (executed, *_) = _entries(names, machine, at.L_EXECUTE)
+    waited, (timeout, *_) = _entries(names, machine, at.L_WAIT)
+    took, (entity, taken_address, source, taken) = _entries(names, machine, at.L_TAKE)
+    message, taken_message = address.view(np.uint64), taken_address.view(np.uint64)
+    passed_on = _frame(took, message=taken_message).filter(pl.Series(taken == 1))
     frames = {
-        **_callbacks(names, machine, columns),
-        **_publications(names, machine, columns),
-        **_takes(names, machine, columns),
-        **_executors(names, machine, columns),
-        "asynchronous_send": _sends(names, machine, columns),
+        "callback_start": _frame(
+            started,
+            callback=names.callbacks[callback],
+            is_intra_process=np.zeros(callback.size, dtype=np.int32),
+            thread_time=used,
+        ),
+        "callback_end": _frame(
+            ended, callback=names.callbacks[ended_callback], thread_time=ended_used
+        ),
+        "rclcpp_publish": _frame(published, message=message),
+        "rcl_publish": _frame(
+            published, publisher_handle=names.publishers[publisher], message=message
+        ),
+        "rmw_publish": _frame(
+            published,
+            rmw_publisher_handle=names.rmw_publishers[publisher],
+            message=message,
+            timestamp=published["time"].to_numpy(),
+        ),
+        "rmw_take": _frame(
+            took,
+            rmw_subscription_handle=names.rmw_handles[entity],
+            message=taken_message,
+            source_timestamp=source,
+            taken=taken.astype(np.int32),
+        ),
+        "rcl_take": passed_on,
+        "rclcpp_take": passed_on,
+        "rclcpp_executor_get_next_ready": _frame(chosen),
+        "rclcpp_executor_execute": _frame(chosen, handle=names.handles[executed]),
+        "rclcpp_executor_wait_for_work": _frame(waited, timeout=timeout),
+        "asynchronous_send": _sends(names, machine),
         "sched_switch": _switches(system, names, machine),
         "gate_release": _releases(system, names, machine),
     }
     return {name: frame for name, frame in frames.items() if frame.height}
 
 
-def _field(machine: Machine, kind: int, field: int) -> at.Int64s:
-    return machine.logs[kind][2 + field, : machine.counts[kind, at.A_COUNT]]
+def _log(machine: Machine, kind: int) -> at.Int64s:
+    """The entries of a kind: a row of times, one of threads, and one for each field."""
+    return machine.logs[kind][:, : machine.counts[kind, at.A_COUNT]]
 
 
-def _common(names: Names, times: at.Int64s, threads: at.Int64s) -> Columns:
-    return {
+def _entries(names: Names, machine: Machine, kind: int) -> tuple[Columns, list[at.Int64s]]:
+    """The columns that all events have, and the fields, of the entries of a kind."""
+    times, threads, *fields = _log(machine, kind)
+    columns = {
         "time": pl.Series("time", times),
         "pid": pl.Series("pid", names.pids[threads]),
         "tid": pl.Series("tid", names.tids[threads]),
         "cpu": pl.Series("cpu", names.cpus[threads]),
     }
-
-
-def _entries(names: Names, machine: Machine, kind: int) -> Columns:
-    rows = machine.counts[kind, at.A_COUNT]
-    return _common(names, machine.logs[kind][0, :rows], machine.logs[kind][1, :rows])
+    return columns, fields
 
 
 def _frame(common: Columns, **fields: npt.NDArray[Any]) -> pl.DataFrame:
@@ -197,77 +230,11 @@ def _frame(common: Columns, **fields: npt.NDArray[Any]) -> pl.DataFrame:
     )
 
 
-def _callbacks(
-    names: Names, machine: Machine, columns: dict[int, Columns]
-) -> dict[str, pl.DataFrame]:
-    start, end = at.L_START, at.L_END
-    return {
-        "callback_start": _frame(
-            columns[start],
-            callback=names.callbacks[_field(machine, start, 0)],
-            is_intra_process=np.zeros(machine.counts[start, at.A_COUNT], dtype=np.int32),
-            thread_time=_field(machine, start, 1),
-        ),
-        "callback_end": _frame(
-            columns[end],
-            callback=names.callbacks[_field(machine, end, 0)],
-            thread_time=_field(machine, end, 1),
-        ),
-    }
-
-
-def _publications(
-    names: Names, machine: Machine, columns: dict[int, Columns]
-) -> dict[str, pl.DataFrame]:
-    common = columns[at.L_PUBLISH]
-    publisher = _field(machine, at.L_PUBLISH, 0)
-    message = _field(machine, at.L_PUBLISH, 1).view(np.uint64)
-    handle, rmw = names.publishers[publisher], names.rmw_publishers[publisher]
-    now = machine.logs[at.L_PUBLISH][0, : len(publisher)]
-    return {
-        "rclcpp_publish": _frame(common, message=message),
-        "rcl_publish": _frame(common, publisher_handle=handle, message=message),
-        "rmw_publish": _frame(common, rmw_publisher_handle=rmw, message=message, timestamp=now),
-    }
-
-
-def _takes(names: Names, machine: Machine, columns: dict[int, Columns]) -> dict[str, pl.DataFrame]:
-    entity, source, taken = (_field(machine, at.L_TAKE, field) for field in (0, 2, 3))
-    message = _field(machine, at.L_TAKE, 1).view(np.uint64)
-    rmw_take = _frame(
-        columns[at.L_TAKE],
-        rmw_subscription_handle=names.rmw_handles[entity],
-        message=message,
-        source_timestamp=source,
-        taken=taken.astype(np.int32),
-    )
-    passed_on = _frame(columns[at.L_TAKE], message=message)
-    if not taken.all():
-        passed_on = passed_on.filter(pl.Series(taken == 1))
-    return {"rmw_take": rmw_take, "rcl_take": passed_on, "rclcpp_take": passed_on}
-
-
-def _executors(
-    names: Names, machine: Machine, columns: dict[int, Columns]
-) -> dict[str, pl.DataFrame]:
-    handle = names.handles[_field(machine, at.L_EXECUTE, 0)]
-    return {
-        "rclcpp_executor_get_next_ready": _frame(columns[at.L_EXECUTE]),
-        "rclcpp_executor_execute": _frame(columns[at.L_EXECUTE], handle=handle),
-        "rclcpp_executor_wait_for_work": _frame(
-            columns[at.L_WAIT], timeout=_field(machine, at.L_WAIT, 0)
-        ),
-    }
-
-
-def _sends(names: Names, machine: Machine, columns: dict[int, Columns]) -> pl.DataFrame:
+def _sends(names: Names, machine: Machine) -> pl.DataFrame:
     """Sends are logged when they are over; an event has the time at which one began."""
-    publisher, timestamp, outcome, duration = (
-        _field(machine, at.L_SEND, field) for field in range(4)
-    )
-    sent = machine.logs[at.L_SEND][0, : len(publisher)] - duration
+    over, (publisher, timestamp, outcome, duration) = _entries(names, machine, at.L_SEND)
     return _frame(
-        {**columns[at.L_SEND], "time": pl.Series("time", sent)},
+        {**over, "time": over["time"] - duration},
         rmw_publisher_handle=names.rmw_publishers[publisher],
         timestamp=timestamp,
         outcome=np.array(WORDS["outcome"])[outcome],
@@ -277,9 +244,7 @@ def _sends(names: Names, machine: Machine, columns: dict[int, Columns]) -> pl.Da
 
 def _switches(system: System, names: Names, machine: Machine) -> pl.DataFrame:
     """What ran where: `sched_switch`, the idle thread being number 0."""
-    rows = machine.counts[at.L_SWITCH, at.A_COUNT]
-    times, following = machine.logs[at.L_SWITCH][0, :rows], machine.logs[at.L_SWITCH][1, :rows]
-    core, before, runnable = (_field(machine, at.L_SWITCH, field) for field in range(3))
+    times, following, core, before, runnable, _ = _log(machine, at.L_SWITCH)
     # One place more than threads are: NONE, the last one, is nobody.
     tids = np.append(names.tids, 0).astype(np.int32)
     pids = np.append(names.pids, 0).astype(np.int32)
@@ -314,20 +279,20 @@ def _core_rows(machine: Machine) -> at.Int64s:
 
 
 def _releases(system: System, names: Names, machine: Machine) -> pl.DataFrame:
-    rows = machine.counts[at.L_RELEASE, at.A_COUNT]
-    columns = machine.logs[at.L_RELEASE][:, :rows]
+    columns, fields = _entries(names, machine, at.L_RELEASE)
+    callback, source, arrival, release, origin, slot, cycles, stamped, overrun, mode = fields
     frame = _frame(
-        _common(names, columns[0], columns[1]),
-        callback=names.callbacks[columns[2]],
-        source_timestamp=columns[3],
-        arrival=columns[4],
-        origin=columns[6],
-        release=columns[5],
-        slot=columns[7].astype(np.int32),
-        cycles_waited=columns[8].astype(np.int32),
-        anchor=np.array(["cycle", "stamp"])[columns[9]],
-        overrun=np.array([*WORDS["overrun"], ""])[columns[10]],
-        mode=np.array([*system.modes, ""])[columns[11]],
+        columns,
+        callback=names.callbacks[callback],
+        source_timestamp=source,
+        arrival=arrival,
+        origin=origin,
+        release=release,
+        slot=slot.astype(np.int32),
+        cycles_waited=cycles.astype(np.int32),
+        anchor=np.array(["cycle", "stamp"])[stamped],
+        overrun=np.array([*WORDS["overrun"], ""])[overrun],
+        mode=np.array([*system.modes, ""])[mode],
     )
     absent = [pl.col(name).replace({NONE: None}) for name in ("release", "slot")]
     unsaid = [pl.col(name).replace({"": None}) for name in ("overrun", "mode")]

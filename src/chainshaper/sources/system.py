@@ -33,6 +33,7 @@ _RELEASES: tuple[tuple[tuple[int, int], str], ...] = (
     ((7, 0), "iron"),
     ((8, 3), "jazzy"),
     ((8, 7), "kilted"),
+    ((8, 11), "lyrical"),
 )
 _LATER = "rolling"
 

@@ -160,12 +160,8 @@ def _described_modes(modes: Modes | None) -> ModesDescription | None:
 
 
 def _remapped(node: NodeDescription, old: str, new: str) -> NodeDescription:
-    callbacks = tuple(
-        callback.model_copy(
-            update={
-                "publishes": tuple(new if topic == old else topic for topic in callback.publishes)
-            }
-        )
-        for callback in node.callbacks
-    )
-    return node.model_copy(update={"callbacks": callbacks})
+    callbacks = []
+    for callback in node.callbacks:
+        publishes = tuple(new if topic == old else topic for topic in callback.publishes)
+        callbacks.append(callback.model_copy(update={"publishes": publishes}))
+    return node.model_copy(update={"callbacks": tuple(callbacks)})

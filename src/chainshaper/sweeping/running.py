@@ -14,11 +14,11 @@ from chainshaper.durations import parse_duration
 from chainshaper.enforcement.realtime import available_cores
 from chainshaper.errors import InputError
 from chainshaper.planning import Plan
-from chainshaper.reporting.whole_file import new_file, write_whole
 from chainshaper.sweeping.grid import Grid, grid_of, is_duration, points_of
 from chainshaper.sweeping.kept_rows import Row, kept_rows, rows_beside
 from chainshaper.sweeping.points import FIGURES
 from chainshaper.sweeping.workers import groups_of, rows_from_cluster, rows_from_here
+from chainshaper.whole_file import new_file, write_whole
 from chainshaper.workload.description import Application, application_as_written
 
 __all__ = ["rows_beside", "sweep"]

@@ -81,7 +81,7 @@ def _profile_of(grid: Grid, group: Group) -> Profile | str | None:
 
 
 def _rows_from_processes(grid: Grid, groups: Sequence[Group], workers: int) -> Rows:
-    # What has to be compiled is compiled once, here, and found in Numba's cache by the others.
+    # What has to be compiled is compiled once, here, and found on disk by the others.
     _, values = groups[0].points[0]
     warm = replace(grid, cycles=WARM_UP_CYCLES)
     row_at(warm, values, _profile_of(warm, groups[0]))

@@ -19,6 +19,7 @@ run before it happens is said here, and nothing about a particular application i
 
 import re
 from collections.abc import Collection, Iterator
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -207,21 +208,18 @@ class Application(Part):
 
     @model_validator(mode="after")
     def _consistent(self) -> "Application":
-        publishers: dict[str, list[str]] = {}
-        for node, callback in self.callbacks():
-            for topic in callback.publishes:
-                publishers.setdefault(topic, []).append(node)
+        published = {topic for _, callback in self.callbacks() for topic in callback.publishes}
         for name, described in self.nodes.items():
             if not _NODE.fullmatch(name):
                 raise wrong_value("a node's name has letters, digits, _ and / only", "nodes", name)
             for number, callback in enumerate(described.callbacks):
                 where = ("nodes", name, "callbacks", number)
                 for wanted in (callback.subscription, *callback.synchronises):
-                    if wanted is not None and wanted not in publishers:
+                    if wanted is not None and wanted not in published:
                         key = "synchronises" if callback.subscription is None else "subscription"
                         raise wrong_value(
                             f"no node publishes {wanted}; published are "
-                            f"{', '.join(sorted(publishers)) or 'no topics'}",
+                            f"{', '.join(sorted(published)) or 'no topics'}",
                             *(*where, key),
                         )
                 modes = None if callback.gate is None else callback.gate.modes
@@ -231,10 +229,10 @@ class Application(Part):
                         *(*where, "gate", "modes", "topic"),
                     )
         for topic in self.topics:
-            if topic not in publishers:
+            if topic not in published:
                 raise wrong_value("is published by no node: remove it", "topics", topic)
         self._refuse_equal_names()
-        self._refuse_unknown_way_points(publishers.keys())
+        self._refuse_unknown_way_points(published)
         self._refuse_endless_cycles()
         for node in self.simulation.drift:
             if node not in self.nodes:
@@ -262,27 +260,19 @@ class Application(Part):
 
     def _refuse_endless_cycles(self) -> None:
         """No message may circle for ever."""
-        fed: dict[str, set[str]] = {}
+        order = TopologicalSorter[str]()
         for _, callback in self.callbacks():
-            for topic in (callback.subscription, *callback.synchronises):
-                if topic is not None:
-                    fed.setdefault(topic, set()).update(callback.publishes)
-        for start, nexts in fed.items():
-            path, seen = [(start, iter(sorted(nexts)))], {start}
-            while path:
-                following = next(path[-1][1], None)
-                if following is None:
-                    path.pop()
-                elif following == start:
-                    circle = " → ".join([*(topic for topic, _ in path), start])
-                    raise wrong_value(
-                        f"the topics form a cycle, in which messages would circle for ever: "
-                        f"{circle}; break it at one of these topics",
-                        "nodes",
-                    )
-                elif following not in seen:
-                    seen.add(following)
-                    path.append((following, iter(sorted(fed.get(following, ())))))
+            for topic in filter(None, (callback.subscription, *callback.synchronises)):
+                for published in callback.publishes:
+                    order.add(published, topic)
+        try:
+            order.prepare()
+        except CycleError as error:
+            raise wrong_value(
+                "the topics form a cycle, in which messages would circle for ever: "
+                f"{' → '.join(error.args[1])}; break it at one of these topics",
+                "nodes",
+            ) from error
 
     def callbacks(self) -> Iterator[tuple[str, CallbackDescription]]:
         """Every callback with the name of its node, in the order of the file."""

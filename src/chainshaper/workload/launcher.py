@@ -4,15 +4,14 @@ import contextlib
 import json
 import os
 import select
-import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import IO, Any
 
+from chainshaper.enforcement.own_processes import end_in_words, module_command
 from chainshaper.errors import OperationError
 
 __all__ = ["Child", "end_all", "first_casualty", "start_child"]
@@ -87,18 +86,10 @@ class Child:
             code = self.process.wait(timeout=2)
         except subprocess.TimeoutExpired:
             return f"{self.name} (pid {self.pid}) sends something that is not part of the protocol"
-        how = f"was killed by {_signal_name(-code)}" if code < 0 else f"ended with code {code}"
         self.errors.seek(0)
         said = self.errors.read().decode(errors="replace").strip().splitlines()
         last = f": {said[-1]}" if said else ""
-        return f"{self.name} (pid {self.pid}) {how} before the run was over{last}"
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:  # most real-time signals have no name of their own
-        return f"signal {number}"
+        return f"{self.name} (pid {self.pid}) {end_in_words(code)} before the run was over{last}"
 
 
 def start_child(
@@ -111,9 +102,7 @@ def start_child(
     errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the child
     try:
         process = subprocess.Popen(
-            [sys.executable, "-P", "-m", module, *arguments]
-            if sys.version_info >= (3, 11)
-            else [sys.executable, "-m", module, *arguments],
+            [*module_command(module), *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,

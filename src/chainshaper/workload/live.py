@@ -7,9 +7,10 @@ that end with the run, so nothing on the machine is different afterwards.
 
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -18,7 +19,6 @@ from chainshaper.enforcement.gate import clock_offset
 from chainshaper.enforcement.realtime import check_cores, may_use_fifo
 from chainshaper.enforcement.threads.listing import (
     Scheduling,
-    Thread,
     apply_scheduling,
     foreign_realtime_processes,
     list_threads,
@@ -84,7 +84,7 @@ def run_application(
     plan: dict[str, Any] | None = None,
     enforcement: Enforcement | None = None,
     command: Sequence[str] = (),
-    progress: Progress | None = None,
+    progress: Progress = lambda *_: None,
 ) -> Recording:
     """Run an application for ``cycles`` periods of its chain and record it.
 
@@ -113,8 +113,6 @@ def run_application(
         )
     reason = "the process may not use SCHED_FIFO" if not permitted else "SCHED_FIFO was declined"
     realtime = permitted if realtime is None else realtime
-    if progress is None:
-        progress = _no_progress
     nodes: dict[str, Child] = {}
     meters: dict[int, Child] = {}
     finished = False
@@ -131,7 +129,7 @@ def run_application(
         offset_before = clock_offset()
         with _enforced(enforcement, nodes, timing):
             for child in [*nodes.values(), *meters.values()]:
-                child.tell(**timing.for_processes())
+                child.tell(**asdict(timing))
             threads = _watch(nodes, meters, timing, progress)
         progress(1.0, "collecting events")
         logs = [_read_log(name, child, application) for name, child in nodes.items()]
@@ -157,10 +155,6 @@ def run_application(
         plan=plan,
     )
     return write_recording(output, tables, info)
-
-
-def _no_progress(share: float, what: str) -> None:
-    pass
 
 
 def node_name(name: str) -> str:
@@ -223,14 +217,6 @@ class _Timing:
             meter_from_ns=start + timer.phase_ns + grid,
         )
 
-    def for_processes(self) -> dict[str, int]:
-        return {
-            "start_ns": self.start_ns,
-            "last_timer_ns": self.last_timer_ns,
-            "stop_ns": self.stop_ns,
-            "meter_from_ns": self.meter_from_ns,
-        }
-
 
 def _enforced(
     enforcement: Enforcement | None, nodes: dict[str, Child], timing: _Timing
@@ -264,13 +250,9 @@ def _spec(
     application: Application, name: str, timer: CallbackDescription, domain: int
 ) -> dict[str, Any]:
     """A node's description as its process gets it: durations are ns here."""
-    writers: dict[str, int] = {}
-    readers: dict[str, int] = {}
-    for _, callback in application.callbacks():
-        for topic in callback.publishes:
-            writers[topic] = writers.get(topic, 0) + 1
-        for topic in callback.subscriptions:
-            readers[topic] = readers.get(topic, 0) + 1
+    callbacks = [callback for _, callback in application.callbacks()]
+    writers = Counter(topic for callback in callbacks for topic in callback.publishes)
+    readers = Counter(topic for callback in callbacks for topic in callback.subscriptions)
     return {
         "node": node_name(name),
         "domain": domain,
@@ -281,7 +263,7 @@ def _spec(
         "callbacks": [cb.model_dump() for cb in application.nodes[name].callbacks],
         "topics": {topic: application.topic(topic).model_dump() for topic in writers},
         "announced": sorted(application.announced()),
-        "expected": {topic: (writers[topic], readers.get(topic, 0)) for topic in writers},
+        "expected": {topic: (writers[topic], readers[topic]) for topic in writers},
     }
 
 
@@ -303,15 +285,13 @@ def _allocate_threads(application: Application, nodes: dict[str, Child], realtim
         executor, dds = application.scheduling_of(name), application.dds_scheduling_of(name)
         for thread in list_threads(child.pid):
             if thread.role == "executor":
-                wanted = (executor.core, executor.priority)
+                core, priority = executor.core, executor.priority
             elif thread.role == "publisher":
                 # Below the executor: it shares the writer's lock with it, and may spin on it.
-                wanted = (executor.core, max(1, executor.priority - 1))
+                core, priority = executor.core, max(1, executor.priority - 1)
             else:
-                wanted = (dds.core, dds.priority)
-            apply_scheduling(
-                thread, Scheduling(wanted[1] if realtime else None, cores=(wanted[0],))
-            )
+                core, priority = dds.core, dds.priority
+            apply_scheduling(thread, Scheduling(priority if realtime else None, cores=(core,)))
 
 
 def _watch(
@@ -339,29 +319,21 @@ def _watch(
 
 
 def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[ThreadInfo, ...]:
-    def info(thread: Thread, node: str, role: str) -> ThreadInfo:
-        return ThreadInfo(
+    children = [(child, node_name(name)) for name, child in nodes.items()]
+    children += [(child, "") for child in meters.values()]
+    return tuple(
+        ThreadInfo(
             tid=thread.tid,
             pid=thread.pid,
             comm=thread.comm,
             node=node,
-            role=role,
+            role=thread.role if node else "stall-meter",
             policy=thread.policy,
             priority=thread.priority,
             cores=thread.cores,
         )
-
-    return tuple(
-        [
-            info(thread, node_name(name), thread.role)
-            for name, child in nodes.items()
-            for thread in list_threads(child.pid)
-        ]
-        + [
-            info(thread, "", "stall-meter")
-            for child in meters.values()
-            for thread in list_threads(child.pid)
-        ]
+        for child, node in children
+        for thread in list_threads(child.pid)
     )
 
 

@@ -16,9 +16,9 @@ from collections.abc import Callable
 
 from chainshaper.enforcement.gate import sleep_until
 from chainshaper.enforcement.realtime import (
-    die_with_parent,
     lock_memory,
     set_thread_name,
+    signalled_with_parent,
     stop_garbage_collection,
 )
 from chainshaper.workload import protocol
@@ -82,7 +82,7 @@ def watch(
 def main() -> None:
     """Watch the core this process is put on, as the launcher says."""
     spec = protocol.receive()
-    die_with_parent(spec["parent"])
+    signalled_with_parent(spec["parent"], signal.SIGKILL)
     set_thread_name("stall-meter")
     signals: list[int] = []
     signal.signal(ENOUGH, lambda number, _: signals.append(number))

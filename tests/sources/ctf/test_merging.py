@@ -7,7 +7,7 @@ import pytest
 
 from chainshaper.sources.ctf import open_trace, read_events
 from chainshaper.sources.ctf.lttng_text import lttng_metadata
-from chainshaper.sources.ctf.machine import AHEAD
+from chainshaper.sources.ctf.tables import AHEAD
 from chainshaper.sources.ctf.tsdl import parse_tsdl
 from chainshaper.sources.ctf.writer import EventRecord, encode_packet, write_trace
 

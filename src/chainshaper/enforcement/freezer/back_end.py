@@ -33,18 +33,9 @@ from pathlib import Path
 from typing import IO
 
 from chainshaper.enforcement.freezer import cgroups
-from chainshaper.enforcement.freezer.counters import (
-    ACKNOWLEDGED,
-    LOST,
-    PROCESS,
-    REAL_TIME,
-    SUPERVISOR,
-    create_page,
-    read_counters,
-)
+from chainshaper.enforcement.freezer.counters import create_page, read_counters
 from chainshaper.enforcement.freezer.slot_boundaries import (
     Anchoring,
-    check_table,
     first_anchoring,
     next_anchoring,
 )
@@ -60,8 +51,9 @@ from chainshaper.enforcement.freezer.state import (
     save_state,
     start_log,
 )
-from chainshaper.enforcement.freezer.supervisor import how_it_ended, module_command
+from chainshaper.enforcement.own_processes import end_in_words, module_command
 from chainshaper.enforcement.servers import ServerCounters, ServerTable
+from chainshaper.enforcement.threads.listing import has_ended, start_of
 from chainshaper.errors import InputError, OperationError, PlatformError
 
 __all__ = ["Freezer", "create"]
@@ -82,11 +74,9 @@ def create(table: ServerTable, run_directory: Path) -> "Freezer":
     to one run at a time; what a run left there that was killed altogether is restored first.
 
     Raises:
-        InputError: the table contradicts itself.
         OperationError: another run is in force, or a process of ours does not start.
         PlatformError: no cgroup v2 here, a core is missing, or the folder cannot be written to.
     """
-    check_table(table)
     cgroups.mount_point()
     try:
         run_directory.mkdir(parents=True, exist_ok=True)
@@ -153,7 +143,7 @@ class Freezer:
             raise InputError(f"no server is named {server}: {', '.join(self._cores)} are")
         with self._lock:
             self._check_in_force()
-            born = cgroups.started_at(tid)
+            born = start_of(tid, tid)
             parent = self._parent_for(tid)
             group = Group(parent / self._folder_name(server), server)
             if group not in self._state.groups:
@@ -198,7 +188,7 @@ class Freezer:
 
     def counters(self) -> dict[str, ServerCounters]:
         """See :meth:`BackEnd.counters`; up to 20 ms old."""
-        return read_counters(self._page, self.table)
+        return read_counters(self._page)
 
     @property
     def supervisor(self) -> int:
@@ -208,18 +198,18 @@ class Freezer:
     @property
     def dispatchers(self) -> dict[int, int]:
         """The process id of each core's dispatcher."""
-        return {core: self._page.words[self._page.core(core) + PROCESS] for core in self._pipes}
+        return {core: self._page.cores[core].process for core in self._pipes}
 
     def real_time(self) -> bool:
         """Whether the dispatchers may be SCHED_FIFO; if not, slots open and close late."""
-        return all(self._page.words[self._page.core(core) + REAL_TIME] for core in self._pipes)
+        return all(own.real_time for own in self._page.cores.values())
 
     def failure(self) -> str | None:
         """See :meth:`BackEnd.failure`. A lost group or thread leaves the others enforced."""
         if self._failure is not None or self._ending:
             return self._failure
         for server in self.table.servers:
-            if self._page.words[self._page.server(server.name) + LOST]:
+            if self._page.servers[server.name].lost:
                 return (
                     f"somebody removed a cgroup of server {server.name}: the threads that were "
                     "in it run freely; release, and apply again"
@@ -228,8 +218,9 @@ class Freezer:
         for tid, born in list(self._born.items()):
             if tid in inside:
                 continue
-            if not cgroups.has_ended(tid, born):
-                return (
+            if not has_ended(tid, born):
+                self._watcher.join(1.0)  # it was the supervisor, perhaps, which ends then
+                return self._failure or (
                     f"somebody moved thread {tid} out of its server's cgroup: it runs freely; "
                     "release, and apply again"
                 )
@@ -285,11 +276,11 @@ class Freezer:
 
     def _wait_until_running(self) -> None:
         deadline = time.monotonic() + _START_S
-        while self._page.words[SUPERVISOR] == 0:
+        while self._page.supervisor.value == 0:
             code = self._supervisor.poll()
             if code is not None:
                 kind = PlatformError if code == PlatformError.exit_code else OperationError
-                raise kind(log_text(self.run_directory) or f"the supervisor {how_it_ended(code)}")
+                raise kind(log_text(self.run_directory) or f"the supervisor {end_in_words(code)}")
             if time.monotonic() > deadline:
                 raise OperationError(
                     f"the servers' processes did not start within {_START_S:g} s: is the machine "
@@ -346,7 +337,7 @@ class Freezer:
     def _await_answers(self, told: dict[int, int]) -> None:
         deadline = time.monotonic() + _ANSWER_S
         for core, number in told.items():
-            while self._page.words[self._page.core(core) + ACKNOWLEDGED] < number:
+            while self._page.cores[core].acknowledged < number:
                 self._check_in_force()
                 if time.monotonic() > deadline:
                     raise OperationError(
@@ -361,7 +352,7 @@ class Freezer:
         poll.register(pidfd, select.POLLIN)
         seen, still = -1, 0
         while not poll.poll(_LOOK_MS):
-            beats = self._page.words[SUPERVISOR]
+            beats = self._page.supervisor.value
             still = still + 1 if beats == seen else 0
             seen = beats
             if still >= _LOOKS_UNTIL_HUNG:
@@ -373,8 +364,8 @@ class Freezer:
         said = log_text(self.run_directory).splitlines()
         if code < 0:  # it could not say so itself
             hung = " (it hung, or was stopped)" if still >= _LOOKS_UNTIL_HUNG else ""
-            said.insert(0, f"the supervisor {how_it_ended(code)}{hung}")
-        self._failure = "; ".join(said) or f"the supervisor {how_it_ended(code)}"
+            said.insert(0, f"the supervisor {end_in_words(code)}{hung}")
+        self._failure = "; ".join(said) or f"the supervisor {end_in_words(code)}"
         with self._lock:
             if not self._released:
                 self._restore()

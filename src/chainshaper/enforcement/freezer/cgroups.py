@@ -22,11 +22,9 @@ from chainshaper.errors import OperationError, PlatformError
 __all__ = [
     "cgroup_of",
     "dissolve",
-    "has_ended",
     "make_threaded_child",
     "mount_point",
     "move_thread",
-    "started_at",
     "threads_in",
 ]
 
@@ -183,21 +181,6 @@ def dissolve(folder: Path, within_s: float = 1.0) -> str | None:
                 return f"the cgroup {folder} is left behind: {reason}"
             time.sleep(0.001)
     return None
-
-
-def started_at(tid: int) -> int | None:
-    """When a thread was born, in clock ticks after boot; None when it has ended.
-
-    Thread ids are used again: two looks at a thread are at the same thread if this is the same.
-    """
-    stat = _read(Path(f"/proc/{tid}/stat"))
-    return int(stat.rpartition(")")[2].split()[19]) if stat else None
-
-
-def has_ended(tid: int, born: int) -> bool:
-    """Whether the thread that was born then is gone, or a zombie that nobody has waited for."""
-    stat = _read(Path(f"/proc/{tid}/stat")).rpartition(")")[2].split()
-    return not stat or int(stat[19]) != born or stat[0] in {"Z", "X"}
 
 
 def _read(path: Path) -> str:

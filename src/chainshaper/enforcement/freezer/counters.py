@@ -14,59 +14,51 @@ in the machine's order, each written by one process only:
 that a dispatcher has carried out. Overruns of -1 cannot be known here.
 """
 
+import ctypes
 import mmap
 import os
 from pathlib import Path
 
 from chainshaper.enforcement.servers import ServerCounters, ServerTable
 
-__all__ = [
-    "ACKNOWLEDGED",
-    "BEATS",
-    "LATE",
-    "LONGEST",
-    "LOST",
-    "OVERRUNS",
-    "PROCESS",
-    "REAL_TIME",
-    "SLOTS",
-    "SUPERVISOR",
-    "CounterPage",
-    "create_page",
-    "open_page",
-    "read_counters",
-]
+__all__ = ["CounterPage", "create_page", "open_page", "read_counters"]
 
-SUPERVISOR = 0
-BEATS, ACKNOWLEDGED, REAL_TIME, PROCESS = range(4)
-SLOTS, LATE, LONGEST, OVERRUNS, LOST = range(5)
-_PER_CORE, _PER_SERVER = 4, 5
+
+def _numbers(*names: str) -> list[tuple[str, type[ctypes.c_int64]]]:
+    return [(name, ctypes.c_int64) for name in names]
+
+
+class _Core(ctypes.Structure):
+    beats: int
+    acknowledged: int
+    real_time: int
+    process: int
+    _fields_ = _numbers("beats", "acknowledged", "real_time", "process")
+
+
+class _Server(ctypes.Structure):
+    slots: int
+    late: int
+    longest: int
+    overruns: int
+    lost: int
+    _fields_ = _numbers("slots", "late", "longest", "overruns", "lost")
 
 
 class CounterPage:
-    """The numbers as one sequence, and where in it those of a core or a server begin."""
+    """The numbers of a table's supervisor, cores and servers, in memory that is theirs."""
 
-    def __init__(self, words: memoryview, table: ServerTable) -> None:
-        self.words = words
-        cores = sorted({server.core for server in table.servers})
-        self._cores = {core: 1 + place * _PER_CORE for place, core in enumerate(cores)}
-        first = 1 + len(cores) * _PER_CORE
-        self._servers = {
-            server.name: first + place * _PER_SERVER for place, server in enumerate(table.servers)
-        }
-
-    @property
-    def size(self) -> int:
-        """Bytes that it takes."""
-        return 8 * (1 + len(self._cores) * _PER_CORE + len(self._servers) * _PER_SERVER)
-
-    def core(self, core: int) -> int:
-        """Where the numbers of a core's dispatcher begin."""
-        return self._cores[core]
-
-    def server(self, name: str) -> int:
-        """Where the numbers of a server begin."""
-        return self._servers[name]
+    def __init__(self, memory: mmap.mmap, table: ServerTable) -> None:
+        place = ctypes.sizeof(ctypes.c_int64)
+        self.supervisor = ctypes.c_int64.from_buffer(memory)
+        self.cores: dict[int, _Core] = {}
+        for core in sorted({server.core for server in table.servers}):
+            self.cores[core] = _Core.from_buffer(memory, place)
+            place += ctypes.sizeof(_Core)
+        self.servers: dict[str, _Server] = {}
+        for server in table.servers:
+            self.servers[server.name] = _Server.from_buffer(memory, place)
+            place += ctypes.sizeof(_Server)
 
 
 def create_page(path: Path, table: ServerTable) -> tuple[CounterPage, int]:
@@ -75,7 +67,8 @@ def create_page(path: Path, table: ServerTable) -> tuple[CounterPage, int]:
     Returns the file descriptor as well: closing it makes the link lead nowhere.
     """
     memory = os.memfd_create(path.name)
-    os.truncate(memory, CounterPage(memoryview(b""), table).size)
+    each = ctypes.sizeof(_Core) + ctypes.sizeof(_Server)  # there are not more cores than servers
+    os.truncate(memory, ctypes.sizeof(ctypes.c_int64) + each * len(table.servers))
     path.unlink(missing_ok=True)
     path.symlink_to(f"/proc/{os.getpid()}/fd/{memory}")
     return open_page(path, table), memory
@@ -88,16 +81,14 @@ def open_page(path: Path, table: ServerTable) -> CounterPage:
         OSError: its owner has ended, or belongs to another user.
     """
     with path.open("r+b") as file:
-        return CounterPage(memoryview(mmap.mmap(file.fileno(), 0)).cast("q"), table)
+        return CounterPage(mmap.mmap(file.fileno(), 0), table)
 
 
-def read_counters(page: CounterPage, table: ServerTable) -> dict[str, ServerCounters]:
+def read_counters(page: CounterPage) -> dict[str, ServerCounters]:
     """The counters of every server, as :meth:`BackEnd.counters` gives them."""
-    found = {}
-    for server in table.servers:
-        place = page.server(server.name)
-        slots, late, longest, overruns, _ = page.words[place : place + _PER_SERVER].tolist()
-        found[server.name] = ServerCounters(
-            slots, late, longest, overruns if overruns >= 0 else None
+    return {
+        name: ServerCounters(
+            its.slots, its.late, its.longest, its.overruns if its.overruns >= 0 else None
         )
-    return found
+        for name, its in page.servers.items()
+    }

@@ -15,15 +15,10 @@ servers wait, closed, for less than that.
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from chainshaper.enforcement.servers import ServerTable
-from chainshaper.errors import InputError
-
 __all__ = [
     "Anchoring",
     "Boundary",
     "boundaries_of",
-    "check_slots",
-    "check_table",
     "first_anchoring",
     "instants",
     "moved",
@@ -53,37 +48,6 @@ class Anchoring:
 
     begin_ns: int
     end_ns: int
-
-
-def check_slots(name: str, slots: tuple[tuple[int, int], ...], cycle_ns: int) -> None:
-    """Refuse slots that no cycle could have.
-
-    Raises:
-        InputError: a slot is empty, out of order or outside the cycle.
-    """
-    previous = 0
-    for start, end in slots:
-        if not previous <= start < end <= cycle_ns:
-            raise InputError(
-                f"server {name}: slot [{start}, {end}) ns must come after the slot before it and "
-                f"lie within the cycle of {cycle_ns} ns; correct the plan"
-            )
-        previous = end
-
-
-def check_table(table: ServerTable) -> None:
-    """Refuse a table that contradicts itself.
-
-    Raises:
-        InputError: it has no servers or no cycle time, two have one name, or see `check_slots`.
-    """
-    names = [server.name for server in table.servers]
-    if not names or table.cycle_ns <= 0:
-        raise InputError("a table of servers needs a cycle time and at least one server")
-    for server in table.servers:
-        if names.count(server.name) > 1:
-            raise InputError(f"two servers are named {server.name}: rename one")
-        check_slots(server.name, server.slots, table.cycle_ns)
 
 
 def boundaries_of(

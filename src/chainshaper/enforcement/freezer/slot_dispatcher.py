@@ -30,19 +30,7 @@ from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
 
-from chainshaper.enforcement.freezer.counters import (
-    ACKNOWLEDGED,
-    BEATS,
-    LATE,
-    LONGEST,
-    LOST,
-    OVERRUNS,
-    PROCESS,
-    REAL_TIME,
-    SLOTS,
-    CounterPage,
-    open_page,
-)
+from chainshaper.enforcement.freezer.counters import CounterPage, open_page
 from chainshaper.enforcement.freezer.slot_boundaries import (
     Anchoring,
     Boundary,
@@ -83,9 +71,8 @@ class Dispatcher:
         self.cycle_ns = table.cycle_ns
         self.boundaries = boundaries_of(table.cycle_ns, tuple(s.slots for s in servers))
         self.places = {server.name: number for number, server in enumerate(servers)}
-        self.counters = [page.server(server.name) for server in servers]
-        self.own = page.core(core)
-        self.words = page.words
+        self.counters = [page.servers[server.name] for server in servers]
+        self.own = page.cores[core]
         self.commands = commands
         self.heard = b""
         self.groups: list[dict[str, OpenGroup]] = [{} for _ in servers]
@@ -143,7 +130,10 @@ class Dispatcher:
     def _note(self, boundary: Boundary, closed: list[int], lateness: int) -> None:
         """What a switch has to leave behind for later."""
         for server in boundary.starts:
-            self._count(self.counters[server], lateness)
+            counters = self.counters[server]
+            counters.slots += 1
+            counters.late += lateness > LATE_NS
+            counters.longest = max(counters.longest, lateness)
         if self.open is not None:
             self.unexamined.update(closed)
         self.open = boundary.open
@@ -164,7 +154,7 @@ class Dispatcher:
                 del self.groups[server][folder]
                 os.close(group.freeze)
                 os.close(group.threads)
-                self.words[self.counters[server] + LOST] += 1
+                self.counters[server].lost += 1
 
     def _tick_until_boundary(self) -> None:
         """Tick once, and on and on until the boundary is near.
@@ -190,17 +180,11 @@ class Dispatcher:
 
     def _give_sign(self, now: int) -> None:
         """Show that we live. After long without that, the supervisor has thawed what we closed."""
-        self.words[self.own + BEATS] += 1
+        self.own.beats += 1
         if now - self.last_sign > _THAWED_AFTER_NS and self.open is not None:
             for server in sorted(set(range(len(self.groups))) - self.open):
                 self._write(server, b"1")
         self.last_sign = now
-
-    def _count(self, counters: int, lateness: int) -> None:
-        self.words[counters + SLOTS] += 1
-        if lateness > LATE_NS:
-            self.words[counters + LATE] += 1
-        self.words[counters + LONGEST] = max(self.words[counters + LONGEST], lateness)
 
     def _examine(self) -> None:
         """Count overruns of servers that have closed, as soon as their threads have stopped."""
@@ -208,17 +192,16 @@ class Dispatcher:
             if self.open is None or server in self.open:
                 self.unexamined.discard(server)  # open again before anybody could look
                 continue
-            place = self.counters[server] + OVERRUNS
             try:
                 wanted_to_run = overrun(group.threads for group in self.groups[server].values())
             except PermissionError:
-                self.words[place] = -1
+                self.counters[server].overruns = -1
                 self.unexamined.discard(server)
                 continue
             if wanted_to_run is not None:
                 self.unexamined.discard(server)
-            if wanted_to_run and self.words[place] >= 0:
-                self.words[place] += 1
+            if wanted_to_run and self.counters[server].overruns >= 0:
+                self.counters[server].overruns += 1
 
     def _obey(self) -> None:
         """Carry out the owner's commands."""
@@ -237,7 +220,7 @@ class Dispatcher:
                 self._add(self.places[command["server"]], command["folder"])
             else:
                 self._move(Anchoring(command["begin_ns"], command["end_ns"]))
-            self.words[self.own + ACKNOWLEDGED] = command["number"]
+            self.own.acknowledged = command["number"]
 
     def _add(self, server: int, folder: str) -> None:
         try:
@@ -246,7 +229,7 @@ class Dispatcher:
                 os.open(f"{folder}/cgroup.threads", os.O_RDONLY | os.O_CLOEXEC),
             )
         except OSError:  # somebody was quick to remove it
-            self.words[self.counters[server] + LOST] += 1
+            self.counters[server].lost += 1
             return
         closed = self.open is not None and server not in self.open
         self._write(server, b"1" if closed else b"0")
@@ -328,8 +311,8 @@ def main() -> None:
     dispatcher = Dispatcher(state.table, core, page, commands)
     set_thread_name(f"dispatcher/{core}")
     try:
-        page.words[dispatcher.own + REAL_TIME] = become_real_time(core)
-        page.words[dispatcher.own + PROCESS] = os.getpid()
+        dispatcher.own.real_time = become_real_time(core)
+        dispatcher.own.process = os.getpid()
         dispatcher.run()
     except OperationError as error:
         sys.stderr.write(f"dispatcher of core {core}: {error}\n")

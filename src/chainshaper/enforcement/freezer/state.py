@@ -59,14 +59,8 @@ class FreezerState:
 
 def save_state(run_directory: Path, state: FreezerState) -> None:
     """Write the file beside and rename it: it is whole at every instant."""
-    content = {
-        "owner": state.owner,
-        "cycle_ns": state.table.cycle_ns,
-        "servers": [asdict(server) for server in state.table.servers],
-        "groups": [{"folder": str(g.folder), "server": g.server} for g in state.groups],
-    }
     partial = run_directory / f"{STATE}.partial"
-    partial.write_text(json.dumps(content, indent=1))
+    partial.write_text(json.dumps(asdict(state), indent=1, default=str))
     partial.replace(run_directory / STATE)
 
 
@@ -80,16 +74,12 @@ def load_state(run_directory: Path) -> FreezerState | None:
     try:
         content = json.loads(path.read_text())
         servers = tuple(
-            ReservationServer(
-                server["name"],
-                server["core"],
-                server["priority"],
-                tuple((start, end) for start, end in server["slots"]),
-            )
-            for server in content["servers"]
+            ReservationServer(**{**one, "slots": tuple(map(tuple, one["slots"]))})
+            for one in content["table"]["servers"]
         )
         groups = tuple(Group(Path(g["folder"]), g["server"]) for g in content["groups"])
-        return FreezerState(content["owner"], ServerTable(content["cycle_ns"], servers), groups)
+        table = ServerTable(content["table"]["cycle_ns"], servers)
+        return FreezerState(content["owner"], table, groups)
     except FileNotFoundError:
         return None
     except (ValueError, KeyError, TypeError) as error:

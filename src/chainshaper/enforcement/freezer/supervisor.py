@@ -28,7 +28,7 @@ import time
 from pathlib import Path
 from types import FrameType
 
-from chainshaper.enforcement.freezer.counters import BEATS, SUPERVISOR, CounterPage, open_page
+from chainshaper.enforcement.freezer.counters import CounterPage, open_page
 from chainshaper.enforcement.freezer.state import (
     COUNTERS,
     load_state,
@@ -36,10 +36,11 @@ from chainshaper.enforcement.freezer.state import (
     restore,
     thaw,
 )
+from chainshaper.enforcement.own_processes import end_in_words, module_command
 from chainshaper.enforcement.realtime import set_thread_name
 from chainshaper.errors import ChainshaperError, OperationError, PlatformError
 
-__all__ = ["main", "module_command"]
+__all__ = ["main"]
 
 PRIORITY = 98
 LOOK_S = 0.02
@@ -50,12 +51,6 @@ _START_S = 10.0
 
 class _EndAsked(BaseException):
     """The owner asks for the end (SIGTERM)."""
-
-
-def module_command(module: str) -> list[str]:
-    """How a module is run as a process that does not import from the user's current folder."""
-    safe_path = ["-P"] if sys.version_info >= (3, 11) else []
-    return [sys.executable, *safe_path, "-m", module]
 
 
 def _start(run_directory: Path, core: int, commands: int) -> subprocess.Popen[bytes]:
@@ -76,26 +71,17 @@ def _wait_until_running(page: CounterPage, dispatchers: dict[int, subprocess.Pop
     """
     deadline = time.monotonic() + _START_S
     for core, process in dispatchers.items():
-        while page.words[page.core(core) + BEATS] == 0:
+        while page.cores[core].beats == 0:
             code = process.poll()
             if code is not None:
                 kind = PlatformError if code == PlatformError.exit_code else OperationError
-                raise kind(f"the dispatcher of core {core} {how_it_ended(code)} at its start")
+                raise kind(f"the dispatcher of core {core} {end_in_words(code)} at its start")
             if time.monotonic() > deadline:
                 raise OperationError(
                     f"the dispatcher of core {core} did not start within {_START_S:g} s: is a "
                     "real-time process keeping that core from everybody?"
                 )
             time.sleep(0.002)
-
-
-def how_it_ended(code: int) -> str:
-    """A return code of subprocess in words."""
-    if code >= 0:
-        return f"ended with code {code}"
-    with contextlib.suppress(ValueError):
-        return f"was killed by {signal.Signals(-code).name}"
-    return f"was killed by signal {-code}"
 
 
 def _watch(
@@ -113,14 +99,14 @@ def _watch(
     seen = dict.fromkeys(dispatchers, -1)
     still = dict.fromkeys(dispatchers, 0)
     while True:
-        page.words[SUPERVISOR] += 1
+        page.supervisor.value += 1
         for ended, _ in poll.poll(LOOK_S * 1000):
             if ended == owner:
                 return "the owner has ended without releasing the servers"
             core = pidfds[ended]
-            return f"the dispatcher of core {core} {how_it_ended(dispatchers[core].wait())}"
+            return f"the dispatcher of core {core} {end_in_words(dispatchers[core].wait())}"
         for core in dispatchers:
-            beats = page.words[page.core(core) + BEATS]
+            beats = page.cores[core].beats
             still[core] = still[core] + 1 if beats == seen[core] else 0
             seen[core] = beats
             if still[core] == LOOKS_UNTIL_THAWED:

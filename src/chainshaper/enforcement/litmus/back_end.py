@@ -27,8 +27,8 @@ from chainshaper.enforcement.litmus.resctl import (
     plugin_command,
     reservation_ids,
 )
-from chainshaper.enforcement.runs.journal import Journal, discard_journal, open_journal
-from chainshaper.enforcement.runs.scheduling_memory import note_scheduling, restore_scheduling
+from chainshaper.enforcement.runs.journal import Journal
+from chainshaper.enforcement.runs.scheduling_memory import note_scheduling, release_threads
 from chainshaper.enforcement.runs.scheduling_state import SchedulingClass, state_of
 from chainshaper.enforcement.servers import ServerCounters, ServerTable
 from chainshaper.enforcement.threads.listing import find_thread
@@ -42,11 +42,10 @@ NOTE = "litmus-plugin"
 COMMAND_S = 10.0
 
 
-def create(table: ServerTable, journal: Journal | None = None, proc: Path = PROC) -> "Litmus":
+def create(table: ServerTable, journal: Journal, proc: Path = PROC) -> "Litmus":
     """Prepare servers; nothing is changed before :meth:`Litmus.arm`.
 
-    What was there is kept in ``journal``; without one, in a journal of its own that is discarded
-    with the release. ``proc`` is where LITMUS^RT shows itself.
+    What was there is kept in ``journal``. ``proc`` is where LITMUS^RT shows itself.
 
     Raises:
         PlatformError: the kernel is not LITMUS^RT, or its tools are not installed.
@@ -79,10 +78,9 @@ class Litmus:
 
     name = "litmus"
 
-    def __init__(self, table: ServerTable, journal: Journal | None, proc: Path) -> None:
+    def __init__(self, table: ServerTable, journal: Journal, proc: Path) -> None:
         self._table = table
         self._journal = journal
-        self._owns_journal = journal is None
         self._proc = proc
         self._members: dict[int, str] = {}
         self._ids: dict[str, int] = {}
@@ -108,8 +106,6 @@ class Litmus:
         Raises:
             OperationError: LITMUS^RT refuses; what was done before stays until the release.
         """
-        if self._journal is None:
-            self._journal = open_journal()
         if not self._ids:
             self._journal.note(NOTE, previous=_active_plugin(self._proc), proc=str(self._proc))
             _run(plugin_command(PLUGIN))
@@ -125,8 +121,7 @@ class Litmus:
 
     def counters(self) -> dict[str, ServerCounters]:
         """Nothing is counted: LITMUS^RT does not tell."""
-        nothing = ServerCounters(None, None, None, None)
-        return {server.name: nothing for server in self._table.servers}
+        return {server.name: ServerCounters() for server in self._table.servers}
 
     def failure(self) -> str | None:
         """Whether somebody has changed the plugin."""
@@ -140,25 +135,11 @@ class Litmus:
         Raises:
             OperationError: the kernel refuses; the message says what is left.
         """
-        if self._journal is None:
-            return
-        outcomes = restore_scheduling(self._journal)
         self._ids = {}
-        failed = [
-            f"{one.tid} ({one.comm}): {one.reason}" for one in outcomes if one.fate == "failed"
-        ]
-        if failed:
-            raise OperationError(
-                f"threads that could not be put back: {'; '.join(failed)}; {self._journal.path} "
-                "says what they had"
-            )
+        release_threads(self._journal)
         restore_plugin(self._journal)
-        if self._owns_journal:
-            discard_journal(self._journal)
-            self._journal = None
 
     def _attach(self, tid: int) -> None:
-        assert self._journal is not None  # noqa: S101 - armed
         thread = find_thread(tid)
         if thread is None:
             return

@@ -28,12 +28,10 @@ __all__ = [
     "Command",
     "attach_command",
     "create_command",
-    "detach_command",
     "interval_text",
     "litmus_commands",
     "milliseconds_text",
     "plugin_command",
-    "release_commands",
     "reservation_ids",
     "turned",
 ]
@@ -68,12 +66,6 @@ def litmus_commands(
             for tid in members.get(server.name, ())
         ),
     )
-
-
-def release_commands(tids: Iterable[int], previous: str = NO_PLUGIN) -> tuple[Command, ...]:
-    """All commands that end it: threads first, then the plugin, and with it all reservations."""
-    back = () if previous == NO_PLUGIN else (plugin_command(previous),)
-    return (*(detach_command(tid) for tid in tids), plugin_command(NO_PLUGIN), *back)
 
 
 def reservation_ids(table: ServerTable, generation: int = 0) -> dict[str, int]:
@@ -120,11 +112,6 @@ def create_command(
 def attach_command(tid: int | str, number: int, core: int) -> Command:
     """Move a running thread to the core, and into its reservation."""
     return ("resctl", "-a", str(tid), "-r", str(number), "-c", str(core))
-
-
-def detach_command(tid: int) -> Command:
-    """Take a thread out of its reservation: back to SCHED_OTHER, by the tool of util-linux."""
-    return ("chrt", "--other", "--pid", "0", str(tid))
 
 
 def interval_text(start_ns: int, end_ns: int) -> str:

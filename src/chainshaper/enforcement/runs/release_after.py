@@ -13,15 +13,42 @@ import select
 import signal
 import subprocess
 import sys
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
+from chainshaper.enforcement.own_processes import module_command
+from chainshaper.enforcement.runs.claims import claim_run
 from chainshaper.enforcement.runs.journal import FILE, Journal
-from chainshaper.enforcement.runs.state import undo_run
+from chainshaper.enforcement.runs.scheduling_memory import release_threads
+from chainshaper.enforcement.runs.state import remove_run, undo_run
 from chainshaper.errors import OperationError
 
-__all__ = ["start_watching"]
+__all__ = ["run_claimed", "start_watching"]
 
 _START_S = 20.0
+
+
+@contextlib.contextmanager
+def run_claimed(
+    cores: Collection[int], nodes: Collection[str], folder: Path | None = None
+) -> Iterator[Journal]:
+    """A run that governs these, watched over: all in its journal is as before when it is over.
+
+    Raises:
+        OperationError, PlatformError: see :func:`.claim_run`, :func:`start_watching` and
+            :func:`.release_threads`.
+    """
+    journal = claim_run(cores, nodes, folder)
+    watcher = None
+    try:
+        watcher = start_watching(journal.path.parent)
+        yield journal
+    finally:
+        release_threads(journal)
+        remove_run(journal)
+        if watcher is not None:
+            watcher.kill()
+            watcher.wait()
 
 
 def start_watching(folder: Path) -> subprocess.Popen[bytes]:
@@ -33,7 +60,7 @@ def start_watching(folder: Path) -> subprocess.Popen[bytes]:
     reading, writing = os.pipe()
     try:
         watcher = subprocess.Popen(
-            [sys.executable, "-m", __name__, str(os.getpid()), str(folder), str(writing)],
+            [*module_command(__name__), str(os.getpid()), str(folder), str(writing)],
             pass_fds=(writing,),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,

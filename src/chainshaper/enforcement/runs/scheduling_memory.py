@@ -49,6 +49,7 @@ __all__ = [
     "change_scheduling",
     "is_remembered",
     "note_scheduling",
+    "release_threads",
     "restore_inherited",
     "restore_scheduling",
 ]
@@ -170,6 +171,21 @@ def restore_scheduling(journal: Journal) -> tuple[Outcome, ...]:
         return ()
     restored = tuple(_restore(one) for one in reversed(_remembered(journal)))
     return restored + restore_inherited(journal)
+
+
+def release_threads(journal: Journal) -> None:
+    """:func:`restore_scheduling`, where all has to be put back.
+
+    Raises:
+        OperationError: the kernel refuses for some threads; the others are as before.
+    """
+    left = [one for one in restore_scheduling(journal) if one.fate == "failed"]
+    if left:
+        raise OperationError(
+            "not everything could be put back: "
+            f"{'; '.join(f'{one.tid} ({one.comm}): {one.reason}' for one in left)}; {journal.path} "
+            "says what was there, `chainshaper release` tries again"
+        )
 
 
 def restore_inherited(journal: Journal) -> tuple[Outcome, ...]:

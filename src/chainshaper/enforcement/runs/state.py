@@ -20,7 +20,7 @@ from typing import Any
 from chainshaper.enforcement.freezer import state as freezer_state
 from chainshaper.enforcement.litmus import back_end as litmus
 from chainshaper.enforcement.runs.journal import Journal, discard_journal, find_journals
-from chainshaper.enforcement.runs.scheduling_memory import restore_scheduling
+from chainshaper.enforcement.runs.scheduling_memory import release_threads
 from chainshaper.enforcement.servers import ServerCounters
 from chainshaper.errors import OperationError, PlatformError
 
@@ -155,9 +155,9 @@ def undo_run(journal: Journal) -> tuple[str, ...]:
     with _locked(journal.path.parent):
         if not journal.path.exists():
             return ()
-        for undo in (_thaw, _restore_threads, _back_to_former_plugin):
+        for undo in (_thaw, release_threads, litmus.restore_plugin):
             try:
-                left += undo(journal)
+                undo(journal)
             except (OperationError, PlatformError) as error:
                 left.append(str(error))
         if not left:
@@ -188,35 +188,17 @@ def _locked(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def _thaw(journal: Journal) -> list[str]:
+def _thaw(journal: Journal) -> None:
     # The freezer's own supervisor may be at it: it holds the folder's lock until it is done.
     deadline = time.monotonic() + 5
     while True:
         try:
             freezer_state.clean_up(journal.path.parent)
+            return
         except OperationError:
             if time.monotonic() > deadline:
                 raise
             time.sleep(0.05)
-        else:
-            return []
-
-
-def _back_to_former_plugin(journal: Journal) -> list[str]:
-    if not journal.outdated:
-        litmus.restore_plugin(journal)
-    return []
-
-
-def _restore_threads(journal: Journal) -> list[str]:
-    if journal.outdated:
-        return []
-    outcomes = restore_scheduling(journal)
-    return [
-        f"thread {one.tid} ({one.comm}) could not be put back: {one.reason}"
-        for one in outcomes
-        if one.fate == "failed"
-    ]
 
 
 def _from_json(content: dict[str, Any]) -> RunState:

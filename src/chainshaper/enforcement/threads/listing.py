@@ -24,6 +24,7 @@ __all__ = [
     "apply_scheduling",
     "find_thread",
     "foreign_realtime_processes",
+    "has_ended",
     "innermost_id",
     "list_threads",
     "parents",
@@ -196,6 +197,15 @@ def start_of(pid: int, tid: int) -> int | None:
         return int(_stat(f"/proc/{pid}/task/{tid}")[1][19])
     except OSError:
         return None
+
+
+def has_ended(tid: int, started: int) -> bool:
+    """Whether the thread that started then is gone, or a zombie that nobody has waited for."""
+    try:
+        fields = _stat(f"/proc/{tid}")[1]
+    except OSError:
+        return True
+    return int(fields[19]) != started or fields[0] in {b"Z", b"X"}
 
 
 def apply_scheduling(thread: Thread, wanted: Scheduling) -> None:

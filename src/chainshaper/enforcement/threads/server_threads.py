@@ -16,14 +16,15 @@ On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DES
 The result is a list that can be looked at before anything is done.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain as joined
 
+from chainshaper.enforcement.servers import ReservationServer
 from chainshaper.enforcement.threads.allocation import Allocation, NodeThread
 from chainshaper.enforcement.threads.listing import Scheduling
 from chainshaper.errors import InputError, OperationError
-from chainshaper.planning.plan import Plan
+from chainshaper.planning.plan import Plan, Server, shaping_nodes
 from chainshaper.planning.plan import Thread as PlannedThread
 
 __all__ = [
@@ -114,18 +115,15 @@ def plan_scheduling(
         InputError: see :func:`server_priorities`.
     """
     members = server_members(plan, allocation)
-    cores = {server.name: server.core for server in plan.servers}
-    priorities = {server.name: server.priority for server in plan.servers}
     receiving = _receiving(plan, members, allocation)
     return scheduling_around(
-        members, cores, priorities, allocation, available_cores, receiving=receiving
+        members, plan.servers, allocation, available_cores, receiving=receiving
     )
 
 
 def scheduling_around(
     members: Mapping[str, Sequence[NodeThread]],
-    cores: Mapping[str, int],
-    priorities: Mapping[str, int],
+    servers: Collection[Server | ReservationServer],
     allocation: Allocation,
     available_cores: Sequence[int],
     *,
@@ -133,14 +131,14 @@ def scheduling_around(
 ) -> tuple[WantedScheduling, ...]:
     """What the threads of servers, and the others of their processes, shall get.
 
-    ``members``, ``cores`` and ``priorities`` are by server's name. ``receiving`` is what threads
+    ``members`` are by server's name. ``receiving`` is what threads
     that receive an output shall get, whose processes are treated alike.
 
     Raises:
         OperationError: a thread cannot leave the core of a publisher that would outrank it.
         InputError: see :func:`server_priorities`.
     """
-    own = wanted_of_members(members, cores, priorities)
+    own = wanted_of_members(members, servers)
     ours = [*joined.from_iterable(members.values()), *(one.thread for one in receiving)]
     pids = {member.thread.pid for member in ours}
     planned = {member.thread.identity for member in ours}
@@ -149,7 +147,7 @@ def scheduling_around(
         for thread in allocation.threads
         if thread.thread.pid in pids and thread.thread.identity not in planned
     ]
-    free_cores = tuple(sorted(set(available_cores) - set(cores.values())))
+    free_cores = tuple(sorted(set(available_cores) - {server.core for server in servers}))
     beside = _dds_threads(others, free_cores)
     return below_their_siblings((*own, *receiving, *beside, *_out_of_the_way(own, others)))
 
@@ -180,23 +178,21 @@ def left_by_back_end(
 
 
 def wanted_of_members(
-    members: Mapping[str, Sequence[NodeThread]],
-    cores: Mapping[str, int],
-    priorities: Mapping[str, int],
+    members: Mapping[str, Sequence[NodeThread]], servers: Collection[Server | ReservationServer]
 ) -> tuple[WantedScheduling, ...]:
-    """Class, priority and core of servers' threads; the three mappings are by server's name."""
-    ranks = server_priorities(priorities.values())
+    """Class, priority and core of servers' threads; ``members`` are by server's name."""
+    ranks = server_priorities(server.priority for server in servers)
     return tuple(
         WantedScheduling(
             member,
             Scheduling(
-                ranks[priorities[server]], (cores[server],), takes_turns=len(members[server]) > 1
+                ranks[server.priority], (server.core,), takes_turns=len(members[server.name]) > 1
             ),
-            server,
-            f"server priority {priorities[server]}",
+            server.name,
+            f"server priority {server.priority}",
         )
-        for server in sorted(members, key=lambda name: priorities[name])
-        for member in members[server]
+        for server in sorted(servers, key=lambda one: one.priority)
+        for member in members[server.name]
     )
 
 
@@ -206,21 +202,18 @@ def below_their_siblings(wanted: Sequence[WantedScheduling]) -> tuple[WantedSche
     for one in wanted:
         thread, core = one.thread.thread, (one.wanted.cores or (None,))[0]
         siblings = [
-            other.wanted.priority
+            other.wanted.priority - 1
             for other in wanted
             if other.thread.thread.pid == thread.pid
             and other.thread.thread.role != "publisher"
             and other.wanted.priority is not None
             and core in (other.wanted.cores or other.thread.thread.cores)
         ]
-        priority = one.wanted.priority
-        if thread.role == "publisher" and priority is not None and siblings:
-            below = min(siblings) - 1
-            if below < priority:
-                scheduling = Scheduling(max(1, below), one.wanted.cores, one.wanted.takes_turns)
-                reason = "below its siblings, whose locks it spins on"
-                lowered.append(WantedScheduling(one.thread, scheduling, one.server, reason))
-                continue
+        below = max(1, min(siblings, default=99))
+        if thread.role == "publisher" and below < (one.wanted.priority or 0):
+            scheduling = replace(one.wanted, priority=below)
+            reason = "below its siblings, whose locks it spins on"
+            one = replace(one, wanted=scheduling, reason=reason)  # noqa: PLW2901
         lowered.append(one)
     return tuple(lowered)
 
@@ -256,12 +249,7 @@ def _receiving(
     """The executors of nodes that receive an output, unless they are in a server themselves."""
     planned = {one.thread.identity for group in members.values() for one in group}
     below = min(server_priorities(server.priority for server in plan.servers).values()) - STEP
-    cores = {
-        receiver: node.core
-        for node in (plan.shaping_node, *plan.further_shaping_nodes)
-        if node is not None
-        for receiver in node.receivers
-    }
+    cores = {receiver: node.core for node in shaping_nodes(plan) for receiver in node.receivers}
     return [
         WantedScheduling(one, Scheduling(max(1, below), (core,)), None, RECEIVES)
         for one in allocation.threads

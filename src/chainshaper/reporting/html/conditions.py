@@ -9,6 +9,7 @@ import polars as pl
 from chainshaper.exploration import event_counts, lost_text
 from chainshaper.recording import Recording, ThreadInfo
 from chainshaper.reporting.html.markup import details, listed, table
+from chainshaper.reporting.html.told import Told
 from chainshaper.steps import Measurement
 
 __all__ = ["condition_tables", "note_lists"]
@@ -16,11 +17,12 @@ __all__ = ["condition_tables", "note_lists"]
 UNKNOWN = "unknown"
 
 
-def condition_tables(measurements: Sequence[Measurement], names: Sequence[str]) -> str:
+def condition_tables(told: Sequence[Told]) -> str:
     """One column per recording; threads, as the kernel reported them, below."""
+    measurements = [one.measurement for one in told]
     recordings = [measurement.recording for measurement in measurements]
     infos = [recording.info for recording in recordings]
-    every = list(range(1, len(names) + 1))
+    every = list(range(1, len(told) + 1))
     rows = [
         ["folder", *(str(recording.path) for recording in recordings)],
         ["first cycle", *(_begun(measurement) for measurement in measurements)],
@@ -38,21 +40,17 @@ def condition_tables(measurements: Sequence[Measurement], names: Sequence[str]) 
         ["plan in force", *(_plan(measurement) for measurement in measurements)],
     ]
     threads = [
-        details(f"Threads of {name} ({len(info.threads)})", _threads(info.threads))
-        for name, info in zip(names, infos, strict=True)
+        details(f"Threads of {one.name} ({len(info.threads)})", _threads(info.threads))
+        for one, info in zip(told, infos, strict=True)
         if info.threads
     ]
-    return "\n".join([table(["", *names], rows, words=every), *threads])
+    return "\n".join([table(["", *(one.name for one in told)], rows, words=every), *threads])
 
 
-def note_lists(measurements: Sequence[Measurement], names: Sequence[str]) -> str:
+def note_lists(told: Sequence[Told]) -> str:
     """What a reader of the figures must know, recording by recording."""
-    lines = [
-        f"{name}: {note}"
-        for name, measurement in zip(names, measurements, strict=True)
-        for note in dict.fromkeys(measurement.analysis.notes)
-    ]
-    return listed(lines)
+    notes = [(one.name, dict.fromkeys(one.measurement.analysis.notes)) for one in told]
+    return listed([f"{name}: {note}" for name, own in notes for note in own])
 
 
 _YES_NO = {True: "yes", False: "no", None: UNKNOWN}

@@ -38,25 +38,21 @@ def timeline_data(
     windows = _windows(traversals.filter(pl.col("traversal").is_in(kept)), timeline)
     began, ended = windows
     slices = _inside(timeline.slices, began, ended)
-    threads = timeline.threads
-    lane_of = {key: lane for lane, key in enumerate(threads.select("pid", "tid").iter_rows())}
-    lanes = [lane_of[key] for key in slices.select("pid", "tid").iter_rows()]
+    lanes = timeline.threads.select("pid", "tid").with_row_index("lane")
+    slices = slices.join(lanes, on=["pid", "tid"], how="left", maintain_order="left")
     names = {callback.id: callback.label for callback in measurement.analysis.graph.callbacks}
-    used = slices["callback_id"].unique().sort().to_list()
-    number_of = {callback: number for number, callback in enumerate(used)}
+    used, numbers = np.unique(slices["callback_id"].to_numpy(), return_inverse=True)
     return {
-        "threads": [
-            [nodes, about or ""] for nodes, about in threads.select("nodes", "about").iter_rows()
-        ],
-        "callbacks": [names[callback] for callback in used],
-        "lane": lanes,
-        "callback": [number_of[callback] for callback in slices["callback_id"]],
+        "threads": timeline.threads.select("nodes", pl.col("about").fill_null("")).rows(),
+        "callbacks": [names[callback] for callback in used.tolist()],
+        "lane": slices["lane"].to_list(),
+        "callback": numbers.tolist(),
         "start": (slices["start"] - zero).to_list(),
         "length": (slices["end"] - slices["start"]).to_list(),
         "used": slices["execution_ns"].to_list(),
         "unended": np.flatnonzero(~slices["ended"].to_numpy()).tolist(),
         "windows": np.column_stack([began - zero, ended - zero]).tolist(),
-        "cycles": _cycles(measurement, timeline, kept, lane_of, zero),
+        "cycles": _cycles(measurement, timeline, kept, lanes, zero),
         "of": traversals.height,
         "chosen": _chosen(traversals),
         "stalls": _stalls(timeline, began, ended, zero),
@@ -125,67 +121,54 @@ def _cycles(
     measurement: Measurement,
     timeline: Timeline,
     kept: Sequence[int],
-    lane_of: dict[tuple[Any, ...], int],
+    lanes: pl.DataFrame,
     zero: int,
 ) -> list[dict[str, Any]]:
     """Each kept cycle; its hops ``[lane, take, start, publish, end]`` count from its start."""
-    analysis = measurement.analysis
-    threads = timeline.slices.select("instance", "pid", "tid")
+    cycles = measurement.analysis.traversals.filter(pl.col("traversal").is_in(kept))
+    times = (pl.col(name) - pl.col("begun") for name in ("take", "start", "publish", "end"))
     hops = (
-        analysis.hops.filter(pl.col("traversal").is_in(kept))
-        .join(threads, on="instance", how="left", maintain_order="left")
+        measurement.analysis.hops.join(cycles.select("traversal", begun="start"), on="traversal")
+        .join(timeline.slices.select("instance", "pid", "tid"), on="instance", how="left")
+        .join(lanes, on=["pid", "tid"], how="left")
         .sort("traversal", "hop")
+        .select("traversal", "lane", *times)
     )
-    rows: dict[int, list[list[int | None]]] = {}
-    begun = dict(analysis.traversals.select("traversal", "start").iter_rows())
-    for hop in hops.iter_rows(named=True):
-        origin = begun[hop["traversal"]]
-        times = [hop[name] for name in ("take", "start", "publish", "end")]
-        rows.setdefault(hop["traversal"], []).append(
-            [
-                lane_of[(hop["pid"], hop["tid"])],
-                *(None if time is None else time - origin for time in times),
-            ]
-        )
-    origins = dict(timeline.origins.select("traversal", "origin").iter_rows())
-    held = {
-        traversal: [arrival, let_go, overrun]
-        for traversal, arrival, let_go, overrun in timeline.holds.select(
-            "traversal", "arrival", "let_go", "overrun"
-        ).iter_rows()
-    }
+    hops_of: dict[int, list[list[int | None]]] = {}
+    for traversal, *hop in hops.iter_rows():
+        hops_of.setdefault(traversal, []).append(hop)
+    origins = timeline.origins.select("traversal", "origin")
+    held = timeline.holds.unique("traversal", keep="last", maintain_order=True)
+    rows = cycles.join(origins, on="traversal", how="left", maintain_order="left").join(
+        held.select("traversal", "arrival", "let_go", "overrun"),
+        on="traversal",
+        how="left",
+        maintain_order="left",
+    )
     found = []
-    for row in analysis.traversals.filter(pl.col("traversal").is_in(kept)).iter_rows(named=True):
+    for row in rows.iter_rows(named=True):
         number, start = row["traversal"], row["start"]
-        cycle: dict[str, Any] = {"n": number, "start": start - zero, "hops": rows.get(number, [])}
+        cycle = {"n": number, "start": start - zero, "hops": hops_of.get(number, [])}
         if row["complete"]:
             cycle["latency"] = row["latency_ns"]
         else:
             cycle["reason"] = f"{row['reason']} ({row['broken_at']})"
         if row["disturbed"]:
             cycle["disturbed"] = 1
-        if row["received"] is not None:
-            cycle["received"] = row["received"] - start
-        if number in origins:
-            cycle["origin"] = origins[number] - start
-        if number in held:
-            arrival, let_go, overrun = held[number]
-            cycle["held"] = [arrival - start, let_go - start, overrun]
+        for name in ("received", "origin"):
+            if row[name] is not None:
+                cycle[name] = row[name] - start
+        if row["arrival"] is not None:
+            cycle["held"] = [row["arrival"] - start, row["let_go"] - start, row["overrun"]]
         found.append(cycle)
     return found
 
 
-def _stalls(
-    timeline: Timeline,
-    began: Times,
-    ended: Times,
-    zero: int,
-) -> list[list[int]]:
+def _stalls(timeline: Timeline, began: Times, ended: Times, zero: int) -> list[list[int]]:
     inside = _inside(timeline.stalls.sort("start"), began, ended)
-    return [
-        [-1 if core is None else core, start - zero, end - start]
-        for core, start, end in inside.iter_rows()
-    ]
+    lasted = pl.col("end") - pl.col("start")
+    rows = inside.select(pl.col("core").fill_null(-1), pl.col("start") - zero, lasted)
+    return [list(row) for row in rows.iter_rows()]
 
 
 def _servers(plan: Plan | None) -> list[list[Any]]:

@@ -15,15 +15,16 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from chainshaper.analysis import callback_statistics, data_flow
+from chainshaper.analysis import data_flow
 from chainshaper.errors import InputError
 from chainshaper.planning import Plan, dump_plan
 from chainshaper.reporting.html import conditions, tables
 from chainshaper.reporting.html.markup import details, paragraph, section
 from chainshaper.reporting.html.series import plan_drawing, recording_data
-from chainshaper.reporting.timeline import Timeline, timeline_of
-from chainshaper.reporting.whole_file import new_file, write_whole
+from chainshaper.reporting.html.told import Told
+from chainshaper.reporting.timeline import timeline_of
 from chainshaper.steps import Measurement
+from chainshaper.whole_file import new_file, write_whole
 
 __all__ = ["ENDINGS", "report_page", "write_report"]
 
@@ -58,39 +59,33 @@ def report_page(measurements: Sequence[Measurement], cycles: Sequence[int] = ())
                 f"there is no cycle {cycle}: the recordings have {most} at most, numbered from 0"
             )
     names = distinct_names([measurement.recording.path for measurement in measurements])
-    flows = [data_flow(m.recording.events, m.recording.info.clock_offset_ns) for m in measurements]
-    timelines = [
-        timeline_of(measurement.recording, flow, measurement.analysis, measurement.plan)
-        for measurement, flow in zip(measurements, flows, strict=True)
-    ]
-    plans = _plans(measurements, names)
-    callbacks = [
-        tables.callback_table(name, callback_statistics(flow))
-        for name, flow in zip(names, flows, strict=True)
-    ]
+    told = [_told(*named) for named in zip(names, measurements, strict=True)]
+    plans = _plans(told)
     sections = [
-        *_measured(measurements, names),
-        section("callbacks", "Callbacks", *callbacks),
-        *_cycle_by_cycle(measurements, names, timelines),
+        *_measured(told),
+        section("callbacks", "Callbacks", *map(tables.callback_table, told)),
+        *_cycle_by_cycle(told),
         *_plan_sections(plans),
         section(
             "conditions",
             "What was recorded, where and how",
-            conditions.condition_tables(measurements, names),
-            conditions.note_lists(measurements, names),
+            conditions.condition_tables(told),
+            conditions.note_lists(told),
         ),
     ]
     data = {
-        "recordings": [
-            recording_data(name, measurement, timeline, cycles)
-            for name, measurement, timeline in zip(names, measurements, timelines, strict=True)
-        ],
+        "recordings": [recording_data(one, cycles) for one in told],
         "plans": [plan_drawing(plan) for plan in plans.values()],
     }
     chain = measurements[0].analysis.chain.spec
-    return _filled(
-        f"End-to-end latency of {chain}", tables.headline(measurements, names), sections, data
-    )
+    return _filled(f"End-to-end latency of {chain}", tables.headline(told), sections, data)
+
+
+def _told(name: str, measurement: Measurement) -> Told:
+    recording = measurement.recording
+    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    timeline = timeline_of(recording, flow, measurement.analysis, measurement.plan)
+    return Told(name, measurement, flow, timeline)
 
 
 def distinct_names(paths: Sequence[Path]) -> list[str]:
@@ -103,13 +98,13 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
     return [f"{path} ({number})" for number, path in enumerate(paths, start=1)]
 
 
-def _measured(measurements: Sequence[Measurement], names: Sequence[str]) -> list[str]:
+def _measured(told: Sequence[Told]) -> list[str]:
     return [
         section(
             "figures",
-            "Before and after" if len(names) > 1 else "Figures",
-            tables.comparison_table(measurements, names),
-            tables.prediction_tables(measurements, names),
+            "Before and after" if len(told) > 1 else "Figures",
+            tables.comparison_table(told),
+            tables.prediction_tables(told),
         ),
         section(
             "latency",
@@ -122,14 +117,12 @@ def _measured(measurements: Sequence[Measurement], names: Sequence[str]) -> list
             "hops",
             "Where the time goes",
             _chart("breakdown", "Mean communication and computation of every hop"),
-            *map(tables.breakdown_table, names, measurements),
+            *map(tables.breakdown_table, told),
         ),
     ]
 
 
-def _cycle_by_cycle(
-    measurements: Sequence[Measurement], names: Sequence[str], timelines: Sequence[Timeline]
-) -> list[str]:
+def _cycle_by_cycle(told: Sequence[Told]) -> list[str]:
     return [
         section(
             "cycles",
@@ -139,28 +132,23 @@ def _cycle_by_cycle(
         section(
             "overruns",
             "Overruns and incomplete cycles",
-            *map(tables.overrun_table, names, measurements, timelines),
-            tables.incomplete_table(measurements, names),
+            *map(tables.overrun_table, told),
+            tables.incomplete_table(told),
         ),
-        section(
-            "stalls",
-            "Stalls of the machine",
-            *map(tables.stall_tables, names, measurements, timelines),
-        ),
+        section("stalls", "Stalls of the machine", *map(tables.stall_tables, told)),
     ]
 
 
-def _plans(measurements: Sequence[Measurement], names: Sequence[str]) -> dict[str, Plan]:
+def _plans(told: Sequence[Told]) -> dict[str, Plan]:
     """Different plans, each under the names of the recordings it was in force in."""
     found: list[tuple[Plan, list[str]]] = []
-    for name, measurement in zip(names, measurements, strict=True):
-        if measurement.plan is None:
-            continue
-        known = next((users for plan, users in found if plan == measurement.plan), None)
-        if known is None:
-            found.append((measurement.plan, [name]))
-        else:
-            known.append(name)
+    for one in told:
+        plan = one.measurement.plan
+        known = next((users for other, users in found if other == plan), None)
+        if known is not None:
+            known.append(one.name)
+        elif plan is not None:
+            found.append((plan, [one.name]))
     return {", ".join(users): plan for plan, users in found}
 
 

@@ -17,8 +17,7 @@ from chainshaper.planning import Plan, publish_slots
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.reporting.breakdown import PARTS, hop_breakdown
 from chainshaper.reporting.html.cycles import timeline_data
-from chainshaper.reporting.timeline import Timeline
-from chainshaper.steps import Measurement
+from chainshaper.reporting.html.told import Told
 
 __all__ = ["latency_histogram", "latency_points", "plan_drawing", "recording_data"]
 
@@ -29,14 +28,13 @@ BINS = 10_000
 """Fine bins over a recording's latencies at most."""
 
 
-def recording_data(
-    name: str, measurement: Measurement, timeline: Timeline, cycles: Sequence[int]
-) -> dict[str, Any]:
+def recording_data(told: Told, cycles: Sequence[int]) -> dict[str, Any]:
     """Everything that is drawn of one recording; ``cycles`` are kept in the timeline anyway."""
+    measurement = told.measurement
     starts = measurement.analysis.traversals["start"]
     zero = int(starts[0]) if len(starts) else 0
     return {
-        "name": name,
+        "name": told.name,
         "slots": _output_slots(measurement.plan),
         "points": latency_points(measurement.analysis.traversals, zero),
         "histogram": latency_histogram(measurement.analysis.traversals),
@@ -51,7 +49,7 @@ def recording_data(
             }
             for row in hop_breakdown(measurement.analysis).iter_rows(named=True)
         ],
-        "timeline": timeline_data(measurement, timeline, cycles, zero),
+        "timeline": timeline_data(measurement, told.timeline, cycles, zero),
     }
 
 

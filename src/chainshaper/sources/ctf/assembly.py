@@ -2,28 +2,19 @@
 
 # ruff: noqa: PLR0917 - what is known of a trace on the way down its metadata
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
 
+from chainshaper.sources.ctf import tables as tb
 from chainshaper.sources.ctf.errors import CtfError
-from chainshaper.sources.ctf.layout import (
-    REGISTERS,
-    LayoutError,
-    Number,
-    Reader,
-    Shape,
-    Slot,
-    Step,
-    compile_fields,
-)
-from chainshaper.sources.ctf.program import Code, Op, Program, Storage
+from chainshaper.sources.ctf.layout import LayoutError, Number, Reader, Step, compile_fields
+from chainshaper.sources.ctf.metadata import CtfFolder
+from chainshaper.sources.ctf.program import Program, Storage
+from chainshaper.sources.ctf.shapes import Shape, Slot
 from chainshaper.sources.ctf.types import (
     EnumType,
     EventClass,
@@ -39,8 +30,6 @@ from chainshaper.sources.ctf.types import (
 
 __all__ = ["Assembly", "Table", "Wanted", "assemble", "attach"]
 
-_STREAM_WIDTH = 20
-_EVENT_WIDTH = 11
 _DENSE_IDS = 4096
 
 
@@ -57,7 +46,7 @@ class Table:
     slots: tuple[Slot, ...]
     levels: int
     has_cpu: bool
-    counter: int
+    counter: int = field(compare=False)
 
 
 @dataclass(frozen=True)
@@ -74,47 +63,55 @@ class Wanted:
 
 
 @dataclass
+class Event:
+    """An event class: its row, its table's number (-1 where not wanted), its steps.
+
+    ``stream`` is the row of its stream class.
+    """
+
+    name: str
+    row: list[int]
+    table: int
+    steps: list[Step]
+    stream: int
+
+
+@dataclass
 class Assembly:
     """Tables for the kernels, and what their rows mean."""
 
     program: Program = field(default_factory=Program)
     stream_rows: list[list[int]] = field(default_factory=list)
-    event_rows: list[list[int]] = field(default_factory=list)
-    event_names: list[str] = field(default_factory=list)
-    # Per event class: its table's number (-1 where not wanted) and its steps.
-    event_tables: list[int] = field(default_factory=list)
-    event_steps: list[list[Step]] = field(default_factory=list)
-    event_streams: list[int] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
     # Rows of the stream classes of each folder: first, end.
     folders: list[tuple[int, int]] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
     ids: list[int] = field(default_factory=list)
     counters: int = 0
-    registers: int = len(REGISTERS)
+    registers: int = len(tb.REGISTERS)
 
     def streams(self) -> NDArray[np.int64]:
-        """The table of stream classes (see `tables.StreamColumn`)."""
-        return np.array(self.stream_rows, np.int64).reshape(-1, _STREAM_WIDTH)
+        """The table of stream classes (see `tables`)."""
+        return np.array(self.stream_rows, np.int64).reshape(-1, tb.STREAM_COLUMNS)
 
-    def events(self) -> NDArray[np.int64]:
-        """The table of event classes (see `tables.EventColumn`)."""
-        return np.array(self.event_rows or [[0] * _EVENT_WIDTH], np.int64)
+    def event_rows(self) -> NDArray[np.int64]:
+        """The table of event classes (see `tables`)."""
+        return np.array([e.row for e in self.events] or [[0] * tb.EVENT_COLUMNS], np.int64)
 
 
-def assemble(folders: Sequence[tuple[Path, TraceClass]], wanted: Wanted) -> Assembly:
+def assemble(folders: Sequence[CtfFolder], wanted: Wanted) -> Assembly:
     """Lay out every stream and event class of all ``folders``.
 
     Raises `CtfError` for types that cannot be read.
     """
     assembly = Assembly()
-    for path, trace in folders:
+    for folder in folders:
         first = len(assembly.stream_rows)
         try:
-            _folder(assembly, len(assembly.folders), trace, wanted)
+            _folder(assembly, folder.declared, wanted)
         except LayoutError as error:
-            raise CtfError(
-                path / "metadata", None, str(error), "the trace cannot be read"
-            ) from None
+            file = folder.path / "metadata"
+            raise CtfError(file, None, str(error), "the trace cannot be read") from None
         assembly.folders.append((first, len(assembly.stream_rows)))
     return assembly
 
@@ -124,49 +121,49 @@ def attach(assembly: Assembly, table: int, storage: Storage, time: int, cpu: int
 
     ``time`` and ``cpu`` are the addresses of those columns, ``cpu`` 0 for none.
     """
-    for event, own in enumerate(assembly.event_tables):
-        if own == table:
-            row = assembly.event_rows[event]
-            row[4], row[5] = assembly.program.add(assembly.event_steps[event], storage)
-            row[8], row[9] = time, cpu
-            row[10] = int(row[2] >= 8 and row[3] > 0 and assembly.program.offsets(row[4], row[5]))
+    for event in assembly.events:
+        if event.table == table:
+            row = event.row
+            start, stop = assembly.program.add(event.steps, storage)
+            row[tb.E_FILL], row[tb.E_FILL_STOP] = start, stop
+            row[tb.E_TIME], row[tb.E_CPU] = time, cpu
+            row[tb.E_CONSTANT] = int(
+                row[tb.E_ALIGN] >= 8
+                and row[tb.E_SIZE] > 0
+                and assembly.program.offsets(start, stop)
+            )
 
 
-def _folder(
-    assembly: Assembly,
-    folder: int,
-    trace: TraceClass,
-    wanted: Wanted,
-) -> None:
-    reader = Reader(big=trace.byte_order == "be", registers=len(REGISTERS))
+def _folder(assembly: Assembly, trace: TraceClass, wanted: Wanted) -> None:
+    reader = Reader(big=trace.byte_order == "be", registers=len(tb.REGISTERS))
     header, _ = compile_fields(reader, "trace.packet.header", trace.packet_header, fixed=True)
     pending: list[tuple[list[int], list[Step], list[Step]]] = []
     for stream in trace.streams.values():
         own = Reader(reader.big, reader.registers, dict(reader.roots))
         packet, _ = compile_fields(own, "stream.packet.context", stream.packet_context, fixed=True)
         event, _ = compile_fields(own, "stream.event.header", stream.event_header, fixed=True)
-        row = [0] * _STREAM_WIDTH
-        row[0], row[1] = stream.id, folder
-        row[8:12] = _quick_header(stream.event_header, reader.big)
-        row[16] = _frequency(stream, trace)
+        row = [0] * tb.STREAM_COLUMNS
+        row[tb.S_ID] = stream.id
+        row[tb.S_ALIGN : tb.S_CLOCK_BITS + 1] = _quick_header(stream.event_header, reader.big)
+        row[tb.S_FREQUENCY] = _frequency(stream, trace)
         known = {n.register for n in [*header, *packet] if isinstance(n, Number)}
-        row[17] = sum(1 << r for r in known if 0 <= r < len(REGISTERS))
+        row[tb.S_KNOWN] = sum(1 << r for r in known if 0 <= r < len(tb.REGISTERS))
         if trace.uuid is not None:
-            row[18], row[19] = _uuid_words(trace.uuid)
+            row[tb.S_UUID_LOW], row[tb.S_UUID_HIGH] = _uuid_words(trace.uuid)
         else:
-            row[17] &= ~(1 << REGISTERS["uuid_low"])
-        has_cpu = bool(row[17] >> REGISTERS["cpu_id"] & 1)
+            row[tb.S_KNOWN] &= ~(1 << tb.R_UUID_LOW)
+        has_cpu = bool(row[tb.S_KNOWN] >> tb.R_CPU & 1)
         rows = _events(assembly, own, stream, trace, has_cpu, wanted)
         reader.registers = max(reader.registers, own.registers)
-        row[12:16] = _id_table(assembly, rows)
+        row[tb.S_ID_FIRST : tb.S_DEFAULT + 1] = _id_table(assembly, rows)
         assembly.stream_rows.append(row)
         pending.append((row, packet, event))
     # Only now is it known which of the headers' numbers anybody refers to.
     start, stop = assembly.program.add(header, None)
     for row, packet, event in pending:
-        row[2], row[3] = start, stop
-        row[4], row[5] = assembly.program.add(packet, None)
-        row[6], row[7] = assembly.program.add(event, None)
+        row[tb.S_HEADER], row[tb.S_HEADER_STOP] = start, stop
+        row[tb.S_CONTEXT], row[tb.S_CONTEXT_STOP] = assembly.program.add(packet, None)
+        row[tb.S_EVENT], row[tb.S_EVENT_STOP] = assembly.program.add(event, None)
     assembly.registers = max(assembly.registers, reader.registers)
 
 
@@ -187,25 +184,22 @@ def _events(
         steps, columns = _event(own, stream, event, trace, wanted)
         reader.registers = max(reader.registers, own.registers)
         number, storage = -1, None
-        row = [0] * _EVENT_WIDTH
-        row[6] = -1
+        row = [0] * tb.EVENT_COLUMNS
+        row[tb.E_COUNTER] = -1
         if keep:
             number = _table(assembly, event.name, columns, own, has_cpu)
             table = assembly.tables[number]
             storage = Storage(table.counter)
-            row[6], row[7] = table.counter, table.levels
-        row[0], row[1] = assembly.program.add(steps, storage)
-        only = assembly.program.rows[row[0] : row[1]]
+            row[tb.E_COUNTER], row[tb.E_LEVELS] = table.counter, table.levels
+        start, stop = row[tb.E_WALK], row[tb.E_WALK_STOP] = assembly.program.add(steps, storage)
+        only = assembly.program.rows[start:stop]
         if not only:
-            row[2] = 1
-        elif len(only) == 1 and only[0][Op.CODE] == Code.SKIP:
-            row[2], row[3] = only[0][Op.ALIGN], only[0][Op.SIZE]
-        rows[event.id] = len(assembly.event_rows)
-        assembly.event_rows.append(row)
-        assembly.event_names.append(event.name)
-        assembly.event_tables.append(number)
-        assembly.event_steps.append(steps)
-        assembly.event_streams.append(len(assembly.stream_rows))
+            row[tb.E_ALIGN] = 1
+        elif len(only) == 1 and only[0][tb.O_CODE] == tb.SKIP:
+            row[tb.E_ALIGN], row[tb.E_SIZE] = only[0][tb.O_ALIGN], only[0][tb.O_SIZE]
+        rows[event.id] = len(assembly.events)
+        place = len(assembly.stream_rows)
+        assembly.events.append(Event(event.name, row, number, steps, place))
     return rows
 
 
@@ -283,13 +277,12 @@ def _table(
     has_cpu: bool,
 ) -> int:
     """The number of the table for events of this name and shape."""
-    shape = (name, tuple(columns), tuple(reader.slots), reader.levels, has_cpu)
-    for number, table in enumerate(assembly.tables):
-        if (table.name, table.columns, table.slots, table.levels, table.has_cpu) == shape:
-            return number
-    assembly.tables.append(Table(*shape, counter=assembly.counters))
-    assembly.counters += reader.levels
-    return len(assembly.tables) - 1
+    slots, counter = tuple(reader.slots), assembly.counters
+    table = Table(name, tuple(columns), slots, reader.levels, has_cpu, counter)
+    if table not in assembly.tables:
+        assembly.tables.append(table)
+        assembly.counters += reader.levels
+    return assembly.tables.index(table)
 
 
 def _id_table(assembly: Assembly, rows: dict[int, int]) -> list[int]:

@@ -5,13 +5,14 @@ Attributes are the ``name = value;`` pairs between braces, read by
 `declarations.Parser.attributes`.
 """
 
-from __future__ import annotations
+from collections.abc import Mapping
+from typing import TypeVar
 
-from chainshaper.sources.ctf.types import ByteOrder, FloatType, IntegerType, StringType
+from chainshaper.sources.ctf.tokens import TsdlError
+from chainshaper.sources.ctf.types import ByteOrder, Encoding, FloatType, IntegerType, StringType
 
 __all__ = [
     "Attributes",
-    "TsdlError",
     "Value",
     "checked_alignment",
     "float_type",
@@ -24,18 +25,28 @@ Value = int | str
 Attributes = dict[str, tuple[Value, int]]
 """Name → value and its character offset."""
 
-_BYTE_ORDERS: dict[str, ByteOrder] = {
+_T = TypeVar("_T")
+_BYTE_ORDERS: dict[Value, ByteOrder] = {
     "le": "le",
     "be": "be",
     "network": "be",
     "native": "native",
 }
-_BASES = {"decimal": 10, "dec": 10, "d": 10, "i": 10, "u": 10, "hexadecimal": 16, "hex": 16}
-_BASES |= {"x": 16, "X": 16, "p": 16, "octal": 8, "oct": 8, "o": 8, "binary": 2, "b": 2}
-
-
-class TsdlError(ValueError):
-    """Metadata that is no TSDL; ``args`` are the character offset and the reason."""
+_SIGNED: dict[Value, bool] = {
+    0: False,
+    "false": False,
+    "FALSE": False,
+    1: True,
+    "true": True,
+    "TRUE": True,
+}
+_BASES: dict[Value, int] = {
+    **dict.fromkeys(("decimal", "dec", "d", "i", "u", 10), 10),
+    **dict.fromkeys(("hexadecimal", "hex", "x", "X", "p", 16), 16),
+    **dict.fromkeys(("octal", "oct", "o", 8), 8),
+    **dict.fromkeys(("binary", "b", 2), 2),
+}
+_ENCODINGS: dict[Value, Encoding] = {"none": "none", "utf8": "utf8", "ascii": "ascii"}
 
 
 def checked_alignment(align: int, offset: int) -> int:
@@ -50,20 +61,13 @@ def integer_type(found: Attributes, offset: int) -> IntegerType:
     size = _number(found, "size", 0)
     if not 0 < size <= 64:
         raise TsdlError(offset, f"integer of {size} bits; 1 to 64 are supported")
-    signed, signed_at = found.get("signed", (0, 0))
-    if signed not in (0, 1, "true", "false", "TRUE", "FALSE"):
-        raise TsdlError(signed_at, f"signed must be true or false, not {signed!r}")
-    base, base_at = found.get("base", (10, 0))
-    base = _BASES.get(base, base) if isinstance(base, str) else base
-    if base not in (2, 8, 10, 16):
-        raise TsdlError(base_at, f"unknown base {base!r}")
+    _one_of(_BASES, found, "base", 10)  # how a person would like to see it
     return IntegerType(
         size=size,
         align=checked_alignment(_number(found, "align", 1 if size % 8 else 8), offset),
-        signed=signed in (1, "true", "TRUE"),
-        byte_order=_byte_order(found),
-        base=int(base),
-        encoding=_encoding(found),  # type: ignore[arg-type]
+        signed=_one_of(_SIGNED, found, "signed", 0),
+        byte_order=_one_of(_BYTE_ORDERS, found, "byte_order", "native"),
+        encoding=_encoding(found, "none"),
         clock=_clock(found),
     )
 
@@ -86,13 +90,14 @@ def float_type(found: Attributes, offset: int) -> FloatType:
             offset, f"floating point of {exponent} + {mantissa} bits; IEEE 32 or 64 supported"
         )
     align = checked_alignment(_number(found, "align", 8), offset)
-    return FloatType(exponent + mantissa, align, _byte_order(found))
+    return FloatType(
+        exponent + mantissa, align, _one_of(_BYTE_ORDERS, found, "byte_order", "native")
+    )
 
 
 def string_type(found: Attributes) -> StringType:
     """``string``, with or without attributes; raises `TsdlError`."""
-    encoding = _encoding(found) if "encoding" in found else "utf8"
-    return StringType(encoding)  # type: ignore[arg-type]
+    return StringType(_encoding(found, "utf8"))
 
 
 def _number(found: Attributes, name: str, default: int) -> int:
@@ -102,16 +107,16 @@ def _number(found: Attributes, name: str, default: int) -> int:
     return value
 
 
-def _byte_order(found: Attributes) -> ByteOrder:
-    value, offset = found.get("byte_order", ("native", 0))
-    if value not in _BYTE_ORDERS:
-        raise TsdlError(offset, f"unknown byte order {value!r}")
-    return _BYTE_ORDERS[str(value)]
+def _one_of(choices: Mapping[Value, _T], found: Attributes, name: str, default: Value) -> _T:
+    value, offset = found.get(name, (default, 0))
+    if value not in choices:
+        raise TsdlError(offset, f"unknown {name.replace('_', ' ')} {value!r}")
+    return choices[value]
 
 
-def _encoding(found: Attributes) -> str:
-    value, offset = found.get("encoding", ("none", 0))
-    encoding = str(value).lower().replace("-", "").replace("_", "")
-    if encoding not in ("none", "utf8", "ascii"):
-        raise TsdlError(offset, f"unknown encoding {value!r}")
-    return encoding
+def _encoding(found: Attributes, default: Encoding) -> Encoding:
+    plain: Attributes = {
+        name: (str(value).lower().replace("-", "").replace("_", ""), offset)
+        for name, (value, offset) in found.items()
+    }
+    return _one_of(_ENCODINGS, plain, "encoding", default)

@@ -2,8 +2,6 @@
 
 # ruff: noqa: PLR0911, PLR0917 - one branch per shape, all with the same parameters
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,7 +9,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from chainshaper.sources.ctf.layout import (
+from chainshaper.sources.ctf.shapes import (
     ListShape,
     OptionShape,
     RecordShape,

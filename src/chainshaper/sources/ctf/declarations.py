@@ -13,14 +13,13 @@ from typing import NoReturn
 
 from chainshaper.sources.ctf.attributes import (
     Attributes,
-    TsdlError,
     Value,
     checked_alignment,
     float_type,
     integer_type,
     string_type,
 )
-from chainshaper.sources.ctf.tokens import Token
+from chainshaper.sources.ctf.tokens import Token, TsdlError
 from chainshaper.sources.ctf.types import (
     ArrayType,
     EnumMapping,
@@ -34,7 +33,7 @@ from chainshaper.sources.ctf.types import (
     alignment,
 )
 
-__all__ = ["Parser", "Scope", "TsdlError", "Value"]
+__all__ = ["Parser", "Scope"]
 
 _DEEPEST = 32
 

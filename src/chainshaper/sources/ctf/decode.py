@@ -6,8 +6,6 @@ wanted events straight to their rows.  Spans are independent and run on several 
 many of them only a part of a large trace is in memory at once.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 from collections.abc import Collection, Sequence
@@ -18,11 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.compiled import kernel
+from chainshaper.sources.ctf import tables as tb
 from chainshaper.sources.ctf.assembly import Assembly
 from chainshaper.sources.ctf.errors import CtfError
-from chainshaper.sources.ctf.machine import AHEAD, NEVER, Failure, State
 from chainshaper.sources.ctf.streams import MappedFile, Scratch
-from chainshaper.sources.ctf.tables import AheadColumn, Cursor, FileColumn, PacketColumn
 from chainshaper.sources.ctf.trace import CtfStream
 
 __all__ = ["LARGE_BYTES", "Stream", "Walk", "default_threads", "fill", "span_borders", "walk"]
@@ -33,12 +30,12 @@ _CHUNK_BYTES = 128 << 20
 _SMALL_BYTES = 4 << 20
 LARGE_BYTES = 512 << 20
 _FAILURES = {
-    Failure.TRUNCATED: "an event reaches past the end of its packet's content",
-    Failure.NO_OPTION: "a variant's tag names none of its options",
-    Failure.BAD_LENGTH: "an array or sequence is longer than the rest of its packet",
-    Failure.UNTERMINATED: "a string does not end within its packet",
-    Failure.UNKNOWN_EVENT: "an event id that the metadata does not declare",
-    Failure.FULL_TABLE: "more events than were counted",
+    tb.TRUNCATED: "an event reaches past the end of its packet's content",
+    tb.NO_OPTION: "a variant's tag names none of its options",
+    tb.BAD_LENGTH: "an array or sequence is longer than the rest of its packet",
+    tb.UNTERMINATED: "a string does not end within its packet",
+    tb.UNKNOWN_EVENT: "an event id that the metadata does not declare",
+    tb.FULL_TABLE: "more events than were counted",
 }
 
 
@@ -56,8 +53,9 @@ class Walk:
     """What pass 1 found in one file.
 
     ``counts`` per event class; ``marks`` (spans - 1, 3) where each span but the first begins:
-    packet, bit position, clock; ``reached`` (spans, counters) the rows before the end of each
-    span; ``warnings`` about events that cannot be read; ``sorted`` whether time ever went back.
+    packet, bit position, clock; ``reached`` (spans + 1, counters) the rows before each span and
+    before the end; ``warnings`` about events that cannot be read; ``sorted`` whether time never
+    went back.
     """
 
     counts: NDArray[np.int64]
@@ -75,15 +73,13 @@ def default_threads() -> int:
 def span_borders(streams: Collection[CtfStream], threads: int) -> NDArray[np.int64]:
     """Instants (ns) that cut the streams into spans of about equal size in bytes."""
     tables = [s.table for s in streams]
-    total = sum(int(t[:, PacketColumn.BYTES].sum()) for t in tables)
+    total = sum(int(t[:, tb.P_BYTES].sum()) for t in tables)
     spans = max(-(-total // _CHUNK_BYTES), threads) if total > _SMALL_BYTES else 1
-    known = [
-        s.begin_ns is not None and s.table[0, PacketColumn.BEGIN] == s.begin_ns for s in streams
-    ]
+    known = [s.begin_ns is not None and s.table[0, tb.P_BEGIN] == s.begin_ns for s in streams]
     if spans <= 1 or not tables or not all(known):
         return np.zeros(0, np.int64)
-    begins = np.concatenate([t[:, PacketColumn.BEGIN] for t in tables])
-    sizes = np.concatenate([t[:, PacketColumn.BYTES] for t in tables])
+    begins = np.concatenate([t[:, tb.P_BEGIN] for t in tables])
+    sizes = np.concatenate([t[:, tb.P_BYTES] for t in tables])
     order = np.argsort(begins, kind="stable")
     reached = np.cumsum(sizes[order])
     places = np.searchsorted(reached, total * np.arange(1, spans) / spans)
@@ -96,9 +92,9 @@ def walk(stream: Stream, assembly: Assembly, borders: NDArray[np.int64], lean: b
     ``lean`` has it give back the file's memory behind it.
     """
     scratch = Scratch(assembly)
-    counts = np.zeros(max(len(assembly.event_names), 1), np.int64)
+    counts = np.zeros(max(len(assembly.events), 1), np.int64)
     marks = np.zeros((len(borders) + 1, 3 + len(scratch.rows)), np.int64)
-    scratch.state[State.LATEST] = -(1 << 62)
+    scratch.state[tb.X_LATEST] = -(1 << 62)
     packets = stream.packets
     border = first = 0
     while first < len(packets):
@@ -109,19 +105,20 @@ def walk(stream: Stream, assembly: Assembly, borders: NDArray[np.int64], lean: b
             borders.ctypes.data, border, len(borders), marks.ctypes.data,
         )  # fmt: skip
         if lean:
-            end = packets[last - 1, PacketColumn.BYTE] + packets[last - 1, PacketColumn.BYTES]
-            stream.file.forget(int(packets[first, PacketColumn.BYTE]), int(end))
+            end = packets[last - 1, tb.P_BYTE] + packets[last - 1, tb.P_BYTES]
+            stream.file.forget(int(packets[first, tb.P_BYTE]), int(end))
         first = last
     marks[border:, 0], marks[border:, 1], marks[border:, 3:] = len(packets), -1, scratch.rows
     warnings = _packet_warnings(stream)
-    ordered = not scratch.state[State.UNSORTED]
-    return Walk(counts, marks[:-1, :3], marks[:, 3:], warnings, ordered)
+    ordered = not scratch.state[tb.X_UNSORTED]
+    reached = np.vstack([np.zeros_like(scratch.rows), marks[:, 3:]])
+    return Walk(counts, marks[:-1, :3], reached, warnings, ordered)
 
 
 def _chunk(packets: NDArray[np.int64], first: int) -> int:
     """The end of the packets from ``first`` on that make up a chunk of memory."""
-    limit = packets[first, PacketColumn.BYTE] + _CHUNK_BYTES
-    last = int(np.searchsorted(packets[:, PacketColumn.BYTE], limit))
+    limit = packets[first, tb.P_BYTE] + _CHUNK_BYTES
+    last = int(np.searchsorted(packets[:, tb.P_BYTE], limit))
     return max(last, first + 1)
 
 
@@ -130,12 +127,12 @@ def _packet_warnings(stream: Stream) -> list[str]:
         str(
             CtfError(
                 stream.path,
-                int(packet[PacketColumn.BYTE] + (packet[PacketColumn.ERROR_AT] >> 3)),
-                _FAILURES[Failure(int(packet[PacketColumn.ERROR]))],
+                int(packet[tb.P_BYTE] + (packet[tb.P_ERROR_AT] >> 3)),
+                _FAILURES[int(packet[tb.P_ERROR])],
                 "the rest of this packet is not read",
             )
         )
-        for packet in stream.packets[stream.packets[:, PacketColumn.ERROR] < 0]
+        for packet in stream.packets[stream.packets[:, tb.P_ERROR] < 0]
     ]
 
 
@@ -152,30 +149,29 @@ def fill(
     file changed since pass 1.
     """
     files = _span_files(span, streams, walks)
-    before = sum(w.reached[span - 1] for w in walks) if span else walks[0].reached[0] * 0
     count = len(streams)
     scratch = Scratch(assembly, count)
-    scratch.rows[:] = before
-    scratch.caps[:] = sum(w.reached[span] for w in walks)
-    cursors = np.zeros((count, len(Cursor)), np.int64)
-    ahead = np.zeros((count * AHEAD, len(AheadColumn)), np.int64)
+    scratch.rows[:] = sum(w.reached[span] for w in walks)
+    scratch.caps[:] = sum(w.reached[span + 1] for w in walks)
+    cursors = np.zeros((count, tb.CURSOR_COLUMNS), np.int64)
+    ahead = np.zeros((count * tb.AHEAD, tb.AHEAD_COLUMNS), np.int64)
     leaves = 1 << (count - 1).bit_length()
-    tree = np.full((2 * leaves, 2), NEVER, np.int64)
+    tree = np.full((2 * leaves, 2), tb.NEVER, np.int64)
     tree[0] = 0
     while True:
         status = _fill_columns(
             scratch.address, files.ctypes.data, count, cursors.ctypes.data, ahead.ctypes.data,
             tree.ctypes.data, leaves, packets.ctypes.data, scratch.registers.ctypes.data,
-            assembly.registers, len(assembly.event_rows),
+            assembly.registers, len(assembly.events),
         )  # fmt: skip
-        if status != Failure.FULL_DICTIONARY:
+        if status != tb.FULL_DICTIONARY:
             break
         scratch.grow()
     if status < 0:
         raise CtfError(
             streams[0].path.parent,
             None,
-            f"{_FAILURES[Failure(status)]}: the files changed while they were read",
+            f"{_FAILURES[status]}: the files changed while they were read",
             "stop the recording first",
         )
     strings = [
@@ -187,20 +183,20 @@ def fill(
 
 def _span_files(span: int, streams: Sequence[Stream], walks: Sequence[Walk]) -> NDArray[np.int64]:
     """The kernels' table of files for one span."""
-    files = np.zeros((len(streams), len(FileColumn)), np.int64)
+    files = np.zeros((len(streams), tb.FILE_COLUMNS), np.int64)
     first = 0
     for row, stream, found in zip(files, streams, walks, strict=True):
-        row[FileColumn.BASE], row[FileColumn.SIZE] = stream.file.address, stream.file.size
-        row[FileColumn.PACKET], row[FileColumn.POSITION] = first, -1
+        row[tb.F_BASE], row[tb.F_SIZE] = stream.file.address, stream.file.size
+        row[tb.F_PACKET], row[tb.F_POSITION] = first, -1
         if span:
             packet, position, clock = found.marks[span - 1]
-            row[FileColumn.PACKET], row[FileColumn.POSITION] = first + packet, position
-            row[FileColumn.CLOCK] = clock
-        row[FileColumn.LAST_PACKET], row[FileColumn.LAST_POSITION] = first + len(stream.packets), -1
+            row[tb.F_PACKET], row[tb.F_POSITION] = first + packet, position
+            row[tb.F_CLOCK] = clock
+        row[tb.F_LAST_PACKET], row[tb.F_LAST_POSITION] = first + len(stream.packets), -1
         if span < len(found.marks):
             packet, position, _ = found.marks[span]
-            row[FileColumn.LAST_PACKET] = first + packet
-            row[FileColumn.LAST_POSITION] = position
+            row[tb.F_LAST_PACKET] = first + packet
+            row[tb.F_LAST_POSITION] = position
         first += len(stream.packets)
     return files
 
@@ -210,8 +206,8 @@ def _forget(
 ) -> None:
     """Let go of the pages that a span was the last to read."""
     for row, stream in zip(files, streams, strict=True):
-        first, last = int(row[FileColumn.PACKET]), int(row[FileColumn.LAST_PACKET])
+        first, last = int(row[tb.F_PACKET]), int(row[tb.F_LAST_PACKET])
         if first < last:
-            begin = int(packets[first, PacketColumn.BYTE])
-            end = packets[last - 1, PacketColumn.BYTE] + packets[last - 1, PacketColumn.BYTES]
+            begin = int(packets[first, tb.P_BYTE])
+            end = packets[last - 1, tb.P_BYTE] + packets[last - 1, tb.P_BYTES]
             stream.file.forget(begin, int(end))

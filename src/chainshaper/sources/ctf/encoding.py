@@ -4,8 +4,6 @@ Values are plain Python: int, float, str, list for arrays and sequences, mapping
 users see) for structures, (option name, value) for variants.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,13 +1,13 @@
 """What can be wrong with a trace, said so that a person can act on it."""
 
-from __future__ import annotations
-
 from pathlib import Path
+
+from chainshaper.errors import InputError
 
 __all__ = ["CtfError"]
 
 
-class CtfError(Exception):
+class CtfError(InputError):
     """A trace that cannot be read.
 
     Attributes: ``path`` (the file or folder), ``offset`` (byte offset in it, ``None`` where it

@@ -3,16 +3,15 @@
 See `kernels` for the passes before it.
 """
 
+# mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
+
 # Kernels take many numbers rather than objects, which Numba would have to count references to.
 # ruff: noqa: PLR0917
-
-from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 
 from chainshaper.compiled.memory import compiled, get, put, store_long, store_word
+from chainshaper.sources.ctf import tables as tb
 from chainshaper.sources.ctf.interpreter import execute, move_batch
 from chainshaper.sources.ctf.kernels import (
     copy_numbers,
@@ -21,85 +20,31 @@ from chainshaper.sources.ctf.kernels import (
     read_header,
     step_over,
 )
-from chainshaper.sources.ctf.machine import AHEAD, BATCH, NEVER, Failure, Machine, State
-from chainshaper.sources.ctf.tables import (
-    A_ADDRESS,
-    A_EVENT,
-    A_ROW,
-    A_TIME,
-    C_CLOCK,
-    C_COUNT,
-    C_CPU,
-    C_END,
-    C_PACKET,
-    C_PLACE,
-    C_POSITION,
-    C_ROW,
-    E_ALIGN,
-    E_CONSTANT,
-    E_COUNTER,
-    E_CPU,
-    E_FILL,
-    E_FILL_STOP,
-    E_LEVELS,
-    E_ROW,
-    E_SIZE,
-    E_TIME,
-    F_BASE,
-    F_CLOCK,
-    F_LAST_PACKET,
-    F_LAST_POSITION,
-    F_PACKET,
-    F_POSITION,
-    F_ROW,
-    F_SIZE,
-    P_BYTE,
-    P_CPU,
-    P_END,
-    P_ROW,
-    P_STREAM,
-    S_FREQUENCY,
-    S_ROW,
-)
 
 __all__ = ["fill_columns"]
 
-A_ALL, B_ROW = A_ROW * AHEAD, 8 * (1 + 2 * BATCH)
-CLOCK = int(State.CLOCK)
-FULL_TABLE, UNKNOWN_EVENT = int(Failure.FULL_TABLE), int(Failure.UNKNOWN_EVENT)
-M_STREAMS, M_EVENTS, M_IDS, M_COUNTERS, M_BATCHES = (
-    int(Machine.STREAMS),
-    int(Machine.EVENTS),
-    int(Machine.IDS),
-    int(Machine.COUNTERS),
-    int(Machine.BATCHES),
-)
-M_STATE, M_ROWS, M_CAPS, M_SAVED = (
-    int(Machine.STATE),
-    int(Machine.ROWS),
-    int(Machine.CAPS),
-    int(Machine.SAVED),
-)
+A_ALL = tb.A_ROW * tb.AHEAD
 
 
 @compiled()
-def next_packet(machine: Any, file: Any, packets: Any, index: Any, regs: Any) -> Any:
+def next_packet(machine, file, packets, index, regs):
     """Open the first packet from ``index`` on that has events in the file's span.
 
     Returns (packet, position of its first event, end of its events in the span); position -1
     for the span's end, a failure below that.
     """
-    last = get(file, F_LAST_PACKET)
-    while index < last or (index == last and get(file, F_LAST_POSITION) >= 0):
-        packet = packets + index * P_ROW
-        end = get(file, F_LAST_POSITION) if index == last else get(packet, P_END)
+    last = get(file, tb.F_LAST_PACKET)
+    while index < last or (index == last and get(file, tb.F_LAST_POSITION) >= 0):
+        packet = packets + index * tb.P_ROW
+        end = get(file, tb.F_LAST_POSITION) if index == last else get(packet, tb.P_END)
         if end > 0:
-            position = open_packet(machine, packet, get(file, F_BASE), get(file, F_SIZE), regs)
+            base, size = get(file, tb.F_BASE), get(file, tb.F_SIZE)
+            position = open_packet(machine, packet, base, size, regs)
             if position < 0:
-                return index, np.int64(FULL_TABLE), end
-            if index == get(file, F_PACKET) and get(file, F_POSITION) >= 0:
-                position = get(file, F_POSITION)
-                put(get(machine, M_STATE), CLOCK, get(file, F_CLOCK))
+                return index, np.int64(tb.FULL_TABLE), end
+            if index == get(file, tb.F_PACKET) and get(file, tb.F_POSITION) >= 0:
+                position = get(file, tb.F_POSITION)
+                put(get(machine, tb.M_STATE), tb.X_CLOCK, get(file, tb.F_CLOCK))
             if position < end:
                 return index, position, end
         index += 1
@@ -107,101 +52,99 @@ def next_packet(machine: Any, file: Any, packets: Any, index: Any, regs: Any) ->
 
 
 @compiled()
-def read_ahead(machine: Any, file: Any, cursor: Any, ahead: Any, packets: Any, regs: Any) -> Any:
+def read_ahead(machine, file, cursor, ahead, packets, regs):
     """Find the next wanted events of a file: how many, 0 at the span's end.
 
     Fills the file's part of the table ``ahead`` up to the end of a packet, whose registers then
     hold for all of them, or to an event whose length only reading it will tell. Negative where
     the file no longer is what it was when its events were counted.
     """
-    state, events = get(machine, M_STATE), get(machine, M_EVENTS)
-    put(state, CLOCK, get(cursor, C_CLOCK))
-    index, position, end = get(cursor, C_PACKET), get(cursor, C_POSITION), get(cursor, C_END)
+    state, events = get(machine, tb.M_STATE), get(machine, tb.M_EVENTS)
+    put(state, tb.X_CLOCK, get(cursor, tb.C_CLOCK))
+    index, position = get(cursor, tb.C_PACKET), get(cursor, tb.C_POSITION)
+    end = get(cursor, tb.C_END)
     count = np.int64(0)
     while count == 0:
         if position >= end:
             index, position, end = next_packet(machine, file, packets, index + 1, regs)
             if position < 0:
                 return np.int64(0) if position == -1 else position
-        packet = packets + index * P_ROW
-        stream = get(machine, M_STREAMS) + get(packet, P_STREAM) * S_ROW
-        at, content, frequency = get(packet, P_BYTE), get(packet, P_END), get(stream, S_FREQUENCY)
-        start, mapped = get(file, F_BASE) + at, get(file, F_SIZE) - at
-        while position < end and count < AHEAD:
+        packet = packets + index * tb.P_ROW
+        stream = get(machine, tb.M_STREAMS) + get(packet, tb.P_STREAM) * tb.S_ROW
+        at, content = get(packet, tb.P_BYTE), get(packet, tb.P_END)
+        frequency = get(stream, tb.S_FREQUENCY)
+        start, mapped = get(file, tb.F_BASE) + at, get(file, tb.F_SIZE) - at
+        while position < end and count < tb.AHEAD:
             position, event = read_header(machine, stream, start, mapped, content, position, regs)
             if position < 0:
-                return np.int64(FULL_TABLE)
-            row = events + event * E_ROW
-            if get(row, E_COUNTER) >= 0:
-                entry = ahead + count * A_ROW
-                put(entry, A_TIME, nanoseconds(get(state, CLOCK), frequency))
-                put(entry, A_EVENT, event)
+                return np.int64(tb.FULL_TABLE)
+            row = events + event * tb.E_ROW
+            if get(row, tb.E_COUNTER) >= 0:
+                entry = ahead + count * tb.A_ROW
+                put(entry, tb.A_TIME, nanoseconds(get(state, tb.X_CLOCK), frequency))
+                put(entry, tb.A_EVENT, event)
                 count += 1
-                align, size = get(row, E_ALIGN), get(row, E_SIZE)
+                align, size = get(row, tb.E_ALIGN), get(row, tb.E_SIZE)
                 position = (position + align - 1) & -align if align > 0 else position
-                if get(row, E_CONSTANT) == 0 or (position + size >> 3) + 8 > mapped:
-                    put(entry, A_ADDRESS, np.int64(0))
+                if get(row, tb.E_CONSTANT) == 0 or (position + size >> 3) + 8 > mapped:
+                    put(entry, tb.A_ADDRESS, np.int64(0))
                     break
-                put(entry, A_ADDRESS, start + (position >> 3))
+                put(entry, tb.A_ADDRESS, start + (position >> 3))
                 position += size
             else:
                 position = step_over(machine, row, start, mapped, content, position, regs)
             if position < 0 or position > content:
-                return np.int64(FULL_TABLE)
-        put(cursor, C_CPU, get(packet, P_CPU))
-    put(cursor, C_PACKET, index)
-    put(cursor, C_POSITION, position)
-    put(cursor, C_END, end)
-    put(cursor, C_CLOCK, get(state, CLOCK))
-    put(cursor, C_PLACE, np.int64(0))
-    put(cursor, C_COUNT, count)
+                return np.int64(tb.FULL_TABLE)
+        put(cursor, tb.C_CPU, get(packet, tb.P_CPU))
+    put(cursor, tb.C_PACKET, index)
+    put(cursor, tb.C_POSITION, position)
+    put(cursor, tb.C_END, end)
+    put(cursor, tb.C_CLOCK, get(state, tb.X_CLOCK))
+    put(cursor, tb.C_PLACE, np.int64(0))
+    put(cursor, tb.C_COUNT, count)
     return count
 
 
 @compiled()
-def write_apart(
-    machine: Any, event: Any, file: Any, cursor: Any, packets: Any, regs: Any, row: Any
-) -> Any:
+def write_apart(machine, event, file, cursor, packets, regs, row):
     """Write an event whose length is not known before: 0 or a failure, after which it is undone.
 
     It is the last that was read ahead, so that its file goes on behind it.
     """
-    state, counters = get(machine, M_STATE), get(machine, M_ROWS) + 8 * get(event, E_COUNTER)
-    levels = get(event, E_LEVELS)
+    state, levels = get(machine, tb.M_STATE), get(event, tb.E_LEVELS)
+    counters = get(machine, tb.M_ROWS) + 8 * get(event, tb.E_COUNTER)
     if levels > 1:
-        copy_numbers(get(machine, M_SAVED), counters, levels)
-    packet = packets + get(cursor, C_PACKET) * P_ROW
-    at = get(packet, P_BYTE)
-    put(state, CLOCK, get(cursor, C_CLOCK))
+        copy_numbers(get(machine, tb.M_SAVED), counters, levels)
+    packet = packets + get(cursor, tb.C_PACKET) * tb.P_ROW
+    at = get(packet, tb.P_BYTE)
+    put(state, tb.X_CLOCK, get(cursor, tb.C_CLOCK))
     position = execute(
-        machine, get(event, E_FILL), get(event, E_FILL_STOP), get(file, F_BASE) + at,
-        get(file, F_SIZE) - at, get(packet, P_END), get(cursor, C_POSITION), regs, row,
+        machine, get(event, tb.E_FILL), get(event, tb.E_FILL_STOP), get(file, tb.F_BASE) + at,
+        get(file, tb.F_SIZE) - at, get(packet, tb.P_END), get(cursor, tb.C_POSITION), regs, row,
     )  # fmt: skip
     if position < 0:
         if levels > 1:
-            copy_numbers(counters, get(machine, M_SAVED), levels)
+            copy_numbers(counters, get(machine, tb.M_SAVED), levels)
         return position
-    put(cursor, C_POSITION, position)
-    put(cursor, C_CLOCK, get(state, CLOCK))
+    put(cursor, tb.C_POSITION, position)
+    put(cursor, tb.C_CLOCK, get(state, tb.X_CLOCK))
     return np.int64(0)
 
 
 @compiled(inline=True)
-def write_event(machine: Any, file: Any, cursor: Any, entry: Any, packets: Any, regs: Any) -> Any:
+def write_event(machine, file, cursor, entry, packets, regs):
     """Write an event that was read ahead to its row: 0 or a failure, after which it is undone."""
-    number, address = get(entry, A_EVENT), get(entry, A_ADDRESS)
-    event, rows = get(machine, M_EVENTS) + number * E_ROW, get(machine, M_ROWS)
-    counter = get(event, E_COUNTER)
+    number, address = get(entry, tb.A_EVENT), get(entry, tb.A_ADDRESS)
+    event, rows = get(machine, tb.M_EVENTS) + number * tb.E_ROW, get(machine, tb.M_ROWS)
+    counter = get(event, tb.E_COUNTER)
     row = get(rows, counter)
-    if row >= get(get(machine, M_CAPS), counter):
-        return np.int64(FULL_TABLE)
+    if row >= get(get(machine, tb.M_CAPS), counter):
+        return np.int64(tb.FULL_TABLE)
     if address != 0:
-        batch = get(machine, M_BATCHES) + number * B_ROW
+        batch = get(machine, tb.M_BATCHES) + number * tb.B_ROW
         count = get(batch, 0)
-        if count == BATCH:
-            status = move_batch(
-                machine, get(event, E_FILL), get(event, E_FILL_STOP), get(event, E_SIZE) >> 3, batch
-            )
+        if count == tb.BATCH:
+            status = move_batch(machine, event, batch)
             if status < 0:
                 return status
             count = np.int64(0)
@@ -212,30 +155,28 @@ def write_event(machine: Any, file: Any, cursor: Any, entry: Any, packets: Any, 
         status = write_apart(machine, event, file, cursor, packets, regs, row)
         if status < 0:
             return status
-    store_long(get(event, E_TIME) + 8 * row, np.uint64(get(entry, A_TIME)))
-    if get(event, E_CPU) != 0:
-        store_word(get(event, E_CPU) + 4 * row, np.uint64(get(cursor, C_CPU)))
+    store_long(get(event, tb.E_TIME) + 8 * row, np.uint64(get(entry, tb.A_TIME)))
+    if get(event, tb.E_CPU) != 0:
+        store_word(get(event, tb.E_CPU) + 4 * row, np.uint64(get(cursor, tb.C_CPU)))
     put(rows, counter, row + 1)
     return np.int64(0)
 
 
 @compiled()
-def finish_batches(machine: Any, events: Any) -> Any:
+def finish_batches(machine, events):
     """Write what is left in the batches of all event classes; 0 or FULL_DICTIONARY."""
     for number in range(events):
-        batch = get(machine, M_BATCHES) + number * B_ROW
+        batch = get(machine, tb.M_BATCHES) + number * tb.B_ROW
         if get(batch, 0) > 0:
-            event = get(machine, M_EVENTS) + number * E_ROW
-            status = move_batch(
-                machine, get(event, E_FILL), get(event, E_FILL_STOP), get(event, E_SIZE) >> 3, batch
-            )
+            event = get(machine, tb.M_EVENTS) + number * tb.E_ROW
+            status = move_batch(machine, event, batch)
             if status < 0:
                 return status
     return np.int64(0)
 
 
 @compiled(inline=True)
-def play(tree: Any, leaf: Any, time: Any, file: Any) -> None:
+def play(tree, leaf, time, file):
     """Enter a file's next time at a ``leaf`` of the tournament and find the winners above it.
 
     Node n has the children 2n and 2n + 1 and the (time, file) of the earlier of them; node 1 is
@@ -257,18 +198,8 @@ def play(tree: Any, leaf: Any, time: Any, file: Any) -> None:
 
 @compiled()
 def fill_columns(
-    machine: Any,
-    files: Any,
-    count: Any,
-    cursors: Any,
-    ahead: Any,
-    tree: Any,
-    leaves: Any,
-    packets: Any,
-    regs: Any,
-    registers: Any,
-    events: Any,
-) -> Any:
+    machine, files, count, cursors, ahead, tree, leaves, packets, regs, registers, events
+):
     """Write the wanted events of a span of all ``count`` files, merged by time.
 
     ``tree`` has twice as many nodes as ``leaves``, a power of two and at least ``count``; all
@@ -279,32 +210,32 @@ def fill_columns(
     """
     while get(tree, 0) < count:
         file = get(tree, 0)
-        row, cursor, own = files + file * F_ROW, cursors + file * C_ROW, ahead + file * A_ALL
-        put(cursor, C_PACKET, get(row, F_PACKET) - 1)
+        row, cursor, own = files + file * tb.F_ROW, cursors + file * tb.C_ROW, ahead + file * A_ALL
+        put(cursor, tb.C_PACKET, get(row, tb.F_PACKET) - 1)
         status = read_ahead(machine, row, cursor, own, packets, regs + 8 * registers * file)
         if status < 0:
             return status
         if status > 0:
-            play(tree, leaves + file, min(get(own, A_TIME), NEVER - 1), file)
+            play(tree, leaves + file, min(get(own, tb.A_TIME), tb.NEVER - 1), file)
         put(tree, 0, file + 1)
-    while get(tree, 2) < NEVER:
+    while get(tree, 2) < tb.NEVER:
         file = get(tree, 3)
-        row, cursor, own = files + file * F_ROW, cursors + file * C_ROW, ahead + file * A_ALL
-        entry = own + get(cursor, C_PLACE) * A_ROW
+        row, cursor, own = files + file * tb.F_ROW, cursors + file * tb.C_ROW, ahead + file * A_ALL
+        entry = own + get(cursor, tb.C_PLACE) * tb.A_ROW
         its = regs + 8 * registers * file
         status = write_event(machine, row, cursor, entry, packets, its)
         if status < 0:
             return status
-        place = get(cursor, C_PLACE) + 1
-        time = np.int64(NEVER)
-        if place < get(cursor, C_COUNT):
-            put(cursor, C_PLACE, place)
-            time = min(get(own + place * A_ROW, A_TIME), NEVER - 1)
+        place = get(cursor, tb.C_PLACE) + 1
+        time = np.int64(tb.NEVER)
+        if place < get(cursor, tb.C_COUNT):
+            put(cursor, tb.C_PLACE, place)
+            time = min(get(own + place * tb.A_ROW, tb.A_TIME), tb.NEVER - 1)
         else:
             status = read_ahead(machine, row, cursor, own, packets, its)
             if status < 0:
                 return status
             if status > 0:
-                time = min(get(own, A_TIME), NEVER - 1)
+                time = min(get(own, tb.A_TIME), tb.NEVER - 1)
         play(tree, leaves + file, time, file)
     return finish_batches(machine, events)

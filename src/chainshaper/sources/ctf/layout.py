@@ -12,7 +12,6 @@ event; every array or sequence opens a level of its own, with one row per elemen
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from chainshaper.sources.ctf.shapes import (
@@ -24,6 +23,7 @@ from chainshaper.sources.ctf.shapes import (
     Slot,
     TextShape,
 )
+from chainshaper.sources.ctf.tables import REGISTERS
 from chainshaper.sources.ctf.types import (
     ArrayType,
     EnumMapping,
@@ -40,48 +40,18 @@ from chainshaper.sources.ctf.types import (
 )
 
 __all__ = [
-    "REGISTERS",
     "Align",
     "Characters",
     "Choice",
-    "Frame",
     "LayoutError",
-    "ListShape",
     "Number",
-    "OptionShape",
     "Reader",
-    "RecordShape",
     "Repeat",
-    "ScalarShape",
-    "Shape",
-    "Slot",
     "Step",
     "Text",
-    "TextShape",
     "compile_fields",
 ]
 
-# Numbers that the decoder itself needs, by their TSDL name in the packet header and context.
-REGISTERS = {
-    name: register
-    for register, name in enumerate(
-        (
-            "id",
-            "magic",
-            "stream_id",
-            "stream_instance_id",
-            "timestamp_begin",
-            "timestamp_end",
-            "content_size",
-            "packet_size",
-            "packet_seq_num",
-            "events_discarded",
-            "cpu_id",
-            "uuid_low",
-            "uuid_high",
-        )
-    )
-}
 _DEEPEST = 12
 _MOST_STEPS = 100_000
 
@@ -343,18 +313,11 @@ def _repeat(
     reader.levels += keep
     body, shape = _compile(reader, name, element, [*frames, {}], inner, keep)
     repeat = Repeat(alignment(kind), count, length, body, slot, level, inner if keep else -1)
-    if not any(True for _ in _contents(body)):
+    if all(isinstance(step, Align) for step in body):  # an array of empty structures
         return [Align(repeat.align)], None
     if shape is None:
         return [repeat], None
     return [repeat], ListShape(slot, inner, -1 if length is not None else count, shape)
-
-
-def _contents(steps: list[Step]) -> Iterator[Step]:
-    """The steps that can take bits, to tell an array of empty structures."""
-    for step in steps:
-        if not isinstance(step, Align):
-            yield step
 
 
 def _choice(

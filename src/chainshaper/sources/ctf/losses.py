@@ -1,14 +1,12 @@
 """What the tracer says that it dropped (LTTng's packet context, CTF 1.8 section 5.2)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.sources.ctf.tables import PacketColumn
+from chainshaper.sources.ctf import tables as tb
 
 __all__ = ["count_losses"]
 
@@ -25,9 +23,9 @@ def count_losses(
     """
     table = np.concatenate([table for _, table in files])
     # Files of one stream follow each other (tracefile rotation), not always by name.
-    table = table[np.argsort(table[:, PacketColumn.BEGIN], kind="stable")]
-    counter = table[:, PacketColumn.DISCARDED]
-    sequence = table[:, PacketColumn.SEQUENCE]
+    table = table[np.argsort(table[:, tb.P_BEGIN], kind="stable")]
+    counter = table[:, tb.P_DISCARDED]
+    sequence = table[:, tb.P_SEQUENCE]
     before = 0 if sequence[0] <= 0 else counter[0]
     steps = np.diff(counter, prepend=before)
     steps[steps < 0] += 1 << 32

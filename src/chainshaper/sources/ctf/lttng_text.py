@@ -4,8 +4,6 @@ The declarations are those of lttng-ust 2.13 and lttng-modules 2.13, reproduced 
 put into traces.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 

@@ -1,20 +1,33 @@
 """A trace's ``metadata`` file: plain TSDL text or packets of it (CTF 1.8, section 7.1)."""
 
-from __future__ import annotations
-
 import struct
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from chainshaper.sources.ctf.errors import CtfError
-from chainshaper.sources.ctf.tsdl import TsdlError, parse_tsdl
-from chainshaper.sources.ctf.types import TraceClass
+from chainshaper.sources.ctf.tokens import TsdlError
+from chainshaper.sources.ctf.tsdl import parse_tsdl
+from chainshaper.sources.ctf.types import Clock, TraceClass
 
-__all__ = ["METADATA_MAGIC", "read_metadata", "read_metadata_text"]
+__all__ = ["METADATA_MAGIC", "CtfFolder", "read_metadata", "read_metadata_text"]
 
 METADATA_MAGIC = 0x75D11D57
 _HEADER = "I16sIIIBBBBB"
 _LARGEST = 64 << 20
 _RECORD_SEPARATOR = b"\x1e"  # begins every fragment of CTF 2's JSON text sequence
+
+
+@dataclass(frozen=True)
+class CtfFolder:
+    """One folder with a ``metadata`` file: what it declares."""
+
+    path: Path
+    declared: TraceClass = field(repr=False)
+
+    @property
+    def clock(self) -> Clock:
+        """The folder's clock; one of 1 GHz without offset where the metadata has none."""
+        return next(iter(self.declared.clocks.values()), Clock("none"))
 
 
 def read_metadata(path: Path) -> TraceClass:

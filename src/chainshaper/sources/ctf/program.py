@@ -1,18 +1,16 @@
 """From steps to the table of operations that the compiled kernels interpret.
 
-One row of 16 int64 per operation, the columns named by `Op`.  Runs of fixed size that nobody asks
+One row per operation, with the columns `O_…` of `tables`.  Runs of fixed size that nobody asks
 for become one `SKIP`, so that an event that is not wanted costs one addition.
 """
 
-from __future__ import annotations
-
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
+from chainshaper.sources.ctf import tables as tb
 from chainshaper.sources.ctf.layout import (
     Align,
     Characters,
@@ -23,55 +21,14 @@ from chainshaper.sources.ctf.layout import (
     Text,
 )
 
-__all__ = ["ROW", "Code", "Op", "Program", "Storage"]
+__all__ = ["Program", "Storage"]
 
-# Rows are two cache lines, and a shift away from each other.
-ROW = 16
 # More bits than any packet has: sizes beyond are all the same and must not overflow int64.
 _ENDLESS = 1 << 56
 
 
-class Op(IntEnum):
-    """Columns of the table of operations."""
-
-    CODE = 0
-    ALIGN = 1  # bits
-    SIZE = 2  # bits; of one element for SKIP_MANY and COPY
-    FLAGS = 3  # 1 signed, 2 big-endian, 4 advances the clock
-    ADDRESS = 4  # where row 0 of the slot lies, 0 for no slot
-    WIDTH = 5  # bytes per row of the slot
-    COUNTER = 6  # the level's row counter
-    REGISTER = 7  # written by NUMBER, the length or tag for others; -1 for none
-    COUNT = 8  # constant length; first range of SWITCH
-    TARGET = 9  # operation to go on with
-    INNER = 10  # the element level's row counter, -1 where nobody wants it
-    INNER_ADDRESS = 11  # where COPY writes
-    LEAST = 12  # the least bits an element takes; number of ranges of SWITCH
-    OFFSET = 13  # bytes from the aligned start of an event of constant layout
-
-
-class Code(IntEnum):
-    """Operations."""
-
-    SKIP = 0
-    NUMBER = 1
-    TEXT = 2
-    CHARACTERS = 3
-    SKIP_MANY = 4
-    COPY = 5
-    LOOP = 6
-    AGAIN = 7
-    SWITCH = 8
-    JUMP = 9
-    # A NUMBER of 8, 4, 2 or 1 bytes as they lie in the packet, one per event.
-    MOVE_LONG = 10
-    MOVE_WORD = 11
-    MOVE_HALF = 12
-    MOVE_BYTE = 13
-
-
-_MOVES = {64: Code.MOVE_LONG, 32: Code.MOVE_WORD, 16: Code.MOVE_HALF, 8: Code.MOVE_BYTE}
-_CONSTANT = {Code.SKIP, Code.CHARACTERS, *_MOVES.values()}
+_MOVES = {64: tb.MOVE_LONG, 32: tb.MOVE_WORD, 16: tb.MOVE_HALF, 8: tb.MOVE_BYTE}
+_CONSTANT = {tb.SKIP, tb.CHARACTERS, *_MOVES.values()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,46 +63,46 @@ class Program:
         """Note where each of an event's operations reads, if that is the same in every event."""
         position = 0
         for row in self.rows[start:stop]:
-            code = row[Op.CODE]
-            if code not in _CONSTANT or row[Op.REGISTER] >= 0:
+            code = row[tb.O_CODE]
+            if code not in _CONSTANT or row[tb.O_REGISTER] >= 0:
                 return False
-            position += -position % row[Op.ALIGN]
-            row[Op.OFFSET] = position >> 3
-            position += 8 * row[Op.COUNT] if code == Code.CHARACTERS else row[Op.SIZE]
+            position += -position % row[tb.O_ALIGN]
+            row[tb.O_OFFSET] = position >> 3
+            position += 8 * row[tb.O_COUNT] if code == tb.CHARACTERS else row[tb.O_SIZE]
         return True
 
     def arrays(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Operations (n x 16) and ranges (m x 4), never empty."""
-        rows = self.rows or [[0] * ROW]
+        rows = self.rows or [[0] * tb.OPERATION_COLUMNS]
         return np.array(rows, np.int64), np.array(self.ranges or [(0, 0, 0, 0)], np.int64)
 
-    def _row(self, code: Code, **values: int) -> list[int]:
-        row = [0] * ROW
-        row[Op.CODE] = code
-        row[Op.ALIGN] = 1
-        row[Op.REGISTER] = row[Op.INNER] = -1
-        for name, value in values.items():
-            row[Op[name]] = value
+    def _row(self, code: int, values: Mapping[int, int]) -> list[int]:
+        row = [0] * tb.OPERATION_COLUMNS
+        row[tb.O_CODE] = code
+        row[tb.O_ALIGN] = 1
+        row[tb.O_REGISTER] = row[tb.O_INNER] = -1
+        for column, value in values.items():
+            row[column] = value
         self.rows.append(row)
         return row
 
     def _skip(self, align: int, size: int) -> None:
         size = min(size, _ENDLESS)
-        if len(self.rows) > self.joint and self.rows[-1][Op.CODE] == Code.SKIP:
+        if len(self.rows) > self.joint and self.rows[-1][tb.O_CODE] == tb.SKIP:
             last = self.rows[-1]
-            joined = _joined((last[Op.ALIGN], last[Op.SIZE]), (align, size))
+            joined = _joined((last[tb.O_ALIGN], last[tb.O_SIZE]), (align, size))
             if joined is not None:
-                last[Op.ALIGN], last[Op.SIZE] = joined[0], min(joined[1], _ENDLESS)
+                last[tb.O_ALIGN], last[tb.O_SIZE] = joined[0], min(joined[1], _ENDLESS)
                 return
-        self._row(Code.SKIP, ALIGN=align, SIZE=size)
+        self._row(tb.SKIP, {tb.O_ALIGN: align, tb.O_SIZE: size})
 
-    def _place(self, slot: int, level: int, storage: Storage | None) -> dict[str, int]:
+    def _place(self, slot: int, level: int, storage: Storage | None) -> dict[int, int]:
         if slot < 0 or storage is None or not storage.addresses:
             return {}
         return {
-            "ADDRESS": storage.addresses[slot],
-            "WIDTH": storage.widths[slot],
-            "COUNTER": storage.counter + level,
+            tb.O_ADDRESS: storage.addresses[slot],
+            tb.O_WIDTH: storage.widths[slot],
+            tb.O_COUNTER: storage.counter + level,
         }
 
     def _emit(self, steps: list[Step], storage: Storage | None) -> None:
@@ -156,7 +113,7 @@ class Program:
                 case Number():
                     self._number(step, storage)
                 case Text(slot=slot, level=level):
-                    self._row(Code.TEXT, ALIGN=8, **self._place(slot, level, storage))
+                    self._row(tb.TEXT, {tb.O_ALIGN: 8, **self._place(slot, level, storage)})
                 case Characters():
                     self._characters(step, storage)
                 case Repeat():
@@ -169,27 +126,30 @@ class Program:
         if not place and step.register < 0 and not step.clock:
             self._skip(step.align, step.size)
             return
-        code = Code.NUMBER
+        code = tb.NUMBER
         if place and step.level == 0 and step.register < 0 and _as_it_lies(step):
             code = _MOVES[step.size]
         self._row(
             code,
-            ALIGN=step.align,
-            SIZE=step.size,
-            FLAGS=step.signed + 2 * step.big + 4 * step.clock,
-            REGISTER=step.register,
-            **place,
+            {
+                tb.O_ALIGN: step.align,
+                tb.O_SIZE: step.size,
+                tb.O_FLAGS: step.signed + 2 * step.big + 4 * step.clock,
+                tb.O_REGISTER: step.register,
+                **place,
+            },
         )
 
     def _characters(self, step: Characters, storage: Storage | None) -> None:
         place = self._place(step.slot, step.level, storage)
         register = step.length.register if step.length is not None else -1
         if place:
-            self._row(Code.CHARACTERS, ALIGN=8, REGISTER=register, COUNT=step.count, **place)
+            own = {tb.O_ALIGN: 8, tb.O_REGISTER: register, tb.O_COUNT: step.count}
+            self._row(tb.CHARACTERS, own | place)
         elif step.length is None:
             self._skip(8, 8 * step.count)
         else:
-            self._row(Code.SKIP_MANY, ALIGN=8, SIZE=8, REGISTER=register)
+            self._row(tb.SKIP_MANY, {tb.O_ALIGN: 8, tb.O_SIZE: 8, tb.O_REGISTER: register})
 
     def _repeat(self, step: Repeat, storage: Storage | None) -> None:
         counted = storage is not None and step.inner >= 0
@@ -200,22 +160,27 @@ class Program:
         if fixed is not None and even and step.length is None and not counted:
             self._skip(max(step.align, fixed[0]), fixed[1] * step.count)
             return
-        shared = {"ALIGN": step.align, "REGISTER": register, "COUNT": step.count, "INNER": inner}
-        shared |= self._place(step.slot, step.level, storage)
+        shared = {
+            tb.O_ALIGN: step.align,
+            tb.O_REGISTER: register,
+            tb.O_COUNT: step.count,
+            tb.O_INNER: inner,
+            **self._place(step.slot, step.level, storage),
+        }
         if fixed is not None and even and fixed[1] > 0:
-            self._row(Code.SKIP_MANY, SIZE=fixed[1], **shared)
+            self._row(tb.SKIP_MANY, {tb.O_SIZE: fixed[1], **shared})
             return
         copied = self._copied(step, storage)
         if copied is not None and storage is not None:
             address = storage.addresses[copied.slot]
-            self._row(Code.COPY, SIZE=copied.size, INNER_ADDRESS=address, **shared)
+            self._row(tb.COPY, {tb.O_SIZE: copied.size, tb.O_INNER_ADDRESS: address, **shared})
             return
-        loop = self._row(Code.LOOP, LEAST=_least(step.body), **shared)
+        loop = self._row(tb.LOOP, {tb.O_LEAST: _least(step.body), **shared})
         self.joint = len(self.rows)
         start = len(self.rows)
         self._emit(step.body, storage)
-        self._row(Code.AGAIN, TARGET=start, INNER=inner)
-        loop[Op.TARGET] = self.joint = len(self.rows)
+        self._row(tb.AGAIN, {tb.O_TARGET: start, tb.O_INNER: inner})
+        loop[tb.O_TARGET] = self.joint = len(self.rows)
 
     def _copied(self, step: Repeat, storage: Storage | None) -> Number | None:
         """An array's element, if elements lie in the packet just as they lie in its slot."""
@@ -233,17 +198,17 @@ class Program:
 
     def _choice(self, step: Choice, storage: Storage | None) -> None:
         place = self._place(step.slot, step.level, storage)
-        switch = self._row(Code.SWITCH, REGISTER=step.tag.register, **place)
+        switch = self._row(tb.SWITCH, {tb.O_REGISTER: step.tag.register, **place})
         # Unsigned tags are compared as signed numbers, both with their top bit turned.
         unsigned = not step.tag.signed
-        switch[Op.FLAGS] = int(not unsigned)
+        switch[tb.O_FLAGS] = int(not unsigned)
         first, ends = len(self.ranges), []
         for index, (ranges, _) in enumerate(step.options):
             for ends_at in ranges:
                 low, high = (max(v, 0) - (1 << 63) if unsigned else v for v in ends_at)
                 low, high = max(low, -(1 << 63)), min(high, (1 << 63) - 1)
                 self.ranges.append((low, high, 0, index + 1))
-        switch[Op.COUNT], switch[Op.LEAST] = first, len(self.ranges) - first
+        switch[tb.O_COUNT], switch[tb.O_LEAST] = first, len(self.ranges) - first
         places = range(first, len(self.ranges))
         for index, (_, body) in enumerate(step.options):
             self.joint = len(self.rows)
@@ -252,9 +217,9 @@ class Program:
                 if option == index + 1:
                     self.ranges[place_at] = (low, high, len(self.rows), option)
             self._emit(body, storage)
-            ends.append(self._row(Code.JUMP))
+            ends.append(self._row(tb.JUMP, {}))
         for jump in ends:
-            jump[Op.TARGET] = len(self.rows)
+            jump[tb.O_TARGET] = len(self.rows)
         self.joint = len(self.rows)
 
 

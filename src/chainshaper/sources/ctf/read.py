@@ -2,9 +2,7 @@
 
 # ruff: noqa: PLR0917 - the parts of one pass
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
@@ -13,6 +11,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from chainshaper.sources.ctf import tables as tb
 from chainshaper.sources.ctf.assembly import Assembly, Table, Wanted, assemble, attach
 from chainshaper.sources.ctf.columns import column
 from chainshaper.sources.ctf.decode import (
@@ -24,12 +23,12 @@ from chainshaper.sources.ctf.decode import (
     span_borders,
     walk,
 )
-from chainshaper.sources.ctf.layout import TextShape
 from chainshaper.sources.ctf.program import Storage
+from chainshaper.sources.ctf.shapes import TextShape
 from chainshaper.sources.ctf.streams import MappedFile
 from chainshaper.sources.ctf.trace import CtfStream, CtfTrace
 
-__all__ = ["Events", "count", "read"]
+__all__ = ["Events", "count_events", "read_events"]
 
 _HUGE_PAGE = 2 << 20
 _NULL_COLUMNS = {"cpu": pl.Int32, "pid": pl.Int32, "tid": pl.Int32}
@@ -47,24 +46,52 @@ class Events(dict[str, pl.DataFrame]):
     unread: tuple[CtfStream, ...] = ()
 
 
-def count(trace: CtfTrace, threads: int | None = None) -> tuple[dict[str, int], tuple[str, ...]]:
-    """Events per name in order of the names, zeros included, and warnings."""
-    assembly = _assembly(trace, Wanted())
+def count_events(trace: CtfTrace, threads: int | None = None) -> dict[str, int]:
+    """Events per name, zeros included, ordered by name; nothing is built.
+
+    Raises `CtfError` where a file is gone.
+    """
+    assembly = assemble(trace.folders, Wanted())
     with _mapped(trace.streams) as streams:
         walks = _walks(streams, assembly, np.zeros(0, np.int64), threads)
-    return _counts(trace, assembly, walks), tuple(w for found in walks for w in found.warnings)
+    return _counts(trace, assembly, walks)
 
 
-def read(
+def read_events(
     trace: CtfTrace,
-    wanted: Wanted,
-    threads: int | None,
+    names: Collection[str] | None = None,
+    *,
+    context: bool = False,
+    nameless: Collection[str] = (),
+    threads: int | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Events:
-    """See `chainshaper.sources.ctf.read_events`."""
-    assembly = _assembly(trace, wanted)
-    rows = {assembly.event_streams[e] for e, t in enumerate(assembly.event_tables) if t >= 0}
-    used = [s for s in trace.streams if not rows.isdisjoint(s.table[:, 2].tolist())]
+    """Read events into one frame per name, ordered by name of event.
+
+    Every name of ``names`` (None: all) that the metadata declares is in the result, without
+    rows where it never happened.  Rows are sorted by ``time``; equal times stand in the order
+    of the stream files, and in one file as recorded.  Columns:
+
+    * ``time``: Int64, ns on the trace's own clock (CLOCK_MONOTONIC for LTTng), its offset not
+      added; ``cpu``: Int32; ``pid``, ``tid``: integers as recorded (``vpid``, ``vtid`` in user
+      space, ``pid``, ``tid`` in the kernel); null where the trace has none.
+    * ``procname``: Categorical, where recorded; not for the events that are ``nameless``, since
+      reading it is most of the work for an event without other texts.
+    * the payload under its own names without LTTng's leading underscore; a field called like
+      one of the above is ``payload.<name>``.  Integers and floats keep their width and sign,
+      enumerations their integer; strings and text arrays are String (bytes that are not UTF-8
+      as ``\\xNN``); arrays are Array, sequences List, structures Struct, variants Struct with
+      all but the chosen option null.
+    * with ``context``, the other context fields as ``context.<name>``.
+
+    Events that cannot be read end their packet; the result's ``warnings`` say which and why.
+    ``progress`` is told the share that is done, from 0 to 1.
+    Raises `CtfError` where a file is gone or changes while it is read.
+    """
+    asked = frozenset(trace.event_names if names is None else names)
+    assembly = assemble(trace.folders, Wanted(asked, frozenset(nameless), context))
+    rows = {event.stream for event in assembly.events if event.table >= 0}
+    used = [s for s in trace.streams if not rows.isdisjoint(s.table[:, tb.P_STREAM].tolist())]
     borders = span_borders(used, threads or default_threads())
     with _mapped(used) as streams:
         walks = _walks(streams, assembly, borders, threads, lambda share: progress(share / 3))
@@ -80,7 +107,7 @@ def read(
             lambda share: progress((1 + 2 * share) / 3),
         )
     unsorted = not all(w.sorted for w in walks)
-    events = Events(_frames(assembly, storage, total, texts, unsorted))
+    events = Events(_frames(assembly, storage, texts, unsorted))
     events.warnings = tuple(w for found in walks for w in found.warnings)
     events.counts = _counts(trace, assembly, walks)
     read_paths = {stream.path for stream in used}
@@ -91,14 +118,9 @@ def read(
 def _counts(trace: CtfTrace, assembly: Assembly, walks: list[Walk]) -> dict[str, int]:
     counts = dict.fromkeys(trace.event_names, 0)
     for found in walks:
-        for name, number in zip(assembly.event_names, found.counts.tolist(), strict=False):
-            counts[name] += number
+        for event, number in zip(assembly.events, found.counts.tolist(), strict=False):
+            counts[event.name] += number
     return counts
-
-
-def _assembly(trace: CtfTrace, wanted: Wanted) -> Assembly:
-    folders = [(folder.path, folder.declared) for folder in trace.folders]
-    return assemble(folders, wanted)
 
 
 @contextmanager
@@ -222,8 +244,7 @@ def _recode(
     codes: NDArray[np.uint32],
 ) -> None:
     """Replace one span's own codes of strings by those of the whole."""
-    before = sum(w.reached[span - 1] for w in walks) if span else walks[0].reached[0] * 0
-    after = sum(w.reached[span] for w in walks)
+    before, after = (sum(w.reached[border] for w in walks) for border in (span, span + 1))
     for table, arrays in zip(assembly.tables, storage, strict=True):
         for place in _text_slots(table):
             counter = table.counter + table.slots[place].level
@@ -246,17 +267,15 @@ def _text_slots(table: Table) -> list[int]:
 def _frames(
     assembly: Assembly,
     storage: list[_Arrays],
-    total: NDArray[np.int64],
     texts: list[str],
     unsorted: bool,
 ) -> dict[str, pl.DataFrame]:
     strings = pl.Series("", texts or [""], dtype=pl.String)
     categories = strings.cast(pl.Categorical)
     parts: dict[str, list[pl.DataFrame]] = {}
-    for number, table in enumerate(assembly.tables):
+    for table in assembly.tables:
         # Arrays are let go one table at a time: Polars has copies of its own.
-        frame = _frame(table, storage[number], strings, categories)
-        storage[number] = _Arrays(table, total * 0)
+        frame = _frame(table, storage.pop(0), strings, categories)
         parts.setdefault(table.name, []).append(frame)
     frames: dict[str, pl.DataFrame] = {}
     for name in sorted(parts):

@@ -1,7 +1,5 @@
 """Stream files on disk: mapping them and finding their packets (CTF 1.8, section 5)."""
 
-from __future__ import annotations
-
 import mmap
 from pathlib import Path
 
@@ -9,70 +7,69 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.compiled import kernel
+from chainshaper.sources.ctf import tables as tb
 from chainshaper.sources.ctf.assembly import Assembly
 from chainshaper.sources.ctf.errors import CtfError
-from chainshaper.sources.ctf.machine import BATCH, STATE_SIZE, Machine, State
-from chainshaper.sources.ctf.tables import PacketColumn, ScanStatus
 
 __all__ = ["MappedFile", "Scratch", "packet_table", "stream_paths"]
 
 _scan_packets = kernel("chainshaper.sources.ctf.kernels", "scan_packets")
 _rehash = kernel("chainshaper.sources.ctf.texts", "rehash")
 _REASONS = {
-    ScanStatus.BAD_MAGIC: "packet does not begin with the CTF magic number",
-    ScanStatus.BAD_UUID: "packet belongs to another trace (uuid differs from the metadata's)",
-    ScanStatus.BAD_STREAM: "packet of a stream class that the metadata does not declare",
-    ScanStatus.BAD_SIZE: "packet with impossible content or packet size",
-    ScanStatus.BAD_HEADER: "packet header cut short",
-    ScanStatus.CUT: "last packet cut short by the end of the file",
+    tb.BAD_MAGIC: "packet does not begin with the CTF magic number",
+    tb.BAD_UUID: "packet belongs to another trace (uuid differs from the metadata's)",
+    tb.BAD_STREAM: "packet of a stream class that the metadata does not declare",
+    tb.BAD_SIZE: "packet with impossible content or packet size",
+    tb.BAD_HEADER: "packet header cut short",
+    tb.CUT: "last packet cut short by the end of the file",
 }
 
 
 class Scratch:
     """The tables that kernels work with in one thread, and their addresses.
 
-    ``address`` is that of the table of addresses (see `machine.Machine`); it is valid as
+    ``address`` is that of the table of addresses (see `tables`); it is valid as
     long as this lives.
     """
 
     def __init__(self, assembly: Assembly, files: int = 1) -> None:
         counters = max(assembly.counters, 1)
         ops, ranges = assembly.program.arrays()
-        self.state = np.zeros(STATE_SIZE, np.int64)
+        self.state = np.zeros(tb.STATE_WORDS, np.int64)
         self.rows = np.zeros(counters, np.int64)
         self.caps = np.full(counters, 1 << 62, np.int64)
         self.registers = np.zeros((files, assembly.registers), np.int64)
         # One place more than used: places are read eight bytes at a time.
         self.slots = np.zeros(1024 + 1, np.int32)
         self.entries = np.zeros((512, 4), np.int64)
-        self._words = np.zeros(len(Machine), np.int64)
+        self._words = np.zeros(tb.MACHINE_WORDS, np.int64)
         self._tables = {
-            Machine.OPS: ops,
-            Machine.RANGES: ranges,
-            Machine.STATE: self.state,
-            Machine.ROWS: self.rows,
-            Machine.CAPS: self.caps,
-            Machine.SAVED: np.zeros(counters, np.int64),
-            Machine.STREAMS: assembly.streams(),
-            Machine.EVENTS: assembly.events(),
-            Machine.IDS: np.array(assembly.ids or [0], np.int64),
-            Machine.BATCHES: np.zeros((len(assembly.event_rows), 1 + 2 * BATCH), np.int64),
+            tb.M_OPS: ops,
+            tb.M_RANGES: ranges,
+            tb.M_STATE: self.state,
+            tb.M_ROWS: self.rows,
+            tb.M_CAPS: self.caps,
+            tb.M_SAVED: np.zeros(counters, np.int64),
+            tb.M_STREAMS: assembly.streams(),
+            tb.M_EVENTS: assembly.event_rows(),
+            tb.M_IDS: np.array(assembly.ids or [0], np.int64),
+            tb.M_BATCHES: np.zeros((len(assembly.events), 1 + 2 * tb.BATCH), np.int64),
         }
         for word, table in self._tables.items():
             self._words[word] = table.ctypes.data
-        self._words[Machine.COUNTERS] = counters
+        self._words[tb.M_COUNTERS] = counters
         self._place_dictionary()
         self.address = int(self._words.ctypes.data)
 
     def _place_dictionary(self) -> None:
-        self._words[Machine.SLOTS] = self.slots.ctypes.data
-        self._words[Machine.MASK] = len(self.slots) - 2
-        self._words[Machine.ENTRIES] = self.entries.ctypes.data
-        self._words[Machine.ROOM] = len(self.entries)
+        self._words[tb.M_SLOTS] = self.slots.ctypes.data
+        self._words[tb.M_MASK] = len(self.slots) - 2
+        self._words[tb.M_ENTRIES] = self.entries.ctypes.data
+        self._words[tb.M_ROOM] = len(self.entries)
 
     def strings(self) -> NDArray[np.int64]:
         """Address, length, hash and last word of the strings in the dictionary, by code."""
-        return self.entries[: self.state[State.STRINGS]]
+        return self.entries[: self.state[tb.X_STRINGS]]
 
     def grow(self) -> None:
         """Give the dictionary four times its places."""
@@ -81,7 +78,7 @@ class Scratch:
         self.entries = entries
         self.slots = np.zeros(4 * (len(self.slots) - 1) + 1, np.int32)
         self._place_dictionary()
-        _rehash(self.address, int(self.state[State.STRINGS]))
+        _rehash(self.address, int(self.state[tb.X_STRINGS]))
 
 
 class MappedFile:
@@ -121,36 +118,36 @@ def stream_paths(folder: Path) -> list[Path]:
 def packet_table(
     path: Path, assembly: Assembly, folder: int
 ) -> tuple[NDArray[np.int64], list[str]]:
-    """The packets of a stream file (see `tables.PacketColumn`) and warnings about it.
+    """The packets of a stream file (see `tables`) and warnings about it.
 
     Reading stops where a packet's header makes no sense, since nothing says where the next one
     begins; a packet that the end of the file cuts short is kept up to there.
     """
     if path.stat().st_size == 0:
-        return np.zeros((0, len(PacketColumn)), np.int64), []
+        return np.zeros((0, tb.PACKET_COLUMNS), np.int64), []
     file = MappedFile(path)
     scratch = Scratch(assembly)
-    packets = np.zeros((256, len(PacketColumn)), np.int64)
+    packets = np.zeros((256, tb.PACKET_COLUMNS), np.int64)
     first, last = assembly.folders[folder]
     reached = np.zeros(2, np.int64)
-    status = ScanStatus.FULL
-    while status == ScanStatus.FULL:
-        status = ScanStatus(_scan_packets(
+    status = tb.FULL
+    while status == tb.FULL:
+        status = _scan_packets(
             scratch.address, scratch.registers.ctypes.data, file.address, file.size,
             packets.ctypes.data, len(packets), reached.ctypes.data, first, last,
-        ))  # fmt: skip
-        if status == ScanStatus.FULL:
+        )  # fmt: skip
+        if status == tb.FULL:
             packets = np.concatenate([packets, np.zeros_like(packets)])
     size, (offset, found) = file.size, reached.tolist()
     file.close()
-    if status == ScanStatus.DONE:
+    if status == tb.DONE:
         return packets[:found].copy(), []
     error = CtfError(
         path,
         offset,
         _REASONS[status],
         "events up to the cut are read"
-        if status == ScanStatus.CUT
+        if status == tb.CUT
         else f"the last {size - offset} bytes of the file are not read",
     )
     return packets[:found].copy(), [str(error)]

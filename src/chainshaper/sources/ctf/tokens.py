@@ -1,11 +1,9 @@
 """Splitting TSDL text into tokens (CTF 1.8, appendix C)."""
 
-from __future__ import annotations
-
 import re
 from typing import Literal, NamedTuple
 
-__all__ = ["Token", "TokenError", "tokenize"]
+__all__ = ["Token", "TsdlError", "tokenize"]
 
 
 class Token(NamedTuple):
@@ -16,8 +14,8 @@ class Token(NamedTuple):
     offset: int
 
 
-class TokenError(ValueError):
-    """Text that is no token; ``args`` are the character offset and the reason."""
+class TsdlError(ValueError):
+    """Metadata that is no TSDL; ``args`` are the character offset and the reason."""
 
 
 _TOKEN = re.compile(
@@ -40,34 +38,34 @@ _ESCAPES = {"n": "\n", "t": "\t", "r": "\r", "a": "\a", "b": "\b", "f": "\f", "v
 def tokenize(text: str) -> list[Token]:
     """The tokens of ``text`` without white space and comments, closed by one of kind ``end``.
 
-    Raises `TokenError` at the first character that begins no token.
+    Raises `TsdlError` at the first character that begins no token.
     """
     tokens: list[Token] = []
     position = 0
     while position < len(text):
         if len(tokens) > _MOST:
-            raise TokenError(position, f"more than {_MOST} tokens")
-        match = _TOKEN.match(text, position)
-        if match is None:
+            raise TsdlError(position, f"more than {_MOST} tokens")
+        matched = _TOKEN.match(text, position)
+        if matched is None:
             rest = text[position : position + 2]
             reason = "unterminated comment" if rest == "/*" else "unterminated string"
             if rest != "/*" and rest[0] not in "\"'":
                 reason = f"unexpected character {rest[0]!r}"
-            raise TokenError(position, reason)
-        kind, found = match.lastgroup, match.group()
-        if kind == "string":
-            tokens.append(Token("string", _unescape(found[found.index('"') + 1 : -1]), position))
-        elif kind == "character":
-            tokens.append(Token("integer", str(ord(_unescape(found[1:-1])[:1])), position))
-        elif kind == "integer":
-            if len(found) > 80:
-                raise TokenError(position, "integer out of range")
-            tokens.append(Token("integer", str(_integer(found)), position))
-        elif kind == "word":
-            tokens.append(Token("word", found, position))
-        elif kind == "mark":
-            tokens.append(Token("mark", found, position))
-        position = match.end()
+            raise TsdlError(position, reason)
+        kind, found = matched.lastgroup, matched.group()
+        match kind:
+            case "string":
+                found = _unescape(found[found.index('"') + 1 : -1])
+                tokens.append(Token("string", found, position))
+            case "character":
+                tokens.append(Token("integer", str(ord(_unescape(found[1:-1])[:1])), position))
+            case "integer":
+                if len(found) > 80:
+                    raise TsdlError(position, "integer out of range")
+                tokens.append(Token("integer", str(_integer(found)), position))
+            case "word" | "mark":
+                tokens.append(Token(kind, found, position))
+        position = matched.end()
     tokens.append(Token("end", "", position))
     return tokens
 

@@ -1,34 +1,21 @@
 """Opening CTF traces: what was recorded, where, by which clock, and what was lost."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from chainshaper.sources.ctf import tables as tb
+from chainshaper.sources.ctf.assembly import Wanted, assemble
 from chainshaper.sources.ctf.errors import CtfError
-from chainshaper.sources.ctf.metadata import read_metadata
-from chainshaper.sources.ctf.types import Clock, TraceClass
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+from chainshaper.sources.ctf.losses import count_losses
+from chainshaper.sources.ctf.metadata import CtfFolder, read_metadata
+from chainshaper.sources.ctf.streams import packet_table, stream_paths
 
 __all__ = ["CtfFolder", "CtfStream", "CtfTrace", "open_trace"]
-
-
-@dataclass(frozen=True)
-class CtfFolder:
-    """One folder with a ``metadata`` file: what it declares."""
-
-    path: Path
-    declared: TraceClass = field(repr=False)
-
-    @property
-    def clock(self) -> Clock:
-        """The folder's clock; one of 1 GHz without offset where the metadata has none."""
-        return next(iter(self.declared.clocks.values()), Clock("none"))
 
 
 @dataclass(frozen=True)
@@ -42,7 +29,6 @@ class CtfStream:
 
     path: Path
     folder: int
-    class_id: int
     instance: int | None
     packets: int
     begin_ns: int | None
@@ -65,8 +51,6 @@ class CtfTrace:
     streams: tuple[CtfStream, ...]
     event_names: tuple[str, ...]
     env: Mapping[str, str | int]
-    clock_name: str
-    clock_frequency: int
     clock_offset_ns: int
     packets: int
     discarded_events: int
@@ -80,12 +64,8 @@ def open_trace(*paths: Path | str) -> CtfTrace:
     Reads metadata and packet headers only.  Raises `CtfError` where a path holds no trace or
     metadata cannot be understood; stream files with damage give ``warnings`` instead.
     """
-    # Numba is slow to import: only who opens a trace pays for it.
-    from chainshaper.sources.ctf.assembly import Wanted, assemble
-    from chainshaper.sources.ctf.streams import packet_table, stream_paths
-
     folders = [CtfFolder(path, read_metadata(path / "metadata")) for path in _find(paths)]
-    assembly = assemble([(f.path, f.declared) for f in folders], Wanted())
+    assembly = assemble(folders, Wanted())
     warnings = _clock_warnings(folders)
     streams: list[CtfStream] = []
     for number, folder in enumerate(folders):
@@ -95,9 +75,8 @@ def open_trace(*paths: Path | str) -> CtfTrace:
             warnings += found
             if len(table):
                 tables.append((path, table))
-        identifiers = [row[0] for row in assembly.stream_rows]
-        rates = [row[16] for row in assembly.stream_rows]
-        streams += _streams(number, tables, identifiers, rates, warnings)
+        rates = [row[tb.S_FREQUENCY] for row in assembly.stream_rows]
+        streams += _streams(number, tables, rates, warnings)
     clock = folders[0].clock
     names = {
         e.name for f in folders for s in f.declared.streams.values() for e in s.events.values()
@@ -107,8 +86,6 @@ def open_trace(*paths: Path | str) -> CtfTrace:
         streams=tuple(streams),
         event_names=tuple(sorted(names)),
         env=folders[0].declared.env,
-        clock_name=clock.name,
-        clock_frequency=clock.frequency,
         clock_offset_ns=clock.offset_ns,
         packets=sum(stream.packets for stream in streams),
         discarded_events=sum(stream.discarded_events for stream in streams),
@@ -147,35 +124,30 @@ def _clock_warnings(folders: list[CtfFolder]) -> list[str]:
 def _streams(
     folder: int,
     tables: list[tuple[Path, NDArray[np.int64]]],
-    identifiers: list[int],
     rates: list[int],
     warnings: list[str],
 ) -> list[CtfStream]:
     """The streams of a folder's files, with what was lost counted per stream."""
-    from chainshaper.sources.ctf.losses import count_losses
-    from chainshaper.sources.ctf.tables import PacketColumn
-
     groups: dict[Any, list[int]] = {}
     for index, (path, table) in enumerate(tables):
         first = table[0]
-        instance = int(first[PacketColumn.INSTANCE])
+        instance = int(first[tb.P_INSTANCE])
         own = path if instance < 0 else instance
-        groups.setdefault((int(first[PacketColumn.STREAM]), own), []).append(index)
+        groups.setdefault((int(first[tb.P_STREAM]), own), []).append(index)
     losses = {
         group[0]: count_losses([tables[i] for i in group], warnings) for group in groups.values()
     }
     found = []
     for index, (path, table) in enumerate(tables):
-        stream = int(table[0, PacketColumn.STREAM])
-        begin, end = int(table[0, PacketColumn.BEGIN]), int(table[-1, PacketColumn.LAST])
-        instance = int(table[0, PacketColumn.INSTANCE])
+        stream = int(table[0, tb.P_STREAM])
+        begin, end = int(table[0, tb.P_BEGIN]), int(table[-1, tb.P_LAST])
+        instance = int(table[0, tb.P_INSTANCE])
         discarded, lost = losses.get(index, (0, 0))
         rate = rates[stream]
         found.append(
             CtfStream(
                 path=path,
                 folder=folder,
-                class_id=identifiers[stream],
                 instance=None if instance < 0 else instance,
                 packets=len(table),
                 begin_ns=begin * 1_000_000_000 // rate if begin >= 0 else None,

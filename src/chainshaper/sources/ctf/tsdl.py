@@ -1,11 +1,10 @@
 """Reading the blocks of TSDL metadata into a `TraceClass` (CTF 1.8, section 7)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
-from chainshaper.sources.ctf.declarations import Parser, TsdlError, Value
-from chainshaper.sources.ctf.tokens import TokenError, tokenize
+from chainshaper.sources.ctf.attributes import Value
+from chainshaper.sources.ctf.declarations import Parser
+from chainshaper.sources.ctf.tokens import TsdlError, tokenize
 from chainshaper.sources.ctf.types import (
     Clock,
     EventClass,
@@ -15,7 +14,7 @@ from chainshaper.sources.ctf.types import (
     Type,
 )
 
-__all__ = ["TsdlError", "parse_tsdl"]
+__all__ = ["parse_tsdl"]
 
 _NANOSECONDS = 1_000_000_000
 
@@ -26,10 +25,7 @@ def parse_tsdl(text: str) -> TraceClass:
     Raises `TsdlError` with the character offset and the reason where the text is no TSDL, names
     something undeclared, or declares something twice.
     """
-    try:
-        parser = Parser(tokenize(text))
-    except TokenError as error:
-        raise TsdlError(*error.args) from None
+    parser = Parser(tokenize(text))
     reader = _Blocks(parser)
     while parser.token.kind != "end":
         reader.block()
@@ -112,7 +108,6 @@ class _Blocks:
             frequency=frequency,
             offset_ns=integer("offset_s", 0) * _NANOSECONDS + cycles * _NANOSECONDS // frequency,
             uuid=str(values["uuid"][0]) if "uuid" in values else None,
-            description=str(values["description"][0]) if "description" in values else "",
         )
 
     def _stream(self, values: dict[str, Value | Type], offset: int) -> None:
@@ -137,7 +132,6 @@ class _Blocks:
         event = EventClass(
             id=identifier or 0,
             name=name,
-            stream_id=stream_id or 0,
             context=_struct(values, "context", offset),
             fields=_struct(values, "fields", offset),
         )
@@ -158,7 +152,7 @@ class _Blocks:
                 raise TsdlError(offset, f"event {event.name!r} of undeclared stream {target}")
             if event.id in events[target]:
                 raise TsdlError(offset, f"event {event.name!r}: id {event.id} declared twice")
-            events[target][event.id] = replace(event, stream_id=target)
+            events[target][event.id] = event
         uuid = self.trace.get("uuid")
         return TraceClass(
             byte_order="le" if byte_order == "le" else "be",

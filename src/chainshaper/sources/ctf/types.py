@@ -14,6 +14,7 @@ __all__ = [
     "ArrayType",
     "ByteOrder",
     "Clock",
+    "Encoding",
     "EnumMapping",
     "EnumType",
     "EventClass",
@@ -32,6 +33,7 @@ __all__ = [
 ]
 
 ByteOrder = Literal["native", "le", "be"]
+Encoding = Literal["none", "utf8", "ascii"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +44,7 @@ class IntegerType:
     align: int
     signed: bool = False
     byte_order: ByteOrder = "native"
-    base: int = 10
-    encoding: Literal["none", "utf8", "ascii"] = "none"
+    encoding: Encoding = "none"
     clock: str | None = None
 
 
@@ -72,16 +73,12 @@ class EnumType:
     container: IntegerType
     mappings: tuple[EnumMapping, ...]
 
-    def labels(self, value: int) -> tuple[str, ...]:
-        """Every label whose range holds ``value``, in order of declaration."""
-        return tuple(m.label for m in self.mappings if m.low <= value <= m.high)
-
 
 @dataclass(frozen=True, slots=True)
 class StringType:
     """``string`` (section 4.2.5): bytes up to and including the first NUL."""
 
-    encoding: Literal["none", "utf8", "ascii"] = "utf8"
+    encoding: Encoding = "utf8"
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +144,6 @@ class Clock:
     frequency: int = 1_000_000_000
     offset_ns: int = 0
     uuid: str | None = None
-    description: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +152,6 @@ class EventClass:
 
     id: int
     name: str
-    stream_id: int
     context: StructType | None = None
     fields: StructType | None = None
 

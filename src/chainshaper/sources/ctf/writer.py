@@ -3,8 +3,6 @@
 Any metadata text can be given; `lttng_text` makes LTTng's own.  babeltrace2 reads the result.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -57,13 +57,12 @@ def with_found_nodes(
     }
     changed: dict[str, pl.DataFrame] = dict(tables)
     for kind in _KINDS:
-        handles = {
-            (pid, topic): numbers[pid, node]
-            for (of_kind, pid, topic), node in owners.items()
-            if of_kind == kind
-        }
-        if handles:
-            changed[f"rcl_{kind}_init"] = _with_nodes(changed[f"rcl_{kind}_init"], handles)
+        created = events.table(tables, f"rcl_{kind}_init")
+        keys = [(kind, *key) for key in created.select("pid", "topic_name").iter_rows()]
+        found = [numbers[key[1], owners[key]] if key in owners else None for key in keys]
+        if any(found):
+            node = pl.col("node_handle").fill_null(pl.Series(found, dtype=pl.UInt64))
+            changed[f"rcl_{kind}_init"] = created.with_columns(node)
     new = {
         "rcl_node_init": _node_rows(numbers),
         "rclcpp_timer_link_node": _timer_links(changed, nodes_of, numbers),
@@ -112,12 +111,6 @@ def _owners(
         if len(found) == 1:
             (owners[kind, pid, topic],) = found
     return owners, nodes_of
-
-
-def _with_nodes(created: pl.DataFrame, handles: Mapping[tuple[int, str], int]) -> pl.DataFrame:
-    found = [handles.get(key) for key in created.select("pid", "topic_name").iter_rows()]
-    node = pl.Series(found, dtype=pl.UInt64)
-    return created.with_columns(node_handle=pl.coalesce("node_handle", node))
 
 
 def _node_rows(numbers: Mapping[tuple[int, str], int]) -> pl.DataFrame:

@@ -90,7 +90,8 @@ def with_functions(
 ) -> events.EventTables:
     """Add what `rclcpp_callback_register` would have told: (process, callback) → its function.
 
-    Callbacks were registered when they were added, or before ``began_ns``.
+    Callbacks were registered when they were added, or before ``began_ns``. What the event itself
+    told, as on Humble, stays.
     """
     named = pl.DataFrame(
         [(*callback, symbol) for callback, symbol in functions.items()],
@@ -99,30 +100,26 @@ def with_functions(
     )
     added = pl.concat([events.table(tables, name).select("time", *_CALLBACK) for name in ADDED])
     latest = added.group_by(_CALLBACK).agg(pl.col("time").max())
-    rows = named.join(latest, on=_CALLBACK, how="left").with_columns(
-        pl.col("time").fill_null(began_ns), tid=pl.col("pid")
-    )
-    if not rows.height:
-        return tables
     known = events.table(tables, "rclcpp_callback_register")
-    both = pl.concat(
-        [rows.select(c for c in known.columns if c in rows.columns), known], how="diagonal"
-    )
-    return {**tables, "rclcpp_callback_register": both.select(known.columns).sort("time")}
+    unknown = named.join(known, on=_CALLBACK, how="anti").join(latest, on=_CALLBACK, how="left")
+    return {**tables, **added_rows(tables, {"rclcpp_callback_register": unknown}, began_ns)}
 
 
 def added_rows(
     tables: events.EventTables, rows: Mapping[str, pl.DataFrame], began_ns: int
 ) -> dict[str, pl.DataFrame]:
-    """The tables with new rows in front, as events of ``began_ns``; empty ones are left out."""
+    """The tables with new rows, as events of ``began_ns`` where no ``time`` says otherwise.
+
+    Tables that get none are left out.
+    """
     added = {}
     for name, found in rows.items():
         if found.height:
-            new = found.with_columns(time=pl.lit(began_ns, dtype=pl.Int64), tid=pl.col("pid"))
+            time = pl.col("time") if "time" in found.columns else pl.lit(None, pl.Int64)
+            new = found.with_columns(time=time.fill_null(began_ns), tid=pl.col("pid"))
             known = events.table(tables, name)
-            added[name] = pl.concat(
-                [new.select(c for c in known.columns if c in new.columns), known], how="diagonal"
-            ).select(known.columns)
+            both = pl.concat([new, known], how="diagonal").select(known.columns)
+            added[name] = both.sort("time", maintain_order=True)
     return added
 
 

@@ -182,17 +182,13 @@ def _handles(lines: pl.DataFrame, points: Sequence[TracePoint], texts: _Texts) -
         schema={"time": pl.Int64, "tid": pl.Int64, "topic": pl.String},
         orient="row",
     )
-    codes = pl.DataFrame(
-        [(code, point.event) for code, point in enumerate(points, FIRST_POINT)],
-        schema={"code": pl.Int64, "event": pl.String},
-        orient="row",
-    )
+    event_of = {code: point.event for code, point in enumerate(points, FIRST_POINT)}
     return (
-        lines.join(named, on=["time", "tid"])
-        .join(codes, on="code")
+        lines.filter(pl.col("code").is_in(list(event_of)))
+        .join(named, on=["time", "tid"])
         .select(
             pl.col("pid").cast(pl.Int32),
-            "event",
+            pl.col("code").replace_strict(event_of, return_dtype=pl.String).alias("event"),
             pl.col(VALUES[0]).cast(pl.UInt64).alias("handle"),
             "topic",
         )

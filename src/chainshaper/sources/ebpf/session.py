@@ -26,7 +26,7 @@ import polars as pl
 
 from chainshaper import events
 from chainshaper.enforcement.gate import clock_offset
-from chainshaper.enforcement.realtime import interrupted_with_parent
+from chainshaper.enforcement.realtime import signalled_with_parent
 from chainshaper.enforcement.threads.listing import parents
 from chainshaper.enforcement.threads.processes import descendants
 from chainshaper.errors import InputError, OperationError, PlatformError
@@ -304,7 +304,7 @@ def _in_the_background(parent_pid: int) -> None:
     Every event wakes it. If it pre-empted the thread then, as ordinary processes do, these were two
     switches, thus two events, and so on: ten times as many events as there were to be recorded.
     """
-    interrupted_with_parent(parent_pid)
+    signalled_with_parent(parent_pid, signal.SIGINT)
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     os.nice(_NICE)
 

@@ -16,6 +16,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 from chainshaper.sources.ebpf.elf_symbols import exported_functions
 
@@ -40,6 +41,10 @@ class TracingLibrary:
         return None if self.version is None else int(self.version.partition(".")[0])
 
 
+_Known: TypeAlias = dict[tuple[int, int], TracingLibrary]
+"""Libraries by device and inode."""
+
+
 def installed_libraries(environment: Mapping[str, str]) -> tuple[TracingLibrary, ...]:
     """The libraries that a command started with this environment can find.
 
@@ -49,24 +54,18 @@ def installed_libraries(environment: Mapping[str, str]) -> tuple[TracingLibrary,
     folders = [Path(prefix) / "lib" for prefix in prefixes if prefix]
     folders += [Path(entry) for entry in environment.get("LD_LIBRARY_PATH", "").split(":") if entry]
     folders += sorted(_INSTALLATIONS.glob("*/lib"))
-    return _read(folder / LIBRARY for folder in folders)
+    known: _Known = {}
+    for folder in folders:
+        if (folder / LIBRARY).is_file():
+            _library((folder / LIBRARY).absolute(), known)
+    return tuple(known.values())
 
 
 def mapped_libraries(pids: Iterable[int]) -> dict[int, tuple[TracingLibrary, ...]]:
     """Process → the libraries that it has mapped; only those that have one."""
-    known: dict[tuple[int, int], TracingLibrary] = {}
-    found = {}
-    for pid in pids:
-        libraries = []
-        for path in _mapped(pid):
-            status = path.stat()
-            key = status.st_dev, status.st_ino
-            if key not in known:
-                known[key] = _library(path)
-            libraries.append(known[key])
-        if libraries:
-            found[pid] = tuple(libraries)
-    return found
+    known: _Known = {}
+    found = {pid: tuple(_library(path, known) for path in _mapped(pid)) for pid in pids}
+    return {pid: libraries for pid, libraries in found.items() if libraries}
 
 
 def _mapped(pid: int) -> Iterator[Path]:
@@ -82,17 +81,12 @@ def _mapped(pid: int) -> Iterator[Path]:
             yield outside if outside.is_file() and outside.samefile(inside) else inside
 
 
-def _read(paths: Iterable[Path]) -> tuple[TracingLibrary, ...]:
-    files: dict[tuple[int, int], Path] = {}
-    for path in paths:
-        if path.is_file():
-            status = path.stat()
-            files.setdefault((status.st_dev, status.st_ino), path.absolute())
-    return tuple(_library(path) for path in files.values())
-
-
-def _library(path: Path) -> TracingLibrary:
-    return TracingLibrary(path, exported_functions(path), _version(path))
+def _library(path: Path, known: _Known) -> TracingLibrary:
+    status = path.stat()
+    key = status.st_dev, status.st_ino
+    if key not in known:
+        known[key] = TracingLibrary(path, exported_functions(path), _version(path))
+    return known[key]
 
 
 def _version(library: Path) -> str | None:

@@ -20,6 +20,7 @@ Upstream: lttng-tools, `utils_get_rundir`; lttng-ust, `setup_local_apps`; lttng(
 import os
 import shlex
 import shutil
+import signal
 import subprocess
 import tempfile
 import time
@@ -29,7 +30,7 @@ from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
-from chainshaper.enforcement.realtime import interrupted_with_parent
+from chainshaper.enforcement.realtime import signalled_with_parent
 from chainshaper.errors import OperationError, PlatformError
 
 __all__ = ["Lttng", "connect"]
@@ -137,7 +138,7 @@ def _with_daemon(lttng: Lttng) -> Lttng:
             stderr=log,
             start_new_session=True,
             # It ends in order, with its consumers, should we be killed.
-            preexec_fn=partial(interrupted_with_parent, os.getpid()),  # noqa: PLW1509 - one call
+            preexec_fn=partial(signalled_with_parent, os.getpid(), signal.SIGINT),  # noqa: PLW1509 - one call
         )
     started = Lttng(lttng.home, daemon)
     deadline = time.monotonic() + _START_S

@@ -15,6 +15,7 @@ read host by host, and where two of them use the same number, the later host's a
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock
@@ -25,8 +26,7 @@ import polars as pl
 from chainshaper import events
 from chainshaper.errors import InputError, OperationError
 from chainshaper.recording import Recording, RecordingInfo
-from chainshaper.sources.ctf import CtfError, CtfTrace, count_events, open_trace, read_events
-from chainshaper.sources.ctf.read import Events
+from chainshaper.sources.ctf import CtfTrace, Events, count_events, open_trace, read_events
 from chainshaper.sources.ctf.types import ArrayType
 from chainshaper.sources.lttng.event_fields import (
     CARET_INIT,
@@ -256,21 +256,17 @@ def open_lttng_trace(
     return Recording(Path(paths[0]), info, tables)
 
 
-class _as_our_errors:  # noqa: N801 - reads like a function where it is used
-    """What the decoder raises inside becomes an error of the project."""
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, CtfError):
-            raise InputError(str(error)) from error
-        if isinstance(error, PermissionError):
-            raise InputError(
-                f"{error.filename}: no permission to read it: copy the trace, or run as its owner"
-            ) from error
-        if isinstance(error, OSError):
-            raise OperationError(f"the trace cannot be read: {error}") from error
+@contextmanager
+def _as_our_errors() -> Iterator[None]:
+    """What the operating system says about files becomes an error of the project."""
+    try:
+        yield
+    except PermissionError as error:
+        raise InputError(
+            f"{error.filename}: no permission to read it: copy the trace, or run as its owner"
+        ) from error
+    except OSError as error:
+        raise OperationError(f"the trace cannot be read: {error}") from error
 
 
 def _untold(*_: object) -> None:

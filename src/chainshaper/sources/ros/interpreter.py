@@ -12,8 +12,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from chainshaper.enforcement.threads.listing import read_proc
+from chainshaper.errors import OperationError
 
-__all__ = ["environment_of", "run_with_rclpy"]
+__all__ = ["environment_of", "run_with_rclpy", "start_with_rclpy", "why_it_failed"]
 
 _NOT_FOR_US = ("LD_PRELOAD",)
 """What is loaded into the nodes for tracing shall not trace us."""
@@ -32,32 +33,55 @@ def environment_of(pid: int) -> dict[str, str]:
 def run_with_rclpy(
     environment: Mapping[str, str], script: str, *arguments: str, within_s: float
 ) -> tuple[str, str | None]:
-    """Run a script file in a node's environment.
+    """Run a script file in a node's environment, and wait for its end.
 
     Returns:
         What it printed, and why it failed, if it did.
     """
+    try:
+        process = start_with_rclpy(environment, script, *arguments)
+    except OperationError as error:
+        return "", str(error)
+    with process:
+        try:
+            printed, said = process.communicate(timeout=within_s)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            return "", f"ROS 2 did not answer within {within_s:g} s"
+    problem = why_it_failed(process, said)
+    return ("" if problem else printed), problem
+
+
+def start_with_rclpy(
+    environment: Mapping[str, str], script: str, *arguments: str
+) -> "subprocess.Popen[str]":
+    """Start a script file in a node's environment; what it prints is for the caller to read.
+
+    Raises:
+        OperationError: there is no such Python.
+    """
     command = [*_interpreter(environment), script, *arguments]
     try:
-        run = subprocess.run(
+        return subprocess.Popen(
             command,
             env={name: text for name, text in environment.items() if name not in _NOT_FOR_US},
             stdin=subprocess.DEVNULL,
-            capture_output=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
             text=True,
             errors="replace",
-            timeout=within_s,
-            check=False,
             start_new_session=True,
         )
-    except subprocess.TimeoutExpired:
-        return "", f"ROS 2 did not answer within {within_s:g} s"
     except OSError as error:
-        return "", str(error)
-    if run.returncode != 0:
-        last = next((line for line in reversed(run.stderr.splitlines()) if line.strip()), "")
-        return "", last.strip() or f"{command[0]} ended with code {run.returncode}"
-    return run.stdout, None
+        raise OperationError(f"{command[0]} cannot be started: {error.strerror}") from error
+
+
+def why_it_failed(process: "subprocess.Popen[str]", said: str) -> str | None:
+    """The last line of what a script that has ended ``said`` on standard error, if it failed."""
+    if process.returncode == 0:
+        return None
+    last = next((line for line in reversed(said.splitlines()) if line.strip()), "")
+    return last.strip() or f"the script ended with code {process.returncode}"
 
 
 def _interpreter(environment: Mapping[str, str]) -> list[str]:

@@ -1,44 +1,61 @@
-"""Setting an integer parameter of a node that runs, by the Python of a ROS 2 installation.
+"""Setting an integer parameter of nodes that run, by the Python of a ROS 2 installation.
 
-    python3 ros_parameter.py NODE NAME VALUE [SECONDS]
+    python3 parameter.py NAME VALUE NODE...
 
 This file is run, not imported, like :mod:`chainshaper.sources.ros.graph`. It ends with an error
-when the node has no such parameter, refuses the value, or does not answer within SECONDS (5).
+that names each node which has no such parameter, refuses the value, or does not answer in time;
+all of them together have five seconds.
 """
 
 import importlib
 import sys
+import time
 from typing import Any
 
 NODE = "_chainshaper_parameter"
+PATIENCE_S = 5.0
+LOOK_S = 0.05
 
 
 def main() -> None:
-    """Call the node's service ``set_parameters``."""
+    """Call the service ``set_parameters`` of all nodes at once."""
     rclpy: Any = importlib.import_module("rclpy")
     service: Any = importlib.import_module("rcl_interfaces.srv").SetParameters
-    parameter_class: Any = importlib.import_module("rclpy.parameter").Parameter
-    name, parameter, value = sys.argv[1], sys.argv[2], int(sys.argv[3])
-    patience = float(sys.argv[4]) if len(sys.argv) > 4 else 5.0
+    parameter: Any = importlib.import_module("rclpy.parameter").Parameter
+    name, value, *nodes = sys.argv[1:]
     rclpy.init(args=[])
     node = rclpy.create_node(NODE, enable_rosout=False, start_parameter_services=False)
     try:
-        client = node.create_client(service, f"{name}/set_parameters")
-        if not client.wait_for_service(timeout_sec=patience):
-            sys.exit(f"{name} offers no parameters")
-        request = service.Request()
-        wanted = parameter_class(parameter, parameter_class.Type.INTEGER, value)
-        request.parameters = [wanted.to_parameter_msg()]
-        answer = client.call_async(request)
-        rclpy.spin_until_future_complete(node, answer, timeout_sec=patience)
-        if not answer.done():
-            sys.exit(f"{name} did not answer")
-        (result,) = answer.result().results
-        if not result.successful:
-            sys.exit(f"{name} refused {parameter}: {result.reason or 'no reason given'}")
+        wanted = parameter(name, parameter.Type.INTEGER, int(value)).to_parameter_msg()
+        request = service.Request(parameters=[wanted])
+        clients = {one: node.create_client(service, f"{one}/set_parameters") for one in nodes}
+        answers: dict[str, Any] = {}
+        until = time.monotonic() + PATIENCE_S
+        while time.monotonic() < until:
+            for one, client in clients.items():
+                if one not in answers and client.service_is_ready():
+                    answers[one] = client.call_async(request)
+            rclpy.spin_once(node, timeout_sec=LOOK_S)
+            if len(answers) == len(nodes) and all(answer.done() for answer in answers.values()):
+                break
     finally:
         node.destroy_node()
         rclpy.shutdown()
+    asked = [_problem(one, name, answers.get(one)) for one in nodes]
+    problems = [problem for problem in asked if problem is not None]
+    if problems:
+        sys.exit("; ".join(problems))
+
+
+def _problem(node: str, name: str, answer: Any) -> "str | None":
+    if answer is None:
+        return f"{node} offers no parameters"
+    if not answer.done():
+        return f"{node} did not answer"
+    (result,) = answer.result().results
+    if result.successful:
+        return None
+    return f"{node} refused {name}: {result.reason or 'no reason given'}"
 
 
 if __name__ == "__main__":

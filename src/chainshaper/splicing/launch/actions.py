@@ -70,7 +70,7 @@ class Edit(NamedTuple):
 class Condition(NamedTuple):
     """When an action is carried out: ``if`` or ``unless`` this text, written as in the file."""
 
-    kind: Literal["if", "unless"]
+    kind: str
     text: str
 
 

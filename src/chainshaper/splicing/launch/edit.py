@@ -64,14 +64,14 @@ class Copies:
 
 @dataclass
 class _Work:
-    """Edits per instance of a launch file, and remaps for nodes, each with the node's place.
+    """Edits per instance of a launch file, and remaps per instance and node's place.
 
     For launch files themselves also the rules and nodes that are to stand at their start.
     """
 
     edits: dict[int, list[Edit]] = field(default_factory=lambda: defaultdict(list))
-    remaps: dict[int, list[tuple[object, tuple[str, str]]]] = field(
-        default_factory=lambda: defaultdict(list)
+    remaps: dict[tuple[int, int], tuple[object, list[tuple[str, str]]]] = field(
+        default_factory=dict
     )
     rules: dict[int, list[tuple[str, str]]] = field(default_factory=lambda: defaultdict(list))
     starts: dict[int, list[ShapingProcess]] = field(default_factory=lambda: defaultdict(list))
@@ -138,15 +138,16 @@ def _near(work: _Work, file: LaunchFile, remedy: Remedy) -> bool:
             edits = language.add_set_remaps(file, place, [remedy.bound])
     elif rule is not None and remedy.sure:
         if rule.rule.span is not None and _once(file, rule.rule.span):
-            edits = [language.replaced(file, rule.rule.span, remedy.target)]
+            edits = [language.replaced(file, rule.rule.span, remedy.wanted.target)]
     elif node is not None and remedy.near and not (rule is not None and rule.from_arguments):
-        added = (remedy.match, remedy.target) if remedy.sure else remedy.bound
+        added = (remedy.match, remedy.wanted.target) if remedy.sure else remedy.bound
         place = node.action.place
         if place is None or not _once(file, place):
             return False
         if language.add_remaps(file, place, [added]) is None:
             return False
-        work.remaps[remedy.instance].append((place, added))
+        _, remaps = work.remaps.setdefault((remedy.instance, id(place)), (place, []))
+        remaps += [added] if added not in remaps else []
         return True
     known = work.edits[remedy.instance]
     known += [edit for edit in edits or () if edit not in known]
@@ -155,11 +156,9 @@ def _near(work: _Work, file: LaunchFile, remedy: Remedy) -> bool:
 
 def _edits_of_nodes(walk: Walk, work: _Work) -> None:
     """Turn remaps for nodes into edits, one for each node."""
-    for number, remaps in work.remaps.items():
+    for (number, _), (place, rules) in work.remaps.items():
         file = walk.instances[number].file
-        for place in {id(place): place for place, _ in remaps}.values():
-            rules = list(dict.fromkeys(rule for other, rule in remaps if other is place))
-            work.edits[number] += LANGUAGES[file.language].add_remaps(file, place, rules) or []
+        work.edits[number] += LANGUAGES[file.language].add_remaps(file, place, rules) or []
 
 
 def _once(file: LaunchFile, place: object) -> bool:

@@ -168,11 +168,9 @@ def _flag(element: Element, name: str) -> bool:
 
 
 def _conditions(element: Element) -> Conditions:
-    found = [("if", element.attributes.get("if")), ("unless", element.attributes.get("unless"))]
+    given = element.attributes
     return frozenset(
-        Condition("if" if kind == "if" else "unless", attribute.value)
-        for kind, attribute in found
-        if attribute is not None
+        Condition(kind, given[kind].value) for kind in ("if", "unless") if kind in given
     )
 
 

@@ -6,7 +6,7 @@ it counts for nodes of this name only. That is what makes a rule safe where many
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from chainshaper.splicing.launch.actions import RemapRule, SetRemap
 
@@ -76,7 +76,5 @@ def rules_in_force(rules: Sequence[PlacedRule], node: FullName) -> list[PlacedRu
                 continue
             matches.add(match)
         target = None if rule.target is None else expanded(rule.target, node)
-        found.append(
-            PlacedRule(match, target, rule.rule, rule.scope, from_arguments=rule.from_arguments)
-        )
+        found.append(replace(rule, match=match, target=target))
     return found

@@ -7,7 +7,7 @@ gives the name or the file cannot be read so far, the rule begins with the node'
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Literal
 
@@ -41,20 +41,23 @@ class Sure(Enum):
 
 @dataclass(frozen=True)
 class Remedy:
-    """One change to one instance of a launch file: what ``match`` names becomes ``target``.
+    """One change to one instance of a launch file: what ``match`` names becomes what is wanted.
 
     Either the target of ``rule`` is replaced, or a rule is added before it where it holds for a
-    scope, or before ``node``'s own. With neither it is for the whole of the launch file. ``owner``
-    is the name of the node that it must be bound to wherever others hear it.
+    scope, or before ``node``'s own. With neither it is for the whole of the launch file.
     """
 
+    wanted: Wanted
     instance: int
     match: str
-    target: str
-    owner: str
-    node: PlacedNode | None
-    rule: PlacedRule | None
-    certainty: Sure
+    node: PlacedNode | None = None
+    rule: PlacedRule | None = None
+    certainty: Sure = Sure.NO
+
+    @property
+    def owner(self) -> str:
+        """The name of the node that a rule must be bound to wherever others hear it."""
+        return FullName.of(self.wanted.node).base
 
     @property
     def sure(self) -> bool:
@@ -69,7 +72,7 @@ class Remedy:
     @property
     def bound(self) -> tuple[str, str]:
         """The rule as it may be heard by all nodes."""
-        return f"{self.owner}:{self.match}", self.target
+        return f"{self.owner}:{self.match}", self.wanted.target
 
 
 def remedies_for(walk: Walk, wanted: Wanted) -> tuple[list[Remedy], list[str]]:
@@ -83,15 +86,13 @@ def remedies_for(walk: Walk, wanted: Wanted) -> tuple[list[Remedy], list[str]]:
     name, notes = FullName.of(wanted.node), []
     found = _named(walk, name)
     _refuse_several(walk, found, wanted)
-    remedies = [
-        remedy for node in found for remedy in _remedies(walk, node, name, wanted, Sure.YES)
-    ]
+    remedies = [remedy for node in found for remedy in _remedies(walk, node, wanted, Sure.YES)]
     if all(node.conditions for node in found):
         possible = [node for node in walk.nodes if _possible(node, name, found)]
         alone = len(possible) == 1 and not walk.unreadable and possible[0].action.name is None
         sure = Sure.IF_NAMED_SO if alone else Sure.NO
         for node in possible:
-            remedies += _remedies(walk, node, name, wanted, sure)
+            remedies += _remedies(walk, node, wanted, sure)
         if possible:
             places = ", ".join(_place(walk, node) for node in possible)
             notes.append(
@@ -99,7 +100,7 @@ def remedies_for(walk: Walk, wanted: Wanted) -> tuple[list[Remedy], list[str]]:
                 f" is bound to the name {name.base}"
             )
         for number, action in walk.unreadable:
-            remedies.append(_for_all(number, name, wanted))
+            remedies.append(Remedy(wanted, number, wanted.topic))
             notes.append(
                 f"{walk.instances[number].file.path}:{action.line}: not known before launch, may"
                 f" start {name}: {action.reason}"
@@ -142,10 +143,8 @@ def _refuse_several(walk: Walk, found: Sequence[PlacedNode], wanted: Wanted) -> 
                 )
 
 
-def _remedies(
-    walk: Walk, node: PlacedNode, name: FullName, wanted: Wanted, certainty: Sure
-) -> list[Remedy]:
-    sure = certainty is Sure.YES
+def _remedies(walk: Walk, node: PlacedNode, wanted: Wanted, certainty: Sure) -> list[Remedy]:
+    sure, name = certainty is Sure.YES, FullName.of(wanted.node)
     rules = rules_in_force(node.rules, name)
     for rule in rules:
         if rule.target == wanted.target:
@@ -161,48 +160,23 @@ def _remedies(
             f" {wanted.topic}, so it is not the one that {wanted.does} it: give a recording of this"
             " application, or a plan made from one"
         )
+    direct = Remedy(wanted, node.instance, wanted.topic, node, certainty=certainty)
     found = [
-        Remedy(
+        replace(
+            direct,
             instance=rule.scope[0] if rule.scope else node.instance,
             match=rule.match or wanted.topic,
-            target=wanted.target,
-            owner=name.base,
-            node=node,
             rule=rule,
-            certainty=certainty,
         )
         for rule in leading
     ]
     if sure and found:
         return found
-    direct = Remedy(
-        instance=node.instance,
-        match=wanted.topic,
-        target=wanted.target,
-        owner=name.base,
-        node=node,
-        rule=None,
-        certainty=certainty,
-    )
     return [*found, *([] if elsewhere else [direct])]
 
 
-def _for_all(number: int, name: FullName, wanted: Wanted) -> Remedy:
-    return Remedy(
-        instance=number,
-        match=wanted.topic,
-        target=wanted.target,
-        owner=name.base,
-        node=None,
-        rule=None,
-        certainty=Sure.NO,
-    )
-
-
 def _nobody(walk: Walk, wanted: Wanted) -> str:
-    names = sorted(
-        {f"{(node.namespace or '').rstrip('/')}/{node.name}" for node in walk.nodes if node.name}
-    )
+    names = sorted({node.full_name for node in walk.nodes if node.name})
     shown = ", ".join(names[:_SHOWN]) + (", …" if len(names) > _SHOWN else "")
     message = (
         f"nobody {wanted.does} {wanted.topic}: the launch files start no node {wanted.node}, only"
@@ -237,12 +211,12 @@ def heard_by_owner(walk: Walk, remedy: Remedy) -> None:
     if rule is not None and rule.from_arguments:
         raise OperationError(
             f"{_place(walk, node)}: the command line of {node.action.label} remaps {remedy.match}"
-            f" and precedes every other rule: make it {remedy.target} by hand, in a copy"
+            f" and precedes every other rule: make it {remedy.wanted.target} by hand, in a copy"
         )
     if node.sheltered:
         raise OperationError(
             f"{_place(walk, node)}: a group around it forwards nothing from outside, and its place"
-            f" cannot be edited: remap {remedy.match} to {remedy.target} by hand, in a copy"
+            f" cannot be edited: remap {remedy.match} to {remedy.wanted.target} by hand, in a copy"
         )
 
 
@@ -255,7 +229,7 @@ def notes_of_bound_rule(walk: Walk, remedy: Remedy) -> list[str]:
             " once, or cannot be changed alone, or is certain at launch only"
         )
     namesakes = {
-        f"{(node.namespace or '').rstrip('/')}/{node.name}"
+        node.full_name
         for node in walk.nodes
         if node.name == remedy.owner and remedy.node is not None
         if node.namespace is not None and node.namespace != remedy.node.namespace

@@ -7,7 +7,7 @@ which conditions they run. The same file, included twice, is followed twice.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from chainshaper.errors import InputError
@@ -62,6 +62,11 @@ class PlacedNode:
     conditions: Conditions
     sheltered: bool
 
+    @property
+    def full_name(self) -> str:
+        """As people write it, where both parts are known."""
+        return f"{(self.namespace or '').rstrip('/')}/{self.name}"
+
 
 @dataclass
 class Walk:
@@ -79,20 +84,28 @@ class Walk:
 
 @dataclass
 class _Context:
+    """What holds where the walk has come to, in the launch file that is instance ``number``."""
+
+    walk: Walk
+    number: int
     configurations: dict[str, str | None] = field(default_factory=dict)
     namespace: str | None = ""
     rules: list[PlacedRule] = field(default_factory=list)
     conditions: Conditions = frozenset()
     sheltered: bool = False
 
+    @property
+    def instance(self) -> Instance:
+        return self.walk.instances[self.number]
+
     def copy(self) -> "_Context":
-        return _Context(
-            dict(self.configurations),
-            self.namespace,
-            list(self.rules),
-            self.conditions,
-            self.sheltered,
-        )
+        return replace(self, configurations={**self.configurations}, rules=[*self.rules])
+
+    def text(self, template: Template) -> str | None:
+        return resolve(template, Surroundings(self.configurations, self.instance.file.path))
+
+    def rule(self, rule: RemapRule) -> PlacedRule:
+        return PlacedRule(self.text(rule.match), self.text(rule.target), rule)
 
 
 def follow(files: Sequence[LaunchFile], arguments: dict[str, str]) -> Walk:
@@ -104,68 +117,61 @@ def follow(files: Sequence[LaunchFile], arguments: dict[str, str]) -> Walk:
     walk = Walk()
     for file in files:
         walk.instances.append(Instance(file, None, None))
-        _follow_file(walk, len(walk.instances) - 1, _Context({**arguments}))
+        _carry_out(file.actions, _Context(walk, len(walk.instances) - 1, {**arguments}), set())
     return walk
 
 
-def _follow_file(walk: Walk, number: int, context: _Context) -> None:
-    _carry_out(walk, number, walk.instances[number].file.actions, context, set())
-
-
-def _carry_out(
-    walk: Walk, number: int, actions: Iterable[Action], context: _Context, done: set[int]
-) -> None:
+def _carry_out(actions: Iterable[Action], context: _Context, done: set[int]) -> None:
     for action in actions:
         match action:
             case NodeAction() if id(action) not in done:
                 done.add(id(action))  # an event handler's target is the node again
-                walk.nodes.append(_placed(walk, number, action, context))
+                context.walk.nodes.append(_placed(action, context))
             case SetRemap():
-                placed = _rule(walk, number, action.rule, context, scope=(number, action))
-                context.rules.append(placed)
+                scope = (context.number, action)
+                context.rules.append(replace(context.rule(action.rule), scope=scope))
             case PushNamespace():
-                pushed = _text(walk, number, action.namespace, context)
-                context.namespace = _below(context.namespace, pushed)
+                context.namespace = _below(context.namespace, context.text(action.namespace))
             case SetConfiguration():
-                _configure(walk, number, action, context)
+                _configure(action, context)
             case Group():
-                _carry_out_group(walk, number, action, context, done)
+                _carry_out_group(action, context, done)
             case Include():
-                _include(walk, number, action, context)
+                _include(action, context)
             case Unreadable():
-                walk.unreadable.append((number, action))
+                context.walk.unreadable.append((context.number, action))
 
 
-def _carry_out_group(
-    walk: Walk, number: int, group: Group, context: _Context, done: set[int]
-) -> None:
+def _carry_out_group(group: Group, context: _Context, done: set[int]) -> None:
     inner = context
-    if group.scoped:
-        inner = context.copy() if group.forwarding else _Context(sheltered=True)
+    if group.scoped and group.forwarding:
+        inner = context.copy()
+    elif group.scoped:
+        inner = _Context(context.walk, context.number, sheltered=True)
     before = context.conditions
     inner.conditions = before | group.conditions
-    _carry_out(walk, number, group.actions, inner, done)
+    _carry_out(group.actions, inner, done)
     inner.conditions = before
 
 
-def _include(walk: Walk, number: int, include: Include, context: _Context) -> None:
+def _include(include: Include, context: _Context) -> None:
     for setting in include.configurations:
-        _configure(walk, number, setting, context)
-    text = _text(walk, number, include.path, context)
+        _configure(setting, context)
+    walk, number, before = context.walk, context.number, context.conditions
+    text = context.text(include.path)
     path = None if text is None else Path(text)
     if path is None or not path.is_file() or not is_launch_file(path):
         walk.not_followed.append((number, include))
         return
     if path.resolve() in _including(walk, number):
         raise InputError(
-            f"{walk.instances[number].file.path}:{include.line}: includes {path}, which includes it"
-            " in turn: there is no end to that"
+            f"{context.instance.file.path}:{include.line}: includes {path}, which includes it in"
+            " turn: there is no end to that"
         )
     walk.instances.append(Instance(read_launch_file(path), number, include))
-    before = context.conditions
-    context.conditions = before | include.conditions
-    _follow_file(walk, len(walk.instances) - 1, context)
-    context.conditions = before
+    context.number, context.conditions = len(walk.instances) - 1, before | include.conditions
+    _carry_out(context.instance.file.actions, context, set())
+    context.number, context.conditions = number, before
 
 
 def _including(walk: Walk, number: int | None) -> set[Path]:
@@ -176,54 +182,33 @@ def _including(walk: Walk, number: int | None) -> set[Path]:
     return found
 
 
-def _configure(walk: Walk, number: int, setting: SetConfiguration, context: _Context) -> None:
-    name = _text(walk, number, setting.name, context)
+def _configure(setting: SetConfiguration, context: _Context) -> None:
+    name = context.text(setting.name)
     if name is None:
         return
     if setting.declared and setting.value is None:
-        walk.instances[number].required.append(name)
+        context.instance.required.append(name)
     if not setting.declared or name not in context.configurations:
         value = setting.value
-        known = None if value is None else _text(walk, number, value, context)
-        context.configurations[name] = known
+        context.configurations[name] = None if value is None else context.text(value)
 
 
-def _placed(walk: Walk, number: int, action: NodeAction, context: _Context) -> PlacedNode:
-    own = [_rule(walk, number, rule, context) for rule in action.rules]
+def _placed(action: NodeAction, context: _Context) -> PlacedNode:
+    own = [context.rule(rule) for rule in action.rules]
     namespace = context.namespace
     if action.namespace is not None:
-        namespace = _below(namespace, _text(walk, number, action.namespace, context))
-    from_arguments = [
-        PlacedRule(rule.match, rule.target, rule.rule, from_arguments=True)
-        for rule in own[: action.arguments]
-    ]
+        namespace = _below(namespace, context.text(action.namespace))
+    from_arguments = [replace(rule, from_arguments=True) for rule in own[: action.arguments]]
     # ROS 2 tries rules of the command line first, then those of the scope, then the node's own.
     return PlacedNode(
         action=action,
-        instance=number,
-        name=None if action.name is None else _text(walk, number, action.name, context),
+        instance=context.number,
+        name=None if action.name is None else context.text(action.name),
         namespace=namespace,
         rules=(*from_arguments, *context.rules, *own[action.arguments :]),
         conditions=context.conditions | action.conditions,
         sheltered=context.sheltered,
     )
-
-
-def _rule(
-    walk: Walk,
-    number: int,
-    rule: RemapRule,
-    context: _Context,
-    scope: tuple[int, SetRemap] | None = None,
-) -> PlacedRule:
-    match = _text(walk, number, rule.match, context)
-    target = _text(walk, number, rule.target, context)
-    return PlacedRule(match, target, rule, scope)
-
-
-def _text(walk: Walk, number: int, template: Template, context: _Context) -> str | None:
-    where = Surroundings(context.configurations, walk.instances[number].file.path)
-    return resolve(template, where)
 
 
 def _below(namespace: str | None, name: str | None) -> str | None:

@@ -6,23 +6,23 @@ stay, because an edit replaces or inserts just the characters it has to.
 """
 
 import re
+import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
 from xml.parsers import expat
+from xml.sax.saxutils import escape
 
 from chainshaper.errors import InputError
 from chainshaper.splicing.launch.actions import Edit, LaunchFile, Rules, Span
 from chainshaper.splicing.launch.elements import Attribute, Element, actions_of, location_edits
-from chainshaper.splicing.launch.start import command_line
 from chainshaper.splicing.shaping_process import ShapingProcess
 
 __all__ = ["add_at_start", "add_remaps", "add_set_remaps", "keep_folder", "read", "replaced"]
 
 _ATTRIBUTE = re.compile(r"""([^\s=/>"']+)\s*=\s*("[^"]*"|'[^']*')""")
-_TAG_NAME = re.compile(r"<([^\s/>]+)")
-_ENTITIES = (("&amp;", "&"), ("&lt;", "<"), ("&gt;", ">"), ("&quot;", '"'), ("&apos;", "'"))
+_START_TAG = re.compile(r"""<([^\s/>]+)(?:[^"'>]|"[^"]*"|'[^']*')*>""")
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +59,13 @@ def _parse(path: Path, text: str) -> Element:
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         begin = len(data[: parser.CurrentByteIndex].decode())
-        name = _TAG_NAME.match(text, begin)
-        if name is None or name[1] != tag:
+        found = _START_TAG.match(text, begin)
+        if found is None or found[1] != tag:
             raise InputError(
                 f"{path}:{parser.CurrentLineNumber}: <{tag}> comes out of an XML entity: write"
                 " the element itself"
             )
-        span = Span(begin, _tag_end(text, begin))
-        open_tags.append(_Tag(tag, span, parser.CurrentLineNumber, attributes))
+        open_tags.append(_Tag(tag, Span(*found.span()), parser.CurrentLineNumber, attributes))
 
     def end(tag: str) -> None:  # noqa: ARG001 - expat gives it
         closed = open_tags.pop()
@@ -84,20 +83,6 @@ def _parse(path: Path, text: str) -> Element:
     return outermost.children[0]
 
 
-def _tag_end(text: str, begin: int) -> int:
-    """Where a start tag ends; a ``>`` may stand in an attribute's quotes."""
-    quote = ""
-    for position in range(begin, len(text)):
-        character = text[position]
-        if quote:
-            quote = "" if character == quote else quote
-        elif character in "\"'":
-            quote = character
-        elif character == ">":
-            return position + 1
-    return len(text)
-
-
 def _element(tag: _Tag, text: str) -> Element:
     begin = tag.span.start + len(tag.name) + 1
     attributes = {
@@ -113,9 +98,7 @@ def replaced(file: LaunchFile, span: Span, value: str) -> Edit:  # noqa: ARG001 
 
 
 def _written(value: str) -> str:
-    for entity, raw in _ENTITIES:
-        value = value.replace(raw, entity)
-    return value
+    return escape(value, {'"': "&quot;", "'": "&apos;"})
 
 
 def add_remaps(file: LaunchFile, place: object, rules: Rules) -> list[Edit]:
@@ -161,9 +144,8 @@ def _rule(tag: str, rule: tuple[str, str]) -> str:
 
 def _process(process: ShapingProcess) -> str:
     if process.command is not None:
-        words = command_line(process.command, process)
-        command = " ".join(f"'{word}'" if " " in word else word for word in words)
-        return f'<executable cmd="{_written(command)}" output="screen"/>'
+        command = _written(shlex.join(process.command_line))
+        return f'<executable cmd="{command}" output="screen"/>'
     inside = [f'<param from="{_written(str(process.parameters_file))}"/>']
     inside += [_rule("remap", rule) for rule in process.remappings]
     return "\n".join(

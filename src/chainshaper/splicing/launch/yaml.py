@@ -5,7 +5,7 @@ that comments, quotes, block and flow style stay as they were. New keys and item
 the style of what surrounds them, before what is there.
 """
 
-from collections import Counter
+import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,6 @@ import yaml
 from chainshaper.errors import InputError
 from chainshaper.splicing.launch.actions import Edit, LaunchFile, Rules, Span
 from chainshaper.splicing.launch.elements import Attribute, Element, actions_of, location_edits
-from chainshaper.splicing.launch.start import command_line
 from chainshaper.splicing.shaping_process import ShapingProcess
 
 __all__ = ["add_at_start", "add_remaps", "add_set_remaps", "keep_folder", "read", "replaced"]
@@ -65,20 +64,19 @@ def _launch_file(path: Path, text: str, root: yaml.Node | None) -> LaunchFile:
 
 def _aliased(root: yaml.Node) -> set[int]:
     """Nodes that stand in several places by an alias, with all that is inside them."""
-    references: Counter[int] = Counter()
-    pending: list[tuple[yaml.Node, bool]] = [(root, False)]
+    seen: set[int] = set()
     found: set[int] = set()
-    while pending:
-        node, inside = pending.pop()
-        references[id(node)] += 1
-        if references[id(node)] > 2 or (id(node) in found and inside):
-            continue
-        inside = inside or references[id(node)] > 1
-        if inside:
-            found.add(id(node))
-        values = node.value if not isinstance(node, yaml.ScalarNode) else []
-        for value in values:
-            pending += [(one, inside) for one in (value if isinstance(value, tuple) else [value])]
+
+    def visit(node: yaml.Node, inside: bool) -> None:
+        inside = inside or id(node) in seen
+        if id(node) in found:
+            return
+        (found if inside else seen).add(id(node))
+        for value in node.value if not isinstance(node, yaml.ScalarNode) else ():
+            for one in value if isinstance(value, tuple) else (value,):
+                visit(one, inside)
+
+    visit(root, False)
     return found
 
 
@@ -177,9 +175,7 @@ def _set_remaps(rules: Rules) -> list[dict[str, Any]]:
 
 def _process(process: ShapingProcess) -> dict[str, Any]:
     if process.command is not None:
-        words = command_line(process.command, process)
-        command = " ".join(f"'{word}'" if " " in word else word for word in words)
-        return {"executable": {"cmd": command, "output": "screen"}}
+        return {"executable": {"cmd": shlex.join(process.command_line), "output": "screen"}}
     return {
         "node": {
             "pkg": process.package,

@@ -5,7 +5,7 @@ Classes that are not known here start no nodes themselves, but actions inside th
 carried out: those of an event handler, for instance.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,10 +25,8 @@ from chainshaper.splicing.launch.actions import (
     Unreadable,
 )
 from chainshaper.splicing.launch.python.values import (
-    Description,
     Source,
     Text,
-    When,
     actions_in,
     joined_path,
     template_of,
@@ -85,9 +83,9 @@ class Call:
         condition = self.keywords.get("condition")
         if condition is None:
             return self.conditions
-        if isinstance(condition, When):
-            return self.conditions | {condition.condition}
-        return self.conditions | {Condition("if", repr(condition))}
+        if not isinstance(condition, Condition):
+            condition = Condition("if", repr(condition))
+        return self.conditions | {condition}
 
 
 def constructed(call: Call) -> Any:  # noqa: PLR0911 - one case per kind of action
@@ -100,10 +98,10 @@ def constructed(call: Call) -> Any:  # noqa: PLR0911 - one case per kind of acti
         return Source(template_of(call.argument(0, "launch_file_path", "location")), call.first)
     match call.name:
         case "LaunchDescription":
-            return Description(actions_in(call.argument(0, "initial_entities"), call.line))
+            return actions_in(call.argument(0, "initial_entities"), call.line)
         case "IfCondition" | "UnlessCondition":
             text = repr(call.argument(0, "predicate_expression"))
-            return When(Condition("if" if call.name == "IfCondition" else "unless", text))
+            return Condition(call.name.removesuffix("Condition").lower(), text)
         case "PushRosNamespace" | "PushROSNamespace":
             return PushNamespace(template_of(call.argument(0, "namespace")))
         case "SetRemap":
@@ -124,8 +122,7 @@ def constructed(call: Call) -> Any:  # noqa: PLR0911 - one case per kind of acti
 def _node(call: Call) -> Any:
     rules = [
         RemapRule(template_of(pair[0]), template_of(pair[1]), _spans(call, pair, 2)[1])
-        for pair in _items(call.keywords.get("remappings"))
-        if isinstance(pair, list | tuple) and len(pair) == 2
+        for pair in _pairs(call.keywords.get("remappings"))
     ]
     from_arguments = [
         rule
@@ -155,6 +152,10 @@ def _optional(value: Any) -> Template | None:
 
 def _items(value: Any) -> Sequence[Any]:
     return value if isinstance(value, list | tuple) else ()
+
+
+def _pairs(value: Any) -> list[Sequence[Any]]:
+    return [pair for pair in _items(value) if isinstance(pair, list | tuple) and len(pair) == 2]
 
 
 def _spans(call: Call, sequence: Any, length: int) -> Sequence[Span | None]:
@@ -195,20 +196,13 @@ def _substitution(call: Call) -> Any:
 
 def _configuration(call: Call) -> SetConfiguration:
     declared = call.name == "DeclareLaunchArgument"
-    value = call.keywords.get("default_value") if declared else call.argument(1, "value")
-    if declared and len(call.positional) > 1:
-        value = call.positional[1]
-    return SetConfiguration(
-        template_of(call.argument(0, "name")), _optional(value), declared=declared
-    )
+    value = _optional(call.argument(1, "default_value" if declared else "value"))
+    return SetConfiguration(template_of(call.argument(0, "name")), value, declared)
 
 
 def _group(call: Call) -> Group:
     kept = call.keywords.get("launch_configurations")
-    settings = [
-        SetConfiguration(template_of(name), template_of(value), declared=False)
-        for name, value in (kept.items() if isinstance(kept, dict) else ())
-    ]
+    settings = _settings(kept.items() if isinstance(kept, dict) else ())
     return Group(
         (*settings, *actions_in(call.argument(0, "actions"), call.line)),
         scoped=call.keywords.get("scoped", True) is not False,
@@ -221,12 +215,15 @@ def _include(call: Call) -> Include:
     source = call.argument(0, "launch_description_source")
     if not isinstance(source, Source):
         source = Source(template_of(source), call.first)
-    settings = [
-        SetConfiguration(template_of(pair[0]), template_of(pair[1]), declared=False)
-        for pair in _items(call.keywords.get("launch_arguments"))
-        if isinstance(pair, list | tuple) and len(pair) == 2
-    ]
-    return Include(call.line, source.path, source.span, tuple(settings), call.when())
+    settings = _settings(_pairs(call.keywords.get("launch_arguments")))
+    return Include(call.line, source.path, source.span, settings, call.when())
+
+
+def _settings(pairs: Iterable[Sequence[Any]]) -> tuple[SetConfiguration, ...]:
+    return tuple(
+        SetConfiguration(template_of(name), template_of(value), declared=False)
+        for name, value in pairs
+    )
 
 
 def _other(call: Call) -> Group:

@@ -16,7 +16,6 @@ from chainshaper.errors import InputError
 from chainshaper.splicing.launch.actions import Edit, LaunchFile, Rules, Span
 from chainshaper.splicing.launch.python.offsets import Offsets
 from chainshaper.splicing.launch.python.reading import read_actions
-from chainshaper.splicing.launch.start import command_line
 from chainshaper.splicing.shaping_process import ShapingProcess
 
 __all__ = [
@@ -155,7 +154,7 @@ def process_class(process: ShapingProcess) -> str:
 def process_text(process: ShapingProcess, name: str) -> str:
     """The call that starts a shaping node; ``name`` is what its class is called there."""
     if process.command is not None:
-        return f"{name}(cmd={command_line(process.command, process)!r}, output='screen')"
+        return f"{name}(cmd={process.command_line!r}, output='screen')"
     return (
         f"{name}(package={process.package!r}, executable={process.executable!r},"
         f" name={process.name!r}, namespace={process.namespace!r},"

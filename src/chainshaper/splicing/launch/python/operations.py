@@ -16,7 +16,6 @@ from typing import Any
 from chainshaper.splicing.launch.actions import Substitution
 from chainshaper.splicing.launch.python.values import (
     Bound,
-    Description,
     Text,
     actions_in,
     joined_path,
@@ -141,8 +140,8 @@ def method_value(  # noqa: PLR0911 - one per method
     """The value of a method's call; a description or list that it adds to is changed."""
     holder, name = method.value, method.attribute
     first = arguments[0] if arguments else None
-    if isinstance(holder, Description) and name in ("add_action", "add_entity"):
-        holder.actions.extend(actions_in(first, line))
+    if isinstance(holder, list) and name in ("add_action", "add_entity"):  # a launch description
+        holder.extend(actions_in(first, line))
         return None
     if isinstance(holder, list) and name in ("append", "extend", "insert"):
         many = first if isinstance(first, list | tuple) else [first]

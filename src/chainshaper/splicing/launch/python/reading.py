@@ -136,7 +136,7 @@ def _if(reading: Reading, statement: ast.If, names: Names) -> _End:
     text = ast.unparse(statement.test)
     before = reading.conditions
     for kind, block in (("if", statement.body), ("unless", statement.orelse)):
-        reading.conditions = before | {Condition("if" if kind == "if" else "unless", text)}
+        reading.conditions = before | {Condition(kind, text)}
         branch = names.new_child()
         outcomes.append((_run(reading, block, branch), dict(branch.maps[0])))
     reading.conditions = before

@@ -1,56 +1,32 @@
 """What expressions in a Python launch file stand for, as far as reading it can tell.
 
-Texts, numbers, lists, tuples and dictionaries stand for themselves, and so do the actions of
-:mod:`chainshaper.splicing.launch.actions`. Paths are texts. The rest is here; above all
-:class:`Unknown`, which whatever is not understood turns into.
+Texts, numbers, lists, tuples and dictionaries stand for themselves, and so do the actions and
+conditions of :mod:`chainshaper.splicing.launch.actions`. Paths are texts, a launch description is
+the list of its actions. The rest is here; above all :class:`Unknown`, which whatever is not
+understood turns into.
 """
 
 import ast
 from collections import ChainMap
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from chainshaper.splicing.launch.actions import (
-    Action,
-    Condition,
-    Group,
-    Include,
-    NodeAction,
-    PushNamespace,
-    SetConfiguration,
-    SetRemap,
-    Span,
-    Substitution,
-    Template,
-    Unreadable,
-)
+from chainshaper.splicing.launch.actions import Action, Span, Substitution, Template, Unreadable
 from chainshaper.splicing.launch.substitutions import UNKNOWN
 
 __all__ = [
     "Bound",
-    "Description",
     "Function",
     "Named",
     "Source",
     "Text",
     "Unknown",
-    "When",
     "actions_in",
     "joined_path",
     "template_of",
 ]
 
 Names: TypeAlias = "ChainMap[str, Any]"
-
-_ACTIONS = (
-    NodeAction,
-    SetRemap,
-    PushNamespace,
-    SetConfiguration,
-    Group,
-    Include,
-    Unreadable,
-)
 
 
 @dataclass(frozen=True)
@@ -95,26 +71,12 @@ class Bound:
     attribute: str
 
 
-@dataclass(frozen=True, eq=False)
-class Description:
-    """A launch description that is being filled; ``condition`` of a container's own."""
-
-    actions: list[Any] = field(default_factory=list)
-
-
 @dataclass(frozen=True)
 class Source:
     """Where an include takes its launch description from."""
 
     path: Template
     span: Span | None
-
-
-@dataclass(frozen=True)
-class When:
-    """An IfCondition or UnlessCondition."""
-
-    condition: Condition
 
 
 def template_of(value: Any) -> Template:
@@ -137,10 +99,8 @@ def actions_in(value: Any, line: int) -> list[Action]:
     """The actions that a value holds where launch wants some."""
     if isinstance(value, Unknown):
         return [Unreadable(value.line, value.source)]
-    if isinstance(value, _ACTIONS):
+    if isinstance(value, Action):
         return [value]
-    if isinstance(value, Description):
-        return actions_in(value.actions, line)
     if isinstance(value, list | tuple):
         return [action for item in value for action in actions_in(item, line)]
     return []

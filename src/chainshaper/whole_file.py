@@ -10,16 +10,17 @@ from chainshaper.errors import InputError, OperationError
 __all__ = ["new_file", "write_whole"]
 
 
-def new_file(path: str | Path, endings: tuple[str, ...]) -> Path:
+def new_file(path: str | Path, endings: tuple[str, ...] = ()) -> Path:
     """The path, once it is sure that a file of this kind can be made there.
 
     Asked before long work begins, so that nobody waits to learn it at the end.
 
     Raises:
-        InputError: it exists, its folder does not, or it ends in none of ``endings``.
+        InputError: it exists, its folder does not, or it ends in none of ``endings``, if
+            there are any.
     """
     path = Path(path)
-    if path.suffix not in endings:
+    if endings and path.suffix not in endings:
         raise InputError(f"{path}: write to a file that ends in {' or '.join(endings)}")
     if path.exists():
         raise InputError(
@@ -49,5 +50,5 @@ def write_whole(path: Path, parts: Iterable[bytes]) -> Path:
     except OSError as error:
         if partial is not None:
             partial.unlink(missing_ok=True)
-        raise OperationError(f"{path}: the file cannot be written: {error}") from error
+        raise OperationError(f"{path}: the file cannot be written: {error.strerror}") from error
     return path
