@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 MEMORY_MB, MEMORY_WITH_FILES_MB = 768, 2048
-LIMIT_S = 600
+LIMIT_S = 900
 MACHINE, RESULTS = "machine", "results"
 """Tags under which a guest finds the machine's own files, read-only, and a folder that stays."""
 

@@ -220,7 +220,9 @@ def test_every_sink_of_a_plan_has_its_shaping_node(tmp_path: Path) -> None:
 def test_under_let_per_callback_every_output_waits_for_the_next_cycle(tmp_path: Path) -> None:
     described = application(TWO_SINKS)
     profile = simulate(described, tmp_path / "profile", cycles=5)
-    planned = plan_recording(profile, request=PlanRequest(policy="let-per-callback"))
+    planned = plan_recording(
+        profile, request=PlanRequest(policy="let-per-callback", spin_ns=300_000)
+    )
     recording = simulated(tmp_path, described, planned, cycles=3)
     # The nodes share core 1. Before its slot [1, 2) that of /in watches the clock for 0.3 ms while
     # the source computes; /left comes in the slot [0, 1) of the cycle after that.

@@ -110,7 +110,8 @@ def _number(found: Attributes, name: str, default: int) -> int:
 def _one_of(choices: Mapping[Value, _T], found: Attributes, name: str, default: Value) -> _T:
     value, offset = found.get(name, (default, 0))
     if value not in choices:
-        raise TsdlError(offset, f"unknown {name.replace('_', ' ')} {value!r}")
+        known = ", ".join(map(str, choices))
+        raise TsdlError(offset, f"unknown {name.replace('_', ' ')} {value!r}: none of {known}")
     return choices[value]
 
 

@@ -10,7 +10,7 @@ whether or not LTTng is there. The arguments are the fields of the event's table
 
 `rclcpp_callback_register` is not called from Iron on, except under an LTTng session.
 
-Upstream: ros2_tracing, `tracetools/include/tracetools/tracetools.h`, tags 4.1.1 to 8.4.0.
+Upstream: ros2_tracing, `tracetools/include/tracetools/tracetools.h`, tags 4.1.1 to 8.10.1.
 """
 
 from collections.abc import Sequence
