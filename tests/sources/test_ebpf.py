@@ -134,10 +134,7 @@ def test_execution_times_are_the_threads_own_cpu_time(program: Program, tmp_path
     assert instances.height == len(own) == 2 * CYCLES
     # Reading its own clocks costs the thread a little outside the callback, being traced inside.
     assert sum(instances["execution_ns"]) == pytest.approx(sum(own), rel=0.15)
-    responses = instances["end"] - instances["start"]
-    assert (instances["execution_ns"] <= responses).all()
-    # On a machine that is slow enough, a sleep of a millisecond is over before it has begun.
-    assert (instances["execution_ns"] < responses).mean() > 0.5
+    assert (instances["execution_ns"] < instances["end"] - instances["start"]).all()
     switches = run.tables["sched_switch"]
     tid = run.tables["callback_start"].item(0, "tid")
     involved = (switches["prev_tid"] == tid).fill_null(False) | (switches["next_tid"] == tid)
