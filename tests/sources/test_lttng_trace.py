@@ -298,5 +298,7 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
         said = refused(2, verb, trace, "-o", tmp_path / name)
         assert f"{name} exists already and is not overwritten" in said
         assert (tmp_path / name).read_text() == "mine"
-    assert "ends in .svg or .dot or .json" in refused(2, "graph", trace, "-o", tmp_path / "graph.png")
+    assert "ends in .svg or .dot or .json" in refused(
+        2, "graph", trace, "-o", tmp_path / "graph.png"
+    )
     assert "no such folder" in refused(2, "graph", trace, "-o", tmp_path / "no" / "graph.svg")
