@@ -195,7 +195,7 @@ class Node:
 
     def create_publisher(self, message_type: type, topic: str, qos: QoSProfile | int) -> Publisher:
         topic = self.resolve_topic_name(topic)
-        if topic.startswith("~/_"):
+        if topic.startswith("/_"):
             return Publisher(topic, "rehearsed")
         _say(publisher=topic, type=message_type.__name__, qos=vars(qos))
         return Publisher(topic)

@@ -208,7 +208,7 @@ def test_messages_leave_unchanged_inside_their_slot(
     assert all(a <= b for a, b in zip(releases["time"], times, strict=True))
     rehearsed = [words for words in run.said if "rehearsed" in words]
     assert {words["payload"] for words in rehearsed} == {"0001000000"}
-    assert {words["rehearsed"] for words in rehearsed} == {"~/_rehearsal"}
+    assert {words["rehearsed"] for words in rehearsed} == {"/_chainshaper_rehearsal"}
     for before, release in zip([0, *times], releases["release"], strict=False):
         assert any(before < words["time"] < release for words in rehearsed)
 

@@ -23,8 +23,8 @@ from chainshaper.analysis.matching import first_after, latest_before, nearest
 
 __all__ = ["CALLBACK_SCHEMA", "INTERNAL_TOPICS", "Objects", "named_nodes", "resolve_objects"]
 
-INTERNAL_TOPICS = frozenset(("/parameter_events", "/rosout", "/clock"))
-"""Topics that every node has for itself: they connect no computation."""
+INTERNAL_TOPICS = frozenset(("/parameter_events", "/rosout", "/clock", "/_chainshaper_rehearsal"))
+"""Topics that every node has for itself, or every shaping node: they connect no computation."""
 
 CALLBACK_SCHEMA: dict[str, pl.DataType] = {
     "callback_id": pl.UInt32(),

@@ -13,6 +13,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
+from chainshaper.analysis.objects import INTERNAL_TOPICS
 from chainshaper.app import Callback
 from chainshaper.durations import format_duration
 from chainshaper.exploration import ApplicationDescription, lost_text
@@ -34,7 +35,7 @@ ENDINGS = (".svg", ".dot", ".json")
 _CALLBACK_FIELDS = (
     *("id", "node", "pid", "kind", "topic", "period_ns", "symbol", "publishes", "passes_on"),
 )
-_OWN_TOPICS = frozenset(("/rosout", "/parameter_events"))
+_OWN_TOPICS = INTERNAL_TOPICS - {"/clock"}
 _OWN_SERVICES = frozenset(
     (
         "describe_parameters",

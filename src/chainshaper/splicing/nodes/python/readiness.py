@@ -19,6 +19,9 @@ from std_msgs.msg import Empty
 
 __all__ = ["Readiness"]
 
+REHEARSAL_TOPIC = "/_chainshaper_rehearsal"
+"""Of all shaping nodes, and hidden, since its name begins with an underscore."""
+
 EMPTY = bytes((0, 1, 0, 0, 0))
 """A serialized ``std_msgs/Empty``."""
 
@@ -38,8 +41,7 @@ class Readiness:
     AWAKE, AS_USUAL = (value.to_bytes(4, sys.byteorder, signed=True) for value in (0, -1))
 
     def __init__(self, node: Node) -> None:
-        # A hidden topic: its name begins with an underscore.
-        self._rehearsal = node.create_publisher(Empty, "~/_rehearsal", 1)
+        self._rehearsal = node.create_publisher(Empty, REHEARSAL_TOPIC, 1)
         self._to_itself = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._to_itself.setblocking(False)
         self._latency = None

@@ -35,8 +35,8 @@ class Readiness
 {
 public:
   explicit Readiness(rclcpp::Node & node)
-  : rehearsal_(node.create_generic_publisher(  // a hidden topic: it begins with an underscore
-        "~/_rehearsal", "std_msgs/msg/Empty", rclcpp::QoS(1))),
+  : rehearsal_(node.create_generic_publisher(  // of all shaping nodes; an underscore hides it
+        "/_chainshaper_rehearsal", "std_msgs/msg/Empty", rclcpp::QoS(1))),
     empty_(serialized_empty.size()),
     to_itself_(socket(AF_INET, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0)),
     latency_(open("/dev/cpu_dma_latency", O_WRONLY | O_CLOEXEC))
