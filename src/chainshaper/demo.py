@@ -21,6 +21,7 @@ import polars as pl
 from chainshaper.analysis import callback_statistics, data_flow
 from chainshaper.errors import OperationError
 from chainshaper.planning import Plan, plan_warnings, save_plan
+from chainshaper.planning.overruns import with_room_for_overruns
 from chainshaper.recording import refuse_existing
 from chainshaper.reporting.comparison_files import write_comparison
 from chainshaper.steps import (
@@ -80,7 +81,7 @@ def run_demo(
             progress=_part(progress, 0.0, 0.48, "unshaped run"),
         )
     progress(0.48, "planning")
-    plan = plan_recording(before)
+    plan = with_room_for_overruns(plan_recording(before))
     save_plan(plan, folder / "plan.yaml")
     after = shape_application(
         description,
