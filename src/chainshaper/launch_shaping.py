@@ -127,6 +127,7 @@ def shape_launch(
     )
     progress(0.0, "planning")
     plan, about_margin = plan_launched(before, chain, request or PlanRequest())
+    plan = with_room_for_overruns(plan)
     save_plan(plan, folder / "plan.yaml")
     splicing = _spliced(plan, launch, folder / "launch", node, first)
     after = record(
@@ -182,8 +183,6 @@ def plan_launched(
 ) -> tuple[Plan, tuple[str, ...]]:
     """The plan, and what to know about its margin where nobody said anything about that.
 
-    Outputs that come somewhat late have room (:func:`with_room_for_overruns`).
-
     It is then as long as the tail of the latencies demands (:data:`OVERRUN_PROBABILITY`), and not
     shorter than the standard: the way from the chain to the shaping node is not in what was
     measured. Where the tail tells nothing it is the standard.
@@ -192,17 +191,17 @@ def plan_launched(
     """
     standard = plan_recording(recording, chain, request)
     if request.epsilon_ns is not None or request.overrun_probability is not None:
-        return with_room_for_overruns(standard), ()
+        return standard, ()
     derived = replace(request, overrun_probability=OVERRUN_PROBABILITY)
     try:
         plan = plan_recording(recording, chain, derived)
     except OperationError as error:
-        return with_room_for_overruns(standard), (
+        return standard, (
             f"the margin is the standard {format_duration(standard.margin.epsilon_ns)}, since "
             f"none can be derived: {error}",
         )
     longer = plan.margin.epsilon_ns > standard.margin.epsilon_ns
-    return with_room_for_overruns(plan if longer else standard), ()
+    return (plan if longer else standard), ()
 
 
 def _spliced(

@@ -13,7 +13,6 @@ from typing import Any, Literal, TypeAlias
 
 import yaml
 
-from chainshaper.enforcement import gate
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.plan import Plan, ShapingNode, server_of
@@ -35,7 +34,8 @@ __all__ = [
 ]
 
 NodeKind: TypeAlias = Literal["python", "cpp", "typed"]
-_PYTHON_NODES = Path(__file__).parent / "nodes" / "python"
+_PACKAGE = Path(__file__).parents[1]
+_PYTHON_NODES = _PACKAGE / "splicing" / "nodes" / "python"
 
 
 @dataclass(frozen=True)
@@ -168,26 +168,23 @@ def python_node(executable: str) -> str:
 
     What one of these parts imports from another is there already, so such imports are left out.
     """
-    parts = [
-        Path(gate.__file__),
-        _PYTHON_NODES / "message_events.py",
-        _PYTHON_NODES / "callback_events.py",
-        _PYTHON_NODES / "endpoints.py",
-        _PYTHON_NODES / "readiness.py",
-        _PYTHON_NODES / f"{executable}.py",
-    ]
-    texts = [_without_own_imports(part.read_text(encoding="utf-8")) for part in parts]
-    return "#!/usr/bin/env python3\n" + "\n\n".join(texts)
+    parts: dict[Path, str] = {}
+    _add_part(_PYTHON_NODES / f"{executable}.py", parts)
+    return "#!/usr/bin/env python3\n" + "\n\n".join(parts.values())
 
 
-def _without_own_imports(text: str) -> str:
+def _add_part(path: Path, parts: dict[Path, str]) -> None:
+    """Add the text of a file without its imports of ours, behind the files that these name."""
+    text = path.read_text(encoding="utf-8")
     lines = text.splitlines(keepends=True)
     for statement in reversed(ast.parse(text).body):
-        if isinstance(statement, ast.ImportFrom) and (statement.module or "").startswith(
-            "chainshaper."
-        ):
+        module = getattr(statement, "module", None) or ""
+        if isinstance(statement, ast.ImportFrom) and module.startswith("chainshaper."):
             del lines[statement.lineno - 1 : statement.end_lineno]
-    return "".join(lines)
+            imported = _PACKAGE.parent / f"{module.replace('.', '/')}.py"
+            if imported not in parts:
+                _add_part(imported, parts)
+    parts[path] = "".join(lines)
 
 
 def _program(

@@ -10,7 +10,6 @@ loaded, or was built without tracing, a callback is registered as it is.
 
 import ctypes
 import functools
-import os
 from collections.abc import Callable
 from typing import Any
 
@@ -18,7 +17,7 @@ from rclpy.clock import Clock
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from chainshaper.splicing.nodes.python.message_events import emit_takes
+from chainshaper.splicing.nodes.python.message_events import emit_takes, trace_points
 
 __all__ = ["create_subscription", "create_timer"]
 
@@ -34,18 +33,6 @@ _TRACE_POINTS = {
 }
 
 
-def _trace_points() -> dict[str, Any]:
-    """The functions by their events' names; none where one of them is missing."""
-    try:
-        library = ctypes.CDLL("libtracetools.so", mode=os.RTLD_NOLOAD)
-        functions = {name: getattr(library, f"ros_trace_{name}") for name in _TRACE_POINTS}
-    except (OSError, AttributeError):
-        return {}
-    for name, function in functions.items():
-        function.argtypes, function.restype = _TRACE_POINTS[name], None
-    return functions
-
-
 def create_subscription(
     node: Node,
     message_type: Any,
@@ -56,7 +43,7 @@ def create_subscription(
     raw: bool = False,
 ) -> None:
     """`Node.create_subscription`, with the events of rclcpp's."""
-    emit = _trace_points()
+    emit = trace_points(_TRACE_POINTS)
     seen = _seen(callback, emit)
     subscription = node.create_subscription(message_type, topic, seen, qos, raw=raw)
     if emit:
@@ -70,7 +57,7 @@ def create_subscription(
 
 def create_timer(node: Node, period_ns: int, callback: Callable[[], None], clock: Clock) -> None:
     """`Node.create_timer`, with the events of rclcpp's."""
-    emit = _trace_points()
+    emit = trace_points(_TRACE_POINTS)
     seen = _seen(callback, emit)
     # rclpy takes seconds and cuts off behind the nanosecond.
     timer = node.create_timer((period_ns + 0.5) / 1e9, seen, clock=clock)

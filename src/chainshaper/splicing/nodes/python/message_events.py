@@ -9,12 +9,12 @@ all other messages are exported, and called from here instead (ros2_tracing,
 import ctypes
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from rclpy.subscription import Subscription
 
-__all__ = ["emit_takes", "publish_function"]
+__all__ = ["emit_takes", "publish_function", "trace_points"]
 
 _ADDRESS = ctypes.c_void_p
 _MESSAGE_EVENTS = {
@@ -24,18 +24,25 @@ _MESSAGE_EVENTS = {
 }
 
 
-def _missing_events() -> dict[str, Any]:
-    """The functions by their events' names; none where rcl and rmw call them, or nobody can."""
-    if hasattr(Subscription, "CallbackType"):  # later than Humble
-        return {}
+def trace_points(wanted: Mapping[str, tuple[Any, ...]]) -> dict[str, Any]:
+    """The functions of events, by their names with their arguments' types.
+
+    None where the library is not loaded, or one of them is missing.
+    """
     try:
         library = ctypes.CDLL("libtracetools.so", mode=os.RTLD_NOLOAD)
-        functions = {name: getattr(library, f"ros_trace_{name}") for name in _MESSAGE_EVENTS}
+        functions = {name: getattr(library, f"ros_trace_{name}") for name in wanted}
     except (OSError, AttributeError):
         return {}
     for name, function in functions.items():
-        function.argtypes, function.restype = _MESSAGE_EVENTS[name], None
+        function.argtypes, function.restype = wanted[name], None
     return functions
+
+
+def _missing_events() -> dict[str, Any]:
+    """The functions by their events' names; none where rcl and rmw call them, or nobody can."""
+    later_than_humble = hasattr(Subscription, "CallbackType")
+    return {} if later_than_humble else trace_points(_MESSAGE_EVENTS)
 
 
 def publish_function(publisher: Any) -> Callable[[bytes], None]:
