@@ -98,8 +98,8 @@ void show_origins()
 void write_log(const std::string & path)
 {
   Gate gate;
-  gate.slots = {{20'000'000, 21'000'000}};
-  gate.cycle_ns = 100'000'000;
+  gate.slots = {{300'000'000, 400'000'000}};
+  gate.cycle_ns = 1'000'000'000;
   gate.overrun = Policy::discard;
   gate.modes = Modes{{"city", "highway"}, {0, 0}, 1, Policy::discard};
   Shaper shaper(gate, 0);
@@ -113,26 +113,27 @@ void write_log(const std::string & path)
   shaper.announce("city", monotonic_ns());
   const Held second = shaper.hold(stamp());
   log.write(shaper.gate(), second, std::nullopt, monotonic_ns(), shaper.time_lost(second));
-  const Held late = shaper.hold(stamp() - 50'000'000);
+  const Held late = shaper.hold(stamp() - 500'000'000);
   log.write(
     shaper.gate(), late, std::numeric_limits<std::int64_t>::max(), std::nullopt, std::nullopt);
 }
 
-// Where cycles of 100 ms begin that are to begin 7 ms later, before and after that is in force.
+// Cycles of 4 s are to begin 2 s from now instead: when one begins before that is in force (counted
+// from where one did), and behind it (counted from where the first was to). In ms.
 void moved_phase()
 {
   Gate gate;
-  gate.slots = {{0, 100'000'000}};
-  gate.cycle_ns = 100'000'000;
+  gate.cycle_ns = 4'000'000'000;
+  gate.slots = {{0, gate.cycle_ns}};
   gate.anchor = Anchor::cycle;
   Shaper shaper(gate, 0);
-  const std::int64_t begins = shaper.hold(std::nullopt).release.origin_ns + 200'000'000;
-  sleep_until(begins);
-  shaper.set_phase(7'000'000, begins + 8'000'000);
-  for (const std::int64_t at : {106'000'000, 108'000'000}) {
-    sleep_until(begins + at);
-    std::cout << (shaper.hold(std::nullopt).release.origin_ns - begins) / 1'000'000 << "\n";
-  }
+  const std::int64_t now = monotonic_ns();
+  const std::int64_t moved = now + 2'000'000'000;
+  shaper.set_phase(moved % gate.cycle_ns, now);
+  const auto origin = [&] {return shaper.hold(std::nullopt).release.origin_ns;};
+  std::cout << origin() % gate.cycle_ns / 1'000'000 << "\n";
+  sleep_until(moved);
+  std::cout << (origin() - moved) / 1'000'000 << "\n";
 }
 
 }  // namespace
