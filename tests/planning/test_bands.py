@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from chainshaper.errors import InputError, OperationError
+from chainshaper.plan_choices import Goal
 from chainshaper.planning.bands import (
     BandProblem,
-    Goal,
     band_problem,
     broken_constraint,
     enough_bands,

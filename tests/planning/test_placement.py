@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from chainshaper.errors import InputError, OperationError
+from chainshaper.plan_choices import Solver
 from chainshaper.planning.baselines import server_per_chain
-from chainshaper.planning.placement import Solver, choose_bands, with_bands, with_long_slot
+from chainshaper.planning.placement import choose_bands, with_bands, with_long_slot
 from chainshaper.planning.plan import Plan, publish_slots
 from chainshaper.planning.shaping import plan_shaping
 

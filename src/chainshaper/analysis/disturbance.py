@@ -27,18 +27,15 @@ from chainshaper import events
 from chainshaper.analysis.departures import gate_decisions
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.traversals import Traversals
+from chainshaper.enforcement.gate import STALL_NS
 
 __all__ = [
     "COMPUTING_THRESHOLD_NS",
-    "THRESHOLD_NS",
     "disturbed",
     "overlapping",
     "stalled_after",
     "stalled_within",
 ]
-
-THRESHOLD_NS = 100_000
-"""Stalls shorter than this are what an ordinary wake-up takes."""
 
 WAKING_NS = 200_000
 """A stall that ends this shortly before a release leaves the gate no time to wake up for it."""
@@ -71,7 +68,7 @@ class _Stalls:
 def disturbed(
     flow: DataFlow,
     traversals: Traversals,
-    threshold_ns: int = THRESHOLD_NS,
+    threshold_ns: int = STALL_NS,
     computing_threshold_ns: int = COMPUTING_THRESHOLD_NS,
     waking_ns: int = WAKING_NS,
 ) -> Mask:
@@ -97,9 +94,7 @@ def disturbed(
     return complete & (hit | _queued_behind(hit, start, end, ~held & complete))
 
 
-def stalled_after(
-    flow: DataFlow, start: Times, end: Times, threshold_ns: int = THRESHOLD_NS
-) -> Mask:
+def stalled_after(flow: DataFlow, start: Times, end: Times, threshold_ns: int = STALL_NS) -> Mask:
     """Which windows [start, end] any stall meets: a delivery that the machine disturbed."""
     stalls = _Stalls.of(flow, threshold_ns)
     return overlapping(start, end, stalls.began, stalls.ended)

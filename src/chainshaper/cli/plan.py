@@ -8,7 +8,9 @@ import typer
 
 from chainshaper.cli import plan_options as options
 from chainshaper.cli.options import JsonOption, duration_option
+from chainshaper.enforcement.gate import Anchor, Late, Overrun
 from chainshaper.errors import InputError
+from chainshaper.plan_choices import Goal, Policy, Publication, Solver
 
 if TYPE_CHECKING:
     from chainshaper.planning import Plan, PlanRequest, Profile
@@ -24,9 +26,9 @@ def plan(
     output: options.PlanOutput = None,
     latencies: options.LatenciesOption = None,
     period: options.PeriodOption = None,
-    policy: Annotated[options.Policy, typer.Option(help="How it is scheduled.")] = "shaped",
+    policy: Annotated[Policy, typer.Option(help="How it is scheduled.")] = "shaped",
     publication: Annotated[
-        options.Publication, typer.Option(help="By a shaping node, or the publisher's own thread.")
+        Publication, typer.Option(help="By a shaping node, or the publisher's own thread.")
     ] = "synchronous",
     publish_slot: Annotated[
         int, duration_option("--publish-slot", "Length of the publish slot.")
@@ -36,12 +38,12 @@ def plan(
     overrun_probability: options.ProbabilityOption = None,
     bands: options.BandsOption = "1",
     solver: Annotated[
-        options.Solver, typer.Option(help="What places bands.", rich_help_panel="Latency bands")
+        Solver, typer.Option(help="What places bands.", rich_help_panel="Latency bands")
     ] = "exact",
     grid: options.GridOption = "1us",  # type: ignore[assignment]
     modes: options.ModesOption = None,
     late: Annotated[
-        options.LateForMode,
+        Late,
         typer.Option(
             help="With --modes, an output behind its mode's slot: wait for the next cycle's, or"
             " not, or at once, or in the cycle's next slot.",
@@ -51,7 +53,7 @@ def plan(
     max_gap: options.MaxGapOption = None,
     max_share: options.MaxShareOption = None,
     minimise: Annotated[
-        options.Minimise, typer.Option(help="What to make small.", rich_help_panel="Latency bands")
+        Goal, typer.Option(help="What to make small.", rich_help_panel="Latency bands")
     ] = "mean",
     mean_at_most: options.MeanAtMostOption = None,
     least_gain: options.LeastGainOption = "2%",  # type: ignore[assignment]
@@ -60,11 +62,11 @@ def plan(
     first_slot: options.FirstSlotOption = None,
     sink: options.SinksOption = None,
     anchor: Annotated[
-        options.Anchor,
+        Anchor,
         typer.Option(help="What slots count from: the message's stamp, or the cycle."),
     ] = "stamp",
     overrun: Annotated[
-        options.Overrun,
+        Overrun,
         typer.Option(help="An output that missed its slot: wait for the next, or not, or at once."),
     ] = "wait",
     spin: Annotated[

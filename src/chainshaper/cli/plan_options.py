@@ -1,67 +1,42 @@
-"""The options of `chainshaper plan`, and what they are worth in Python.
-
-Choices are the planner's own types, written once more so that `--help` need not load the planner.
-"""
+"""The options of `chainshaper plan`, and what they are worth in Python."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from chainshaper.cli.options import duration_option
+from chainshaper.enforcement.gate import Late
 from chainshaper.errors import InputError
 
 if TYPE_CHECKING:
     from chainshaper.planning import Modes
 
 __all__ = [
-    "Anchor",
     "BandsOption",
     "ChainsOption",
     "CurveOption",
     "EpsilonOption",
     "FirstSlotOption",
     "GridOption",
-    "LateForMode",
     "LatenciesOption",
     "LeastGainOption",
     "MaxGapOption",
     "MaxShareOption",
     "MeanAtMostOption",
-    "Minimise",
     "ModesOption",
-    "Overrun",
     "PeriodOption",
     "PlanOutput",
-    "Policy",
     "ProbabilityOption",
-    "Publication",
     "ReceiversOption",
     "SeedOption",
     "SinksOption",
     "SlotStartOption",
-    "Solver",
     "modes_of",
 ]
 
 
-Anchor: TypeAlias = Literal["stamp", "cycle"]
-Overrun: TypeAlias = Literal["wait", "discard", "publish"]
-Policy: TypeAlias = Literal[
-    "shaped",
-    "one-long-slot",
-    "server-per-callback",
-    "server-per-chain",
-    "let-per-callback",
-    "let-per-chain",
-]
-Publication: TypeAlias = Literal["synchronous", "asynchronous"]
-Solver: TypeAlias = Literal["exact", "pso", "random"]
-Minimise: TypeAlias = Literal["mean", "jitter", "gap"]
-LateForMode: TypeAlias = Literal["wait", "discard", "publish", "next-slot"]
-
-
-def modes_of(text: str | None, late: LateForMode) -> "Modes | None":
+def modes_of(text: str | None, late: Late) -> "Modes | None":
     """The modes that `--modes` names, such as ``/mode:city=2,highway=1``; the first is the default.
 
     Raises:

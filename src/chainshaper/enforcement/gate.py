@@ -38,14 +38,18 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias, get_args
 
 __all__ = [
     "ANCHORS",
     "LATE",
     "OVERRUNS",
     "STALL_NS",
+    "Anchor",
     "Gate",
+    "Late",
     "Modes",
+    "Overrun",
     "Release",
     "Shaper",
     "clock_offset",
@@ -57,9 +61,10 @@ __all__ = [
     "watch_until",
 ]
 
-ANCHORS = ("stamp", "cycle")
-OVERRUNS = ("wait", "discard", "publish")
-LATE = (*OVERRUNS, "next-slot")
+Anchor: TypeAlias = Literal["stamp", "cycle"]
+Overrun: TypeAlias = Literal["wait", "discard", "publish"]
+Late: TypeAlias = Literal["wait", "discard", "publish", "next-slot"]
+ANCHORS, OVERRUNS, LATE = get_args(Anchor), get_args(Overrun), get_args(Late)
 
 STALL_NS = 100_000
 """A thread may wake up so late on a machine that does not stall."""

@@ -26,18 +26,17 @@ i < i', j < j', which is why the average gains less with every further band.)
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.durations import format_duration
 from chainshaper.errors import InputError, OperationError
+from chainshaper.plan_choices import Goal
 from chainshaper.planning.latency_file import check_latencies
 
 __all__ = [
     "BandProblem",
-    "Goal",
     "Placement",
     "band_problem",
     "broken_constraint",
@@ -47,8 +46,6 @@ __all__ = [
     "placement_curve",
     "refuse_more_than_fit",
 ]
-
-Goal: TypeAlias = Literal["mean", "jitter", "gap"]
 
 UNREACHABLE = 2**63 - 1  # the cost of what cannot be placed
 MOST_CELLS = 120_000_000  # grid points × bands: more than a gigabyte

@@ -6,16 +6,16 @@ average (sections 3.3 and 4.1), without touching the longest latency.
 """
 
 from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.durations import format_duration
 from chainshaper.errors import InputError
+from chainshaper.plan_choices import Goal, Solver
 from chainshaper.planning.bands import (
     BandProblem,
-    Goal,
     Placement,
     band_problem,
     enough_bands,
@@ -35,9 +35,7 @@ from chainshaper.planning.publisher_threads import below_executors
 from chainshaper.planning.shaping import predict_bands
 from chainshaper.planning.swarm import place_by_swarm, place_randomly
 
-__all__ = ["BandChoice", "Solver", "choose_bands", "with_bands", "with_long_slot"]
-
-Solver: TypeAlias = Literal["exact", "pso", "random"]
+__all__ = ["BandChoice", "choose_bands", "with_bands", "with_long_slot"]
 
 MOST_BANDS = 12  # as far as `auto` looks; figure 7 is flat from the fourth on
 

@@ -18,17 +18,16 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from chainshaper.durations import format_duration
+from chainshaper.enforcement.gate import Anchor, Overrun
 from chainshaper.errors import InputError
+from chainshaper.plan_choices import Policy
 from chainshaper.planning.plan_parts import (
     PER_CALLBACK,
-    Anchor,
     BandPrediction,
     ChainOfPlan,
     Evidence,
     Margin,
     Modes,
-    Overrun,
-    Policy,
     Prediction,
     Server,
     ShapingNode,
@@ -48,15 +47,12 @@ from chainshaper.yaml_file import (
 
 __all__ = [
     "PER_CALLBACK",
-    "Anchor",
     "BandPrediction",
     "ChainOfPlan",
     "Evidence",
     "Margin",
     "Modes",
-    "Overrun",
     "Plan",
-    "Policy",
     "Prediction",
     "Server",
     "ShapingNode",

@@ -11,18 +11,16 @@ from typing import Annotated, Literal, NamedTuple, TypeAlias
 from pydantic import AfterValidator, Field, model_validator
 
 from chainshaper.durations import format_duration
+from chainshaper.enforcement.gate import Late
 from chainshaper.yaml_file import Duration, FullName, Part, PositiveDuration, wrong_value
 
 __all__ = [
     "PER_CALLBACK",
-    "Anchor",
     "BandPrediction",
     "ChainOfPlan",
     "Evidence",
     "Margin",
     "Modes",
-    "Overrun",
-    "Policy",
     "Prediction",
     "Server",
     "ShapingNode",
@@ -54,21 +52,8 @@ ModeName = Annotated[str, AfterValidator(_mode_name)]
 Slot: TypeAlias = tuple[Duration, Duration]
 """A time slot [start, end) of a cycle."""
 
-Policy: TypeAlias = Literal[
-    "shaped",
-    "one-long-slot",
-    "server-per-callback",
-    "server-per-chain",
-    "let-per-callback",
-    "let-per-chain",
-]
 PER_CALLBACK = ("server-per-callback", "let-per-callback")
 """Policies whose slots follow from the callbacks, so that an execution may span cycles."""
-
-Anchor: TypeAlias = Literal["stamp", "cycle"]
-
-Overrun: TypeAlias = Literal["wait", "discard", "publish"]
-"""What becomes of an output that missed its last slot: see :mod:`chainshaper.enforcement.gate`."""
 
 
 class ChainOfPlan(Part):
@@ -224,7 +209,7 @@ class Modes(Part):
     topic: FullName
     default: ModeName
     bands: Annotated[dict[ModeName, Annotated[int, Field(ge=1)]], Field(min_length=1)]
-    late: Literal["wait", "discard", "publish", "next-slot"] = "wait"
+    late: Late = "wait"
 
     @model_validator(mode="after")
     def _default_exists(self) -> "Modes":

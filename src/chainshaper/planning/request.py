@@ -8,14 +8,15 @@ bare latencies and a period; a policy that needs more says so.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain as joined
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.durations import format_duration
+from chainshaper.enforcement.gate import Anchor, Overrun
 from chainshaper.errors import InputError, OperationError
-from chainshaper.planning.bands import Goal
+from chainshaper.plan_choices import Goal, Policy, Publication, Solver
 from chainshaper.planning.baselines import (
     CallbackTimes,
     let_per_callback,
@@ -29,27 +30,21 @@ from chainshaper.planning.latency_file import check_latencies
 from chainshaper.planning.margins import derive_margin
 from chainshaper.planning.placement import (
     BandChoice,
-    Solver,
     choose_bands,
     with_bands,
     with_long_slot,
 )
 from chainshaper.planning.plan import (
     PER_CALLBACK,
-    Anchor,
     Evidence,
     Margin,
     Modes,
-    Overrun,
     Plan,
-    Policy,
     revised,
 )
 from chainshaper.planning.shaping import evidence_of, plan_shaping
 
 __all__ = ["PlanRequest", "Profile", "band_choice", "plan_chain"]
-
-Publication: TypeAlias = Literal["synchronous", "asynchronous"]
 
 DEFAULT_EPSILON_NS = 1_000_000
 DEFAULT_CORE = 1

@@ -7,20 +7,20 @@ cycles, but at the same time in all of them (paper, sections 3.1 and 3.2).
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.durations import format_duration
+from chainshaper.enforcement.gate import Anchor, Overrun
 from chainshaper.errors import InputError, OperationError
+from chainshaper.plan_choices import Publication
 from chainshaper.planning.latency_file import check_latencies
 from chainshaper.planning.plan import (
-    Anchor,
     ChainOfPlan,
     Evidence,
     Margin,
-    Overrun,
     Plan,
     Prediction,
     Server,
@@ -51,7 +51,7 @@ def plan_shaping(
     epsilon_ns: int = 1_000_000,
     margin: Margin | None = None,
     publish_slot_ns: int = 1_000_000,
-    publication: Literal["synchronous", "asynchronous"] = "synchronous",
+    publication: Publication = "synchronous",
     output_depth: int | None = None,
     core: int = 1,
     output_core: int | None = None,

@@ -14,7 +14,7 @@ import time
 from array import array
 from collections.abc import Callable
 
-from chainshaper.enforcement.gate import sleep_until
+from chainshaper.enforcement.gate import STALL_NS, sleep_until
 from chainshaper.enforcement.realtime import (
     lock_memory,
     set_thread_name,
@@ -23,12 +23,10 @@ from chainshaper.enforcement.realtime import (
 )
 from chainshaper.workload import protocol
 
-__all__ = ["ENOUGH", "NO_PACE", "PERIOD_NS", "PRIORITY", "THRESHOLD_NS", "main", "watch"]
+__all__ = ["ENOUGH", "NO_PACE", "PERIOD_NS", "PRIORITY", "main", "watch"]
 
 PERIOD_NS = 1_000_000
 """A wake-up costs some 20 us on a virtual machine: more of them would disturb what they watch."""
-THRESHOLD_NS = 100_000
-"""Wake-ups later than this are recorded: what the kernel needs to wake a thread is less."""
 PRIORITY = 98
 """Above everything it watches, so that none of it looks like a stall."""
 ENOUGH = signal.SIGUSR1
@@ -43,7 +41,7 @@ def watch(
     start_ns: int,
     stop_ns: int,
     period_ns: int = PERIOD_NS,
-    threshold_ns: int = THRESHOLD_NS,
+    threshold_ns: int = STALL_NS,
     enough: Callable[[], bool] = lambda: False,
 ) -> "tuple[array[int], int, int]":
     """Sleep in steps of ``period_ns`` from ``start_ns`` until ``stop_ns`` on the calling thread.

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
+from chainshaper.enforcement.gate import STALL_NS
 from chainshaper.enforcement.threads.listing import Scheduling, apply_scheduling, list_threads
 from chainshaper.recording import StallMeterInfo
 from chainshaper.workload import stall_meter
@@ -60,7 +61,7 @@ def read_meters(
     info = StallMeterInfo(
         cores=tuple(meters),
         period_ns=stall_meter.PERIOD_NS,
-        threshold_ns=stall_meter.THRESHOLD_NS,
+        threshold_ns=STALL_NS,
         wakeups=wakeups,
         median_lateness_ns=tuple(lateness),
         realtime=realtime,
