@@ -120,29 +120,38 @@ def test_being_stopped_at_a_slots_end_is_no_beginning() -> None:
     assert find_drift(np.array([], dtype=np.int64), CYCLE, 8, 0, slots) is None
 
 
-def test_wake_ups_without_work_can_be_left_out() -> None:
+def test_wake_ups_without_work_can_be_left_out_and_others_not_looked_for() -> None:
     """It wakes five times per period and works in one of them."""
     body = (
         "import time\n"
         "due, number = time.monotonic_ns(), 0\n"
-        "print(flush=True)\n"
+        "print(due, flush=True)\n"
         "while True:\n"
-        "    due, number = due + 10_000_000, number + 1\n"
+        "    due, number = due + 40_000_000, number + 1\n"
         "    time.sleep(max(0, due - time.monotonic_ns()) / 1e9)\n"
         "    used = time.thread_time_ns()\n"
-        "    while number % 5 == 0 and time.thread_time_ns() - used < 3_000_000:\n"
+        "    while number % 5 == 0 and time.thread_time_ns() - used < 12_000_000:\n"
         "        pass\n"
     )
     with subprocess.Popen([sys.executable, "-c", body], stdout=subprocess.PIPE) as process:
         try:
             assert process.stdout is not None
-            process.stdout.readline()
-            every = watch_wake_ups(process.pid, process.pid, 500 * MS)
-            working = watch_wake_ups(process.pid, process.pid, 500 * MS, least_ns=150_000)
+            begins = int(process.stdout.readline())
+            every = watch_wake_ups(process.pid, process.pid, 1200 * MS)
+            working = watch_wake_ups(process.pid, process.pid, 1200 * MS, least_ns=MS)
+            closes = begins + 70 * MS  # and opens 100 ms later, 30 ms before it works
+
+            def until_then(now_ns: int) -> int:
+                place = (now_ns - closes) % (200 * MS)
+                return 0 if place > 100 * MS else 100 * MS - place
+
+            some = watch_wake_ups(process.pid, process.pid, 1200 * MS, rest_ns=until_then)
         finally:
             process.kill()
-    assert len(working) > 5
-    assert _longest_rest(working, 50 * MS) > 25 * MS > _longest_rest(every, 50 * MS)
+    assert len(some) > 0
+    assert ((some - closes) % (200 * MS) > 99 * MS).all()
+    assert len(working) >= 3
+    assert _longest_rest(working, 200 * MS) > 100 * MS > _longest_rest(every, 200 * MS)
 
 
 def _longest_rest(wake_ups: npt.NDArray[np.int64], period: int) -> int:

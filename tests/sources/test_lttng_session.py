@@ -9,13 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from lttng_daemon import lttng, users_daemon
 from lttng_node import required_node
-from processes import wait_for
 
 from chainshaper.errors import InputError, OperationError, PlatformError
 from chainshaper.events import EventTables
 from chainshaper.recording import RecordingInfo
-from chainshaper.sources.lttng.commands import connect
 from chainshaper.sources.lttng.session import MIB, LttngSession, buffer_size
 
 DEPTH = 7  # of every queue in chain_node.c
@@ -28,28 +27,10 @@ def node() -> Path:
 
 @pytest.fixture
 def foreign_daemon(node: Path, tmp_path: Path) -> Iterator[dict[str, str]]:
-    """A root session daemon that is not ours, and the environment of somebody who uses it."""
-    if os.geteuid() != 0:
-        pytest.skip("only root can start the session daemon that traces everybody")
     home = tmp_path / "user"
     home.mkdir()
-    environment = {**os.environ, "LTTNG_HOME": str(home)}
-    lttng = connect()
-    running = lttng.daemon is None
-    lttng.close()
-    daemon = None if running else subprocess.Popen(["lttng-sessiond", "--quiet"], env=environment)
-    try:
-        wait_for(lambda: _lttng(environment, "list").returncode == 0, "the session daemon")
+    with users_daemon(home) as environment:
         yield environment
-    finally:
-        if daemon is not None:
-            daemon.terminate()
-            daemon.wait(20)
-
-
-def _lttng(environment: dict[str, str], *arguments: str) -> "subprocess.CompletedProcess[str]":
-    command = ["lttng", "--no-sessiond", *arguments]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
 
 def recorded(
@@ -107,16 +88,16 @@ def test_a_users_daemon_and_sessions_stay_as_they_are(
     node: Path, foreign_daemon: dict[str, str], tmp_path: Path
 ) -> None:
     current = Path(foreign_daemon["LTTNG_HOME"]) / ".lttngrc"
-    assert _lttng(foreign_daemon, "create", "mine", f"--output={tmp_path / 'mine'}").returncode == 0
+    assert lttng(foreign_daemon, "create", "mine", f"--output={tmp_path / 'mine'}").returncode == 0
     try:
-        before = current.read_text(), _lttng(foreign_daemon, "list", "mine").stdout
+        before = current.read_text(), lttng(foreign_daemon, "list", "mine").stdout
         folder = tmp_path / "trace"
         folder.mkdir()
         recorded(LttngSession(folder, ["x"], ()), node, "exit", "0")
-        assert (current.read_text(), _lttng(foreign_daemon, "list", "mine").stdout) == before
-        assert "chainshaper" not in _lttng(foreign_daemon, "list").stdout
+        assert (current.read_text(), lttng(foreign_daemon, "list", "mine").stdout) == before
+        assert "chainshaper" not in lttng(foreign_daemon, "list").stdout
     finally:
-        _lttng(foreign_daemon, "destroy", "mine")
+        lttng(foreign_daemon, "destroy", "mine")
 
 
 def test_applications_that_we_have_not_started_are_left_out(
@@ -136,26 +117,6 @@ def test_applications_that_we_have_not_started_are_left_out(
     assert info.processes == {pid: "/flood"}
     assert info.trace_events["ros2:callback_start"] == 300
     assert any("not started are left out" in note and str(stranger) in note for note in info.notes)
-
-
-def test_a_session_whose_owner_was_killed_is_removed_by_the_next(
-    node: Path, foreign_daemon: dict[str, str], tmp_path: Path
-) -> None:
-    ended = subprocess.Popen(["true"])
-    ended.wait()
-    abandoned, alive = f"chainshaper-{ended.pid}-1", "chainshaper-1-1"
-    for name in (abandoned, alive):
-        _lttng(foreign_daemon, "create", name, f"--output={tmp_path / name}")
-    try:
-        folder = tmp_path / "trace"
-        folder.mkdir()
-        recorded(LttngSession(folder, ["x"], ()), node, "exit", "0")
-        left = _lttng(foreign_daemon, "list").stdout
-        assert abandoned not in left
-        assert alive in left
-    finally:
-        for name in (abandoned, alive):
-            _lttng(foreign_daemon, "destroy", name)
 
 
 def test_events_that_did_not_fit_are_counted_and_the_remedy_is_named(

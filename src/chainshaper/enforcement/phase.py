@@ -88,17 +88,19 @@ def watch_wake_ups(
     progress: Callable[[float], None] = lambda _: None,
     *,
     least_ns: int = 0,
+    rest_ns: Callable[[int], int] = lambda _: 0,
 ) -> npt.NDArray[np.int64]:
     """When a thread became ready to run, each time it did (ns of CLOCK_MONOTONIC).
 
     A wake-up is known to lie between two looks, and the later of them is taken, minus the time
     that the thread had to wait for its core. Those after which it ran for less than ``least_ns``
-    are left out.
+    are left out. ``rest_ns`` says at any time for how long not to look.
 
     Raises:
         OperationError: the thread has ended.
     """
-    found: list[tuple[int, int]] = []  # when, and how long the thread had run by then
+    # When it woke up (0: a rest begins, or the end), and how long it had run by then.
+    found: list[tuple[int, int]] = []
     path = Path(f"/proc/{pid}/task/{tid}/schedstat")
     started = now = time.monotonic_ns()
     born = start_of(pid, tid)
@@ -106,11 +108,14 @@ def watch_wake_ups(
         with _undisturbed(), path.open("rb", buffering=0) as file:
             ran, waited, times = map(int, file.read().split())
             while now < started + for_ns:
-                time.sleep(POLL_NS / 1e9)
+                rest = rest_ns(now)
+                time.sleep(max(rest, POLL_NS) / 1e9)
                 file.seek(0)
                 ran_by_now, waited_by_now, times_by_now = map(int, file.read().split())
                 now = time.monotonic_ns()
-                if times_by_now > times:
+                if rest > 0:
+                    found.append((0, ran))
+                elif times_by_now > times:
                     found.append((now - (waited_by_now - waited), ran))
                 ran, waited, times = ran_by_now, waited_by_now, times_by_now
                 progress(min(1.0, (now - started) / for_ns))
@@ -121,9 +126,9 @@ def watch_wake_ups(
             f"thread {tid} of process {pid} ended while its phase was measured: start the "
             "application again"
         ) from error
-    wake_ups = np.array([*found, (0, ran)], dtype=np.int64)
-    ran_after = np.diff(wake_ups[:, 1])
-    return np.asarray(wake_ups[:-1, 0][ran_after >= least_ns], dtype=np.int64)
+    when, ran_by_then = np.array([*found, (0, ran)], dtype=np.int64).T
+    worked = np.diff(ran_by_then) >= least_ns
+    return np.asarray(when[:-1][worked & (when[:-1] > 0)], dtype=np.int64)
 
 
 def find_phase(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> Phase | None:
@@ -190,11 +195,15 @@ class DriftWatch:
     ``latest_ns`` is how far that is from ``expected_ns`` (None: not seen yet). Held back by a
     server, a thread begins with its slot; once its timer expires inside the slot, it begins so
     much later, and that is the drift. Where nothing holds it, its beginning is seen to move.
-    Looking is done on ``cores``, if there are any: it would delay what runs in slots.
+    Looking takes a tenth of a core: it is done on ``cores``, if there are any, since it would delay
+    what runs in slots, and only ``NEAR`` where the thread began last, since it would also delay
+    what is delivered. A thread that is not seen there any more is looked for in the whole cycle.
     """
 
     EVERY_S = 10.0
     CYCLES = 8
+    NEAR = 0.04
+    """So much of the cycle before and after."""
 
     def __init__(
         self,
@@ -214,19 +223,30 @@ class DriftWatch:
     def _look_again(self) -> None:
         if self._cores:
             os.sched_setaffinity(0, self._cores)  # the calling thread's alone
+        near_ns: int | None = self._expected_ns
         with contextlib.suppress(OperationError):  # the thread has ended
             while True:
                 time.sleep(self.EVERY_S)
-                seen = watch_wake_ups(
-                    *self._thread,
-                    self.CYCLES * self._cycle_ns,
-                    least_ns=TO_STOP_NS if self._slots else 0,
-                )
-                drift = find_drift(
-                    seen, self._cycle_ns, self.CYCLES, self._expected_ns, self._slots
-                )
+                drift = self._look(near_ns)
+                near_ns = None if drift is None else self._expected_ns + drift
                 if drift is not None:
                     self.latest_ns = drift
+
+    def _look(self, near_ns: int | None) -> int | None:
+        """The drift, if the thread was seen; near where it was expected, None: anywhere."""
+        cycle_ns, near = self._cycle_ns, round(self.NEAR * self._cycle_ns)
+
+        def until_near(now_ns: int) -> int:
+            place = (now_ns - (near_ns or 0) + near) % cycle_ns
+            return 0 if near_ns is None or place < 2 * near else cycle_ns - place
+
+        seen = watch_wake_ups(
+            *self._thread,
+            self.CYCLES * cycle_ns,
+            least_ns=TO_STOP_NS if self._slots else 0,
+            rest_ns=until_near,
+        )
+        return find_drift(seen, cycle_ns, self.CYCLES, self._expected_ns, self._slots)
 
 
 @contextlib.contextmanager

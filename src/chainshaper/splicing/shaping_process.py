@@ -152,6 +152,8 @@ def shaping_parameters(plan: Plan, node: ShapingNode, log: Path | None) -> dict[
         "output_depth": plan.chain.output_depth or 10,
         "log": "" if log is None else str(log.absolute()),
     }
+    if node.receivers:
+        parameters["server_cores"] = sorted({server.core for server in plan.servers})
     if plan.modes is not None and node == plan.shaping_node:
         parameters |= {
             "mode_topic": plan.modes.topic,

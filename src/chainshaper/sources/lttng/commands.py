@@ -11,10 +11,20 @@ Which session daemon traces an application depends on who runs it:
   this machine are then recorded too.
 * Otherwise we start one and end it afterwards: a root daemon if we are root, else one of our
   user's. It listens for applications in a home directory of our own, which the command gets as its
-  `LTTNG_HOME`. So it traces the command and nothing else, and a daemon of the user's keeps its
-  sessions.
+  `LTTNG_HOME`. So it traces the command and nothing else.
 
-Upstream: lttng-tools, `utils_get_rundir`; lttng-ust, `setup_local_apps`; lttng(1).
+Recordings that run at the same time, and daemons that others start meanwhile, share nothing with a
+daemon of ours: its run directory, where clients look for it, is in our home directory. Root's is
+/var/run/lttng whatever its environment says, so root's daemon and clients have that directory
+mounted there, in mount namespaces that they alone see. Where root may not mount (most containers),
+the daemon is in everybody's place, and there can be one recording at a time.
+
+We may be killed at any moment. A daemon of ours is told so by the kernel; everything else is left
+to a shell that waits for our end, destroys our sessions in somebody's daemon and removes the home
+directory.
+
+Upstream: lttng-tools, `utils_get_rundir` and `set_session_daemon_path`; lttng-ust,
+`setup_local_apps`; lttng(1), lttng-sessiond(8).
 """
 
 import os
@@ -25,12 +35,14 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
 from chainshaper.enforcement.realtime import signalled_with_parent
+from chainshaper.enforcement.threads.listing import read_proc
 from chainshaper.errors import OperationError, PlatformError
 
 __all__ = ["Lttng", "connect"]
@@ -41,14 +53,33 @@ _PACKAGES = (
 )
 _ANSWER_S = 60.0
 _START_S = 15.0
+_RUN_DIRECTORY = Path("/var/run/lttng")
+_APART = (
+    *("unshare", "--mount", "--propagation=slave", "sh", "-c"),
+    f'mkdir -p {_RUN_DIRECTORY} && mount --bind "$0" {_RUN_DIRECTORY} && exec "$@"',
+)
+_AFTERWARDS = """
+read -r _
+for name in $(timeout 60 lttng --no-sessiond --mi xml list | grep -o "$0-[0-9]*"); do
+    timeout 60 lttng --no-sessiond destroy "$name"
+done
+rm -rf "$LTTNG_HOME"
+"""
 
 
 @dataclass(frozen=True)
 class Lttng:
-    """A connection to a session daemon; ``daemon`` is its process where we have started it."""
+    """A connection to a session daemon.
+
+    ``home`` is a directory of our own, whose unique name sessions are called after. ``afterwards``
+    is the shell that clears up when we are gone. ``daemon`` is the daemon's process where we have
+    started it, and ``inside`` what commands begin with that shall see its run directory.
+    """
 
     home: Path
+    afterwards: "subprocess.Popen[bytes]"
     daemon: "subprocess.Popen[bytes] | None" = None
+    inside: tuple[str, ...] = ()
 
     @property
     def environment(self) -> dict[str, str]:
@@ -64,7 +95,7 @@ class Lttng:
         what = shlex.join(("lttng", *arguments))
         try:
             run = subprocess.run(
-                ["lttng", "--no-sessiond", "--mi", "xml", *arguments],
+                [*self.inside, "lttng", "--no-sessiond", "--mi", "xml", *arguments],
                 env=_environment(self.home),
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
@@ -89,30 +120,37 @@ class Lttng:
 
     def close(self) -> None:
         """End the daemon if it is ours, and remove the home directory; harmless when repeated."""
-        if self.daemon is not None and self.daemon.poll() is None:
+        if self.daemon is not None:
             self.daemon.terminate()
             try:
                 self.daemon.wait(_START_S)
             except subprocess.TimeoutExpired:
                 self.daemon.kill()
                 self.daemon.wait()
-        shutil.rmtree(self.home, ignore_errors=True)
+        self.afterwards.communicate()
 
 
 def connect() -> Lttng:
     """Find the session daemon that traces our applications, or start one.
 
     Raises:
-        PlatformError: LTTng is not installed.
+        PlatformError: LTTng is not installed, or cannot make two recordings at a time here.
         OperationError: the daemon does not start; with its own words.
     """
     if shutil.which("lttng") is None:
         raise PlatformError(f"the command `lttng` is not there: {_PACKAGES}")
-    # Sockets lie in it, whose paths may have 108 characters only: not beside the recording.
-    lttng = Lttng(Path(tempfile.mkdtemp(prefix="chainshaper-lttng-")))
+    lttng = _without_daemon()
     try:
-        if _answers(lttng):
+        found = _answers(lttng)
+        if found and not _hears_one_command_only():
             return lttng
+        lttng = replace(lttng, inside=_run_directory_apart(lttng.home))
+        if found and not lttng.inside:
+            raise PlatformError(
+                "another recording runs, and LTTng can make one at a time here, because root may "
+                "not mount: wait for its end, or record where mounting is permitted (Docker: "
+                "`--privileged`)"
+            )
         if shutil.which("lttng-sessiond") is None:
             raise PlatformError(
                 f"no LTTng session daemon runs, and `lttng-sessiond` is not there: {_PACKAGES}"
@@ -123,6 +161,45 @@ def connect() -> Lttng:
         raise
 
 
+def _without_daemon() -> Lttng:
+    # Sockets lie in it, whose paths may have 108 characters only: not beside the recording.
+    home = Path(tempfile.mkdtemp(prefix="chainshaper-lttng-"))
+    afterwards = subprocess.Popen(
+        ["sh", "-c", _AFTERWARDS, home.name],
+        env=_environment(home),
+        stdin=subprocess.PIPE,  # ends with us, however that happens
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    return Lttng(home, afterwards)
+
+
+def _hears_one_command_only() -> bool:
+    """Whether the root daemon that runs is another recording's: no other application finds it."""
+    with suppress(OSError, ValueError):
+        pid = int((_RUN_DIRECTORY / "lttng-sessiond.pid").read_text())
+        return b"--apps-sock=" in read_proc(f"/proc/{pid}/cmdline")
+    return False
+
+
+def _run_directory_apart(home: Path) -> tuple[str, ...]:
+    """What root's commands begin with that see a run directory of our own; empty if not permitted.
+
+    Everybody else's is in the home directory anyway.
+    """
+    if os.getuid() != 0:
+        return ()
+    folder = home / "run"
+    folder.mkdir()
+    inside = (*_APART, str(folder))
+    try:
+        trial = subprocess.run([*inside, "true"], capture_output=True, check=False)
+    except OSError:  # no `unshare` here
+        return ()
+    return inside if trial.returncode == 0 else ()
+
+
 def _with_daemon(lttng: Lttng) -> Lttng:
     said = lttng.home / "daemon.log"
     folder = lttng.home / ".lttng"
@@ -131,7 +208,7 @@ def _with_daemon(lttng: Lttng) -> Lttng:
         (folder / f"lttng-ust-sock-{version}").symlink_to("applications")
     with said.open("wb") as log:
         daemon = subprocess.Popen(
-            ["lttng-sessiond", "--quiet", f"--apps-sock={folder / 'applications'}"],
+            [*lttng.inside, "lttng-sessiond", "--quiet", f"--apps-sock={folder / 'applications'}"],
             env=_environment(lttng.home),
             stdin=subprocess.DEVNULL,
             stdout=log,
@@ -140,7 +217,7 @@ def _with_daemon(lttng: Lttng) -> Lttng:
             # It ends in order, with its consumers, should we be killed.
             preexec_fn=partial(signalled_with_parent, os.getpid(), signal.SIGINT),  # noqa: PLW1509 - one call
         )
-    started = Lttng(lttng.home, daemon)
+    started = replace(lttng, daemon=daemon)
     deadline = time.monotonic() + _START_S
     while not _answers(started):
         if daemon.poll() is not None or time.monotonic() > deadline:

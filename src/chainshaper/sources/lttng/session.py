@@ -10,7 +10,7 @@ the application runs on: LTTng cannot add buffers to a session that has been sta
 until then stays lost and is counted, and what happens between the two sessions (some milliseconds)
 is not recorded, which a note says.
 
-A session daemon that ran before ours may trace other applications too (:mod:`.lttng_commands`).
+A session daemon that ran before ours may trace other applications too (:mod:`.commands`).
 What they did is left out of the tables: a second run of the same nodes would make two of every
 chain.
 
@@ -21,7 +21,6 @@ Upstream: lttng-enable-channel(1), `tracetools_trace` of ros2_tracing (events, c
 """
 
 import os
-import re
 import shutil
 import time
 from collections.abc import Mapping, Sequence
@@ -51,7 +50,6 @@ DEFAULT_BUFFER = 4 * MIB
 _SUB_BUFFERS = 4
 _SMALLEST = _SUB_BUFFERS * 4096
 _ENLARGED_BY = 4
-_NAME = re.compile(r"chainshaper-(\d+)-\d+")
 
 
 class LttngSession:
@@ -80,7 +78,6 @@ class LttngSession:
     def start(self) -> Mapping[str, str]:
         """Have a session daemon, and a session that is on."""
         self._lttng = connect()
-        _remove_abandoned_sessions(self._lttng)
         self._kernel = self._kernel_tracer(self._lttng)
         self._lttng.ask("start", self._new_session(self._lttng))
         timeout = str(REGISTER_TIMEOUT_MS)
@@ -91,8 +88,7 @@ class LttngSession:
         """Look whether the daemon is there and the session loses nothing; enlarge the buffers."""
         if self._lttng is None:
             return None
-        others, own = processes_apart(f"{MARK}={self._sessions[0]}")
-        self._strangers = (self._strangers | others) - own
+        self._look_for_strangers(self._lttng)
         try:
             if self._discarded(self._lttng):
                 self._enlarge(self._lttng)
@@ -106,6 +102,7 @@ class LttngSession:
     def stop(self) -> None:
         """Stop the session; LTTng waits until its buffers are on disk."""
         if self._lttng is not None and self._sessions:
+            self._look_for_strangers(self._lttng)
             self._lttng.ask("stop", self._sessions[-1])
 
     def remove(self) -> None:
@@ -137,6 +134,12 @@ class LttngSession:
         notes = (*info.notes, *self._notes, *self._loss(info.lost))
         return tables, info.model_copy(update={"notes": notes})
 
+    def _look_for_strangers(self, lttng: Lttng) -> None:
+        """Note who else runs, if the daemon is somebody's and so hears everybody."""
+        if lttng.daemon is None:
+            others, own = processes_apart(f"{MARK}={self._sessions[0]}")
+            self._strangers = (self._strangers | others) - own
+
     def _kernel_tracer(self, lttng: Lttng) -> bool:
         try:
             lttng.ask("list", "--kernel")
@@ -153,7 +156,7 @@ class LttngSession:
     def _new_session(self, lttng: Lttng) -> str:
         """Prepare a session with buffers of the present size; its name."""
         number = len(self._sessions) + 1
-        name = f"chainshaper-{os.getpid()}-{number}"
+        name = f"{lttng.home.name}-{number}"
         output = self._folder.absolute() / f"session-{number}"
         # LTTng 2.15 began to write CTF 2, which nobody else reads yet.
         old_format = ("--trace-format=ctf-1.8",) if _version(lttng) >= (2, 15) else ()
@@ -228,13 +231,3 @@ def _version(lttng: Lttng) -> tuple[int, int]:
     answer = lttng.ask("version")
     major, minor = (answer.findtext(f".//{{*}}{name}") for name in ("major", "minor"))
     return int(major or 0), int(minor or 0)
-
-
-def _remove_abandoned_sessions(lttng: Lttng) -> None:
-    """Sessions of ours in somebody's daemon whose owner was killed: nobody else would end them."""
-    for found in lttng.ask("list").iterfind(".//{*}session"):
-        name = found.findtext("{*}name") or ""
-        owner = _NAME.fullmatch(name)
-        if owner is not None and not Path(f"/proc/{owner[1]}").exists():
-            with suppress(OperationError):
-                lttng.ask("destroy", name)

@@ -17,6 +17,8 @@ from contextlib import suppress
 from rclpy.node import Node
 from std_msgs.msg import Empty
 
+from chainshaper.enforcement.kept_core import KeptCore
+
 __all__ = ["Readiness"]
 
 REHEARSAL_TOPIC = "/_chainshaper_rehearsal"
@@ -40,7 +42,10 @@ class Readiness:
 
     AWAKE, AS_USUAL = (value.to_bytes(4, sys.byteorder, signed=True) for value in (0, -1))
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, delivery_core: int | None, pause_ns: int) -> None:
+        """The output is delivered on that core, for ``pause_ns`` after it was published."""
+        self._delivery_core = None if delivery_core is None else KeptCore(delivery_core)
+        self._pause_ns = pause_ns
         self._rehearsal = node.create_publisher(Empty, REHEARSAL_TOPIC, 1)
         self._to_itself = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._to_itself.setblocking(False)
@@ -59,6 +64,8 @@ class Readiness:
     def get_ready(self, release_ns: int) -> None:
         """For a release at that time of CLOCK_MONOTONIC, as far as there is time left for it."""
         self._ask_for(self.AWAKE)
+        if self._delivery_core is not None:
+            self._delivery_core.keep_until(release_ns + self._pause_ns)
         for _ in range(2):  # the second time all that the first has loaded is in order
             if time.monotonic_ns() > release_ns - REHEARSAL_NS:
                 return

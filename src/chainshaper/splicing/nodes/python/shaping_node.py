@@ -136,11 +136,20 @@ def change_phase_with(node: Node, shaper: Shaper) -> None:
     node.add_on_set_parameters_callback(changed)
 
 
+def delivery_core(node: Node) -> int | None:
+    """Where DDS threads deliver the output: the first core that is ours to use and has no server.
+
+    None where the plan does not name its servers' cores, because it leaves receivers alone.
+    """
+    taken = parameter(node, "server_cores", [-1])
+    return None if -1 in taken else min(os.sched_getaffinity(0) - set(taken), default=None)
+
+
 def set_up(node: Node) -> None:
     """Make the node's endpoints."""
-    readiness = Readiness(node)
-    shaper = Shaper(gate_from(node), parameter(node, "spin_ns", 0), readiness.get_ready)
     log, pause_ns = GateLog(node, parameter(node, "log", "")), parameter(node, "pause_ns", 0)
+    readiness = Readiness(node, delivery_core(node), pause_ns)
+    shaper = Shaper(gate_from(node), parameter(node, "spin_ns", 0), readiness.get_ready)
     change_phase_with(node, shaper)
     info = wait_for_publisher(node, "input")
     offered = offered_by(info, parameter(node, "output_depth", 10))

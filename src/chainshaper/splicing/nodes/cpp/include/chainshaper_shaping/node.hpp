@@ -8,6 +8,7 @@
 #include <sched.h>
 #include <sys/mman.h>
 
+#include <algorithm>
 #include <chrono>
 #include <csignal>
 #include <cstring>
@@ -177,16 +178,34 @@ inline Gate gate_from(rclcpp::Node & node)
   return gate;
 }
 
+// Where DDS threads deliver the output: the first core that is ours to use and has no server. None
+// where the plan does not name its servers' cores, because it leaves receivers alone.
+inline std::optional<std::size_t> delivery_core(rclcpp::Node & node)
+{
+  const auto taken = parameter<std::vector<std::int64_t>>(node, "server_cores", {});
+  cpu_set_t ours;
+  if (taken.empty() || sched_getaffinity(0, sizeof(ours), &ours) != 0) {
+    return std::nullopt;
+  }
+  for (std::size_t core = 0; core < CPU_SETSIZE; ++core) {
+    const auto number = static_cast<std::int64_t>(core);
+    if (CPU_ISSET(core, &ours) && std::find(taken.begin(), taken.end(), number) == taken.end()) {
+      return core;
+    }
+  }
+  return std::nullopt;
+}
+
 // The gate of a node, with everything around it but the topics of the messages.
 class Shaping
 {
 public:
   explicit Shaping(rclcpp::Node & node)
-  : node_(node), readiness_(node),
+  : node_(node), pause_ns_(parameter<std::int64_t>(node, "pause_ns", 0)),
+    readiness_(node, delivery_core(node), pause_ns_),
     shaper_(
       gate_from(node), parameter<std::int64_t>(node, "spin_ns", 0),
-      [this](std::int64_t release_ns) {readiness_.get_ready(release_ns);}),
-    pause_ns_(parameter<std::int64_t>(node, "pause_ns", 0))
+      [this](std::int64_t release_ns) {readiness_.get_ready(release_ns);})
   {
     const auto log = parameter<std::string>(node, "log", "");
     if (!log.empty() && !log_.open_file(log)) {
@@ -261,10 +280,10 @@ public:
 
 private:
   rclcpp::Node & node_;
+  std::int64_t pause_ns_;
   Readiness readiness_;
   Shaper shaper_;
   GateLog log_;
-  std::int64_t pause_ns_;
   rclcpp::node_interfaces::OnSetParametersCallbackHandle::SharedPtr phase_;
   rclcpp::Subscription<std_msgs::msg::String>::SharedPtr modes_;
 };

@@ -23,9 +23,11 @@
 #include <array>
 #include <cstdint>
 #include <cstring>
+#include <optional>
 
 #include "rclcpp/rclcpp.hpp"
 
+#include "kept_core.hpp"
 #include "shaper.hpp"
 
 namespace chainshaper
@@ -34,8 +36,10 @@ namespace chainshaper
 class Readiness
 {
 public:
-  explicit Readiness(rclcpp::Node & node)
-  : rehearsal_(node.create_generic_publisher(  // of all shaping nodes; an underscore hides it
+  // The core is where the output is delivered, for `pause_ns` after it was published.
+  Readiness(rclcpp::Node & node, std::optional<std::size_t> delivery_core, std::int64_t pause_ns)
+  : pause_ns_(pause_ns),
+    rehearsal_(node.create_generic_publisher(  // of all shaping nodes; an underscore hides it
         "/_chainshaper_rehearsal", "std_msgs/msg/Empty", rclcpp::QoS(1))),
     empty_(serialized_empty.size()),
     to_itself_(socket(AF_INET, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0)),
@@ -45,6 +49,9 @@ public:
       RCLCPP_WARN(
         node.get_logger(), "/dev/cpu_dma_latency: %s: idle cores sleep, and deliver less "
         "regularly; run as root, or give the user the right to write it", std::strerror(errno));
+    }
+    if (delivery_core) {
+      delivery_core_.emplace(*delivery_core);
     }
     auto & message = empty_.get_rcl_serialized_message();
     std::memcpy(message.buffer, serialized_empty.data(), serialized_empty.size());
@@ -74,6 +81,9 @@ public:
   void get_ready(std::int64_t release_ns)
   {
     ask_for(0);
+    if (delivery_core_) {
+      delivery_core_->keep_until(release_ns + pause_ns_);
+    }
     for (int time = 0; time < 2; ++time) {  // the second finds in order what the first has loaded
       if (monotonic_ns() > release_ns - rehearsal_ns) {
         return;
@@ -103,6 +113,8 @@ private:
     }
   }
 
+  std::int64_t pause_ns_;
+  std::optional<KeptCore> delivery_core_;
   rclcpp::GenericPublisher::SharedPtr rehearsal_;
   rclcpp::SerializedMessage empty_;
   int to_itself_;

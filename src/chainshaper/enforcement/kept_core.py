@@ -1,0 +1,51 @@
+"""A core that is kept clear of other work while an output is delivered there.
+
+DDS threads that receive outrank everything else on their core, but that does not help them at once:
+unless the kernel is fully preemptible, an ordinary thread that is inside a system call goes on
+until it is through with it, and a core that idles has to wake up first. So a thread of the lowest
+real-time priority watches the clock there, from somewhat before a release until the output is
+delivered. Ordinary threads do not run meanwhile, and receiving ones preempt it within microseconds.
+
+That thread is a process of its own: within one of Python it would hold up the gate.
+"""
+
+import inspect
+import os
+import subprocess
+import sys
+from contextlib import suppress
+
+__all__ = ["KeptCore"]
+
+
+def _keep(core: int) -> None:
+    """Keep a core until the times (ns of CLOCK_MONOTONIC) that come on standard input."""
+    import os
+    import time
+
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    os.sched_setaffinity(0, {core})
+    while told := os.read(0, 8):
+        until_ns = int.from_bytes(told, "little")
+        while time.monotonic_ns() < until_ns:
+            pass
+
+
+class KeptCore:
+    """A process that keeps a core; it ends with the one that made it, and does not listen to
+    Ctrl-C. Where SCHED_FIFO or the core is refused, nothing is kept."""
+
+    def __init__(self, core: int) -> None:
+        program = f"{inspect.getsource(_keep)}\n_keep({core})"
+        self._keeper = subprocess.Popen(
+            [sys.executable, "-I", "-S", "-c", program],
+            stdin=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+
+    def keep_until(self, time_ns: int) -> None:
+        """Keep the core from now until then."""
+        assert self._keeper.stdin is not None  # noqa: S101
+        with suppress(BrokenPipeError):
+            os.write(self._keeper.stdin.fileno(), time_ns.to_bytes(8, "little"))
