@@ -20,7 +20,7 @@ __all__ = ["KeptCore"]
 
 def _keep(core: int) -> None:
     """Keep a core until the times (ns of CLOCK_MONOTONIC) that come on standard input."""
-    import os
+    import os  # this function is all that its process has
     import time
 
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
@@ -32,20 +32,33 @@ def _keep(core: int) -> None:
 
 
 class KeptCore:
-    """A process that keeps a core; it ends with the one that made it, and does not listen to
-    Ctrl-C. Where SCHED_FIFO or the core is refused, nothing is kept."""
+    """A process that keeps a core. It ends with the one that made it, and hears no Ctrl-C.
+
+    Where SCHED_FIFO or the core is refused, nothing is kept.
+    """
 
     def __init__(self, core: int) -> None:
         program = f"{inspect.getsource(_keep)}\n_keep({core})"
-        self._keeper = subprocess.Popen(
+        told, self._tell = os.pipe()
+        self._process = subprocess.Popen(
             [sys.executable, "-I", "-S", "-c", program],
-            stdin=subprocess.PIPE,
+            stdin=told,
             stderr=subprocess.DEVNULL,
             start_new_session=True,
         )
+        os.close(told)
+
+    @property
+    def pid(self) -> int:
+        """The id of its process."""
+        return self._process.pid
 
     def keep_until(self, time_ns: int) -> None:
         """Keep the core from now until then."""
-        assert self._keeper.stdin is not None  # noqa: S101
         with suppress(BrokenPipeError):
-            os.write(self._keeper.stdin.fileno(), time_ns.to_bytes(8, "little"))
+            os.write(self._tell, time_ns.to_bytes(8, "little"))
+
+    def end(self) -> None:
+        """Give the core back."""
+        os.close(self._tell)
+        self._process.wait()

@@ -118,7 +118,7 @@ def run_application(
     finished = False
     try:
         progress(0.0, "starting nodes")
-        _start_nodes(application, timer, nodes)
+        _start_nodes(application, timer, nodes, realtime)
         if realtime:  # what can be pre-empted itself cannot tell a stall from ordinary scheduling
             start_meters(application.cores(), meters)
         memory_locked = _await_ready([*nodes.values(), *meters.values()])
@@ -228,7 +228,7 @@ def _enforced(
 
 
 def _start_nodes(
-    application: Application, timer: CallbackDescription, nodes: dict[str, Child]
+    application: Application, timer: CallbackDescription, nodes: dict[str, Child], realtime: bool
 ) -> None:
     """Start a process per node, into ``nodes``: what fails later can end those started."""
     from chainshaper.workload.dds import closed_domain_configuration, free_domain
@@ -237,7 +237,7 @@ def _start_nodes(
     environment = {"CYCLONEDDS_URI": closed_domain_configuration(), **SINGLE_THREADED}
     for name in application.nodes:
         nodes[name] = start_child(f"node {name}", NODE_MODULE, environment, _ros_arguments(name))
-        nodes[name].tell(**_spec(application, name, timer, domain))
+        nodes[name].tell(**_spec(application, name, timer, domain, realtime))
 
 
 def _ros_arguments(name: str) -> tuple[str, ...]:
@@ -247,12 +247,13 @@ def _ros_arguments(name: str) -> tuple[str, ...]:
 
 
 def _spec(
-    application: Application, name: str, timer: CallbackDescription, domain: int
+    application: Application, name: str, timer: CallbackDescription, domain: int, realtime: bool
 ) -> dict[str, Any]:
     """A node's description as its process gets it: durations are ns here."""
     callbacks = [callback for _, callback in application.callbacks()]
     writers = Counter(topic for callback in callbacks for topic in callback.publishes)
     readers = Counter(topic for callback in callbacks for topic in callback.subscriptions)
+    executor, dds = application.scheduling_of(name), application.dds_scheduling_of(name)
     return {
         "node": node_name(name),
         "domain": domain,
@@ -260,6 +261,7 @@ def _spec(
         "parent": os.getpid(),
         "discovery_ns": DISCOVERY_NS,
         "origin_phase": timer.phase_ns,
+        "delivery_core": dds.core if realtime and dds.core != executor.core else None,
         "callbacks": [cb.model_dump() for cb in application.nodes[name].callbacks],
         "topics": {topic: application.topic(topic).model_dump() for topic in writers},
         "announced": sorted(application.announced()),

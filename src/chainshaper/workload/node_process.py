@@ -15,6 +15,7 @@ from itertools import count
 from typing import Any
 
 from chainshaper.enforcement.gate import STALL_NS, Gate, Modes, Shaper, sleep_until, text_of
+from chainshaper.enforcement.kept_core import KeptCore
 from chainshaper.enforcement.realtime import (
     lock_memory,
     set_thread_name,
@@ -291,7 +292,13 @@ class NodeProcess:
         return body
 
     def _shaper(self, gate: dict[str, Any]) -> Shaper:
-        modes = gate["modes"]
+        modes, core = gate["modes"], self.spec["delivery_core"]
+        delivery_core = None if core is None else KeptCore(core)
+
+        def get_ready(release_ns: int) -> None:
+            if delivery_core is not None:
+                delivery_core.keep_until(release_ns + gate["pause_ns"])
+
         shaper = Shaper(
             Gate(
                 slots=tuple((begin, finish) for begin, finish in gate["slots"]),
@@ -302,6 +309,7 @@ class NodeProcess:
                 modes=modes and Modes(modes["bands"], modes["default"], modes["late"]),
             ),
             gate["spin_ns"],
+            get_ready,
         )
         self.shapers.append(shaper)
         return shaper
