@@ -137,6 +137,8 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
         300: Scheduling(83, (1,)),
         301: Scheduling(91, (0,)),  # waited for, so above other DDS threads
     }
+    more_cores = _by_tid(plan_scheduling(plan, allocation, (0, 1, 2, 3)))
+    assert more_cores[301] == Scheduling(91, (0,)), "the core that is kept clear for them"
     assert 300 not in _by_tid(left_by_back_end("scx", wanted)), "it would outrank the servers"
     alone = revised(plan, shaping_node=node.model_copy(update={"receivers": ()}))
     assert set(_by_tid(plan_scheduling(alone, allocation, (0, 1)))) == {100, 200}

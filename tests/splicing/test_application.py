@@ -34,7 +34,7 @@ def test_the_publisher_is_remapped_and_the_shaping_node_takes_its_place(
     assert callback.gate is not None
     assert callback.gate.slots == publish_slots(plan)
     assert (callback.gate.cycle_ns, callback.gate.anchor) == (50_000_000, "stamp")
-    assert (callback.gate.spin_ns, callback.gate.pause_ns) == (1_000_000, 500_000)
+    assert (callback.gate.spin_ns, callback.gate.pause_ns) == (1_000_000, 2_000_000)
 
 
 def test_nothing_else_changes(application: Application, plan: Plan) -> None:

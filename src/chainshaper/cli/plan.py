@@ -73,8 +73,13 @@ def plan(
         int, duration_option("--spin", "How long the gate watches the clock before its slot.")
     ] = "1ms",  # type: ignore[assignment]
     pause: Annotated[
-        int, duration_option("--pause", "How long the gate rests after publishing.")
-    ] = "500us",  # type: ignore[assignment]
+        int | None,
+        duration_option(
+            "--pause",
+            "How long the gate rests after publishing. Default: 2ms, a twentieth of the cycle at"
+            " most.",
+        ),
+    ] = None,
     receivers: options.ReceiversOption = True,
     json: JsonOption = False,
 ) -> None:

@@ -117,7 +117,7 @@ class PlanRequest:
     anchor: Anchor = "stamp"
     overrun: Overrun = "wait"
     spin_ns: int = 1_000_000
-    pause_ns: int = 500_000
+    pause_ns: int | None = None
     with_receivers: bool = True
 
 

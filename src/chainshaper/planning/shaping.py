@@ -35,6 +35,7 @@ __all__ = ["evidence_of", "plan_shaping", "plan_warnings", "predict_bands", "sha
 
 OUTPUT_PRIORITY = 1  # better than the chain's: a publish slot inside its slot has to pre-empt it
 CHAIN_PRIORITY = 2
+PAUSE_NS = 2_000_000  # a receiver on a slow machine takes a millisecond to get to its callback
 
 FEW_SAMPLES = 100
 NEARLY_FULL = 0.95  # of the cycle; also the kernel's default share for real-time threads
@@ -59,7 +60,7 @@ def plan_shaping(
     overrun: Overrun = "wait",
     fifo_priority: int = 84,
     spin_ns: int = 1_000_000,
-    pause_ns: int = 500_000,
+    pause_ns: int | None = None,
     receivers: Sequence[str] = (),
     **conditions: Any,
 ) -> Plan:
@@ -84,7 +85,8 @@ def plan_shaping(
             puts the publisher's own thread into R_m°.
         output_depth: history of the output's writer (keep last).
         core, output_core: cores of the two servers.
-        anchor, fifo_priority, spin_ns, pause_ns, receivers: for the shaping node.
+        anchor, fifo_priority, spin_ns, pause_ns, receivers: for the shaping node; it pauses for
+            2 ms, a twentieth of the period at most, if nothing else is asked for.
         overrun: what becomes of an output that missed its slot.
         conditions: how the latencies were taken: the other fields of
             :class:`~chainshaper.planning.plan_parts.Evidence`.
@@ -119,7 +121,7 @@ def plan_shaping(
                 core=output_core,
                 fifo_priority=fifo_priority,
                 spin_ns=spin_ns,
-                pause_ns=pause_ns,
+                pause_ns=min(PAUSE_NS, period_ns // 20) if pause_ns is None else pause_ns,
                 receivers=tuple(receivers),
             )
         publishing = [node.thread] if node is not None else []

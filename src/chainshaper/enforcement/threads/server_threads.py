@@ -4,7 +4,8 @@ On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DES
 
 * DDS threads of the application stand above all servers, on other cores where there are any:
   what they deliver must not wait for what it is delivered to;
-* those of them that receive stand above the others, since they are waited for;
+* those of them that receive stand above the others, since they are waited for; where the output is
+  received, they have the first of these cores, which the shaping node keeps clear;
 * servers stand below 88 in the order of their own priority, smaller first;
 * who receives what a shaping node publishes stands below all servers, on the shaping node's core:
   idle then, and just awake. It may take as long as it likes, and delays no chain;
@@ -148,7 +149,7 @@ def scheduling_around(
         if thread.thread.pid in pids and thread.thread.identity not in planned
     ]
     free_cores = tuple(sorted(set(available_cores) - {server.core for server in servers}))
-    beside = _dds_threads(others, free_cores)
+    beside = _dds_threads(others, free_cores, {one.thread.thread.pid for one in receiving})
     return below_their_siblings((*own, *receiving, *beside, *_out_of_the_way(own, others)))
 
 
@@ -258,21 +259,23 @@ def _receiving(
     ]
 
 
-def _dds_threads(others: Sequence[NodeThread], cores: tuple[int, ...]) -> list[WantedScheduling]:
-    """DDS threads above all servers; on machines without a free core they stay where they are."""
-    return [
-        WantedScheduling(
-            thread,
-            Scheduling(
-                DDS_RECEIVE_PRIORITY if thread.thread.kind == "receive" else DDS_PRIORITY,
-                cores or None,
-            ),
-            None,
-            "DDS threads deliver for the servers",
-        )
-        for thread in others
-        if thread.thread.role == "dds"
-    ]
+def _dds_threads(
+    others: Sequence[NodeThread], cores: tuple[int, ...], receivers: Collection[int]
+) -> list[WantedScheduling]:
+    """DDS threads above all servers; on machines without a free core they stay where they are.
+
+    ``receivers`` are the processes that receive an output.
+    """
+    wanted = []
+    for one in others:
+        if one.thread.role != "dds":
+            continue
+        receives = one.thread.kind == "receive"
+        own = cores[:1] if receives and one.thread.pid in receivers else cores
+        priority = DDS_RECEIVE_PRIORITY if receives else DDS_PRIORITY
+        reason = "DDS threads deliver for the servers"
+        wanted.append(WantedScheduling(one, Scheduling(priority, own or None), None, reason))
+    return wanted
 
 
 def _out_of_the_way(
