@@ -221,7 +221,8 @@ def test_under_let_per_callback_every_output_waits_for_the_next_cycle(tmp_path: 
     described = application(TWO_SINKS)
     profile = simulate(described, tmp_path / "profile", cycles=5)
     planned = plan_recording(
-        profile, request=PlanRequest(policy="let-per-callback", spin_ns=300_000)
+        profile,
+        request=PlanRequest(policy="let-per-callback", spin_ns=300_000, pause_ns=500_000),
     )
     recording = simulated(tmp_path, described, planned, cycles=3)
     # The nodes share core 1. Before its slot [1, 2) that of /in watches the clock for 0.3 ms while
