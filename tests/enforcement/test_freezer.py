@@ -24,7 +24,12 @@ from gated import (
 from processes import children_of, wait_for
 
 from chainshaper.enforcement.freezer.back_end import Freezer, create
-from chainshaper.enforcement.freezer.cgroups import cgroup_of
+from chainshaper.enforcement.freezer.cgroups import (
+    QUICK_MOVES,
+    cgroup_of,
+    mount_options,
+    remount,
+)
 from chainshaper.enforcement.realtime import may_use_fifo
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.errors import InputError, OperationError, PlatformError
@@ -44,6 +49,7 @@ def server(
 @contextmanager
 def freezer(folder: Path, *servers: ReservationServer, cycle: int = CYCLE) -> Iterator[Freezer]:
     """Servers in force; afterwards nothing of them is left, whatever the test did to them."""
+    mounted = mount_options()
     back_end = create(ServerTable(cycle, servers), folder / "run")
     (supervisor,) = set(children_of(os.getpid())) & {back_end.supervisor}
     dispatchers = children_of(supervisor)
@@ -52,6 +58,7 @@ def freezer(folder: Path, *servers: ReservationServer, cycle: int = CYCLE) -> It
     finally:
         back_end.release()
         assert groups_left(os.getpid()) == []
+        assert mount_options() == mounted
         assert [entry.name for entry in (folder / "run").iterdir()] == ["freezer.log"]
         wait_for(
             lambda: not any(Path(f"/proc/{pid}").exists() for pid in [supervisor, *dispatchers]),
@@ -278,6 +285,24 @@ def test_threads_that_end_inside_and_outside_their_slots_are_no_failure(tmp_path
             spinner.process.wait(timeout=20)
         assert back_end.members() == {"a": ()}
         assert back_end.failure() is None
+
+
+def test_others_that_move_processes_make_nobody_wait_meanwhile(tmp_path: Path) -> None:
+    mounted = mount_options()
+    remount(f"{mounted},{QUICK_MOVES}")
+    try:
+        if QUICK_MOVES not in mount_options():
+            pytest.skip(f"this kernel, or our privileges, do not allow the option {QUICK_MOVES}")
+        with freezer(tmp_path / "theirs", server("a", (0, 1))) as back_end:
+            back_end.release()
+            assert QUICK_MOVES in mount_options(), "somebody else wanted it so"
+    finally:
+        remount(mounted)
+    with freezer(tmp_path / "ours", server("a", (0, 1))):
+        assert mount_options() == f"{mounted},{QUICK_MOVES}"
+    with pytest.raises(PlatformError), freezer(tmp_path, server("a", (0, 1), core=99)):
+        pass
+    assert mount_options() == mounted
 
 
 def test_a_group_that_somebody_removes_is_told(tmp_path: Path) -> None:

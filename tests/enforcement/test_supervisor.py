@@ -19,7 +19,7 @@ import pytest
 from gated import CORE, MS, Stamping, cpu_ns, groups_left, kill, needs_cgroups, stamping
 from processes import children_of, wait_for
 
-from chainshaper.enforcement.freezer.cgroups import cgroup_of
+from chainshaper.enforcement.freezer.cgroups import cgroup_of, mount_options
 from chainshaper.enforcement.freezer.state import clean_up, load_state
 from chainshaper.errors import OperationError
 
@@ -38,6 +38,7 @@ class Run:
     folder: Path
     spinner: Stamping
     home: Path
+    mounted: str  # how the hierarchy was
 
     def ask(self, line: str) -> str:
         assert self.owner.stdin is not None
@@ -51,11 +52,15 @@ class Run:
         return "frozen 1" in (group / "cgroup.events").read_text()
 
     def wait_until_restored(self) -> None:
-        """The thread runs, where it was, no group is left and none of the processes but owner."""
+        """The thread runs, where it was, no group is left and none of the processes but owner.
+
+        The hierarchy is mounted as before.
+        """
         ran = cpu_ns(self.spinner.tid)
         wait_for(lambda: cpu_ns(self.spinner.tid) > ran, "the thread to run again")
         wait_for(lambda: groups_left(self.owner.pid) == [], "its group to be removed")
         assert cgroup_of(self.spinner.tid) == self.home
+        wait_for(lambda: mount_options() == self.mounted, "the former mount options")
         wait_for(
             lambda: not any(map(alive, [self.supervisor, *self.dispatchers])),
             "our processes to end",
@@ -75,7 +80,7 @@ def run_of(
     folder: Path, cycle_ms: int = MINUTE, slot_ms: int = 2, frozen: bool = True
 ) -> Iterator[Run]:
     with stamping(folder, 60) as spinner:
-        home = cgroup_of(spinner.tid)
+        home, mounted = cgroup_of(spinner.tid), mount_options()
         script = Path(__file__).with_name("freezer_owner.py")
         arguments = [folder / "run", CORE, cycle_ms, slot_ms, spinner.tid]
         owner = subprocess.Popen(
@@ -91,7 +96,9 @@ def run_of(
             said = owner.stdout.readline()
             assert said.startswith("in force"), owner.stderr and owner.stderr.read()
             supervisor = int(said.split()[-1])
-            run = Run(owner, supervisor, children_of(supervisor), folder / "run", spinner, home)
+            run = Run(
+                owner, supervisor, children_of(supervisor), folder / "run", spinner, home, mounted
+            )
             assert len(run.dispatchers) == 1
             if frozen:
                 wait_for(run.is_frozen, "the thread to be frozen")

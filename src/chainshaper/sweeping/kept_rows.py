@@ -49,8 +49,8 @@ def kept_rows(
             rows = dict(finished or {})
 
             def keep(number: int, row: Row) -> None:
+                rows[number] = row  # first: an interruption must not take it for an empty file
                 _append(file, {"number": number, "row": row})
-                rows[number] = row
 
             try:
                 yield rows, keep

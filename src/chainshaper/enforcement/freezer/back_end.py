@@ -88,7 +88,7 @@ def create(table: ServerTable, run_directory: Path) -> "Freezer":
         ) from error
     try:
         stale = load_state(run_directory)
-        if left := restore(stale.groups if stale else ()):
+        if left := restore(stale):
             raise OperationError("; ".join(left))
         start_log(log)
         return Freezer(table, run_directory, log)
@@ -107,7 +107,9 @@ class Freezer:
         self.run_directory = run_directory
         self._log = log
         self._cores = {server.name: server.core for server in table.servers}
-        self._state = FreezerState(os.getpid(), table)
+        before = cgroups.mount_options()
+        mounts = before if cgroups.QUICK_MOVES not in before.split(",") else None
+        self._state = FreezerState(os.getpid(), table, mounts)
         self._born: dict[int, int] = {}
         self._anchoring: Anchoring | None = None
         self._failure: str | None = None
@@ -120,12 +122,14 @@ class Freezer:
         self._pidfds: list[int] = []
         self._supervisor = self._start_supervisor()
         try:
-            self._wait_until_running()
+            self._wait_until_running()  # from here on somebody is there to put things back
+            if mounts is not None:
+                cgroups.remount(f"{mounts},{cgroups.QUICK_MOVES}")
             self._pidfds = [os.pidfd_open(pid) for pid in self.dispatchers.values()]
         except BaseException:
             self._supervisor.kill()  # the dispatchers notice, and have nothing to thaw
             self._supervisor.wait()
-            self._close(())
+            self._close(self._restore())
             raise
         self._watcher = threading.Thread(target=self._watch, name="freezer-watch", daemon=True)
         self._watcher.start()
@@ -371,7 +375,7 @@ class Freezer:
                 self._restore()
 
     def _restore(self) -> tuple[str, ...]:
-        left = restore(self._state.groups)
+        left = restore(self._state)
         for dispatcher in self._pidfds:
             with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(dispatcher, signal.SIGKILL)

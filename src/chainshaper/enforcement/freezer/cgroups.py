@@ -12,6 +12,7 @@ way back is always the same, up to the parent. Until the child is removed the pa
 """
 
 import contextlib
+import ctypes
 import errno
 import os
 import time
@@ -20,15 +21,37 @@ from pathlib import Path
 from chainshaper.errors import OperationError, PlatformError
 
 __all__ = [
+    "QUICK_MOVES",
     "cgroup_of",
     "dissolve",
     "make_threaded_child",
+    "mount_options",
     "mount_point",
     "move_thread",
+    "remount",
     "threads_in",
 ]
 
 MOUNTS = Path("/proc/mounts")
+QUICK_MOVES = "favordynmods"
+"""A mount option since Linux 6.0 (Documentation/admin-guide/cgroup-v2.rst, "Mounting").
+
+Without it whoever moves a process to another group (a service manager, a container engine) waits
+for a grace period of RCU, which is 10 to 30 ms, and holds meanwhile what freezing needs as well:
+a slot opens so much later. Forks and exits become a little slower with it.
+"""
+_REMOUNT = 32
+_MOUNT_FLAGS = {
+    "rw": 0,
+    "ro": 1,
+    "nosuid": 2,
+    "nodev": 4,
+    "noexec": 8,
+    "noatime": 1 << 10,
+    "nodiratime": 1 << 11,
+    "relatime": 1 << 21,
+}
+"""Of mount(2); an option that is none of them is the file system's own."""
 _THREADED_CONTROLLERS = {"cpu", "cpuset", "perf_event", "pids"}
 _REMEDY = (
     "run as root, or start the application in a group that is yours "
@@ -42,11 +65,36 @@ def mount_point() -> Path:
     Raises:
         PlatformError: it is not.
     """
+    return _mount()[0]
+
+
+def mount_options() -> str:
+    """How the version 2 hierarchy is mounted: ``rw,nosuid,nodev,noexec,relatime,nsdelegate``.
+
+    Raises:
+        PlatformError: it is not.
+    """
+    return _mount()[1]
+
+
+def remount(options: str) -> None:
+    """Have the hierarchy mounted with these options, if the kernel knows and permits them.
+
+    By a call of the kernel, since `mount` would go on when we are killed meanwhile.
+    """
+    names = options.split(",")
+    flags = _REMOUNT | sum(_MOUNT_FLAGS.get(name, 0) for name in names)
+    own = ",".join(name for name in names if name not in _MOUNT_FLAGS)
+    folder = os.fsencode(mount_point())
+    ctypes.CDLL(None).mount(b"none", folder, b"cgroup2", ctypes.c_ulong(flags), own.encode())
+
+
+def _mount() -> tuple[Path, str]:
     # Beside version 1 hierarchies it usually stands at /sys/fs/cgroup/unified.
     for line in MOUNTS.read_text().splitlines():
-        _, folder, kind, *_ = line.split()
+        _, folder, kind, options, *_ = line.split()
         if kind == "cgroup2":
-            return Path(folder.encode().decode("unicode_escape"))
+            return Path(folder.encode().decode("unicode_escape")), options
     raise PlatformError(
         "no cgroup v2 hierarchy is mounted here, so threads cannot be frozen: "
         "`mount -t cgroup2 none /sys/fs/cgroup/unified`, or boot with "

@@ -319,7 +319,7 @@ def main() -> None:
         dispatcher.thaw_all()
         # Nobody else may be left to do it, and it does no harm if somebody is.
         latest = load_state(run_directory)
-        restore(latest.groups if latest else ())
+        restore(latest)
         sys.exit(error.exit_code)
     except ChainshaperError as error:
         sys.stderr.write(f"{error}\n")

@@ -2,8 +2,9 @@
 
 Whoever of the freezer's processes survives must be able to put everything back, and so must a
 stranger after all of them have been killed at once. So the file is written *before* each change.
-It holds the groups only: a group is made directly beneath the one from which its threads came,
-so their way back is its parent, for them and for the children that they have had since.
+It holds the groups: a group is made directly beneath the one from which its threads came, so their
+way back is its parent, for them and for the children that they have had since. And it holds how the
+hierarchy was mounted.
 
 The run's log stands beside it. It is at the same time the lock of the run directory: the owner
 opens it and all its processes inherit it, so it stays locked until the last of them is gone.
@@ -18,7 +19,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import IO
 
-from chainshaper.enforcement.freezer.cgroups import dissolve
+from chainshaper.enforcement.freezer.cgroups import (
+    QUICK_MOVES,
+    dissolve,
+    mount_options,
+    mount_point,
+    remount,
+)
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.errors import OperationError
 
@@ -50,10 +57,14 @@ class Group:
 
 @dataclass(frozen=True)
 class FreezerState:
-    """A run: the process it belongs to, the table it enforces, the groups it has made."""
+    """A run: the process it belongs to, the table it enforces, the groups it has made.
+
+    ``mount_options`` are those that the hierarchy had, where we have it mounted differently.
+    """
 
     owner: int
     table: ServerTable
+    mount_options: str | None = None
     groups: tuple[Group, ...] = ()
 
 
@@ -79,7 +90,7 @@ def load_state(run_directory: Path) -> FreezerState | None:
         )
         groups = tuple(Group(Path(g["folder"]), g["server"]) for g in content["groups"])
         table = ServerTable(content["table"]["cycle_ns"], servers)
-        return FreezerState(content["owner"], table, groups)
+        return FreezerState(content["owner"], table, content.get("mount_options"), groups)
     except FileNotFoundError:
         return None
     except (ValueError, KeyError, TypeError) as error:
@@ -96,9 +107,20 @@ def thaw(groups: Iterable[Group]) -> None:
             (group.folder / "cgroup.freeze").write_text("0")
 
 
-def restore(groups: Iterable[Group]) -> tuple[str, ...]:
-    """Put every thread back and remove the groups; what could not be, in sentences."""
-    return tuple(left for group in groups if (left := dissolve(group.folder)) is not None)
+def restore(state: FreezerState | None) -> tuple[str, ...]:
+    """Put every thread back, remove the groups, mount as before; what could not be, in sentences.
+
+    Of several runs at a time, the one that has it mounted differently changes that back.
+    """
+    if state is None:
+        return ()
+    left = tuple(told for group in state.groups if (told := dissolve(group.folder)) is not None)
+    before = state.mount_options
+    if before is not None and QUICK_MOVES in mount_options().split(","):
+        remount(before)
+        if QUICK_MOVES in mount_options().split(","):
+            left += (f"{mount_point()} is still mounted with {QUICK_MOVES}, and was with {before}",)
+    return left
 
 
 def remove_state(run_directory: Path) -> None:
@@ -143,7 +165,7 @@ def clean_up(run_directory: Path) -> tuple[Path, ...]:
         if state is None:
             return ()
         dissolved = tuple(g.folder for g in state.groups if g.folder.is_dir())
-        left = restore(state.groups)
+        left = restore(state)
         if left:
             raise OperationError("; ".join(left))
         remove_state(run_directory)

@@ -130,7 +130,7 @@ def _end(run_directory: Path, dispatchers: dict[int, subprocess.Popen[bytes]]) -
     They are killed outright, because one that has been stopped hears nothing else.
     """
     state = load_state(run_directory)
-    left = restore(state.groups if state else ())
+    left = restore(state)
     for process in dispatchers.values():
         process.kill()
         process.wait()
