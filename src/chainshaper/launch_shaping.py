@@ -72,7 +72,7 @@ def shape_launch(
     chain: str | None = None,
     choose: Choose | None = None,
     request: PlanRequest | None = None,
-    duration_ns: int = 40_000_000_000,
+    duration_ns: int = 60_000_000_000,
     source: Literal["lttng", "ebpf"] = "lttng",
     node: NodeKind = "python",
     back_end: str = "auto",

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["shape"]
 
 DESCRIPTIONS = (".yaml", ".yml")
-DURATION_NS = 40_000_000_000
+DURATION_NS = 60_000_000_000
 
 
 def shape(
@@ -61,7 +61,7 @@ def shape(
     chain: ChainOption = None,
     duration: Annotated[
         int | None,
-        duration_option("--duration", "How long to measure, before and after. Default: 40s."),
+        duration_option("--duration", "How long to measure, before and after. Default: 60s."),
     ] = None,
     source: SourceOption = "lttng",
     node: Annotated[
