@@ -10,8 +10,10 @@ import importlib.metadata
 import json
 import multiprocessing
 import os
+import pickle
 import re
 import signal
+import tempfile
 import threading
 import time
 from collections import deque
@@ -20,6 +22,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, TypeAlias
 
 from chainshaper.errors import ChainshaperError, InputError, OperationError
@@ -85,38 +88,47 @@ def _rows_from_processes(grid: Grid, groups: Sequence[Group], workers: int) -> R
     _, values = groups[0].points[0]
     warm = replace(grid, cycles=WARM_UP_CYCLES)
     row_at(warm, values, _profile_of(warm, groups[0]))
-    others = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(
-        workers, multiprocessing.get_context("spawn"), initializer=_end_with_parent
-    )
-    try:
-        yield from _rows_from_pool(pool, grid, groups, 2 * workers)
-    except BrokenProcessPool as error:
-        raise OperationError(
-            "a process that computed points was killed; finished rows are kept: free memory, or"
-            " ask for fewer with --workers, and the same command goes on"
-        ) from error
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-        for process in set(multiprocessing.active_children()) - others:
-            process.terminate()
+    with tempfile.TemporaryDirectory(prefix="chainshaper-sweep-") as folder:
+        others = set(multiprocessing.active_children())
+        pool = ProcessPoolExecutor(
+            workers, multiprocessing.get_context("spawn"), initializer=_end_with_parent
+        )
+        try:
+            yield from _rows_from_pool(pool, grid, groups, 2 * workers, Path(folder))
+        except BrokenProcessPool as error:
+            raise OperationError(
+                "a process that computed points was killed; finished rows are kept: free memory,"
+                " or ask for fewer with --workers, and the same command goes on"
+            ) from error
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in set(multiprocessing.active_children()) - others:
+                process.terminate()
+                process.join()
 
 
 def _rows_from_pool(
-    pool: ProcessPoolExecutor, grid: Grid, groups: Sequence[Group], at_once: int
+    pool: ProcessPoolExecutor, grid: Grid, groups: Sequence[Group], at_once: int, folder: Path
 ) -> Rows:
-    """Points whose profile is there come first, so that few profiles are held at a time."""
+    """Points whose profile is there come first, so that few profiles are kept at a time.
+
+    Processes hand them on in files: one that is killed while it sends as much through the pool's
+    pipe leaves the other end waiting for the rest for ever.
+    """
     coming = iter(groups)
-    ready: deque[tuple[tuple[int, Values], Profile | str | None]] = deque()
-    pending: dict[Future[Any], Group | int] = {}
+    ready: deque[tuple[tuple[int, Values], Path]] = deque()
+    pending: dict[Future[Any], Group | tuple[int, Path]] = {}
+    points_left: dict[Path, int] = {}
     while True:
         with _interrupts_later():
             while len(pending) < at_once:
                 if ready:
                     (number, values), profile = ready.popleft()
-                    pending[pool.submit(row_at, grid, values, profile)] = number
+                    pending[pool.submit(_row_by, grid, values, profile)] = (number, profile)
                 elif (group := next(coming, None)) is not None:
-                    pending[pool.submit(_profile_of, grid, group)] = group
+                    profile = folder / str(group.points[0][0])
+                    points_left[profile] = len(group.points)
+                    pending[pool.submit(_keep_profile, grid, group, profile)] = group
                 else:
                     break
         if not pending:
@@ -125,8 +137,21 @@ def _rows_from_pool(
             of = pending.pop(future)
             if isinstance(of, Group):
                 ready.extend((point, future.result()) for point in of.points)
-            else:
-                yield of, future.result()
+                continue
+            number, profile = of
+            points_left[profile] -= 1
+            if points_left[profile] == 0:
+                profile.unlink()
+            yield number, future.result()
+
+
+def _keep_profile(grid: Grid, group: Group, file: Path) -> Path:
+    file.write_bytes(pickle.dumps(_profile_of(grid, group)))
+    return file
+
+
+def _row_by(grid: Grid, values: Values, profile: Path) -> dict[str, Any]:
+    return row_at(grid, values, pickle.loads(profile.read_bytes()))  # noqa: S301 - ours
 
 
 @contextmanager
