@@ -25,7 +25,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from chainshaper.enforcement.gate import Gate, Modes
+from chainshaper.enforcement.gate import Anchor, Gate, Late, Modes, Overrun
+from chainshaper.plan_choices import Publication
 from chainshaper.workload.distributions import ExecutionTime, SimulationDescription
 from chainshaper.yaml_file import (
     AS_YAML,
@@ -63,7 +64,7 @@ class ModesDescription(Part):
     topic: FullName
     bands: Annotated[dict[str, int], Field(min_length=1)]
     default: str
-    late: Literal["wait", "discard", "publish", "next-slot"] = "wait"
+    late: Late = "wait"
 
 
 class GateDescription(Part):
@@ -74,8 +75,8 @@ class GateDescription(Part):
 
     slots: Annotated[tuple[tuple[Duration, Duration], ...], Field(min_length=1)]
     cycle_ns: PositiveDuration
-    anchor: Literal["stamp", "cycle"] = "stamp"
-    overrun: Literal["wait", "discard", "publish"] = "wait"
+    anchor: Anchor = "stamp"
+    overrun: Overrun = "wait"
     due_cycles: Annotated[int, Field(ge=0)] = 0
     modes: ModesDescription | None = None
     spin_ns: Duration = 0
@@ -176,7 +177,7 @@ class TopicDescription(Part):
     A message that is older than ``lifespan_ns`` is neither sent nor received any more.
     """
 
-    publication: Literal["synchronous", "asynchronous"] = "synchronous"
+    publication: Publication = "synchronous"
     reliability: Literal["reliable", "best_effort"] = "reliable"
     depth: int = Field(default=10, ge=1)
     lifespan_ns: PositiveDuration | None = None

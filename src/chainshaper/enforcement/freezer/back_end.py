@@ -107,8 +107,7 @@ class Freezer:
         self.run_directory = run_directory
         self._log = log
         self._cores = {server.name: server.core for server in table.servers}
-        before = cgroups.mount_options()
-        mounts = before if cgroups.QUICK_MOVES not in before.split(",") else None
+        mounts = None if cgroups.moves_are_quick() else cgroups.mount_options()
         self._state = FreezerState(os.getpid(), table, mounts)
         self._born: dict[int, int] = {}
         self._anchoring: Anchoring | None = None

@@ -28,6 +28,7 @@ __all__ = [
     "mount_options",
     "mount_point",
     "move_thread",
+    "moves_are_quick",
     "remount",
     "threads_in",
 ]
@@ -75,6 +76,11 @@ def mount_options() -> str:
         PlatformError: it is not.
     """
     return _mount()[1]
+
+
+def moves_are_quick() -> bool:
+    """Whether the hierarchy is mounted with :data:`QUICK_MOVES`."""
+    return QUICK_MOVES in mount_options().split(",")
 
 
 def remount(options: str) -> None:

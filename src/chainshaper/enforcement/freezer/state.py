@@ -22,8 +22,8 @@ from typing import IO
 from chainshaper.enforcement.freezer.cgroups import (
     QUICK_MOVES,
     dissolve,
-    mount_options,
     mount_point,
+    moves_are_quick,
     remount,
 )
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
@@ -116,9 +116,9 @@ def restore(state: FreezerState | None) -> tuple[str, ...]:
         return ()
     left = tuple(told for group in state.groups if (told := dissolve(group.folder)) is not None)
     before = state.mount_options
-    if before is not None and QUICK_MOVES in mount_options().split(","):
+    if before is not None and moves_are_quick():
         remount(before)
-        if QUICK_MOVES in mount_options().split(","):
+        if moves_are_quick():
             left += (f"{mount_point()} is still mounted with {QUICK_MOVES}, and was with {before}",)
     return left
 
