@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from calm_runs import calm_run
 from hypothesis import settings
 from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain, small_chain_text
 
@@ -64,14 +65,18 @@ def plan() -> Plan:
 def unshaped(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """A live run of the small chain, with real-time scheduling where it is permitted."""
     folder = tmp_path_factory.mktemp("unshaped")
-    return run_application(small_chain(folder), folder / "before", cycles=CYCLES)
+    application = small_chain(folder)
+    return calm_run(lambda output: run_application(application, output, cycles=CYCLES), folder)
 
 
 @pytest.fixture(scope="session")
 def shaped(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> Recording:
     """The same with the shaping node, anchored to the messages' stamps."""
     folder = tmp_path_factory.mktemp("shaped")
-    return shape_application(small_chain(folder), plan, folder / "after", cycles=CYCLES)
+    application = small_chain(folder)
+    return calm_run(
+        lambda output: shape_application(application, plan, output, cycles=CYCLES), folder
+    )
 
 
 @pytest.fixture

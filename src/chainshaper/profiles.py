@@ -43,14 +43,16 @@ def profile_of(
 
     Raises:
         InputError: the chain's period is not known, or known and given as well.
-        OperationError: no complete undisturbed traversal.
+        OperationError: fewer than two complete undisturbed traversals.
     """
     complete = analysis.traversals.filter(pl.col("complete") & ~pl.col("disturbed"))
-    if complete.height == 0:
+    if complete.height < 2:
         raise OperationError(
-            f"{recording.path}: of {analysis.traversals.height} traversals of "
-            f"{analysis.chain.spec} none is complete and undisturbed by the machine, so there is "
-            "nothing to plan from: see `chainshaper latency`, and record again"
+            f"{recording.path}: of {analysis.traversals.height} traversals of {analysis.chain.spec}"
+            f" {complete.height or 'none'} is complete and undisturbed by the machine"
+            f" ({analysis.statistics.incomplete} incomplete, {analysis.statistics.disturbed}"
+            " disturbed), too few to plan from: see `chainshaper latency`, and record again, longer"
+            " or on a calmer machine"
         )
     graph, chain = analysis.graph, analysis.chain
     period = _period(analysis, period_ns)

@@ -123,7 +123,7 @@ def profile_chains(
 
     Raises:
         InputError: no such chain, or no period.
-        OperationError: a chain without a complete undisturbed traversal.
+        OperationError: a chain with fewer than two complete undisturbed traversals.
     """
     if not isinstance(recording, Recording):
         recording = open_source(recording)
