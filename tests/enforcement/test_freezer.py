@@ -15,6 +15,7 @@ from gated import (
     ahead_of_others,
     cpu_ns,
     groups_left,
+    kill,
     needs_cgroups,
     own_cgroup,
     share_inside,
@@ -358,6 +359,30 @@ def test_a_core_that_the_machine_lacks_is_named_and_nothing_stays_behind(tmp_pat
         create(ServerTable(CYCLE, (server("a", (0, 1), core=1000),)), tmp_path / "run")
     assert [entry.name for entry in (tmp_path / "run").iterdir()] == ["freezer.log"]
     create(ServerTable(CYCLE, (server("a", (0, 1)),)), tmp_path / "run").release()
+
+
+@pytest.mark.parametrize(
+    ("victim", "reason"),
+    [("dispatcher", "dispatcher of core . was killed"), ("supervisor", "supervisor was killed")],
+)
+def test_what_is_killed_as_soon_as_it_runs_is_named_and_nothing_stays_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, victim: str, reason: str
+) -> None:
+    wait_until_running = Freezer._wait_until_running
+
+    def killed(back_end: Freezer) -> None:
+        wait_until_running(back_end)
+        dispatchers = list(back_end.dispatchers.values())
+        for pid in [back_end.supervisor] if victim == "supervisor" else dispatchers:
+            kill(pid)
+        wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in dispatchers), "their end")
+
+    monkeypatch.setattr(Freezer, "_wait_until_running", killed)
+    mounted = mount_options()
+    with pytest.raises(OperationError, match=f"{reason} by SIGKILL"):
+        create(ServerTable(CYCLE, (server("a", (0, 1)),)), tmp_path / "run")
+    assert [entry.name for entry in (tmp_path / "run").iterdir()] == ["freezer.log"]
+    assert mount_options() == mounted
 
 
 def test_a_run_directory_that_cannot_be_made_is_named(tmp_path: Path) -> None:

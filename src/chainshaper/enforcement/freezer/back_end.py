@@ -124,7 +124,7 @@ class Freezer:
             self._wait_until_running()  # from here on somebody is there to put things back
             if mounts is not None:
                 cgroups.remount(f"{mounts},{cgroups.QUICK_MOVES}")
-            self._pidfds = [os.pidfd_open(pid) for pid in self.dispatchers.values()]
+            self._hold_dispatchers()
         except BaseException:
             self._supervisor.kill()  # the dispatchers notice, and have nothing to thaw
             self._supervisor.wait()
@@ -280,16 +280,38 @@ class Freezer:
     def _wait_until_running(self) -> None:
         deadline = time.monotonic() + _START_S
         while self._page.supervisor.value == 0:
-            code = self._supervisor.poll()
-            if code is not None:
-                kind = PlatformError if code == PlatformError.exit_code else OperationError
-                raise kind(log_text(self.run_directory) or f"the supervisor {end_in_words(code)}")
+            if self._supervisor.poll() is not None:
+                raise self._end_at_start()
             if time.monotonic() > deadline:
                 raise OperationError(
                     f"the servers' processes did not start within {_START_S:g} s: is the machine "
                     "overloaded?"
                 )
             time.sleep(0.002)
+
+    def _hold_dispatchers(self) -> None:
+        """A pidfd of each: should they have to be ended, nobody is who has got their number."""
+        for pid in self.dispatchers.values():
+            try:
+                self._pidfds.append(os.pidfd_open(pid))
+            except ProcessLookupError:
+                raise self._end_at_start() from None
+
+    def _end_at_start(self) -> OperationError | PlatformError:
+        """Why the supervisor has ended, or is about to, because a dispatcher has."""
+        try:
+            code = self._supervisor.wait(_ANSWER_S)
+        except subprocess.TimeoutExpired:
+            return OperationError("a dispatcher has ended at its start, and its supervisor hangs")
+        kind = PlatformError if code == PlatformError.exit_code else OperationError
+        return kind(self._why_it_ended(code))
+
+    def _why_it_ended(self, code: int, hung: str = "") -> str:
+        """What the supervisor and its dispatchers have said, and what they could not say."""
+        said = log_text(self.run_directory).splitlines()
+        if code < 0 or not said:
+            said.insert(0, f"the supervisor {end_in_words(code)}{hung}")
+        return "; ".join(said)
 
     def _check_in_force(self) -> None:
         if self._ending or self._failure is not None:
@@ -364,11 +386,8 @@ class Freezer:
         if self._ending:
             return
         code = self._supervisor.wait()
-        said = log_text(self.run_directory).splitlines()
-        if code < 0:  # it could not say so itself
-            hung = " (it hung, or was stopped)" if still >= _LOOKS_UNTIL_HUNG else ""
-            said.insert(0, f"the supervisor {end_in_words(code)}{hung}")
-        self._failure = "; ".join(said) or f"the supervisor {end_in_words(code)}"
+        hung = " (it hung, or was stopped)" if still >= _LOOKS_UNTIL_HUNG else ""
+        self._failure = self._why_it_ended(code, hung)
         with self._lock:
             if not self._released:
                 self._restore()
