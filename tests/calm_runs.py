@@ -10,21 +10,23 @@ from pathlib import Path
 from chainshaper import measure_latency
 from chainshaper.recording import Recording
 
-__all__ = ["ATTEMPTS", "calm_run"]
+__all__ = ["calm_run"]
 
-ATTEMPTS = 5
+_ATTEMPTS = 5
 
 
 def calm_run(
     run: Callable[[Path], Recording], folder: Path, longest_stall_ns: int | None = None
 ) -> Recording:
-    """``run`` into a folder below ``folder`` until half the traversals at least are undisturbed.
+    """``run`` in folders below ``folder`` until half the traversals at least are undisturbed.
 
     Nor has the machine stalled for longer than ``longest_stall_ns`` then. What the last of five
     attempts gives is taken as it is.
     """
-    for attempt in range(ATTEMPTS):
-        recording = run(folder / f"recording{attempt}")
+    for attempt in range(_ATTEMPTS):
+        place = folder / f"attempt{attempt}"
+        place.mkdir()
+        recording = run(place)
         measured = measure_latency(recording)
         undisturbed = measured.analysis.undisturbed.count
         stalled = measured.longest_stall_ns or 0

@@ -66,7 +66,9 @@ def unshaped(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """A live run of the small chain, with real-time scheduling where it is permitted."""
     folder = tmp_path_factory.mktemp("unshaped")
     application = small_chain(folder)
-    return calm_run(lambda output: run_application(application, output, cycles=CYCLES), folder)
+    return calm_run(
+        lambda place: run_application(application, place / "before", cycles=CYCLES), folder
+    )
 
 
 @pytest.fixture(scope="session")
@@ -75,7 +77,7 @@ def shaped(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> Recording:
     folder = tmp_path_factory.mktemp("shaped")
     application = small_chain(folder)
     return calm_run(
-        lambda output: shape_application(application, plan, output, cycles=CYCLES), folder
+        lambda place: shape_application(application, plan, place / "after", cycles=CYCLES), folder
     )
 
 
