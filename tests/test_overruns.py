@@ -1,6 +1,7 @@
 """Outputs that missed their slot: counted by what was done about them, recorded live."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from command_line import called, json_of
 from small_chain import PERIOD_NS, small_chain
 
 from chainshaper import measure_latency, save_plan, shape_application
-from chainshaper.overruns import gate_releases, overruns_in, overruns_text
+from chainshaper.overruns import gate_releases, into_open_slots, overruns_in, overruns_text
 from chainshaper.planning import Plan, let_per_chain, plan_shaping, publish_slots
 from chainshaper.planning.plan import revised
 from chainshaper.recording import Recording
@@ -68,6 +69,26 @@ def test_outputs_published_at_once_wait_for_nothing(tmp_path: Path) -> None:
     assert measured.held.late > 0
 
 
+def test_what_comes_into_an_open_slot_leaves_at_once_and_is_counted(tmp_path: Path) -> None:
+    early = _too_early()
+    ((start, _),) = publish_slots(early)
+    wide = tuple(
+        server.model_copy(update={"slots": ((server.slots[0][0], PERIOD_NS),)})
+        for server in early.servers
+    )
+    plan = revised(early, servers=wide)
+    recording = shape_application(small_chain(tmp_path), plan, tmp_path / "wide", cycles=24)
+    releases = recording.events["gate_release"]
+    behind = releases["arrival"] - releases["origin"] - start
+    measured = measure_latency(recording)
+    assert 0 < (behind > 0).sum() < releases.height
+    assert measured.into_open_slots == (behind > 0).sum()
+    assert measured.overruns == {}
+    shown = called("compare", recording.path, recording.path).out
+    assert re.search(rf"came when it was open +│ +{measured.into_open_slots} │", shown)
+    assert json_of("latency", recording.path)["into_open_slots"] == measured.into_open_slots
+
+
 def test_what_was_done_is_reported_wherever_the_latency_is(tmp_path: Path) -> None:
     plan_file, output = tmp_path / "plan.yaml", tmp_path / "rec"
     application = tmp_path / "small_chain.yaml"
@@ -95,6 +116,7 @@ def test_what_was_done_is_reported_wherever_the_latency_is(tmp_path: Path) -> No
 def test_an_unshaped_recording_has_no_overruns(unshaped: Recording) -> None:
     assert overruns_in(unshaped, None) is None
     assert measure_latency(unshaped).overruns is None
+    assert into_open_slots(unshaped, None) is None
 
 
 def _without_column(recording: Recording, cycles_waited: list[int]) -> Recording:

@@ -1,5 +1,8 @@
 """Overruns in a recording: outputs that came behind the slot they were due in, and what was done.
 
+One that comes when its slot has opened already is in time, but a gate cannot hold it until the
+slot's start: it leaves at once, and later than all others. Those are counted, too.
+
 A gate records its decision for every message. The thread of an asynchronous publisher decides
 nothing; there the messages that were never sent count as discarded, and those that were sent in a
 later cycle than due as having waited.
@@ -14,7 +17,7 @@ from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.publisher_threads import publisher_servers
 from chainshaper.recording import Recording
 
-__all__ = ["gate_releases", "overruns_in", "overruns_text"]
+__all__ = ["gate_releases", "into_open_slots", "overruns_in", "overruns_text"]
 
 _DONE = {
     "wait": "waited for the next slot",
@@ -57,6 +60,17 @@ def overruns_in(
             late = analysis.traversals["latency_ns"].drop_nulls() >= due_until
             counts["wait"] += int(late.sum())
     return {policy: count for policy, count in counts.items() if count}
+
+
+def into_open_slots(recording: Recording, plan: Plan | None) -> int | None:
+    """How many outputs came into their slot when it was open already; None: no gate decided.
+
+    They took longer than the plan's L̄ + ε, and make up the jitter that a wide slot lets through.
+    """
+    if "gate_release" not in recording.events:
+        return None
+    table = gate_releases(recording, plan).filter(pl.col("overrun").is_null())
+    return int((table["release"] == table["arrival"]).sum())
 
 
 def overruns_text(overruns: dict[str, int]) -> str:

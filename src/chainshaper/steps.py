@@ -14,7 +14,7 @@ from chainshaper import events
 from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
 from chainshaper.durations import format_duration
 from chainshaper.errors import InputError
-from chainshaper.overruns import overruns_in
+from chainshaper.overruns import into_open_slots, overruns_in
 from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain
 from chainshaper.planning.publisher_threads import publisher_servers
 from chainshaper.predictions import PredictionHeld, hold_prediction
@@ -45,14 +45,17 @@ class Measurement:
 
     ``longest_stall_ns`` is the machine's own during the recording (None: nobody watched it),
     ``overruns`` counts outputs that came too late for their publish slot, per policy that was
-    applied to them: ``wait``, ``discard``, ``publish`` (None: nothing was gated). ``plan`` is the
-    plan in force, and ``held`` its prediction beside this measurement.
+    applied to them: ``wait``, ``discard``, ``publish`` (None: nothing was gated);
+    ``into_open_slots`` those that came in time, but too late to be held until their slot's start
+    (None: no gate decided). ``plan`` is the plan in force, and ``held`` its prediction beside this
+    measurement.
     """
 
     recording: Recording
     analysis: LatencyAnalysis
     longest_stall_ns: int | None
     overruns: dict[str, int] | None
+    into_open_slots: int | None
     plan: Plan | None
     held: PredictionHeld | None
 
@@ -98,6 +101,7 @@ def measure_latency(
         analysis=analysis,
         longest_stall_ns=_longest_stall(recording),
         overruns=overruns_in(recording, plan, analysis),
+        into_open_slots=into_open_slots(recording, plan),
         plan=plan,
         held=hold_prediction(plan, recording, analysis) if plan and planned_for else None,
     )

@@ -202,6 +202,7 @@ def test_incomplete_cycles_and_overruns_have_numbers_and_reasons(tmp_path: Path)
     assert lost[2:] == ["/t1", "2", "2, 3"]
     assert ["incomplete", "2 (2 lost)"] in page.rows["figures"]
     assert ["too late for their slot", "1"] in page.rows["figures"]
+    assert ["came when it was open", "0"] in page.rows["figures"]
 
 
 def test_where_nobody_watched_no_cycle_is_called_undisturbed(tmp_path: Path) -> None:

@@ -58,6 +58,7 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
         "silent": analysis.silent,
         "overruns": None if measurement.overruns is None else sum(measurement.overruns.values()),
         "overruns_by_policy": measurement.overruns,
+        "into_open_slots": measurement.into_open_slots,
         "stalls_watched": measurement.longest_stall_ns is not None,
         "longest_stall_ns": measurement.longest_stall_ns,
         "realtime": measurement.recording.info.realtime,
@@ -143,6 +144,7 @@ def comparison_table(comparison: Comparison) -> Table:
     )
     table.add_row("  incomplete", *(str(a.statistics.incomplete) for a in analyses))
     table.add_row("  too late for their slot", *map(_overruns, measurements))
+    table.add_row("  came when it was open", *(_count(m.into_open_slots) for m in measurements))
     table.add_row("longest stall of the machine", *(ms(m.longest_stall_ns) for m in measurements))
     infos = [measurement.recording.info for measurement in measurements]
     table.add_row("lost while recording", *(str(sum(info.lost.values())) for info in infos))
@@ -156,6 +158,10 @@ def comparison_table(comparison: Comparison) -> Table:
                 f"jitter at most {milliseconds(predicted.jitter_ns)}"
             )
     return table
+
+
+def _count(number: int | None) -> str:
+    return ABSENT if number is None else str(number)
 
 
 def _overruns(measurement: Measurement) -> str:

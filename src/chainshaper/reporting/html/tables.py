@@ -77,6 +77,7 @@ def comparison_table(recordings: Sequence[Told]) -> str:
         ["disturbed by the machine", *map(_disturbed, measurements)],
         ["incomplete", *map(_incomplete, measurements)],
         ["too late for their slot", *map(_overruns, measurements)],
+        ["came when it was open", *map(_into_open_slots, measurements)],
         ["begun without publishing", *(str(a.silent) for a in analyses)],
         ["longest stall of the machine [ms]", *(ms(m.longest_stall_ns) for m in measurements)],
     ]
@@ -112,6 +113,11 @@ def _overruns(measurement: Measurement) -> str:
     if measurement.overruns is None:
         return "not gated"
     return str(sum(measurement.overruns.values()))
+
+
+def _into_open_slots(measurement: Measurement) -> str:
+    count = measurement.into_open_slots
+    return "not gated" if count is None else str(count)
 
 
 def prediction_tables(recordings: Sequence[Told]) -> str:
