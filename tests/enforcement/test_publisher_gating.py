@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 from applied_plans import leftovers, needs_fifo
+from calm_runs import calm_run
 from gated import needs_cgroups
 from small_chain import PERIOD_NS, small_chain
 
@@ -44,7 +45,9 @@ def test_the_publisher_waits_for_its_slot_and_its_executor_does_not(tmp_path: Pa
     application = _burning_meanwhile(small_chain(tmp_path, publication="asynchronous"))
     plan = _plan()
     ((_, server, _),) = publisher_servers(plan)
-    recording = shape_application(application, plan, tmp_path / "rec", cycles=60)
+    recording = calm_run(
+        lambda place: shape_application(application, plan, place / "rec", cycles=60), tmp_path
+    )
 
     measured = measure_latency(recording)
     undisturbed = measured.analysis.traversals.filter(~pl.col("disturbed"))

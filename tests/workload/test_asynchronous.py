@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from calm_runs import calm_run
 from frozen_thread import freezing_publisher_of, need_threaded_cgroups
 from hypothesis import given
 from hypothesis import strategies as st
@@ -125,7 +126,10 @@ def _bulk(latencies: pl.Series) -> float:
 
 
 def test_the_publication_is_when_the_message_was_sent_not_handed_over(tmp_path: Path) -> None:
-    recording = run_application(_asynchronous(tmp_path), tmp_path / "rec", cycles=12)
+    application = _asynchronous(tmp_path)
+    recording = calm_run(
+        lambda place: run_application(application, place / "rec", cycles=12), tmp_path
+    )
     events = recording.events
     sends = events["asynchronous_send"]
     analysis = measure_latency(recording).analysis
@@ -150,7 +154,10 @@ def test_a_gated_publisher_thread_shapes_the_latency_and_stops_nobody_else(tmp_p
     application = _asynchronous(tmp_path)
     before = measure_latency(run_application(application, tmp_path / "before", cycles=40)).analysis
     gating = freezing_publisher_of("/third", SLOT, PERIOD_NS)
-    recording = run_application(application, tmp_path / "after", cycles=40, enforcement=gating)
+    recording = calm_run(
+        lambda place: run_application(application, place / "after", cycles=40, enforcement=gating),
+        tmp_path,
+    )
     after = measure_latency(recording).analysis
 
     assert after.incomplete == {}, "nothing is lost"

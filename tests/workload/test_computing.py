@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from calm_runs import calm_run
 from small_chain import DDS_CORE, EXECUTOR_CORE
 
 from chainshaper import run_application, simulate
@@ -85,7 +86,9 @@ def test_megabytes_are_computed_on_and_what_returns_nothing_publishes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     application = _application(tmp_path, monkeypatch)
-    recording = run_application(application, tmp_path / "rec", cycles=12)
+    recording = calm_run(
+        lambda place: run_application(application, place / "rec", cycles=12), tmp_path
+    )
     analysis = analyse_latency(recording, application.chain)
     # Three in four of the squares begin the chain with a message; the first five cycles warm up.
     assert analysis.statistics.count == 9

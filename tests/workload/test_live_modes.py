@@ -4,6 +4,7 @@ from pathlib import Path
 
 import polars as pl
 import pytest
+from calm_runs import calm_run
 from small_chain import EXECUTOR_CORE, small_chain_text
 
 from chainshaper import measure_latency, shape_application
@@ -46,7 +47,11 @@ def with_modes(plan: Plan) -> Plan:
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> Recording:
     folder = tmp_path_factory.mktemp("modes")
-    return shape_application(with_driver(folder), with_modes(plan), folder / "rec", cycles=24)
+    application = with_driver(folder)
+    return calm_run(
+        lambda place: shape_application(application, with_modes(plan), place / "rec", cycles=24),
+        folder,
+    )
 
 
 def test_each_output_leaves_in_the_slot_of_its_mode(recording: Recording) -> None:
