@@ -54,8 +54,8 @@ from chainshaper.recording import (
 from chainshaper.sources.ros.interpreter import environment_of
 from chainshaper.sources.ros.snapshot import ask_graph
 from chainshaper.sources.tracer import Tracer
-from chainshaper.splicing.gate_log import with_gate_logs
-from chainshaper.workload.stall_watch import StallWatch, stalls_watched
+from chainshaper.splicing.gate_log import releases_so_far, with_gate_logs
+from chainshaper.workload.stall_watch import StallWatch, far_from, stalls_watched
 
 __all__ = ["Recorded", "Scheduling", "record_command"]
 
@@ -97,6 +97,7 @@ class _Run:
     stop: threading.Event
     progress: Callable[[float, str], None]
     pids: Sequence[int] = ()
+    gate_logs: Sequence[Path] = ()
     command: "subprocess.Popen[bytes] | None" = None
     schedule: Callable[[Sequence[Process]], bool] | None = None
     begun_ns: int = 0
@@ -150,11 +151,13 @@ def record_command(
     folder = _work_folder(output)
     try:
         tracer = _tracer(source, folder, command, pids, buffer)
-        run = _Run(tracer, folder, duration_ns, stop or threading.Event(), progress, pids)
+        run = _Run(
+            tracer, folder, duration_ns, stop or threading.Event(), progress, pids, gate_logs
+        )
         _trace(run, command, command_stdout, scheduling, watch_stalls=watch_stalls)
         progress(1.0, "reading the events")
         try:
-            recording = _written(output, run, command, chain, plan, gate_logs)
+            recording = _written(output, run, command, chain, plan)
         except ChainshaperError as error:
             raise OperationError(f"{error}{_what_is_left(run, output)}") from error
         if any(folder.iterdir()):
@@ -211,6 +214,8 @@ def _trace(
         if scheduling is not None:
             run.schedule = undo.enter_context(scheduling)
         run.begun_ns = time.monotonic_ns()
+        if scheduling is None:
+            run.stalls.begin()
         _watch(run)
         run.ended_ns = time.monotonic_ns()
         run.progress(1.0, "ending")
@@ -263,7 +268,8 @@ def _look(run: _Run) -> None:
     if nodes:
         run.environment = environment_of(nodes[-1].pid) or run.environment
     if run.schedule is not None and run.schedule(processes) and run.in_force_ns is None:
-        run.in_force_ns = time.monotonic_ns()
+        # What was before is left out, so stalls are watched from here on.
+        run.in_force_ns = run.stalls.begin(far_from(releases_so_far(run.gate_logs)))
 
 
 def _ask_for_qos(run: _Run) -> None:
@@ -276,19 +282,14 @@ def _ask_for_qos(run: _Run) -> None:
         run.endpoints, run.no_qos_because = ask_graph(run.environment)
 
 
-def _written(  # noqa: PLR0917 - what is known of the run, put together once
-    output: Path,
-    run: _Run,
-    command: Sequence[str],
-    chain: str | None,
-    plan: Plan | None,
-    gate_logs: Sequence[Path],
+def _written(
+    output: Path, run: _Run, command: Sequence[str], chain: str | None, plan: Plan | None
 ) -> Recording:
     tables, info = run.tracer.recording()
     if run.stalls.table is not None:
         tables = {**tables, "machine_stall": run.stalls.table}
     since_ns = run.in_force_ns or run.begun_ns
-    tables, missing = with_gate_logs(tables, gate_logs, since_ns, run.ended_ns)
+    tables, missing = with_gate_logs(tables, run.gate_logs, since_ns, run.ended_ns)
     run.notes += missing
     if run.command is None:  # its nodes were created before tracing began
         from chainshaper.sources.ebpf.found_nodes import with_found_nodes

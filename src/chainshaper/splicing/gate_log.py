@@ -5,16 +5,19 @@ lines of comma-separated values with the columns of the event ``gate_release``
 (:mod:`chainshaper.events`), to which this turns them.
 """
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
 import polars as pl
 
 from chainshaper import events
 from chainshaper.enforcement.gate import STALL_NS
 from chainshaper.errors import InputError
 
-__all__ = ["read_gate_log", "with_gate_logs"]
+__all__ = ["read_gate_log", "releases_so_far", "with_gate_logs"]
 
 
 def read_gate_log(path: str | Path) -> pl.DataFrame:
@@ -48,6 +51,15 @@ def read_gate_log(path: str | Path) -> pl.DataFrame:
         raise InputError(f"{path}: a line is not as a shaping node writes it: {error}") from error
     null = pl.lit(None, dtype=types["callback"]).alias("callback")
     return table.with_columns(null).select(*types).sort("time", maintain_order=True)
+
+
+def releases_so_far(logs: Iterable[Path]) -> npt.NDArray[np.int64]:
+    """The latest planned releases (ns) of shaping nodes that are at work, at most 100 of each."""
+    found = [np.empty(0, dtype=np.int64)]
+    for log in logs:
+        with contextlib.suppress(InputError):  # not there yet, or nothing is in it
+            found.append(read_gate_log(log)["release"].drop_nulls().tail(100).to_numpy())
+    return np.concatenate(found)
 
 
 def with_gate_logs(

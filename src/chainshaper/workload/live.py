@@ -31,7 +31,6 @@ from chainshaper.recording import (
     refuse_existing,
     write_recording,
 )
-from chainshaper.workload import stall_meter
 from chainshaper.workload.description import (
     Application,
     CallbackDescription,
@@ -39,7 +38,7 @@ from chainshaper.workload.description import (
 )
 from chainshaper.workload.event_reading import ProcessLog, event_tables, meter_tables
 from chainshaper.workload.launcher import Child, end_all, first_casualty, start_child
-from chainshaper.workload.stall_watch import promote_meters, read_meters, start_meters
+from chainshaper.workload.stall_watch import far_from, promote_meters, read_meters, start_meters
 
 __all__ = ["Enforcement", "Progress", "StartedNodes", "origin_timer", "run_application"]
 
@@ -69,7 +68,6 @@ ENFORCING_NS = 2_000_000_000
 DISCOVERY_NS = 20_000_000_000
 ANSWER_S = 60.0
 """A process that is silent for longer, discovery included, hangs."""
-METER_BEHIND_NS = 500_000
 SINGLE_THREADED = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 """What a callback computes, it computes on its executor's thread."""
 NODE_MODULE = "chainshaper.workload.node_process"
@@ -203,8 +201,7 @@ class _Timing:
         first = start + timer.phase_ns + WARM_UP_CYCLES * period
         end = first + cycles * period
         gates = [cb.gate for _, cb in application.callbacks() if cb.gate is not None]
-        release = gates[0].slots[-1][0] if gates else 0
-        grid = release % stall_meter.PERIOD_NS + METER_BEHIND_NS
+        releases = [opens for gate in gates for opens, _ in gate.slots] or [0]
         return cls(
             start_ns=start,
             anchor_ns=start + timer.phase_ns,
@@ -212,9 +209,7 @@ class _Timing:
             record_from_ns=first - min(1_000_000, period // 10),
             last_timer_ns=end - min(1_000_000, period // 10),
             stop_ns=end + completion_ns(application, period),
-            # The stall meter's grid keeps away from the planned releases: what happens there the
-            # gate sees more exactly, as long as no other thread's wake-up comes in between.
-            meter_from_ns=start + timer.phase_ns + grid,
+            meter_from_ns=start + timer.phase_ns + far_from(releases),
         )
 
 

@@ -9,8 +9,10 @@ import os
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import numpy as np
+import numpy.typing as npt
 import polars as pl
 
 from chainshaper.enforcement.gate import STALL_NS
@@ -22,6 +24,7 @@ from chainshaper.workload.launcher import Child, end_all, start_child
 
 __all__ = [
     "StallWatch",
+    "far_from",
     "measure_stalls",
     "promote_meters",
     "read_meters",
@@ -31,6 +34,27 @@ __all__ = [
 
 MODULE = "chainshaper.workload.stall_meter"
 LONGEST_NS = 7 * 24 * 3600 * 1_000_000_000
+LEAD_NS = 50_000_000
+
+
+def far_from(instants_ns: npt.ArrayLike, period_ns: int = stall_meter.PERIOD_NS) -> int:
+    """Where in its period a meter is to wake up, to be as far as may be from recurring instants.
+
+    A wake-up takes its core for some 40 us, and delays by that what is published or delivered
+    then. Most cycles are whole multiples of the period: there it would do so in every cycle of a
+    run, or in none. What happens at a release its gate sees more exactly anyway.
+
+        >>> far_from([20_100_000, 40_200_000], 1_000_000)
+        650000
+
+    0 where there are no such instants.
+    """
+    places = np.unique(np.asarray(instants_ns, dtype=np.int64) % period_ns)
+    if not len(places):
+        return 0
+    gaps = np.diff(places, append=places[0] + period_ns)
+    widest = int(gaps.argmax())
+    return int(places[widest] + gaps[widest] // 2) % period_ns
 
 
 def start_meters(cores: Iterable[int], meters: dict[int, Child]) -> None:
@@ -75,26 +99,36 @@ class StallWatch:
 
     table: pl.DataFrame | None = None
     info: StallMeterInfo | None = None
+    meters: dict[int, Child] = field(default_factory=dict)
+    begun: bool = False
+
+    def begin(self, place_ns: int = 0) -> int:
+        """Begin to watch, with wake-ups at that place of their period; from when on they do."""
+        start = time.monotonic_ns() + LEAD_NS
+        start += (place_ns - start) % stall_meter.PERIOD_NS
+        for child in self.meters.values():
+            child.tell(start_ns=start, meter_from_ns=start, stop_ns=start + LONGEST_NS)
+        self.begun = True
+        return start
 
 
 @contextmanager
 def stalls_watched(cores: Iterable[int], realtime: bool) -> Iterator[StallWatch]:
-    """Watch cores for as long as the context lasts.
+    """Watch cores from when the watch is begun until the context ends.
 
     Raises:
         OperationError: a meter died.
     """
-    meters: dict[int, Child] = {}
     watch, finished = StallWatch(), False
+    meters = watch.meters
     try:
         start_meters(cores, meters)
         for child in meters.values():
             child.hear()
         promote_meters(meters, realtime)
-        start = time.monotonic_ns() + 50_000_000
-        for child in meters.values():
-            child.tell(start_ns=start, meter_from_ns=start, stop_ns=start + LONGEST_NS)
         yield watch
+        if not watch.begun:
+            watch.begin()
         for child in meters.values():
             child.process.send_signal(stall_meter.ENOUGH)
         seen, watch.info = read_meters(meters, realtime)
@@ -112,6 +146,7 @@ def measure_stalls(
         OperationError: a meter died.
     """
     with stalls_watched(cores, realtime) as watch:
+        watch.begin()
         time.sleep(duration_ns / 1e9)
     assert watch.table is not None  # noqa: S101 - the watch is over
     assert watch.info is not None  # noqa: S101

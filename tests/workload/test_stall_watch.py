@@ -1,0 +1,49 @@
+"""When stall meters wake up, and since when they watch."""
+
+import time
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from chainshaper.enforcement.realtime import available_cores
+from chainshaper.workload.stall_meter import PERIOD_NS
+from chainshaper.workload.stall_watch import far_from, stalls_watched
+
+
+def _distance(place: int, instants: list[int], period: int) -> int:
+    return min(min((place - one) % period, (one - place) % period) for one in instants)
+
+
+@given(st.lists(st.integers(0, 10**6), min_size=1, max_size=6), st.integers(2, 60))
+def test_no_other_place_is_farther_from_all_instants(instants: list[int], period: int) -> None:
+    place = far_from(instants, period)
+    farthest = max(_distance(other, instants, period) for other in range(period))
+    assert 0 <= place < period
+    assert _distance(place, instants, period) == farthest
+
+
+def test_without_instants_any_place_is_as_good() -> None:
+    assert far_from([]) == 0
+
+
+def test_meters_wake_at_their_place_from_when_the_watch_begins() -> None:
+    cores = available_cores()[:1]
+    with stalls_watched(cores, realtime=False) as watch:
+        before = time.monotonic_ns()
+        begun = watch.begin(123_456)
+        time.sleep(0.2)
+        after = time.monotonic_ns()
+    assert begun > before
+    assert begun % PERIOD_NS == 123_456
+    assert watch.table is not None
+    assert watch.info is not None
+    assert watch.info.wakeups > 0
+    assert (watch.table["time"] % PERIOD_NS == 123_456).all()
+    assert watch.table["time"].is_between(begun, after + 2_000_000_000).all()
+
+
+def test_a_watch_that_is_never_begun_ends_and_has_seen_nothing() -> None:
+    with stalls_watched(available_cores()[:1], realtime=False) as watch:
+        pass
+    assert watch.info is not None
+    assert watch.info.wakeups <= 1
