@@ -1,11 +1,13 @@
 """What is written for a shaping node, and the Python node at work on a stand-in for rclpy."""
 
 import ast
+import importlib
 import os
 import signal
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -212,6 +214,27 @@ def test_messages_leave_unchanged_inside_their_slot(
     # Who wakes up too late, on a machine that is busy with others, does not rehearse.
     between = zip([0, *times], releases["release"], strict=False)
     assert any(before < one["time"] < release for before, release in between for one in rehearsed)
+
+
+def test_every_release_is_rehearsed_twice_where_there_is_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ros = SimpleNamespace(Node=object, Empty=object)
+    for module in ("rclpy", "rclpy.node", "std_msgs", "std_msgs.msg"):
+        monkeypatch.setitem(sys.modules, module, ros)
+    readiness = importlib.import_module("chainshaper.splicing.nodes.python.readiness")
+    published: list[bytes] = []
+    node = SimpleNamespace(
+        create_publisher=lambda *_: SimpleNamespace(publish=published.append),
+        get_logger=lambda: SimpleNamespace(warning=lambda _: None),
+    )
+    ready = readiness.Readiness(node, None, 0)
+    for releases in (1, 2, 3):
+        ready.get_ready(time.monotonic_ns() + 60_000 * MS)
+        assert published == [readiness.EMPTY] * 2 * releases
+    ready.get_ready(time.monotonic_ns())
+    assert len(published) == 6, "there was no time left"
+    ready.relax()
 
 
 @pytest.mark.parametrize(
