@@ -29,8 +29,14 @@ import polars as pl
 import yaml
 from results import MS, Run
 
-from chainshaper import apply_plan, open_recording, run_application, shape_application, simulate
-from chainshaper.analysis import analyse_latency
+from chainshaper import (
+    apply_plan,
+    measure_latency,
+    open_recording,
+    run_application,
+    shape_application,
+    simulate,
+)
 from chainshaper.enforcement.realtime import available_cores, may_use_fifo
 from chainshaper.enforcement.runs.state import RunState
 from chainshaper.errors import OperationError
@@ -151,7 +157,7 @@ def latencies_of(
     name: str, recording: Recording, chain: str | None = None, *, since_ns: int = 0
 ) -> Run:
     """The latencies of a recorded chain, of the cycles that began at ``since_ns`` or later."""
-    frame = analyse_latency(recording, chain or recording.info.chain or "").traversals
+    frame = measure_latency(recording, chain).analysis.traversals
     frame = frame.filter(pl.col("start") >= since_ns).sort("start")
     return Run(
         name,

@@ -55,6 +55,7 @@ def plan_with_slot(latencies_ns: NDArray[np.int64], slot_ms: int) -> Plan:
         publish_slot_ns=slot_ms * MS,
         publication="asynchronous",
         output_depth=10,
+        overrun="wait",
         core=1,
     )
 

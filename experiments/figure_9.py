@@ -85,6 +85,7 @@ def shaped_plan(application: Application, latencies: Mapping[str, Run]) -> Plan:
         publisher=f"/vertex{first.removeprefix('/t')}",
         nodes=[f"/vertex{topic.removeprefix('/t')}" for topic in application.chain.split("..")],
         epsilon_ns=-(-longest // MS) * MS + MS - longest,
+        overrun="wait",
         core=1,
     )
     plan = over_cores(plan, core_of)

@@ -74,6 +74,7 @@ def plans(latencies: NDArray[np.int64]) -> dict[str, Plan]:
         publisher=NODES[-1],
         nodes=NODES,
         epsilon_ns=epsilon,
+        overrun="wait",
     )
     callbacks = [
         CallbackTimes(node, core, longest * 1000, longest * 1000, longest * 1000, after)

@@ -81,7 +81,7 @@ def plan_as(column: str, chain: str, profile: Path, fifo: Run) -> Plan:
     """
     longest = int(fifo.undisturbed_ns.max())
     end = -(-longest // MS) * MS + (MS if chain == "valet parking" else 0)
-    shaped = plan_recording(profile, request=PlanRequest(epsilon_ns=end - longest))
+    shaped = plan_recording(profile, request=PlanRequest(epsilon_ns=end - longest, overrun="wait"))
     if column == "LET per callback":
         return let_per_callback(shaped, TOPICS[chain])
     return let_per_chain(shaped) if column == "LET per chain" else shaped

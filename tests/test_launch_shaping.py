@@ -1,22 +1,15 @@
-"""Shaping a `ros2 launch`: what is refused before anything is launched, and the margin planned.
+"""Shaping a `ros2 launch`: what is refused before anything is launched.
 
 The flow itself needs ROS 2 and minutes; every step of it is tested where it is at home.
 """
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from command_line import refused
-from story import OFFSET, Story
 
 from chainshaper import shape_launch
 from chainshaper.errors import InputError, PlatformError
-from chainshaper.launch_shaping import plan_launched
-from chainshaper.planning import PlanRequest
-from chainshaper.recording import Recording, RecordingInfo
-
-MS = 1_000_000
 
 
 @pytest.fixture
@@ -49,35 +42,3 @@ def test_missing_build_tools_are_named_before_minutes_are_spent(
     with pytest.raises(PlatformError, match="colcon, which building the shaping node needs"):
         shape_launch(["ros2", "launch", str(launch_file)], tmp_path / "out", node="cpp")
     assert not (tmp_path / "out").exists()
-
-
-def _recorded(cycles: int, largest_share: float) -> Recording:
-    """One timer that publishes after five uniform parts of 5 to 15 ms, or less of each."""
-    story = Story()
-    node = story.node("/first", 1)
-    timer, writer = story.timer(node, period=100 * MS), story.publisher(node, "/out")
-    parts = np.random.default_rng(7).uniform(5, 5 + 10 * largest_share, (cycles, 5))
-    for cycle, latency in enumerate(parts.sum(axis=1)):
-        begins = (1000 + 100 * cycle) * MS
-        ends = begins + int(latency * MS)
-        story.runs(timer, begins, ends + 1, writes=((writer, ends),))
-    info = RecordingInfo(source="simulated", clock_offset_ns=OFFSET)
-    return Recording(Path("measured"), info, story.tables())
-
-
-def test_without_a_margin_given_it_covers_the_tail_and_the_way_to_the_shaping_node() -> None:
-    plan, notes = plan_launched(_recorded(400, 1.0), "/out", PlanRequest())
-    assert notes == ()
-    assert plan.margin.source == "derived"
-    assert plan.margin.epsilon_ns > 1 * MS
-    even, _ = plan_launched(_recorded(400, 0.1), "/out", PlanRequest())
-    assert even.margin.epsilon_ns == 1 * MS, "the tail ends before"
-    given, notes = plan_launched(_recorded(400, 1.0), "/out", PlanRequest(epsilon_ns=2 * MS))
-    assert (given.margin.epsilon_ns, given.margin.source, notes) == (2 * MS, "given", ())
-
-
-def test_where_no_margin_can_be_derived_it_says_so() -> None:
-    plan, (note,) = plan_launched(_recorded(120, 1.0), "/out", PlanRequest())
-    assert plan.margin.epsilon_ns == 1 * MS
-    assert "the standard 1ms" in note
-    assert "120 latencies are too few" in note

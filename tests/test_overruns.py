@@ -1,7 +1,12 @@
 """Outputs that missed their slot: counted by what was done about them, recorded live."""
 
 import json
+import os
 import re
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +16,21 @@ import pytest
 from command_line import called, json_of
 from small_chain import PERIOD_NS, small_chain
 
-from chainshaper import measure_latency, save_plan, shape_application
-from chainshaper.overruns import gate_releases, into_open_slots, overruns_in, overruns_text
+from chainshaper import measure_latency, save_plan, shape_application, simulate
+from chainshaper.enforcement.gate import sleep_until
+from chainshaper.overruns import (
+    dropped_in,
+    dropped_text,
+    gate_releases,
+    into_open_slots,
+    overruns_in,
+    overruns_text,
+)
 from chainshaper.planning import Plan, let_per_chain, plan_shaping, publish_slots
 from chainshaper.planning.plan import revised
 from chainshaper.recording import Recording
+from chainshaper.reporting.tables import latency_json
+from chainshaper.workload.live import StartedNodes
 
 MS = 1_000_000
 
@@ -53,7 +68,9 @@ def test_discarded_outputs_are_not_published_and_not_lost(tmp_path: Path) -> Non
     within = let_go["time"] - let_go["origin"]
     assert ((within >= start) & (within < end)).all()
     assert measured.held is not None
-    assert measured.held.late == 0
+    # What was let go as the slot ended leaves a moment later, and is late.
+    at_the_end = measured.analysis.traversals.filter(pl.col("latency_ns") >= end - MS // 10)
+    assert measured.held.late <= at_the_end.height
 
 
 def test_outputs_published_at_once_wait_for_nothing(tmp_path: Path) -> None:
@@ -111,6 +128,42 @@ def test_what_was_done_is_reported_wherever_the_latency_is(tmp_path: Path) -> No
     assert f"{count} ({count} discard)" in called("compare", output, output).out
     both = json_of("compare", output, output)["recordings"]
     assert [one["overruns_by_policy"] for one in both] == [{"discard": count}] * 2
+
+
+def test_what_a_gate_lost_is_shown_wherever_recordings_are_compared(tmp_path: Path) -> None:
+    """An overrun that waits meets the output of the next cycle, which takes its place."""
+    application = small_chain(tmp_path)
+    profile = simulate(application, tmp_path / "profile", cycles=24)
+    plan = revised(_too_early(), overrun="wait", messages="newest")
+    shaped = simulate(application, tmp_path / "shaped", plan, cycles=24)
+    count = (dropped_in(shaped) or {})["replaced"]
+    assert dropped_in(shaped) == {"replaced": count}
+    assert dropped_in(profile) is None
+
+    said = dropped_text({"replaced": count})
+    assert said in " ".join(called("latency", shaped.path).out.split())
+    both = json_of("compare", profile.path, shaped.path, "--json")["recordings"]
+    assert [one["dropped"] for one in both] == [None, count]
+    assert both[1]["dropped_by_reason"] == {"replaced": count}
+    table = called("compare", profile.path, shaped.path).out
+    assert re.search(rf"messages lost at the gate .*{count} \(", table)
+    page = tmp_path / "page.html"
+    called("report", profile.path, shaped.path, "-o", page)
+    assert f"{count} ({count} replaced)" in page.read_text()
+
+
+@pytest.mark.parametrize(
+    ("dropped", "said"),
+    [
+        ({"overflowed": 1}, "1 message was lost at the gate (1 overflowed)"),
+        (
+            {"surplus": 2, "lost by DDS": 1},
+            "3 messages were lost at the gate (2 surplus, 1 lost by DDS)",
+        ),
+    ],
+)
+def test_losses_in_words(dropped: dict[str, int], said: str) -> None:
+    assert dropped_text(dropped) == said
 
 
 def test_an_unshaped_recording_has_no_overruns(unshaped: Recording) -> None:
@@ -173,3 +226,68 @@ def test_of_a_gated_publisher_what_was_not_sent_was_discarded(unshaped: Recordin
 )
 def test_overruns_in_words(overruns: dict[str, int], said: str) -> None:
     assert overruns_text(overruns) == said
+
+
+@contextmanager
+def _stopped_once(nodes: StartedNodes) -> Iterator[None]:
+    """/second stands still from the start of cycle 15 on, for more than two periods."""
+
+    def stop() -> None:
+        sleep_until(nodes.anchor_ns + 15 * PERIOD_NS)
+        os.kill(nodes.pids["/second"], signal.SIGSTOP)
+        sleep_until(nodes.anchor_ns + 17 * PERIOD_NS + 20 * MS)
+        os.kill(nodes.pids["/second"], signal.SIGCONT)
+
+    thread = threading.Thread(target=stop)
+    thread.start()
+    yield
+    thread.join()
+
+
+def test_a_late_output_is_not_hidden_by_a_stall_after_it_was_due(
+    tmp_path: Path, plan: Plan
+) -> None:
+    """A node is stopped; the machine is said to stall while its output waits."""
+    recording = shape_application(
+        small_chain(tmp_path), plan, tmp_path / "rec", cycles=24, enforcement=_stopped_once
+    )
+    cycles = measure_latency(recording).analysis.traversals
+    stopped = cycles.filter("late").row(0, named=True)
+    assert stopped["latency_ns"] > PERIOD_NS
+    ((opens, _),) = publish_slots(plan)
+    assert abs(stopped["due_at"] - stopped["start"] - opens) < 2 * MS
+    stall = pl.DataFrame(
+        {
+            "time": [stopped["due_at"] + 2 * MS],
+            "pid": [1],
+            "tid": [1],
+            "cpu": [1],
+            "duration": [15 * MS],
+        },
+        schema_overrides={"pid": pl.Int32, "tid": pl.Int32, "cpu": pl.Int32},
+    )
+    stalled = replace(recording, events={**recording.events, "machine_stall": stall})
+    found = measure_latency(stalled).analysis
+    (same,) = found.traversals.filter(found.traversals["start"] == stopped["start"]).rows(
+        named=True
+    )
+    assert not same["disturbed"]
+    assert found.undisturbed.late
+    values = latency_json(measure_latency(stalled))
+    late = int(found.traversals["late"].sum())
+    assert values["late"] == late >= 1
+    assert values["max_all_ns"] == found.traversals["latency_ns"].max()
+    assert values["max_all_ns"] >= stopped["latency_ns"]
+    assert values["jitter_all_ns"] == values["max_all_ns"] - values["min_ns"]
+    measured = measure_latency(recording)
+    assert measured.held is not None
+    assert (measured.held.late_of_all, measured.held.cycles) == (late, values["count"])
+
+
+def test_what_went_around_the_shaping_node_is_said_apart() -> None:
+    around = "2 went around the shaping node, which was not there"
+    assert overruns_text({"bypass": 2}) == around
+    assert overruns_text({"wait": 1, "bypass": 2}) == (
+        f"1 output was too late for its slot (1 waited for the next slot); {around}"
+    )
+    assert "3 were not published" in overruns_text({"silence": 3})

@@ -157,13 +157,9 @@ def test_shaping_opens_a_server_on_each_core_of_the_graph() -> None:
     assert ("first", ((0, 2 * MS),)) in [(server.name, server.slots) for server in apart.servers]
 
 
-def test_a_further_sink_gets_a_slot_of_its_own() -> None:
-    plan = plan_recording(
-        _recorded(), CHAIN, PlanRequest(epsilon_ns=0), sinks=["/rear_raw../small"]
-    )
-    assert [node.output for node in plan.further_shaping_nodes] == ["/small"]
-    slots = {server.name: server.slots for server in plan.servers}
-    assert slots["output_chainshaper_small"][0][0] == 45 * MS - 1
+def test_a_sink_that_the_chain_waits_for_is_refused() -> None:
+    with pytest.raises(InputError, match=r"pose waits for /small, which"):
+        plan_recording(_recorded(), CHAIN, sinks=["/rear_raw../small"])
     with pytest.raises(InputError, match="further sinks are shaped"):
         plan_recording(
             _recorded(), CHAIN, PlanRequest(policy="server-per-chain"), sinks=["/rear_raw../small"]
@@ -179,10 +175,9 @@ def test_who_subscribes_to_the_output_and_is_not_in_the_chain_receives_it() -> N
     assert left == revised(
         plan, shaping_node=plan.shaping_node.model_copy(update={"receivers": ()})
     )
-    both = plan_recording(recording, CHAIN, sinks=("/rear_raw../fused",))
-    assert [node.receivers for node in both.further_shaping_nodes] == [("/voxel",)]
-    assert both.shaping_node is not None
-    assert both.shaping_node.receivers == (), "nobody takes /pose"
+    whole = plan_recording(recording, CHAIN)
+    assert whole.shaping_node is not None
+    assert whole.shaping_node.receivers == (), "no node takes /pose"
 
 
 def test_asynchronous_publication_gates_the_last_nodes_thread() -> None:

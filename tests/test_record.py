@@ -248,7 +248,7 @@ def test_a_trace_that_cannot_be_read_is_kept_and_named(
 ) -> None:
     made: list[BrokenTracer] = []
 
-    def tracer(_source: str, folder: Path, *_: object) -> BrokenTracer:
+    def tracer(_source: str, folder: Path, *_: object, **_how: object) -> BrokenTracer:
         made.append(BrokenTracer(folder))
         return made[0]
 
@@ -294,7 +294,9 @@ def test_real_nodes_are_recorded_with_types_and_qos(
         assert one.type in ("std_msgs/msg/String", "example_interfaces/msg/String")
         assert one.reliability == "reliable"
         assert one.depth
-    assert info.distribution == os.environ["ROS_DISTRO"]
+    # A ROS 2 that was built from source need not say its name.
+    assert info.distribution == os.environ.get("ROS_DISTRO", info.distribution)
+    assert info.distribution is not None
     executors = {thread.node for thread in info.threads if thread.role == "executor"}
     assert executors == {"/talker", "/listener"}
     assert json_of("latency", path, "--chain", "/talker../chatter")["count"] >= 3

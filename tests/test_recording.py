@@ -10,6 +10,7 @@ import pytest
 
 from chainshaper import events
 from chainshaper.errors import InputError, OperationError
+from chainshaper.exploration import convert_recording
 from chainshaper.recording import (
     RecordingInfo,
     StallMeterInfo,
@@ -18,6 +19,7 @@ from chainshaper.recording import (
     refuse_existing,
     write_recording,
 )
+from chainshaper.reporting.contents import contents_json
 
 INFO = RecordingInfo(
     source="live",
@@ -52,7 +54,11 @@ def _names(folder: Path) -> list[str]:
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     written = write_recording(tmp_path / "rec", _tables(), INFO)
     for recording in (written, open_recording(tmp_path / "rec")):
-        assert recording.info == INFO
+        assert recording.info.model_copy(update={"checksums": None}) == INFO
+        assert sorted(recording.info.checksums or {}) == [
+            "callback_end.parquet",
+            "machine_stall.parquet",
+        ]
         assert sorted(recording.events) == ["callback_end", "machine_stall"]
         assert len(recording.events) == 2
         assert recording.events["callback_end"]["time"].to_list() == [10, 20], "sorted by time"
@@ -77,7 +83,7 @@ def test_nothing_of_the_users_is_overwritten(tmp_path: Path) -> None:
 
 def test_an_empty_folder_may_be_filled(tmp_path: Path) -> None:
     (tmp_path / "rec").mkdir()
-    assert write_recording(tmp_path / "rec", _tables(), INFO).info == INFO
+    assert len(write_recording(tmp_path / "rec", _tables(), INFO).events) == 2
 
 
 def test_places_that_cannot_take_a_folder_are_refused_before(
@@ -194,15 +200,13 @@ def test_a_newer_format_asks_for_an_update_whatever_else_it_holds(whole: Path) -
         open_recording(whole)
 
 
-@pytest.mark.parametrize("kept", [0.0, 0.1, 0.5, 0.99])
-def test_a_cut_off_table_is_named_when_it_is_read(whole: Path, kept: float) -> None:
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.99])
+def test_a_cut_off_table_is_named_when_it_is_opened(whole: Path, share: float) -> None:
     file = whole / "callback_end.parquet"
     content = file.read_bytes()
-    file.write_bytes(content[: int(len(content) * kept)])
-    recording = open_recording(whole)
+    file.write_bytes(content[: int(len(content) * share)])
     with pytest.raises(InputError, match=f"{file}: not a readable event table"):
-        _ = recording.events["callback_end"]
-    assert recording.events["machine_stall"].height == 0, "the others can still be read"
+        open_recording(whole)
 
 
 def test_a_table_without_time_is_no_event_table(whole: Path) -> None:
@@ -216,3 +220,109 @@ def test_a_table_that_vanishes_is_named(whole: Path) -> None:
     shutil.rmtree(whole)
     with pytest.raises(InputError, match=r"callback_end.parquet: not a readable event table"):
         _ = recording.events["callback_end"]
+
+
+def test_every_flipped_bit_is_noticed(whole: Path) -> None:
+    file = whole / "callback_end.parquet"
+    content = file.read_bytes()
+    for place in range(0, len(content), 7):
+        damaged = bytearray(content)
+        damaged[place] ^= 1 << place % 8
+        file.write_bytes(damaged)
+        with pytest.raises(InputError) as refused:
+            _ = open_recording(whole).events["callback_end"]
+        assert str(refused.value).startswith(f"{file}: "), place
+
+
+def test_a_table_of_several_parts_has_a_checksum_for_each(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "rec", [_tables(), _tables(), _tables()], INFO).path
+    recording = open_recording(path)
+    assert recording.events["callback_end"]["time"].to_list() == [10, 10, 10, 20, 20, 20]
+    parts = sorted((path / "callback_end.parquet").iterdir())
+    assert {str(part.relative_to(path)) for part in parts} < set(recording.info.checksums or {})
+    parts[1].write_bytes(parts[0].read_bytes().replace(b"Polars", b"Qolars"))
+    with pytest.raises(InputError, match=f"{parts[1]}: damaged: its checksum is crc32:"):
+        _ = open_recording(path).events["callback_end"]
+    parts[2].unlink()
+    with pytest.raises(InputError, match=f"{parts[2]}: no such file, but recording.json names it"):
+        open_recording(path)
+
+
+def _without_checksums(whole: Path) -> Path:
+    file = whole / "recording.json"
+    values = json.loads(file.read_text())
+    del values["checksums"]
+    file.write_text(json.dumps(values))
+    return whole / "callback_end.parquet"
+
+
+def test_a_recording_from_before_there_were_checksums_is_read(whole: Path) -> None:
+    _without_checksums(whole)
+    recording = open_recording(whole)
+    assert recording.info == INFO
+    assert recording.events["callback_end"]["callback"].to_list() == [8, 7]
+    said = "this recording has no checksums"
+    assert any(said in note for note in contents_json(recording)["notes"])
+    converted = convert_recording(recording, whole.parent / "converted")
+    assert not any(said in note for note in contents_json(converted)["notes"])
+
+
+@pytest.mark.parametrize(
+    ("column", "said"),
+    [
+        (None, "an event table needs a column `callback`, this one has none"),
+        (pl.lit("x"), "column `callback` has values of type String, not UInt64"),
+        (pl.lit(1.5), "column `callback` has values of type Float64, not UInt64"),
+        (pl.lit([1]), "column `callback` has values of type List"),
+        (pl.lit(-1), "not a readable event table (conversion from `i32` to `u64` failed"),
+    ],
+)
+def test_columns_that_are_not_the_events_are_named(
+    whole: Path, column: pl.Expr | None, said: str
+) -> None:
+    file = _without_checksums(whole)
+    frame = pl.read_parquet(file)
+    changed = frame.drop("callback") if column is None else frame.with_columns(callback=column)
+    changed.write_parquet(file)
+    with pytest.raises(InputError) as refused:
+        _ = open_recording(whole).events["callback_end"]
+    assert str(refused.value).startswith(f"{file}: ")
+    assert said in str(refused.value)
+
+
+def test_integers_of_another_width_and_tables_without_cores_are_taken(whole: Path) -> None:
+    file = _without_checksums(whole)
+    frame = pl.read_parquet(file).with_columns(pl.col("callback", "pid").cast(pl.Int64))
+    frame.drop("cpu").write_parquet(file)
+    found = open_recording(whole).events["callback_end"]
+    assert {**found.schema} == {**events.empty("callback_end").schema}
+
+
+def test_rows_that_no_file_of_this_size_has_are_refused(whole: Path) -> None:
+    file = _without_checksums(whole)
+    zeros = {name: pl.repeat(0, 20_000_000, dtype=kind, eager=True)
+             for name, kind in events.empty("callback_end").schema.items()}  # fmt: skip
+    pl.DataFrame(zeros).write_parquet(file, compression="zstd", statistics=False)
+    with pytest.raises(InputError, match=r"20000000 rows in .* bytes are more than any run has"):
+        _ = open_recording(whole).events["callback_end"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"clock_offset_ns": "5"}, {"clock_offset_ns": 10**30}, {"clock_offset_ns": 1.5},
+        {"clock_offset_ns": None}, {"lost": {"x": "many"}}, {"lost": []}, {"notes": "x"},
+        {"threads": [{}]}, {"threads": {"x": 1}}, {"processes": {"x": "y"}}, {"host": 1},
+        {"plan": []}, {"application": "x"}, {"stall_meter": 1}, {"realtime": "yes"},
+        {"checksums": ["x"]}, {"checksums": {"callback_end.parquet": 1}}, {"format": [1]},
+        {"endpoints": [{"node": "/x", "topic": "/y", "kind": "service"}]}, {"format": "1"},
+    ],
+)  # fmt: skip
+def test_facts_of_the_wrong_type_are_named(whole: Path, change: dict[str, object]) -> None:
+    file = whole / "recording.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
+    with pytest.raises(InputError) as refused:
+        open_recording(whole)
+    assert str(refused.value).startswith(f"{file}: ")
+    assert next(iter(change)) in str(refused.value)
+    assert "\n" not in str(refused.value)

@@ -95,14 +95,11 @@ def cases() -> tuple[Case, ...]:
 def in_hand(back_end: str, table: ServerTable, folder: Path) -> Iterator[BackEnd]:
     """The servers of a table, released when the block ends."""
     journal = open_journal(folder)
-    servers = make_back_end(back_end, table, journal.path.parent, journal)
+    servers = make_back_end(back_end, table, journal)
     try:
         yield servers
     finally:
         servers.release()
-        for path in journal.path.parent.iterdir():
-            if path != journal.path:
-                path.unlink()
         discard_journal(journal)
 
 

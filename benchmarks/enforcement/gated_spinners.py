@@ -143,4 +143,6 @@ def _spin(log: Path, core: int, seconds: float, fifo: bool) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 5:
+        sys.exit("enter_exit.py beside this file starts it; run that one")
     _spin(Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]), sys.argv[4] == "1")

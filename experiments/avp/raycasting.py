@@ -35,7 +35,7 @@ def cast(lidar: Lidar, pose: Floats, boxes: Floats) -> Floats:
     return ranges
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")  # used once: a cache would be loaded without a look at who wrote it
 def _cast(origin: Floats, azimuths: Floats, slopes: Floats, boxes: Floats, nearest: Floats) -> None:
     """Horizontal distances, (azimuths, beams), into ``nearest``."""
     x, y, z = origin

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from chainshaper.applying import apply_plan
     from chainshaper.doctor import examine_machine
     from chainshaper.dry_run import planned_changes
-    from chainshaper.enforcement.runs.state import end_run, find_runs
+    from chainshaper.enforcement.runs.state import find_runs
+    from chainshaper.enforcement.runs.undoing import end_run
     from chainshaper.errors import ChainshaperError, InputError, OperationError, PlatformError
     from chainshaper.exploration import (
         ApplicationDescription,
@@ -94,7 +95,8 @@ _HOMES = {
     ),
     "chainshaper.applying": ("apply_plan",),
     "chainshaper.doctor": ("examine_machine",),
-    "chainshaper.enforcement.runs.state": ("end_run", "find_runs"),
+    "chainshaper.enforcement.runs.state": ("find_runs",),
+    "chainshaper.enforcement.runs.undoing": ("end_run",),
     "chainshaper.errors": ("ChainshaperError", "InputError", "OperationError", "PlatformError"),
     "chainshaper.exploration": (
         "ApplicationDescription",

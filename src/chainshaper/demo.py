@@ -10,7 +10,7 @@ DIR/comparison.json    every figure of the printed table
 """
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
@@ -20,8 +20,7 @@ import polars as pl
 
 from chainshaper.analysis import callback_statistics, data_flow
 from chainshaper.errors import OperationError
-from chainshaper.planning import Plan, plan_warnings, save_plan
-from chainshaper.planning.overruns import with_room_for_overruns
+from chainshaper.planning import Plan, PlanRequest, save_plan
 from chainshaper.recording import refuse_existing
 from chainshaper.reporting.comparison_files import write_comparison
 from chainshaper.steps import (
@@ -34,6 +33,8 @@ from chainshaper.workload.description import load_application
 from chainshaper.workload.live import Progress, run_application
 
 __all__ = ["DemoResult", "run_demo", "synthetic_chain"]
+
+_STANDARD = PlanRequest()
 
 
 @dataclass(frozen=True)
@@ -57,11 +58,15 @@ def run_demo(
     *,
     application: str | Path | None = None,
     cycles: int = 320,
+    request: PlanRequest = _STANDARD,
     realtime: bool | None = None,
     command: Sequence[str] = (),
+    planned: Callable[[Plan], None] = lambda _: None,
     progress: Progress = lambda *_: None,
 ) -> DemoResult:
     """Run an application, plan, shape, run again and compare.
+
+    ``planned`` gets the plan before it is used, to say what is doubtful about it.
 
     Raises:
         InputError: ``folder`` exists and is not empty, or the application is not right.
@@ -81,8 +86,9 @@ def run_demo(
             progress=_part(progress, 0.0, 0.48, "unshaped run"),
         )
     progress(0.48, "planning")
-    plan = with_room_for_overruns(plan_recording(before))
+    plan = plan_recording(before, request=request)
     save_plan(plan, folder / "plan.yaml")
+    planned(plan)
     after = shape_application(
         description,
         plan,
@@ -100,7 +106,7 @@ def run_demo(
         callbacks=callback_statistics(data_flow(before.events, before.info.clock_offset_ns)),
         plan=plan,
         comparison=comparison,
-        notes=tuple(dict.fromkeys([*before.info.notes, *after.info.notes, *plan_warnings(plan)])),
+        notes=tuple(dict.fromkeys([*before.info.notes, *after.info.notes])),
     )
 
 

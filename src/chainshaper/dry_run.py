@@ -4,7 +4,9 @@ Also what both need to know of a plan beside the threads that run: the table of 
 end, and the thread with which the chain begins.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from chainshaper.enforcement.back_ends import choose_back_end
 from chainshaper.enforcement.litmus.resctl import litmus_commands
@@ -21,9 +23,12 @@ from chainshaper.enforcement.threads.server_threads import (
 )
 from chainshaper.errors import OperationError
 from chainshaper.planning import Plan
+from chainshaper.planning.overruns import open_until_done
 from chainshaper.planning.plan import shaping_nodes
-from chainshaper.recording import Recording
 from chainshaper.thread_search import find_threads
+
+if TYPE_CHECKING:
+    from chainshaper.recording import Recording  # slow to import
 
 __all__ = [
     "LEAD_NS",
@@ -52,8 +57,9 @@ def planned_changes(
     plan: Plan,
     back_end: str = "auto",
     *,
-    recording: Recording | None = None,
+    recording: "Recording | None" = None,
     phase_ns: int | None = None,
+    users: Collection[str | int] = (),
 ) -> Changes:
     """What :func:`.applying.apply_plan` would do; nothing is changed.
 
@@ -61,8 +67,9 @@ def planned_changes(
 
     Raises: as :func:`.applying.apply_plan`.
     """
+    plan = open_until_done(plan)
     table = server_table(plan)
-    found = find_threads(plan, recording)
+    found = find_threads(plan, recording, users=users)
     if back_end != "litmus":
         choice = choose_back_end(back_end)
         wanted = plan_scheduling(plan, found, available_cores())

@@ -26,7 +26,19 @@ from typing import TypeAlias
 
 import polars as pl
 
-__all__ = ["COMMON_COLUMNS", "FIELDS", "OPTIONAL_FIELDS", "EventTables", "empty", "table"]
+__all__ = [
+    "COMMON_COLUMNS",
+    "CREATION",
+    "FIELDS",
+    "OPTIONAL_FIELDS",
+    "VERSION_FIELDS",
+    "EventTables",
+    "as_table",
+    "column_problems",
+    "empty",
+    "happened",
+    "table",
+]
 
 EventTables: TypeAlias = Mapping[str, pl.DataFrame]
 """One frame per event name, each sorted by ``time``."""
@@ -185,15 +197,56 @@ OPTIONAL_FIELDS: dict[str, dict[str, pl.DataType]] = {
     "gate_release": {
         # Null: the message came in time; otherwise what was done about the overrun, "wait",
         # "discard" or "publish", or about a message behind its mode's slot, also "next-slot".
-        # Recordings from before there was a choice lack it.
+        # "bypass" and "silence" are a standby's: it published the message at once, or did not,
+        # because no shaping node was there. Recordings from before there was a choice lack it.
         "overrun": pl.String(),
         "mode": pl.String(),  # of the message's cycle; null: the gate knows no modes
+        # Null: it left, or the recording is from before messages could wait. "replaced" by a newer
+        # one of its cycle, "surplus" behind the first one of it, "overflowed" where newer ones
+        # needed the room, "discarded" as an overrun.
+        "dropped": pl.String(),
         "published": _NANOSECONDS,  # when publishing returned, in the log of a ROS 2 node
         # For how long behind the release neither the gate nor any other thread ran on its core,
         # in the same log: what the machine itself took.
         "stalled": _NANOSECONDS,
+        # In the same log: how many messages DDS lost between the one before and this one (null:
+        # not known), and the number of the row since the node started. Rows that are missing
+        # could not be written, or were in a file that has been removed since.
+        "lost": pl.Int64(),
+        "row": pl.Int64(),
     },
 }
+
+VERSION_FIELDS = {
+    "rmw_publish": {"rmw_publisher_handle", "timestamp"},  # since Jazzy
+    "rmw_take": {"taken"},
+    "callback_start": {"is_intra_process"},
+    "rclcpp_ring_buffer_enqueue": {"overwritten"},
+    "dispatch_subscription_callback": {"source_stamp"},
+}
+"""Fields that not every version has, and that the analysis asks for as such."""
+
+
+CREATION = frozenset(
+    name
+    for name in FIELDS
+    if name.endswith(("_init", "_added", "_register", "_link_node", "_to_ipb", "_to_subscription"))
+) | {"rmw_implementation", "rclcpp_construct_ring_buffer"}
+"""The events of objects' creation, which say what all others are about."""
+
+
+def happened(tables: EventTables, since_ns: int, until_ns: int | None = None) -> EventTables:
+    """The events from one instant to another, and the creation of all objects.
+
+    A gate's decision belongs to the cycle that it was about: one that began before is left out.
+    """
+    kept = dict(tables)
+    for name, frame in tables.items():
+        if name not in CREATION:
+            begun = pl.min_horizontal("time", *{"origin"}.intersection(frame.columns))
+            ended = pl.lit(False) if until_ns is None else pl.col("time") >= until_ns
+            kept[name] = frame.filter((begun >= since_ns) & ~ended)
+    return kept
 
 
 def empty(name: str) -> pl.DataFrame:
@@ -213,3 +266,54 @@ def table(tables: EventTables, name: str, columns: Iterable[str] = ()) -> pl.Dat
     known = {**COMMON_COLUMNS, **FIELDS[name], **OPTIONAL_FIELDS.get(name, {})}
     missing = [column for column in columns if column not in frame.columns]
     return frame.with_columns(pl.lit(None, dtype=known[column]).alias(column) for column in missing)
+
+
+def _types(name: str) -> dict[str, pl.DataType]:
+    """Every column that a table of event ``name`` may have; of others only the common ones."""
+    own = {**FIELDS.get(name, {}), **OPTIONAL_FIELDS.get(name, {})}
+    return {**COMMON_COLUMNS, **own} if name in FIELDS else {"time": COMMON_COLUMNS["time"]}
+
+
+def column_problems(schema: Mapping[str, pl.DataType], name: str) -> list[str]:
+    """What is wrong with the columns of a table of event ``name``, in words."""
+    types = _types(name)
+    optional = {"cpu", *OPTIONAL_FIELDS.get(name, ()), *VERSION_FIELDS.get(name, ())}
+    problems = [
+        f"an event table needs a column `{column}`, this one has none"
+        for column in types
+        if column not in schema and column not in optional
+    ]
+    problems += [
+        f"column `{column}` has values of type {schema[column]}, not {kind}"
+        for column, kind in types.items()
+        if column in schema and not _alike(schema[column], kind)
+    ]
+    return problems
+
+
+def _alike(found: pl.DataType, wanted: pl.DataType) -> bool:
+    """Whether values can become those of a column: integers of another width can."""
+    if isinstance(wanted, pl.List):
+        return isinstance(found, pl.List | pl.Array) and found.inner.is_integer()
+    if wanted.is_integer():
+        return found.is_integer() or isinstance(found, pl.Null)
+    return isinstance(found, pl.String | pl.Categorical | pl.Null)
+
+
+def as_table(frame: pl.DataFrame, name: str) -> pl.DataFrame:
+    """A frame with the types of its event's table.
+
+    Raises:
+        polars.exceptions.PolarsError: a value does not fit, or a row has no time.
+    """
+    if "cpu" not in frame.columns:
+        frame = frame.with_columns(cpu=pl.lit(None, COMMON_COLUMNS["cpu"]))
+    wrong = [
+        pl.col(column).cast(kind, strict=True)
+        for column, kind in _types(name).items()
+        if column in frame.columns and frame.schema[column] != kind
+    ]
+    frame = frame.with_columns(wrong) if wrong else frame
+    if frame["time"].null_count():
+        raise pl.exceptions.InvalidOperationError("rows without a time")
+    return frame

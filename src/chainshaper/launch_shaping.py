@@ -12,24 +12,23 @@ as far as that is permitted.
 
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 from chainshaper.analysis import ChainEnumeration, data_flow, graph_of
 from chainshaper.app import ApplicationGraph
 from chainshaper.applying import START_NS, apply_plan
-from chainshaper.durations import format_duration
 from chainshaper.enforcement.realtime import may_use_fifo
 from chainshaper.enforcement.runs.state import RunState
 from chainshaper.enforcement.threads.processes import Process
+from chainshaper.enforcement.threads.users import run_users
 from chainshaper.errors import ChainshaperError, InputError, OperationError
 from chainshaper.exploration import list_chains
 from chainshaper.launch_splicing import Splicing, splice_launch_files
-from chainshaper.planning import Plan, PlanRequest, plan_warnings, save_plan
-from chainshaper.planning.overruns import with_room_for_overruns
+from chainshaper.planning import Plan, PlanRequest, save_plan
 from chainshaper.profiling import chain_nodes, profiling_condition
 from chainshaper.record import Scheduling, record_command
 from chainshaper.recording import Recording, refuse_existing
@@ -40,14 +39,10 @@ from chainshaper.splicing.launch.folder import NODES
 from chainshaper.splicing.shaping_process import NodeKind
 from chainshaper.steps import Comparison, compare_recordings, plan_recording
 
-__all__ = ["ShapedLaunch", "plan_launched", "shape_launch"]
+__all__ = ["ShapedLaunch", "shape_launch"]
 
 FIRST_LOOK_NS = 10_000_000_000
 """How long the first recording takes: long enough for everything to have started and run."""
-
-OVERRUN_PROBABILITY = 1e-5
-"""A run of a minute at 100 ms has 600 cycles: none of them is to be too late. The margin for that
-is added to every cycle's latency."""
 
 Choose: TypeAlias = Callable[[ApplicationGraph, ChainEnumeration], str]
 """Asked which of the chains that were found is meant."""
@@ -76,14 +71,17 @@ def shape_launch(
     source: Literal["lttng", "ebpf"] = "lttng",
     node: NodeKind = "python",
     back_end: str = "auto",
+    users: Collection[str | int] = (),
     stop: threading.Event | None = None,
+    planned: Callable[[Plan], None] = lambda _: None,
     progress: Callable[[float, str], None] = lambda *_: None,
 ) -> ShapedLaunch:
     """Measure a chain of a launched application, plan, splice, apply, and measure again.
 
     ``chain`` is the one to shape; without it, ``choose`` is asked. The application is launched
-    three times: briefly, and for ``duration_ns`` before and after. ``stop`` ends the step that is
-    under way, and with it everything.
+    three times: briefly, and for ``duration_ns`` before and after. ``planned``
+    gets the plan before it is used, to say what is doubtful about it. ``stop`` ends the step that
+    is under way, and with it everything. ``users`` are for :func:`.apply_plan`.
 
     Raises:
         InputError: ``folder`` is not empty, the command is not `ros2 launch`, or what it launches
@@ -94,6 +92,7 @@ def shape_launch(
     if node != "python":
         check_build_tools()
     folder, stop = refuse_existing(folder), stop or threading.Event()
+    taken = run_users(users)
     folder.mkdir(exist_ok=True)
 
     def record(name: str, words: Sequence[str], lasting_ns: int, **how: Any) -> Recording:
@@ -126,9 +125,9 @@ def shape_launch(
         scheduling=_profiled(first, chain),
     )
     progress(0.0, "planning")
-    plan, about_margin = plan_launched(before, chain, request or PlanRequest())
-    plan = with_room_for_overruns(plan)
+    plan = plan_recording(before, chain, request or PlanRequest())
     save_plan(plan, folder / "plan.yaml")
+    planned(plan)
     splicing = _spliced(plan, launch, folder / "launch", node, first)
     after = record(
         "after",
@@ -136,7 +135,7 @@ def shape_launch(
         duration_ns,
         chain=chain,
         watch_stalls=True,
-        scheduling=_in_force(plan, back_end, first),
+        scheduling=_in_force(plan, back_end, first, taken),
         plan=plan,
         gate_logs=splicing.logs,
     )
@@ -145,8 +144,6 @@ def shape_launch(
     write_comparison(comparison, folder)
     found = [
         *before.info.notes,
-        *about_margin,
-        *plan_warnings(plan),
         *splicing.notes,
         *after.info.notes,
     ]
@@ -178,32 +175,6 @@ def _chain(first: Recording, chain: str | None, choose: Choose | None) -> str:
     return choose(graph_of(flow), found)
 
 
-def plan_launched(
-    recording: Recording, chain: str, request: PlanRequest
-) -> tuple[Plan, tuple[str, ...]]:
-    """The plan, and what to know about its margin where nobody said anything about that.
-
-    It is then as long as the tail of the latencies demands (:data:`OVERRUN_PROBABILITY`), and not
-    shorter than the standard: the way from the chain to the shaping node is not in what was
-    measured. Where the tail tells nothing it is the standard.
-
-    Raises: as :func:`chainshaper.steps.plan_recording`.
-    """
-    standard = plan_recording(recording, chain, request)
-    if request.epsilon_ns is not None or request.overrun_probability is not None:
-        return standard, ()
-    derived = replace(request, overrun_probability=OVERRUN_PROBABILITY)
-    try:
-        plan = plan_recording(recording, chain, derived)
-    except OperationError as error:
-        return standard, (
-            f"the margin is the standard {format_duration(standard.margin.epsilon_ns)}, since "
-            f"none can be derived: {error}",
-        )
-    longer = plan.margin.epsilon_ns > standard.margin.epsilon_ns
-    return (plan if longer else standard), ()
-
-
 def _spliced(
     plan: Plan, launch: LaunchCommand, folder: Path, node: NodeKind, recording: Recording
 ) -> Splicing:
@@ -228,7 +199,7 @@ def _with_shaping_node(launch: LaunchCommand, splicing: Splicing) -> list[str]:
 
 @contextmanager
 def _in_force(
-    plan: Plan, back_end: str, recording: Recording
+    plan: Plan, back_end: str, recording: Recording, users: frozenset[int]
 ) -> Iterator[Callable[[Sequence[Process]], bool]]:
     """The plan in force on what runs; what it gives says whether all servers have opened.
 
@@ -245,6 +216,7 @@ def _in_force(
                 back_end=back_end,
                 recording=recording,
                 wait_ns=START_NS,
+                users=users,
                 stop=stop,
                 watch=states.append,
             )

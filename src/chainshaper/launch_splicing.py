@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from chainshaper.errors import InputError
-from chainshaper.planning.plan import Plan, ShapingNode
+from chainshaper.plan_choices import Fallback
+from chainshaper.planning.plan import Plan, ShapingNode, revised
 from chainshaper.splicing.launch.edit import Copies, edited_copies, unified_diff
 from chainshaper.splicing.launch.file import read_launch_file
 from chainshaper.splicing.launch.folder import (
@@ -29,6 +30,7 @@ from chainshaper.splicing.launch.folder import (
 from chainshaper.splicing.launch.targets import Wanted
 from chainshaper.splicing.launch.walk import follow
 from chainshaper.splicing.shaping_process import (
+    STANDBY,
     NodeKind,
     ShapingProcess,
     write_shaping_process,
@@ -60,8 +62,8 @@ class Splicing:
 
     ``launch`` maps each launch file that changed to the copy to launch instead; ``originals`` maps
     every copy to what it was made from. ``processes`` are the nodes that were added, ``logs`` where
-    shaping nodes note what they did. ``diff`` is a unified diff of all launch files, ``notes`` what
-    to know before relying on it.
+    shaping nodes and their standbys note what they did. ``diff`` is a unified diff of all launch
+    files, ``notes`` what to know before relying on it.
     """
 
     folder: Path
@@ -93,13 +95,14 @@ def splice_launch_files(
     arguments: Mapping[str, str] | None = None,
     message_type: str | None = None,
     recording: "Recording | None" = None,
+    fallback: Fallback | None = None,
 ) -> Splicing:
     """Write copies of launch files that start the plan's shaping nodes, into a new folder.
 
     ``arguments`` are launch arguments by name, where the files are launched with other values
     than their defaults. ``recording`` is one of the application: it tells who publishes a topic
-    and of which type it is, as far as the plan does not. A folder that was spliced before and
-    not changed since is replaced.
+    and of which type it is, as far as the plan does not. ``fallback`` goes before the plan's. A
+    folder that was spliced before and not changed since is replaced.
 
     Raises:
         InputError: the plan shapes nothing; nobody publishes its output, or a node's name
@@ -108,6 +111,7 @@ def splice_launch_files(
     """
     folder = usable(Path(output))
     wanted = _wanted(plan, recording)
+    plan = plan if fallback is None else revised(plan, fallback=fallback)
     logs = {shaping.name: folder / LOGS / f"{shaping.name}.csv" for shaping, _ in wanted}
 
     def written(nodes: Path) -> _Remaps:
@@ -124,7 +128,8 @@ def splice_launch_files(
         ]
 
     spliced = _spliced(launch_files, folder, arguments, written, throttled=False)
-    return replace(spliced, logs=tuple(logs.values()))
+    standbys = [log.with_stem(f"{log.stem}{STANDBY}") for log in logs.values()]
+    return replace(spliced, logs=(*logs.values(), *standbys))
 
 
 def splice_throttlers(
@@ -264,6 +269,7 @@ def _wanted(plan: Plan, recording: "Recording | None") -> list[tuple[ShapingNode
 
 def _publisher(plan: Plan, node: ShapingNode, graph: "ApplicationGraph | None") -> str:
     names = () if graph is None else graph.publishers.get(node.output, ())
+    names = tuple(name for name in names if name != f"/{node.name}{STANDBY}")
     if len(names) > 1:
         raise InputError(
             f"{node.output} has {len(names)} publishers, {', '.join(sorted(names))}: a shaping node"
@@ -291,7 +297,8 @@ def _moved(process: ShapingProcess, here: Path, there: Path) -> ShapingProcess:
         word.replace(str(here), str(there), 1) for word in process.command
     )
     parameters = there / process.parameters_file.relative_to(here)
-    return replace(process, command=command, parameters_file=parameters)
+    standby = process.standby and _moved(process.standby, here, there)
+    return replace(process, command=command, parameters_file=parameters, standby=standby)
 
 
 def _unchanged(files: Sequence[Path], copies: Copies) -> list[str]:

@@ -12,12 +12,21 @@ import polars as pl
 
 from chainshaper import events
 from chainshaper.analysis import LatencyAnalysis
+from chainshaper.analysis.departures import with_overrun
+from chainshaper.enforcement.gate import DROPPED
 from chainshaper.planning import Plan
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.publisher_threads import publisher_servers
 from chainshaper.recording import Recording
 
-__all__ = ["gate_releases", "into_open_slots", "overruns_in", "overruns_text"]
+__all__ = [
+    "dropped_in",
+    "dropped_text",
+    "gate_releases",
+    "into_open_slots",
+    "overruns_in",
+    "overruns_text",
+]
 
 _DONE = {
     "wait": "waited for the next slot",
@@ -25,18 +34,16 @@ _DONE = {
     "publish": "published at once",
     "next-slot": "left in the slot behind their mode's",
 }
+_WITHOUT_NODE = {
+    "bypass": "went around the shaping node, which was not there",
+    "silence": "were not published, since the shaping node was not there",
+}
 
 
 def gate_releases(recording: Recording, plan: Plan | None) -> pl.DataFrame:
-    """The table `gate_release` with ``overrun`` and ``mode``, which older recordings lack.
-
-    Without the former a message overran when it left in a later cycle than the ``plan`` says.
-    """
-    table = events.table(recording.events, "gate_release", ["mode"])
-    if "overrun" in table.columns:
-        return table
-    late = pl.col("cycles_waited") > (0 if plan is None else cycles_until_output(plan))
-    return table.with_columns(overrun=pl.when(late).then(pl.lit("wait")))
+    """The table `gate_release` with ``overrun``, which older recordings lack."""
+    due = 0 if plan is None else cycles_until_output(plan)
+    return with_overrun(events.table(recording.events, "gate_release"), due)
 
 
 def overruns_in(
@@ -44,6 +51,7 @@ def overruns_in(
 ) -> dict[str, int] | None:
     """How many outputs overran, per policy that was applied to them; None: nothing was gated.
 
+    Those that a standby dealt with, while the shaping node was not there, count as overruns too.
     ``analysis`` is that of the plan's chain; without it, outputs of an asynchronous publisher that
     waited cannot be counted.
     """
@@ -51,7 +59,7 @@ def overruns_in(
     if "gate_release" not in recording.events and not gated:
         return None
     treated = gate_releases(recording, plan)["overrun"].drop_nulls()
-    counts = {policy: int((treated == policy).sum()) for policy in _DONE}
+    counts = {policy: int((treated == policy).sum()) for policy in (*_DONE, *_WITHOUT_NODE)}
     if gated and plan is not None:
         outcomes = events.table(recording.events, "asynchronous_send")["outcome"]
         counts["discard"] += int((outcomes != "sent").sum())
@@ -73,9 +81,40 @@ def into_open_slots(recording: Recording, plan: Plan | None) -> int | None:
     return int((table["release"] == table["arrival"]).sum())
 
 
+def dropped_in(recording: Recording) -> dict[str, int] | None:
+    """How many messages gates received and did not let out, per reason, and how many DDS lost
+    before they reached one, where its numbers say so; None: no gate decided.
+
+    The reasons are those of ``dropped`` in :mod:`chainshaper.events`.
+    """
+    if "gate_release" not in recording.events:
+        return None
+    table = events.table(recording.events, "gate_release", ["dropped", "lost", "overrun"])
+    discarded = pl.col("release").is_null() & (pl.col("overrun") == "discard")
+    reasons = table.select(
+        pl.coalesce("dropped", pl.when(discarded).then(pl.lit("discarded")))
+    ).to_series()
+    counts = {reason: int((reasons == reason).sum()) for reason in DROPPED}
+    counts["lost by DDS"] = int(table["lost"].sum())
+    return {reason: count for reason, count in counts.items() if count}
+
+
+def dropped_text(dropped: dict[str, int]) -> str:
+    """``3 messages were lost at the gate (2 replaced, 1 overflowed)``."""
+    total = sum(dropped.values())
+    why = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
+    return f"{total} {'message was' if total == 1 else 'messages were'} lost at the gate ({why})"
+
+
 def overruns_text(overruns: dict[str, int]) -> str:
     """``3 outputs were too late for their slot (2 discarded, 1 published at once)``."""
-    total = sum(overruns.values())
-    done = ", ".join(f"{count} {_DONE[policy]}" for policy, count in overruns.items())
+    without = [
+        f"{n} {_WITHOUT_NODE[what]}" for what, n in overruns.items() if what in _WITHOUT_NODE
+    ]
+    treated = {policy: count for policy, count in overruns.items() if policy in _DONE}
+    if without and not treated:
+        return "; ".join(without)
+    total = sum(treated.values())
+    done = ", ".join(f"{count} {_DONE[policy]}" for policy, count in treated.items())
     late = "output was too late for its" if total == 1 else "outputs were too late for their"
-    return f"{total} {late} slot ({done})"
+    return "; ".join([f"{total} {late} slot ({done})", *without])

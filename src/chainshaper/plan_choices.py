@@ -5,7 +5,7 @@ The planner takes a while to import, and `chainshaper plan --help` should not.
 
 from typing import Literal, TypeAlias
 
-__all__ = ["Goal", "Policy", "Publication", "Solver"]
+__all__ = ["Fallback", "Goal", "Policy", "Publication", "Solver"]
 
 Policy: TypeAlias = Literal[
     "shaped",
@@ -16,6 +16,9 @@ Policy: TypeAlias = Literal[
     "let-per-chain",
 ]
 """How the chain is scheduled: the paper's way, or one of those that it compares (section 2.5)."""
+
+Fallback: TypeAlias = Literal["bypass", "silence"]
+"""What becomes of an output while its shaping node is not there."""
 
 Publication: TypeAlias = Literal["synchronous", "asynchronous"]
 """By a shaping node, or by the publisher's own thread (section 3.2)."""

@@ -38,14 +38,16 @@ def profile_of(
 ) -> Profile:
     """The profile of one analysed chain.
 
-    L̄ and all other times are over cycles that the machine did not disturb: a stall of the
-    machine is not part of the chain's latency. ``period_ns`` is for chains that no timer starts.
+    L̄ and all other times but ``every_latency_ns`` are over cycles that the machine did not disturb:
+    a stall of the machine is not part of the chain's latency, but its output is late nevertheless.
+    ``period_ns`` is for chains that no timer starts.
 
     Raises:
         InputError: the chain's period is not known, or known and given as well.
         OperationError: fewer than two complete undisturbed traversals.
     """
-    complete = analysis.traversals.filter(pl.col("complete") & ~pl.col("disturbed"))
+    every = analysis.traversals.filter("complete")
+    complete = every.filter(~pl.col("disturbed"))
     if complete.height < 2:
         raise OperationError(
             f"{recording.path}: of {analysis.traversals.height} traversals of {analysis.chain.spec}"
@@ -63,10 +65,13 @@ def profile_of(
     calm = _undisturbed_instances(flow, analysis.traversals)
     return Profile(
         latencies_ns=complete["latency_ns"].to_numpy().astype(np.int64),
+        every_latency_ns=every["latency_ns"].to_numpy().astype(np.int64),
         period_ns=period,
         spec=chain.spec,
         nodes=tuple(graph.callbacks[number].node for number in chain.callbacks),
         topics=chain.topics,
+        begins=(chain.callbacks[0], graph.callbacks[chain.callbacks[0]].label),
+        upstream=_upstream(graph, chain, stages),
         core_of=core_of,
         receivers=_receivers(graph, chain, nodes),
         callbacks=tuple(_times(flow, calm, stage, core_of[stage.node]) for stage in stages),
@@ -169,6 +174,24 @@ def _stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
         )
         for members, topic in order
     ]
+
+
+def _upstream(graph: ApplicationGraph, chain: Chain, stages: list[_Stage]) -> frozenset[str]:
+    """The topics that the chain's output waits for, those before its first callback included."""
+    found = {stage.topic for stage in stages}
+    first = graph.callbacks[chain.callbacks[0]].topic
+    ahead = set() if first is None else {first}
+    while ahead:
+        found |= ahead
+        writers = [
+            (callback, topic)
+            for callback in graph.callbacks
+            for topic in ahead.intersection(callback.publishes)
+        ]
+        inputs = [number for one, topic in writers for number in _inputs(graph, one, topic)]
+        read = {graph.callbacks[number].topic for number in inputs}
+        ahead = {topic for topic in read if topic is not None} - found
+    return frozenset(found - {chain.topics[-1]})
 
 
 def _feeding(graph: ApplicationGraph, chain: Chain) -> set[str]:

@@ -18,9 +18,9 @@ from pathlib import Path
 from chainshaper.analysis import data_flow, find_chain, graph_of
 from chainshaper.durations import format_duration
 from chainshaper.enforcement.realtime import available_cores, check_cores, may_use_fifo
+from chainshaper.enforcement.runs.guardian import run_claimed
 from chainshaper.enforcement.runs.journal import Journal
-from chainshaper.enforcement.runs.release_after import run_claimed
-from chainshaper.enforcement.runs.scheduling_memory import change_scheduling
+from chainshaper.enforcement.runs.scheduling_memory import change_all
 from chainshaper.enforcement.servers import ReservationServer
 from chainshaper.enforcement.threads.allocation import (
     Allocation,
@@ -119,11 +119,10 @@ class _Condition:
         server = ReservationServer("the chain", self.core, 1, ())
         wanted = scheduling_around({server.name: members}, [server], found, available_cores())
         new = [one for one in wanted if one.thread.thread.identity not in self.done]
-        for one in new:
-            # One after the other, as under SCHED_FIFO in the paper: no turns.
-            scheduling = replace(one.wanted, takes_turns=False)
-            change_scheduling(self.journal, one.thread.thread, scheduling)
-            self.done.add(one.thread.thread.identity)
+        # One after the other, as under SCHED_FIFO in the paper: no turns.
+        changes = [(one.thread.thread, replace(one.wanted, takes_turns=False)) for one in new]
+        change_all(self.journal, changes)
+        self.done.update(thread.identity for thread, _ in changes)
         return not new
 
 

@@ -9,11 +9,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from chainshaper.enforcement.back_ends import choose_back_end, make_back_end
-from chainshaper.enforcement.runs.release_after import run_claimed
+from chainshaper.enforcement.runs.guardian import run_claimed
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.enforcement.threads.listing import list_threads
 from chainshaper.errors import OperationError
 from chainshaper.planning import Plan
+from chainshaper.planning.overruns import open_until_done
 from chainshaper.planning.publisher_threads import publisher_servers
 from chainshaper.workload.live import StartedNodes
 
@@ -30,14 +31,14 @@ def publishers_gated(plan: Plan, nodes: StartedNodes) -> Iterator[None]:
             or the servers failed meanwhile.
     """
     choice = choose_back_end("freezer")  # the others want threads that nobody scheduled before
-    held = [(server, names) for _, server, names in publisher_servers(plan)]
+    held = [(server, names) for _, server, names in publisher_servers(open_until_done(plan))]
     table = ServerTable(
         plan.cycle_ns,
         tuple(ReservationServer(s.name, s.core, s.priority, s.slots) for s, _ in held),
     )
     cores = {server.core for server, _ in held}
     with run_claimed(cores, {name for _, names in held for name in names}) as journal:
-        servers = make_back_end(choice.name, table, journal.path.parent, journal)
+        servers = make_back_end(choice.name, table, journal)
         try:
             for server, names in held:
                 for name in names:

@@ -17,18 +17,23 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeAlias
 
-import polars as pl
-
+from chainshaper import events
 from chainshaper.command_process import check_command, end_command, start_command
 from chainshaper.durations import format_duration
 from chainshaper.enforcement.own_processes import end_in_words
 from chainshaper.enforcement.realtime import available_cores, may_use_fifo
+from chainshaper.enforcement.runs.governing import (
+    Governed,
+    governing,
+    in_force_throughout,
+)
+from chainshaper.enforcement.threads.allocation import strangers_text
 from chainshaper.enforcement.threads.listing import parents
 from chainshaper.enforcement.threads.processes import (
     Process,
@@ -36,6 +41,7 @@ from chainshaper.enforcement.threads.processes import (
     find_applications,
     list_processes,
 )
+from chainshaper.enforcement.threads.users import run_users
 from chainshaper.errors import ChainshaperError, InputError, OperationError
 from chainshaper.events import EventTables
 from chainshaper.exploration import with_trace_events
@@ -47,14 +53,16 @@ from chainshaper.recorded_application import (
 )
 from chainshaper.recording import (
     EndpointInfo,
+    InForceInfo,
     Recording,
     refuse_existing,
     write_recording,
 )
-from chainshaper.sources.ros.interpreter import environment_of
+from chainshaper.sources.ros.interpreter import Environment, environment_of
 from chainshaper.sources.ros.snapshot import ask_graph
 from chainshaper.sources.tracer import Tracer
 from chainshaper.splicing.gate_log import releases_so_far, with_gate_logs
+from chainshaper.whole_file import open_to_all
 from chainshaper.workload.stall_watch import StallWatch, far_from, stalls_watched
 
 __all__ = ["Recorded", "Scheduling", "record_command"]
@@ -88,7 +96,8 @@ class Recorded:
 class _Run:
     """What there is to keep together while an application is recorded, and what was seen of it.
 
-    ``environment`` is a node's. ``in_force_ns`` is when the scheduling that was asked for was.
+    ``environment`` is a node's. ``in_force_ns`` is when the scheduling that was asked for was,
+    ``governed`` are plans that others put in force meanwhile (`chainshaper apply`).
     """
 
     tracer: Tracer
@@ -96,6 +105,7 @@ class _Run:
     duration_ns: int | None
     stop: threading.Event
     progress: Callable[[float, str], None]
+    users: frozenset[int]
     pids: Sequence[int] = ()
     gate_logs: Sequence[Path] = ()
     command: "subprocess.Popen[bytes] | None" = None
@@ -103,10 +113,13 @@ class _Run:
     begun_ns: int = 0
     ended_ns: int = 0
     processes: tuple[Process, ...] = ()
-    environment: Mapping[str, str] = field(default_factory=dict)
+    strangers: str | None = None
+    environment: Environment | None = None
+    no_environment_because: str = "no process was seen that looks like a node"
     endpoints: tuple[EndpointInfo, ...] = ()
     no_qos_because: str | None = None
     in_force_ns: int | None = None
+    governed: tuple[Governed, ...] = ()
     stalls: StallWatch = field(default_factory=StallWatch)
     exit_code: int | None = None
     notes: tuple[str, ...] = ()
@@ -119,6 +132,7 @@ def record_command(
     source: str = "lttng",
     duration_ns: int | None = None,
     pids: Sequence[int] = (),
+    users: Collection[str | int] = (),
     buffer: int | None = None,
     chain: str | None = None,
     scheduling: Scheduling | None = None,
@@ -132,12 +146,13 @@ def record_command(
     """Record an application until it ends, ``duration_ns`` are over, or ``stop`` is set.
 
     ``command`` is started, and ended with the recording. Without one, eBPF attaches to ``pids``
-    and their descendants, or to all that runs. ``buffer`` is the size of LTTng's buffer of a core
-    in bytes. ``chain`` is noted as the chain of interest, ``plan`` as the plan in force;
-    ``gate_logs`` are where its shaping nodes note what they do. ``watch_stalls`` has a sleeper on
-    every core notice when the machine stands still, which takes some 2 % of it. What the command
-    prints goes to the file descriptor ``command_stdout``, if that is given. ``progress`` is told
-    the share that is done, as far as that is known, and what is being done.
+    and their descendants, or to all that ``users`` run (names or numbers; default: who launched
+    us, and root). ``buffer`` is the size of LTTng's buffer of a core in bytes. ``chain`` is noted
+    as the chain of interest, ``plan`` as the plan in force; ``gate_logs`` are where its shaping
+    nodes note what they do. ``watch_stalls`` has a sleeper on every core notice when the machine
+    stands still, which takes some 2 % of it. What the command prints goes to the file descriptor
+    ``command_stdout``, if that is given. ``progress`` is told the share that is done, as far as
+    that is known, and what is being done.
 
     Raises:
         InputError: ``output`` exists, there is no such command or process, or no such source.
@@ -145,15 +160,14 @@ def record_command(
         OperationError: tracing does not start, nothing was traced, or it cannot be read or
             written; what the tracer wrote is then kept beside ``output``, and named.
     """
-    output = refuse_existing(output)
+    output, taken = refuse_existing(output), run_users(users)
     if command:
         check_command(command)
     folder = _work_folder(output)
     try:
-        tracer = _tracer(source, folder, command, pids, buffer)
-        run = _Run(
-            tracer, folder, duration_ns, stop or threading.Event(), progress, pids, gate_logs
-        )
+        tracer = _tracer(source, folder, command, pids, buffer, users=taken)
+        stop = stop or threading.Event()
+        run = _Run(tracer, folder, duration_ns, stop, progress, taken, pids, gate_logs)
         _trace(run, command, command_stdout, scheduling, watch_stalls=watch_stalls)
         progress(1.0, "reading the events")
         try:
@@ -161,7 +175,7 @@ def record_command(
         except ChainshaperError as error:
             raise OperationError(f"{error}{_what_is_left(run, output)}") from error
         if any(folder.iterdir()):
-            folder.chmod(0o755)
+            open_to_all(folder)
             folder.rename(recording.path / TRACE_FOLDER)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -177,19 +191,25 @@ def _work_folder(output: Path) -> Path:
 
 
 def _tracer(
-    source: str, folder: Path, command: Sequence[str], pids: Sequence[int], buffer: int | None
+    source: str,
+    folder: Path,
+    command: Sequence[str],
+    pids: Sequence[int],
+    buffer: int | None,
+    *,
+    users: frozenset[int],
 ) -> Tracer:
     if source == "lttng":
         from chainshaper.sources.lttng.session import LttngSession
 
-        return LttngSession(folder, command, pids, buffer)
+        return LttngSession(folder, command, pids, buffer, users)
     if source != "ebpf":
         raise InputError(f"{source!r} is no source of events: name lttng or ebpf")
     if buffer is not None:
         raise InputError("--buffer is about LTTng's buffers: leave it out with `--source ebpf`")
     from chainshaper.sources.ebpf.session import EbpfTracer
 
-    return EbpfTracer(folder, command, pids)
+    return EbpfTracer(folder, command, pids, users)
 
 
 def _trace(
@@ -261,12 +281,19 @@ def _look(run: _Run) -> None:
         family = {pid for one in run.pids for pid in descendants(parent_of, one)} & parent_of.keys()
         processes = list_processes(family)
     else:
-        processes = find_applications(list_processes())
+        everybody = find_applications(list_processes())
+        processes = tuple(one for one in everybody if one.user in run.users)
+        run.strangers = strangers_text(everybody, run.users) or run.strangers
     run.processes = processes
+    pids = {one.pid for one in processes}
+    run.governed = governing(pids, time.monotonic_ns(), run.governed)
     # The node that was started last, not its launcher, nor what only carries its command line.
     nodes = sorted(find_applications(processes), key=lambda one: (one.participates, one.pid))
     if nodes:
-        run.environment = environment_of(nodes[-1].pid) or run.environment
+        try:
+            run.environment = environment_of(nodes[-1].pid)
+        except OperationError as error:
+            run.no_environment_because = str(error)
     if run.schedule is not None and run.schedule(processes) and run.in_force_ns is None:
         # What was before is left out, so stalls are watched from here on.
         run.in_force_ns = run.stalls.begin(far_from(releases_so_far(run.gate_logs)))
@@ -276,8 +303,8 @@ def _ask_for_qos(run: _Run) -> None:
     """Types and QoS of all topics, while the application is still there."""
     if run.exit_code is not None:
         run.no_qos_because = "the application had ended by itself"
-    elif not run.environment:
-        run.no_qos_because = "no process was seen that looks like a node"
+    elif run.environment is None:
+        run.no_qos_because = run.no_environment_because
     else:
         run.endpoints, run.no_qos_because = ask_graph(run.environment)
 
@@ -297,16 +324,17 @@ def _written(
         tables, info = with_found_nodes(tables, info, run.endpoints, run.processes)
     recording = Recording(output, info, tables)
     threads = recorded_threads_of(run.processes, recording)
-    notes = (*info.notes, *run.notes)
+    notes = (*info.notes, *run.notes, *((run.strangers,) if run.strangers else ()))
     if run.no_qos_because is not None:
         notes += (f"types and QoS of topics could not be asked for: {run.no_qos_because}.",)
     if run.schedule is not None:
         tables, note = _from_in_force(tables, run)
         notes += (note,)
+    variables = {} if run.environment is None else run.environment.variables
     facts = {
         "kernel": platform.release(),
-        "distribution": run.environment.get("ROS_DISTRO") or info.distribution,
-        "rmw": run.environment.get("RMW_IMPLEMENTATION") or info.rmw,
+        "distribution": variables.get("ROS_DISTRO") or info.distribution,
+        "rmw": variables.get("RMW_IMPLEMENTATION") or info.rmw,
         "command": tuple(command),
         "threads": threads,
         "endpoints": known_endpoints(tables, run.endpoints),
@@ -314,24 +342,23 @@ def _written(
         "stall_meter": run.stalls.info,
         "chain": chain,
         "plan": None if plan is None else plan.model_dump(mode="json"),
+        "in_force": None if plan is None else InForceInfo(since_ns=since_ns),
         "notes": notes,
     }
+    if plan is None and (governed := in_force_throughout(run.governed)) is not None:
+        facts["plan"] = governed.plan
+        facts["in_force"] = InForceInfo(since_ns=governed.since_ns, until_ns=governed.until_ns)
     return write_recording(output, tables, with_trace_events(recording).model_copy(update=facts))
 
 
 def _from_in_force(tables: EventTables, run: _Run) -> tuple[EventTables, str]:
     """The events of what happened under the scheduling, and those of all objects' creation."""
-    from chainshaper.sources.lttng.trace import CREATION
-
     since = run.in_force_ns
     if since is None:
         raise OperationError(
             "the run was over before the threads had the scheduling it was to be recorded with"
         )
-    kept = {
-        name: frame if name in CREATION else frame.filter(pl.col("time") >= since)
-        for name, frame in tables.items()
-    }
+    kept = events.happened(tables, since)
     lasted = format_duration(round(since - run.begun_ns, -8))
     return kept, f"the first {lasted} were left out: the scheduling was not in force yet."
 

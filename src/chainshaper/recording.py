@@ -2,7 +2,9 @@
 
 The folder is written beside its final place and renamed when it is complete, so a recording
 that exists is whole. `recording.json` says under which conditions the events were taken, and
-what was lost on the way: figures computed from a recording are only as good as these facts.
+what was lost on the way: figures computed from a recording are only as good as these facts. It
+also has a checksum of every other file, which is compared when the file is read; the columns of
+all tables are looked at when the recording is opened.
 """
 
 import io
@@ -11,20 +13,23 @@ import os
 import platform
 import shutil
 import tempfile
+import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 import polars as pl
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from chainshaper.errors import InputError, OperationError
-from chainshaper.events import EventTables
+from chainshaper.events import EventTables, as_table, column_problems
+from chainshaper.whole_file import open_to_all
 from chainshaper.yaml_file import explanations, key_text
 
 __all__ = [
     "EndpointInfo",
+    "InForceInfo",
     "Recording",
     "RecordingInfo",
     "StallMeterInfo",
@@ -36,6 +41,12 @@ __all__ = [
 
 INFO_FILE = "recording.json"
 FORMAT = 1
+MOST_ROWS = 1_000_000
+MOST_ROWS_PER_BYTE = 16
+"""A file has no more rows than both together; events as regular as a clock take four bytes each."""
+UNREADABLE = (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError)
+
+Integer: TypeAlias = Annotated[int, Field(ge=-(1 << 63), lt=1 << 63)]
 
 
 class ThreadInfo(BaseModel):
@@ -43,14 +54,14 @@ class ThreadInfo(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    tid: int
-    pid: int
+    tid: Integer
+    pid: Integer
     comm: str
     node: str
     role: str  # executor, dds, publisher, stall-meter, unknown
     policy: str  # SCHED_FIFO, SCHED_OTHER, ...
-    priority: int
-    cores: tuple[int, ...]
+    priority: Integer
+    cores: tuple[Integer, ...]
 
 
 class EndpointInfo(BaseModel):
@@ -70,11 +81,11 @@ class EndpointInfo(BaseModel):
     reliability: str | None = None
     durability: str | None = None
     history: str | None = None
-    depth: int | None = None
-    deadline_ns: int | None = None
-    lifespan_ns: int | None = None
+    depth: Integer | None = None
+    deadline_ns: Integer | None = None
+    lifespan_ns: Integer | None = None
     liveliness: str | None = None
-    liveliness_lease_ns: int | None = None
+    liveliness_lease_ns: Integer | None = None
 
 
 class StallMeterInfo(BaseModel):
@@ -87,12 +98,25 @@ class StallMeterInfo(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    cores: tuple[int, ...]
-    period_ns: int
-    threshold_ns: int
-    wakeups: int
-    median_lateness_ns: tuple[int, ...]
+    cores: tuple[Integer, ...]
+    period_ns: Integer
+    threshold_ns: Integer
+    wakeups: Integer
+    median_lateness_ns: tuple[Integer, ...]
     realtime: bool
+
+
+class InForceInfo(BaseModel):
+    """When the plan was in force, of the time that was recorded (ns of CLOCK_MONOTONIC).
+
+    From the start of the first cycle that was governed as a whole; ``until_ns`` is None where it
+    was in force to the end.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    since_ns: int
+    until_ns: int | None = None
 
 
 class RecordingInfo(BaseModel):
@@ -107,25 +131,28 @@ class RecordingInfo(BaseModel):
 
     model_config = ConfigDict(frozen=True)
 
-    format: int = FORMAT
+    format: Integer = FORMAT
     source: str  # live, simulated, lttng, ebpf
     host: str = Field(default_factory=platform.node)
     kernel: str = Field(default_factory=platform.release)
     distribution: str | None = None  # of ROS 2
     rmw: str | None = None
-    clock_offset_ns: int
+    clock_offset_ns: Integer
     command: tuple[str, ...] = ()
-    processes: dict[int, str] = {}  # pid → the node or command it runs
+    processes: dict[Integer, str] = {}  # pid → the node or command it runs
     threads: tuple[ThreadInfo, ...] = ()
     endpoints: tuple[EndpointInfo, ...] = ()
     realtime: bool | None = None  # None: unknown
     notes: tuple[str, ...] = ()
-    lost: dict[str, int] = {}
-    trace_events: dict[str, int] = {}
+    lost: dict[str, Integer] = {}
+    trace_events: dict[str, Integer] = {}
     stall_meter: StallMeterInfo | None = None
     chain: str | None = None  # the chain the application's description names first
     application: dict[str, Any] | None = None  # the description that ran, when we ran it
     plan: dict[str, Any] | None = None  # the plan in force, when one was
+    in_force: InForceInfo | None = None  # None: no plan was, or the recording is from before
+    # File → its CRC-32, as `crc32:89abcdef`; None in recordings from before there were any.
+    checksums: dict[str, str] | None = None
 
 
 @dataclass(frozen=True)
@@ -143,23 +170,56 @@ class Recording:
 
 
 class _TablesOnDisk(Mapping[str, pl.DataFrame]):
-    def __init__(self, path: Path) -> None:
-        self._files = {file.stem: file for file in sorted(path.glob("*.parquet"))}
+    def __init__(self, path: Path, checksums: Mapping[str, str]) -> None:
+        self._path = path
+        self._checksums = checksums
+        self._files = {
+            file.stem: sorted(file.glob("*.parquet")) if file.is_dir() else [file]
+            for file in sorted(path.glob("*.parquet"))
+        }
         self._read: dict[str, pl.DataFrame] = {}
+        known = {str(file.relative_to(path)) for files in self._files.values() for file in files}
+        if missing := sorted(checksums.keys() - known):
+            raise InputError(
+                f"{path / missing[0]}: no such file, but {INFO_FILE} names it: copy the recording"
+                " whole, or record the run again"
+            )
+        for name, files in self._files.items():
+            for file in files:
+                _check_columns(file, name)
 
     def __getitem__(self, name: str) -> pl.DataFrame:
         if name not in self._read:
-            file = self._files[name]
-            try:
-                frame = pl.read_parquet(file, glob=False)
-            except (pl.exceptions.PolarsError, OSError) as error:
-                raise InputError(
-                    f"{file}: not a readable event table ({error}); record the run again"
-                ) from error
-            if "time" not in frame.columns:
-                raise InputError(f"{file}: an event table needs a column `time`, this one has none")
-            self._read[name] = frame.sort("time", maintain_order=True)
+            self._read[name] = self._table(name).sort("time", maintain_order=True)
         return self._read[name]
+
+    def _table(self, name: str) -> pl.DataFrame:
+        """A table's rows, once it is sure that they are what was written."""
+        files = self._files[name]
+        file = files[0].parent if len(files) > 1 else files[0]
+        try:
+            parts: list[Any] = [io.BytesIO(self._content(part)) for part in files]
+            lazy = pl.scan_parquet(parts, glob=False)
+            rows = lazy.select(pl.len()).collect().item()
+            size = sum(part.getbuffer().nbytes for part in parts)
+            if rows > MOST_ROWS + MOST_ROWS_PER_BYTE * size:
+                raise InputError(
+                    f"{file}: {rows} rows in {size} bytes are more than any run has; record the"
+                    " run again"
+                )
+            return as_table(lazy.collect(), name)
+        except UNREADABLE as error:
+            raise _unreadable(file, error) from error
+
+    def _content(self, file: Path) -> bytes:
+        content = file.read_bytes()
+        expected = self._checksums.get(str(file.relative_to(self._path)))
+        if expected is not None and expected != _checksum(content):
+            raise InputError(
+                f"{file}: damaged: its checksum is {_checksum(content)}, {INFO_FILE} says"
+                f" {expected}; copy the recording again, or record the run again"
+            )
+        return content
 
     def __iter__(self) -> Any:
         return iter(self._files)
@@ -168,11 +228,32 @@ class _TablesOnDisk(Mapping[str, pl.DataFrame]):
         return len(self._files)
 
 
+def _check_columns(file: Path, name: str) -> None:
+    """Refuse a table whose columns are not those of its event."""
+    try:
+        with file.open("rb") as stream:
+            problems = column_problems(pl.read_parquet_schema(stream), name)
+    except UNREADABLE as error:
+        raise _unreadable(file, error) from error
+    if problems:
+        raise InputError(f"{file}: {'; '.join(problems)}; record the run again")
+
+
+def _unreadable(file: Path, error: BaseException) -> InputError:
+    reason = " ".join(str(error).split())
+    return InputError(f"{file}: not a readable event table ({reason}); record the run again")
+
+
+def _checksum(content: bytes | memoryview) -> str:
+    return f"crc32:{zlib.crc32(content):08x}"
+
+
 def open_recording(path: str | Path) -> Recording:
     """Open a recording folder.
 
     Raises:
-        InputError: no such folder, no or an unreadable `recording.json`, a newer format.
+        InputError: no such folder, no or an unreadable `recording.json`, a newer format, a table
+            that is missing or has not the columns of its event.
     """
     path = Path(path)
     file = path / INFO_FILE
@@ -184,7 +265,8 @@ def open_recording(path: str | Path) -> Recording:
             f"{path}: {what}; a recording is made with `chainshaper run APP.yaml -o {path}`, a "
             "trace, which is accepted as well, with `ros2 trace`"
         )
-    return Recording(path, _read_info(file), _TablesOnDisk(path))
+    info = _read_info(file)
+    return Recording(path, info, _TablesOnDisk(path, info.checksums or {}))
 
 
 def _read_info(file: Path) -> RecordingInfo:
@@ -199,7 +281,7 @@ def _read_info(file: Path) -> RecordingInfo:
             f"{file}: format {format_}, this chainshaper reads format {FORMAT}; update it"
         )
     try:
-        return RecordingInfo.model_validate(values)
+        return RecordingInfo.model_validate_json(json.dumps(values), strict=True)
     except ValidationError as error:
         problems = [
             f"{key_text(where)}: {reason}" for where, reason in explanations(error, RecordingInfo)
@@ -245,11 +327,14 @@ def write_recording(
         partial = Path(
             tempfile.mkdtemp(prefix=f".{path.name}.partial-", dir=path.absolute().parent)
         )
+        checksums: dict[str, str] = {}
         for part in [tables] if isinstance(tables, Mapping) else tables:
             for name, frame in part.items():
-                _write_table(_next_part(partial / f"{name}.parquet"), frame)
+                file = _next_part(partial / f"{name}.parquet", checksums)
+                checksums[str(file.relative_to(partial))] = _write_table(file, frame)
+        info = info.model_copy(update={"checksums": checksums})
         (partial / INFO_FILE).write_text(info.model_dump_json(indent=2) + "\n")
-        partial.chmod(0o755)
+        open_to_all(partial)
         partial.rename(path)
     except (OSError, pl.exceptions.PolarsError) as error:
         raise OperationError(f"{path}: the recording cannot be written: {error}") from error
@@ -259,21 +344,24 @@ def write_recording(
     return open_recording(path)
 
 
-def _next_part(file: Path) -> Path:
+def _next_part(file: Path, checksums: dict[str, str]) -> Path:
     """Where the next part of a table goes: the first one is a file, several are a folder."""
     if file.is_file():
         first = file.rename(file.with_suffix(".first"))
         file.mkdir()
         first.rename(file / "000000.parquet")
+        checksums[f"{file.name}/000000.parquet"] = checksums.pop(file.name)
     return file / f"{len(list(file.iterdir())):06}.parquet" if file.is_dir() else file
 
 
-def _write_table(file: Path, frame: pl.DataFrame) -> None:
+def _write_table(file: Path, frame: pl.DataFrame) -> str:
+    """Write a file; returns its checksum."""
     # By way of memory: writing to a file itself, Polars reports a full disk as a file that is out
     # of specification.
     content = io.BytesIO()
     frame.write_parquet(content, compression="zstd", compression_level=1, statistics=False)
-    with file.open("wb") as stream:
+    with file.open("xb") as stream:
         stream.write(content.getbuffer())
         stream.flush()
         os.fsync(stream.fileno())
+    return _checksum(content.getbuffer())

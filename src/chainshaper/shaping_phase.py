@@ -3,9 +3,12 @@
 Outputs without a stamp (a `geometry_msgs/Twist`, say) are held to the cycle, whose beginning no
 message tells. It is measured while a plan is in force, and told to the nodes as a parameter. That
 takes ROS 2 a second or two, in a process of its own: who tells does not wait for it, but looks.
+
+That process runs as the user of the nodes' processes, in one's environment. As whom we may not run,
+our own environment is used, where ROS 2 is sourced in it. Which participant of the domain answers
+under a node's name, DDS does not prove without its security plug-ins; two that do are noticed.
 """
 
-import subprocess
 import time
 from dataclasses import dataclass
 
@@ -15,7 +18,13 @@ from chainshaper.errors import OperationError
 from chainshaper.planning import Plan
 from chainshaper.planning.plan import shaping_nodes
 from chainshaper.sources.ros import parameter as ros_parameter
-from chainshaper.sources.ros.interpreter import environment_of, start_with_rclpy, why_it_failed
+from chainshaper.sources.ros.interpreter import (
+    Environment,
+    Script,
+    environment_of,
+    own_environment,
+    start_with_rclpy,
+)
 
 __all__ = ["NOBODY", "Telling", "moved_text", "tell_phase"]
 
@@ -27,29 +36,27 @@ _PATIENCE_S = 20
 class Telling:
     """Nodes that are being told, by a process of ours.
 
-    ``process`` is None where there is nobody to tell, or it was ``refused``; ``begun`` is s of
+    ``script`` is None where there is nobody to tell, or it was ``refused``; ``begun`` is s of
     CLOCK_MONOTONIC.
     """
 
     nodes: tuple[str, ...]
-    process: "subprocess.Popen[str] | None"
+    script: Script | None
     begun: float
     refused: str | None = None
 
     def is_over(self) -> bool:
         """Look whether the nodes know, or never will."""
         late = time.monotonic() - self.begun > _PATIENCE_S
-        return self.process is None or self.process.poll() is not None or late
+        return self.script is None or self.script.is_over() or late
 
     def end(self) -> tuple[str, ...]:
         """What went wrong, in words. To be called when it is over, or nobody waits for it."""
         problem = self.refused
-        if self.process is not None:
-            late = self.process.poll() is None
-            self.process.kill()
-            _, said = self.process.communicate()
-            unanswered = f"ROS 2 did not answer within {_PATIENCE_S} s"
-            problem = unanswered if late else why_it_failed(self.process, said)
+        if self.script is not None:
+            late = not self.script.is_over()
+            _, problem = self.script.end()
+            problem = f"ROS 2 did not answer within {_PATIENCE_S} s" if late else problem
         if problem is None:
             return ()
         return (
@@ -68,21 +75,37 @@ def tell_phase(plan: Plan, found: Allocation, phase_ns: int) -> Telling:
     ``phase_ns`` is where the chain begins in every cycle, on CLOCK_MONOTONIC. The nodes of a chain
     are in one domain: any of them has the environment in which all are found.
     """
-    environments = {}
-    for node in (one.thread.node for one in shaping_nodes(plan)):
-        pid = next((one.thread.pid for one in found.threads if node in one.nodes), None)
-        environment = environment_of(pid) if pid is not None else {}
-        if "AMENT_PREFIX_PATH" in environment:  # else it is the live workload's
-            environments[node] = environment
-    if not environments:
-        return NOBODY
-    nodes = tuple(environments)
-    arguments = ("phase_ns", str(phase_ns % plan.cycle_ns), *nodes)
+    pids = {
+        node: one.thread.pid
+        for node in (one.thread.node for one in shaping_nodes(plan))
+        for one in found.threads
+        if node in one.nodes
+    }
     try:
-        process = start_with_rclpy(environments[nodes[0]], ros_parameter.__file__, *arguments)
+        environments = {node: _environment_for(pid) for node, pid in pids.items()}
+        nodes = tuple(node for node, one in environments.items() if _is_ros(one))
+        if not nodes:  # they are the live workload's
+            return NOBODY
+        arguments = ("phase_ns", str(phase_ns % plan.cycle_ns), *nodes)
+        script = start_with_rclpy(environments[nodes[0]], ros_parameter.__file__, *arguments)
     except OperationError as error:
-        return Telling(nodes, None, 0.0, str(error))
-    return Telling(nodes, process, time.monotonic())
+        return Telling(tuple(pids), None, 0.0, str(error))
+    return Telling(nodes, script, time.monotonic())
+
+
+def _environment_for(pid: int) -> Environment:
+    """The environment of a node, or ours where nothing of the node's may be run."""
+    try:
+        return environment_of(pid)
+    except OperationError:
+        ours = own_environment()
+        if _is_ros(ours):
+            return ours
+        raise
+
+
+def _is_ros(environment: Environment) -> bool:
+    return "AMENT_PREFIX_PATH" in environment.variables
 
 
 def moved_text(drift_ns: int) -> str:

@@ -6,7 +6,7 @@ in a room.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -14,10 +14,10 @@ from chainshaper import events
 from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
 from chainshaper.durations import format_duration
 from chainshaper.errors import InputError
-from chainshaper.overruns import into_open_slots, overruns_in
+from chainshaper.overruns import dropped_in, into_open_slots, overruns_in
 from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain
 from chainshaper.planning.publisher_threads import publisher_servers
-from chainshaper.predictions import PredictionHeld, hold_prediction
+from chainshaper.predictions import PredictionHeld, due_of, hold_prediction
 from chainshaper.profiles import profile_of
 from chainshaper.recording import Recording
 from chainshaper.sources import open_source
@@ -40,6 +40,27 @@ _STANDARD = PlanRequest()
 
 
 @dataclass(frozen=True)
+class LeftOut:
+    """What was recorded before the plan came into force, and after its release (ns)."""
+
+    before_ns: int = 0
+    after_ns: int = 0
+
+    @property
+    def text(self) -> str | None:
+        """In words; None where it is nothing."""
+        parts = [
+            f"the {which} {format_duration(round(lasted, -6))}, {when}"
+            for which, lasted, when in (
+                ("first", self.before_ns, "before the plan came into force"),
+                ("last", self.after_ns, "after it was released"),
+            )
+            if round(lasted, -6)
+        ]
+        return f"left out: {' and '.join(parts)}" if parts else None
+
+
+@dataclass(frozen=True)
 class Measurement:
     """A recording with its chain's latency analysis.
 
@@ -47,8 +68,10 @@ class Measurement:
     ``overruns`` counts outputs that came too late for their publish slot, per policy that was
     applied to them: ``wait``, ``discard``, ``publish`` (None: nothing was gated);
     ``into_open_slots`` those that came in time, but too late to be held until their slot's start
-    (None: no gate decided). ``plan`` is the plan in force, and ``held`` its prediction beside this
-    measurement.
+    (None: no gate decided), and ``dropped`` messages that were lost at a gate, per reason. ``plan``
+    is the plan in force, and ``held`` its prediction beside this measurement. All of it is about
+    the time in which the plan was in force, where the recording says when that was: ``left_out``
+    names the rest.
     """
 
     recording: Recording
@@ -56,8 +79,10 @@ class Measurement:
     longest_stall_ns: int | None
     overruns: dict[str, int] | None
     into_open_slots: int | None
+    dropped: dict[str, int] | None
     plan: Plan | None
     held: PredictionHeld | None
+    left_out: LeftOut
 
 
 @dataclass(frozen=True)
@@ -92,9 +117,17 @@ def measure_latency(
     """
     if not isinstance(recording, Recording):
         recording = open_source(recording)
-    analysis = analyse_latency(recording, chain_of(recording, chain))
     if plan is None and recording.info.plan is not None:
         plan = Plan.model_validate(recording.info.plan, strict=False)
+    spell, left_out = _in_force(recording)
+    analysis = analyse_latency(
+        recording,
+        chain_of(recording, chain),
+        due=() if plan is None else due_of(plan),
+        between=spell,
+    )
+    if spell is not None:
+        recording = replace(recording, events=events.happened(recording.events, *spell))
     planned_for = plan is not None and plan.chain.output in (None, analysis.chain.topics[-1])
     return Measurement(
         recording=recording,
@@ -102,9 +135,23 @@ def measure_latency(
         longest_stall_ns=_longest_stall(recording),
         overruns=overruns_in(recording, plan, analysis),
         into_open_slots=into_open_slots(recording, plan),
+        dropped=dropped_in(recording),
         plan=plan,
-        held=hold_prediction(plan, recording, analysis) if plan and planned_for else None,
+        held=hold_prediction(plan, analysis) if plan and planned_for else None,
+        left_out=left_out,
     )
+
+
+def _in_force(recording: Recording) -> tuple[tuple[int, int | None] | None, LeftOut]:
+    """When the plan was in force, if not throughout, and what was recorded besides."""
+    spell, starts = recording.info.in_force, events.table(recording.events, "callback_start")
+    if spell is None or not starts.height:
+        return None, LeftOut()
+    first, last = int(starts["time"][0]), int(starts["time"][-1])
+    before = max(0, min(spell.since_ns, last) - first)
+    after = 0 if spell.until_ns is None else max(0, last - max(spell.until_ns, first))
+    within = (spell.since_ns, spell.until_ns) if before or after else None
+    return within, LeftOut(before, after)
 
 
 def _longest_stall(recording: Recording) -> int | None:

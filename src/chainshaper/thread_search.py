@@ -8,13 +8,19 @@ from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from chainshaper.enforcement.threads.allocation import Allocation, RecordedProcess, allocate
+from chainshaper.enforcement.threads.allocation import (
+    Allocation,
+    RecordedProcess,
+    allocate,
+    strangers_text,
+)
 from chainshaper.enforcement.threads.processes import (
     Process,
     descendants,
     find_applications,
     list_processes,
 )
+from chainshaper.enforcement.threads.users import run_users
 from chainshaper.errors import InputError
 
 if TYPE_CHECKING:
@@ -29,19 +35,22 @@ def find_threads(
     recording: "Recording | None" = None,
     *,
     recorded: Sequence[RecordedProcess] = (),
+    users: Collection[str | int] = (),
 ) -> Allocation:
     """Find the threads of an application and what each of them does.
 
     ``where`` is a process, which stands for its descendants too; a plan, for the nodes of its
     servers; or None for all that looks like an application of ROS 2 or DDS. ``recording`` is one
     of the processes that still run, if there is one; who looks often gives what it says about them,
-    ``recorded``, instead.
+    ``recorded``, instead. Only processes of ``users`` (names or numbers; default: who launched us,
+    and root) are nodes; a process that is asked for is, whoever runs it.
 
     Raises:
-        InputError: there is no such process.
+        InputError: there is no such process, or no such user.
     """
-    processes = list_processes()
+    processes, taken = list_processes(), run_users(users)
     notes: tuple[str, ...] = ()
+    strangers = None
     if recording is not None:
         # Reading events is slow to import: only who has a recording pays for it.
         from chainshaper.recorded_threads import recorded_processes
@@ -52,18 +61,25 @@ def find_threads(
         chosen = tuple(process for process in processes if process.pid in family)
         if not any(process.pid == where for process in chosen):
             raise InputError(f"no process {where}: it has ended, or is the kernel's own")
+        taken |= {process.user for process in chosen if process.user is not None}
     else:
-        found = allocate(find_applications(processes), recorded, among=processes)
+        found = allocate(find_applications(processes), recorded, processes, taken)
         nodes = {} if where is None else _planned_nodes(where)
         hosted = None if where is None else nodes.keys() | _receivers(where)
-        chosen = tuple(process for process in processes if _hosts(process, found, hosted))
+        chosen = tuple(
+            process
+            for process in processes
+            if process.user in taken and _hosts(process, found, hosted)
+        )
+        strangers = strangers_text(processes, taken, hosted)
         notes += _missing(found, nodes)
         if where is None and not chosen:
             notes += ("no process looks like an application of ROS 2 or DDS",)
-    found = allocate(chosen, recorded, among=processes)
+    found = allocate(chosen, recorded, processes, taken)
     if recorded and not any(one.nodes_known_by == "recording" for one in found.threads):
         notes += ("none of these processes is in the recording: they were started after it",)
-    return replace(found, notes=notes + found.notes)
+    notes += found.notes + (() if strangers is None else (strangers,))
+    return replace(found, notes=notes, strangers=strangers)
 
 
 def _planned_nodes(plan: "Plan") -> dict[str, str]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from chainshaper.errors import InputError, OperationError
 
-__all__ = ["new_file", "write_whole"]
+__all__ = ["new_file", "open_to_all", "write_whole"]
 
 
 def new_file(path: str | Path, endings: tuple[str, ...] = ()) -> Path:
@@ -45,10 +45,23 @@ def write_whole(path: Path, parts: Iterable[bytes]) -> Path:
             stream.writelines(parts)
             stream.flush()
             os.fsync(stream.fileno())
-        partial.chmod(0o644)
+            os.fchmod(stream.fileno(), 0o644)  # the name may be a link of a folder's owner by now
         partial.rename(path)
     except OSError as error:
         if partial is not None:
             partial.unlink(missing_ok=True)
         raise OperationError(f"{path}: the file cannot be written: {error.strerror}") from error
     return path
+
+
+def open_to_all(folder: Path) -> None:
+    """Let everybody read a folder that we have made; never what a link in its place leads to.
+
+    Raises:
+        OSError: it is no folder any more.
+    """
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        os.fchmod(descriptor, 0o755)
+    finally:
+        os.close(descriptor)

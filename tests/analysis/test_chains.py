@@ -343,7 +343,12 @@ def test_named_paths_of_caret(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "nodes: []", "named_paths: [{path_name: x}]", "named_paths: 3", "a: [b"]
+    "text",
+    [
+        *("", "nodes: []", "named_paths: [{path_name: x}]", "named_paths: 3", "a: [b", "[" * 2000),
+        "a: &a [*a]\n",
+        "a: &a0 [1, 1]\n" + "".join(f"a{n}: &a{n} [*a{n - 1}, *a{n - 1}]\n" for n in range(1, 40)),
+    ],
 )
 def test_files_that_are_no_caret_architecture(tmp_path: Path, text: str) -> None:
     file = tmp_path / "architecture.yaml"

@@ -8,24 +8,27 @@ from story import OFFSET, Story
 
 from chainshaper.analysis import data_flow, disturbed, find_chain, graph_of, traverse
 from chainshaper.analysis.disturbance import overlapping, stalled_within
+from chainshaper.analysis.punctuality import Due, with_punctuality
 
 
 def one_traversal(
     stalls: list[tuple[int, int]],
     release: int | None = None,
-    cycles_waited: int = 0,
+    overran: bool = False,
     arrival: int = 2_000,
+    due: Due | None = None,
 ) -> bool:
-    """A traversal from 1,000 to 10,000, whose last hop may be a gate with origin 1,300.
+    """A traversal from 1,000 to 100 behind ``release``, or to 10,000 without a gate.
 
-    Single stalls count from 50, those of a computing traversal from 200 in all.
+    The gate has the origin 1,300. Single stalls count from 50, computing ones from 200 in all.
     """
+    end = 10_000 if release is None else release + 100
     story = Story()
     source, gate = story.node("/source", 1), story.node("/gate", 2)
     timer, t1 = story.timer(source), story.publisher(source, "/tmp")
     hold, out = story.subscription(gate, "/tmp"), story.publisher(gate, "/t1")
     story.runs(timer, 1_000, 1_200, writes=((t1, 1_100),))
-    story.runs(hold, 2_000, 10_100, reads=1_100, writes=((out, 10_000),))
+    story.runs(hold, 2_000, end + 100, reads=1_100, writes=((out, end),))
     if release is not None:
         story.event(
             "gate_release",
@@ -37,15 +40,19 @@ def one_traversal(
             origin=1_300,
             release=release,
             slot=0,
-            cycles_waited=cycles_waited,
+            cycles_waited=int(overran),
             anchor="stamp",
+            overrun="wait" if overran else None,
         )
     for time, duration in stalls:
         story.event("machine_stall", time, 9, duration=duration)
     flow = data_flow(story.tables())
-    graph = graph_of(flow)
-    found = traverse(flow, find_chain(graph, "/tmp../t1"), graph)
-    (mask,) = disturbed(flow, found, threshold_ns=50, computing_threshold_ns=200, waking_ns=100)
+    found = traverse(flow, find_chain(graph_of(flow), "/tmp../t1"))
+    frame, _ = with_punctuality(flow, found, due)
+    margin = 0 if due is None else due.margin_ns
+    (mask,) = disturbed(
+        flow, frame, margin, threshold_ns=50, computing_threshold_ns=200, waking_ns=100
+    )
     return bool(mask)
 
 
@@ -70,27 +77,38 @@ def test_stalls_of_a_computing_traversal_add_up(stalls: list[tuple[int, int]], h
 @pytest.mark.parametrize(
     ("stall", "hit"),
     [
-        ((5_000, 3_000), False),  # absorbed by the wait
-        ((9_000, 800), False),  # over 100 before the release, 9,900
+        ((5_000, 3_000), False),  # the margin has room for it
+        ((5_000, 3_001), True),
+        ((9_000, 800), False),  # over 100 before the output is due, at 9,900
         ((9_000, 801), True),  # leaves too little time to wake up
         ((9_950, 60), True),
         ((9_950, 49), False),
-        ((10_001, 60), False),  # the output is out
+        ((10_001, 60), False),  # the output was due
+        ((10_001, 9_000), False),
         ((1_200, 100), True),  # while the origin is stamped
         ((1_301, 100), False),
         ((900, 100), False),  # over before the start
     ],
 )
-def test_a_gate_absorbs_stalls_before_its_release(stall: tuple[int, int], hit: bool) -> None:
-    assert one_traversal([stall], release=9_900) is hit
+@pytest.mark.parametrize("late", [False, True])
+def test_a_stall_counts_alike_whether_the_output_is_late_or_not(
+    stall: tuple[int, int], hit: bool, late: bool
+) -> None:
+    """Slot [8,600, 8,700) of a cycle of 20,000: what misses it leaves 20,000 later."""
+    due = Due(20_000, slots=((8_600, 8_700),), margin_ns=3_000)
+    release, arrival = (29_900, 10_050) if late else (9_900, 2_000)
+    assert one_traversal([stall], release, late, arrival, due) is hit
 
 
-def test_a_message_that_was_not_held_absorbed_nothing() -> None:
-    assert one_traversal([(5_000, 200)], release=9_900, cycles_waited=1)
-    assert one_traversal([(5_000, 200)], release=9_900, arrival=9_900)  # inside its slot
-    assert one_traversal([(5_000, 200)], release=9_900, arrival=9_950)
-    assert not one_traversal([(5_000, 199)], release=9_900, arrival=9_950)
-    assert one_traversal([(9_950, 60)], release=9_900, arrival=9_900)  # between release and output
+def test_without_a_plan_a_late_output_was_due_when_others_were_let_go() -> None:
+    assert one_traversal([(5_000, 200)], release=9_900)
+    assert not one_traversal([(5_000, 199)], release=9_900)
+
+
+def test_without_a_gate_what_comes_behind_the_cycle_it_was_due_in_is_no_excuse() -> None:
+    """A cycle of 6,000: the output was due at 7,000, and came at 10,000."""
+    assert one_traversal([(6_800, 200)], due=Due(6_000))
+    assert not one_traversal([(6_801, 3_000)], due=Due(6_000))
 
 
 def two_traversals(first_end: int) -> list[bool]:
@@ -102,9 +120,9 @@ def two_traversals(first_end: int) -> list[bool]:
     story.runs(timer, 2_000, 2_150, writes=((t1, 2_150),), tid=2)
     story.event("machine_stall", 1_200, 9, duration=300)
     flow = data_flow(story.tables())
-    graph = graph_of(flow)
-    found = traverse(flow, find_chain(graph, "/source../t1"), graph)
-    return list(disturbed(flow, found, threshold_ns=50, computing_threshold_ns=200))
+    found = traverse(flow, find_chain(graph_of(flow), "/source../t1"))
+    frame, _ = with_punctuality(flow, found, None)
+    return list(disturbed(flow, frame, threshold_ns=50, computing_threshold_ns=200))
 
 
 def test_who_queued_behind_a_disturbed_traversal_is_disturbed_with_it() -> None:

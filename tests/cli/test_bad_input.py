@@ -1,9 +1,13 @@
 """What people do by mistake: one message with the place and the remedy, and the right exit code."""
 
+import errno
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
+import polars as pl
 import pytest
 from command_line import called, chainshaper, message_of, refused
 from small_chain import small_chain_text
@@ -254,3 +258,56 @@ def test_the_exit_code_of_the_process_tells_the_kinds_of_failure_apart(
             assert finished.code == 0
         else:
             message_of(finished, code)
+
+
+def _lack_of_memory_below() -> None:
+    try:
+        raise MemoryError
+    except MemoryError as error:
+        raise ValueError("no matrix") from error
+
+
+def _enomem() -> None:
+    raise OSError(errno.ENOMEM, "Cannot allocate memory")
+
+
+def _polars_panics() -> None:
+    raise pl.exceptions.PanicException("assertion failed:\n offset")
+
+
+@pytest.mark.parametrize(
+    ("fails", "said"),
+    [
+        (lambda: np.zeros(1 << 60, np.uint8), "memory ran out (Unable to allocate 1.00 EiB"),
+        (lambda: bytearray(1 << 62), "memory ran out (Python could not allocate it)"),
+        (_lack_of_memory_below, "memory ran out (Python could not allocate it)"),
+        (_enomem, "memory ran out ([Errno 12] Cannot allocate memory)"),
+        (_polars_panics, "Polars cannot process this data (assertion failed: offset): check"),
+    ],
+)
+def test_memory_that_runs_out_is_one_message(fails: Callable[[], object], said: str) -> None:
+    with mock.patch("chainshaper.cli.app.app", lambda *_, **__: fails()):
+        message = refused(1, "info")
+    assert said in message
+    assert message.count("\n") == 1
+
+
+def test_other_mistakes_of_ours_stay_tracebacks() -> None:
+    with (
+        mock.patch("chainshaper.cli.app.app", side_effect=KeyError("x")),
+        pytest.raises(KeyError),
+    ):
+        called("info")
+
+
+@pytest.mark.parametrize("megabytes", [100, 400, 650])
+def test_limited_memory_ends_in_one_message_whoever_wanted_more(
+    megabytes: int, unshaped: Recording
+) -> None:
+    limited = ("sh", "-c", f'ulimit -v {megabytes * 1000}; exec "$@"', "sh")
+    finished = chainshaper("latency", unshaped.path, prefix=limited)
+    assert "Traceback" not in finished.err
+    # OpenBLAS ends the process by itself, with its own message.
+    last = finished.err.strip().splitlines()[-1]
+    assert finished.code == 1
+    assert last.startswith(("error: memory ran out", "OpenBLAS error: Memory allocation"))

@@ -194,7 +194,7 @@ def test_auto_shows_the_curve_and_says_why_it_stops(tmp_path: Path) -> None:
         (("--policy", "let-per-chain", "--bands", "3"), "--bands places latency bands"),
         (("--policy", "let-per-callback"), "needs the chain's callbacks"),
         (("--policy", "server-per-callback"), "needs the chain's callbacks"),
-        (("--epsilon", "1ms", "--overrun-probability", "1e-6"), "either given or derived"),
+        (("--epsilon", "1ms", "--overrun-probability", "1e-6"), "either given or covers a share"),
         (("--sink", "/a../b"), "give a recording for several"),
     ],
 )
@@ -232,7 +232,7 @@ def test_slots_do_not_depend_on_who_publishes(policy: str, tmp_path: Path) -> No
     file = tmp_path / "latencies.txt"
     file.write_text("40ms\n61ms\n70ms\n85ms\n")
     common: list[str | Path] = ["plan", "--latencies", file, "--period", "100ms"]
-    common += ["--policy", policy, "--publication"]
+    common += ["--policy", policy, "--overrun", "wait", "--publication"]
     assert json_of(*common, "asynchronous") == json_of(*common, "synchronous")
 
 

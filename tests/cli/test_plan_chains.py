@@ -76,20 +76,40 @@ def test_impossible_offsets_are_explained(tmp_path: Path) -> None:
     assert "collide at every offset" in refused(1, "offsets", *files)
 
 
-def test_several_chains_of_a_recording(tmp_path: Path, unshaped: Recording) -> None:
+TWO_CHAINS = Path(__file__).parents[2] / "examples" / "two_chains.yaml"
+
+
+@pytest.fixture(scope="module")
+def two_chains(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("numba")
+    folder = tmp_path_factory.mktemp("two_chains") / "rec"
+    assert called("simulate", TWO_CHAINS, "-o", folder, "--cycles", "100").code == 0
+    return folder
+
+
+def test_several_chains_of_a_recording(tmp_path: Path, two_chains: Path) -> None:
+    folder = tmp_path / "plans"
+    chains = ("--chain", "/scan../command", "--chain", "/image../label")
+    values = json_of("plan", two_chains, *chains, "-o", folder)
+    assert [plan["chain"]["spec"] for plan in values["plans"]] == list(chains[1::2])
+    assert sorted(path.name for path in folder.iterdir()) == ["1_command.yaml", "2_label.yaml"]
+    assert "one by one" in refused(2, "plan", two_chains, *chains, "--sink", "/scan../map")
+
+
+def test_a_further_sink(two_chains: Path) -> None:
+    values = json_of("plan", two_chains, "--chain", "/scan../command", "--sink", "/scan../map")
+    assert [node["output"] for node in values["further_shaping_nodes"]] == ["/map"]
+    twice = refused(2, "plan", two_chains, "--sink", "/scan../command")
+    assert "both publish /command" in twice
+
+
+def test_what_would_be_planned_wrong_is_refused(unshaped: Recording, tmp_path: Path) -> None:
     folder = tmp_path / "plans"
     chains = ("--chain", "/t1../t3", "--chain", "/t1../t2")
-    values = json_of("plan", unshaped.path, *chains, "-o", folder, "--publish-slot", "100us")
-    assert [plan["chain"]["spec"] for plan in values["plans"]] == ["/t1../t3", "/t1../t2"]
-    assert sorted(path.name for path in folder.iterdir()) == ["1_t3.yaml", "2_t2.yaml"]
-    assert "one by one" in refused(2, "plan", unshaped.path, *chains, "--sink", "/t1../t2")
-
-
-def test_a_further_sink(unshaped: Recording) -> None:
-    values = json_of("plan", unshaped.path, "--sink", "/t1../t2", "--publish-slot", "100us")
-    assert [node["output"] for node in values["further_shaping_nodes"]] == ["/t2"]
-    twice = refused(2, "plan", unshaped.path, "--sink", "/t1../t3")
-    assert "the plan shapes /t3 already" in twice
+    for wanted in (chains, ("--sink", "/t1../t2")):
+        said = refused(2, "plan", unshaped.path, *wanted, "-o", folder, "--publish-slot", "100us")
+        assert "/t1../t3 waits for /t2, which the plan for /t1../t2" in said
+        assert not folder.exists()
 
 
 def test_a_plan_says_that_events_were_lost(unshaped: Recording, tmp_path: Path) -> None:

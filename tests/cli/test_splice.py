@@ -22,7 +22,9 @@ def test_it_shows_a_diff_and_what_to_launch(files: tuple[Path, Path, Path]) -> N
     plan, robot, folder = files
     finished = called("splice", plan, robot, "-o", folder)
     lines = finished.out.splitlines()
-    assert (finished.code, finished.err) == (0, "")
+    assert finished.code == 0
+    (said,) = finished.err.splitlines()
+    assert said.startswith("note: the sample is small: 2 cycles"), "before the plan is used"
     assert lines[:2] == [f"--- {robot}", f"+++ {folder}/robot.launch.xml"]
     assert '-  <node pkg="robot" exec="third" name="third"/>' in lines
     assert '+    <remap from="/t3" to="/t3_tmp"/>' in lines
@@ -38,7 +40,10 @@ def test_its_json_says_the_same(files: tuple[Path, Path, Path]) -> None:
     assert said["launch"] == {str(robot): copy}
     assert said["originals"] == {copy: str(robot)}
     assert said["nodes"] == ["chainshaper_t3"]
-    assert said["logs"] == [str(folder / "logs/chainshaper_t3.csv")]
+    assert said["standbys"] == ["chainshaper_t3_standby"]
+    assert said["logs"] == [
+        str(folder / f"logs/{name}.csv") for name in ("chainshaper_t3", "chainshaper_t3_standby")
+    ]
     assert said["diff"].startswith(f"--- {robot}\n")
     assert (said["notes"], said["setup"]) == ([], None)
 
@@ -49,6 +54,18 @@ def test_notes_go_to_standard_error(files: tuple[Path, Path, Path]) -> None:
     finished = called("splice", plan, robot, "-o", folder)
     assert "note: " in finished.err
     assert "the remap is bound to the name third" in finished.err
+
+
+def test_the_fallback_is_the_plan_s_or_the_option_s(files: tuple[Path, Path, Path]) -> None:
+    plan, robot, folder = files
+    fallbacks = []
+    for options in ([], ["--fallback", "silence"]):
+        assert called("splice", plan, robot, "-o", folder, *options).code == 0
+        parameters = folder / "shaping_nodes" / "chainshaper_t3_standby.yaml"
+        fallbacks.append("fallback: silence" in parameters.read_text())
+    assert fallbacks == [False, True]
+    refusal = refused(2, "splice", "--throttle", "/a:/t=1ms", robot, "-o", folder, *options)
+    assert "a throttler has no fallback" in refusal
 
 
 def test_launch_arguments_are_written_as_for_ros2_launch(files: tuple[Path, Path, Path]) -> None:

@@ -1,5 +1,6 @@
 """Plans put in force by `chainshaper apply` on real processes, and what must be true afterwards."""
 
+import os
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,8 +14,9 @@ from processes import children_of, wait_for
 
 from chainshaper.enforcement.freezer import cgroups
 from chainshaper.enforcement.realtime import available_cores, may_use_fifo
-from chainshaper.enforcement.runs.journal import journals_folder
-from chainshaper.enforcement.threads.listing import list_threads
+from chainshaper.enforcement.runs.journal import find_journals
+from chainshaper.enforcement.threads.listing import list_threads, parents, start_of
+from chainshaper.enforcement.threads.processes import descendants
 from chainshaper.planning import Plan, save_plan
 from chainshaper.planning.plan_parts import (
     ChainOfPlan,
@@ -33,9 +35,8 @@ needs_fifo = pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not pe
 
 
 MODULES = {
-    "supervisor": "chainshaper.enforcement.freezer.supervisor",
+    "guardian": "chainshaper.enforcement.runs.guardian",
     "dispatcher": "chainshaper.enforcement.freezer.slot_dispatcher",
-    "watcher": "chainshaper.enforcement.runs.release_after",
 }
 FREEZER = ("--backend", "freezer", "--phase", "0ms")
 
@@ -121,9 +122,12 @@ def scheduling(pid: int) -> list[object]:
 
 
 def leftovers() -> list[Path]:
-    """Groups and runs of ours that are on this machine."""
-    runs = journals_folder()
-    return [*groups_left(), *(runs.iterdir() if runs.is_dir() else ())]
+    """Groups and runs that are on this machine, those of living processes of others apart."""
+    ours = {None, *descendants(parents(), os.getpid())}
+    runs = [journal.path.parent for journal in find_journals() if journal.owner in ours]
+    owners = {group: int(group.name.split("-")[1].split(".")[0]) for group in groups_left()}
+    gone = (g for g, pid in owners.items() if pid in ours or start_of(pid, pid) is None)
+    return [*runs, *(group for group in gone if not cgroups.has_unseen_threads(group))]
 
 
 @dataclass(frozen=True)
@@ -174,8 +178,7 @@ def processes_of(run: subprocess.Popen[str], name: str) -> list[int]:
     """Processes of a run by what they do; `apply` itself is the run."""
     if name == "apply":
         return [run.pid]
-    own = [pid for child in children_of(run.pid) for pid in (child, *children_of(child))]
-    return [pid for pid in own if MODULES[name] in command_line(pid)]
+    return [pid for pid in children_of(run.pid) if MODULES[name] in command_line(pid)]
 
 
 def command_line(pid: int) -> str:

@@ -1,13 +1,16 @@
 """A stand-in for a ROS 2 node that starts processes once it is told to.
 
-    python forking_node.py TRIGGER OUTPUT --ros-args -r __node:=NAME
+    python forking_node.py TRIGGER OUTPUT [dds] --ros-args -r __node:=NAME
 
 When the file TRIGGER appears, it forks a child, and another that forks a daemon (whose parent ends,
 and which has a session of its own), and writes the ids of the child and of the daemon to OUTPUT.
+With `dds` it has a thread as DDS has, which tells it from what it forks.
 """
 
+import ctypes
 import os
 import sys
+import threading
 import time
 
 
@@ -16,8 +19,15 @@ def wait_a_minute() -> None:
     os._exit(0)
 
 
+def dds_thread() -> None:
+    ctypes.CDLL(None).prctl(15, b"recvUC", 0, 0, 0)
+    time.sleep(600)
+
+
 def main() -> None:
     trigger, output = sys.argv[1:3]
+    if sys.argv[3] == "dds":
+        threading.Thread(target=dds_thread, daemon=True).start()
     while not os.path.exists(trigger):  # noqa: PTH110 - as little as possible is imported
         time.sleep(0.01)
     child = os.fork()

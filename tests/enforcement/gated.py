@@ -143,7 +143,7 @@ def share_inside(
 
 def groups_left(owner_pid: int | None = None) -> list[Path]:
     """Cgroups that a run of this owner, or of any, has not removed."""
-    name = "chainshaper-*" if owner_pid is None else f"chainshaper-{owner_pid}-*"
+    name = "chainshaper-*" if owner_pid is None else f"chainshaper-{owner_pid}.*"
     while True:
         with contextlib.suppress(FileNotFoundError):  # one was removed while we looked: once more
             return sorted(mount_point().rglob(name))

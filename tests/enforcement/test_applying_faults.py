@@ -47,29 +47,33 @@ pytestmark = [needs_fifo, needs_cgroups]
 
 
 @pytest.mark.parametrize(
-    ("victim", "number", "told"),
+    ("number", "guardians", "reason"),
     [
-        ("dispatcher", signal.SIGKILL, "dispatcher of core {core} was killed by SIGKILL"),
-        ("dispatcher", signal.SIGSTOP, "dispatcher of core {core} hung, or somebody stopped it"),
-        ("supervisor", signal.SIGKILL, "the supervisor was killed by SIGKILL"),
-        ("supervisor", signal.SIGSTOP, "(it hung, or was stopped)"),
+        (signal.SIGKILL, None, "dispatcher of core {core} was killed by SIGKILL"),
+        (signal.SIGSTOP, None, "dispatcher of core {core} hung, or somebody stopped it"),
+        (signal.SIGKILL, signal.SIGKILL, "dispatcher of core {core} was killed by SIGKILL"),
+        (signal.SIGKILL, signal.SIGSTOP, "dispatcher of core {core} was killed by SIGKILL"),
     ],
 )
-def test_when_a_process_of_the_servers_is_lost_the_run_ends_and_says_which(
-    tmp_path: Path, victim: str, number: signal.Signals, told: str
+def test_when_a_dispatcher_is_lost_the_run_ends_and_says_so(
+    tmp_path: Path, number: signal.Signals, guardians: signal.Signals | None, reason: str
 ) -> None:
-    chance = random.Random(f"{victim} {number}")
-    with node_to_govern(tmp_path) as governed:
-        for _ in range(2 if number == signal.SIGKILL else 1):
-            with applied(one_server_plan(), tmp_path, *FREEZER) as run:
-                time.sleep(chance.uniform(0, 0.2))
-                (pid,) = processes_of(run, victim)
-                kill(pid, number)
-                said = ended(run)
-            assert run.returncode == 1
-            assert told.format(core=one_server_plan().servers[0].core) in said
-            assert "everything is as it was before" in said
-            governed.check_as_before()
+    """Also with both guardians: `apply` looks itself, every second."""
+    chance = random.Random(f"{number} {guardians}")
+    with (
+        node_to_govern(tmp_path) as governed,
+        applied(one_server_plan(), tmp_path, *FREEZER) as run,
+    ):
+        time.sleep(chance.uniform(0, 0.2))
+        for pid in processes_of(run, "guardian") if guardians else ():
+            kill(pid, guardians or 0)
+        (pid,) = processes_of(run, "dispatcher")
+        kill(pid, number)
+        said = ended(run)
+        assert run.returncode == 1
+        assert reason.format(core=one_server_plan().servers[0].core) in said
+        assert "everything is as it was before" in said
+        governed.check_as_before()
 
 
 def test_a_killed_run_is_undone_at_whatever_moment(tmp_path: Path) -> None:
@@ -83,7 +87,7 @@ def test_a_killed_run_is_undone_at_whatever_moment(tmp_path: Path) -> None:
                 governed.check_as_before()
 
 
-@pytest.mark.parametrize("victim", ["apply", "watcher", "supervisor", "dispatcher"])
+@pytest.mark.parametrize("victim", ["apply", "guardian", "dispatcher"])
 def test_what_is_killed_while_a_run_starts_leaves_nothing(tmp_path: Path, victim: str) -> None:
     chance = random.Random(f"{victim} at start")
     with node_to_govern(tmp_path) as governed:
@@ -115,21 +119,26 @@ def test_a_stopped_run_goes_on_being_served_and_can_be_released(tmp_path: Path) 
         governed.check_as_before()
 
 
-def test_a_killed_watcher_is_replaced_and_a_stopped_one_does_no_harm(tmp_path: Path) -> None:
-    with node_to_govern(tmp_path) as governed:
-        with applied(one_server_plan(), tmp_path, *FREEZER) as run:
-            (first,) = processes_of(run, "watcher")
-            kill(first)
-            wait_for(lambda: processes_of(run, "watcher") not in ([], [first]), "another watcher")
-            run.kill()
-            run.wait()
-            governed.check_as_before()
-        with applied(one_server_plan(), tmp_path, *FREEZER) as run:
-            (pid,) = processes_of(run, "watcher")
-            kill(pid, signal.SIGSTOP)
-            run.send_signal(signal.SIGINT)
-            assert run.wait(timeout=20) == 0
-            governed.check_as_before()
+@pytest.mark.parametrize("back_end", ["freezer", "fifo"])
+def test_lost_guardians_are_replaced_and_the_plan_stays_in_force(
+    tmp_path: Path, back_end: str
+) -> None:
+    options = ("--backend", back_end, "--phase", "0ms")
+    with (
+        node_to_govern(tmp_path) as governed,
+        applied(one_server_plan(), tmp_path, *options) as run,
+    ):
+        lost = processes_of(run, "guardian")
+        assert len(lost) == 2
+        kill(lost[0], signal.SIGKILL)
+        kill(lost[1], signal.SIGSTOP)
+        wait_for(lambda: len(set(processes_of(run, "guardian")) - set(lost)) == 2, "others")
+        assert scheduling(governed.pid) != governed.scheduling
+        time.sleep(0.5)  # until they watch
+        kill(processes_of(run, "guardian")[0], signal.SIGSTOP)
+        run.kill()
+        run.wait()
+        governed.check_as_before()
 
 
 def test_an_application_that_is_killed_ends_the_run_and_it_says_so(tmp_path: Path) -> None:

@@ -22,12 +22,13 @@ from gated import (
     sleeping,
     stamping,
 )
-from processes import children_of, wait_for
+from processes import wait_for
 
 from chainshaper.enforcement.freezer import cgroups
 from chainshaper.enforcement.freezer.back_end import Freezer, create
 from chainshaper.enforcement.freezer.slot_dispatcher import PRIORITY, overrun
 from chainshaper.enforcement.realtime import may_use_fifo
+from chainshaper.enforcement.runs.journal import discard_journal, open_journal
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.enforcement.threads.listing import list_threads
 
@@ -42,16 +43,17 @@ def freezer(folder: Path, cycle: int, *slots: tuple[tuple[int, int], ...]) -> It
     servers = tuple(
         ReservationServer(f"server-{number}", CORE, 1, own) for number, own in enumerate(slots)
     )
-    back_end = create(ServerTable(cycle, servers), folder / "run")
+    journal = open_journal(folder)
+    back_end = create(ServerTable(cycle, servers), journal)
     try:
         yield back_end
     finally:
         back_end.release()
+        discard_journal(journal)
 
 
 def dispatcher_of(back_end: Freezer) -> int:
-    (pid,) = children_of(back_end.supervisor)
-    return pid
+    return back_end.dispatchers[CORE]
 
 
 def frozen(folder: Path) -> bool:
@@ -65,8 +67,6 @@ def test_it_runs_on_the_core_that_it_gates_above_everything_there(tmp_path: Path
         (thread,) = list_threads(dispatcher_of(back_end))
         assert (thread.policy, thread.priority, thread.cores) == ("SCHED_FIFO", PRIORITY, (CORE,))
         assert thread.comm == f"dispatcher/{CORE}"
-        (watcher,) = list_threads(back_end.supervisor)
-        assert watcher.priority > PRIORITY
         assert back_end.real_time()
         status = Path(f"/proc/{thread.pid}/status").read_text()
         locked = next(line for line in status.splitlines() if line.startswith("VmLck"))
@@ -76,11 +76,9 @@ def test_it_runs_on_the_core_that_it_gates_above_everything_there(tmp_path: Path
 def test_what_a_terminal_sends_is_not_for_them(tmp_path: Path) -> None:
     with freezer(tmp_path, CYCLE, ((0, 5 * MS),)) as back_end:
         dispatcher = dispatcher_of(back_end)
-        assert os.getsid(back_end.supervisor) != os.getsid(0)
         assert os.getsid(dispatcher) != os.getsid(0)
         for number in (signal.SIGINT, signal.SIGHUP):
             kill(dispatcher, number)
-            kill(back_end.supervisor, number)
         time.sleep(0.2)
         assert back_end.failure() is None
         assert dispatcher_of(back_end) == dispatcher
@@ -95,8 +93,8 @@ def test_without_the_class_it_gates_as_well_as_it_can_and_says_so(tmp_path: Path
         libc.prctl(24, CAP_SYS_NICE, 0, 0, 0)
 
     with stamping(tmp_path, 30) as spinner:
-        script = Path(__file__).with_name("freezer_owner.py")
-        arguments = [tmp_path / "run", CORE, 40, 20, spinner.tid]
+        script = Path(__file__).with_name("servers_owner.py")
+        arguments = ["freezer", tmp_path, CORE, 40, 20, spinner.tid]
         owner = subprocess.Popen(
             [sys.executable, str(script), *map(str, arguments)],
             stdin=subprocess.PIPE,
@@ -217,5 +215,4 @@ def test_what_it_writes_to_is_on_no_disk(tmp_path: Path) -> None:
             line for line in maps if line.split()[1].startswith("rw") and "s" in line.split()[1]
         ]
         assert len(shared) == 1
-        assert "/memfd:freezer.counters" in shared[0]
-        assert Path(tmp_path / "run" / "freezer.counters").is_symlink()
+        assert "/memfd:counters" in shared[0]

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from passing import decided
 
 from chainshaper.enforcement import gate as gate_module
 from chainshaper.enforcement.gate import Gate, Release, Shaper, origin_of, release_of
@@ -25,10 +26,10 @@ def test_a_new_phase_is_in_force_from_the_next_cycle_that_begins_there(
 ) -> None:
     shaper = Shaper(Gate(((60 * MS, 61 * MS),), 100 * MS, anchor="cycle"))
     shaper.set_phase(phase * MS, 100 * MS if phase == 13 else 100 * MS + 1)
-    before = shaper.decide(b"", first_ms * MS - 1)
+    before = decided(shaper, b"", first_ms * MS - 1)
     assert before.origin_ns == 100 * MS, "what comes until then belongs to a cycle as it was"
-    assert shaper.decide(b"", first_ms * MS).origin_ns == first_ms * MS
-    assert shaper.decide(b"", (first_ms + 100) * MS).origin_ns == (first_ms + 100) * MS
+    assert decided(shaper, b"", first_ms * MS).origin_ns == first_ms * MS
+    assert decided(shaper, b"", (first_ms + 100) * MS).origin_ns == (first_ms + 100) * MS
 
 
 @pytest.mark.parametrize(
@@ -217,23 +218,23 @@ def test_a_step_of_the_wall_clock_disturbs_no_message(monkeypatch: pytest.Monkey
     shaper = Shaper(Gate(((60 * MS, 61 * MS),), 100 * MS))
 
     started = 5 * SECOND + 42 * MS
-    before = shaper.decide(message(started + offset), started + 30 * MS)
+    before = decided(shaper, message(started + offset), started + 30 * MS)
     assert (before.anchor, before.at_ns) == ("stamp", started + 60 * MS)
 
     under_way = message(started + 100 * MS + offset)
     offset += 3600 * SECOND
-    during = shaper.decide(under_way, started + 130 * MS)
+    during = decided(shaper, under_way, started + 130 * MS)
     assert (during.anchor, during.at_ns) == ("cycle", started + 160 * MS)
 
-    after = shaper.decide(message(started + 200 * MS + offset), started + 230 * MS)
+    after = decided(shaper, message(started + 200 * MS + offset), started + 230 * MS)
     assert (after.anchor, after.at_ns) == ("stamp", started + 260 * MS)
 
 
 def test_a_shaper_without_stamps_keeps_the_phase_of_the_last_good_one() -> None:
     shaper = Shaper(Gate(((60 * MS, 61 * MS),), 100 * MS))
     offset = gate_module.clock_offset()
-    good = shaper.decide(message(5_042 * MS + offset), 5_072 * MS)
-    stampless = shaper.decide(message(0), 5_172 * MS)
+    good = decided(shaper, message(5_042 * MS + offset), 5_072 * MS)
+    stampless = decided(shaper, message(0), 5_172 * MS)
     assert stampless.anchor == "cycle"
     assert good.at_ns is not None
     assert stampless.at_ns is not None

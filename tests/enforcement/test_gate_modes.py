@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from passing import decided
 
 from chainshaper.enforcement import gate as gate_module
 from chainshaper.enforcement.gate import LATE, Gate, Modes, Shaper, release_of, text_of
@@ -168,17 +169,17 @@ def test_a_shaper_follows_the_modes_that_are_announced(monkeypatch: pytest.Monke
     slots = tuple((start * MS, end * MS) for start, end in GATE.slots)
     shaper = Shaper(Gate(slots=slots, cycle_ns=100 * MS, modes=MODES))
     assert shaper.mode == "city"
-    assert shaper.decide(_at(1000 * MS), 1010 * MS).at_ns == 1060 * MS
+    assert decided(shaper, _at(1000 * MS), 1010 * MS).at_ns == 1060 * MS
 
     assert shaper.switch("highway", 1050 * MS)
     assert shaper.mode == "highway"
-    assert shaper.decide(_at(1000 * MS), 1055 * MS).at_ns == 1060 * MS, "its cycle was begun"
-    assert shaper.decide(_at(1100 * MS), 1110 * MS).at_ns == 1120 * MS
+    assert decided(shaper, _at(1000 * MS), 1055 * MS).at_ns == 1060 * MS, "its cycle was begun"
+    assert decided(shaper, _at(1100 * MS), 1110 * MS).at_ns == 1120 * MS
 
     assert shaper.switch("highway", 1150 * MS), "no change, but a mode that exists"
     assert not shaper.switch("sea", 1150 * MS)
     assert not shaper.switch(None, 1150 * MS)
-    assert shaper.decide(_at(1200 * MS), 1210 * MS).mode == "highway"
+    assert decided(shaper, _at(1200 * MS), 1210 * MS).mode == "highway"
 
 
 def test_a_shaper_without_modes_has_none() -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +16,8 @@ from chainshaper.enforcement.runs.journal import (
     find_journals,
     journals_folder,
     open_journal,
+    process_of,
+    remembered_journal,
 )
 from chainshaper.errors import OperationError, PlatformError
 
@@ -59,13 +62,48 @@ def test_what_was_cut_off_does_not_spoil_what_is_noted_behind_it(tmp_path: Path)
 
 
 @pytest.mark.parametrize("line", ["hello", "[1]", '"kind"', "{}", '{"path": 1}'])
-def test_what_is_no_line_of_a_journal_is_named(tmp_path: Path, line: str) -> None:
+def test_what_is_no_line_of_a_journal_is_passed_over_and_named(tmp_path: Path, line: str) -> None:
     journal = open_journal(tmp_path, "run")
     with journal.path.open("a") as stream:
         stream.write(line + "\n")
     journal.note("cgroup", path="b")
-    with pytest.raises(OperationError, match=r"journal\.jsonl, line 2: not a line of a journal"):
-        journal.entries()
+    assert [entry["kind"] for entry in journal.entries()] == ["opened", "cgroup"]
+    known = {"opened": process_of, "cgroup": lambda entry: entry["path"]}
+    assert journal.strange_lines(known) == ((2, line),)
+    assert journal.strange_lines({"opened": process_of})[1][0] == 3, "of no kind that is known"
+    assert journal.read("cgroup", lambda entry: entry["type"]) == (), "it has no such field"
+    assert journal.owner == os.getpid()
+
+
+def test_many_changes_are_one_write(tmp_path: Path) -> None:
+    journal = open_journal(tmp_path, "run")
+    journal.note_all("cgroup", ({"path": str(number)} for number in range(3)))
+    assert [entry["path"] for entry in journal.entries("cgroup")] == ["0", "1", "2"]
+
+
+def test_a_journal_whose_folder_is_removed_stays_known_to_those_who_have_it_open(
+    tmp_path: Path,
+) -> None:
+    journal = open_journal(tmp_path, "run")
+    journal.note("cgroup", path="a")
+    shutil.rmtree(journal.path.parent)
+    assert [entry["path"] for entry in journal.entries("cgroup")] == ["a"]
+    assert Journal(journal.path).entries() == ()
+    journal.note("cgroup", path="b")
+    assert [entry["path"] for entry in Journal(journal.path).entries("cgroup")] == ["a", "b"]
+    shutil.rmtree(journal.path.parent)
+    assert journal.keep()
+    assert [entry["path"] for entry in Journal(journal.path).entries("cgroup")] == ["a", "b"]
+    assert journal.path.stat().st_mode & 0o077 == 0
+
+
+def test_a_journal_that_was_discarded_is_not_written_again(tmp_path: Path) -> None:
+    journal = open_journal(tmp_path, "run")
+    other = remembered_journal(journal.path)
+    discard_journal(journal)
+    assert not other.keep()
+    assert other.entries() == ()
+    assert not journal.path.exists()
 
 
 def test_a_second_journal_of_the_same_run_is_refused(tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from subprocess import PIPE
 
 import pytest
 from applied_plans import CYCLE, MS, needs_fifo, plan_for, running_node, server
@@ -23,6 +22,7 @@ from chainshaper.enforcement.phase import DriftWatch
 from chainshaper.enforcement.runs.state import RunState
 from chainshaper.planning import Plan
 from chainshaper.shaping_phase import NOBODY, Telling
+from chainshaper.sources.ros.interpreter import Script
 
 
 @contextmanager
@@ -49,8 +49,9 @@ def applied(
 
 def telling(*command: str) -> Telling:
     """Somebody is told by a command."""
-    process = subprocess.Popen(command, stdout=PIPE, stderr=PIPE, text=True)
-    return Telling(("/shaper",), process, time.monotonic())
+    printed, said = os.memfd_create("printed"), os.memfd_create("said")
+    process = subprocess.Popen(command, stdout=printed, stderr=said, start_new_session=True)
+    return Telling(("/shaper",), Script(process, printed, said), time.monotonic())
 
 
 @needs_fifo
@@ -102,8 +103,8 @@ def test_it_can_be_stopped_before_the_nodes_were_told(
     ):
         wait_for(lambda: bool(tellings), "the nodes to be told")
     (only,) = tellings
-    assert only.process is not None
-    assert only.process.returncode == -signal.SIGKILL
+    assert only.script is not None
+    assert only.script.process.returncode == -signal.SIGKILL
 
 
 def test_a_node_that_never_answers_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:

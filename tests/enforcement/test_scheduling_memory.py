@@ -19,12 +19,15 @@ from chainshaper.enforcement.runs import journal as journal_module
 from chainshaper.enforcement.runs.journal import Journal, find_journals, open_journal
 from chainshaper.enforcement.runs.scheduling_memory import (
     Outcome,
+    change_all,
     change_scheduling,
+    look_alikes,
+    note_descendants,
     restore_inherited,
     restore_scheduling,
 )
 from chainshaper.enforcement.runs.scheduling_state import SchedulingState, set_state, state_of
-from chainshaper.enforcement.threads.listing import RESET_ON_FORK, Scheduling
+from chainshaper.enforcement.threads.listing import RESET_ON_FORK, Scheduling, list_threads
 from chainshaper.errors import OperationError
 
 pytestmark = pytest.mark.skipif(
@@ -293,3 +296,56 @@ def test_a_state_can_be_set_aspect_by_aspect(tmp_path: Path) -> None:
         wait_for(lambda: not Path(f"/proc/{actor.pid}/task/{tid}").exists(), "its end")
         with pytest.raises(ProcessLookupError):
             set_state(tid, before, ["cores"])
+
+
+def test_many_threads_are_written_down_at_once_and_again_only_when_they_change(
+    tmp_path: Path, journal: Journal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written: list[int] = []
+    monkeypatch.setattr(os, "fsync", written.append)
+    with acting(tmp_path, *(f"t{number}" for number in range(20))) as actor:
+        wanted = [(thread, WANTED) for thread in list_threads(actor.pid)]
+        change_all(journal, wanted)
+        assert len(written) == 1
+        change_all(journal, wanted)
+        assert len(written) == 1
+        assert len(restore_scheduling(journal)) == 21
+
+
+def test_a_descendant_is_known_by_what_was_written_down_when_its_parent_has_ended(
+    tmp_path: Path, journal: Journal
+) -> None:
+    with acting(tmp_path) as actor:
+        before = state_of(actor.pid)
+        change_scheduling(journal, actor.thread("main"), WANTED)
+        time.sleep(0.05)
+        between = actor.fork()  # dies with its parent, unless that is told otherwise
+        note_descendants(journal)
+        note_descendants(journal)
+        assert [entry["pid"] for entry in journal.entries("descendant")] == [between]
+        text = journal.path.read_text()
+        # As if it had lost its parent: the thread of the journal is another process's.
+        journal.path.write_text(text.replace(f'"pid": {actor.pid}, "comm"', '"pid": 1, "comm"'))
+        assert {one.tid for one in restore_inherited(journal)} == {between}
+        assert state_of(between) == before
+        journal.path.write_text(text)
+        restore_scheduling(journal)
+
+
+def test_a_stranger_with_all_that_we_gave_is_named_and_left(
+    tmp_path: Path, journal: Journal
+) -> None:
+    (tmp_path / "other").mkdir()
+    with acting(tmp_path) as actor, acting(tmp_path / "other") as other:
+        time.sleep(0.05)
+        change_scheduling(journal, actor.thread("main"), WANTED)
+        assert look_alikes(journal) == ()
+        with subprocess.Popen(["sleep", "60"]) as stranger:
+            set_state(stranger.pid, state_of(actor.pid), ["scheduling_class", "cores"])
+            set_state(other.pid, state_of(actor.pid), ["scheduling_class", "cores"])  # older
+            (named,) = look_alikes(journal)
+            assert f"thread {stranger.pid} (sleep) is left as it is: SCHED_FIFO 30" in named
+            restore_scheduling(journal)
+            assert state_of(stranger.pid).scheduling_class.priority == 30
+            assert state_of(other.pid).scheduling_class.priority == 30
+            stranger.kill()

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from chainshaper.enforcement.own_processes import what_happened
 from chainshaper.enforcement.scx import back_end as scx
 from chainshaper.enforcement.scx import libbpf
 from chainshaper.enforcement.scx import requirements as scx_requirements
-from chainshaper.enforcement.scx.kicker import what_happened
 from chainshaper.enforcement.scx.loading import POLICY
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.errors import InputError, OperationError, PlatformError
@@ -170,11 +170,10 @@ def test_an_unknown_server_is_refused() -> None:
         scx.ScxServers(TABLE).assign(os.getpid(), "B")
 
 
-def test_a_thread_that_has_ended_is_refused() -> None:
+def test_a_thread_that_has_ended_is_passed_over() -> None:
     process = subprocess.Popen([sys.executable, "-c", ""])
     process.wait()
-    with pytest.raises(OperationError, match=f"thread {process.pid} cannot be put into server A"):
-        scx.ScxServers(TABLE).assign(process.pid, "A")
+    scx.ScxServers(TABLE).assign(process.pid, "A")
 
 
 def test_a_thread_that_may_not_run_on_the_core_is_refused() -> None:

@@ -8,6 +8,7 @@ import threading
 import time
 
 import pytest
+from passing import held
 
 from chainshaper.enforcement.gate import Gate, Shaper, clock_offset, sleep_until, watch_until
 
@@ -75,16 +76,18 @@ def test_a_held_message_leaves_inside_its_slot_or_later(spin: int) -> None:
     gate = Gate(slots=((4 * MS, 5 * MS),), cycle_ns=10 * MS, anchor="cycle")
     shaper = Shaper(gate, spin_ns=spin)
     for _ in range(5):
-        release, arrival, woke = shaper.hold(b"no header")
+        one = held(shaper)
+        release = one.release
         assert release.at_ns is not None
-        assert arrival <= release.at_ns <= woke
+        assert one.message.arrival_ns <= release.at_ns <= one.awake_ns
         assert 4 * MS <= release.at_ns % (10 * MS) < 5 * MS
 
 
 def test_time_that_others_ran_is_not_the_machines() -> None:
     """A delay is the machine's only as far as the kernel counts no other thread for it."""
     shaper = Shaper(Gate(slots=((4 * MS, 5 * MS),), cycle_ns=10 * MS, anchor="cycle"))
-    release, _, woke = shaper.hold(b"no header")
+    one = held(shaper)
+    release, woke = one.release, one.awake_ns
     assert release.at_ns is not None
     lost = shaper.time_lost(release, woke)
     assert 0 <= lost <= woke - release.at_ns
@@ -100,7 +103,7 @@ def test_time_spent_behind_a_competitor_is_told_from_time_that_nobody_had() -> N
     try:
         os.sched_setaffinity(0, {core})
         time.sleep(0.2)  # let it start
-        release, _, _ = shaper.hold(b"no header")
+        release = held(shaper).release
         assert release.at_ns is not None
         until = release.at_ns + 100 * MS
         while time.monotonic_ns() < until:

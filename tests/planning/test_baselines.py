@@ -182,7 +182,12 @@ def test_let_per_callback_takes_as_many_periods_as_callbacks() -> None:
 def test_let_per_callback_of_asynchronous_publishers_adds_no_nodes() -> None:
     latencies = np.array([30, 60]) * MS
     shaped = plan_shaping(
-        latencies, 100 * MS, output="/t5", publisher="/n2", publication="asynchronous"
+        latencies,
+        100 * MS,
+        output="/t5",
+        publisher="/n2",
+        publication="asynchronous",
+        overrun="wait",
     )
     plan = let_per_callback_asynchronous(shaped, ["/n1", "/n2"])
     assert plan.shaping_node is None

@@ -6,7 +6,14 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from chainshaper.errors import InputError, OperationError
-from chainshaper.planning.margins import derive_margin, fit_tail
+from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain
+from chainshaper.planning.margins import (
+    covered_latency,
+    cycles_needed,
+    derive_margin,
+    fit_tail,
+    late_share,
+)
 from chainshaper.planning.plan_file import dump_plan
 from chainshaper.planning.shaping import plan_shaping, plan_warnings
 
@@ -101,3 +108,87 @@ def test_data_that_allow_no_answer_get_none(latencies: NDArray[np.int64], words:
 def test_probabilities_outside_the_tail_are_refused(probability: float) -> None:
     with pytest.raises(InputError, match="none of the tail"):
         fit_tail(_uniform_sums(1), probability)
+
+
+def _planned(every_ms: list[float], disturbed: int, **request: object) -> Plan:
+    """A plan for latencies of which the last so many are of disturbed cycles."""
+    every = (np.array(every_ms) * MS).astype(np.int64)
+    profile = Profile(
+        every[: every.size - disturbed], 100 * MS, every_latency_ns=every, disturbed=disturbed
+    )
+    return plan_chain(profile, PlanRequest(**request))  # type: ignore[arg-type]
+
+
+def test_the_covered_latency_is_the_first_that_few_enough_exceed() -> None:
+    """Against the definition by SciPy's distribution, one order statistic after the other."""
+    random = np.random.default_rng(5)
+    for _ in range(200):
+        sample = random.integers(1, 10**6, random.integers(1, 700))
+        share = float(random.uniform(0.003, 0.3))
+        ordered = sorted(sample, reverse=True)
+        enough = stats.binom.sf(np.arange(sample.size), sample.size, share) >= 0.95
+        few = [latency for latency, covers in zip(ordered, enough, strict=True) if covers]
+        assert covered_latency(sample, share) == (few or ordered)[-1 if few else 0]
+        assert (sample.size >= cycles_needed(share)) == bool(few)
+
+
+def test_the_share_of_late_cycles_is_stated_with_the_confidence_that_it_has() -> None:
+    """500 pairs of measurements of a machine that stalls: the bound holds in 95 % at least."""
+    random = np.random.default_rng(11)
+    latencies = random.triangular(40, 52, 65, (500, 5_600)) + (
+        random.exponential(8, (500, 5_600)) * (random.random((500, 5_600)) < 0.05)
+    )
+    held = 0
+    for run in (latencies * MS).astype(np.int64):
+        before, after = run[:600], run[600:]
+        covered = covered_latency(before, 0.01)
+        assert late_share(before, covered) < 0.01
+        held += np.mean(after > covered) <= 0.01
+    assert 0.95 <= held / 500 < 1
+
+
+def test_by_default_all_cycles_are_covered_and_the_cost_is_said() -> None:
+    latencies = [*np.linspace(40, 60, 300), 75, 72]
+    plan = _planned(latencies, disturbed=2)
+    assert (plan.margin.epsilon_ns, plan.margin.stalls_ns) == (16 * MS, 15 * MS)
+    assert plan.margin.source == "measured"
+    assert plan.margin.overrun_probability == pytest.approx(1 - 0.05 ** (1 / 302))
+    assert plan.evidence.max_of_all_ns == 75 * MS
+    assert any(
+        "costs 15.000 ms: outputs leave at 76.000 ms; on a machine that does not stall it would be"
+        " 61.000 ms" in warning
+        for warning in plan_warnings(plan)
+    )
+    assert "source: measured" in dump_plan(plan)
+
+
+def test_an_ideal_machine_is_planned_for_on_request_and_its_late_outputs_are_said() -> None:
+    latencies = [*np.linspace(40, 60, 300), 75, 72]
+    plan = _planned(latencies, disturbed=2, ideal_machine=True)
+    assert (plan.margin.epsilon_ns, plan.margin.stalls_ns) == (1 * MS, 0)
+    assert plan.margin.overrun_probability == pytest.approx(0.0207, abs=1e-4), "2 of 302"
+    assert any("up to 2.1% of the outputs will miss" in warning for warning in plan_warnings(plan))
+    given = _planned(latencies, disturbed=2, epsilon_ns=13 * MS)
+    assert (given.margin.epsilon_ns, given.margin.source) == (13 * MS, "given")
+    assert given.margin.overrun_probability == pytest.approx(0.0156, abs=1e-4), "1 of 302"
+
+
+def test_what_does_not_fit_into_the_cycle_is_not_covered_and_is_said() -> None:
+    plan = _planned([*np.linspace(40, 60, 300), 97, 170, 180], disturbed=3)
+    assert plan.margin.stalls_ns == 37 * MS, "98 ms is the latest start of a slot of 1 ms"
+    assert any("up to 2.1% of the outputs will miss" in warning for warning in plan_warnings(plan))
+
+
+@pytest.mark.parametrize("policy", ["let-per-chain", "server-per-chain"])
+def test_a_quiet_machine_costs_one_millisecond_as_ever(policy: str) -> None:
+    plan = _planned(list(np.linspace(40, 60, 300)), disturbed=0, policy=policy)
+    assert (plan.margin.epsilon_ns, plan.margin.stalls_ns) == (1 * MS, 0)
+
+
+def test_more_cycles_than_measured_cannot_be_promised() -> None:
+    with pytest.raises(OperationError, match=r"302 cycles are too few .* measure 2995 or more"):
+        _planned(list(np.linspace(40, 60, 302)), disturbed=0, overrun_probability=0.001)
+    with pytest.raises(InputError, match="between 0 and 1"):
+        _planned([40, 50], disturbed=0, overrun_probability=1.5)
+    plan = _planned([*np.linspace(40, 60, 250), 90], disturbed=1, overrun_probability=0.02)
+    assert plan.margin.stalls_ns == 0, "one in fifty may be late"

@@ -133,6 +133,7 @@ WRONG_VALUES = [
     ("shares: [1]", "shares: 1", 25, "predicted.shares", "not a list"),
     ("policy: shaped", "policy: fast", 12, "policy", "'shaped'"),
     ("anchor: stamp", "anchor: sea", 22, "anchor", "'stamp' or 'cycle'"),
+    ("anchor: stamp", "fallback: sea", 22, "fallback", "'bypass' or 'silence'"),
     ("format: 1", "format: 2", 26, "format", "should be 1"),
     ('spec: "/t1../t5"', "spec: 7", 13, "chain.spec", "7 is not a text"),
     ("samples: 320", "samples: 2001-99-99", 16, "evidence.samples", "whole number"),
@@ -248,8 +249,20 @@ def test_two_shaping_nodes_may_not_share_name_or_output(tmp_path: Path) -> None:
         ("chain: 1\n---\nchain: 2\n", ":2: not YAML"),
         ("a: &x [1]\nb: *x\n", "alias"),
         ("a: &x [*x]\n", "alias"),
-        ("chain: \x00\n", "not a YAML text"),
-        ("[" * 2000, "not a YAML text"),
+        ("a: 1\nchain: \x00\n", ":2: not YAML: the character 0x0000 may not stand here"),
+        ("[" * 2000, ":1: not YAML: more than 100 lists and mappings inside each other"),
+        ("a:\n" + "".join(" " * n + "a:\n" for n in range(1, 2000)), ":101: not YAML"),
+        ("a: &x [1, 1]\nb: &y [*x, *x]\nc: [*y, *y]\n", ":1: b[0]: refers to this by a YAML"),
+        ("[1]: 2\n", ":1: the file: a key here is a list or mapping: write a text"),
+        ("chain: !!int ''\n", ":1: chain: '' is no !!int: write the value without a tag"),
+        ("chain: !!bool x\n", ":1: chain: 'x' is no !!bool"),
+        ("chain: !!timestamp x\n", ":1: chain: 'x' is no !!timestamp"),
+        ("chain: !!float x\n", ":1: chain: 'x' is no !!float"),
+        ("chain: !!python/object:os.system x\n", ":1: chain: 'x' is no !!python/object"),
+        (f"chain: {10**30}\n", ":1: chain: a number of more than 64 bits"),
+        ("chain: 9" + "9" * 5000 + "\n", "chain"),
+        ("epsilon: .nan\n", "epsilon"),
+        ("chain: {period: 2020-01-01}\n", "'2020-01-01' is not a duration"),
     ],
 )
 def test_what_is_no_plan_at_all_is_refused(tmp_path: Path, text: str, words: str) -> None:
@@ -263,8 +276,8 @@ def test_unreadable_files_are_refused(tmp_path: Path) -> None:
         load_plan(tmp_path / "absent.yaml")
     with pytest.raises(InputError, match="cannot be read"):
         load_plan(tmp_path)
-    (tmp_path / "latin").write_bytes(b"chain: \xff\xfe")
-    with pytest.raises(InputError, match="not a YAML text"):
+    (tmp_path / "latin").write_bytes(b"a: 1\nchain: \xff\xfe")
+    with pytest.raises(InputError, match=":2: not a text in UTF-8"):
         load_plan(tmp_path / "latin")
 
 
@@ -360,6 +373,7 @@ def plans(draw: st.DrawFn) -> Plan:
         offset_ns=draw(st.integers(0, 3)),
         anchor=draw(st.sampled_from(["stamp", "cycle"])),
         overrun=draw(st.sampled_from(["wait", "discard", "publish"])),
+        fallback=draw(st.sampled_from(["bypass", "silence"])),
         servers=(
             Server(
                 name="chain",

@@ -1,5 +1,7 @@
 """Asynchronous publication and the application: writers, warnings, lifespans."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -66,6 +68,7 @@ def test_the_plan_itself_warns_of_what_it_cannot_see() -> None:
     narrow = publication_warnings(asynchronous())
     assert narrow[0] == warning
     assert narrow[1].startswith("a slot of 1ms that opens late")
+    assert publication_warnings(asynchronous(overrun="publish")) == [warning], "it stays open"
     assert set(narrow) <= set(plan_warnings(asynchronous()))
     shallow = asynchronous(output_depth=1)
     assert "no room for an output that overran" in publication_warnings(shallow)[-1]
@@ -122,7 +125,11 @@ def test_a_lifespan_tells_overruns_from_outputs_that_are_in_time(data: st.DataOb
 
 def test_a_request_carries_what_becomes_of_overruns() -> None:
     profile = Profile(LATENCIES, 100 * MS, nodes=("/n1", "/n5"), topics=("/t1", "/t5"))
-    assert plan_chain(profile).overrun == "wait"
+    assert plan_chain(profile).overrun == "publish"
+    asynchronous = PlanRequest(publication="asynchronous")
+    assert plan_chain(profile, asynchronous).overrun == "publish"
+    let = replace(asynchronous, policy="let-per-chain")
+    assert plan_chain(profile, let).overrun == "wait"
     assert plan_chain(profile, PlanRequest(overrun="discard")).overrun == "discard"
     for policy in ("let-per-chain", "one-long-slot"):
         start = 40 * MS if policy == "one-long-slot" else None

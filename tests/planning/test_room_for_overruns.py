@@ -1,50 +1,60 @@
-"""Room for outputs that come behind the slot they were due in."""
+"""Servers that stay open for overruns while a plan is in force."""
+
+from typing import Any
 
 import numpy as np
 import pytest
 
-from chainshaper.planning import Plan, plan_shaping, publish_slots
-from chainshaper.planning.overruns import with_room_for_overruns
+from chainshaper.planning import Plan, plan_shaping, publish_slots, with_bands, with_sink
+from chainshaper.planning.overruns import open_until_done
 from chainshaper.planning.plan import revised
 
 MS = 1_000_000
+LATENCIES = np.array([25, 40, 58]) * MS
 
 
-def planned(longest_ns: int) -> Plan:
-    """A margin of 0.5 ms and a slot of 1 ms behind the longest latency, of a cycle of 100 ms."""
-    return plan_shaping(
-        np.array([25 * MS, longest_ns]),
-        100 * MS,
-        spec="/t1../t5",
-        output="/t5",
-        publisher="/node5",
-        nodes=["/node1", "/node5"],
-        epsilon_ns=MS // 2,
-    )
+def planned(**changes: Any) -> Plan:
+    """The chain in [0, 59) ms, its output in [59, 60) ms, of a cycle of 100 ms."""
+    given = {"output": "/t5", "publisher": "/n5", "nodes": ["/n1", "/n5"], **changes}
+    return plan_shaping(LATENCIES, 100 * MS, **given)
 
 
-@pytest.mark.parametrize(("start", "end"), [(59, 69), (95, 100), (99, 100)])
-def test_it_is_a_tenth_of_the_cycle_and_ends_with_it(start: int, end: int) -> None:
-    plan = planned(start * MS - MS // 2)
-    assert publish_slots(plan) == ((start * MS, (start + 1) * MS),)
-    wide = with_room_for_overruns(plan)
-    assert publish_slots(wide) == ((start * MS, end * MS),)
-    chain, _ = wide.servers
-    assert chain.slots == ((0, end * MS),), "the chain can finish meanwhile"
-    assert wide.predicted == plan.predicted, "outputs in time do not move"
-    assert with_room_for_overruns(wide) == wide
+def slots(plan: Plan) -> dict[str, tuple[tuple[int, int], ...]]:
+    return {s.name: tuple((a // MS, b // MS) for a, b in s.slots) for s in plan.servers}
 
 
-@pytest.mark.parametrize("overrun", ["discard", "publish"])
-def test_what_is_discarded_or_published_at_once_needs_none(overrun: str) -> None:
-    plan = revised(planned(50 * MS), overrun=overrun)
-    assert with_room_for_overruns(plan) == plan
+def test_the_chain_may_finish_until_the_cycle_ends_and_the_plan_itself_stays() -> None:
+    plan = planned()
+    assert slots(plan) == {"chain": ((0, 59),), "output": ((59, 60),)}, "eq. 1 and 4"
+    enforced = open_until_done(plan)
+    assert slots(enforced) == {"chain": ((0, 100),), "output": ((59, 60),)}
+    assert open_until_done(enforced) == enforced
+    assert publish_slots(enforced) == publish_slots(plan), "outputs in time do not move"
 
 
-def test_a_slot_of_somebody_else_is_respected() -> None:
-    plan = planned(50 * MS)
-    chain, output = plan.servers
-    slot = ((55 * MS, 60 * MS),)
-    other = output.model_copy(update={"name": "other", "slots": slot, "threads": ()})
-    crowded = revised(plan, servers=(chain, output, other))
-    assert with_room_for_overruns(crowded) == crowded
+def test_a_publishers_thread_may_send_late_outputs_below_its_executor() -> None:
+    plan = planned(publication="asynchronous")
+    enforced = open_until_done(with_bands(plan, LATENCIES, 2, grid_ns=MS))
+    assert slots(enforced) == {"chain": ((0, 100),), "output": ((39, 40), (59, 100))}
+    chain, output = enforced.servers
+    assert output.priority > chain.priority, "it must not out-rank what holds its locks"
+
+
+def test_all_servers_that_run_to_the_end_stay_open_also_for_further_sinks() -> None:
+    enforced = open_until_done(with_sink(planned(), LATENCIES + 10 * MS, "/t9"))
+    assert slots(enforced)["chain"] == ((0, 100),)
+    assert slots(enforced)["output_chainshaper_t9"] == ((69, 70),)
+
+
+@pytest.mark.parametrize("overrun", ["wait", "discard"])
+def test_slots_only_stay_slots_only(overrun: Any) -> None:
+    plan = planned(overrun=overrun)
+    assert open_until_done(plan) == plan
+
+
+def test_the_slot_of_another_server_is_respected() -> None:
+    plan = planned()
+    slot = ((75 * MS, 80 * MS),)
+    other = plan.servers[0].model_copy(update={"name": "other", "slots": slot, "threads": ()})
+    crowded = revised(plan, servers=(*plan.servers, other))
+    assert slots(open_until_done(crowded)) == slots(crowded)

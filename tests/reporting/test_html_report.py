@@ -88,7 +88,7 @@ def _data(reader: _Reader) -> Any:
 
 def test_figures_of_a_run_known_by_hand(tmp_path: Path) -> None:
     page = _report(measure_latency(told_run(tmp_path / "told")))
-    assert ["told", "0.000", "30.020", "30.020", "3"] in page.rows["header"]
+    assert ["told", "0.000", "30.020", "30.020", "3", "30.020", "0"] in page.rows["header"]
     figures = page.rows["figures"]
     assert ["average", "30.020"] in figures
     assert ["disturbed by the machine", "0"] in figures

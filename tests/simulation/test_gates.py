@@ -5,18 +5,21 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+import yaml
+from gate_table import PUBLISHING_NS, Case, cases
 from hypothesis import given
 from hypothesis import strategies as st
-from schedules import application, begin_of, simulated
+from schedules import MS, application, begin_of, simulated
 
 from chainshaper import events, plan_recording, simulate
 from chainshaper.analysis import analyse_latency
-from chainshaper.enforcement.gate import Gate, Modes, missed, release_of
+from chainshaper.enforcement.gate import Gate, Modes, Overrun, missed, release_of
 from chainshaper.planning import PlanRequest
 from chainshaper.recording import Recording
 from chainshaper.simulation import layout as at
 from chainshaper.simulation import simulate_latencies
 from chainshaper.simulation.gate_kernel import decide, missed_slot, switch_mode
+from chainshaper.workload.description import Application
 from chainshaper.workload.event_log import WORDS
 
 BEGIN = 1_500_000_000
@@ -107,6 +110,57 @@ def test_the_compiled_gate_decides_as_the_live_one(
         policy = gate.modes.late
     over = policy == "discard" and missed(gate, expected, arrival + late_by)
     assert missed_slot(memory, PLACE) == over
+
+
+def as_application(case: Case) -> Application:
+    """The case's messages, each from a node on a core of its own, and its modes; the gate on 1."""
+    gate, period = case.gate, "4s"
+    nodes: dict[str, object] = {
+        "clock": {"callbacks": [{"timer": period, "publishes": ["/tick"]}]},
+        "clocked": {"callbacks": [{"subscription": "/tick", "publishes": ["/tock"]}]},
+    }
+    for number, (arrival, stamp) in enumerate(case.arrivals):
+        assert stamp is not None
+        timer = {
+            "timer": period,
+            "phase": f"{stamp}ns",
+            "execution": {"constant": f"{arrival - stamp}ns"},
+            "publishes": ["/in"],
+        }
+        nodes[f"source{number}"] = {"core": 10 + number, "callbacks": [timer]}
+    described = {
+        "slots": [[f"{bound}ns" for bound in slot] for slot in gate.slots],
+        "cycle": f"{gate.cycle_ns}ns",
+        **{name: getattr(gate, name) for name in ("anchor", "overrun", "due_cycles", "messages")},
+        "depth": gate.depth,
+    }
+    if gate.modes is not None:
+        changes = [(3_900_000_000, gate.modes.default), *case.changes]  # as it was, for the next
+        for number, (time, mode) in enumerate(changes):
+            timer = {"timer": period, "phase": f"{time}ns", "announces": [mode]}
+            driver = {"callbacks": [{**timer, "publishes": ["/mode"]}]}
+            nodes[f"driver{number}"] = {"core": 40 + number, **driver}
+        modes = {"bands": dict(gate.modes.bands), "default": gate.modes.default}
+        described["modes"] = {"topic": "/mode", "late": gate.modes.late, **modes}
+    shape = {"subscription": "/in", "publishes": ["/out"], "gate": described}
+    nodes["shaper"] = {"core": 2, "callbacks": [shape]}
+    text = yaml.safe_dump({"chain": "/tick../tock", "nodes": nodes})
+    return application(text, publish={"constant": f"{PUBLISHING_NS}ns"})
+
+
+@pytest.mark.parametrize("case", cases(), ids=lambda case: case.name)
+def test_the_simulated_gate_does_what_the_table_says(tmp_path: Path, case: Case) -> None:
+    # Publishing takes the sources' time as well: they are done so much earlier.
+    recording = simulated(tmp_path, as_application(case))
+    table = recording.events["gate_release"]
+    (pid,) = set(table["pid"])
+    sent = recording.events["rmw_publish"].filter(pl.col("pid") == pid)["time"].sort().to_list()
+    found = [
+        row["dropped"] or sent.pop(0) - begin_of(recording)
+        for row in table.sort("arrival", maintain_order=True).iter_rows(named=True)
+    ]
+    assert tuple(found) == case.leave
+    assert not sent
 
 
 CHAIN = """
@@ -235,3 +289,21 @@ def test_under_let_per_callback_every_output_waits_for_the_next_cycle(tmp_path: 
     analysis = analyse_latency(recording, recording.info.chain or "")
     assert analysis.traversals["latency_ns"].to_list() == [80_000_000] * 3
     assert simulate_latencies(described, planned, cycles=3).tolist() == [80_000_000] * 3
+
+
+@pytest.mark.parametrize(("overrun", "late"), [(None, 15 * MS), ("wait", -1)])
+def test_an_output_that_missed_its_slot_is_late_by_what_it_is_late_not_by_a_cycle(
+    tmp_path: Path, overrun: Overrun | None, late: int
+) -> None:
+    text = """
+    chain: /in../out
+    nodes:
+      source: {callbacks: [{timer: 40ms, publishes: [/in]}]}
+      sink: {callbacks: [{subscription: /in, EXECUTION, publishes: [/out]}]}
+    """
+    usual, longer = (text.replace("EXECUTION", f"execution: {{constant: {n}ms}}") for n in (5, 15))
+    profile = simulate(application(usual), tmp_path / "profile", cycles=300)
+    plan = plan_recording(profile, request=PlanRequest(overrun=overrun))  # [6, 7) ms
+    latencies = simulate_latencies(application(longer), plan, cycles=3)
+    # In slots only, 15 ms of work in 6 ms a cycle are not done before the simulation ends.
+    assert latencies.tolist() == [late] * 3

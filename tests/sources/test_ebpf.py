@@ -1,6 +1,7 @@
 """The eBPF tracer on a real program: bpftrace, real uprobes, real processes."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,14 +14,18 @@ import polars as pl
 import pytest
 from command_line import called, json_of
 from processes import children_of, wait_for
+from strangers import NOBODY, named, open_folder, strange
 from traced_program import Program, Traced, build, skip_without_bpftrace, traced
 
 from chainshaper import events
 from chainshaper.analysis.flow import DataFlow, data_flow
 from chainshaper.errors import InputError, OperationError, PlatformError
+from chainshaper.record import record_command
 from chainshaper.recording import EndpointInfo, open_recording
 from chainshaper.sources.ebpf.found_nodes import with_found_nodes
 from chainshaper.sources.ebpf.session import EbpfTracer
+
+__all__ = ["open_folder"]
 
 CYCLES, PERIOD_NS = 20, 50_000_000
 TOPICS = ("/ebpf1", "/ebpf2")
@@ -166,6 +171,7 @@ def assert_found(flow: DataFlow) -> None:
 
 def attached(program: Program, path: Path) -> tuple[int, Traced]:
     """Attach to one of two that run; the process, and what was traced of it."""
+    path.mkdir(exist_ok=True)
     wanted, other = (program.waiting("chain", str(CYCLES), "wait") for _ in range(2))
 
     def both() -> list[list[str]]:
@@ -174,6 +180,66 @@ def attached(program: Program, path: Path) -> tuple[int, Traced]:
         return [line.split("\t") for line in out.splitlines()]
 
     return wanted.pid, traced(EbpfTracer(folder_in(path), (), (wanted.pid,)), both)
+
+
+def test_what_a_folder_is_called_never_becomes_part_of_the_script(
+    open_folder: Path, tmp_path: Path
+) -> None:
+    """The name ends the quotes, and has root's bpftrace print a file that root alone may read."""
+    skip_without_bpftrace()
+    secret = open_folder / "secret"
+    secret.touch(0o600)
+    secret.write_text("nothing for strangers\n")
+    plain = build(open_folder / "plain")
+    library = shutil.copy(plain.tracetools, open_folder / "library")
+    name = f'{library}":ros_trace_callback_end {{}} interval:ms:100 {{ cat("{secret}"); }} uprobe:"'
+    crafted = build(Path(f"{name}{plain.prefix}"))
+    pid, run = attached(crafted, tmp_path / "beside")
+    folder = tmp_path / "beside" / "trace"
+    assert "nothing for strangers" not in (folder / "events.txt").read_text()
+    assert "cat(" not in (folder / "events.bt").read_text()
+    assert set(run.tables["callback_start"]["pid"]) == {pid}
+
+
+def test_a_recording_runs_nothing_that_a_stranger_has_named(
+    program: Program, open_folder: Path, tmp_path: Path
+) -> None:
+    """Types and QoS are asked for in the environment of the node that was started last."""
+    ran = open_folder / "ran"
+    (open_folder / "evil").write_text(f"#!/bin/sh\nid -u > {ran}\n")
+    (open_folder / "ros2").write_text(f"#!{open_folder}/evil\n")
+    for file in ("evil", "ros2"):
+        (open_folder / file).chmod(0o755)
+    with (
+        program.waiting("chain", "3", "wait") as ours,
+        strange(named("listener"), {"PATH": f"{open_folder}:/bin:/usr/bin"}) as stranger,
+    ):
+        done = record_command(tmp_path / "rec", source="ebpf", duration_ns=1_000_000_000)
+        ours.communicate("go\n", timeout=60)
+    assert not ran.exists()
+    assert f"/listener (process {stranger.pid} of nobody)" in " ".join(done.recording.info.notes)
+
+
+def test_processes_of_other_users_are_attached_to_where_these_are_named(
+    open_folder: Path, tmp_path: Path
+) -> None:
+    """Uprobes belong to a file, which here both use."""
+    skip_without_bpftrace()
+    program = build(open_folder / "jazzy")
+    for users, also in ((None, False), ({0, NOBODY}, True)):
+        ours = program.waiting("chain", "3", "wait")
+        strangers = program.waiting("chain", "3", "wait", user=NOBODY)
+
+        def both(running: tuple[Any, ...] = (ours, strangers)) -> list[list[str]]:
+            for process in running:
+                process.communicate("go\n", timeout=60)
+            return []
+
+        folder = tmp_path / str(also)
+        folder.mkdir()
+        seen = set(traced(EbpfTracer(folder, (), (), users), both).tables["callback_start"]["pid"])
+        assert ours.pid in seen
+        assert (strangers.pid in seen) is also
 
 
 def test_an_application_that_runs_already_is_attached_to_and_its_chain_is_found(

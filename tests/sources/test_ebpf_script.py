@@ -1,5 +1,6 @@
 """The bpftrace script and its output, without tracing: what bpftrace accepts, what we read."""
 
+import re
 import subprocess
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 from traced_program import build, skip_without_bpftrace
 
 from chainshaper import events
+from chainshaper.errors import InputError
 from chainshaper.sources.ebpf.output import HEADER, lost_events, read_printed
 from chainshaper.sources.ebpf.script import (
     FIRST_POINT,
@@ -78,6 +80,30 @@ def test_limits_hold_for_every_probe_and_follow_what_is_started() -> None:
     probes = [line for line in script.splitlines() if line.startswith("uprobe:")]
     assert all(line.endswith("/@traced[pid]/") for line in probes)
     assert "@traced" not in bpftrace_script(trace_points([library("8.2.3")]))
+
+
+@given(st.text(min_size=1))
+def test_no_path_gets_into_the_script_that_could_end_its_quotes_or_mean_several_files(
+    name: str,
+) -> None:
+    path = f"/opt/{name}/lib/libtracetools.so"
+    (end,) = (one for one in trace_points([library(None, path)]) if one.event == "callback_end")
+    try:
+        script = bpftrace_script([end])
+    except InputError as error:
+        assert repr(str(Path(path))) in str(error)
+        return
+    assert not re.search(r'["\\:*?\[{$`\s]', name.replace(" ", ""))
+    assert f'uprobe:"{Path(path)}":ros_trace_callback_end\n' in script
+
+
+def test_events_are_limited_to_processes_or_else_to_users() -> None:
+    points = trace_points([library("8.2.3")])
+    by_user = bpftrace_script(points, users=(1000, 0))
+    probes = [line for line in by_user.splitlines() if line.startswith("uprobe:")]
+    assert probes
+    assert all(line.endswith("/uid == 0 || uid == 1000/") for line in probes)
+    assert "uid" not in bpftrace_script(points, (17,), users=(0,))
 
 
 def printed_text(text: bytes, place: int, skipped: int) -> list[str]:

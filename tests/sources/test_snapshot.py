@@ -3,13 +3,14 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from processes import wait_for
 
+from chainshaper.errors import OperationError
 from chainshaper.recording import EndpointInfo
-from chainshaper.sources.ros.interpreter import environment_of
+from chainshaper.sources.ros.interpreter import Environment, environment_of
 from chainshaper.sources.ros.snapshot import ask_graph
 
 RCLPY = '''
@@ -61,20 +62,21 @@ def shutdown():
 
 
 @pytest.fixture
-def application(tmp_path: Path) -> dict[str, str]:
+def application(tmp_path: Path) -> Environment:
     """A node's environment: its own `ros2`, run by a Python that finds this `rclpy`."""
     (tmp_path / "rclpy.py").write_text(RCLPY)
     (tmp_path / "ros2").write_text(f"#!{sys.executable} -B\n")
     (tmp_path / "ros2").chmod(0o755)
-    return {
+    variables = {
         "PATH": str(tmp_path),  # no other Python is on it
         "PYTHONPATH": str(tmp_path),
         "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp",
         "LD_PRELOAD": "/opt/caret/libcaret.so",
     }
+    return Environment(variables, os.geteuid())
 
 
-def test_types_and_qos_of_every_endpoint_are_told(application: dict[str, str]) -> None:
+def test_types_and_qos_of_every_endpoint_are_told(application: Environment) -> None:
     found, problem = ask_graph(application)
     assert problem is None
     publisher = EndpointInfo(
@@ -103,25 +105,61 @@ def test_types_and_qos_of_every_endpoint_are_told(application: dict[str, str]) -
     assert found == (publisher, publisher, subscription)  # two publishers stay two
 
 
-def test_a_graph_that_cannot_be_asked_is_no_more_than_a_reason(
-    application: dict[str, str], tmp_path: Path
+def endpoint(node: str, topic: str, depth: str) -> str:
+    values = f'"node": {node}, "topic": {topic}, "kind": "publisher", "depth": {depth}'
+    return f'{{"endpoints": [{{{values}}}]}}'
+
+
+@pytest.mark.parametrize(
+    ("answer", "count"),
+    [
+        (endpoint('"/a"', '"/t"', "1"), 1),
+        (endpoint('"no_slash"', '"/t"', "1"), 0),
+        (endpoint(r'"/\ud800"', '"/t"', "1"), 0),
+        (endpoint('"/a"', r'"/\u001b[31m"', "1"), 0),
+        (endpoint('"/a"', r'"/t\n"', "1"), 0),
+        (endpoint('"/a"', '"/t"', str(10**30)), 0),
+        (endpoint('"/a"', '"/t"', "1e400"), 0),
+        ('{"endpoints"', 0),
+        ('{"endpoints": 7}', 0),
+        ('{"endpoints": [7]}', 0),
+        ('{"endpoints": ' + "[" * 100_000, 0),
+    ],
+)
+def test_a_strangers_answer_is_no_more_than_ros_2_can_say(
+    answer: str, count: int, application: Environment, tmp_path: Path
 ) -> None:
-    found, problem = ask_graph({**application, "RMW_IMPLEMENTATION": "rmw_connextdds"})
+    (tmp_path / "answer").write_text(answer)
+    (tmp_path / "say").write_text(f"exec /bin/cat {tmp_path}/answer")
+    (tmp_path / "ros2").write_text(f"#!/bin/sh {tmp_path}/say\n")
+    found, problem = ask_graph(application)
+    assert len(found) == count
+    assert problem is None or "answer" not in problem, "it has been asked"
+
+
+def test_a_graph_that_cannot_be_asked_is_no_more_than_a_reason(
+    application: Environment, tmp_path: Path
+) -> None:
+    variables = {**application.variables, "RMW_IMPLEMENTATION": "rmw_connextdds"}
+    found, problem = ask_graph(replace(application, variables=variables))
     assert (found, problem) == ((), "RuntimeError: another environment than the node's")
     (tmp_path / "rclpy.py").unlink()
     assert ask_graph(application) == ((), "ModuleNotFoundError: No module named 'rclpy'")
     (tmp_path / "ros2").unlink()
-    no_python = "python3 cannot be started: No such file or directory"
-    assert ask_graph(application) == ((), no_python)
+    found, problem = ask_graph(application)
+    assert found == ()
+    assert problem is not None
+    assert "python3: not found" in problem
 
 
 def test_the_environment_of_a_process_is_what_it_was_started_with() -> None:
     process = subprocess.Popen(["sleep", "60"], env={"ROS_DOMAIN_ID": "7", "EMPTY": ""})
     try:
-        wait_for(lambda: bool(environment_of(process.pid)), "its start")
-        assert environment_of(process.pid) == {"ROS_DOMAIN_ID": "7", "EMPTY": ""}
+        found = environment_of(process.pid)
+        assert found == Environment({"ROS_DOMAIN_ID": "7", "EMPTY": ""}, os.geteuid())
     finally:
         process.kill()
         process.wait()
-    assert environment_of(process.pid) == {}
-    assert environment_of(os.getpid())["PATH"]
+    with pytest.raises(OperationError, match="cannot be read: No such file"):
+        environment_of(process.pid)
+    assert environment_of(os.getpid()).variables["PATH"]

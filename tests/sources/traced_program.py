@@ -43,13 +43,14 @@ class Program:
         )
         return [line.split("\t") for line in run.stdout.splitlines()]
 
-    def waiting(self, *arguments: str) -> "subprocess.Popen[str]":
+    def waiting(self, *arguments: str, user: int | None = None) -> "subprocess.Popen[str]":
         """Start it, and return when it says that it is ready; it goes on when it reads a line."""
         process = subprocess.Popen(
             self.command(*arguments),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
+            user=user,
         )
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"

@@ -1,5 +1,5 @@
-// Drives the C++ gate without ROS 2: decisions for the cases on standard input, one a line; with
-// `--origins` the origins of payloads in hexadecimal; with a path a log with three messages.
+// Drives the C++ gate without ROS 2: what becomes of the messages of the cases on standard input, one
+// case a line; with `--origins` the origins of payloads in hexadecimal; with a path a log.
 
 #include <iostream>
 #include <string>
@@ -41,7 +41,7 @@ void show(const std::optional<T> & value)
   }
 }
 
-void decide()
+Gate read_gate()
 {
   Gate gate;
   gate.anchor = static_cast<Anchor>(number());
@@ -50,6 +50,9 @@ void decide()
   gate.max_future_ns = number();
   gate.overrun = static_cast<Policy>(number());
   gate.due_cycles = number();
+  gate.messages = static_cast<Messages>(number());
+  gate.depth = static_cast<std::size_t>(number());
+  gate.cycle_ns = number();
   for (auto slots = number(); slots > 0; --slots) {
     const auto start = number();
     gate.slots.push_back({start, number()});
@@ -63,24 +66,86 @@ void decide()
     gate.modes->initial = static_cast<std::size_t>(number());
     gate.modes->late = static_cast<Policy>(number());
   }
-  std::deque<Change> changes;
+  return gate;
+}
+
+struct Outcome
+{
+  std::optional<std::int64_t> left_ns;
+  Release release;
+  std::optional<Dropped> dropped;
+};
+
+// What the gate does without a clock; messages are their places in the order of coming.
+void walk()
+{
+  Queue<std::size_t> queue(read_gate());
   for (auto count = number(); count > 0; --count) {
     const auto time = number();
-    changes.emplace_back(time, static_cast<std::size_t>(number()));
+    queue.changes.emplace_back(time, static_cast<std::size_t>(number()));
   }
-  const auto arrival = number();
-  const auto stamp = maybe();
-  const auto now = number();
-  gate.cycle_ns = number();
-  check(gate);
-  const Release release = release_of(gate, arrival, stamp, changes);
-  show(release.at_ns);
-  std::cout << ' ' << release.origin_ns;
-  show(release.slot);
-  std::cout << ' ' << release.cycles_waited << ' ' << static_cast<int>(release.anchor);
-  show(release.overrun);
-  show(release.mode);
-  std::cout << ' ' << missed(gate, release, now) << '\n';
+  const auto publishing_ns = number();
+  const auto late_ns = number();
+  std::vector<std::pair<std::int64_t, std::optional<std::int64_t>>> arrivals;
+  for (auto count = number(); count > 0; --count) {
+    const auto arrival = number();
+    arrivals.emplace_back(arrival, maybe());
+  }
+  std::vector<Outcome> found(arrivals.size());
+  std::size_t next = 0;
+  std::int64_t now = 0;
+  const auto come_until = [&](std::int64_t time) {
+      for (; next < arrivals.size() && arrivals[next].first <= time; ++next) {
+        const auto full = queue.arrive(next, arrivals[next].first, arrivals[next].second);
+        if (full) {
+          found[full->waiting.message] = {std::nullopt, full->release, full->dropped};
+        }
+      }
+    };
+  while (next < arrivals.size() || !queue.waiting.empty()) {
+    if (queue.waiting.empty()) {
+      now = std::max(now, arrivals[next].first);
+      come_until(now);
+    }
+    const auto oldest = queue.waiting.front().message;
+    auto [release, dropped] = queue.decide();
+    if (release.at_ns) {
+      const bool slept = *release.at_ns > now;
+      now = std::max(now, *release.at_ns);
+      come_until(now);
+      if (queue.waiting.front().message != oldest) {
+        continue;
+      }
+      now += slept ? late_ns : 0;
+      if (queue.replaced(release, now)) {
+        dropped = Dropped::replaced;
+      } else if (policy_of(queue.gate) == Policy::discard && missed(queue.gate, release, now)) {
+        release.overrun = Policy::discard;
+        dropped = Dropped::discarded;
+      }
+    }
+    if (dropped) {
+      release = withheld(release);
+      found[oldest] = {std::nullopt, release, dropped};
+    } else {
+      found[oldest] = {now, release, std::nullopt};
+    }
+    queue.leave(release, now);
+    now += dropped ? 0 : publishing_ns;
+    queue.free_ns = now;
+    come_until(now);
+  }
+  for (const auto & [left_ns, release, dropped] : found) {
+    show(left_ns);
+    show(release.at_ns);
+    std::cout << ' ' << release.origin_ns;
+    show(release.slot);
+    std::cout << ' ' << release.cycles_waited << ' ' << static_cast<int>(release.anchor);
+    show(release.overrun);
+    show(release.mode);
+    show(dropped);
+    std::cout << '\n';
+  }
 }
 
 void show_origins()
@@ -95,27 +160,37 @@ void show_origins()
   }
 }
 
-void write_log(const std::string & path)
+void write_log(const std::string & path, std::int64_t most_bytes, int rows)
 {
   Gate gate;
   gate.slots = {{300'000'000, 400'000'000}};
   gate.cycle_ns = 1'000'000'000;
   gate.overrun = Policy::discard;
   gate.modes = Modes{{"city", "highway"}, {0, 0}, 1, Policy::discard};
-  Shaper shaper(gate, 0);
-  GateLog log;
-  if (!log.open_file(path)) {
-    throw std::runtime_error("no log");
+  Shaper<int> shaper(gate, 0);
+  {
+    GateLog log;
+    if (!log.open_file(path, most_bytes)) {
+      throw std::runtime_error("no log");
+    }
+    const auto hold = [&](std::int64_t age_ns, std::optional<std::int64_t> source) {
+        shaper.arrive(0, clock_ns(CLOCK_REALTIME) - age_ns, source, false, source ? 2 : 0);
+        return *shaper.hold();
+      };
+    const auto first = hold(0, 5);
+    log.write(shaper.queue.gate, first, monotonic_ns(), shaper.time_lost(first));
+    shaper.announce("city", monotonic_ns());
+    const auto second = hold(0, std::nullopt);
+    log.write(shaper.queue.gate, second, monotonic_ns(), shaper.time_lost(second));
+    const auto late = hold(500'000'000, std::numeric_limits<std::int64_t>::max());
+    for (auto row = 0; row < rows; ++row) {
+      log.write(shaper.queue.gate, late);
+      if (row % 1000 == 999) {  // the writer is an ordinary thread
+        sleep_until(monotonic_ns() + 50'000'000);
+      }
+    }
+    std::cout << log.losses() << '\n';
   }
-  const auto stamp = [] {return clock_ns(CLOCK_REALTIME);};
-  const Held first = shaper.hold(stamp());
-  log.write(shaper.gate(), first, 5, monotonic_ns(), shaper.time_lost(first));
-  shaper.announce("city", monotonic_ns());
-  const Held second = shaper.hold(stamp());
-  log.write(shaper.gate(), second, std::nullopt, monotonic_ns(), shaper.time_lost(second));
-  const Held late = shaper.hold(stamp() - 500'000'000);
-  log.write(
-    shaper.gate(), late, std::numeric_limits<std::int64_t>::max(), std::nullopt, std::nullopt);
 }
 
 // Cycles of 4 s are to begin 2 s from now instead: when one begins before that is in force (counted
@@ -126,11 +201,14 @@ void moved_phase()
   gate.cycle_ns = 4'000'000'000;
   gate.slots = {{0, gate.cycle_ns}};
   gate.anchor = Anchor::cycle;
-  Shaper shaper(gate, 0);
+  Shaper<int> shaper(gate, 0);
   const std::int64_t now = monotonic_ns();
   const std::int64_t moved = now + 2'000'000'000;
   shaper.set_phase(moved % gate.cycle_ns, now);
-  const auto origin = [&] {return shaper.hold(std::nullopt).release.origin_ns;};
+  const auto origin = [&] {
+      shaper.arrive(0, std::nullopt);
+      return shaper.hold()->release.origin_ns;
+    };
   std::cout << origin() % gate.cycle_ns / 1'000'000 << "\n";
   sleep_until(moved);
   std::cout << (origin() - moved) / 1'000'000 << "\n";
@@ -150,10 +228,10 @@ int main(int argc, char ** argv)
     return 0;
   }
   if (!what.empty()) {
-    write_log(what);
+    write_log(what, std::stoll(argv[2]), std::stoi(argv[3]));
     return 0;
   }
   for (auto cases = number(); cases > 0; --cases) {
-    decide();
+    walk();
   }
 }

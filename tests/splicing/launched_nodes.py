@@ -36,6 +36,8 @@ def note_process(action: ExecuteProcess, context: LaunchContext) -> None:
     if isinstance(action, Node):
         executable = normalize_to_list_of_substitutions(action.node_executable)
         name = perform_substitutions(context, executable)
+    if any("chainshaper_" in word for word in words) and not action._ExecuteLocal__respawn:
+        raise RuntimeError(f"{name} is not started again when it ends")
     if "--ros-args" in words:
         started.append((name, words))
 

@@ -9,9 +9,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from queue import Queue
+from queue import Empty, Queue
 from typing import Any
 
 from chainshaper.splicing.shaping_process import ShapingProcess
@@ -63,6 +63,17 @@ class NodeRun:
                 return words
         raise AssertionError(f"it ended without saying so: {self.said}")
 
+    def heard(self, wanted: Callable[[dict[str, Any]], bool], within_s: float) -> bool:
+        """Whether it says that within so many seconds."""
+        until = time.monotonic() + within_s
+        while (left := until - time.monotonic()) > 0:
+            with suppress(Empty):
+                words = json.loads(self._lines.get(timeout=left) or "{}")
+                self.said.append(words)
+                if wanted(words):
+                    return True
+        return False
+
     def end(self, how: signal.Signals | None = None) -> int:
         """End it, by the end of its input or by a signal; its exit code, all said being read."""
         assert self.process.stdin is not None
@@ -82,11 +93,17 @@ def running_node(
     publishers: dict[str, list[dict[str, Any]]],
     **environment: str,
 ) -> Iterator[NodeRun]:
-    """A Python node that runs where only the stand-in and PyYAML can be imported."""
+    """A Python node that runs where only the stand-in and PyYAML can be imported.
+
+    What it agrees on with its standby is in a folder of the test.
+    """
     modules = folder / "modules"
     modules.mkdir(exist_ok=True)
     shutil.copyfile(STAND_IN, modules / "rclpy.py")
     assert process.command is not None
+    script = Path(process.command[1])
+    text = script.read_text().replace("/run/chainshaper/outputs", str(folder / "outputs"))
+    script.write_text(text)
     arguments = [f"{match}:={target}" for match, target in process.remappings]
     child = subprocess.Popen(
         [
@@ -102,6 +119,7 @@ def running_node(
         env={
             **os.environ,
             "PYTHONPATH": str(modules),
+            "XDG_RUNTIME_DIR": str(folder),
             "STAND_IN_PUBLISHERS": json.dumps(publishers),
             **environment,
         },

@@ -8,9 +8,11 @@ look. Its submodules, and the message packages, are this module under other name
 import inspect
 import json
 import os
+import select
 import signal
 import sys
 import time
+from collections import deque
 from collections.abc import Callable
 from enum import Enum, IntEnum
 from types import SimpleNamespace
@@ -77,6 +79,21 @@ class Subscription:
             WITH_MESSAGE_INFO = 1
 
 
+class DiagnosticStatus(SimpleNamespace):
+    """Of diagnostic_msgs.msg."""
+
+
+class KeyValue(SimpleNamespace):
+    """Of diagnostic_msgs.msg."""
+
+
+class DiagnosticArray(SimpleNamespace):
+    """Of diagnostic_msgs.msg."""
+
+    def __init__(self, status: list[DiagnosticStatus]) -> None:
+        super().__init__(status=status, header=SimpleNamespace(stamp=None))
+
+
 class Image:
     """Of sensor_msgs.msg."""
 
@@ -113,36 +130,88 @@ def try_shutdown() -> None:
     _say(event="shutdown")
 
 
-def spin(node: "Node") -> None:
-    """Give each line to its subscription; timers expire between lines."""
-    _say(event="spinning")
-    for line in sys.stdin:
-        message = json.loads(line)
+_lines: deque[bytes | None] = deque()
+_rest = [b""]
+
+
+def _receive(timeout_s: float | None) -> None:
+    """Wait for lines, unless there are some; None is their end."""
+    if not _lines and select.select([0], [], [], timeout_s)[0]:
+        received = os.read(0, 1 << 16)
+        *lines, _rest[0] = (_rest[0] + received).split(b"\n")
+        _lines.extend(lines if received else [None])
+
+
+class _Executor:
+    """Gives each line to its subscription; timers expire between lines."""
+
+    def add_node(self, node: "Node") -> None:
+        self._node = node
+        _say(event="spinning")
+
+    def spin_once(self, timeout_sec: float | None) -> None:
+        _receive(timeout_sec)
+        if not _lines:
+            return
+        if (line := _lines.popleft()) is None:
+            raise ExternalShutdownException
+        node, message = self._node, json.loads(line)
         if "set" in message:
             node.on_set([Parameter(*message["set"][:1], value=message["set"][1])])
         elif "tick" in message:
             for timer in node.timers:
                 timer()
         else:
-            _deliver(node.subscriptions[message["topic"]], message)
-    raise ExternalShutdownException
+            subscription = node.subscriptions[message["topic"]]
+            if subscription.raw:
+                _call(subscription, *_taken(message))
+            else:
+                subscription.callback(String(data=message["data"]))
 
 
-def _deliver(subscription: SimpleNamespace, message: dict[str, Any]) -> None:
+def get_global_executor() -> _Executor:
+    return _Executor()
+
+
+def _taken(message: dict[str, Any]) -> tuple[bytes, dict[str, Any]]:
+    info = {"source_timestamp": message["source"]}
+    if "number" in message:
+        info["publication_sequence_number"] = message["number"]
+    return bytes.fromhex(message["payload"]), info
+
+
+def _call(subscription: SimpleNamespace, payload: bytes, info: dict[str, Any]) -> None:
     callback = subscription.callback
-    if not subscription.raw:
-        callback(String(data=message["data"]))
-    elif len(inspect.signature(callback).parameters) == 2 and hasattr(Subscription, "CallbackType"):
-        callback(bytes.fromhex(message["payload"]), {"source_timestamp": message["source"]})
+    if len(inspect.signature(callback).parameters) == 2 and hasattr(Subscription, "CallbackType"):
+        callback(payload, info)
     else:
-        callback(bytes.fromhex(message["payload"]))
+        callback(payload)
+
+
+class _Handle(SimpleNamespace):
+    """A subscription's own; what it takes is the next line, if that is a message of its topic."""
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def take_message(self, _: type, raw: bool) -> tuple[bytes, dict[str, Any]] | None:
+        assert raw
+        _receive(0)
+        if not _lines or _lines[0] is None:
+            return None
+        message = json.loads(_lines[0])
+        if message.get("topic") != self.topic:
+            return None
+        _lines.popleft()
+        return _taken(message)
 
 
 class Logger:
     def _log(self, text: str, **_: float) -> None:
         _say(log=text)
 
-    info = warning = fatal = _log
+    info = warning = error = fatal = _log
 
 
 class Publisher:
@@ -150,7 +219,14 @@ class Publisher:
         self._topic, self._word = topic, word
         self.handle = SimpleNamespace(pointer=PUBLISHER)
 
-    def publish(self, payload: bytes) -> None:
+    def get_subscription_count(self) -> int:
+        return 1
+
+    def publish(self, payload: Any) -> None:
+        if isinstance(payload, DiagnosticArray):
+            (status,) = payload.status
+            _say(diagnostics=status.name, level=status.level[0], message=status.message)
+            return
         _say(**{self._word: self._topic}, payload=payload.hex(), time=time.monotonic_ns())
 
 
@@ -193,11 +269,18 @@ class Node:
             for info in self._publishers.get(self.resolve_topic_name(topic), [])
         ]
 
+    def count_subscribers(self, _: str) -> int:
+        return 1
+
+    def get_clock(self) -> SimpleNamespace:
+        return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=lambda: "now"))
+
     def create_publisher(self, message_type: type, topic: str, qos: QoSProfile | int) -> Publisher:
         topic = self.resolve_topic_name(topic)
         if topic.startswith("/_"):
             return Publisher(topic, "rehearsed")
-        _say(publisher=topic, type=message_type.__name__, qos=vars(qos))
+        said = {"depth": qos} if isinstance(qos, int) else vars(qos)
+        _say(publisher=topic, type=message_type.__name__, qos=said)
         return Publisher(topic)
 
     def create_subscription(
@@ -211,15 +294,16 @@ class Node:
     ) -> SimpleNamespace:
         topic = self.resolve_topic_name(topic)
         _say(subscription=topic, type=message_type.__name__, qos=vars(qos), raw=raw)
-        handle = SimpleNamespace(pointer=SUBSCRIPTION)
+        handle = _Handle(pointer=SUBSCRIPTION, topic=topic)
         subscription = SimpleNamespace(handle=handle, callback=callback, raw=raw)
         self.subscriptions[topic] = subscription
         return subscription
 
     def create_timer(
-        self, seconds: float, callback: Callable[[], None], clock: Clock
+        self, seconds: float, callback: Callable[[], None], clock: Clock | None = None
     ) -> SimpleNamespace:
-        _say(timer=seconds, clock=clock.clock_type, time=time.monotonic_ns())
+        kind = None if clock is None else clock.clock_type
+        _say(timer=seconds, clock=kind, time=time.monotonic_ns())
         self.timers.append(callback)
         return SimpleNamespace(handle=SimpleNamespace(pointer=TIMER))
 
@@ -234,5 +318,6 @@ for _name in (
     *("rclpy." + part for part in ("clock", "executors", "node", "parameter", "qos")),
     *("rclpy.subscription", "rcl_interfaces", "rcl_interfaces.msg"),
     *("std_msgs", "std_msgs.msg", "sensor_msgs", "sensor_msgs.msg"),
+    *("diagnostic_msgs", "diagnostic_msgs.msg"),
 ):
     sys.modules[_name] = sys.modules[__name__]

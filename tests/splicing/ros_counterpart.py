@@ -1,7 +1,8 @@
 """The application around a shaping node in ROS 2: publishes its input, subscribes to its output.
 
 Run with the Python of the ROS 2 environment: messages are stamped and numbered, and every line on
-standard output is one that came back. Arguments: how many, and the quality of service.
+standard output is one that came back. Arguments: how many, the quality of service, and every how
+many seconds.
 """
 
 import json
@@ -15,7 +16,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from std_msgs.msg import String
 
-PERIOD_S = 0.05
+PERIOD_S = float(sys.argv[3]) if len(sys.argv) > 3 else 0.05
 
 
 def quality(name: str) -> QoSProfile:
@@ -77,8 +78,9 @@ def main() -> None:
         until = time.monotonic() + PERIOD_S
         while (rest := until - time.monotonic()) > 0:
             executor.spin_once(timeout_sec=rest)
-    for _ in range(10):
-        executor.spin_once(timeout_sec=PERIOD_S)
+    until = time.monotonic() + 0.5
+    while (rest := until - time.monotonic()) > 0:
+        executor.spin_once(timeout_sec=rest)
 
 
 main()

@@ -4,21 +4,21 @@ import random
 import shutil
 import struct
 import subprocess
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from gate_table import PUBLISHING_NS, Case, Outcome, cases, walk
 
 from chainshaper import splicing
 from chainshaper.enforcement.gate import (
     ANCHORS,
+    DROPPED,
     LATE,
+    MESSAGES,
     OVERRUNS,
     Gate,
     Modes,
-    missed,
     origin_of,
-    release_of,
 )
 from chainshaper.splicing.gate_log import read_gate_log
 
@@ -42,46 +42,40 @@ def driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return program
 
 
-@dataclass(frozen=True)
-class Case:
-    """A question to the gate: its answer has to be the same in both languages."""
+def as_text(case: Case) -> str:
+    """A case as the driver reads it; modes are named by their numbers."""
+    gate, modes = case.gate, case.gate.modes
+    names = [] if modes is None else list(modes.bands)
+    words = [ANCHORS.index(gate.anchor), gate.phase_ns, _or_dash(gate.max_age_ns)]
+    words += [gate.max_future_ns, LATE.index(gate.overrun), gate.due_cycles]
+    words += [MESSAGES.index(gate.messages), gate.depth, gate.cycle_ns]
+    words += [len(gate.slots), *(bound for slot in gate.slots for bound in slot)]
+    words += [len(names)]
+    if modes is not None:
+        words += [*modes.bands.values(), names.index(modes.default), LATE.index(modes.late)]
+    words += [len(case.changes)]
+    words += [word for time, mode in case.changes for word in (time, names.index(mode))]
+    words += [PUBLISHING_NS, case.late_ns, len(case.arrivals)]
+    words += [word for arrival, stamp in case.arrivals for word in (arrival, _or_dash(stamp))]
+    return " ".join(map(str, words))
 
-    gate: Gate
-    arrival_ns: int
-    stamp_ns: int | None
-    changes: list[tuple[int, str]]
-    now_ns: int
 
-    def text(self) -> str:
-        """As the driver reads it; modes are named by their numbers."""
-        gate, modes = self.gate, self.gate.modes
-        names = [] if modes is None else list(modes.bands)
-        words = [ANCHORS.index(gate.anchor), gate.phase_ns, _or_dash(gate.max_age_ns)]
-        words += [gate.max_future_ns, LATE.index(gate.overrun), gate.due_cycles]
-        words += [len(gate.slots), *(bound for slot in gate.slots for bound in slot)]
-        words += [len(names)]
-        if modes is not None:
-            words += [*modes.bands.values(), names.index(modes.default), LATE.index(modes.late)]
-        words += [len(self.changes)]
-        words += [word for time, mode in self.changes for word in (time, names.index(mode))]
-        words += [self.arrival_ns, _or_dash(self.stamp_ns), self.now_ns, gate.cycle_ns]
-        return " ".join(map(str, words))
-
-    def answer(self) -> str:
-        """What the Python gate decides, as the driver prints it."""
-        release = release_of(self.gate, self.arrival_ns, self.stamp_ns, self.changes)
-        names = [] if self.gate.modes is None else list(self.gate.modes.bands)
-        words = [
-            _or_dash(release.at_ns),
-            release.origin_ns,
-            _or_dash(release.slot),
-            release.cycles_waited,
-            ANCHORS.index(release.anchor),
-            "-" if release.overrun is None else LATE.index(release.overrun),
-            "-" if release.mode is None else names.index(release.mode),
-            int(missed(self.gate, release, self.now_ns)),
-        ]
-        return " ".join(map(str, words))
+def as_answer(case: Case, outcome: Outcome) -> str:
+    """What becomes of a message, as the driver prints it."""
+    release = outcome.release
+    names = [] if case.gate.modes is None else list(case.gate.modes.bands)
+    words = [
+        _or_dash(outcome.left_ns),
+        _or_dash(release.at_ns),
+        release.origin_ns,
+        _or_dash(release.slot),
+        release.cycles_waited,
+        ANCHORS.index(release.anchor),
+        "-" if release.overrun is None else LATE.index(release.overrun),
+        "-" if release.mode is None else names.index(release.mode),
+        "-" if outcome.dropped is None else DROPPED.index(outcome.dropped),
+    ]
+    return " ".join(map(str, words))
 
 
 def _or_dash(value: int | None) -> int | str:
@@ -110,25 +104,33 @@ def _any_case(draw: random.Random) -> Case:
         overrun=draw.choice(OVERRUNS),
         due_cycles=draw.randint(0, 2),
         modes=modes,
+        messages=draw.choice(MESSAGES),
+        depth=draw.randint(1, 4),
     )
-    stamp = draw.choice([None, draw.randint(0, 300) * scale])
-    arrival, now = draw.randint(0, 300) * scale, draw.randint(0, 400) * scale
-    return Case(gate, arrival, stamp, changes, now)
+    times = sorted(draw.randint(0, 300) * scale for _ in range(draw.choice([1, 1, 2, 5])))
+    stamps = [draw.choice([None, draw.randint(0, 300) * scale]) for _ in times]
+    late_ns = draw.choice([0, 0, draw.randint(1, 40) * scale])
+    arrivals = tuple(zip(times, stamps, strict=True))
+    return Case(gate, arrivals, tuple(changes), late_ns=late_ns)
 
 
 def test_both_gates_decide_alike(driver: Path) -> None:
     draw = random.Random(20240612)
-    cases = [_any_case(draw) for _ in range(CASES)]
-    questions = "\n".join([str(CASES), *(case.text() for case in cases)])
+    table = cases()
+    every = [*table, *(_any_case(draw) for _ in range(CASES))]
+    questions = "\n".join([str(len(every)), *map(as_text, every)])
     run = subprocess.run(
         [driver], input=questions, capture_output=True, text=True, check=True, timeout=60
     )
-    answers = [line.strip() for line in run.stdout.splitlines()]
-    assert len(answers) == CASES
-    for case, answer in zip(cases, answers, strict=True):
-        assert answer == case.answer(), case
-    treated = {case.answer().split()[5] for case in cases}
-    assert treated == {"-", "0", "1", "2", "3"}, "some treatment never occurred"
+    answers = iter(line.strip() for line in run.stdout.splitlines())
+    seen: set[tuple[str | None, str | None]] = set()
+    for case in every:
+        for outcome in walk(case):
+            assert next(answers) == as_answer(case, outcome), case
+            seen.add((outcome.release.overrun, outcome.dropped))
+    assert next(answers, None) is None
+    assert {overrun for overrun, _ in seen} == {None, *LATE}, "some treatment never occurred"
+    assert {dropped for _, dropped in seen} == {None, *DROPPED}
 
 
 def test_both_read_the_same_origin_from_a_payload(driver: Path) -> None:
@@ -154,18 +156,35 @@ def test_both_read_the_same_origin_from_a_payload(driver: Path) -> None:
 def test_the_log_of_the_cpp_node_is_read(driver: Path, tmp_path: Path) -> None:
     log = tmp_path / "gate.csv"
     for _ in range(2):  # a node that is started again adds to its log
-        subprocess.run([driver, str(log)], check=True, timeout=60)
+        subprocess.run([driver, str(log), "1000000", "1"], check=True, timeout=60)
     table = read_gate_log(log)
     assert table.height == 6
+    assert table["row"].to_list() == [1, 2, 3] * 2
     first, second, late = table.rows(named=True)[:3]
     assert (first["mode"], first["slot"], first["overrun"]) == ("highway", 0, None)
     assert first["release"] - first["origin"] == 300_000_000
     assert first["arrival"] < first["release"] <= first["time"] <= first["published"]
     assert (first["source_timestamp"], second["source_timestamp"]) == (5, None)
+    assert (first["lost"], second["lost"]) == (2, 0)
     assert second["mode"] == "city"
     assert 0 <= first["stalled"] <= first["time"] - first["release"]
     assert (late["release"], late["slot"], late["published"], late["stalled"]) == (None,) * 4
-    assert (late["overrun"], late["source_timestamp"]) == ("discard", 2**63 - 1)
+    assert (late["overrun"], late["dropped"]) == ("discard", "discarded")
+    assert late["source_timestamp"] == 2**63 - 1
+
+
+def test_the_log_of_the_cpp_node_is_bounded(driver: Path, tmp_path: Path) -> None:
+    log = tmp_path / "gate.csv"
+    run = subprocess.run(
+        [driver, str(log), "100000", "5000"], check=True, timeout=60, capture_output=True, text=True
+    )
+    assert run.stdout == "5000 discarded, 10002 lost by DDS\n"
+    files = sorted(tmp_path.iterdir())
+    assert [file.name for file in files] == ["gate.csv", "gate.csv.1"]
+    assert sum(file.stat().st_size for file in files) <= 100_000
+    rows = read_gate_log(log)["row"]
+    assert rows[-1] == 5002
+    assert rows.to_list() == list(range(rows[0], 5003)), "both files, in order"
 
 
 def test_a_new_phase_is_in_force_from_the_next_cycle_that_begins_there(driver: Path) -> None:

@@ -47,9 +47,10 @@ def test_the_typed_package_is_the_expected_one_file_by_file() -> None:
         if expected.is_file():
             assert files.pop(str(expected.relative_to(EXPECTED))) == expected.read_text(), expected
     headers = {"gate.hpp", "gate_log.hpp", "node.hpp", "readiness.hpp", "serialized.hpp"}
-    headers |= {"kept_core.hpp", "shaper.hpp"}
+    headers |= {"handover.hpp", "kept_core.hpp", "queue.hpp", "shaper.hpp"}
     assert files.keys() == {
         "src/shaping_node.cpp",
+        "scripts/respawning",
         *(f"include/chainshaper_shaping/{header}" for header in headers),
     }
     assert files.pop("src/shaping_node.cpp") == (NODES / "typed/shaping_node.cpp").read_text()

@@ -136,11 +136,11 @@ def test_all_shaping_nodes_of_a_plan_are_spliced(tmp_path: Path) -> None:
     spliced = splice_launch_files(plan, [robot], tmp_path / "out", recording=recording)
 
     assert [process.name for process in spliced.processes] == ["chainshaper_t2", "chainshaper_t1"]
-    started, also, first, second = yaml.safe_load((tmp_path / "out/robot.launch.yaml").read_text())[
-        "launch"
-    ]
-    assert "chainshaper_t2.py" in started["executable"]["cmd"]
-    assert "chainshaper_t1.py" in also["executable"]["cmd"]
+    launched = yaml.safe_load((tmp_path / "out/robot.launch.yaml").read_text())["launch"]
+    *started, first, second = launched
+    nodes = ("chainshaper_t2", "chainshaper_t2_standby", "chainshaper_t1", "chainshaper_t1_standby")
+    for node, process in zip(nodes, started, strict=True):
+        assert f"/{node}.py" in process["executable"]["cmd"]
     assert first["node"]["remap"] == [{"from": "out", "to": "/t1_tmp"}]
     assert second["node"]["remap"] == [{"from": "/t2", "to": "/t2_tmp"}]
 
@@ -196,6 +196,19 @@ def test_two_publishers_of_the_output_are_refused(tmp_path: Path) -> None:
             plan_for("/ndt", "/pose"), [robot], tmp_path / "out", recording=open_recording(folder)
         )
     assert not (tmp_path / "out").exists()
+
+
+def test_a_standby_is_no_second_publisher(tmp_path: Path) -> None:
+    robot = tmp_path / "robot.launch.yaml"
+    robot.write_text("launch:\n- node: {pkg: a, exec: a, name: ndt}\n")
+    nodes = ({"/pose": "/chainshaper_pose"}, {"/pose": "/chainshaper_pose_standby"})
+    recording = open_recording(_recording_with_publishers(tmp_path, *nodes))
+
+    spliced = splice_launch_files(
+        plan_for("/ndt", "/pose"), [robot], tmp_path / "out", recording=recording
+    )
+
+    assert len(spliced.launch) == 1
 
 
 def test_a_package_s_node_is_started_with_its_parameters_and_remaps(tmp_path: Path) -> None:

@@ -45,9 +45,13 @@ def test_it_holds_the_copies_the_shaping_nodes_and_a_manifest(spliced: Splicing)
         "robot.launch.xml",
         "shaping_nodes/chainshaper_pose.py",
         "shaping_nodes/chainshaper_pose.yaml",
+        "shaping_nodes/chainshaper_pose_standby.py",
+        "shaping_nodes/chainshaper_pose_standby.yaml",
+        "shaping_nodes/respawning.py",
         "splice.json",
     }
-    assert spliced.logs == (spliced.folder / "logs/chainshaper_pose.csv",)
+    logs = spliced.folder / "logs"
+    assert spliced.logs == (logs / "chainshaper_pose.csv", logs / "chainshaper_pose_standby.csv")
     assert spliced.logs[0].parent.is_dir(), "the node makes no folder for its log"
     assert str(spliced.logs[0]) in spliced.processes[0].parameters_file.read_text()
 

@@ -86,9 +86,12 @@ def test_ros_2_remaps_the_publisher_and_nobody_else(
             pytest.skip(f"this distribution cannot launch the original: {before}")
         assert isinstance(before, list), before
         assert isinstance(after, list), after
-        ours = [topics for node, topics in after if node == shaping]
-        assert [(one["input"], one["output"]) for one in ours] == [(tmp, case.output)]
-        others = [(node, topics) for node, topics in after if node != shaping]
+        added = (shaping, f"{shaping}_standby")
+        ours = [
+            (node, topics["input"], topics["output"]) for node, topics in after if node in added
+        ]
+        assert ours == [(node, tmp, case.output) for node in added]
+        others = [(node, topics) for node, topics in after if node not in added]
         assert [node for node, _ in others] == [node for node, _ in before]
         assert case.publisher in [node for node, _ in before]
         for (node, was), (_, now) in zip(before, others, strict=True):

@@ -65,7 +65,9 @@ def nothing_is_half_written(tmp_path: Path) -> object:
             "launch:\n- node: {a: b}\n- just text\n",
             "a.launch.yaml:3: an action is",
         ),
-        ("a.launch.yaml", "launch:\n- &a\n  group: [*a]\n", "a.launch.yaml: not YAML"),
+        ("a.launch.yaml", "launch:\n- [a]: {}\n", "a.launch.yaml:2: an action is one key"),
+        ("a.launch.yaml", "launch:\n- node: {[a]: b}\n", "a.launch.yaml:2: an attribute's name"),
+        ("a.launch.yaml", "launch:\n- &a\n  group: [*a]\n", "a.launch.yaml:2: with its"),
         ("a.launch.py", "def f(:\n    pass\n", "a.launch.py:1: not Python: "),
         ("a.launch.py", "x = 1\ny = (\n", "a.launch.py:2: not Python: '(' was never closed"),
         ("a.launch.py", "print('hello')\n", "a.launch.py: no function generate_launch_description"),
@@ -88,7 +90,7 @@ def test_a_file_that_is_not_there_or_not_text_is_named(splice: Splice, tmp_path:
             plan_for("/ndt", "/pose"), [tmp_path / "no.launch.xml"], tmp_path / "spliced"
         )
     (tmp_path / "a.launch.xml").write_bytes(b"<launch>\xff</launch>")
-    with pytest.raises(InputError, match=r"a\.launch\.xml: not a text in UTF-8"):
+    with pytest.raises(InputError, match=r"a\.launch\.xml:1: not a text in UTF-8"):
         splice_launch_files(
             plan_for("/ndt", "/pose"), [tmp_path / "a.launch.xml"], tmp_path / "spliced"
         )

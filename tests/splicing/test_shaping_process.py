@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +18,7 @@ from processes import wait_for
 from small_chain import EXECUTOR_CORE
 
 from chainshaper.enforcement import gate
+from chainshaper.enforcement.gate import READER_DEPTH
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning import Modes, Plan, ShapingNode, let_per_callback
 from chainshaper.planning.plan import revised
@@ -64,15 +66,21 @@ def test_a_python_node_is_one_file_with_the_gate_of_the_live_workload(
     tmp_path: Path, plan: Plan, node: ShapingNode
 ) -> None:
     process = write_shaping_process(plan, node, "python", tmp_path)
-    assert process == ShapingProcess(
-        name="chainshaper_t3",
-        namespace="/",
-        command=("python3", str(tmp_path / "chainshaper_t3.py")),
-        package=None,
-        executable=None,
-        parameters_file=tmp_path / "chainshaper_t3.yaml",
-        remappings=(("input", "/t3_tmp"), ("output", "/t3")),
+    names = ("chainshaper_t3", "chainshaper_t3_standby")
+    shaping, standby = (
+        ShapingProcess(
+            name=name,
+            namespace="/",
+            command=("python3", str(tmp_path / f"{name}.py")),
+            package=None,
+            executable=None,
+            parameters_file=tmp_path / f"{name}.yaml",
+            remappings=(("input", "/t3_tmp"), ("output", "/t3")),
+        )
+        for name in names
     )
+    assert process == replace(shaping, standby=standby)
+    assert (tmp_path / "chainshaper_t3_standby.py").read_text().count("__main__") == 1
     text = (tmp_path / "chainshaper_t3.py").read_text()
     assert Path(gate.__file__).read_text() in text, "not byte for byte"
     imported = [
@@ -86,7 +94,7 @@ def test_a_python_node_is_one_file_with_the_gate_of_the_live_workload(
 def test_the_parameters_say_what_the_plan_says(
     tmp_path: Path, plan: Plan, node: ShapingNode
 ) -> None:
-    plan = revised(plan, overrun="discard", anchor="cycle", offset_ns=7 * MS)
+    plan = revised(plan, overrun="discard", messages="newest", anchor="cycle", offset_ns=7 * MS)
     process = write_shaping_process(plan, node, "python", tmp_path, log=tmp_path / "gate.csv")
     assert parameters_of(process) == {
         "slots_ns": [21 * MS, 22 * MS],
@@ -95,13 +103,29 @@ def test_the_parameters_say_what_the_plan_says(
         "phase_ns": 7 * MS,
         "overrun": "discard",
         "due_cycles": 0,
+        "messages": "newest",
+        "depth": 0,
         "spin_ns": node.spin_ns,
         "pause_ns": node.pause_ns,
         "core": EXECUTOR_CORE,
         "fifo_priority": node.fifo_priority,
         "output_depth": 10,
         "log": str(tmp_path / "gate.csv"),
+        "handover": parameters_of(process)["handover"],
     }
+    assert process.standby is not None
+    assert parameters_of(process.standby) == {
+        "handover": parameters_of(process)["handover"],
+        "shaping_node": "chainshaper_t3",
+        "fallback": "bypass",
+        "patience_ns": 25 * MS,
+        "output_depth": 10,
+        "depth": 0,
+        "server_cores": sorted({server.core for server in plan.servers}),
+        "log": str(tmp_path / "chainshaper_t3_standby.csv"),
+    }
+    elsewhere = write_shaping_process(plan, node, "python", tmp_path / "elsewhere")
+    assert parameters_of(elsewhere)["handover"] != parameters_of(process)["handover"]
 
 
 def test_under_let_each_topic_is_due_a_cycle_after_the_one_before_it(
@@ -114,6 +138,14 @@ def test_under_let_each_topic_is_due_a_cycle_after_the_one_before_it(
         parameters = parameters_of(write_shaping_process(plan, node, "python", tmp_path))
         due[node.output] = parameters["due_cycles"]
     assert due == {"/t1": 1, "/t2": 2, "/t3": 3}
+
+
+def test_a_prediction_that_is_edited_moves_no_output(
+    tmp_path: Path, plan: Plan, node: ShapingNode
+) -> None:
+    longer = plan.predicted.model_copy(update={"max_ns": 3 * plan.cycle_ns})
+    process = write_shaping_process(revised(plan, predicted=longer), node, "python", tmp_path)
+    assert parameters_of(process)["due_cycles"] == 0
 
 
 def test_modes_are_numbered_by_the_places_of_their_slots(
@@ -269,8 +301,9 @@ def test_the_output_is_offered_as_the_original_was(  # noqa: PLR0917 - a row of 
         assert made["qos"][same] == {**RELIABLE, **offered}[same]
     assert (asked["subscription"], asked["raw"]) == ("/t3_tmp", True)
     assert asked["qos"].items() >= subscription.items()
-    for same in ("history", "depth", "reliability", "durability"):
+    for same in ("history", "reliability", "durability"):
         assert asked["qos"][same] == made["qos"][same], "else the two do not match"
+    assert asked["qos"]["depth"] == READER_DEPTH, "what has no room in the gate, the gate drops"
     assert "lifespan" not in asked["qos"]
 
 

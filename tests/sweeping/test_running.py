@@ -200,7 +200,7 @@ def test_a_process_that_is_killed_is_told_of(description: Path, tmp_path: Path) 
     computing = [
         pid
         for pid in running.nodes().values()
-        if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        if b"sweeping.worker" in Path(f"/proc/{pid}/cmdline").read_bytes()
     ]
     os.kill(computing[0], signal.SIGKILL)
     finished = running.end()

@@ -118,7 +118,7 @@ def _usual_response(analysis: LatencyAnalysis) -> float:
 
 
 def _bulk(latencies: pl.Series) -> float:
-    """How far apart nine in ten latencies lie: what stalls of the machine hit is left out."""
+    """How far apart nine in ten latencies lie."""
     high, low = latencies.quantile(0.95), latencies.quantile(0.05)
     assert high is not None
     assert low is not None
@@ -170,7 +170,7 @@ def test_a_gated_publisher_thread_shapes_the_latency_and_stops_nobody_else(tmp_p
     sent = (undisturbed["end"] - begins) % PERIOD_NS
     assert (sent >= SLOT[0] - MS).all(), "it was sent outside the slot"
     for column in ("latency_ns", "reception_ns"):
-        assert _bulk(after.traversals[column]) < 0.5 * _bulk(before.traversals[column])
+        assert _bulk(undisturbed[column]) < 0.5 * _bulk(before.traversals[column])
     # The executor was never blocked, although its process's publisher was, for four fifths of
     # the time: it took no longer than without gating, far less than the slot is closed for.
     closed = PERIOD_NS - (SLOT[1] - SLOT[0])

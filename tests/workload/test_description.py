@@ -78,11 +78,11 @@ def test_a_node_that_hears_itself_is_a_circle(tmp_path: Path) -> None:
         (b"name: x\n\tchain: y\n", ":2: not YAML: "),
         (b"name: 'x\n", ": not YAML: "),
         (b"a: 1\n---\nb: 2\n", ":2: not YAML: but found another document"),
-        (bytes(range(256)), ": not a YAML text"),
-        (b"\x7fELF\x02\x01\x01\x00\x00", ": not a YAML text"),
-        (b"name: \xe9\n", ": not a YAML text"),  # Latin-1
+        (bytes(range(256)), ":2: not a text in UTF-8"),
+        (b"\x7fELF\x02\x01\x01\x00\x00", ":1: not YAML: the character 0x007f"),
+        (b"name: \xe9\n", ":1: not a text in UTF-8"),  # Latin-1
         (b"a: &loop [*loop]\n", ":1: a[0]: refers to this by a YAML alias"),
-        (b"[" * 5000, ": not a YAML text"),
+        (b"[" * 5000, ":1: not YAML: more than 100 lists"),
     ],
 )
 def test_files_that_are_no_descriptions(content: bytes, said: str, tmp_path: Path) -> None:
@@ -164,7 +164,7 @@ _sources = st.fixed_dictionaries(
 )
 
 
-@given(_sources, _topics, st.integers(0, 2**64))
+@given(_sources, _topics, st.integers(0, 2**64 - 1))
 def test_whatever_is_described_survives_its_file(
     tmp_path_factory: pytest.TempPathFactory,
     source: dict[str, object],

@@ -7,7 +7,7 @@ import polars as pl
 import pytest
 
 from chainshaper import events
-from chainshaper.enforcement.gate import ANCHORS, LATE
+from chainshaper.enforcement.gate import ANCHORS, DROPPED, LATE, MESSAGES
 from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS, EventLog, number_of
 from chainshaper.workload.event_reading import ProcessLog, event_tables, meter_tables
 from chainshaper.workload.stall_meter import NO_PACE
@@ -36,6 +36,7 @@ def test_every_event_is_read_back_as_it_was_recorded(name: str, fields: tuple[st
     expected: dict[str, Any] = {"time": 5000, "pid": 100, "tid": 100, "cpu": 1, **values}
     if name == "gate_release":
         expected |= {"anchor": "cycle", "overrun": "next-slot", "mode": "city"}
+        expected["dropped"] = "discarded"
     if name == "asynchronous_send":
         expected["outcome"] = "overwritten"
     assert tables[name].to_dicts() == [expected]
@@ -50,14 +51,16 @@ def test_the_layout_says_what_the_event_tables_say() -> None:
 
 def test_words_are_those_that_the_gate_uses() -> None:
     assert (WORDS["anchor"], WORDS["overrun"]) == (ANCHORS, LATE)
+    assert (WORDS["messages"], WORDS["dropped"]) == (MESSAGES, DROPPED)
     assert number_of("outcome", "overwritten") == 2
 
 
 def test_a_discarded_message_has_no_release_and_no_slot() -> None:
     log = EventLog()
     overrun = number_of("overrun", "discard")
-    log.point("gate_release")(9, 1, 2, 3, 4, ABSENT, ABSENT, 0, 0, overrun, ABSENT)
-    log.point("gate_release")(19, 1, 2, 3, 4, 18, 0, 0, 1, number_of("overrun", None), 1)
+    log.point("gate_release")(9, 1, 2, 3, 4, ABSENT, ABSENT, 0, 0, overrun, ABSENT, 3)
+    in_time = number_of("overrun", None)
+    log.point("gate_release")(19, 1, 2, 3, 4, 18, 0, 0, 1, in_time, 1, ABSENT)
     table = event_tables([_process(log)], from_ns=0)["gate_release"]
     assert table.select("release", "slot", "anchor", "overrun", "mode").rows() == [
         (None, None, "stamp", "discard", None),

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from unittest import mock
 
 import pytest
 from processes import children_of, wait_for
@@ -53,7 +54,8 @@ class Nursery:
 
     def start(self, body: str) -> Child:
         (self.folder / f"{body}.py").write_text(BODIES[body])
-        child = start_child(f"node {body}", body, {"PYTHONPATH": str(self.folder)})
+        with mock.patch.object(sys, "path", [*sys.path, str(self.folder)]):
+            child = start_child(f"node {body}", body, {}, libraries=[body])
         self.children.append(child)
         return child
 
@@ -160,10 +162,10 @@ def test_children_die_when_their_launcher_is_killed(tmp_path: Path) -> None:
     """SIGKILL leaves the launcher no time for anything: the kernel has to do it."""
     (tmp_path / "bound.py").write_text(BODIES["bound"])
     program = (
-        "import os, time\n"
+        "import os, sys, time\n"
         "from chainshaper.workload.launcher import start_child\n"
-        f"environment = {{'PYTHONPATH': {str(tmp_path)!r}}}\n"
-        "children = [start_child(f'node {i}', 'bound', environment) for i in range(2)]\n"
+        f"sys.path.append({str(tmp_path)!r})\n"
+        "children = [start_child(f'node {i}', 'bound', {}, (), ['bound']) for i in range(2)]\n"
         "for child in children:\n"
         "    child.tell(parent=os.getpid())\n"
         "    child.hear()\n"

@@ -6,6 +6,7 @@ message is handed over. `asynchronous_send` says when, and whether, it was sent;
 cannot know this lack the table, and then what the output's subscriber saw has to be looked at.
 
 A shaping node may discard a message that overran its slot (`gate_release` without a release).
+Which decision was about which message of a chain stands here, once: see :func:`gated_hops`.
 """
 
 import polars as pl
@@ -14,7 +15,14 @@ from chainshaper import events
 from chainshaper.analysis.matching import by_number
 from chainshaper.analysis.objects import Objects
 
-__all__ = ["discarded_instances", "gate_decisions", "why_not_sent", "with_departures"]
+__all__ = [
+    "discarded_instances",
+    "gate_decisions",
+    "gated_hops",
+    "why_not_sent",
+    "with_departures",
+    "with_overrun",
+]
 
 
 def with_departures(
@@ -80,15 +88,50 @@ def gate_decisions(tables: events.EventTables, objects: Objects) -> pl.DataFrame
     A shaping node in ROS 2 does not know its callback's handle. A decision of its is there once for
     each subscription of its process; which one took the message, the source timestamp tells.
     """
-    decisions = events.table(tables, "gate_release")
+    decisions = events.table(tables, "gate_release", ["mode"])
     callbacks = objects.callbacks.select("pid", "callback_id", "kind", callback="handle")
-    known = decisions.join(
-        callbacks.drop("kind").unique(), on=["pid", "callback"], how="inner", maintain_order="left"
-    )
-    if not decisions["callback"].null_count():
+    handles = callbacks.drop("kind").unique()
+    known = decisions.join(handles, on=["pid", "callback"], how="inner", maintain_order="left")
+    nameless = decisions.join(handles, on=["pid", "callback"], how="anti", maintain_order="left")
+    if not nameless.height:
         return known
     listening = callbacks.filter(pl.col("kind") == "subscription").select("pid", "callback_id")
-    unknown = decisions.filter(pl.col("callback").is_null()).join(
-        listening.unique(), on="pid", how="inner", maintain_order="left"
-    )
+    unknown = nameless.join(listening.unique(), on="pid", how="inner", maintain_order="left")
     return pl.concat([known, unknown.select(known.columns)])
+
+
+def with_overrun(decisions: pl.DataFrame, due_cycles: int = 0) -> pl.DataFrame:
+    """Decisions with the column ``overrun``, which older recordings lack.
+
+    Without it a message overran when it left in a later cycle than ``due_cycles`` after its own.
+    """
+    if "overrun" in decisions.columns:
+        return decisions
+    late = pl.col("cycles_waited") > due_cycles
+    return decisions.with_columns(overrun=pl.when(late).then(pl.lit("wait")))
+
+
+_DECIDED = ("arrival", "origin", "release", "slot", "cycles_waited", "anchor", "overrun", "mode")
+
+
+def gated_hops(
+    tables: events.EventTables, objects: Objects, hops: pl.DataFrame, due_cycles: int = 0
+) -> pl.DataFrame:
+    """What gates decided about the messages of a chain: one row per hop whose callback is a gate.
+
+    ``traversal, hop, arrival, origin, release, let_go, slot, cycles_waited, anchor, overrun, mode``
+    of `gate_release`, sorted; ``let_go`` is when it really did. A decision is found by the gate's
+    callback and the message's source timestamp. Several messages may have the same (writers
+    stamp in microseconds, a simulated clock stands still): then the decision is meant whose
+    ``arrival`` is nearest to the start of the callback.
+    """
+    decided = with_overrun(gate_decisions(tables, objects), due_cycles).select(
+        "callback_id", "source_timestamp", *_DECIDED, let_go="time"
+    )
+    keys = ["callback_id", "source_timestamp"]
+    reached = hops.select("traversal", "hop", "start", *keys).drop_nulls(keys)
+    found = reached.join(decided, on=keys, how="inner")
+    apart = (pl.col("arrival") - pl.col("start")).abs()
+    nearest = found.sort("traversal", "hop", apart, maintain_order=True)
+    columns = ("traversal", "hop", *_DECIDED[:3], "let_go", *_DECIDED[3:])
+    return nearest.unique(["traversal", "hop"], keep="first", maintain_order=True).select(columns)

@@ -5,16 +5,17 @@ sleeper at the highest priority, run beside the application, sees it: a row of `
 says that on core ``cpu`` nobody ran from ``time`` for ``duration``. A latency measured across a
 stall says something about the machine, not about the application.
 
-What a stall does to a traversal depends on whether a gate held its output (`gate_release`):
+A cycle is disturbed by stalls **before the moment at which its output was due** (`due_at` of
+:mod:`~chainshaper.analysis.punctuality`), and by no other: what happens to an output that is late
+already, and waits for a later slot, is no excuse for it. Nor is looked at whether it was late:
 
-* **A gate** makes two instants decide the latency: when the origin was taken (between the
-  traversal's start and the anchor's origin), and from shortly before the planned release to the
-  publication. Any stall at one of them disturbs. While the message was held, a stall only
-  shortened the wait.
-* **Not held**: no gate, or the message came in or behind its slot. Stalls while it was computed
-  add up, and disturb it from ``COMPUTING_THRESHOLD_NS`` in all: on one core, within [start, end].
-  A traversal that began before its disturbed predecessor had ended may have queued behind it,
-  and counts as disturbed with it.
+* **At two instants** any stall disturbs what a gate lets go: where the origin is taken (between the
+  traversal's start and the anchor's origin), and around the moment at which the output was due.
+* **In between** stalls add up, on one core, within [start, due]. Without a gate they disturb from
+  ``COMPUTING_THRESHOLD_NS`` in all. A gate absorbs what the plan's margin ε has room for, whatever
+  the cycle's own latency: only more than that disturbs.
+* A traversal that began before its disturbed predecessor was computed may have queued behind it,
+  and counts as disturbed with it, unless the plan has them overlap (logical execution time).
 """
 
 from dataclasses import dataclass
@@ -24,9 +25,7 @@ import numpy.typing as npt
 import polars as pl
 
 from chainshaper import events
-from chainshaper.analysis.departures import gate_decisions
 from chainshaper.analysis.flow import DataFlow
-from chainshaper.analysis.traversals import Traversals
 from chainshaper.enforcement.gate import STALL_NS
 
 __all__ = [
@@ -38,7 +37,8 @@ __all__ = [
 ]
 
 WAKING_NS = 200_000
-"""A stall that ends this shortly before a release leaves the gate no time to wake up for it."""
+"""A gate wakes up and publishes within this time of a release: a stall this shortly before or
+behind the release moves the output."""
 
 COMPUTING_THRESHOLD_NS = 1_000_000
 """A chain that computes for tens of milliseconds is hardly changed by less than this."""
@@ -67,31 +67,36 @@ class _Stalls:
 
 def disturbed(
     flow: DataFlow,
-    traversals: Traversals,
+    frame: pl.DataFrame,
+    margin_ns: int = 0,
+    *,
     threshold_ns: int = STALL_NS,
     computing_threshold_ns: int = COMPUTING_THRESHOLD_NS,
     waking_ns: int = WAKING_NS,
 ) -> Mask:
-    """A mask over the rows of ``traversals.frame``; incomplete traversals are never marked."""
+    """A mask over the rows of ``frame``; incomplete traversals are never marked.
+
+    ``frame`` is that of :func:`~chainshaper.analysis.punctuality.with_punctuality`, ``margin_ns``
+    the margin of the plan in force.
+    """
     stalls = _Stalls.of(flow, threshold_ns)
     if not len(stalls.began):
-        return np.zeros(traversals.frame.height, dtype=np.bool_)
-    frame = traversals.frame.join(
-        _releases(flow, traversals), on="traversal", how="left", maintain_order="left"
+        return np.zeros(frame.height, dtype=np.bool_)
+    complete, gated = frame["complete"].to_numpy(), frame["origin"].is_not_null().to_numpy()
+    start, due, origin, computed = (
+        frame[name].fill_null(frame["start"]).to_numpy()
+        for name in ("start", "due_at", "origin", "computed_at")
     )
-    complete = frame["complete"].to_numpy()
-    start, end = frame["start"].to_numpy(), frame["end"].fill_null(0).to_numpy()
-    gated, held = (
-        frame["release"].is_not_null().to_numpy(),
-        frame["held"].fill_null(False).to_numpy(),
-    )
-    release, origin = (frame[name].fill_null(0).to_numpy() for name in ("release", "origin"))
     first, last = np.minimum(start, origin), np.maximum(start, origin)
     at_instants = overlapping(first, last, stalls.began, stalls.ended)
-    at_instants |= overlapping(release - waking_ns, end, stalls.began, stalls.ended)
-    lost = stalled_within(start, end, stalls.began, stalls.ended, stalls.core)
-    hit = complete & ((gated & at_instants) | (~held & (lost >= computing_threshold_ns)))
-    return complete & (hit | _queued_behind(hit, start, end, ~held & complete))
+    at_instants |= overlapping(due - waking_ns, due + waking_ns, stalls.began, stalls.ended)
+    lost = stalled_within(start, due, stalls.began, stalls.ended, stalls.core)
+    most = np.where(gated, max(computing_threshold_ns, margin_ns + 1), computing_threshold_ns)
+    hit = complete & ((gated & at_instants) | (lost >= most))
+    # A predecessor that was to be out later than the next began is not waited for.
+    following = np.append(start[1:], np.iinfo(np.int64).max) if len(start) else start
+    busy_until = np.where(gated & (due > following), start, computed)
+    return complete & (hit | _queued_behind(hit, start, busy_until, complete))
 
 
 def stalled_after(flow: DataFlow, start: Times, end: Times, threshold_ns: int = STALL_NS) -> Mask:
@@ -100,12 +105,12 @@ def stalled_after(flow: DataFlow, start: Times, end: Times, threshold_ns: int = 
     return overlapping(start, end, stalls.began, stalls.ended)
 
 
-def _queued_behind(hit: Mask, start: Times, end: Times, may_queue: Mask) -> Mask:
-    """Traversals, in order of start, linked to a disturbed one by predecessors still under way."""
+def _queued_behind(hit: Mask, start: Times, busy_until: Times, may_queue: Mask) -> Mask:
+    """Traversals, in order of start, linked to a disturbed one by predecessors still computed."""
     if not len(start):
         return hit
     linked = np.zeros(len(start), dtype=np.bool_)
-    linked[1:] = may_queue[1:] & (start[1:] < np.maximum.accumulate(end)[:-1])
+    linked[1:] = may_queue[1:] & (start[1:] < np.maximum.accumulate(busy_until)[:-1])
     position = np.arange(len(start))
     run_start = np.maximum.accumulate(np.where(linked, 0, position))
     last_hit = np.maximum.accumulate(np.where(hit, position, -1))
@@ -146,24 +151,3 @@ def overlapping(start: Times, end: Times, began: Times, ended: Times) -> npt.NDA
     begun_by_end = np.searchsorted(np.sort(began), end, side="right")
     over_by_start = np.searchsorted(np.sort(ended), start, side="right")
     return np.asarray(begun_by_end > over_by_start, dtype=np.bool_)
-
-
-def _releases(flow: DataFlow, traversals: Traversals) -> pl.DataFrame:
-    """``traversal, release, origin, held`` of those whose last hop was a gate.
-
-    The gate's row is found by its callback and the source timestamp of the message. ``held`` are
-    messages that came before their slot in their own cycle.
-    """
-    last = len(traversals.chain.callbacks) - 1
-    arrived = traversals.hops.filter(pl.col("hop") == last).select(
-        "traversal", "callback_id", "source_timestamp"
-    )
-    in_time = (pl.col("cycles_waited") == 0) & (pl.col("arrival") < pl.col("release"))
-    released = (
-        gate_decisions(flow.events, flow.objects)
-        .select("callback_id", "source_timestamp", "release", "origin", held=in_time)
-        .unique(["callback_id", "source_timestamp"], keep="last", maintain_order=True)
-    )
-    return arrived.join(released, on=["callback_id", "source_timestamp"], how="inner").select(
-        "traversal", "release", "origin", "held"
-    )

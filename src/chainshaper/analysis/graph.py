@@ -85,7 +85,7 @@ def _direct(flow: DataFlow) -> dict[int, set[str]]:
     """Callback id → topics published inside its instances."""
     pairs = (
         flow.publications.lazy()
-        .drop_nulls("callback_id")
+        .drop_nulls(["callback_id", "topic"])
         .select("callback_id", "topic")
         .unique()
         .collect()

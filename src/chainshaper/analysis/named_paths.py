@@ -6,10 +6,10 @@ variable passings of that file are CARET's, ours come from the recording.
 
 from pathlib import Path
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from chainshaper.errors import InputError
+from chainshaper.yaml_file import PlainData, compose, read_text
 
 __all__ = ["load_named_paths"]
 
@@ -46,22 +46,15 @@ def load_named_paths(file: str | Path) -> dict[str, str]:
     Raises:
         InputError: not readable, not YAML, no ``named_paths``, a path without nodes.
     """
+    path = Path(file)
+    root = compose(read_text(path, "CARET's architecture file"), path)
+    plain = PlainData(path, ours=False)
     try:
-        content = yaml.safe_load(Path(file).read_text(encoding="utf-8"))
-        architecture = _Architecture.model_validate(content)
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read: {error.strerror}") from error
-    except yaml.MarkedYAMLError as error:
-        line = f":{error.problem_mark.line + 1}" if error.problem_mark else ""
-        raise InputError(f"{file}{line}: not YAML: {error.problem or error.context}") from error
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{file}: not a YAML text: {error}") from error
+        architecture = _Architecture.model_validate(None if root is None else plain.of(root))
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"]) or "the file"
         raise InputError(
-            f"{file}: {where}: {first['msg']}; chains are read from the `named_paths` of a CARET "
-            "architecture file, each with its `path_name` and `node_chain`"
+            f"{plain.problems(error, _Architecture)}; chains are read from the `named_paths` of a"
+            " CARET architecture file, each with its `path_name` and `node_chain`"
         ) from error
     return {path.path_name: _chain(path) for path in architecture.named_paths}
 

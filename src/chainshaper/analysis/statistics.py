@@ -18,7 +18,8 @@ class LatencyStatistics:
     """Statistics of a sample of latencies, in whole nanoseconds; None where there is no sample.
 
     ``count`` latencies were measured; ``incomplete`` traversals have none; ``disturbed`` of
-    ``count`` were hit by a stall of the machine. ``jitter_ns`` is max − min (paper: J),
+    ``count`` were hit by a stall of the machine; ``late`` of them came behind the slot or cycle
+    they were due in (None: when they were due is not known). ``jitter_ns`` is max − min (paper: J),
     ``spread_ns`` p99.5 − p0.5. ``percentiles_ns`` has the keys 0.5, 1, 5, 25, 50, 75, 95, 99 and
     99.5 as text; they interpolate linearly between the two nearest values (NumPy's default),
     then are rounded.
@@ -33,12 +34,14 @@ class LatencyStatistics:
     jitter_ns: int | None
     spread_ns: int | None
     percentiles_ns: dict[str, int]
+    late: int | None = None
 
 
 def latency_statistics(
     latency_ns: npt.ArrayLike,
     disturbed: npt.ArrayLike | None = None,
     incomplete: int = 0,
+    late: int | None = None,
 ) -> LatencyStatistics:
     """Statistics of latencies in ns; ``disturbed`` marks those that the machine hit.
 
@@ -47,7 +50,7 @@ def latency_statistics(
     sample = np.asarray(latency_ns, dtype=np.int64)
     hit = 0 if disturbed is None else int(np.count_nonzero(np.asarray(disturbed, dtype=bool)))
     if not len(sample):
-        return LatencyStatistics(0, incomplete, hit, None, None, None, None, None, {})
+        return LatencyStatistics(0, incomplete, hit, None, None, None, None, None, {}, late)
     values = np.percentile(sample, PERCENTILES)
     percentiles = {f"{p:g}": round(float(v)) for p, v in zip(PERCENTILES, values, strict=True)}
     low, high = int(sample.min()), int(sample.max())
@@ -61,6 +64,7 @@ def latency_statistics(
         jitter_ns=high - low,
         spread_ns=percentiles["99.5"] - percentiles["0.5"],
         percentiles_ns=percentiles,
+        late=late,
     )
 
 

@@ -1,10 +1,15 @@
 """All verbs of the command line."""
 
 from importlib import import_module
+from typing import Any
 
 import typer
+from typer import Abort
 
-__all__ = ["app"]
+__all__ = ["USAGE_ERROR", "Abort", "app"]
+
+USAGE_ERROR: Any = typer.BadParameter.__base__
+"""What Typer raises where a command line is wrong; the name of its module changes."""
 
 app = typer.Typer(
     help="Constant end-to-end latency for ROS 2 computation chains, without touching their code.",

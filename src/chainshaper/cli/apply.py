@@ -2,14 +2,14 @@
 
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from chainshaper.cli.options import JsonOption, duration_option
+from chainshaper.cli.options import JsonOption, UsersOption, duration_option
 from chainshaper.cli.signals import stop_on_signals
 
 if TYPE_CHECKING:
@@ -59,6 +59,7 @@ def apply(
             "How long the plan's nodes have to appear. Default: 30s with a COMMAND, else no time.",
         ),
     ] = None,
+    user: UsersOption = None,
     dry_run: Annotated[
         bool,
         typer.Option(
@@ -76,15 +77,18 @@ def apply(
     from chainshaper.applying import apply_plan
     from chainshaper.cli.output import notes, print_json, show
     from chainshaper.errors import OperationError
-    from chainshaper.planning import load_plan
+    from chainshaper.planning import load_plan, plan_warnings
     from chainshaper.reporting.servers import servers_table
-    from chainshaper.sources import open_source
 
-    planned = load_plan(plan)
-    recorded = None if recording is None else open_source(recording)
+    planned, recorded = load_plan(plan), None
+    if recording is not None:
+        from chainshaper.sources import open_source  # slow to import
+
+        recorded = open_source(recording)
     if dry_run:
-        _show_changes(planned, backend, recorded, phase, json=json)
+        _show_changes(planned, backend, recorded, phase, user or (), json=json)
         return
+    notes(plan_warnings(planned))
     stop = threading.Event()
     with stop_on_signals(stop), _watching() as (watch, report):
         done = apply_plan(
@@ -95,6 +99,7 @@ def apply(
             recording=recorded,
             phase_ns=phase,
             wait_ns=wait,
+            users=user or (),
             plan_path=str(plan),
             stop=stop,
             watch=watch,
@@ -110,7 +115,13 @@ def apply(
 
 
 def _show_changes(
-    plan: "Plan", backend: str, recording: "Recording | None", phase_ns: int | None, *, json: bool
+    plan: "Plan",
+    backend: str,
+    recording: "Recording | None",
+    phase_ns: int | None,
+    users: Sequence[str],
+    *,
+    json: bool,
 ) -> None:
     import shlex
     from dataclasses import asdict
@@ -119,7 +130,7 @@ def _show_changes(
     from chainshaper.dry_run import planned_changes
     from chainshaper.reporting.servers import changes_table
 
-    changes = planned_changes(plan, backend, recording=recording, phase_ns=phase_ns)
+    changes = planned_changes(plan, backend, recording=recording, phase_ns=phase_ns, users=users)
     if json:
         print_json(asdict(changes))
         return
@@ -159,14 +170,16 @@ def _watching() -> "Iterator[tuple[Callable[[RunState], None], Callable[[float, 
 
 
 def _lines(text: "Callable[[RunState], str]") -> "Callable[[RunState], None]":
+    from chainshaper.cli.output import say
+
     seen = 0
 
     def watch(state: "RunState") -> None:
         nonlocal seen
         if seen == 0:
-            sys.stderr.write(f"in force with {state.back_end}: {state.reason}; Ctrl-C ends it\n")
+            say(f"in force with {state.back_end}: {state.reason}; Ctrl-C ends it")
         elif seen % LINE_EVERY == 0:
-            sys.stderr.write(text(state) + "\n")
+            say(text(state))
         seen += 1
 
     return watch

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from chainshaper.cli.options import CyclesOption, JsonOption, RealtimeOption
+from chainshaper.cli.plan_options import IdealMachineOption
 
 __all__ = ["demo"]
 
@@ -30,6 +31,7 @@ def demo(
     ] = None,
     cycles: CyclesOption = 320,
     realtime: RealtimeOption = None,
+    ideal_machine: IdealMachineOption = False,
     json: JsonOption = False,
 ) -> None:
     """Measure a live chain, plan, splice the shaping node, measure again, show the gain.
@@ -39,6 +41,7 @@ def demo(
     """
     from chainshaper.cli.output import notes, print_json, progress, show, show_line
     from chainshaper.demo import run_demo
+    from chainshaper.planning import PlanRequest, plan_warnings
     from chainshaper.reporting.tables import (
         callback_table,
         comparison_json,
@@ -52,8 +55,10 @@ def demo(
             folder,
             application=application,
             cycles=cycles,
+            request=PlanRequest(ideal_machine=ideal_machine),
             realtime=realtime,
             command=sys.argv,
+            planned=lambda plan: notes(plan_warnings(plan)),
             progress=report,
         )
     if json:

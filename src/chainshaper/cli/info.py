@@ -20,4 +20,4 @@ def info(trace: TraceArgument, json: JsonOption = False) -> None:
         return
     show(*contents_table(opened))
     show_line(lost_events(opened.info))
-    notes(opened.info.notes)
+    notes(result["notes"])

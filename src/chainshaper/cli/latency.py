@@ -33,7 +33,7 @@ def latency(
     """
     from chainshaper.cli.output import late_progress, notes, print_json, show, show_line
     from chainshaper.exploration import lost_events, named_chain
-    from chainshaper.overruns import overruns_text
+    from chainshaper.overruns import dropped_text, overruns_text
     from chainshaper.reporting.breakdown import breakdown_json, breakdown_table
     from chainshaper.reporting.tables import latency_json, latency_table
     from chainshaper.sources import open_source
@@ -60,5 +60,7 @@ def latency(
         counts += f"; incomplete: {reasons}"
     if measurement.overruns:
         counts += f"; {overruns_text(measurement.overruns)}"
+    if measurement.dropped:
+        counts += f"; {dropped_text(measurement.dropped)}"
     show_line(f"{counts}; {lost_events(opened.info)}")
     notes(analysis.notes)

@@ -16,6 +16,7 @@ __all__ = [
     "RealtimeOption",
     "RecordingOutput",
     "TraceArgument",
+    "UsersOption",
     "duration_option",
 ]
 
@@ -55,6 +56,15 @@ RealtimeOption = Annotated[
     bool | None,
     typer.Option(
         "--realtime/--no-realtime", help="Use SCHED_FIFO. Default: where it is permitted."
+    ),
+]
+UsersOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--user",
+        metavar="NAME",
+        help="Whose processes are taken for nodes (may be repeated). Default: yours, also behind "
+        "sudo, and root's.",
     ),
 ]
 

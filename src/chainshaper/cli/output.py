@@ -9,11 +9,21 @@ from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
 from chainshaper.errors import OperationError
+from chainshaper.safe_text import shown
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-__all__ = ["late_progress", "notes", "print_json", "progress", "show", "show_line", "stage_lines"]
+__all__ = [
+    "late_progress",
+    "notes",
+    "print_json",
+    "progress",
+    "say",
+    "show",
+    "show_line",
+    "stage_lines",
+]
 
 PATIENCE_S = 2.0
 """What takes longer than this shows its progress."""
@@ -31,14 +41,18 @@ def show(*tables: "RenderableType") -> None:
 
 
 def show_line(text: str) -> None:
-    """One line on stdout as it is: a path must not be folded."""
+    """A line on stdout, or several, as they are: a path must not be folded."""
+    _write(shown(text, but="\n"))
+
+
+def _write(text: str) -> None:
     with _written():
         sys.stdout.write(text + "\n")
 
 
 def print_json(value: Any) -> None:
-    """One JSON document on stdout."""
-    show_line(json.dumps(value, indent=2))
+    """One JSON document on stdout; the one control character that JSON leaves alone is escaped."""
+    _write(json.dumps(value, indent=2).replace("\x7f", "\\u007f"))
 
 
 @contextmanager
@@ -57,10 +71,15 @@ def _written() -> Iterator[None]:
         ) from error
 
 
+def say(text: str) -> None:
+    """A message on stderr."""
+    sys.stderr.write(shown(text, but="\n") + "\n")
+
+
 def notes(lines: Iterable[str]) -> None:
     """What a reader of the figures must know, one line each, on stderr."""
     for line in lines:
-        sys.stderr.write(f"note: {line}\n")
+        say(f"note: {line}")
 
 
 @contextmanager
@@ -73,16 +92,16 @@ def progress(title: str) -> Iterator[Callable[[float, str], None]]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         TextColumn("{task.percentage:>3.0f}%"),
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task(title, total=1.0)
+        task = bar.add_task(shown(title), total=1.0)
 
         def report(share: float, what: str) -> None:
-            bar.update(task, completed=min(1.0, share), description=f"{title}: {what}")
+            bar.update(task, completed=min(1.0, share), description=shown(f"{title}: {what}"))
 
         yield report
 
@@ -128,7 +147,7 @@ def stage_lines(title: str) -> Callable[[float, str], None]:
     def report(share: float, what: str) -> None:  # noqa: ARG001 - the signature of progress
         nonlocal last
         if what != last:
-            sys.stderr.write(f"{title}: {what}\n")
+            say(f"{title}: {what}")
             last = what
 
     return report

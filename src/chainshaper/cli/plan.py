@@ -8,7 +8,7 @@ import typer
 
 from chainshaper.cli import plan_options as options
 from chainshaper.cli.options import JsonOption, duration_option
-from chainshaper.enforcement.gate import Anchor, Late, Overrun
+from chainshaper.enforcement.gate import Anchor, Late
 from chainshaper.errors import InputError
 from chainshaper.plan_choices import Goal, Policy, Publication, Solver
 
@@ -36,6 +36,7 @@ def plan(
     slot_start: options.SlotStartOption = None,
     epsilon: options.EpsilonOption = None,
     overrun_probability: options.ProbabilityOption = None,
+    ideal_machine: options.IdealMachineOption = False,
     bands: options.BandsOption = "1",
     solver: Annotated[
         Solver, typer.Option(help="What places bands.", rich_help_panel="Latency bands")
@@ -43,13 +44,14 @@ def plan(
     grid: options.GridOption = "1us",  # type: ignore[assignment]
     modes: options.ModesOption = None,
     late: Annotated[
-        Late,
+        Late | None,
         typer.Option(
-            help="With --modes, an output behind its mode's slot: wait for the next cycle's, or"
-            " not, or at once, or in the cycle's next slot.",
+            help="With --modes, an output behind its mode's slot: at once, wait for the next"
+            " cycle's, discard, or in the cycle's next slot. Default: publish.",
             rich_help_panel="Latency bands",
+            show_default=False,
         ),
-    ] = "wait",
+    ] = None,
     max_gap: options.MaxGapOption = None,
     max_share: options.MaxShareOption = None,
     minimise: Annotated[
@@ -65,10 +67,10 @@ def plan(
         Anchor,
         typer.Option(help="What slots count from: the message's stamp, or the cycle."),
     ] = "stamp",
-    overrun: Annotated[
-        Overrun,
-        typer.Option(help="An output that missed its slot: wait for the next, or not, or at once."),
-    ] = "wait",
+    overrun: options.OverrunOption = None,
+    messages: options.MessagesOption = "all-in-order",
+    depth: options.DepthOption = None,
+    fallback: options.FallbackOption = None,
     spin: Annotated[
         int, duration_option("--spin", "How long the gate watches the clock before its slot.")
     ] = "1ms",  # type: ignore[assignment]
@@ -99,6 +101,7 @@ def plan(
         publication=publication,
         epsilon_ns=epsilon,
         overrun_probability=overrun_probability,
+        ideal_machine=ideal_machine,
         publish_slot_ns=publish_slot,
         bands="auto" if bands == "auto" else int(bands),
         solver=solver,
@@ -114,6 +117,9 @@ def plan(
         modes=options.modes_of(modes, late),
         anchor=anchor,
         overrun=overrun,
+        messages=messages,
+        depth=depth,
+        fallback=fallback or "bypass",
         spin_ns=spin,
         pause_ns=pause,
         with_receivers=receivers,
@@ -184,9 +190,8 @@ def _several(
     json: bool,
 ) -> None:
     from chainshaper.cli.offsets import place_and_print
-    from chainshaper.planning import plan_chain
+    from chainshaper.planning import plan_chains
 
     if sinks or curve is not None:
         raise InputError("--sink and --curve go with one chain: plan chains one by one")
-    plans = [plan_chain(profile, request) for profile in profiles]
-    place_and_print(plans, output, json)
+    place_and_print(plan_chains(profiles, request), output, json)

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from chainshaper.cli.options import duration_option
-from chainshaper.enforcement.gate import Late
+from chainshaper.enforcement.gate import Late, Messages, Overrun
 from chainshaper.errors import InputError
+from chainshaper.plan_choices import Fallback
 
 if TYPE_CHECKING:
     from chainshaper.planning import Modes
@@ -16,15 +17,20 @@ __all__ = [
     "BandsOption",
     "ChainsOption",
     "CurveOption",
+    "DepthOption",
     "EpsilonOption",
+    "FallbackOption",
     "FirstSlotOption",
     "GridOption",
+    "IdealMachineOption",
     "LatenciesOption",
     "LeastGainOption",
     "MaxGapOption",
     "MaxShareOption",
     "MeanAtMostOption",
+    "MessagesOption",
     "ModesOption",
+    "OverrunOption",
     "PeriodOption",
     "PlanOutput",
     "ProbabilityOption",
@@ -36,14 +42,16 @@ __all__ = [
 ]
 
 
-def modes_of(text: str | None, late: Late) -> "Modes | None":
+def modes_of(text: str | None, late: Late | None) -> "Modes | None":
     """The modes that `--modes` names, such as ``/mode:city=2,highway=1``; the first is the default.
+
+    An output behind its mode's slot leaves at once unless ``late`` says otherwise.
 
     Raises:
         InputError: it is not of this form, or names what no mode or topic may be called.
     """
     if text is None:
-        if late != "wait":
+        if late is not None:
             raise InputError(f"--late {late} goes with modes: add --modes, or leave it out")
         return None
     from chainshaper.planning import Modes
@@ -58,7 +66,7 @@ def modes_of(text: str | None, late: Late) -> "Modes | None":
             " /driving_mode:city=2,highway=1"
         )
     with wrong_values_refused(Modes):
-        return Modes(topic=topic, default=pairs[0][0], bands=bands, late=late)
+        return Modes(topic=topic, default=pairs[0][0], bands=bands, late=late or "publish")
 
 
 def _bands(text: str) -> str:
@@ -111,15 +119,36 @@ PeriodOption = Annotated[
 ]
 EpsilonOption = Annotated[
     int | None,
-    duration_option("--epsilon", "Margin behind the longest latency. Default: 1ms.", panel=_MARGIN),
+    duration_option(
+        "--epsilon",
+        "A given margin behind the longest undisturbed latency. Default: 1ms behind the latency"
+        " that all cycles but 1 % stay below.",
+        panel=_MARGIN,
+    ),
+]
+IdealMachineOption = Annotated[
+    bool,
+    typer.Option(
+        "--ideal-machine",
+        help="Leave out cycles that the machine disturbed: for one that does not stall.",
+        rich_help_panel=_MARGIN,
+    ),
+]
+OverrunOption = Annotated[
+    Overrun | None,
+    typer.Option(
+        help="An output that missed its slot: at once; or in slots only: wait for the next, or"
+        " discard. Default: publish.",
+        show_default=False,
+    ),
 ]
 ProbabilityOption = Annotated[
     float | None,
     typer.Option(
         "--overrun-probability",
         metavar="P",
-        help="Derive the margin instead: from the tail of the latencies, so that a cycle overruns"
-        " with this probability, such as 1e-6.",
+        help="Share of all cycles that may be late, such as 0.01; below 0.001 it is derived from"
+        " the tail of the latencies.",
         rich_help_panel=_MARGIN,
     ),
 ]
@@ -143,12 +172,31 @@ ModesOption = Annotated[
         rich_help_panel=_BANDS,
     ),
 ]
+MessagesOption = Annotated[
+    Messages, typer.Option(help="Which of several outputs in one cycle leave.")
+]
+DepthOption = Annotated[
+    int | None,
+    typer.Option(
+        min=1,
+        help="How many outputs may wait in the gate. Default: as many as the history of its"
+        " publisher has room for, 10 at least.",
+        show_default=False,
+    ),
+]
 ReceiversOption = Annotated[
     bool,
     typer.Option(
         "--receivers/--no-receivers",
         help="Give nodes that subscribe to the shaped output SCHED_FIFO below all servers, while"
         " the plan is in force.",
+    ),
+]
+FallbackOption = Annotated[
+    Fallback | None,
+    typer.Option(
+        help="While the shaping node is not there: outputs go around it, or none is published."
+        " Default: bypass, or what the plan says."
     ),
 ]
 MaxGapOption = Annotated[

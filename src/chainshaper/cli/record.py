@@ -1,12 +1,13 @@
 """`chainshaper record`: trace an application that runs, or that a command starts."""
 
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import typer
 
-from chainshaper.cli.options import JsonOption, RecordingOutput, duration_option
+from chainshaper.cli.options import JsonOption, RecordingOutput, UsersOption, duration_option
 from chainshaper.cli.signals import stop_on_signals
 from chainshaper.errors import InputError, OperationError
 
@@ -63,9 +64,10 @@ def record(
         list[int] | None,
         typer.Option(
             help="Attach to this process and what it has started (ebpf; may be repeated). "
-            "Default, without a COMMAND: everything that looks like ROS 2."
+            "Default, without a COMMAND: everything of the users that looks like ROS 2."
         ),
     ] = None,
+    user: UsersOption = None,
     buffer: BufferOption = None,
     watch_stalls: Annotated[
         bool,
@@ -92,6 +94,7 @@ def record(
         *(output, command or [], source, duration, buffer),
         json=json,
         pids=pid or [],
+        users=user or [],
         watch_stalls=watch_stalls,
     )
 
@@ -105,6 +108,7 @@ def record_and_show(
     *,
     json: bool,
     pids: list[int] | None = None,
+    users: Sequence[str] = (),
     chain: str | None = None,
     scheduling: "Scheduling | None" = None,
     watch_stalls: bool = False,
@@ -127,6 +131,7 @@ def record_and_show(
             source=source,
             duration_ns=duration_ns,
             pids=pids or (),
+            users=users,
             buffer=buffer_mib and buffer_mib * MIB,
             chain=chain,
             scheduling=scheduling,

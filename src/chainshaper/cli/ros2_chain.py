@@ -6,7 +6,6 @@ lines are the same, help included. Upstream: ros2cli, `ros2cli/command/__init__.
 """
 
 import argparse
-import sys
 from typing import Any
 
 from chainshaper.errors import PlatformError
@@ -36,15 +35,15 @@ class ChainCommand:
 
 def _run(arguments: list[str]) -> int:
     from chainshaper.cli import main
+    from chainshaper.cli.output import say
 
     try:
         main(arguments, NAME)
     except ModuleNotFoundError as error:  # built with colcon, which installs no dependencies
-        print(  # noqa: T201 - the last line of a failed command
+        say(  # the last line of a failed command
             f"error: {NAME} needs the Python package {error.name}: install chainshaper's packages "
             "from PyPI into the Python that ROS runs with (`python3 -m pip install .` in its "
-            "folder)",
-            file=sys.stderr,
+            "folder)"
         )
         return PlatformError.exit_code
     except SystemExit as ended:

@@ -2,6 +2,7 @@
 
 import sys
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,12 +13,18 @@ from chainshaper.cli.options import (
     CyclesOption,
     JsonOption,
     RealtimeOption,
+    UsersOption,
     duration_option,
 )
 from chainshaper.cli.plan_options import (
     BandsOption,
+    DepthOption,
     EpsilonOption,
+    FallbackOption,
+    IdealMachineOption,
+    MessagesOption,
     ModesOption,
+    OverrunOption,
     ReceiversOption,
     modes_of,
 )
@@ -29,6 +36,7 @@ if TYPE_CHECKING:
     from chainshaper.analysis import ChainEnumeration
     from chainshaper.app import ApplicationGraph
     from chainshaper.launch_shaping import ShapedLaunch
+    from chainshaper.planning import PlanRequest
 
 __all__ = ["shape"]
 
@@ -74,7 +82,13 @@ def shape(
     bands: BandsOption = "1",
     modes: ModesOption = None,
     epsilon: EpsilonOption = None,
+    ideal_machine: IdealMachineOption = False,
+    overrun: OverrunOption = None,
+    messages: MessagesOption = "all-in-order",
+    depth: DepthOption = None,
     receivers: ReceiversOption = True,
+    fallback: FallbackOption = None,
+    user: UsersOption = None,
     json: JsonOption = False,
 ) -> None:
     """Run an application with its output shaped as planned, and record it.
@@ -82,8 +96,9 @@ def shape(
     The publisher's output topic is remapped, and the shaping node republishes it in its slots.
     Behind `--`, `ros2 launch` does the whole flow: record, choose a chain, profile, plan, splice,
     apply, record again, compare. Every file in between is kept; --chain, --duration, --source,
-    --node, --backend, --bands, --modes, --epsilon and --no-receivers are for this. Without
-    --epsilon the margin is derived from the latencies measured, where there are enough.
+    --node, --backend, --bands, --modes, --epsilon, --ideal-machine, --overrun, --messages, --depth,
+    --no-receivers, --fallback and --user are for this, and mean what they mean for
+    `chainshaper plan` and `apply`.
     """
     if len(words) == 2 and words[0].endswith(DESCRIPTIONS):
         _shape_described(Path(words[0]), Path(words[1]), output, cycles, realtime)
@@ -93,6 +108,8 @@ def shape(
             "a described application is shaped with its plan, and nothing else: `chainshaper shape "
             "APP.yaml plan.yaml -o REC`"
         )
+    from chainshaper.planning import PlanRequest
+
     _shape_launched(
         words,
         output,
@@ -101,10 +118,18 @@ def shape(
         source=source,
         node=node,
         back_end=backend,
-        bands=bands,
-        modes=modes,
-        epsilon_ns=epsilon,
-        receivers=receivers,
+        request=PlanRequest(
+            bands="auto" if bands == "auto" else int(bands),
+            modes=modes_of(modes, None),
+            epsilon_ns=epsilon,
+            ideal_machine=ideal_machine,
+            overrun=overrun,
+            messages=messages,
+            depth=depth,
+            with_receivers=receivers,
+            fallback=fallback or "bypass",
+        ),
+        users=user or (),
         json=json,
     )
 
@@ -113,12 +138,13 @@ def _shape_described(
     application: Path, plan: Path, output: Path, cycles: int, realtime: bool | None
 ) -> None:
     from chainshaper.cli.output import notes, progress, show_line
-    from chainshaper.overruns import overruns_in, overruns_text
-    from chainshaper.planning import load_plan
+    from chainshaper.overruns import dropped_in, dropped_text, overruns_in, overruns_text
+    from chainshaper.planning import load_plan, plan_warnings
     from chainshaper.steps import shape_application
     from chainshaper.workload.description import load_application
 
     description, planned = load_application(application), load_plan(plan)
+    notes(plan_warnings(planned))
     with progress(f"shaping {description.name}") as report:
         recording = shape_application(
             description,
@@ -132,6 +158,9 @@ def _shape_described(
     overruns = overruns_in(recording, planned)
     if overruns:
         notes([overruns_text(overruns)])
+    dropped = dropped_in(recording)
+    if dropped:
+        notes([dropped_text(dropped)])
     notes(recording.info.notes)
     show_line(str(recording.path))
 
@@ -145,16 +174,14 @@ def _shape_launched(
     source: Source,
     node: NodeKind,
     back_end: str,
-    bands: str,
-    modes: str | None,
-    epsilon_ns: int | None,
-    receivers: bool,
+    request: "PlanRequest",
+    users: Sequence[str],
     json: bool,
 ) -> None:
-    from chainshaper.cli.output import print_json, stage_lines
+    from chainshaper.cli.output import notes, print_json, stage_lines
     from chainshaper.cli.signals import stop_on_signals
     from chainshaper.launch_shaping import shape_launch
-    from chainshaper.planning import PlanRequest
+    from chainshaper.planning import plan_warnings
     from chainshaper.reporting.tables import comparison_json
 
     stop = threading.Event()
@@ -164,17 +191,14 @@ def _shape_launched(
             folder,
             chain=chain,
             choose=_ask if sys.stdin.isatty() and not json else None,
-            request=PlanRequest(
-                bands="auto" if bands == "auto" else int(bands),
-                modes=modes_of(modes, "wait"),
-                epsilon_ns=epsilon_ns,
-                with_receivers=receivers,
-            ),
+            request=request,
             duration_ns=duration_ns,
             source=source,
             node=node,
             back_end=back_end,
+            users=users,
             stop=stop,
+            planned=lambda plan: notes(plan_warnings(plan)),
             progress=stage_lines("shape"),
         )
     if json:
@@ -200,7 +224,9 @@ def _show(shaped: "ShapedLaunch") -> None:
 def _ask(graph: "ApplicationGraph", found: "ChainEnumeration") -> str:
     from chainshaper.cli.output import show
     from chainshaper.reporting.chain_list import chain_table
+    from chainshaper.safe_text import shown
 
     show(chain_table(graph, found))
     default = (found.heaviest or found.chains[0]).spec
-    return str(typer.prompt("Which chain, FIRST..LAST?", default=default, err=True))
+    question = f"Which chain, FIRST..LAST? [{shown(default)}]"
+    return str(typer.prompt(question, default=default, show_default=False, err=True))

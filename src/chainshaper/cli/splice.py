@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeAlias
 import typer
 
 from chainshaper.cli.options import JsonOption
+from chainshaper.cli.plan_options import FallbackOption
 from chainshaper.errors import InputError
+from chainshaper.plan_choices import Fallback
 
 if TYPE_CHECKING:
     from chainshaper.launch_splicing import Splicing, ThrottledInput
@@ -29,6 +31,7 @@ class _Launched(NamedTuple):
     node: NodeKind
     message_type: str | None
     recording: Path | None
+    fallback: Fallback | None
 
 
 def splice(
@@ -87,6 +90,7 @@ def splice(
             show_default=False,
         ),
     ] = None,
+    fallback: FallbackOption = None,
     build: Annotated[
         bool, typer.Option("--build", help="Build the shaping node's package with colcon.")
     ] = False,
@@ -121,7 +125,7 @@ def splice(
         words = [*([] if plan is None else [str(plan)]), *words]
     arguments = dict(word.split(":=", 1) for word in words if ":=" in word)
     files = [word for word in words if ":=" not in word]
-    launched = _Launched(files, arguments, output, node, message_type, recording)
+    launched = _Launched(files, arguments, output, node, message_type, recording, fallback)
     if throttle:
         splicing = _throttled(throttle, launched)
     elif plan is None or not files:
@@ -133,22 +137,27 @@ def splice(
 
 
 def _shaped(plan: Path, launched: _Launched) -> "Splicing":
+    from chainshaper.cli.output import notes
     from chainshaper.launch_splicing import splice_launch_files
-    from chainshaper.planning import load_plan
+    from chainshaper.planning import load_plan, plan_warnings
 
     planned = load_plan(plan)
+    notes(plan_warnings(planned))
     return splice_launch_files(
         *(planned, launched.files, launched.folder),
         node=launched.node,
         arguments=launched.arguments,
         message_type=launched.message_type,
         recording=_opened(launched.recording or _own_recording(planned)),
+        fallback=launched.fallback,
     )
 
 
 def _throttled(inputs: list[str], launched: _Launched) -> "Splicing":
     from chainshaper.launch_splicing import splice_throttlers
 
+    if launched.fallback is not None:
+        raise InputError("a throttler has no fallback: --fallback goes with a plan")
     if launched.node == "typed" or launched.message_type is not None:
         raise InputError("a throttler is for all types: choose --node python or cpp, and no --type")
     if not launched.files:
@@ -203,7 +212,7 @@ def _print(splicing: "Splicing", setup: Path | None, json: bool) -> None:
     if json:
         print_json(_values(splicing, setup))
         return
-    show_line(splicing.diff.rstrip("\n"))
+    show_line(splicing.diff.rstrip("\n").expandtabs())
     notes(splicing.notes)
     if setup is not None:
         show_line(f"source {setup}")
@@ -217,6 +226,7 @@ def _values(splicing: "Splicing", setup: Path | None) -> dict[str, Any]:
         "launch": {str(file): str(copy) for file, copy in splicing.launch.items()},
         "originals": {str(copy): str(file) for copy, file in splicing.originals.items()},
         "nodes": [process.name for process in splicing.processes],
+        "standbys": [one.standby.name for one in splicing.processes if one.standby is not None],
         "logs": [str(log) for log in splicing.logs],
         "setup": None if setup is None else str(setup),
         "diff": splicing.diff,

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from chainshaper.cli.options import JsonOption
+from chainshaper.cli.options import JsonOption, UsersOption
 
 if TYPE_CHECKING:
     from chainshaper.planning import Plan
@@ -30,6 +30,7 @@ def threads(
             "executors for sure. Default: the plan's own, where it exists.",
         ),
     ] = None,
+    user: UsersOption = None,
     json: JsonOption = False,
 ) -> None:
     """Show the threads of running nodes: executors, DDS threads, publishers; class and cores."""
@@ -47,7 +48,8 @@ def threads(
         own = place.evidence.recording
         if recording is None and own and Path(own).is_dir():
             recording = Path(own)
-    found = find_threads(place, None if recording is None else open_source(recording))
+    recorded = None if recording is None else open_source(recording)
+    found = find_threads(place, recorded, users=user or ())
     if json:
         print_json(threads_json(found))
         return

@@ -4,6 +4,10 @@ The file stands beside the kernel's module like Python's own compiled files, or 
 cache where that folder cannot be written; where neither can, every process compiles anew. Its
 name is a digest of everything that decides what is in it: the sources of the kernel's folder and
 of this one, Numba, LLVM, and the processor that it is for.
+
+Machine code does what it wants, and a part of it ends the process. So only files are loaded that
+root and the user of this process alone can change, and that end with the digest of what is in front
+of it. Whatever is not so is compiled anew, and its file replaced where that is permitted.
 """
 
 import ctypes
@@ -12,15 +16,20 @@ import hashlib
 import importlib
 import importlib.util
 import os
+import pwd
 import re
-import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from threading import Lock
 from typing import Any
 
 import llvmlite.binding as llvm  # type: ignore[import-untyped]
+
+from chainshaper.errors import OperationError
+from chainshaper.trusted_files import why_distrusted
+from chainshaper.whole_file import write_whole
 
 __all__ = ["kernel"]
 
@@ -30,6 +39,8 @@ _OF_NUMBAS_RUNTIME = re.compile(r"^declare (.*@(?:NRT_|numba_)\w+\([^)]*\)).*$",
 It is defined in the object file itself, as a trap: under its own name it would take the place of
 the real one for all code that Numba compiles in this process.
 """
+
+_DIGEST_SIZE = hashlib.sha256().digest_size
 
 _loading = Lock()  # LLVM's loader, and the compiler, are for one thread at a time
 
@@ -45,13 +56,13 @@ def kernel(module: str, name: str) -> Callable[..., int]:
     @functools.cache
     def address() -> int:
         path, symbol = _module_file(module), f"{module}.{name}"
-        digest = _digest(path.parent)
+        file = f"{symbol}-{_digest(path.parent)}.o"
         for folder in _folders(path.parent):
-            file = folder / f"{symbol}-{digest}.o"
-            if file.is_file():
-                return _loaded(file.read_bytes(), symbol)
+            code = _read(folder / file)
+            if code is not None:
+                return _loaded(code, symbol)
         code = _compiled(getattr(importlib.import_module(module), name), symbol)
-        _keep(code, _folders(path.parent), symbol, digest)
+        _keep(code, _folders(path.parent), symbol, file)
         return _loaded(code, symbol)
 
     def call(*numbers: int) -> int:
@@ -82,9 +93,40 @@ def _digest(folder: Path) -> str:
 
 
 def _folders(beside: Path) -> Iterator[Path]:
-    """Where machine code may be kept, best first."""
-    yield beside / "__pycache__"
-    yield Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "chainshaper"
+    """Where machine code may be kept, best first.
+
+    Links are followed here, once: what leads there is looked at before it is used.
+    """
+    yield Path(os.path.realpath(beside / "__pycache__"))
+    yield Path(os.path.realpath(_users_cache() / "chainshaper"))
+
+
+def _users_cache() -> Path:
+    """The cache that the environment names; where that is another user's (`sudo -E`), our own."""
+    named = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    if not named.is_absolute():  # and is to be ignored, as its specification has it
+        named = Path(os.path.expanduser("~/.cache"))  # noqa: PTH111 - the other raises without one
+    existing = next(place for place in (named, *named.parents) if os.path.exists(place))  # noqa: PTH110
+    if why_distrusted(existing) is not None:
+        with suppress(KeyError):  # a user without a name
+            return Path(pwd.getpwuid(os.geteuid()).pw_dir, ".cache")
+    return named
+
+
+def _read(file: Path) -> bytes | None:
+    """The object file's content, if it is as it was written, and by whom it may be written."""
+    try:
+        if why_distrusted(file) is not None:
+            return None
+        content = file.read_bytes()
+    except OSError:
+        return None
+    code, digest = content[:-_DIGEST_SIZE], content[-_DIGEST_SIZE:]
+    return code if digest == _content_digest(code, file.name) else None
+
+
+def _content_digest(code: bytes, name: str) -> bytes:
+    return hashlib.sha256(name.encode() + b"\0" + code).digest()
 
 
 @functools.cache
@@ -115,20 +157,28 @@ def _compiled(dispatcher: Any, symbol: str) -> bytes:
     return bytes(_target().emit_object(llvm.parse_assembly(text)))
 
 
-def _keep(code: bytes, folders: Iterator[Path], symbol: str, digest: str) -> None:
+def _keep(code: bytes, folders: Iterator[Path], symbol: str, file: str) -> None:
     """Write the object file into the first folder that takes it, in place of older ones."""
     for folder in folders:
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=folder) as beside:
-                file = Path(beside) / "code"
-                file.write_bytes(code)
-                for old in folder.glob(f"{symbol}-*.o"):
+            _make_own(folder)
+            if why_distrusted(folder) is not None:
+                continue
+            # The linker does not mind what is behind the end of an object file.
+            write_whole(folder / file, [code, _content_digest(code, file)])
+            for old in folder.glob(f"{symbol}-*.o"):
+                if old.name != file:
                     old.unlink(missing_ok=True)
-                file.replace(folder / f"{symbol}-{digest}.o")
-        except OSError:
+        except (OSError, OperationError):
             continue
         return
+
+
+def _make_own(folder: Path) -> None:
+    """Make a folder, and those above it, wherever root and we alone can change what is there."""
+    for one in (*reversed(folder.parents), folder):
+        if not one.exists() and why_distrusted(one.parent) is None:
+            one.mkdir(mode=0o755, exist_ok=True)
 
 
 _engines: list[Any] = []  # code lives as long as its engine

@@ -8,7 +8,6 @@ to the shaping node.
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 from chainshaper.enforcement import fifo
 from chainshaper.enforcement.freezer import back_end as freezer
@@ -85,10 +84,13 @@ def gates(name: str) -> bool:
     return name != "fifo"
 
 
-def make_back_end(name: str, table: ServerTable, folder: Path, journal: Journal) -> BackEnd:
+def make_back_end(
+    name: str, table: ServerTable, journal: Journal, go_on: Callable[[], None] = lambda: None
+) -> BackEnd:
     """Make a back end for a table; no application notices anything yet.
 
-    ``folder`` is that of the run, ``journal`` remembers what was there before.
+    ``journal`` remembers what was there before. Where processes have to start, ``go_on`` is called
+    again and again meanwhile, and may raise.
 
     Raises:
         InputError: the table is not one, or more than the back end can do.
@@ -100,7 +102,7 @@ def make_back_end(name: str, table: ServerTable, folder: Path, journal: Journal)
         case "litmus":
             return litmus.create(table, journal)
         case "freezer":
-            return freezer.create(table, folder)
+            return freezer.create(table, journal, go_on)
         case _:
             return fifo.create(table, journal)
 

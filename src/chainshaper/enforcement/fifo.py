@@ -9,11 +9,13 @@ Who carries out a whole plan has given its threads their priorities already
 a shaping node. Threads that stand in the journal by then are left as they are.
 """
 
+import time
+
 from chainshaper.enforcement.runs.journal import Journal
 from chainshaper.enforcement.runs.scheduling_memory import (
-    change_scheduling,
-    is_remembered,
+    change_all,
     release_threads,
+    remembered_threads,
 )
 from chainshaper.enforcement.servers import ServerCounters, ServerTable
 from chainshaper.enforcement.threads.allocation import NodeThread
@@ -49,7 +51,9 @@ class Fifo:
         self._table = table
         self._journal = journal
         self._members: dict[str, list[NodeThread]] = {s.name: [] for s in table.servers}
+        self._scheduled = {one.identity for one in remembered_threads(journal)}
         self._armed = False
+        self._since_ns: int | None = None
 
     def assign(self, tid: int, server: str) -> None:
         """Put a thread into a server; one that has ended is passed over.
@@ -61,8 +65,9 @@ class Fifo:
         if server not in self._members:
             raise InputError(f"no server {server!r}: choose of {', '.join(self._members)}")
         thread = find_thread(tid)
-        if thread is None or is_remembered(self._journal, thread):
+        if thread is None or thread.identity in self._scheduled:
             return
+        self._scheduled.add(thread.identity)
         self._members[server].append(NodeThread(thread, (), "", ""))
         if self._armed:
             self._schedule()
@@ -75,6 +80,11 @@ class Fifo:
         """
         self._armed = True
         self._schedule()
+        self._since_ns = time.monotonic_ns()
+
+    def in_force_from(self) -> int | None:
+        """See :meth:`BackEnd.in_force_from`."""
+        return self._since_ns
 
     def counters(self) -> dict[str, ServerCounters]:
         """Nothing is counted: there are no slots."""
@@ -95,5 +105,5 @@ class Fifo:
 
     def _schedule(self) -> None:
         wanted = wanted_of_members(self._members, self._table.servers)
-        for one in below_their_siblings(wanted):
-            change_scheduling(self._journal, one.thread.thread, one.wanted)
+        changes = ((one.thread.thread, one.wanted) for one in below_their_siblings(wanted))
+        change_all(self._journal, changes)

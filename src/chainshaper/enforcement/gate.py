@@ -20,6 +20,18 @@ chain ran longer than it was planned for. What becomes of it is a policy:
 * ``discard``: it is never published, so that nobody acts on old data;
 * ``publish``: it leaves at once, so that it does not become older still.
 
+No message leaves before the cycle that it is due in. Under logical execution time that is a later
+one than its own, however early it came.
+
+More **messages** than one may come in a cycle. Which of them leave is a policy, too:
+
+* ``all-in-order``: all that are due in one slot leave in it, one behind the other. What does not
+  fit into the slot has overrun. A gate has room for ``depth`` messages; the oldest one of a full
+  gate is dropped, as in a DDS history;
+* ``newest``: of those that wait when it is time, only the last one that came. One that comes
+  when another of its cycle has left already has overrun;
+* ``first``: only the one that came first.
+
 With **modes** (section 3.3) each mode of the system has its own slot: the latency is constant
 within a mode, and the servers stay as they are when it changes. An early message waits for the
 slot of its mode, past the slots before it; one that comes behind it is treated like an overrun,
@@ -38,20 +50,27 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 __all__ = [
     "ANCHORS",
+    "DROPPED",
     "LATE",
+    "MESSAGES",
     "OVERRUNS",
+    "READER_DEPTH",
     "STALL_NS",
     "Anchor",
     "Gate",
+    "Held",
     "Late",
+    "Messages",
     "Modes",
     "Overrun",
+    "Queue",
     "Release",
     "Shaper",
+    "Waiting",
     "clock_offset",
     "missed",
     "origin_of",
@@ -64,10 +83,16 @@ __all__ = [
 Anchor: TypeAlias = Literal["stamp", "cycle"]
 Overrun: TypeAlias = Literal["wait", "discard", "publish"]
 Late: TypeAlias = Literal["wait", "discard", "publish", "next-slot"]
+Messages: TypeAlias = Literal["all-in-order", "newest", "first"]
+Dropped: TypeAlias = Literal["replaced", "surplus", "overflowed", "discarded"]
 ANCHORS, OVERRUNS, LATE = get_args(Anchor), get_args(Overrun), get_args(Late)
+MESSAGES, DROPPED = get_args(Messages), get_args(Dropped)
 
 STALL_NS = 100_000
 """A thread may wake up so late on a machine that does not stall."""
+
+READER_DEPTH = 1000
+"""History of the reader of a gate: what it has no room for, it drops itself, and so counts it."""
 
 
 @dataclass(frozen=True)
@@ -104,27 +129,36 @@ class Gate:
     when its message is at most ``max_age_ns`` old and comes at most ``max_future_ns`` from the
     future (clocks of different hosts disagree a little).
 
-    A message is due in the cycle that it belongs to, or ``due_cycles`` later (1 under logical
-    execution time); what comes behind the last slot of that cycle is treated as ``overrun``
-    says. With the ``cycle`` anchor a message belongs to the cycle that it arrives in, since
-    nothing says in which one its chain began.
+    A message is due in the cycle that it belongs to, or ``due_cycles`` later (under logical
+    execution time), and leaves no earlier; what comes behind the last slot of that cycle is
+    treated as ``overrun`` says. With the ``cycle`` anchor a message belongs to the cycle that it
+    arrives in, since nothing says in which one its chain began. Under logical execution time it is
+    due in the next one then: the data of each callback came a cycle before its output is due.
+
+    ``messages`` says which of several messages of a cycle leave, ``depth`` how many may wait.
     """
 
     slots: tuple[tuple[int, int], ...]
     cycle_ns: int
     anchor: str = "stamp"
     phase_ns: int = 0
-    max_age_ns: int | None = None  # None: ten cycles
+    max_age_ns: int | None = None  # None: ten cycles more than those it is due after
     max_future_ns: int = 1_000_000
     overrun: str = "wait"
     due_cycles: int = 0
     modes: Modes | None = None
+    messages: str = "all-in-order"
+    depth: int = 10
 
     def __post_init__(self) -> None:
         if self.anchor not in ANCHORS:
             raise ValueError(f"anchor {self.anchor!r}: choose one of {', '.join(ANCHORS)}")
         if self.overrun not in OVERRUNS:
             raise ValueError(f"overrun {self.overrun!r}: choose one of {', '.join(OVERRUNS)}")
+        if self.messages not in MESSAGES:
+            raise ValueError(f"messages {self.messages!r}: choose one of {', '.join(MESSAGES)}")
+        if self.depth < 1:
+            raise ValueError(f"room for {self.depth} messages: a gate needs it for one at least")
         if self.due_cycles < 0:
             raise ValueError(f"due {self.due_cycles} cycles later: no message is due beforehand")
         if self.cycle_ns <= 0:
@@ -175,12 +209,20 @@ class Release:
 
 
 def release_of(
-    gate: Gate, arrival_ns: int, stamp_ns: int | None, changes: Sequence[tuple[int, str]] = ()
+    gate: Gate,
+    arrival_ns: int,
+    stamp_ns: int | None,
+    changes: Sequence[tuple[int, str]] = (),
+    *,
+    ready_ns: int | None = None,
+    phase_ns: int | None = None,
 ) -> Release:
     """Decide when a message that arrived at ``arrival_ns`` may leave.
 
     ``stamp_ns`` is its origin on CLOCK_MONOTONIC (see :func:`origin_of`), None if it has none.
-    ``changes`` are the modes that were announced, each with the time (ns), ascending.
+    ``changes`` are the modes that were announced, each with the time (ns), ascending. It leaves at
+    ``ready_ns`` at the earliest, where others are before it. ``phase_ns`` is in force instead of
+    the gate's own.
 
         >>> gate = Gate(slots=((60, 61),), cycle_ns=100)
         >>> release_of(gate, arrival_ns=1040, stamp_ns=1000).at_ns      # early: held
@@ -190,6 +232,9 @@ def release_of(
         >>> gate = Gate(slots=((60, 61),), cycle_ns=100, overrun="publish")
         >>> release_of(gate, arrival_ns=1070, stamp_ns=1000).at_ns      # missed: at once
         1070
+        >>> gate = Gate(slots=((3, 4),), cycle_ns=100, due_cycles=1)
+        >>> release_of(gate, arrival_ns=1002, stamp_ns=1000).at_ns      # due in the next cycle
+        1103
         >>> modes = Modes(bands={"city": 1, "highway": 0}, default="city", late="next-slot")
         >>> gate = Gate(slots=((20, 21), (60, 61)), cycle_ns=100, modes=modes)
         >>> release_of(gate, arrival_ns=1010, stamp_ns=1000).at_ns      # early for its mode: held
@@ -197,30 +242,33 @@ def release_of(
         >>> release_of(gate, 1110, 1100, changes=[(1050, "highway")]).at_ns
         1120
     """
-    if gate.anchor == "stamp" and stamp_ns is not None and _usable(gate, arrival_ns - stamp_ns):
-        origin, anchor = stamp_ns, "stamp"
+    cycle_ns = gate.cycle_ns
+    if stamp_ns is not None and _counts_from(gate, stamp_ns, arrival_ns):
+        origin, anchor, due = stamp_ns, "stamp", gate.due_cycles
     else:
-        elapsed = (arrival_ns - gate.phase_ns) % gate.cycle_ns
-        origin, anchor = arrival_ns - elapsed, "cycle"
+        elapsed = (arrival_ns - (gate.phase_ns if phase_ns is None else phase_ns)) % cycle_ns
+        origin, anchor, due = arrival_ns - elapsed, "cycle", min(gate.due_cycles, 1)
     mode, first, slots = None, 0, gate.slots
     if gate.modes is not None:
         mode = _mode_at(gate.modes, origin, changes)
         first, slots = _open_to(gate, gate.modes, mode)
+    ready = arrival_ns if ready_ns is None else max(arrival_ns, ready_ns)
     # A stamp slightly from the future puts the arrival before its own cycle: cycle 0 still.
-    cycle = max(0, (arrival_ns - origin) // gate.cycle_ns)
-    due_from = origin + gate.due_cycles * gate.cycle_ns
-    overran, policy = arrival_ns >= due_from + slots[-1][1], gate.policy
+    cycle = max(0, (ready - origin) // cycle_ns)
+    due_from = origin + due * cycle_ns
+    overran, policy = ready >= due_from + slots[-1][1], gate.policy
     if overran and policy != "wait":
-        at_once = arrival_ns if policy == "publish" else None
+        at_once = ready if policy == "publish" else None
         return Release(at_once, origin, None, cycle, anchor, policy, mode)
     treated = "wait" if overran else None
-    if mode is not None and not overran and arrival_ns >= due_from + slots[0][1]:
+    if mode is not None and not overran and ready >= due_from + slots[0][1]:
         treated = "next-slot"
+    cycle = max(due, cycle)
     while True:
-        cycle_start = origin + cycle * gate.cycle_ns
+        cycle_start = origin + cycle * cycle_ns
         for slot, (start, end) in enumerate(slots, first):
-            if arrival_ns < cycle_start + end:
-                at = max(arrival_ns, cycle_start + start)
+            if ready < cycle_start + end:
+                at = max(ready, cycle_start + start)
                 return Release(at, origin, slot, cycle, anchor, treated, mode)
         cycle += 1
 
@@ -246,9 +294,12 @@ def missed(gate: Gate, release: Release, now_ns: int) -> bool:
     return now_ns >= release.origin_ns + release.cycles_waited * gate.cycle_ns + end
 
 
-def _usable(gate: Gate, age_ns: int) -> bool:
-    max_age = 10 * gate.cycle_ns if gate.max_age_ns is None else gate.max_age_ns
-    return -gate.max_future_ns <= age_ns <= max_age
+def _counts_from(gate: Gate, stamp_ns: int, arrival_ns: int) -> bool:
+    """Whether a message's slots count from its stamp."""
+    max_age = gate.max_age_ns
+    if max_age is None:
+        max_age = (10 + gate.due_cycles) * gate.cycle_ns
+    return gate.anchor == "stamp" and -gate.max_future_ns <= arrival_ns - stamp_ns <= max_age
 
 
 def origin_of(payload: bytes) -> int | None:
@@ -334,6 +385,123 @@ def clock_offset() -> int:
     return best
 
 
+@dataclass(eq=False)
+class Waiting:
+    """A message that has come and not left; times are ns of CLOCK_MONOTONIC.
+
+    ``about`` is what its owner knows of it besides. ``lost`` counts those that were lost on the
+    way between the one before it and this one (None: not known).
+    """
+
+    payload: bytes
+    arrival_ns: int
+    stamp_ns: int | None
+    phase_ns: int
+    about: Any = None
+    lost: int | None = None
+
+
+@dataclass(frozen=True)
+class Held:
+    """What became of a message: it may leave now, or was ``dropped``, for that reason.
+
+    ``awake_ns`` is when that was clear (CLOCK_MONOTONIC).
+    """
+
+    message: Waiting
+    release: Release
+    awake_ns: int
+    dropped: str | None = None
+
+
+class Queue:
+    """The messages that wait at a gate, and which of them leave. It knows no clock."""
+
+    def __init__(self, gate: Gate) -> None:
+        self.gate = gate
+        self.phase_ns = gate.phase_ns
+        self.waiting: deque[Waiting] = deque()
+        # So many changes reach back further than the oldest stamp that is of use.
+        self.changes: deque[tuple[int, str]] = deque(maxlen=64)
+        # The starts of the cycle that the oldest message, or another for it, leaves in, and of
+        # that in which one has left.
+        self._leaving: int | None = None
+        self._left: int | None = None
+        self.free_ns = 0  # when it is the turn of the oldest message, if it is there then
+
+    def arrive(
+        self, payload: bytes, arrival_ns: int, stamp_ns: int | None, about: Any = None
+    ) -> Held | None:
+        """A message came; the one for which there is no room any more."""
+        self.waiting.append(Waiting(payload, arrival_ns, stamp_ns, self.phase_ns, about))
+        if stamp_ns is not None and _counts_from(self.gate, stamp_ns, arrival_ns):
+            self.phase_ns = stamp_ns % self.gate.cycle_ns
+        if len(self.waiting) <= self.gate.depth:
+            return None
+        oldest = self.waiting.popleft()
+        return Held(oldest, _withheld(self._release(oldest, arrival_ns)), arrival_ns, "overflowed")
+
+    def decide(self) -> tuple[Release, str | None]:
+        """When the oldest message may leave, or why it never does."""
+        oldest = self.waiting[0]
+        ready = max(oldest.arrival_ns, self.free_ns)
+        release = self._release(oldest, ready)
+        if release.at_ns is None:
+            return release, "discarded"
+        if release.slot is None or self.gate.messages == "all-in-order":
+            return release, None
+        if self._left is not None and self._same_cycle(self._start(release), self._left):
+            if self.gate.messages == "first":
+                return _withheld(release), "surplus"
+            release = self._release(oldest, max(ready, self._left + self.gate.slots[-1][1]))
+            if release.at_ns is None:
+                return release, "discarded"
+            if release.slot is None:
+                return replace(release, at_ns=ready), None
+        start = self._start(release)
+        if self._leaving is None or not self._same_cycle(start, self._leaving):
+            self._leaving = start
+        return release, None
+
+    def replaced(self, release: Release, now_ns: int) -> bool:
+        """Whether a newer message leaves for the oldest one, which was to leave like this."""
+        if self.gate.messages != "newest" or release.slot is None or self._leaving is None:
+            return False
+        for newer in list(self.waiting)[1:]:
+            other = self._release(newer, now_ns)
+            if other.slot is not None and self._same_cycle(self._start(other), self._leaving):
+                return True
+        return False
+
+    def leave(self, release: Release | None, now_ns: int) -> None:
+        """The oldest message leaves, or is dropped; None: it is not this gate's to decide."""
+        self.waiting.popleft()
+        self.free_ns = now_ns
+        if release is not None and release.slot is not None:
+            self._left = self._leaving
+
+    def _release(self, message: Waiting, ready_ns: int) -> Release:
+        return release_of(
+            self.gate,
+            message.arrival_ns,
+            message.stamp_ns,
+            self.changes,
+            ready_ns=ready_ns,
+            phase_ns=message.phase_ns,
+        )
+
+    def _start(self, release: Release) -> int:
+        return release.origin_ns + release.cycles_waited * self.gate.cycle_ns
+
+    def _same_cycle(self, start_ns: int, other_ns: int) -> bool:
+        """Stamps are not quite periodic: cycles are the same less than half a cycle apart."""
+        return 2 * abs(start_ns - other_ns) < self.gate.cycle_ns
+
+
+def _withheld(release: Release) -> Release:
+    return replace(release, at_ns=None, slot=None)
+
+
 class Shaper:
     """A gate at work: holds each message until its release, and minds the clocks.
 
@@ -343,26 +511,42 @@ class Shaper:
     the cycle instead, at the phase that the last good stamp had.
 
     One shaper belongs to one thread, which does nothing else at the time of a release. That makes
-    it a witness of the machine's own stalls (:meth:`time_lost`).
+    it a witness of the machine's own stalls (:meth:`time_lost`). ``look`` has new messages
+    :meth:`arrive`: it is called while others are held, before each release and behind it.
 
     ``on_waking`` is called with the time of a release when it wakes ``spin_ns`` before that, to
-    watch the clock from there; what it does there should be over in time.
+    watch the clock from there; what it does there should be over in time. ``on_decision`` is
+    called with each decision, before it is waited for, and where cycles begin.
     """
 
     STEP_NS = 500_000  # slewing moves the clock by at most 50 us in a cycle of 100 ms
+    LOOK_NS = 50_000_000  # often enough for the reader's history, seldom enough for the core
+    OTHERS_NS = 2_000_000  # an executor's other callbacks take less
 
     def __init__(
-        self, gate: Gate, spin_ns: int = 0, on_waking: Callable[[int], None] = lambda _: None
+        self,
+        gate: Gate,
+        spin_ns: int = 0,
+        on_waking: Callable[[int], None] = lambda _: None,
+        look: Callable[[], None] = lambda: None,
+        on_decision: Callable[[Release, int], None] = lambda *_: None,
     ) -> None:
-        self.gate = gate
+        self.queue = Queue(gate)
         self.spin_ns = spin_ns
+        self.overflowed: list[Held] = []  # since the owner has emptied it
         self._on_waking = on_waking
+        self.look = look
+        self._on_decision = on_decision
+        self._looked = 0
         self._offset = clock_offset()
         self._waiting = _WaitingTime()
         self._waited = 0
-        # So many changes reach back further than the oldest stamp that is of use.
-        self._changes: deque[tuple[int, str]] = deque(maxlen=64)
         self._next_phase: tuple[int, int] | None = None  # from when on, and which
+
+    @property
+    def gate(self) -> Gate:
+        """The gate that is at work."""
+        return self.queue.gate
 
     def set_phase(self, phase_ns: int, now_ns: int) -> None:
         """Cycles begin elsewhere, from the first such beginning after ``now_ns`` on."""
@@ -373,53 +557,106 @@ class Shaper:
         """The mode that was announced last; None without modes."""
         if self.gate.modes is None:
             return None
-        return self._changes[-1][1] if self._changes else self.gate.modes.default
+        changes = self.queue.changes
+        return changes[-1][1] if changes else self.gate.modes.default
 
     def switch(self, mode: str | None, now_ns: int) -> bool:
         """A mode is announced, in force from the next cycle on; False: there is none like it."""
         if self.gate.modes is None or mode is None or mode not in self.gate.modes.bands:
             return False
         if mode != self.mode:
-            self._changes.append((now_ns, mode))
+            self.queue.changes.append((now_ns, mode))
         return True
 
-    def decide(self, payload: bytes, arrival_ns: int) -> Release:
-        """When the message that arrived may leave, after :func:`release_of`."""
+    def arrive(
+        self,
+        payload: bytes,
+        now_ns: int,
+        source_ns: int | None = None,
+        about: Any = None,
+        lost: int | None = None,
+    ) -> None:
+        """A message was taken now.
+
+        With ``source_ns``, its source timestamp (CLOCK_REALTIME), it counts as having come then,
+        if that is after the last look: it waited in the reader.
+        """
         offset = clock_offset()
         stepped = abs(offset - self._offset) > self.STEP_NS
         self._offset = offset
         stamp = None if stepped else origin_of(payload)
-        origin = None if stamp is None else stamp - offset
-        if self._next_phase is not None and arrival_ns >= self._next_phase[0]:
-            self.gate = replace(self.gate, phase_ns=self._next_phase[1])
+        arrival = now_ns
+        if source_ns is not None and not stepped:
+            arrival = min(now_ns, max(self._looked, source_ns - offset))
+        if self._next_phase is not None and arrival >= self._next_phase[0]:
+            self.queue.phase_ns = self._next_phase[1]
             self._next_phase = None
-        release = release_of(self.gate, arrival_ns, origin, self._changes)
-        if release.anchor == "stamp":
-            phase = release.origin_ns % self.gate.cycle_ns
-            self.gate = replace(self.gate, phase_ns=phase)
-        return release
+        full = self.queue.arrive(payload, arrival, None if stamp is None else stamp - offset, about)
+        self.queue.waiting[-1].lost = lost
+        if full is not None:
+            self.overflowed.append(full)
 
-    def hold(self, payload: bytes) -> tuple[Release, int, int]:
-        """Wait until a message may leave: the decision, its arrival and the time then (ns).
+    def hold(self) -> Held | None:
+        """Wait until the oldest message leaves, or is dropped; None: it was overflowed meanwhile.
 
         One that is to be discarded is not waited for. Where overruns are discarded, so is a
         message that came in time and would leave behind its slot because this thread woke late.
         """
-        arrival = time.monotonic_ns()
-        release = self.decide(payload, arrival)
+        queue = self.queue
+        message, now = queue.waiting[0], time.monotonic_ns()
+        release, dropped = queue.decide()
+        self._on_decision(release, queue.phase_ns)
+        if release.at_ns is not None:
+            self._waited = self._waiting.so_far()
+            slept = release.at_ns > now
+            while (awake := release.at_ns - self.spin_ns) > now:
+                sleep_until(min(awake, now + self.LOOK_NS))
+                self._look()
+                now = time.monotonic_ns()
+            if not slept and self.gate.messages == "newest":
+                self._look()
+            if queue.waiting[0] is not message:
+                return None
+            if queue.replaced(release, now):
+                release, dropped = _withheld(release), "replaced"
         if release.at_ns is None:
-            return release, arrival, arrival
-        self._waited = self._waiting.so_far()
-        if release.at_ns > arrival:
-            sleep_until(release.at_ns - self.spin_ns)
+            queue.leave(release, now)
+            return Held(message, release, now, dropped)
+        if slept:
             self._on_waking(release.at_ns)
             if time.monotonic_ns() < release.at_ns:
                 # Awake in time: what other threads took before is of no consequence.
                 self._waited = self._waiting.so_far()
         awake = watch_until(release.at_ns)
         if self.gate.policy == "discard" and missed(self.gate, release, awake):
-            release = replace(release, at_ns=None, slot=None, overrun="discard")
-        return release, arrival, awake
+            release, dropped = replace(_withheld(release), overrun="discard"), "discarded"
+        queue.leave(release, awake)
+        return Held(message, release, awake, dropped)
+
+    def _look(self) -> None:
+        now = time.monotonic_ns()
+        self.look()
+        self._looked = now
+
+    def nothing_due(self) -> bool:
+        """Whether there is time for something else before the next release."""
+        if not self.queue.waiting:
+            return True
+        release, _ = self.queue.decide()
+        latest = time.monotonic_ns() + self.spin_ns + self.OTHERS_NS
+        return release.at_ns is not None and release.at_ns > latest
+
+    def rest(self, published_ns: int, pause_ns: int) -> None:
+        """Pause behind a publication, unless another message has to leave meanwhile."""
+        self.queue.free_ns = published_ns
+        self._look()
+        until = published_ns + pause_ns
+        if self.queue.waiting:
+            release, _ = self.queue.decide()
+            if release.at_ns is None or release.at_ns - self.spin_ns <= until:
+                return
+        sleep_until(until)
+        self.queue.free_ns = time.monotonic_ns()
 
     def time_lost(self, release: Release, until_ns: int) -> int:
         """How much of the delay from a release until then the machine itself took (ns).

@@ -67,6 +67,8 @@ class BackEnd(Protocol):
     def assign(self, tid: int, server: str) -> None:
         """Put a thread into a server; before ``arm`` it goes on running freely.
 
+        One that has ended is passed over: threads come and go.
+
         Raises:
             OperationError: the kernel refuses.
         """
@@ -76,6 +78,9 @@ class BackEnd(Protocol):
 
         Once more with another anchor, it moves the cycles without letting threads slip between.
         """
+
+    def in_force_from(self) -> int | None:
+        """From when on (CLOCK_MONOTONIC, ns) the latest ``arm`` is enforced; None before."""
 
     def counters(self) -> dict[str, ServerCounters]:
         """Per server's name, since the first ``arm``."""

@@ -37,7 +37,7 @@ from chainshaper.planning.plan import (
     server_of,
 )
 from chainshaper.planning.plan_file import dump_plan, load_plan, plan_json, save_plan, save_plans
-from chainshaper.planning.request import PlanRequest, Profile, band_choice, plan_chain
+from chainshaper.planning.request import PlanRequest, Profile, band_choice, plan_chain, plan_chains
 from chainshaper.planning.shaping import plan_shaping, plan_warnings, predict_bands
 
 __all__ = [
@@ -67,6 +67,7 @@ __all__ = [
     "over_cores",
     "place_chains",
     "plan_chain",
+    "plan_chains",
     "plan_json",
     "plan_shaping",
     "plan_warnings",

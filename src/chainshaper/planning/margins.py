@@ -1,10 +1,17 @@
-"""How far beyond the longest measured latency a slot must reach, from the tail of the sample.
+"""How far beyond the longest undisturbed latency a slot must reach.
 
-The longest of n measured latencies is exceeded sooner or later. Extreme value theory says how
-often: whatever the distribution, its excesses over a high threshold u follow, in the limit, a
-generalised Pareto distribution (Pickands–Balkema–de Haan), which can be fitted and read beyond
-the data. With ζ the share of latencies above u, ξ the shape and σ the scale, the latency that
-is exceeded with probability p is
+**By default** (:func:`covered_latency`) so far that a stated share of *all* cycles is in time, also
+of those that the machine disturbed: an actuator does not care who caused a delay. How many of n
+measured cycles may lie beyond follows from the binomial distribution alone, whatever that of the
+latencies (Wilks, *Determination of sample sizes for setting tolerance limits*, Annals of
+Mathematical Statistics 12, 1941): nothing has to be assumed about stalls but that the cycles to
+come are like those measured. The longest of 299 latencies covers 99 % with 95 % confidence.
+
+**Beyond the sample** (:func:`derive_margin`) extreme value theory says how often the longest of n
+latencies is exceeded: whatever the distribution, its excesses over a high threshold u follow, in
+the limit, a generalised Pareto distribution (Pickands–Balkema–de Haan), which can be fitted and
+read beyond the data. With ζ the share of latencies above u, ξ the shape and σ the scale, the
+latency that is exceeded with probability p is
 
     x_p = u + σ/ξ · ((ζ/p)^ξ − 1),
 
@@ -25,6 +32,7 @@ samples of 5,000 and in 93 to 98 of 100 samples of 1,500; where it missed it was
 density does not vanish at the end of the distribution, it errs on the high side.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +43,22 @@ from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.latency_file import check_latencies
 from chainshaper.planning.plan import Margin
 
-__all__ = ["TailFit", "derive_margin", "fit_tail"]
+__all__ = [
+    "EPSILON_NS",
+    "OVERRUN_PROBABILITY",
+    "TailFit",
+    "covered_latency",
+    "cycles_needed",
+    "derive_margin",
+    "fit_tail",
+    "late_share",
+]
+
+EPSILON_NS = 1_000_000
+"""What a margin adds to latencies seen: the way to the shaping node is not in them."""
+
+OVERRUN_PROBABILITY = 0.01
+"""The share of all cycles that may be late by default, at most, with 95 % confidence."""
 
 # A tail is the n^(2/3) longest of n latencies, or these parts of it: the more there are, the
 # further out it begins. A fixed share would leave large samples with a systematic error.
@@ -72,19 +95,69 @@ class TailFit:
     interval_ns: tuple[int, int]
 
 
+def cycles_needed(overrun_probability: float) -> int:
+    """The fewest cycles whose longest covers all but so many, with 95 % confidence: 1 − (1 − p)ⁿ.
+
+    >>> cycles_needed(0.01)
+    299
+    """
+    return math.ceil(math.log(1 - CONFIDENCE) / math.log(1 - overrun_probability))
+
+
+def late_share(every_latency_ns: NDArray[np.int64], latency_ns: int) -> float:
+    """The share of cycles that take longer than ``latency_ns``, at most, with 95 % confidence.
+
+    From how many of the measured ones do (Clopper and Pearson's upper bound).
+    """
+    from scipy.special import betaincinv
+
+    beyond = int(np.count_nonzero(every_latency_ns > latency_ns))
+    if beyond == every_latency_ns.size:
+        return 1.0
+    return float(betaincinv(beyond + 1, every_latency_ns.size - beyond, CONFIDENCE))
+
+
+def covered_latency(
+    latencies_ns: NDArray[np.int64], overrun_probability: float, latest_ns: int | None = None
+) -> int:
+    """The shortest measured latency that covers all cycles but a share, with 95 % confidence (ns).
+
+    It is the k-th longest of n, with the largest k for which P(Bin(n, p) ≥ k) is 95 % at least; the
+    longest, where the sample is too small (:func:`cycles_needed`). What does not fit before
+    ``latest_ns`` cannot be covered: then it is the longest that does, 0 if there is none.
+
+        >>> covered_latency(np.arange(1, 300), 0.01), covered_latency(np.arange(1, 601), 0.01)
+        (299, 599)
+    """
+    from scipy.special import bdtr
+
+    ordered = np.sort(latencies_ns)
+    most = np.arange(math.ceil(overrun_probability * ordered.size) + 1)
+    place = int(np.count_nonzero(bdtr(most, ordered.size, overrun_probability) <= 1 - CONFIDENCE))
+    covered = ordered[-max(1, place)]
+    if latest_ns is not None and covered > latest_ns:
+        covered = ordered[ordered <= latest_ns].max(initial=0)
+    return int(covered)
+
+
 def derive_margin(
-    latencies_ns: NDArray[np.int64], overrun_probability: float, seed: int = 0
+    latencies_ns: NDArray[np.int64],
+    overrun_probability: float,
+    seed: int = 0,
+    *,
+    longest_ns: int | None = None,
 ) -> Margin:
     """The margin ε with which an execution overruns its slot with the given probability.
 
-    ``latencies_ns`` are in the order in which they were measured. The result says that it was
+    ``latencies_ns`` are in the order in which they were measured; the margin counts from
+    ``longest_ns``, their longest unless given. The result says that it was
     derived, and keeps the probability and the confidence interval of ε; hand it to
     :func:`chainshaper.planning.shaping.plan_shaping`.
 
     Raises: as :func:`fit_tail`.
     """
     fit = fit_tail(latencies_ns, overrun_probability, seed)
-    longest = int(np.max(latencies_ns))
+    longest = int(np.max(latencies_ns)) if longest_ns is None else longest_ns
     low, high = (max(0, end - longest) for end in fit.interval_ns)
     return Margin(
         epsilon_ns=max(0, fit.latency_ns - longest),

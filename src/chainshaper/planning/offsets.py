@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 
 from chainshaper.durations import format_duration
 from chainshaper.errors import InputError, OperationError
+from chainshaper.planning.entangled import refuse_shared_parts
 from chainshaper.planning.extras import extra_library
 from chainshaper.planning.plan import Plan, publishing_servers, revised
 from chainshaper.planning.shaping import OUTPUT_PRIORITY
@@ -101,7 +102,7 @@ def with_offsets(
     ``time_limit_s`` bounds the search among chains that can collide with each other.
 
     Raises:
-        InputError: no plans.
+        InputError: no plans, or plans that govern the same threads or the same output.
         OperationError: there are no such offsets, with the reason where a single pair of chains
             or the load of a core already excludes them; or it is not known whether there are,
             because the time was up.
@@ -109,6 +110,7 @@ def with_offsets(
     """
     if not plans:
         raise InputError("no plans to find offsets for: give one per chain")
+    refuse_shared_parts(plans)
     allowed: _Allowed = {}
     for j, k in combinations(range(len(plans)), 2):
         found = _allowed_differences(plans[j], plans[k])

@@ -9,21 +9,36 @@ has expired when the thread may run again.
 from itertools import pairwise
 
 from chainshaper.errors import InputError
-from chainshaper.planning.plan import Plan, output_server, publish_slots, revised, server_of
+from chainshaper.planning.plan import (
+    PER_CALLBACK,
+    Plan,
+    output_server,
+    publish_slots,
+    publishing_servers,
+    revised,
+    server_of,
+)
 from chainshaper.planning.plan_parts import ShapingNode, Thread
+from chainshaper.planning.publisher_threads import below_executors, publisher_servers
 
-__all__ = ["cycles_until_output", "output_lifespan", "with_room_for_overruns"]
+__all__ = ["cycles_until_output", "open_until_done", "output_lifespan"]
 
 
 def cycles_until_output(plan: Plan, node: ShapingNode | None = None) -> int:
-    """How many cycles after its own an output is due: 0, and more under LET.
+    """How many cycles after its own an output is due, and leaves at the earliest: more than 0
+    under LET only.
 
     It is the chain's output, or what ``node`` republishes: under LET per callback, each topic
-    inside the chain is due a cycle after the one before it.
+    inside the chain is due a cycle after the one before it. (Without slots for outputs, as many as
+    the prediction takes.)
     """
-    if plan.policy == "let-per-callback" and node in plan.further_shaping_nodes:
-        return plan.further_shaping_nodes.index(node) + 1
-    return (plan.predicted.max_ns - 1) // plan.cycle_ns
+    if plan.policy == "let-per-chain":
+        return 1
+    if plan.policy == "let-per-callback":
+        if node in plan.further_shaping_nodes:
+            return plan.further_shaping_nodes.index(node) + 1
+        return len(publishing_servers(plan))
+    return (plan.predicted.max_ns - 1) // plan.cycle_ns if plan.policy in PER_CALLBACK else 0
 
 
 def output_lifespan(plan: Plan) -> int | None:
@@ -46,27 +61,32 @@ def output_lifespan(plan: Plan) -> int | None:
     return max([slots[0][1], *waits])
 
 
-def with_room_for_overruns(plan: Plan) -> Plan:
-    """The plan with its last publish slot a tenth of the cycle long, where there is room for it.
+def open_until_done(plan: Plan) -> Plan:
+    """The plan as back ends and the simulator carry it out: what overruns may finish.
 
-    A gate publishes at a slot's start, so its width does not move the output. But what comes late
-    by less than the width then leaves at once, instead of a whole cycle later. The chain's servers
-    go on until the end of that slot, so that it can finish (section 6), and a back end that stops
-    its threads does not do so in the very moment of the publication. Predictions stay: they are
-    for outputs in time.
+    Where an output that missed its slot is to leave at once, the servers that run the chain to its
+    end stay open until the cycle's end (section 6), and so does the last publish slot of an
+    asynchronous publisher's thread: a server that stopped either of them would delay the output by
+    a whole cycle. The plan itself states what is reserved (eq. 1); it is also what is shared out
+    among several chains of a core, and where another server of the same priority has a slot there,
+    the servers stay as planned.
+
+    In the next cycle the thread of an asynchronous publisher waits for its slot again.
     """
-    output = output_server(plan)
-    if output is None or plan.overrun != "wait" or plan.policy != "shaped":
+    shaped = plan.policy in ("shaped", "one-long-slot") and output_server(plan) is not None
+    if plan.overrun != "publish" or not shaped:
         return plan
-    start, end = output.slots[-1]
-    until = min(plan.cycle_ns, max(end, start + plan.cycle_ns // 10))
-    servers = tuple(
-        server.model_copy(update={"slots": (*server.slots[:-1], (server.slots[-1][0], until))})
-        if server is output or server.slots[-1][1] == start
+    publishers = [server for _, server, _ in publisher_servers(plan)]
+    publishing, (last_start, _) = publishing_servers(plan), publish_slots(plan)[-1]
+    servers = [
+        server.model_copy(
+            update={"slots": (*server.slots[:-1], (server.slots[-1][0], plan.cycle_ns))}
+        )
+        if server in publishers or (server not in publishing and server.slots[-1][1] >= last_start)
         else server
         for server in plan.servers
-    )
+    ]
     try:
-        return revised(plan, servers=servers)
-    except InputError:  # somebody else has a slot there
+        return revised(plan, servers=below_executors(servers))
+    except InputError:  # another server has a slot there
         return plan

@@ -18,9 +18,9 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from chainshaper.durations import format_duration
-from chainshaper.enforcement.gate import Anchor, Overrun
+from chainshaper.enforcement.gate import Anchor, Messages, Overrun
 from chainshaper.errors import InputError
-from chainshaper.plan_choices import Policy
+from chainshaper.plan_choices import Fallback, Policy
 from chainshaper.planning.plan_parts import (
     PER_CALLBACK,
     BandPrediction,
@@ -77,7 +77,9 @@ class Plan(Part):
     which all of them count; slots count from the start of the chain's own cycle nevertheless.
     ``anchor`` says what starts a cycle for the shaping node: the stamp that each message carries
     from the chain's first callback, or the servers' own cycle. ``overrun`` says what becomes of
-    an output that missed its last slot. ``shaping_node`` serves the chain's output; it is absent
+    an output that missed its last slot, ``messages`` which of several outputs of one cycle leave,
+    and ``fallback`` what becomes of outputs while their shaping node is not there.
+    ``shaping_node`` serves the chain's output; it is absent
     when the publisher's own thread is gated (asynchronous publication) or nothing is.
     ``further_shaping_nodes`` serve other sinks, or the topics inside a chain whose callbacks
     follow LET one by one. With ``modes`` the slot of an output depends on the mode of the system.
@@ -92,6 +94,8 @@ class Plan(Part):
     offset_ns: Duration = 0
     anchor: Anchor = "stamp"
     overrun: Overrun = "wait"
+    messages: Messages = "all-in-order"
+    fallback: Fallback = "bypass"
     servers: Annotated[tuple[Server, ...], Field(min_length=1)]
     shaping_node: ShapingNode | None = None
     further_shaping_nodes: tuple[ShapingNode, ...] = ()

@@ -30,6 +30,8 @@ _SECTION_COMMENTS = {
     "offset": "this chain's cycles start so much after the instant that all chains count from",
     "anchor": "what starts a cycle: the message's origin stamp (stamp), or the servers (cycle)",
     "overrun": "an output that missed its last slot: wait for the next, discard, publish at once",
+    "messages": "several outputs in one cycle: all leave in order, or the newest, or the first",
+    "fallback": "while the shaping node is not there: bypass, outputs go around it; or silence",
     "servers": "a thread runs only in its server's slots; a smaller priority is better",
     "shaping_node": "republishes the output in its slots; receivers get SCHED_FIFO below servers",
     "modes": "each mode's band, 1 is the first slot; the topic (std_msgs/String) names the mode",
@@ -55,6 +57,8 @@ def dump_plan(plan: Plan) -> str:
         server["threads"] = [_InlineMapping(thread) for thread in server["threads"]]
     if plan.offset_ns == 0:
         del values["offset"]
+    if plan.shaping_node is None and plan.fallback == "bypass":
+        del values["fallback"]
     for node in (values.get("shaping_node"), *values["further_shaping_nodes"]):
         if node is not None:
             node["receivers"] = _Inline(node["receivers"])

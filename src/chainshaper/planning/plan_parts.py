@@ -77,6 +77,7 @@ class Evidence(Part):
     ``incomplete`` counts traversals without an end, ``disturbed`` those that a stall of the
     machine hit, ``utilisation`` is the share of its core that the chain's execution takes,
     ``longest_send_ns`` how long the output's asynchronous publisher took to send one message.
+    The latencies are those of undisturbed cycles; ``max_of_all_ns`` is the longest of all cycles.
     ``lost_events`` counts what the tracer lost, if it lost anything.
     ``None`` is: not known.
     """
@@ -86,6 +87,7 @@ class Evidence(Part):
     min_latency_ns: Duration
     mean_latency_ns: Duration
     max_latency_ns: PositiveDuration
+    max_of_all_ns: PositiveDuration | None = None
     incomplete: Annotated[int, Field(ge=0)] = 0
     disturbed: Annotated[int, Field(ge=0)] = 0
     realtime: bool | None = None
@@ -102,16 +104,19 @@ class Evidence(Part):
 
 
 class Margin(Part):
-    """How far the chain's slot reaches beyond the longest latency measured (ε of eq. 1).
+    """How far the chain's slot reaches beyond the longest undisturbed latency (ε of eq. 1).
 
-    ``given`` by a person, or ``derived`` from the tail of the measured latencies: then the plan
-    keeps the probability of an overrun per cycle that it was derived for, and the confidence
-    interval of the margin.
+    ``given`` by a person, ``measured``: it covers all cycles that were measured but a share, also
+    those that the machine disturbed, for which ``stalls_ns`` of it are needed; either way
+    ``overrun_probability`` is the share of outputs that will be late, at most, with 95 %
+    confidence. Or ``derived`` from the tail of the latencies, for a probability smaller than the
+    sample shows, with the confidence interval of the margin.
     """
 
     epsilon_ns: Duration
-    source: Literal["given", "derived"] = "given"
-    overrun_probability: Annotated[float, Field(gt=0, lt=1)] | None = None
+    source: Literal["given", "measured", "derived"] = "given"
+    overrun_probability: Annotated[float, Field(gt=0, le=1)] | None = None
+    stalls_ns: Duration = 0
     confidence_interval_ns: tuple[Duration, Duration] | None = None
 
 
@@ -167,7 +172,9 @@ class ShapingNode(Part):
     ``publisher`` is the node whose output it takes, of a node that stands elsewhere than behind
     the chain's own output (`chain.publisher`), where it is known. ``receivers`` are nodes that
     subscribe to the output: while the plan is in force their executors run under SCHED_FIFO below
-    all servers, so that what comes in time is taken in time.
+    all servers, so that what comes in time is taken in time. ``depth`` is how many messages may
+    wait in it; None: as many as the histories of the output's publisher and subscribers have room
+    for, as far as they are known, and 10 at least.
     """
 
     name: Annotated[str, AfterValidator(_node_name)]
@@ -179,6 +186,7 @@ class ShapingNode(Part):
     spin_ns: Duration
     pause_ns: Duration
     receivers: tuple[FullName, ...] = ()
+    depth: Annotated[int, Field(ge=1)] | None = None
 
     @property
     def thread(self) -> Thread:

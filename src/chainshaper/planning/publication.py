@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from chainshaper.durations import format_duration
 from chainshaper.errors import InputError
-from chainshaper.planning.overruns import output_lifespan
+from chainshaper.planning.overruns import open_until_done, output_lifespan
 from chainshaper.planning.plan import Plan
 from chainshaper.planning.publisher_threads import messages_held, publisher_servers
 
@@ -85,7 +85,7 @@ def _check_output(topic: str, node: str, own: Sequence[Writer], held: int) -> No
 def publication_warnings(plan: Plan) -> list[str]:
     """What a plan for asynchronous publication asks of the application; one sentence each."""
     warnings = []
-    for _, server, nodes in publisher_servers(plan):
+    for _, server, nodes in publisher_servers(open_until_done(plan)):
         names = ", ".join(nodes)
         warnings.append(
             f"only asynchronous publication can be shaped like this, and all of it is: whatever"

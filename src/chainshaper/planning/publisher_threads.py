@@ -36,10 +36,11 @@ def check_publisher_threads(plan: "Plan") -> None:
         _check_slots(plan, number, server)
         for node in nodes:
             _check_rank(plan, number, server, node)
-        if plan.overrun == "publish":
+        if plan.overrun == "publish" and plan.policy not in ("shaped", "one-long-slot"):
             raise wrong_value(
-                "the thread of an asynchronous publisher cannot publish outside its slots: write"
-                " wait or discard, or plan with --publication synchronous",
+                f"under {plan.policy} an output of an asynchronous publisher that comes in its own"
+                " cycle cannot be told from an overrun of the one before: write wait or discard, or"
+                " plan with --publication synchronous",
                 "overrun",
             )
         depth = plan.chain.output_depth

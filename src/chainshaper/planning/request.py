@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.durations import format_duration
-from chainshaper.enforcement.gate import Anchor, Overrun
+from chainshaper.enforcement.gate import Anchor, Messages, Overrun
 from chainshaper.errors import InputError, OperationError
-from chainshaper.plan_choices import Goal, Policy, Publication, Solver
+from chainshaper.plan_choices import Fallback, Goal, Policy, Publication, Solver
 from chainshaper.planning.baselines import (
     CallbackTimes,
     let_per_callback,
@@ -25,9 +25,18 @@ from chainshaper.planning.baselines import (
     server_per_callback,
     server_per_chain,
 )
+from chainshaper.planning.entangled import refuse_entangled
 from chainshaper.planning.graphs import over_cores, with_first_node_apart, with_sink
 from chainshaper.planning.latency_file import check_latencies
-from chainshaper.planning.margins import derive_margin
+from chainshaper.planning.margins import (
+    EPSILON_NS,
+    MOST_PROBABLE,
+    OVERRUN_PROBABILITY,
+    covered_latency,
+    cycles_needed,
+    derive_margin,
+    late_share,
+)
 from chainshaper.planning.placement import (
     BandChoice,
     choose_bands,
@@ -44,9 +53,8 @@ from chainshaper.planning.plan import (
 )
 from chainshaper.planning.shaping import evidence_of, plan_shaping
 
-__all__ = ["PlanRequest", "Profile", "band_choice", "plan_chain"]
+__all__ = ["PlanRequest", "Profile", "band_choice", "plan_chain", "plan_chains"]
 
-DEFAULT_EPSILON_NS = 1_000_000
 DEFAULT_CORE = 1
 OWN_SLOTS = (*PER_CALLBACK, "let-per-chain")
 """Policies whose plan has no slot behind the chain's, in the same cycle."""
@@ -56,9 +64,12 @@ OWN_SLOTS = (*PER_CALLBACK, "let-per-chain")
 class Profile:
     """What was measured of one chain, under a high SCHED_FIFO priority. Times in nanoseconds.
 
-    ``latencies_ns`` are in the order of time. ``nodes`` are those of the chain's callbacks, one
+    ``latencies_ns`` are those of undisturbed cycles, ``every_latency_ns`` those of all (None: all
+    were undisturbed), both in the order of time. ``nodes`` are those of the chain's callbacks, one
     per callback, ``topics`` what each of these publishes for the chain. ``core_of`` names the
     core of every node whose executor takes part, also on branches that the chain waits for.
+    ``begins`` is the first callback's number in the graph, and its name, ``upstream`` the topics
+    that the output waits for: on the chain, on those branches, and before the chain begins.
     ``receivers`` are the nodes that subscribe to the chain's output and are none of these.
     ``callbacks`` are those of the chain and its branches, see
     :func:`~chainshaper.planning.baselines.server_per_callback`. ``output_depth`` is the history
@@ -68,9 +79,12 @@ class Profile:
 
     latencies_ns: NDArray[np.int64]
     period_ns: int
+    every_latency_ns: NDArray[np.int64] | None = None
     spec: str | None = None
     nodes: tuple[str, ...] = ()
     topics: tuple[str, ...] = ()
+    begins: tuple[int, str] | None = None
+    upstream: frozenset[str] = frozenset()
     core_of: Mapping[str, int] = field(default_factory=dict)
     receivers: tuple[str, ...] = ()
     callbacks: tuple[CallbackTimes, ...] = ()
@@ -90,17 +104,23 @@ class Profile:
 class PlanRequest:
     """The wishes for a plan; every field has the default that the command line has.
 
-    ``epsilon_ns`` is given (None: 1 ms), or derived for ``overrun_probability``. ``bands`` to
+    The margin is ``epsilon_ns`` behind the longest undisturbed latency where that is given.
+    Otherwise it covers all cycles, also disturbed ones, but a share of ``overrun_probability``
+    (None: 1 %, or as few as the sample shows); with ``ideal_machine`` undisturbed cycles only.
+    ``overrun`` says what becomes of an output that missed its slot (None: it leaves at once, where
+    the policy and the publisher allow it). ``bands`` to
     ``seed`` are those of :func:`~chainshaper.planning.placement.with_bands` and go with the
     policy ``shaped``, ``slot_start_ns`` goes with ``one-long-slot``. ``first_slot_ns`` puts the
     chain's first node into a server of its own that ends there. ``modes`` give each mode of the
-    system one of the bands. Without ``with_receivers`` those of the output are left alone.
+    system one of the bands. ``depth`` is the shaping nodes'. Without ``with_receivers`` those of
+    the output are left alone.
     """
 
     policy: Policy = "shaped"
     publication: Publication = "synchronous"
     epsilon_ns: int | None = None
     overrun_probability: float | None = None
+    ideal_machine: bool = False
     publish_slot_ns: int = 1_000_000
     bands: int | Literal["auto"] = 1
     solver: Solver = "exact"
@@ -115,7 +135,10 @@ class PlanRequest:
     first_slot_ns: int | None = None
     modes: Modes | None = None
     anchor: Anchor = "stamp"
-    overrun: Overrun = "wait"
+    overrun: Overrun | None = None
+    messages: Messages = "all-in-order"
+    depth: int | None = None
+    fallback: Fallback = "bypass"
     spin_ns: int = 1_000_000
     pause_ns: int | None = None
     with_receivers: bool = True
@@ -138,6 +161,7 @@ def plan_chain(
         PlatformError: a library that only this request needs is not installed.
     """
     _refuse_contradictions(request, bool(sinks))
+    refuse_entangled((profile, *sinks), request.policy, sinks=True)
     margin = _margin(profile, request)
     if request.policy == "let-per-chain":
         _refuse_longer_than_period(profile)
@@ -157,7 +181,22 @@ def plan_chain(
             publisher=publisher,
             receivers=sink.receivers if request.with_receivers else (),
         )
-    return plan if request.modes is None else revised(plan, modes=request.modes)
+    if request.fallback != _STANDARD.fallback and plan.shaping_node is None:
+        raise InputError(
+            f"--fallback {request.fallback} is for an output with a shaping node, and the plan has"
+            " none: leave it out, or plan with synchronous publication"
+        )
+    return revised(plan, modes=request.modes, fallback=request.fallback)
+
+
+def plan_chains(profiles: Sequence[Profile], request: PlanRequest = _STANDARD) -> tuple[Plan, ...]:
+    """A plan for each of several chains that have nothing in common but cores.
+
+    Raises: as :func:`plan_chain`; InputError also where one chain's plan would move another's
+        outputs.
+    """
+    refuse_entangled(profiles, request.policy)
+    return tuple(plan_chain(profile, request) for profile in profiles)
 
 
 def band_choice(plan: Plan, profile: Profile, request: PlanRequest) -> BandChoice:
@@ -198,6 +237,7 @@ def _shaped(
     last = profile.nodes[-1] if profile.nodes else None
     asynchronous = request.publication == "asynchronous"
     conditions = {n: getattr(profile, n) for n in Evidence.model_fields if hasattr(profile, n)}
+    conditions["max_of_all_ns"] = int(_every_latency(profile).max())
     if not asynchronous:  # how long sends take is no evidence for it
         del conditions["longest_send_ns"]
     plan = plan_shaping(
@@ -213,7 +253,9 @@ def _shaped(
         output_depth=profile.output_depth if asynchronous else None,
         core=profile.core_of.get(last or "", DEFAULT_CORE),
         anchor=request.anchor,
-        overrun=request.overrun,
+        overrun=_overrun(request),
+        messages=request.messages,
+        depth=request.depth,
         fifo_priority=profile.fifo_priority,
         spin_ns=request.spin_ns,
         pause_ns=request.pause_ns,
@@ -229,13 +271,53 @@ def _shaped(
     return over_cores(plan, core_of) if core_of else plan
 
 
+def _overrun(request: PlanRequest) -> Overrun:
+    """At once, unless slots only are asked for: age and gaps of what a receiver has are smallest.
+
+    The thread of an asynchronous publisher cannot do that where outputs are due a cycle later.
+    """
+    if request.overrun is not None:
+        return request.overrun
+    bound = request.publication == "asynchronous" and request.policy in OWN_SLOTS
+    return "wait" if bound else "publish"
+
+
 def _margin(profile: Profile, request: PlanRequest) -> Margin:
-    if request.overrun_probability is not None:
-        return derive_margin(profile.latencies_ns, request.overrun_probability, request.seed)
-    epsilon = DEFAULT_EPSILON_NS if request.epsilon_ns is None else request.epsilon_ns
-    if epsilon < 0:
-        raise InputError("epsilon must be 0ms or more")
-    return Margin(epsilon_ns=epsilon)
+    every, longest = _every_latency(profile), int(check_latencies(profile.latencies_ns).max())
+    if request.epsilon_ns is not None:
+        if request.epsilon_ns < 0:
+            raise InputError("epsilon must be 0ms or more")
+        return Margin(
+            epsilon_ns=request.epsilon_ns,
+            overrun_probability=late_share(every, longest + request.epsilon_ns),
+        )
+    covered = profile.latencies_ns if request.ideal_machine else every
+    probability = request.overrun_probability
+    if probability is not None and not 0 < probability < 1:
+        raise InputError(f"an overrun probability of {probability}: write one between 0 and 1")
+    if probability is not None and probability < MOST_PROBABLE:
+        return derive_margin(covered, probability, request.seed, longest_ns=longest)
+    if probability is not None and covered.size < cycles_needed(probability):
+        raise OperationError(
+            f"{covered.size} cycles are too few for an overrun probability of {probability:g}:"
+            f" measure {cycles_needed(probability)} or more"
+        )
+    stalls, latest = 0, profile.period_ns - request.publish_slot_ns - EPSILON_NS
+    if request.policy not in OWN_SLOTS:  # what a stall adds belongs to no single callback
+        share = probability or OVERRUN_PROBABILITY
+        stalls = max(0, covered_latency(covered, share, latest) - longest)
+    epsilon = EPSILON_NS + stalls
+    return Margin(
+        epsilon_ns=epsilon,
+        source="measured",
+        overrun_probability=late_share(every, longest + epsilon),
+        stalls_ns=stalls,
+    )
+
+
+def _every_latency(profile: Profile) -> NDArray[np.int64]:
+    every = profile.every_latency_ns
+    return profile.latencies_ns if every is None else check_latencies(every)
 
 
 def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
@@ -274,7 +356,8 @@ def _per_callback(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
 def _refuse_contradictions(request: PlanRequest, sinks: bool) -> None:
     if request.epsilon_ns is not None and request.overrun_probability is not None:
         raise InputError(
-            "the margin is either given or derived: leave out --epsilon or the overrun probability"
+            "the margin is either given or covers a share of the cycles: leave out --epsilon or the"
+            " overrun probability"
         )
     if request.policy != "one-long-slot" and request.slot_start_ns is not None:
         raise InputError("a slot's start goes with the policy one-long-slot: add it")

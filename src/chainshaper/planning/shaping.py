@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.durations import format_duration
-from chainshaper.enforcement.gate import Anchor, Overrun
+from chainshaper.durations import format_duration, milliseconds
+from chainshaper.enforcement.gate import Anchor, Messages, Overrun
 from chainshaper.errors import InputError, OperationError
 from chainshaper.plan_choices import Publication
 from chainshaper.planning.latency_file import check_latencies
+from chainshaper.planning.margins import EPSILON_NS, OVERRUN_PROBABILITY, cycles_needed
 from chainshaper.planning.plan import (
     ChainOfPlan,
     Evidence,
@@ -37,7 +38,6 @@ OUTPUT_PRIORITY = 1  # better than the chain's: a publish slot inside its slot h
 CHAIN_PRIORITY = 2
 PAUSE_NS = 2_000_000  # a receiver on a slow machine takes a millisecond to get to its callback
 
-FEW_SAMPLES = 100
 NEARLY_FULL = 0.95  # of the cycle; also the kernel's default share for real-time threads
 
 
@@ -49,7 +49,7 @@ def plan_shaping(
     output: str | None = None,
     publisher: str | None = None,
     nodes: Sequence[str] = (),
-    epsilon_ns: int = 1_000_000,
+    epsilon_ns: int = EPSILON_NS,
     margin: Margin | None = None,
     publish_slot_ns: int = 1_000_000,
     publication: Publication = "synchronous",
@@ -57,7 +57,9 @@ def plan_shaping(
     core: int = 1,
     output_core: int | None = None,
     anchor: Anchor = "stamp",
-    overrun: Overrun = "wait",
+    overrun: Overrun = "publish",
+    messages: Messages = "all-in-order",
+    depth: int | None = None,
     fifo_priority: int = 84,
     spin_ns: int = 1_000_000,
     pause_ns: int | None = None,
@@ -88,6 +90,7 @@ def plan_shaping(
         anchor, fifo_priority, spin_ns, pause_ns, receivers: for the shaping node; it pauses for
             2 ms, a twentieth of the period at most, if nothing else is asked for.
         overrun: what becomes of an output that missed its slot.
+        messages, depth: which of several outputs in one cycle leave, and how many may wait.
         conditions: how the latencies were taken: the other fields of
             :class:`~chainshaper.planning.plan_parts.Evidence`.
 
@@ -118,6 +121,7 @@ def plan_shaping(
         if publication == "synchronous" and output is not None:
             node = ShapingNode(
                 **_names(output),
+                depth=depth,
                 core=output_core,
                 fifo_priority=fifo_priority,
                 spin_ns=spin_ns,
@@ -141,6 +145,7 @@ def plan_shaping(
             cycle_ns=period_ns,
             anchor=anchor,
             overrun=overrun,
+            messages=messages,
             servers=(
                 Server(
                     name="chain",
@@ -221,12 +226,7 @@ def predict_bands(
 def plan_warnings(plan: Plan) -> list[str]:
     """What a person must know before relying on a plan; one sentence each, none if all is well."""
     evidence, cycle = plan.evidence, plan.cycle_ns
-    warnings = []
-    if evidence.samples < FEW_SAMPLES:
-        warnings.append(
-            f"the sample is small: {evidence.samples} latencies; the longest of them says little"
-            f" about the longest to come. Record {FEW_SAMPLES} cycles or more."
-        )
+    warnings = _about_late_outputs(plan)
     if evidence.realtime is False:
         warnings.append(
             "the latencies were taken without real-time scheduling: other programs are in them,"
@@ -237,13 +237,6 @@ def plan_warnings(plan: Plan) -> list[str]:
         warnings.append(
             f"{evidence.lost_events} events were lost while recording: cycles are missing, and the"
             " longest latency may be among them. Record again, see the recording's notes."
-        )
-    if evidence.disturbed:
-        stalled = evidence.longest_stall_ns
-        longest = "" if stalled is None else f" (longest {format_duration(stalled)})"
-        warnings.append(
-            f"the machine stalled while {evidence.disturbed} cycles were measured{longest}; they"
-            " are left out, and how long the chain itself would have taken in them is not known."
         )
     if evidence.incomplete:
         warnings.append(
@@ -280,6 +273,36 @@ def plan_warnings(plan: Plan) -> list[str]:
             " will pile up from cycle to cycle, whatever the slots."
         )
     return [*warnings, *publication_warnings(plan)]
+
+
+def _about_late_outputs(plan: Plan) -> list[str]:
+    """How many outputs will be late, if the sample tells, and what the machine's stalls cost."""
+    evidence, margin = plan.evidence, plan.margin
+    cycles, needed = evidence.samples + evidence.disturbed, cycles_needed(OVERRUN_PROBABILITY)
+    found = []
+    if cycles < needed:
+        found.append(
+            f"the sample is small: {cycles} cycles are too few to say how late one output in a"
+            f" hundred will be. Record {needed} cycles or more."
+        )
+    if evidence.disturbed:
+        stall = evidence.longest_stall_ns
+        what = "" if stall is None else f", longest stall {milliseconds(stall)} ms"
+        found.append(f"the machine disturbed {evidence.disturbed} of {cycles} cycles{what}.")
+    if margin.stalls_ns:
+        end = evidence.max_latency_ns + margin.epsilon_ns
+        found.append(
+            f"covering the disturbed cycles costs {milliseconds(margin.stalls_ns)} ms: outputs"
+            f" leave at {milliseconds(end)} ms; on a machine that does not stall it would be"
+            f" {milliseconds(end - margin.stalls_ns)} ms (--ideal-machine)."
+        )
+    late = margin.overrun_probability or 0.0
+    if cycles >= needed and late > OVERRUN_PROBABILITY and margin.source != "derived":
+        found.append(
+            f"by the latencies of all cycles, up to {late:.1%} of the outputs will miss their slot"
+            f" ({plan.overrun}): a larger margin (--epsilon) or a calmer machine helps."
+        )
+    return found
 
 
 def _names(output: str) -> dict[str, str]:

@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rich.markup import escape
 from rich.table import Table
 
 from chainshaper.analysis.objects import INTERNAL_TOPICS
@@ -18,6 +17,7 @@ from chainshaper.app import Callback
 from chainshaper.durations import format_duration
 from chainshaper.exploration import ApplicationDescription, lost_text
 from chainshaper.reporting.cells import terminal_table
+from chainshaper.safe_text import shown
 from chainshaper.whole_file import new_file, write_whole
 
 __all__ = [
@@ -122,7 +122,7 @@ def application_table(application: ApplicationDescription) -> Table:
         publishes, function = ", ".join(callback.publishes), short_symbol(callback.symbol)
         rows.append((callback.node, callback.pid, callback_text(callback), publishes, function))
     for node, pid, *rest in sorted(rows, key=lambda row: row[:2]):
-        table.add_row(escape(node), str(pid), *map(escape, rest))
+        table.add_row(node, str(pid), *rest)
     return table
 
 
@@ -200,7 +200,7 @@ def application_dot(application: ApplicationDescription) -> str:
 
 
 def _quoted(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+    escaped = shown(text, but="\n").replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
     return f'"{escaped}"'
 
 

@@ -10,7 +10,6 @@ latency, so mean shares add up to one.
 from typing import Any
 
 import polars as pl
-from rich.markup import escape
 from rich.table import Table
 
 from chainshaper.analysis import LatencyAnalysis
@@ -87,5 +86,5 @@ def breakdown_table(analysis: LatencyAnalysis) -> Table:
         for part in PARTS:
             times = row[f"{part}_ns"] or {"mean": None, "max": None}
             cells += [ms(times["mean"]), ms(times["max"]), percent(row[f"{part}_share"])]
-        table.add_row(*map(escape, cells))
+        table.add_row(*cells)
     return table

@@ -3,16 +3,17 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from rich.markup import escape
 from rich.table import Table
 
 from chainshaper.durations import format_duration, milliseconds
 from chainshaper.planning.plan_parts import Server
+from chainshaper.reporting.terminal import PlainTable
 
 __all__ = [
     "ABSENT",
     "FIGURES",
     "YES_NO",
+    "count",
     "min_mean_max",
     "ms",
     "percent",
@@ -36,11 +37,8 @@ FIGURES = (
 
 
 def terminal_table(title: str, texts: Iterable[str], figures: Iterable[str] = ()) -> Table:
-    """An empty table: columns of texts, which are folded where there is no room, then of figures.
-
-    Brackets around the title's unit are not taken for Rich's markup.
-    """
-    table = Table(title=escape(title), title_justify="left")
+    """An empty table: columns of texts, folded where there is no room, then of figures."""
+    table = PlainTable(title=title, title_justify="left")
     for name in texts:
         table.add_column(name, overflow="fold")
     for name in figures:
@@ -51,6 +49,11 @@ def terminal_table(title: str, texts: Iterable[str], figures: Iterable[str] = ()
 def ms(nanoseconds: float | None) -> str:
     """Milliseconds, where there are any."""
     return ABSENT if nanoseconds is None else milliseconds(nanoseconds)
+
+
+def count(number: int | None) -> str:
+    """A number, where it is known."""
+    return ABSENT if number is None else str(number)
 
 
 def min_mean_max(times: Mapping[str, float] | None) -> list[str]:

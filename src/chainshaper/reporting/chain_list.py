@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from rich.markup import escape
 from rich.table import Table
 
 from chainshaper.analysis import ChainEnumeration
@@ -46,7 +45,7 @@ def count_text(found: ChainEnumeration) -> str:
 
 def chain_table(graph: ApplicationGraph, found: ChainEnumeration) -> Table:
     """One row per chain: where it starts, which topics it passes; the heaviest is marked."""
-    heaviest = escape("heaviest [ms]")
+    heaviest = "heaviest [ms]"
     table = terminal_table("Computation chains", ("starts at", "topics"), [heaviest])
     shown = list(found.chains)
     if found.heaviest is not None and found.heaviest not in shown:
@@ -55,8 +54,8 @@ def chain_table(graph: ApplicationGraph, found: ChainEnumeration) -> Table:
         weight = found.heaviest_ns if chain == found.heaviest else None
         row = _chain(graph, chain)
         table.add_row(
-            escape(row["callbacks"][0]),
-            escape(" → ".join(row["topics"])),
+            row["callbacks"][0],
+            " → ".join(row["topics"]),
             "" if weight is None else milliseconds(weight),
         )
     return table

@@ -2,11 +2,11 @@
 
 from typing import Any
 
-from rich.markup import escape
 from rich.table import Table
 
 from chainshaper.exploration import event_counts
-from chainshaper.recording import Recording
+from chainshaper.recording import INFO_FILE, Recording
+from chainshaper.reporting.terminal import PlainTable
 
 __all__ = ["contents_json", "contents_table"]
 
@@ -24,26 +24,36 @@ def contents_json(recording: Recording) -> dict[str, Any]:
         "hosts": [host for host in info.host.split(", ") if host],
         "kernel": info.kernel,
         "processes": {str(pid): name for pid, name in info.processes.items()},
-        "notes": list(info.notes),
+        "notes": [*info.notes, *_without_checksums(recording)],
     }
+
+
+def _without_checksums(recording: Recording) -> list[str]:
+    """Said of a recording from before there were checksums; a tracer's trace never has any."""
+    if recording.info.checksums is not None or not (recording.path / INFO_FILE).is_file():
+        return []
+    return [
+        "this recording has no checksums, so that damage to its files may go unseen: `chainshaper"
+        " convert` writes one that has"
+    ]
 
 
 def contents_table(recording: Recording) -> tuple[Table, Table]:
     """The system that was recorded, and how often each event happened."""
     contents = contents_json(recording)
-    system = Table(title=escape(str(recording.path)), title_justify="left", show_header=False)
+    system = PlainTable(title=str(recording.path), title_justify="left", show_header=False)
     system.add_column("")
     system.add_column("", overflow="fold")
     system.add_row("source", contents["source"])
     system.add_row("distribution", contents["distribution"] or "unknown")
     system.add_row("RMW", contents["rmw"] or "unknown")
-    system.add_row("hosts", escape(", ".join(contents["hosts"])) or "unknown")
+    system.add_row("hosts", ", ".join(contents["hosts"]) or "unknown")
     system.add_row("clock offset", f"{contents['clock_offset_ns']} ns to CLOCK_REALTIME")
     for pid, name in contents["processes"].items():
-        system.add_row(f"process {pid}", escape(name))
-    counts = Table(title="Events", title_justify="left", show_footer=True)
+        system.add_row(f"process {pid}", name)
+    counts = PlainTable(title="Events", title_justify="left", show_footer=True)
     counts.add_column("event", "together")
     counts.add_column("count", f"{sum(contents['events'].values()):,}", justify="right")
     for name, count in contents["events"].items():
-        counts.add_row(escape(name), f"{count:,}")
+        counts.add_row(name, f"{count:,}")
     return system, counts

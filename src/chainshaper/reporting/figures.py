@@ -14,7 +14,9 @@ import polars as pl
 
 from chainshaper.errors import InputError, OperationError
 from chainshaper.planning import BandChoice, publish_slots
+from chainshaper.safe_text import shown
 from chainshaper.steps import Measurement
+from chainshaper.trusted_files import why_distrusted
 from chainshaper.whole_file import new_file, write_whole
 
 if TYPE_CHECKING:
@@ -134,6 +136,9 @@ def new_figure(panels: int = 1) -> tuple[Any, Any]:
     import matplotlib as mpl
 
     mpl.use("Agg")
+    style = Path(mpl.matplotlib_fname())
+    if style.parent == Path.cwd() or why_distrusted(style) is not None:
+        mpl.rcdefaults()  # it may have TeX run, with a preamble of others
     from matplotlib import pyplot as plt
 
     figure, axes = plt.subplots(1, panels, figsize=SIZE_INCHES, layout="constrained")
@@ -158,7 +163,12 @@ def save_figure(figure: Any, path: str | Path) -> Path:
         OperationError: it cannot be written.
     """
     from matplotlib import pyplot as plt
+    from matplotlib.text import Text
 
+    for text in figure.findobj(Text):
+        if text.get_text():  # those of numbers at the axes have none yet
+            text.set_parse_math(False)  # a name may have dollars
+            text.set_text(shown(text.get_text(), but="\n"))
     path, picture = Path(path), io.BytesIO()
     figure.savefig(picture, dpi=130, format=path.suffix.removeprefix(".") or None)
     plt.close(figure)

@@ -3,13 +3,13 @@
 from typing import Any
 
 import polars as pl
-from rich.markup import escape
 from rich.table import Table
 
 from chainshaper.doctor import MachineReport
 from chainshaper.durations import format_duration, milliseconds
 from chainshaper.recording import StallMeterInfo
 from chainshaper.reporting.cells import terminal_table
+from chainshaper.reporting.terminal import plain
 
 __all__ = ["machine_json", "machine_tables", "stall_rows"]
 
@@ -41,9 +41,8 @@ def machine_tables(report: MachineReport) -> tuple[Table, Table]:
     """What the machine can do, and how it stalls."""
     abilities = terminal_table("This machine", ("", "found", "for", "remedy"))
     for check in report.checks:
-        colour = COLOURS[check.state]
-        found = f"[{colour}]{escape(check.found)}[/]"
-        abilities.add_row(check.name, found, check.needed_for, escape(check.remedy))
+        found = plain(check.found, COLOURS[check.state])
+        abilities.add_row(check.name, found, check.needed_for, check.remedy)
     watched = format_duration(report.watched_ns)
     threshold = format_duration(report.stall_meter.threshold_ns)
     title = f"Stalls longer than {threshold} in {watched} [ms]"

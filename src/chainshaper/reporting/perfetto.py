@@ -7,6 +7,7 @@ the slots of the servers, and stalls of the machine. Times are ns of the recordi
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import polars as pl
@@ -16,6 +17,7 @@ from chainshaper.analysis import DataFlow, LatencyAnalysis, data_flow, graph_of
 from chainshaper.recording import Recording
 from chainshaper.reporting.perfetto_format import Slice, Track, encode_trace
 from chainshaper.reporting.timeline import Timeline, timeline_of
+from chainshaper.safe_text import shown
 from chainshaper.steps import Measurement
 from chainshaper.whole_file import new_file, write_whole
 
@@ -43,7 +45,27 @@ def export_perfetto(source: Recording | Measurement, path: str | Path) -> Path:
     if analysis is not None:
         tracks += [*_chain_track(analysis), *_gate_tracks(analysis, timeline)]
     tracks += [*_server_tracks(timeline), *_stall_tracks(timeline)]
-    return write_whole(path, encode_trace(tracks, recording.info.clock_offset_ns))
+    shown_tracks = [_shown(track) for track in tracks]
+    return write_whole(path, encode_trace(shown_tracks, recording.info.clock_offset_ns))
+
+
+def _shown(track: Track) -> Track:
+    """A track with all its texts as they are shown."""
+    families = [
+        [
+            replace(
+                one,
+                name=shown(one.name),
+                arguments={
+                    name: shown(value) if isinstance(value, str) else value
+                    for name, value in one.arguments.items()
+                },
+            )
+            for one in family
+        ]
+        for family in track.families
+    ]
+    return replace(track, owner=shown(track.owner), name=shown(track.name), families=families)
 
 
 def _thread_tracks(recording: Recording, flow: DataFlow, timeline: Timeline) -> list[Track]:

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from rich.markup import escape
 from rich.table import Table
 
 from chainshaper.durations import milliseconds
@@ -10,11 +9,21 @@ from chainshaper.planning import BandChoice
 from chainshaper.predictions import BandHeld, FigureHeld, PredictionHeld
 from chainshaper.reporting.cells import ABSENT, ms, percent, slot_ms, terminal_table
 
-__all__ = ["band_name", "choice_json", "choice_table", "prediction_json", "prediction_table"]
+__all__ = [
+    "band_name",
+    "choice_json",
+    "choice_table",
+    "late_text",
+    "prediction_json",
+    "prediction_table",
+    "range_ms",
+    "verdict",
+]
 
 CONVENTION = (
     "at_start: every output leaves as its slot starts, as a gate does it; at_end: at its slot's"
-    " end, eq. 5's convention; what is measured should lie between the two"
+    " end, eq. 5's convention; from, to: with room for what two samples may differ by, the bounds"
+    " of `holds`"
 )
 
 
@@ -56,19 +65,21 @@ def choice_json(choice: BandChoice) -> dict[str, Any]:
 def prediction_table(held: PredictionHeld) -> Table:
     """Predicted beside measured: the whole, then band by band."""
     figures = ("predicted", "measured", "", "jitter", "share predicted", "measured")
-    table = terminal_table("Prediction and measurement [ms]", [""], figures)
+    whence = ", from the start of the cycle" if held.counted_from == "cycle" else ""
+    table = terminal_table(f"Prediction and measurement{whence} [ms]", [""], figures)
     table.columns[3].justify = "left"
     for title, figure in (
         ("average", held.mean),
         ("maximum", held.max),
         ("jitter (max − min)", held.jitter),
     ):
-        table.add_row(title, _range(figure), ms(figure.measured_ns), _verdict(figure), "", "", "")
+        cells = range_ms(figure), ms(figure.measured_ns), verdict(figure)
+        table.add_row(title, *cells, "", "", "")
     table.add_section()
     for number, band in enumerate(held.bands, start=1):
         table.add_row(
-            escape(band_name(band, number)),
-            escape(slot_ms(band.slot_start_ns, band.slot_end_ns)),
+            band_name(band, number),
+            slot_ms(band.slot_start_ns, band.slot_end_ns),
             ms(band.mean_ns),
             _inside(band),
             ms(band.jitter_ns),
@@ -77,12 +88,20 @@ def prediction_table(held: PredictionHeld) -> Table:
         )
     of_mode = "; shares of a mode: its outputs that were in time for its slot"
     late = of_mode if any(band.mode for band in held.bands) else ""
-    late += f"; {held.late} outputs came behind the slot they were due in" if held.late else ""
+    late += "" if held.late_of_all is None else f"; {late_text(held)}"
     table.caption = (
-        "predicted: outputs at the start … the end of their slots (a gate publishes at the start,"
-        f" eq. 5 counts the end); averages may differ by three standard errors more{late}"
+        "undisturbed cycles; predicted: outputs at the start … the end of their slots (a gate"
+        " publishes at the start, eq. 5 counts the end), averages with three standard errors, no"
+        f" band that may well be empty{late}"
     )
     return table
+
+
+def late_text(held: PredictionHeld) -> str:
+    """How many outputs came late, no cycle left out."""
+    disturbed = (held.late_of_all or 0) - held.late
+    among = f", {disturbed} of them in disturbed cycles" if disturbed else ""
+    return f"of all {held.cycles} outputs {held.late_of_all} came late{among}"
 
 
 def prediction_json(held: PredictionHeld) -> dict[str, Any]:
@@ -94,6 +113,8 @@ def prediction_json(held: PredictionHeld) -> dict[str, Any]:
         "jitter_ns": _figure_json(held.jitter),
         "bands": [vars(band) for band in held.bands],
         "late": held.late,
+        "late_of_all": held.late_of_all,
+        "counted_from": held.counted_from,
     }
 
 
@@ -108,18 +129,22 @@ def _figure_json(figure: FigureHeld) -> dict[str, Any]:
     return {
         "at_start": figure.at_start_ns,
         "at_end": figure.at_end_ns,
+        "from": figure.from_ns,
+        "to": figure.to_ns,
         "measured": figure.measured_ns,
         "holds": figure.holds,
     }
 
 
-def _range(figure: FigureHeld) -> str:
-    if figure.at_start_ns == figure.at_end_ns:
-        return milliseconds(figure.at_end_ns)
-    return f"{milliseconds(figure.at_start_ns)} … {milliseconds(figure.at_end_ns)}"
+def range_ms(figure: FigureHeld) -> str:
+    """What a figure was predicted to lie in: the verdict's own bounds."""
+    if figure.from_ns == figure.to_ns:
+        return milliseconds(figure.to_ns)
+    return f"{milliseconds(figure.from_ns)} … {milliseconds(figure.to_ns)}"
 
 
-def _verdict(figure: FigureHeld) -> str:
+def verdict(figure: FigureHeld) -> str:
+    """Whether it does."""
     return {True: "as predicted", False: "differs", None: ABSENT}[figure.holds]
 
 

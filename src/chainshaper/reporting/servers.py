@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import Any
 
-from rich.markup import escape
 from rich.table import Table
 
 from chainshaper.durations import format_duration
@@ -27,7 +26,7 @@ def servers_table(state: RunState) -> Table:
     table.caption = _caption(state)
     for server in state.servers:
         table.add_row(
-            escape(server.name),
+            server.name,
             str(server.core),
             str(server.priority),
             " ".join(slot_text(slot) for slot in server.slots),
@@ -45,7 +44,7 @@ def runs_table(runs: Sequence[tuple[Journal, RunState | None]]) -> Table:
         owner = journal.owner
         table.add_row(
             journal.path.parent.name,
-            escape(state.plan) if state else "not known yet",
+            state.plan if state else "not known yet",
             state.back_end if state else "",
             str(owner) if owner is not None else "gone",
             _condition(owner is not None, state),
@@ -60,12 +59,12 @@ def changes_table(changes: Sequence[WantedScheduling]) -> Table:
     for one in changes:
         thread, wanted = one.thread.thread, one.wanted
         table.add_row(
-            escape(", ".join(one.thread.nodes)),
+            ", ".join(one.thread.nodes),
             str(thread.pid),
             str(thread.tid),
-            escape(thread.comm),
+            thread.comm,
             thread.role,
-            escape(one.server or ""),
+            one.server or "",
             _class_text(wanted),
             ", ".join(map(str, wanted.cores)) if wanted.cores else "as they are",
             one.reason,
@@ -122,4 +121,4 @@ def _condition(alive: bool, state: RunState | None) -> str:
         return "crashed: `chainshaper release` undoes it"
     if state is None:
         return "being set up"
-    return f"failed: {escape(state.failure)}" if state.failure else run_line(state)
+    return f"failed: {state.failure}" if state.failure else run_line(state)

@@ -4,12 +4,12 @@ from pathlib import Path
 from typing import Any
 
 import polars as pl
-from rich.markup import escape
 from rich.table import Table
 
 from chainshaper.durations import format_duration
 from chainshaper.reporting.cells import ABSENT, ms, terminal_table
 from chainshaper.reporting.figures import new_figure, save_figure
+from chainshaper.safe_text import shown
 
 __all__ = ["draw_sweep", "sweep_table"]
 
@@ -28,10 +28,10 @@ _FIGURES = {
 def sweep_table(frame: pl.DataFrame) -> Table:
     """The axes and the most important figures of each point, those of many only for the first."""
     axes = _axes(frame)
-    names = [escape(_name(name)) for name in (*axes, *_FIGURES.values())]
+    names = [_name(name) for name in (*axes, *_FIGURES.values())]
     table = terminal_table("Simulated end-to-end latency [ms]", (), names)
     for row in frame.head(MOST_ROWS).to_dicts():
-        values = [escape(_value(name, row[name])) for name in axes]
+        values = [_value(name, row[name]) for name in axes]
         if row["error"] is None:
             table.add_row(*values, *(_figure(name, row[name]) for name in _FIGURES))
         else:
@@ -79,7 +79,7 @@ def _name(column: str) -> str:
 def _value(name: str, value: Any) -> str:
     if value is None:
         return ABSENT
-    return format_duration(value) if name.endswith("_ns") else str(value)
+    return format_duration(value) if name.endswith("_ns") else shown(str(value))
 
 
 def _figure(name: str, value: Any) -> str:

@@ -5,7 +5,6 @@ from dataclasses import asdict
 from typing import Any
 
 import polars as pl
-from rich.markup import escape
 from rich.table import Table
 
 from chainshaper.analysis import LatencyStatistics
@@ -16,6 +15,7 @@ from chainshaper.reporting.cells import (
     ABSENT,
     FIGURES,
     YES_NO,
+    count,
     min_mean_max,
     ms,
     percent,
@@ -26,6 +26,7 @@ from chainshaper.reporting.cells import (
     trigger,
 )
 from chainshaper.reporting.predictions import prediction_json
+from chainshaper.reporting.terminal import plain
 from chainshaper.steps import Comparison, Measurement
 
 __all__ = [
@@ -44,13 +45,15 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
     """One chain's latency as plain data; ``instances`` adds every complete traversal.
 
     Without ``stalls_watched`` nobody looked for stalls of the machine, so ``disturbed`` is 0
-    whatever it did.
+    whatever it did. ``late``, ``max_all_ns`` and ``jitter_all_ns`` leave no cycle out.
     Instances have their start and end in ns of the trace clock (wall clock).
     """
-    analysis = measurement.analysis
+    analysis, in_force = measurement.analysis, measurement.recording.info.in_force
     result = {
         "chain": analysis.chain.spec,
         **asdict(analysis.statistics),
+        "max_all_ns": analysis.statistics.max_ns,
+        "jitter_all_ns": analysis.statistics.jitter_ns,
         "undisturbed": asdict(analysis.undisturbed),
         "subscriber": _as_dict(analysis.subscriber),
         "subscriber_undisturbed": _as_dict(analysis.subscriber_undisturbed),
@@ -59,8 +62,12 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
         "overruns": None if measurement.overruns is None else sum(measurement.overruns.values()),
         "overruns_by_policy": measurement.overruns,
         "into_open_slots": measurement.into_open_slots,
+        "dropped": None if measurement.dropped is None else sum(measurement.dropped.values()),
+        "dropped_by_reason": measurement.dropped,
         "stalls_watched": measurement.longest_stall_ns is not None,
         "longest_stall_ns": measurement.longest_stall_ns,
+        "in_force": None if in_force is None else in_force.model_dump(),
+        "left_out": asdict(measurement.left_out),
         "realtime": measurement.recording.info.realtime,
         "lost": measurement.recording.info.lost,
         "notes": list(analysis.notes),
@@ -113,6 +120,8 @@ def latency_table(measurement: Measurement) -> Table:
     for title, field in FIGURES:
         table.add_row(title, *(_figure(statistics, field) for _, statistics in columns))
     table.add_row("cycles", *(ABSENT if s is None else str(s.count) for _, s in columns))
+    table.add_row("came late", *(ABSENT if s is None else count(s.late) for _, s in columns))
+    table.caption = measurement.left_out.text
     return table
 
 
@@ -123,14 +132,15 @@ def _figure(statistics: LatencyStatistics | None, field: str) -> str:
 def comparison_table(comparison: Comparison) -> Table:
     """Before and after in one table: what this project is for."""
     measurements = comparison.measurements
-    names = [escape(measurement.recording.path.name) for measurement in measurements]
+    names = [measurement.recording.path.name for measurement in measurements]
     table = terminal_table(f"End-to-end latency of {comparison.chain} [ms]", [""], names)
     analyses = [measurement.analysis for measurement in measurements]
     _add_section(table, "at publication", [a.undisturbed for a in analyses])
     _add_section(
         table, "at the subscriber's callback", [a.subscriber_undisturbed for a in analyses]
     )
-    table.add_row("[bold]including disturbed cycles[/]", *[""] * len(analyses))
+    table.add_row(plain("all cycles, disturbed ones included", "bold"), *[""] * len(analyses))
+    table.add_row("  came late", *(_of(a.statistics) for a in analyses))
     table.add_row("  maximum", *(_figure(a.statistics, "max_ns") for a in analyses))
     table.add_row("  jitter (max − min)", *(_figure(a.statistics, "jitter_ns") for a in analyses))
     table.add_section()
@@ -143,37 +153,45 @@ def comparison_table(comparison: Comparison) -> Table:
         ),
     )
     table.add_row("  incomplete", *(str(a.statistics.incomplete) for a in analyses))
-    table.add_row("  too late for their slot", *map(_overruns, measurements))
-    table.add_row("  came when it was open", *(_count(m.into_open_slots) for m in measurements))
+    table.add_row("  too late for their slot", *(_counts(m.overruns) for m in measurements))
+    table.add_row("  came when it was open", *(count(m.into_open_slots) for m in measurements))
+    table.add_row("messages lost at the gate", *(_counts(m.dropped) for m in measurements))
     table.add_row("longest stall of the machine", *(ms(m.longest_stall_ns) for m in measurements))
     infos = [measurement.recording.info for measurement in measurements]
     table.add_row("lost while recording", *(str(sum(info.lost.values())) for info in infos))
     table.add_row("real-time scheduling", *(YES_NO.get(info.realtime, ABSENT) for info in infos))
-    for measurement in measurements:
-        if measurement.plan is not None:
-            predicted = measurement.plan.predicted
-            table.caption = (
-                f"planned: slots {slots_ms(publish_slots(measurement.plan))}, "
-                f"predicted maximum {milliseconds(predicted.max_ns)}, "
-                f"jitter at most {milliseconds(predicted.jitter_ns)}"
-            )
+    captions = [
+        f"{name}: {measurement.left_out.text}"
+        for name, measurement in zip(names, measurements, strict=True)
+        if measurement.left_out.text is not None
+    ]
+    planned = [m.plan for m in measurements if m.plan is not None]
+    if planned:
+        predicted = planned[-1].predicted
+        captions.append(
+            f"planned: slots {slots_ms(publish_slots(planned[-1]))}, "
+            f"predicted maximum {milliseconds(predicted.max_ns)}, "
+            f"jitter at most {milliseconds(predicted.jitter_ns)}"
+        )
+    table.caption = "\n".join(captions) or None
     return table
 
 
-def _count(number: int | None) -> str:
-    return ABSENT if number is None else str(number)
+def _of(statistics: LatencyStatistics) -> str:
+    """``3 of 200``, where it is known when outputs were due."""
+    return ABSENT if statistics.late is None else f"{statistics.late} of {statistics.count}"
 
 
-def _overruns(measurement: Measurement) -> str:
-    """How many outputs overran, and what was done about them: ``3 (2 discard, 1 wait)``."""
-    if measurement.overruns is None:
+def _counts(by_kind: dict[str, int] | None) -> str:
+    """How many there are, and of which kinds: ``3 (2 discard, 1 wait)``."""
+    if by_kind is None:
         return ABSENT
-    done = ", ".join(f"{count} {policy}" for policy, count in measurement.overruns.items())
-    return f"{sum(measurement.overruns.values())}{f' ({done})' if done else ''}"
+    kinds = ", ".join(f"{count} {kind}" for kind, count in by_kind.items())
+    return f"{sum(by_kind.values())}{f' ({kinds})' if kinds else ''}"
 
 
 def _add_section(table: Table, title: str, columns: Sequence[LatencyStatistics | None]) -> None:
-    table.add_row(f"[bold]{title}[/]", *[""] * len(columns))
+    table.add_row(plain(title, "bold"), *[""] * len(columns))
     for name, field in FIGURES:
         if field != "min_ns":
             table.add_row(f"  {name}", *(_figure(statistics, field) for statistics in columns))
@@ -187,10 +205,8 @@ def plan_table(plan: Plan) -> Table:
     for column in (0, 3, 4):
         table.columns[column].justify = "left"
     for server in plan.servers:
-        # Brackets of half-open intervals are not Rich's markup.
-        slots = slots_ms(server.slots).replace("[", "\\[")
         where = str(server.core), str(server.priority)
-        table.add_row(server.name, *where, slots, thread_nodes(server))
+        table.add_row(server.name, *where, slots_ms(server.slots), thread_nodes(server))
     predicted = plan.predicted
     offset = f", starting {milliseconds(plan.offset_ns)} late" if plan.offset_ns else ""
     table.caption = (
@@ -207,7 +223,7 @@ def bands_table(plan: Plan) -> Table:
     figures = ("slot", "share of cycles", "jitter at most")
     table = terminal_table("Predicted latency bands [ms]", (), figures)
     for start, end, share, jitter in band_predictions(plan):
-        table.add_row(escape(slot_ms(start, end)), percent(share), ms(jitter))
+        table.add_row(slot_ms(start, end), percent(share), ms(jitter))
     return table
 
 
@@ -235,8 +251,8 @@ def callback_table(statistics: pl.DataFrame) -> Table:
         function = f" ({short_symbol(row['symbol'])})" if alike and row["symbol"] else ""
         tids = row["tids"]
         table.add_row(
-            escape(node),
-            escape(what + function),
+            node,
+            what + function,
             str(tids[0]) if len(tids) == 1 else f"{len(tids)} threads",
             str(row["count"]),
             *(cell for name in measured for cell in min_mean_max(row[f"{name}_ns"])),

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from rich.markup import escape
 from rich.table import Table
 
 from chainshaper.enforcement.threads.allocation import Allocation, NodeThread
@@ -32,10 +31,10 @@ def threads_table(allocation: Allocation) -> Table:
         if first and found.nodes:
             known_by.append(f"node: {row['nodes_known_by']}")
         table.add_row(
-            "" if same_nodes else escape(", ".join(found.nodes) or "unknown"),
+            "" if same_nodes else ", ".join(found.nodes) or "unknown",
             str(row["pid"]) if first else "",
             str(row["tid"]),
-            escape(row["comm"]),
+            row["comm"],
             f"DDS {row['dds_kind']}" if row["role"] == "dds" else row["role"],
             _class(found),
             _ranges(row["cores"]),

@@ -11,10 +11,9 @@ import polars as pl
 
 from chainshaper import events
 from chainshaper.analysis import DataFlow, LatencyAnalysis
-from chainshaper.overruns import gate_releases
+from chainshaper.analysis.punctuality import lateness_in_cycle
 from chainshaper.planning import Plan
-from chainshaper.planning.publisher_threads import publisher_servers
-from chainshaper.predictions import lateness_in_cycle
+from chainshaper.predictions import due_of
 from chainshaper.recording import Recording
 
 __all__ = ["Timeline", "timeline_of"]
@@ -53,7 +52,7 @@ def timeline_of(
 ) -> Timeline:
     """The timeline of a recording; cycles and slots are those of ``analysis`` and ``plan``."""
     slices = _slices(flow)
-    holds = _holds(recording, analysis, plan)
+    holds = _holds(analysis)
     origins = _origins(analysis, plan, holds)
     stalls = events.table(recording.events, "machine_stall", ["cpu"])
     return Timeline(
@@ -108,26 +107,10 @@ def _threads(
     return found.with_columns(pl.Series("about", texts, dtype=pl.String))
 
 
-def _holds(
-    recording: Recording, analysis: LatencyAnalysis | None, plan: Plan | None
-) -> pl.DataFrame:
+def _holds(analysis: LatencyAnalysis | None) -> pl.DataFrame:
     if analysis is None:
-        return pl.DataFrame(schema={**_HELD, "traversal": pl.UInt32(), "hop": pl.UInt8()})
-    # A gate in a Python node has no callback that events know: process and message say which it is.
-    decided = (
-        gate_releases(recording, plan)
-        .rename({"time": "let_go"})
-        .select("pid", "source_timestamp", *_HELD)
-        .unique(["pid", "source_timestamp"], keep="last", maintain_order=True)
-    )
-    processes = pl.DataFrame(
-        [(callback.id, callback.pid) for callback in analysis.graph.callbacks],
-        schema={"callback_id": pl.UInt32(), "pid": pl.Int32()},
-        orient="row",
-    )
-    reached = analysis.hops.join(processes, on="callback_id")
-    held = reached.join(decided, on=["pid", "source_timestamp"], how="inner")
-    return held.select("traversal", "hop", *_HELD).sort("traversal", "hop")
+        return pl.DataFrame(schema={"traversal": pl.UInt32(), "hop": pl.UInt8(), **_HELD})
+    return analysis.releases.select("traversal", "hop", *_HELD)
 
 
 _HELD = {
@@ -145,8 +128,8 @@ def _origins(
 ) -> pl.DataFrame:
     """The gate says from when it counted; else the chain's stamp, or where cycles seem to start.
 
-    Cycles that the recording does not tell are taken to start as :mod:`chainshaper.predictions`
-    takes them.
+    Cycles that the recording does not tell are taken to start as
+    :mod:`chainshaper.analysis.punctuality` takes them.
     """
     if analysis is None or plan is None:
         return pl.DataFrame(
@@ -157,8 +140,7 @@ def _origins(
     rows = analysis.traversals.select("traversal", "start").join(
         told.unique("traversal"), on="traversal", how="left", maintain_order="left"
     )
-    stamped = plan.shaping_node is not None and plan.anchor == "stamp"
-    from_cycle = not stamped or any(publisher_servers(plan))
+    from_cycle = plan.shaping_node is None or due_of(plan)[0].from_cycle
     late = lateness_in_cycle(rows["start"], plan.cycle_ns) if from_cycle else 0
     return rows.select(
         "traversal",

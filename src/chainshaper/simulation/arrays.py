@@ -304,6 +304,7 @@ def _gates(
         )
         row[at.G_PHASE], row[at.G_CHANGED] = timing.anchor_ns, 0
         row[at.G_CHANGES] = len(gates) * at.CHANGES_KEPT
+        row[at.G_MESSAGES] = WORDS["messages"].index(gate.messages)
         if gate.modes is not None:
             row[at.G_LATE] = WORDS["overrun"].index(gate.modes.late)
             row[at.G_DEFAULT], row[at.G_BANDS] = system.modes.index(gate.modes.default), len(bands)
@@ -365,7 +366,9 @@ def _entities(
             row[at.E_DUE] = timing.start_ns + described.phase_ns
         else:
             topic = system.application.topic(entity.topic)
-            row[at.E_HISTORY], row[at.E_DEPTH] = ring(topic.depth), topic.depth
+            gate = described.gate
+            depth = topic.depth if gate is None or entity.listens else gate.depth
+            row[at.E_HISTORY], row[at.E_DEPTH] = ring(depth), depth
             if topic.lifespan_ns is not None:
                 row[at.E_LIFESPAN] = topic.lifespan_ns
     return entities

@@ -8,7 +8,14 @@ CPU time it needs next and what follows (`T_LEFT`, `T_STEP`), or let the thread 
 
 from chainshaper.compiled.memory import compiled
 from chainshaper.simulation import layout as at
-from chainshaper.simulation.gate_kernel import decide, missed_slot, switch_mode
+from chainshaper.simulation.gate_kernel import (
+    decide,
+    drop,
+    left,
+    missed_slot,
+    replaces,
+    switch_mode,
+)
 from chainshaper.simulation.messages import publish
 from chainshaper.simulation.queues import (
     begin_entry,
@@ -72,15 +79,20 @@ def pass_gate(m, thread):
     entity, now = m[thread + at.T_ENTITY], m[at.X_NOW]
     gate = m[entity + at.E_BODY_ROW]
     if m[thread + at.T_STEP] == at.GATE_WAKE:
+        if m[thread + at.T_BEGAN] == at.NONE:  # it has just woken
+            m[thread + at.T_BEGAN] = now
+            _look(m, entity, gate)
+            if m[gate + at.G_AT] == at.NONE:
+                return _released(m, thread)
         if now < m[gate + at.G_AT]:
             m[thread + at.T_LEFT] = m[gate + at.G_AT] - now  # watching the clock
             return True
         m[thread + at.T_BEGAN] = now
         if missed_slot(m, gate):
-            m[gate + at.G_AT] = at.NONE
-            m[gate + at.G_SLOT] = at.NONE
+            drop(m, gate, at.DISCARDED)
             m[gate + at.G_TREATED] = at.DISCARD
             return _released(m, thread)
+        left(m, gate)
         m[thread + at.T_STEP] = at.GATE_PUBLISHED
         publish(m, thread, m[entity + at.E_PUBLISHERS])
         m[thread + at.T_LEFT] = draw(m, m[thread + at.T_PUBLISH])
@@ -97,26 +109,41 @@ def pass_gate(m, thread):
 @compiled()
 def _hold(m, thread):
     gate, now = m[m[thread + at.T_ENTITY] + at.E_BODY_ROW], m[at.X_NOW]
-    decide(m, gate, now, m[thread + at.T_ORIGIN])
+    decide(m, gate, m[thread + at.T_CAME], m[thread + at.T_ORIGIN])
     m[thread + at.T_BEGAN] = now
     if m[gate + at.G_AT] == at.NONE:
         return _released(m, thread)
-    m[thread + at.T_STEP] = at.GATE_WAKE
+    m[thread + at.T_STEP], m[thread + at.T_BEGAN] = at.GATE_WAKE, at.NONE
     if m[gate + at.G_AT] - m[gate + at.G_SPIN] > now:
         sleep(m, thread, m[gate + at.G_AT] - m[gate + at.G_SPIN])
     return True
 
 
 @compiled()
+def _look(m, entity, gate):
+    """What has come meanwhile may leave for the message that is held, or leave no room for it."""
+    if m[entity + at.E_WAITING] == m[entity + at.E_DEPTH]:
+        drop(m, gate, at.OVERFLOWED)
+        return
+    for number in range(m[entity + at.E_WAITING]):
+        place = (m[entity + at.E_HEAD] + number) % m[entity + at.E_DEPTH]
+        message = m[m[entity + at.E_HISTORY] + place]
+        if replaces(m, gate, m[message + at.M_ARRIVAL], m[message + at.M_ORIGIN]):
+            drop(m, gate, at.REPLACED)
+            return
+
+
+@compiled()
 def _released(m, thread):
     entity = m[thread + at.T_ENTITY]
     gate = m[entity + at.E_BODY_ROW]
+    m[gate + at.G_FREE] = m[at.X_NOW]
     place = begin_entry(m, at.L_RELEASE, m[thread + at.T_BEGAN], thread)
     if place != at.NONE:
         stride = m[m[at.X_LOGS] + at.L_RELEASE * at.LOG_COLUMNS + at.A_STRIDE]
         m[place + 2 * stride] = m[entity + at.E_ROW]
         m[place + 3 * stride] = m[thread + at.T_SOURCE]
-        for field in range(at.G_MODE - at.G_ARRIVAL + 1):
+        for field in range(at.G_OTHER - at.G_ARRIVAL):
             m[place + (4 + field) * stride] = m[gate + at.G_ARRIVAL + field]
     return _end(m, thread)
 

@@ -168,6 +168,7 @@ def _take(m, thread):
         m[thread + at.T_ORIGIN] = m[message + at.M_ORIGIN]
         m[thread + at.T_MODE] = m[message + at.M_MODE]
         m[thread + at.T_NUMBER] = m[message + at.M_NUMBER]
+        m[thread + at.T_CAME] = m[message + at.M_ARRIVAL]
         if m[entity + at.E_ON_CHAIN] == 1:
             m[thread + at.T_START] = m[message + at.M_START]
         entry = (m[entity + at.E_ROW], m[message + at.M_ADDRESS], m[message + at.M_SOURCE], 1)

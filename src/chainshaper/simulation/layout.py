@@ -56,8 +56,9 @@ FOREVER = 2**62
     T_NUMBER,
     T_MODE,
     T_BEGAN,  # when sending began, or the gate woke
+    T_CAME,  # when the message that is being dealt with came
     THREAD_COLUMNS,
-) = range(31)
+) = range(32)
 
 SINGLE_THREADED, STATIC, EVENTS, PUBLISHER, DDS = range(5)
 """Kinds of threads: three executors, and what works for them."""
@@ -127,9 +128,13 @@ R_ENTITY, R_LAST, READER_COLUMNS = range(3)
     G_DEFAULT,  # NONE: knows no modes
     G_BANDS,  # one per mode, NONE for those that it does not know
     G_CHANGES,  # a ring of pairs: time, mode
+    G_MESSAGES,
     # ---
     G_PHASE,
     G_CHANGED,  # how many changes of mode so far
+    G_LEAVING,  # starts of cycles, as `Queue` has them
+    G_LEFT,
+    G_FREE,
     # what was decided about the message that it holds:
     G_ARRIVAL,
     G_AT,
@@ -139,11 +144,15 @@ R_ENTITY, R_LAST, READER_COLUMNS = range(3)
     G_BY_STAMP,
     G_TREATED,
     G_MODE,
-    GATE_COLUMNS,
-) = range(23)
+    G_DROPPED,
+    G_OTHER,  # as many for one that waits behind it
+) = range(28)
+GATE_COLUMNS = G_OTHER + G_OTHER - G_ARRIVAL
 
 WAIT, DISCARD, PUBLISH_LATE, NEXT_SLOT = range(4)
-"""The policies, as :data:`chainshaper.workload.event_log.WORDS` numbers them."""
+ALL_IN_ORDER, NEWEST, FIRST = range(3)
+REPLACED, SURPLUS, OVERFLOWED, DISCARDED = range(4)
+"""Policies and reasons, as :data:`chainshaper.workload.event_log.WORDS` numbers them."""
 
 CHANGES_KEPT = 64
 
@@ -236,10 +245,10 @@ RUNNING, MORE_DRAWS, LOG_FULL, MESSAGES_FULL, OVER = range(5)
     L_EXECUTE,  # entity
     L_SEND,  # publisher, source timestamp, outcome, duration
     L_SWITCH,  # core, previous thread, whether it is still runnable
-    L_RELEASE,  # entity, source, arrival, release, origin, slot, cycles, stamped, overrun, mode
+    L_RELEASE,  # entity, source, and the gate's G_ARRIVAL to G_DROPPED
     LOG_KINDS,
 ) = range(10)
-LOG_FIELDS = (6, 6, 6, 6, 6, 6, 6, 6, 12)
+LOG_FIELDS = (6, 6, 6, 6, 6, 6, 6, 6, 13)
 
 # Logs: entries stand column by column, which are A_STRIDE apart.
 A_FIRST, A_STRIDE, A_COUNT, LOG_COLUMNS = range(4)

@@ -102,6 +102,8 @@ def arrive(m, message):
     entity = m[message + at.M_ENTITY]
     m[message + at.M_ARRIVAL] = m[at.X_NOW]
     overwrites = m[entity + at.E_WAITING] == m[entity + at.E_DEPTH]
+    if overwrites and m[entity + at.E_BODY] == at.GATE:
+        _note_overflow(m, entity)
     put_newest(m, entity + at.E_HISTORY, message)
     thread = m[entity + at.E_THREAD]
     # The event of the message that was overwritten is still in the queue, for this one to use.
@@ -109,6 +111,17 @@ def arrive(m, message):
         mark_event(m, thread, entity)
     if m[thread + at.T_RUNNABLE] == 0 and m[thread + at.T_STEP] == at.COLLECT:
         wake(m, thread)
+
+
+@compiled()
+def _note_overflow(m, entity):
+    """A gate has no room any more for the oldest message that waits there."""
+    gate = m[entity + at.E_BODY_ROW]
+    oldest = m[m[entity + at.E_HISTORY] + m[entity + at.E_HEAD]]
+    came, origin = m[oldest + at.M_ARRIVAL], m[oldest + at.M_ORIGIN]
+    about = (m[entity + at.E_ROW], m[oldest + at.M_SOURCE])
+    decision = (came, at.NONE, origin, at.NONE, 0, m[gate + at.G_STAMPED], at.NONE, at.NONE)
+    log(m, at.L_RELEASE, m[entity + at.E_THREAD], (*about, *decision, at.OVERFLOWED))
 
 
 @compiled()

@@ -9,9 +9,11 @@ import polars as pl
 from chainshaper.compiled import kernel
 from chainshaper.durations import format_duration
 from chainshaper.errors import InputError, OperationError
+from chainshaper.planning.overruns import open_until_done
 from chainshaper.planning.plan import Plan
 from chainshaper.planning.publisher_threads import publisher_servers
 from chainshaper.recording import (
+    InForceInfo,
     Recording,
     RecordingInfo,
     ThreadInfo,
@@ -33,6 +35,7 @@ __all__ = ["simulate", "simulate_latencies"]
 _run_engine = kernel("chainshaper.simulation.engine", "run")
 
 START_NS = 1_000_000_000
+LONGEST_NS = 1 << 62
 
 Progress = Callable[[float, str], None]
 
@@ -75,6 +78,7 @@ def simulate(
         chain=simulation.system.application.chain,
         application=application_as_written(simulation.system.application),
         plan=None if plan is None else plan.model_dump(mode="json"),
+        in_force=None if plan is None else InForceInfo(since_ns=simulation.record_from_ns),
     )
     return write_recording(output, _run(simulation, progress), info)
 
@@ -118,6 +122,7 @@ class _Simulation:
     machine: Machine
     streams: Streams
     names: Names
+    record_from_ns: int
 
 
 def _run(
@@ -184,10 +189,17 @@ def _prepare(
         last_timer_ns=end - apart,
         stop_ns=end + completion_ns(application, period),
     )
+    slowest = max((cb.timer_ns or 0) + cb.phase_ns for _, cb in application.callbacks())
+    if timing.stop_ns + slowest > LONGEST_NS:
+        raise InputError(
+            f"{cycles} cycles with the durations of {application.name!r} would end in"
+            f" {format_duration(timing.stop_ns + slowest)}: simulate {format_duration(LONGEST_NS)}"
+            " at the most"
+        )
     streams = Streams(application.seed)
     machine, cores = build_machine(
         system,
-        plan,
+        None if plan is None else open_until_done(plan),
         timing,
         streams,
         events=events,
@@ -195,7 +207,9 @@ def _prepare(
         latencies=0 if events else cycles,
         warm_up=WARM_UP_CYCLES,
     )
-    return _Simulation(system, machine, streams, name_objects(system, machine, cores))
+    return _Simulation(
+        system, machine, streams, name_objects(system, machine, cores), first - apart
+    )
 
 
 def _with_plan(application: Application, plan: Plan) -> Application:

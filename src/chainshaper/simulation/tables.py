@@ -280,7 +280,7 @@ def _core_rows(machine: Machine) -> at.Int64s:
 
 def _releases(system: System, names: Names, machine: Machine) -> pl.DataFrame:
     columns, fields = _entries(names, machine, at.L_RELEASE)
-    callback, source, arrival, release, origin, slot, cycles, stamped, overrun, mode = fields
+    callback, source, arrival, release, origin, slot, cycles, stamped, overrun, mode, why = fields
     frame = _frame(
         columns,
         callback=names.callbacks[callback],
@@ -293,7 +293,8 @@ def _releases(system: System, names: Names, machine: Machine) -> pl.DataFrame:
         anchor=np.array(["cycle", "stamp"])[stamped],
         overrun=np.array([*WORDS["overrun"], ""])[overrun],
         mode=np.array([*system.modes, ""])[mode],
+        dropped=np.array([*WORDS["dropped"], ""])[why],
     )
     absent = [pl.col(name).replace({NONE: None}) for name in ("release", "slot")]
-    unsaid = [pl.col(name).replace({"": None}) for name in ("overrun", "mode")]
+    unsaid = [pl.col(name).replace({"": None}) for name in ("overrun", "mode", "dropped")]
     return frame.with_columns(*absent, *unsaid).sort("time", maintain_order=True)

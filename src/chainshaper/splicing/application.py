@@ -79,7 +79,8 @@ def _spliced(application: Application, plan: Plan, shaping: ShapingNode) -> Appl
         name: _remapped(node, shaping.output, shaping.input) if name == publishers[0] else node
         for name, node in application.nodes.items()
     }
-    nodes[shaping.name] = _described(plan, shaping)
+    depth = shaping.depth or max(10, application.topic(shaping.output).depth)
+    nodes[shaping.name] = _described(plan, shaping, depth)
     topics = dict(application.topics)
     if shaping.output in topics:
         topics[shaping.input] = topics[shaping.output]  # the same quality of service
@@ -120,7 +121,7 @@ def _with_lifespan(
     return application.model_copy(update={"topics": {**application.topics, topic: changed}})
 
 
-def _described(plan: Plan, shaping: ShapingNode) -> NodeDescription:
+def _described(plan: Plan, shaping: ShapingNode, depth: int) -> NodeDescription:
     server = server_of(plan, shaping.thread)  # a plan without one for a shaping node is refused
     try:
         return NodeDescription(
@@ -136,6 +137,8 @@ def _described(plan: Plan, shaping: ShapingNode) -> NodeDescription:
                         anchor=plan.anchor,
                         overrun=plan.overrun,
                         due_cycles=cycles_until_output(plan, shaping),
+                        messages=plan.messages,
+                        depth=depth,
                         modes=_described_modes(plan.modes)
                         if shaping == plan.shaping_node
                         else None,

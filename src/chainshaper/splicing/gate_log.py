@@ -17,30 +17,42 @@ from chainshaper import events
 from chainshaper.enforcement.gate import STALL_NS
 from chainshaper.errors import InputError
 
-__all__ = ["read_gate_log", "releases_so_far", "with_gate_logs"]
+__all__ = ["read_gate_log", "releases_so_far", "rows_missing", "with_gate_logs"]
+
+_LATER = ("dropped", "lost", "row")
+"""Columns that logs have since messages may wait at a gate."""
 
 
 def read_gate_log(path: str | Path) -> pl.DataFrame:
     """The event table ``gate_release`` of a shaping node's log, sorted by time.
 
-    ``callback`` is null: a node does not know its callback's handle. The last line is left out if
-    it is not whole, as when the node was killed while it wrote.
+    The file before it, ``….1``, is a part of it. ``callback`` is null: a node does not know its
+    callback's handle. A last line that is not whole, as of a node before there was a writer of its
+    own, is left out.
 
     Raises:
         InputError: no such file, or it is no shaping node's log.
     """
+    path = Path(path)
+    before = path.with_name(f"{path.name}.1")
+    parts = [before, path] if path.exists() or not before.exists() else [before]
+    tables = [_read_part(part) for part in parts if part is path or part.exists()]
+    return pl.concat(tables).sort("time", maintain_order=True)
+
+
+def _read_part(path: Path) -> pl.DataFrame:
     types = {
         **events.COMMON_COLUMNS,
         **events.FIELDS["gate_release"],
         **events.OPTIONAL_FIELDS["gate_release"],
     }
     try:
-        text = Path(path).read_bytes()
+        text = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     whole = text[: text.rfind(b"\n") + 1]
     names = whole.split(b"\n", 1)[0].decode(errors="replace").split(",")
-    if set(names) != types.keys() - {"callback"}:
+    if types.keys() - {"callback", *_LATER} - set(names) or set(names) - types.keys():
         raise InputError(
             f"{path}:1: this is not the log of a shaping node, which begins with the names of its "
             "columns: name the file that the parameter `log` of the node names"
@@ -49,8 +61,22 @@ def read_gate_log(path: str | Path) -> pl.DataFrame:
         table = pl.read_csv(whole, schema={name: types[name] for name in names})
     except pl.exceptions.PolarsError as error:
         raise InputError(f"{path}: a line is not as a shaping node writes it: {error}") from error
-    null = pl.lit(None, dtype=types["callback"]).alias("callback")
-    return table.with_columns(null).select(*types).sort("time", maintain_order=True)
+    unknown = [pl.lit(None, dtype=types[n]).alias(n) for n in types.keys() - set(names)]
+    return table.with_columns(unknown).select(*types)
+
+
+def rows_missing(releases: pl.DataFrame) -> tuple[int, int]:
+    """How many rows of logs are in no file: removed to make room, and never written.
+
+    Rows are numbered from 1 since a node started; logs of before are taken to be whole.
+    """
+    removed = unwritten = 0
+    numbered = releases.drop_nulls("row")
+    spans = numbered.group_by("pid").agg(first=pl.min("row"), last=pl.max("row"), there=pl.len())
+    for _, first, last, there in spans.iter_rows():
+        removed += first - 1
+        unwritten += last - first + 1 - there
+    return removed, unwritten
 
 
 def releases_so_far(logs: Iterable[Path]) -> npt.NDArray[np.int64]:
@@ -58,7 +84,8 @@ def releases_so_far(logs: Iterable[Path]) -> npt.NDArray[np.int64]:
     found = [np.empty(0, dtype=np.int64)]
     for log in logs:
         with contextlib.suppress(InputError):  # not there yet, or nothing is in it
-            found.append(read_gate_log(log)["release"].drop_nulls().tail(100).to_numpy())
+            releases = read_gate_log(log).filter(pl.col("slot").is_not_null())
+            found.append(releases["release"].drop_nulls().tail(100).to_numpy())
     return np.concatenate(found)
 
 
@@ -83,6 +110,16 @@ def with_gate_logs(
     if not there:
         return tables, missing
     releases = pl.concat([read_gate_log(log) for log in there]).sort("time", maintain_order=True)
+    removed, unwritten = rows_missing(releases)
+    if removed:
+        missing += (
+            f"{removed} rows of shaping nodes' logs were removed to make room for newer ones.",
+        )
+    if unwritten:
+        missing += (
+            f"{unwritten} rows of shaping nodes' logs could not be written: what became of those "
+            "messages is not known. See to room on the disk.",
+        )
     releases = releases.filter(pl.col("origin") >= since_ns, pl.col("time") < until_ns)
     stalls = pl.concat([events.table(tables, "machine_stall"), _stalls(releases)], how="diagonal")
     stalls = stalls.sort("time", maintain_order=True)

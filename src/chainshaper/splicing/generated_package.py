@@ -96,12 +96,14 @@ def message_type_named(text: str) -> MessageType:
 
 def generic_package() -> dict[str, str]:
     """The files of the package for all types: paths inside it, and their text."""
-    return _files_of(_NODES / "cpp")
+    respawning = (_NODES / "python" / "respawning.py").read_text(encoding="utf-8")
+    return {**_files_of(_NODES / "cpp"), "scripts/respawning": respawning}
 
 
 def typed_package(message_type: MessageType) -> dict[str, str]:
     """The files of the package generated for one type: paths inside it, and their text."""
-    shared = {path: text for path, text in generic_package().items() if path.startswith("include/")}
+    parts = ("include/", "scripts/")
+    shared = {path: text for path, text in generic_package().items() if path.startswith(parts)}
     # The modes of the system are named by a std_msgs/String.
     messages = sorted({"std_msgs", message_type.package})
     values = {

@@ -6,8 +6,9 @@ what the plan says, and write the same log (:mod:`chainshaper.splicing.gate_log`
 """
 
 import ast
+import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -25,6 +26,8 @@ from chainshaper.splicing.generated_package import (
 from chainshaper.whole_file import write_whole
 
 __all__ = [
+    "RESPAWN",
+    "STANDBY",
     "NodeKind",
     "ShapingProcess",
     "python_node",
@@ -37,6 +40,19 @@ NodeKind: TypeAlias = Literal["python", "cpp", "typed"]
 _PACKAGE = Path(__file__).parents[1]
 _PYTHON_NODES = _PACKAGE / "splicing" / "nodes" / "python"
 
+RESPAWN = {"respawn": True, "respawn_delay": 0.1}
+"""What a launch file says of every process that is added, in the words of all its languages.
+
+The delay (s) is for a process that ends before it can wait by itself, such as a program that lacks
+a library: starting it over and over takes a tenth of a core.
+"""
+
+STANDBY = "_standby"
+"""What a standby's name has behind that of its shaping node."""
+
+SHORTEST_PATIENCE_NS = 10_000_000
+"""By how much a shaping node may be late before it is taken to hang; else half a cycle."""
+
 
 @dataclass(frozen=True)
 class ShapingProcess:
@@ -44,7 +60,9 @@ class ShapingProcess:
 
     It is either a ``command`` (without ``--ros-args``; name, namespace, parameters and remappings
     are for the launch file to add) or an ``executable`` of a ``package``. ``parameters_file`` is
-    a ROS 2 parameters file; ``remappings`` are pairs such as ``("input", "/t5_tmp")``.
+    a ROS 2 parameters file; ``remappings`` are pairs such as ``("input", "/t5_tmp")``. Whoever
+    starts it starts it again when it ends, and its ``standby`` as well, which passes its output on
+    meanwhile.
     """
 
     name: str
@@ -54,6 +72,7 @@ class ShapingProcess:
     executable: str | None
     parameters_file: Path
     remappings: tuple[tuple[str, str], ...]
+    standby: "ShapingProcess | None" = None
 
     @property
     def command_line(self) -> list[str]:
@@ -91,9 +110,30 @@ def write_shaping_process(
         )
     package, files = _program(kind, "shaping_node", node.name, message_type)
     remappings = (("input", node.input), ("output", node.output))
+    parameters = shaping_parameters(plan, node, log)
+    # The files may be moved before they are used; the log stays where it is.
+    place = hashlib.sha256(str((log or folder).absolute()).encode()).hexdigest()
+    parameters["handover"] = page = f"{node.name}.{place[:8]}"
+    standby = f"{node.name}{STANDBY}"
+    of_standby = {
+        "handover": page,
+        "shaping_node": node.name,
+        "fallback": plan.fallback,
+        "patience_ns": max(plan.cycle_ns // 2, SHORTEST_PATIENCE_NS),
+        "output_depth": parameters["output_depth"],
+        "depth": parameters["depth"],
+        "server_cores": sorted({server.core for server in plan.servers}),
+        "log": "" if log is None else str(log.with_stem(standby).absolute()),
+    }
+    files |= {
+        f"{node.name}.yaml": _yaml(parameters),
+        f"{standby}.py": python_node("standby"),
+        f"{standby}.yaml": _yaml(of_standby),
+    }
+    _write(folder, files)
+    beside = _process(folder, standby, None, "standby", remappings)
     process = _process(folder, node.name, package, "shaping_node", remappings)
-    _write(folder, {**files, f"{node.name}.yaml": _yaml(shaping_parameters(plan, node, log))})
-    return process
+    return replace(process, standby=beside)
 
 
 def write_throttler(
@@ -145,6 +185,8 @@ def shaping_parameters(plan: Plan, node: ShapingNode, log: Path | None) -> dict[
         "phase_ns": plan.offset_ns,
         "overrun": plan.overrun,
         "due_cycles": cycles_until_output(plan, node),
+        "messages": plan.messages,
+        "depth": node.depth or 0,
         "spin_ns": node.spin_ns,
         "pause_ns": node.pause_ns,
         "core": node.core,
@@ -194,7 +236,10 @@ def _program(
 ) -> tuple[str | None, dict[str, str]]:
     """The package that has an executable, if it has one, and the files by their paths."""
     if kind == "python":
-        return None, {f"{name}.py": python_node(executable)}
+        return None, {
+            f"{name}.py": python_node(executable),
+            "respawning.py": (_PYTHON_NODES / "respawning.py").read_text(encoding="utf-8"),
+        }
     package, files = GENERIC_PACKAGE, generic_package()
     if kind == "typed" and message_type is not None:
         known = message_type_named(message_type)

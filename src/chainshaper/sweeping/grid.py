@@ -18,9 +18,9 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+from math import prod
 from typing import Any, TypeAlias, TypeVar
 
-import yaml
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from chainshaper.durations import format_duration, parse_duration
@@ -28,7 +28,7 @@ from chainshaper.errors import InputError
 from chainshaper.planning import Plan, PlanRequest
 from chainshaper.workload.description import Application, application_as_written
 from chainshaper.workload.live import origin_timer
-from chainshaper.yaml_file import AS_YAML, explanations, key_text
+from chainshaper.yaml_file import AS_YAML, PlainData, compose, explanations, key_text
 
 __all__ = [
     "Grid",
@@ -57,7 +57,8 @@ _WISHES = {
     for field in dataclasses.fields(PlanRequest)
     if field.name != "seed"  # that of the application is meant
 }
-_RANGE = re.compile(r"(-?\d+)\.\.(-?\d+)")
+MOST_POINTS = 1_000_000
+_RANGE = re.compile(r"(-?\d{1,18})\.\.(-?\d{1,18})")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)e[+-]?\d+", re.IGNORECASE)
 _Model = TypeVar("_Model", bound=BaseModel)
 
@@ -83,22 +84,31 @@ def parse_axis(text: str) -> tuple[str, tuple[Any, ...]]:
         InputError: it is not of this form.
     """
     name, equals, values = text.partition("=")
+    usage = "write NAME=VALUE,VALUE…, such as epsilon=0ms,1ms,2ms or bands=1..5"
     try:
-        listed = yaml.safe_load(f"[{values}]")
-    except yaml.YAMLError:
-        listed = []
-    if not equals or not name.strip() or not isinstance(listed, list) or not listed:
-        raise InputError(
-            f"--vary {text!r} is no axis: write NAME=VALUE,VALUE…, such as epsilon=0ms,1ms,2ms or"
-            " bands=1..5"
-        )
-    return name.strip(), tuple(value for written in listed for value in _expanded(written))
+        root = compose(f"[{values}]", "value")
+        listed = None if root is None else PlainData("value").of(root)
+    except InputError as error:
+        raise InputError(f"--vary {text!r} is no axis: {usage} ({error})") from error
+    if not equals or not name.strip() or not isinstance(listed, tuple) or not listed:
+        raise InputError(f"--vary {text!r} is no axis: {usage}")
+    return name.strip(), tuple(value for one in _as_json(listed) for value in _expanded(one))
+
+
+def _as_json(value: Any) -> Any:
+    """Plain data as JSON would have it: with lists."""
+    if isinstance(value, dict):
+        return {key: _as_json(one) for key, one in value.items()}
+    return [_as_json(one) for one in value] if isinstance(value, tuple) else value
 
 
 def _expanded(written: Any) -> Iterator[Any]:
     """A range as its numbers, and numbers that YAML 1.1 takes for texts (1e-6)."""
     if isinstance(written, str) and (ends := _RANGE.fullmatch(written)):
-        yield from range(int(ends[1]), int(ends[2]) + 1)
+        numbers = range(int(ends[1]), int(ends[2]) + 1)
+        if numbers[MOST_POINTS:]:
+            raise InputError(f"{written}: more than {MOST_POINTS} values: write a shorter range")
+        yield from numbers
     elif isinstance(written, str) and _NUMBER.fullmatch(written):
         yield float(written)
     else:
@@ -131,6 +141,8 @@ def grid_of(
         texts = [json.dumps(value) for value in values]
         if not values or len(set(texts)) < len(texts):
             raise InputError(f"axis {name}: give at least one value, and none of them twice")
+    if (points := prod(map(len, named.values()))) > MOST_POINTS:
+        raise InputError(f"{points} points: give fewer values, for {MOST_POINTS} points at most")
     first = {name: values[0] for name, values in named.items()}
     for name, values in named.items():
         for value in values:

@@ -167,9 +167,11 @@ def _beside(plan: Plan, latencies: Int64s) -> dict[str, Any]:
     slots = publish_slots(plan)
     latest = delay + slots[-1][1] - 1 if slots else predicted.max_ns
     shares = predicted.shares if len(predicted.shares) == len(slots) else [None] * len(slots)
+    # An output belongs to the last slot that had started when it left, if it is not late.
+    until = [*(start for start, _ in slots[1:]), *(end for _, end in slots[-1:])]
     bands = [
-        _band(latencies, (start, end), delay, share)
-        for (start, end), share in zip(slots, shares, strict=True)
+        _band(latencies, (start, end), last, delay, share)
+        for (start, end), last, share in zip(slots, until, shares, strict=True)
     ]
     jitters = [band["jitter_ns"] for band in bands if band["jitter_ns"] is not None]
     return {
@@ -186,10 +188,10 @@ def _beside(plan: Plan, latencies: Int64s) -> dict[str, Any]:
 
 
 def _band(
-    latencies: Int64s, slot: tuple[int, int], delay: int, predicted: float | None
+    latencies: Int64s, slot: tuple[int, int], until: int, delay: int, predicted: float | None
 ) -> dict[str, Any]:
     start, end = slot[0] + delay, slot[1] + delay
-    inside = latencies[(latencies >= start) & (latencies < end)]
+    inside = latencies[(latencies >= start) & (latencies < until + delay)]
     return {
         "start_ns": start,
         "end_ns": end,

@@ -45,8 +45,7 @@ def sweep(
     plan from, and another one with the plan in force; ``seed`` replaces the description's.
 
     ``workers`` processes compute (default: one per core that we may use), or a Dask cluster, whose
-    ``scheduler`` is at that address. A script that calls this with several has to be guarded by
-    ``if __name__ == "__main__"``, as always with processes.
+    ``scheduler`` is at that address.
 
     The frame has a row for each point, in the order of the axes: a column for each axis (durations
     in ns, with ``_ns`` behind the name), ``cycles``, ``seed``, and the figures of

@@ -8,23 +8,22 @@ computes: a point's row is a function of the point.
 import asyncio
 import importlib.metadata
 import json
-import multiprocessing
 import os
 import pickle
 import re
-import signal
+import subprocess
 import tempfile
-import threading
 import time
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, TypeAlias
 
+from chainshaper.enforcement.own_processes import LIBRARIES, module_command
 from chainshaper.errors import ChainshaperError, InputError, OperationError
 from chainshaper.planning import Profile
 from chainshaper.planning.extras import extra_library
@@ -41,6 +40,7 @@ WARM_UP_CYCLES = 10
 SAME = ("chainshaper", "numpy", "distributed")
 """Packages whose versions rows depend on: NumPy's generators may draw differently."""
 
+Worker: TypeAlias = "subprocess.Popen[bytes]"
 Rows: TypeAlias = Generator[tuple[int, dict[str, Any]], None, None]
 
 
@@ -89,48 +89,55 @@ def _rows_from_processes(grid: Grid, groups: Sequence[Group], workers: int) -> R
     warm = replace(grid, cycles=WARM_UP_CYCLES)
     row_at(warm, values, _profile_of(warm, groups[0]))
     with tempfile.TemporaryDirectory(prefix="chainshaper-sweep-") as folder:
-        others = set(multiprocessing.active_children())
-        pool = ProcessPoolExecutor(
-            workers, multiprocessing.get_context("spawn"), initializer=_end_with_parent
-        )
+        pool = ThreadPoolExecutor(workers)
+        processes = [_start_worker() for _ in range(workers)]
         try:
-            yield from _rows_from_pool(pool, grid, groups, 2 * workers, Path(folder))
-        except BrokenProcessPool as error:
-            raise OperationError(
-                "a process that computed points was killed; finished rows are kept: free memory,"
-                " or ask for fewer with --workers, and the same command goes on"
-            ) from error
+            yield from _rows_from_pool(pool, processes, grid, groups, Path(folder))
         finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in set(multiprocessing.active_children()) - others:
-                process.terminate()
-                process.join()
+            for process in processes:
+                process.kill()  # which ends the thread that waits for it
+            pool.shutdown(cancel_futures=True)
+            for process in processes:
+                process.communicate()
+
+
+def _start_worker() -> Worker:
+    """A process that computes; Ctrl-C is for us."""
+    return subprocess.Popen(
+        [*module_command("chainshaper.sweeping.worker", LIBRARIES), str(os.getpid())],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+    )
 
 
 def _rows_from_pool(
-    pool: ProcessPoolExecutor, grid: Grid, groups: Sequence[Group], at_once: int, folder: Path
+    pool: ThreadPoolExecutor,
+    processes: Sequence[Worker],
+    grid: Grid,
+    groups: Sequence[Group],
+    folder: Path,
 ) -> Rows:
-    """Points whose profile is there come first, so that few profiles are kept at a time.
-
-    Processes hand them on in files: one that is killed while it sends as much through the pool's
-    pipe leaves the other end waiting for the rest for ever.
-    """
+    """Points whose profile is there come first, so that few profiles are kept at a time."""
+    idle: SimpleQueue[Worker] = SimpleQueue()
+    for process in processes:
+        idle.put(process)
     coming = iter(groups)
     ready: deque[tuple[tuple[int, Values], Path]] = deque()
     pending: dict[Future[Any], Group | tuple[int, Path]] = {}
     points_left: dict[Path, int] = {}
     while True:
-        with _interrupts_later():
-            while len(pending) < at_once:
-                if ready:
-                    (number, values), profile = ready.popleft()
-                    pending[pool.submit(_row_by, grid, values, profile)] = (number, profile)
-                elif (group := next(coming, None)) is not None:
-                    profile = folder / str(group.points[0][0])
-                    points_left[profile] = len(group.points)
-                    pending[pool.submit(_keep_profile, grid, group, profile)] = group
-                else:
-                    break
+        while len(pending) < 2 * len(processes):
+            if ready:
+                (number, values), profile = ready.popleft()
+                asked = pool.submit(_computed, idle, _row_by, grid, values, profile)
+                pending[asked] = (number, profile)
+            elif (group := next(coming, None)) is not None:
+                profile = folder / str(group.points[0][0])
+                points_left[profile] = len(group.points)
+                pending[pool.submit(_computed, idle, _keep_profile, grid, group, profile)] = group
+            else:
+                break
         if not pending:
             return
         for future in wait(pending, return_when=FIRST_COMPLETED).done:
@@ -145,6 +152,27 @@ def _rows_from_pool(
             yield number, future.result()
 
 
+def _computed(idle: "SimpleQueue[Worker]", function: Callable[..., Any], *arguments: Any) -> Any:
+    """What a function returns, or raises, in the next process that is idle."""
+    process = idle.get()
+    assert process.stdin is not None  # noqa: S101 - it was started so
+    assert process.stdout is not None  # noqa: S101
+    try:
+        pickle.dump((function, arguments), process.stdin)
+        process.stdin.flush()
+        result, error = pickle.load(process.stdout)  # noqa: S301 - ours
+    except (OSError, EOFError, pickle.UnpicklingError) as failure:
+        raise OperationError(
+            "a process that computed points was killed; finished rows are kept: free memory,"
+            " or ask for fewer with --workers, and the same command goes on"
+        ) from failure
+    finally:
+        idle.put(process)
+    if error is not None:
+        raise error
+    return result
+
+
 def _keep_profile(grid: Grid, group: Group, file: Path) -> Path:
     file.write_bytes(pickle.dumps(_profile_of(grid, group)))
     return file
@@ -152,28 +180,6 @@ def _keep_profile(grid: Grid, group: Group, file: Path) -> Path:
 
 def _row_by(grid: Grid, values: Values, profile: Path) -> dict[str, Any]:
     return row_at(grid, values, pickle.loads(profile.read_bytes()))  # noqa: S301 - ours
-
-
-@contextmanager
-def _interrupts_later() -> Iterator[None]:
-    """Ctrl-C is for us: the processes that are started in here inherit that it is blocked."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _end_with_parent() -> None:
-    """A process whose parent was killed would wait for work for ever."""
-    parent = multiprocessing.parent_process()
-
-    def watch() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
 
 
 def rows_from_cluster(grid: Grid, groups: Sequence[Group], address: str) -> Rows:

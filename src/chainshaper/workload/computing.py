@@ -16,6 +16,8 @@ from itertools import cycle
 from pathlib import Path
 
 from chainshaper.enforcement.gate import origin_of
+from chainshaper.enforcement.own_processes import named_folders
+from chainshaper.trusted_files import why_distrusted
 from chainshaper.workload import dds
 from chainshaper.workload.execution import ExecutionTimes, spend
 
@@ -71,10 +73,12 @@ def computing(name: str, function: Callable[..., object], topics: int) -> Work:
 def load_function(name: str) -> Callable[..., object]:
     """The function that ``MODULE:FUNCTION`` names; ends the process if there is none.
 
-    Modules are found where Python finds them, or in the working directory.
+    Modules are found where Python finds them, on PYTHONPATH, or in the working directory, unless
+    others may change what is there.
     """
     module, _, attribute = name.partition(":")
-    sys.path.append(str(Path.cwd()))
+    places = {folder: why_distrusted(folder) for folder in (*named_folders(), str(Path.cwd()))}
+    sys.path += [folder for folder, reason in places.items() if reason is None]
     try:
         found = getattr(importlib.import_module(module), attribute, None)
     except Exception as error:
@@ -83,6 +87,7 @@ def load_function(name: str) -> Callable[..., object]:
         sys.exit(
             f"{name} cannot be loaded: {_in_words(error)}{where}; its module has to be installed, "
             f"on PYTHONPATH, or in the working directory {Path.cwd()}"
+            + "".join(f"; not {place}: {reason}" for place, reason in places.items() if reason)
         )
     if found is None:
         sys.exit(f"{name} cannot be loaded: {_file(module)} has no {attribute}")

@@ -25,7 +25,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from chainshaper.enforcement.gate import Anchor, Gate, Late, Modes, Overrun
+from chainshaper.enforcement.gate import Anchor, Gate, Late, Messages, Modes, Overrun
 from chainshaper.plan_choices import Publication
 from chainshaper.workload.distributions import ExecutionTime, SimulationDescription
 from chainshaper.yaml_file import (
@@ -51,6 +51,7 @@ __all__ = [
     "load_application",
 ]
 
+MOST_CORES = 8191  # that Linux can be built for
 _FUNCTION = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", re.ASCII)
 _NODE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 
@@ -79,6 +80,8 @@ class GateDescription(Part):
     overrun: Overrun = "wait"
     due_cycles: Annotated[int, Field(ge=0)] = 0
     modes: ModesDescription | None = None
+    messages: Messages = "all-in-order"
+    depth: Annotated[int, Field(ge=1)] = 10
     spin_ns: Duration = 0
     pause_ns: Duration = 0
 
@@ -166,7 +169,7 @@ class NodeDescription(Part):
     """
 
     callbacks: tuple[CallbackDescription, ...] = Field(min_length=1)
-    core: int | None = Field(default=None, ge=0)
+    core: int | None = Field(default=None, ge=0, le=MOST_CORES)
     priority: int | None = Field(default=None, ge=1, le=97)
     dds_priority: int | None = Field(default=None, ge=1, le=97)
 
@@ -179,7 +182,7 @@ class TopicDescription(Part):
 
     publication: Publication = "synchronous"
     reliability: Literal["reliable", "best_effort"] = "reliable"
-    depth: int = Field(default=10, ge=1)
+    depth: int = Field(default=10, ge=1, le=1_000_000)
     lifespan_ns: PositiveDuration | None = None
     payload: int = Field(default=1024, ge=0, le=16_000_000)  # bytes behind the header
 
@@ -187,7 +190,7 @@ class TopicDescription(Part):
 class Scheduling(Part):
     """Core and SCHED_FIFO priority of a class of threads (98 and 99 stay free for measuring)."""
 
-    core: Annotated[int, Field(ge=0)]
+    core: Annotated[int, Field(ge=0, le=MOST_CORES)]
     priority: Annotated[int, Field(ge=1, le=97)]
 
 
@@ -201,7 +204,7 @@ class Application(Part):
 
     name: str
     chain: str
-    seed: int = Field(default=1, ge=0)
+    seed: int = Field(default=1, ge=0, lt=1 << 64)
     scheduling: SchedulingOfApplication
     topics: dict[FullName, TopicDescription] = Field(default_factory=dict)
     simulation: SimulationDescription = SimulationDescription()

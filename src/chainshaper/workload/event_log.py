@@ -39,6 +39,7 @@ LAYOUT: tuple[tuple[str, tuple[str, ...]], ...] = (
             "anchor",
             "overrun",
             "mode",
+            "dropped",
         ),
     ),
     ("asynchronous_send", ("tid", "rmw_publisher_handle", "timestamp", "outcome", "duration")),
@@ -46,7 +47,7 @@ LAYOUT: tuple[tuple[str, tuple[str, ...]], ...] = (
 )
 """Event names and the order of their fields; an event's number is its place in this list."""
 
-WIDTH = 12  # event number, time, and up to ten fields
+WIDTH = 13  # event number, time, and up to eleven fields
 
 ABSENT = -1
 """Stands for null in fields that may be."""
@@ -54,6 +55,8 @@ ABSENT = -1
 WORDS: dict[str, tuple[str, ...]] = {
     "anchor": ("stamp", "cycle"),
     "overrun": ("wait", "discard", "publish", "next-slot"),
+    "messages": ("all-in-order", "newest", "first"),
+    "dropped": ("replaced", "surplus", "overflowed", "discarded"),
     "outcome": ("sent", "expired", "overwritten"),
 }
 """Fields that hold words are recorded as places in these lists.

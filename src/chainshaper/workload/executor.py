@@ -50,6 +50,7 @@ class Executor:
     def __init__(self, participant: Any, log: EventLog) -> None:
         self.timers: list[Timer] = []
         self.subscriptions: list[SubscriptionEntity] = []
+        self.backlogs: list[Callable[[], bool]] = []
         self._wait_set = WaitSet(participant)
         # Never triggered: an empty wait set would return at once instead of waiting.
         self._guard = GuardCondition(participant)
@@ -68,11 +69,13 @@ class Executor:
     def spin_until(self, stop_ns: int, last_timer_ns: int) -> None:
         """Wait and run until ``stop_ns`` of CLOCK_MONOTONIC; a running callback is finished.
 
-        Timers expire up to ``last_timer_ns`` only, so that what they began can be completed.
+        Timers expire up to ``last_timer_ns`` only, so that what they began can be completed. What
+        a callback has taken beyond its own message, its backlog, is worked off first.
         """
         while (now := monotonic_ns()) < stop_ns:
+            more = [work_off() for work_off in self.backlogs]
             due = [timer.due_ns for timer in self.timers if timer.due_ns <= last_timer_ns]
-            timeout = max(0, min([stop_ns, *due]) - now)
+            timeout = 0 if any(more) else max(0, min([stop_ns, *due]) - now)
             self._wait_for_work(now, timeout)
             self._wait_set.wait(timeout)
             now = min(monotonic_ns(), last_timer_ns)
@@ -95,12 +98,15 @@ class Executor:
         self._next_ready(now)
         self._execute(now, entity.handle)
         message = entity.subscription.take()
-        address = id(message)
-        now = monotonic_ns()
         if message is None:
-            self._rmw_take(now, entity.rmw_handle, address, 0, 0)
+            self._rmw_take(monotonic_ns(), entity.rmw_handle, id(message), 0, 0)
             return
-        self._rmw_take(now, entity.rmw_handle, address, message.source_timestamp, 1)
+        self.record_take(entity.rmw_handle, message)
+        entity.callback(message)
+
+    def record_take(self, rmw_handle: int, message: Message) -> None:
+        """Record that a message was taken for the callback that starts next."""
+        now, address = monotonic_ns(), id(message)
+        self._rmw_take(now, rmw_handle, address, message.source_timestamp, 1)
         self._rcl_take(now, address)
         self._rclcpp_take(now, address)
-        entity.callback(message)

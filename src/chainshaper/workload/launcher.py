@@ -93,16 +93,22 @@ class Child:
 
 
 def start_child(
-    name: str, module: str, environment: dict[str, str], arguments: Sequence[str] = ()
+    name: str,
+    module: str,
+    environment: dict[str, str],
+    arguments: Sequence[str] = (),
+    libraries: Sequence[str] = (),
 ) -> Child:
     """Start ``python -m module ARGUMENTS`` in a session of its own, with pipes to talk to it.
+
+    ``libraries`` are what it needs beyond Python's own.
 
     A session of its own keeps Ctrl-C for us: we end children in order, they do not die at random.
     """
     errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the child
     try:
         process = subprocess.Popen(
-            [*module_command(module), *arguments],
+            [*module_command(module, libraries), *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,

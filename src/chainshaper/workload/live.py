@@ -16,7 +16,9 @@ from typing import Any, TypeAlias
 
 from chainshaper.durations import format_duration
 from chainshaper.enforcement.gate import clock_offset
+from chainshaper.enforcement.own_processes import LIBRARIES
 from chainshaper.enforcement.realtime import check_cores, may_use_fifo
+from chainshaper.enforcement.runs.governing import Governed, governing, in_force_throughout
 from chainshaper.enforcement.threads.listing import (
     Scheduling,
     apply_scheduling,
@@ -25,6 +27,7 @@ from chainshaper.enforcement.threads.listing import (
 )
 from chainshaper.errors import InputError, OperationError, PlatformError
 from chainshaper.recording import (
+    InForceInfo,
     Recording,
     RecordingInfo,
     ThreadInfo,
@@ -66,6 +69,8 @@ LEAD_NS = 300_000_000
 ENFORCING_NS = 2_000_000_000
 """Servers have to be in force before the first cycle; starting their processes takes a while."""
 DISCOVERY_NS = 20_000_000_000
+LOOK_NS = 1_000_000_000
+"""How often is looked who governs the nodes: others write it down every second."""
 ANSWER_S = 60.0
 """A process that is silent for longer, discovery included, hangs."""
 SINGLE_THREADED = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -113,6 +118,7 @@ def run_application(
     realtime = permitted if realtime is None else realtime
     nodes: dict[str, Child] = {}
     meters: dict[int, Child] = {}
+    governed: tuple[Governed, ...] = ()
     finished = False
     try:
         progress(0.0, "starting nodes")
@@ -128,7 +134,7 @@ def run_application(
         with _enforced(enforcement, nodes, timing):
             for child in [*nodes.values(), *meters.values()]:
                 child.tell(**asdict(timing))
-            threads = _watch(nodes, meters, timing, progress)
+            threads, governed = _watch(nodes, meters, timing, progress)
         progress(1.0, "collecting events")
         logs = [_read_log(name, child, application) for name, child in nodes.items()]
         seen, meter_info = read_meters(meters, realtime) if meters else ([], None)
@@ -137,6 +143,10 @@ def run_application(
         end_all([*nodes.values(), *meters.values()], patience_s=3.0 if finished else 0.0)
     tables = event_tables(logs, timing.record_from_ns)
     tables |= meter_tables(seen, tables.get("machine_stall"))
+    together = in_force_throughout(governed)
+    in_force = None if plan is None else InForceInfo(since_ns=timing.record_from_ns)
+    if plan is None and together is not None:
+        in_force = InForceInfo(since_ns=together.since_ns, until_ns=together.until_ns)
     notes = _notes(None if realtime else reason, memory_locked, clock_offset() - offset_before)
     info = RecordingInfo(
         source="live",
@@ -150,7 +160,8 @@ def run_application(
         stall_meter=meter_info,
         chain=application.chain,
         application=application_as_written(application),
-        plan=plan,
+        plan=plan or (together.plan if together else None),
+        in_force=in_force,
     )
     return write_recording(output, tables, info)
 
@@ -231,7 +242,9 @@ def _start_nodes(
     domain = free_domain()
     environment = {"CYCLONEDDS_URI": closed_domain_configuration(), **SINGLE_THREADED}
     for name in application.nodes:
-        nodes[name] = start_child(f"node {name}", NODE_MODULE, environment, _ros_arguments(name))
+        nodes[name] = start_child(
+            f"node {name}", NODE_MODULE, environment, _ros_arguments(name), LIBRARIES
+        )
         nodes[name].tell(**_spec(application, name, timer, domain, realtime))
 
 
@@ -296,23 +309,30 @@ def _watch(
     meters: dict[int, Child],
     timing: _Timing,
     progress: Progress,
-) -> tuple[ThreadInfo, ...]:
+) -> tuple[tuple[ThreadInfo, ...], tuple[Governed, ...]]:
     """Wait for the end of the run; the threads as they were while it lasted.
+
+    And the plans that others put in force meanwhile (`chainshaper apply`).
 
     Raises:
         OperationError: a process ended before its time.
     """
     children = [*nodes.values(), *meters.values()]
     threads: tuple[ThreadInfo, ...] = ()
+    governed: tuple[Governed, ...] = ()
+    pids, next_look = {child.pid for child in nodes.values()}, timing.start_ns
     while (now := time.monotonic_ns()) < timing.stop_ns:
         if (casualty := first_casualty(children)) is not None:
             raise OperationError(f"{casualty.obituary()}; the run was ended and nothing recorded")
         if now >= timing.record_from_ns and not threads:
             threads = _snapshot(nodes, meters)
+        if now >= next_look:
+            governed, next_look = governing(pids, now, governed), now + LOOK_NS
         share = (now - timing.start_ns) / (timing.stop_ns - timing.start_ns)
         progress(max(0.0, share), "recording")
         time.sleep(0.1)
-    return threads or _snapshot(nodes, meters)
+    governed = governing(pids, time.monotonic_ns(), governed)
+    return threads or _snapshot(nodes, meters), governed
 
 
 def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[ThreadInfo, ...]:

@@ -9,12 +9,12 @@ import os
 import signal
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from typing import Any
 
-from chainshaper.enforcement.gate import STALL_NS, Gate, Modes, Shaper, sleep_until, text_of
+from chainshaper.enforcement.gate import READER_DEPTH, STALL_NS, Gate, Held, Modes, Shaper, text_of
 from chainshaper.enforcement.kept_core import KeptCore
 from chainshaper.enforcement.realtime import (
     lock_memory,
@@ -100,12 +100,15 @@ class NodeProcess:
     def _add_callback(self, index: int, callback: dict[str, Any]) -> None:
         handle = self.new_handle()
         publishers = [self._publisher(topic) for topic in callback["publishes"]]
-        subscription = None
+        subscription, rmw_handle = None, self.new_handle()
         if callback["subscription"] is not None:
-            subscription = self._subscription(callback["subscription"])
+            depth = 0 if callback["gate"] is None else READER_DEPTH
+            subscription = self._subscription(callback["subscription"], depth)
         if callback["gate"] is not None and subscription is not None:
             shaper = self._shaper(callback["gate"])
-            body = self._shaping_body(handle, shaper, callback["gate"], publishers[0], subscription)
+            body = self._shaping_body(
+                (handle, rmw_handle), shaper, callback["gate"], publishers[0], subscription
+            )
             if callback["gate"]["modes"] is not None:  # before the messages that it concerns
                 self._add_modes(callback["gate"]["modes"]["topic"], shaper)
         else:
@@ -117,7 +120,8 @@ class NodeProcess:
         if subscription is None:
             self._add_timer(handle, callback, body)
         else:
-            self._add_subscription(handle, callback["subscription"], subscription, body)
+            topic = callback["subscription"]
+            self._add_subscription(handle, topic, subscription, body, rmw_handle)
         symbol = f"{self.spec['node']}::callback{index}"
         self.log.init("rclcpp_callback_register", callback=handle, symbol=symbol)
 
@@ -170,10 +174,11 @@ class NodeProcess:
         topic: str,
         subscription: dds.Subscription,
         body: Callable[[dds.Message | None], None],
+        rmw_handle: int | None = None,
     ) -> None:
         entity = SubscriptionEntity(
             handle=self.new_handle(),
-            rmw_handle=self.new_handle(),
+            rmw_handle=rmw_handle or self.new_handle(),
             subscription=subscription,
             callback=body,
         )
@@ -210,13 +215,13 @@ class NodeProcess:
 
         self._add_subscription(handle, topic, self._subscription(topic), body)
 
-    def _subscription(self, topic: str) -> dds.Subscription:
+    def _subscription(self, topic: str, depth: int = 0) -> dds.Subscription:
         qos = self.spec["topics"][topic]
         subscription = dds.Subscription(
             self.participant,
             topic,
             qos["reliability"],
-            qos["depth"],
+            max(depth, qos["depth"]),
             carries_text=topic in self.spec["announced"],
         )
         self.subscriptions.append((topic, subscription))
@@ -306,6 +311,8 @@ class NodeProcess:
                 anchor=gate["anchor"],
                 overrun=gate["overrun"],
                 due_cycles=gate["due_cycles"],
+                messages=gate["messages"],
+                depth=gate["depth"],
                 modes=modes and Modes(modes["bands"], modes["default"], modes["late"]),
             ),
             gate["spin_ns"],
@@ -316,7 +323,7 @@ class NodeProcess:
 
     def _shaping_body(
         self,
-        handle: int,
+        handles: tuple[int, int],
         shaper: Shaper,
         gate: dict[str, Any],
         publisher: "TracedPublisher",
@@ -326,45 +333,83 @@ class NodeProcess:
 
         Between waking and writing nothing is computed, and after writing the thread pauses, so
         that threads it outranks can deliver; only then are its events recorded. It does not
-        pause when another message waits already: one that missed its slot leaves together with
-        the next, and must not make that one late as well.
+        pause when another message has to leave meanwhile.
+
+        What comes while one is held waits at the gate. The executor has it worked off before it
+        takes the next: a message is recorded as taken when it is its turn.
 
         Delay that no other thread caused is recorded like the stall meter's own findings. A
-        message that overran and is to be discarded is recorded, and not published.
+        message that is dropped is recorded, and not published.
         """
         start, end = self._point["callback_start"], self._point["callback_end"]
-        released, stalled = self._point["gate_release"], self._point["machine_stall"]
+        stalled, (handle, rmw_handle) = self._point["machine_stall"], handles
         pause_ns = gate["pause_ns"]
-        modes = [] if gate["modes"] is None else list(gate["modes"]["bands"])
+        note = partial(self._note_release, handle, gate)
+        waiting, overflowed = shaper.queue.waiting, shaper.overflowed
+
+        def look() -> None:
+            while subscription.ready():
+                if (message := subscription.take()) is not None:
+                    now = time.monotonic_ns()
+                    shaper.arrive(message.payload, now, message.source_timestamp, message)
+
+        def let_one_pass() -> None:
+            start(time.monotonic_ns(), handle, time.thread_time_ns(), 0)
+            if (held := shaper.hold()) is not None:
+                if held.release.at_ns is not None:
+                    payload = held.message.payload
+                    published, source_timestamp = publisher.send(payload)
+                    lost = shaper.time_lost(held.release, published)
+                    shaper.rest(published, pause_ns)
+                    publisher.record(payload, published, source_timestamp)
+                    if lost >= STALL_NS:
+                        stalled(held.release.at_ns, lost)
+                note(held)
+            end(time.monotonic_ns(), handle, time.thread_time_ns())
+            for gone in overflowed:
+                self.executor.record_take(rmw_handle, gone.message.about)
+                start(time.monotonic_ns(), handle, time.thread_time_ns(), 0)
+                note(gone)
+                end(time.monotonic_ns(), handle, time.thread_time_ns())
+            overflowed.clear()
 
         def body(message: dds.Message | None) -> None:
             assert message is not None  # noqa: S101 - a gate has a subscription, by validation
-            start(time.monotonic_ns(), handle, time.thread_time_ns(), 0)
-            release, arrival, woke_ns = shaper.hold(message.payload)
-            if release.at_ns is not None:
-                published, source_timestamp = publisher.send(message.payload)
-                lost = shaper.time_lost(release, published)
-                if not subscription.ready():
-                    sleep_until(published + pause_ns)
-                publisher.record(message.payload, published, source_timestamp)
-                if lost >= STALL_NS:
-                    stalled(release.at_ns, lost)
-            released(
-                woke_ns,
-                handle,
-                message.source_timestamp,
-                arrival,
-                release.origin_ns,
-                ABSENT if release.at_ns is None else release.at_ns,
-                ABSENT if release.slot is None else release.slot,
-                release.cycles_waited,
-                number_of("anchor", release.anchor),
-                number_of("overrun", release.overrun),
-                ABSENT if release.mode is None else modes.index(release.mode),
-            )
-            end(time.monotonic_ns(), handle, time.thread_time_ns())
+            alone = not waiting
+            shaper.arrive(message.payload, time.monotonic_ns(), about=message)
+            if alone:
+                let_one_pass()
 
+        def work_off() -> bool:
+            served = False
+            while waiting and not (served and shaper.nothing_due()):
+                self.executor.record_take(rmw_handle, waiting[0].about)
+                let_one_pass()
+                served = True
+            return bool(waiting)
+
+        shaper.look = look
+        self.executor.backlogs.append(work_off)
         return body
+
+    def _note_release(self, handle: int, gate: dict[str, Any], held: Held) -> None:
+        """Record what became of a message at a gate."""
+        modes = [] if gate["modes"] is None else list(gate["modes"]["bands"])
+        release = held.release
+        self._point["gate_release"](
+            held.awake_ns,
+            handle,
+            held.message.about.source_timestamp,
+            held.message.arrival_ns,
+            release.origin_ns,
+            ABSENT if release.at_ns is None else release.at_ns,
+            ABSENT if release.slot is None else release.slot,
+            release.cycles_waited,
+            number_of("anchor", release.anchor),
+            number_of("overrun", release.overrun),
+            ABSENT if release.mode is None else modes.index(release.mode),
+            number_of("dropped", held.dropped),
+        )
 
     # Running ------------------------------------------------------------------------------
 
@@ -395,7 +440,7 @@ class NodeProcess:
         for times in self.execution_times:
             times.refill(min(1 + (stop_ns - start_ns) // min(periods), 100_000))
         for shaper in self.shapers:
-            shaper.gate = replace(shaper.gate, phase_ns=start_ns + self.spec["origin_phase"])
+            shaper.queue.phase_ns = start_ns + self.spec["origin_phase"]
         stop_garbage_collection()
         self.executor.spin_until(stop_ns, last_timer_ns)
 

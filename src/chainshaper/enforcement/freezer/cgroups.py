@@ -24,12 +24,16 @@ __all__ = [
     "QUICK_MOVES",
     "cgroup_of",
     "dissolve",
+    "enter_own_group",
+    "has_unseen_threads",
+    "leave_own_group",
     "make_threaded_child",
     "mount_options",
     "mount_point",
     "move_thread",
     "moves_are_quick",
     "remount",
+    "remove_own_group",
     "threads_in",
 ]
 
@@ -53,6 +57,7 @@ _MOUNT_FLAGS = {
     "relatime": 1 << 21,
 }
 """Of mount(2); an option that is none of them is the file system's own."""
+_ATTEMPTS = 3
 _THREADED_CONTROLLERS = {"cpu", "cpuset", "perf_event", "pids"}
 _REMEDY = (
     "run as root, or start the application in a group that is yours "
@@ -202,8 +207,16 @@ def move_thread(tid: int, folder: Path) -> bool:
 
 
 def threads_in(folder: Path) -> tuple[int, ...]:
-    """The living threads of a group; none when the group is gone."""
-    return tuple(int(tid) for tid in _read(folder / "cgroup.threads").split())
+    """The living threads of a group; none when the group is gone.
+
+    Those that cannot be seen from our process namespace (0 for the kernel) are not among them.
+    """
+    return tuple(int(tid) for tid in _read(folder / "cgroup.threads").split() if tid != "0")
+
+
+def has_unseen_threads(folder: Path) -> bool:
+    """Whether there are some that cannot be seen from our process namespace."""
+    return "0" in _read(folder / "cgroup.threads").split()
 
 
 def dissolve(folder: Path, within_s: float = 1.0) -> str | None:
@@ -235,6 +248,57 @@ def dissolve(folder: Path, within_s: float = 1.0) -> str | None:
                 return f"the cgroup {folder} is left behind: {reason}"
             time.sleep(0.001)
     return None
+
+
+def enter_own_group(name: str) -> bool:
+    """Put this process into a group of that name, out of reach of what befalls its present one.
+
+    That is directly beneath the root of the hierarchy, or as near to it as we may; not beneath a
+    group with processes, which could have no threaded children then. False where it has to stay
+    where it is, as in a container: what ends the container ends it, too.
+    """
+    for folder in _own_groups(name):
+        for _ in range(_ATTEMPTS):  # the last to leave may just be removing it
+            try:
+                folder.mkdir(exist_ok=True)
+                (folder / "cgroup.procs").write_text(str(os.getpid()))
+                return True
+            except FileNotFoundError:
+                continue
+            except OSError:
+                break
+    return False
+
+
+def leave_own_group(name: str) -> None:
+    """Go back to the group above, and remove ours if it is empty then."""
+    with contextlib.suppress(OSError, OperationError, PlatformError):
+        folder = cgroup_of(os.getpid())
+        if folder.name == name:
+            (folder.parent / "cgroup.procs").write_text(str(os.getpid()))
+            folder.rmdir()
+
+
+def remove_own_group(name: str) -> None:
+    """Remove the group of that name, unless other processes are in it."""
+    for folder in _own_groups(name):
+        with contextlib.suppress(OSError):
+            folder.rmdir()
+
+
+def _own_groups(name: str) -> list[Path]:
+    """Where a group of ours may be that is not in reach of our present one, the best first."""
+    try:
+        root, own = mount_point(), cgroup_of(os.getpid())
+    except (OperationError, PlatformError):
+        return []
+    above = [folder for folder in (own, *own.parents) if folder.is_relative_to(root)]
+    return [
+        folder / name
+        for folder in reversed(above)
+        if not (folder / "cgroup.type").exists()  # the machine's own root, where all is allowed
+        or (folder != own and not _read(folder / "cgroup.procs").strip())
+    ]
 
 
 def _read(path: Path) -> str:

@@ -2,16 +2,17 @@
 
 A dispatcher must not wait for anybody, so it tells nothing: it keeps its numbers in memory that
 others can read. Not in a file on a disk, though: a store to a mapped page that is being written
-back waits for the disk, for 0.1 s and more. The memory belongs to the owner and has no file; a link
-in the run directory leads to it for as long as the owner lives. All numbers are 64-bit integers
-in the machine's order, each written by one process only:
+back waits for the disk, for 0.1 s and more. The memory belongs to the owner and has no file; it is
+reached through the owner's descriptors for as long as the owner lives. All numbers are 64-bit
+integers in the machine's order, each written by one kind of process only:
 
-    supervisor   beats
-    per core     beats, acknowledged, real time, process id
+    the owner    released
+    per core     beats, acknowledged, real time, and (by guardians) silent
     per server   slots, late entries, longest lateness (ns), overruns, groups lost
 
-``beats`` moves as long as its process does. ``acknowledged`` is the number of the last command
-that a dispatcher has carried out. Overruns of -1 cannot be known here.
+``beats`` moves as long as its process does; one that did not for too long was ``silent``.
+``acknowledged`` is the number of the last command that a dispatcher has carried out. Servers that
+are ``released`` need no dispatcher any more. Overruns of -1 cannot be known here.
 """
 
 import ctypes
@@ -32,8 +33,8 @@ class _Core(ctypes.Structure):
     beats: int
     acknowledged: int
     real_time: int
-    process: int
-    _fields_ = _numbers("beats", "acknowledged", "real_time", "process")
+    silent: int
+    _fields_ = _numbers("beats", "acknowledged", "real_time", "silent")
 
 
 class _Server(ctypes.Structure):
@@ -46,11 +47,11 @@ class _Server(ctypes.Structure):
 
 
 class CounterPage:
-    """The numbers of a table's supervisor, cores and servers, in memory that is theirs."""
+    """The numbers of a table's owner, cores and servers, in memory that is theirs."""
 
     def __init__(self, memory: mmap.mmap, table: ServerTable) -> None:
         place = ctypes.sizeof(ctypes.c_int64)
-        self.supervisor = ctypes.c_int64.from_buffer(memory)
+        self.released = ctypes.c_int64.from_buffer(memory)
         self.cores: dict[int, _Core] = {}
         for core in sorted({server.core for server in table.servers}):
             self.cores[core] = _Core.from_buffer(memory, place)
@@ -61,17 +62,16 @@ class CounterPage:
             place += ctypes.sizeof(_Server)
 
 
-def create_page(path: Path, table: ServerTable) -> tuple[CounterPage, int]:
-    """Make the memory, all numbers 0, and the link to it.
+def create_page(table: ServerTable) -> tuple[CounterPage, Path, int]:
+    """Make the memory, all numbers 0.
 
-    Returns the file descriptor as well: closing it makes the link lead nowhere.
+    Returns as well where others find it, and the descriptor: closing it ends that.
     """
-    memory = os.memfd_create(path.name)
+    memory = os.memfd_create("counters")
     each = ctypes.sizeof(_Core) + ctypes.sizeof(_Server)  # there are not more cores than servers
     os.truncate(memory, ctypes.sizeof(ctypes.c_int64) + each * len(table.servers))
-    path.unlink(missing_ok=True)
-    path.symlink_to(f"/proc/{os.getpid()}/fd/{memory}")
-    return open_page(path, table), memory
+    path = Path(f"/proc/{os.getpid()}/fd/{memory}")
+    return open_page(path, table), path, memory
 
 
 def open_page(path: Path, table: ServerTable) -> CounterPage:

@@ -13,12 +13,14 @@ kernel remembers for a frozen thread where it was, and shows it in ``/proc/TID/s
 user mode. (Its state says nothing any more: freezing wakes sleepers.) A thread that is caught
 inside a system call passes for one that waits.
 
-It must never leave threads frozen: it thaws them however it ends, and ends when its supervisor or
-the owner is gone. Only SIGKILL and SIGSTOP prevent that, which is what the supervisor is for.
+It must never leave threads frozen: it thaws them however it ends, and ends when the owner is gone.
+Only SIGKILL and SIGSTOP prevent that, which is what guardians are for. Should those be gone
+together with the owner, it undoes the whole run.
 
-    python -m chainshaper.enforcement.freezer.slot_dispatcher RUN_DIRECTORY CORE COMMANDS_FD
+    python -m chainshaper.enforcement.freezer.slot_dispatcher JOURNAL OWNER CORE COMMANDS_FD
 """
 
+import contextlib
 import json
 import os
 import signal
@@ -37,11 +39,13 @@ from chainshaper.enforcement.freezer.slot_boundaries import (
     boundaries_of,
     moved,
 )
-from chainshaper.enforcement.freezer.state import COUNTERS, load_state, restore
+from chainshaper.enforcement.freezer.state import run_of
 from chainshaper.enforcement.gate import sleep_until, watch_until
 from chainshaper.enforcement.realtime import lock_memory, set_thread_name, stop_garbage_collection
+from chainshaper.enforcement.runs.journal import remembered_journal
 from chainshaper.enforcement.servers import ServerTable
 from chainshaper.errors import ChainshaperError, OperationError, PlatformError
+from chainshaper.safe_text import shown
 
 __all__ = ["Dispatcher", "main"]
 
@@ -51,7 +55,7 @@ TICK_NS = 20_000_000
 _REST_NS = 1_000_000  # after a boundary; frozen threads, too, need the core to reach the freezer
 _ROOM_NS = 200_000  # at least, between a tick and the boundaries around it
 _WATCH_NS = 100_000  # before a boundary, instead of sleeping
-_THAWED_AFTER_NS = 60_000_000  # the supervisor waits for a sign of life a little longer
+_THAWED_AFTER_NS = 60_000_000  # guardians wait for a sign of life a little longer
 _FAR = 1 << 62
 _NOTHING: frozenset[int] = frozenset()
 
@@ -66,7 +70,9 @@ class OpenGroup(NamedTuple):
 class Dispatcher:
     """The servers of one core at work; ``groups`` are, for each of them, its cgroups by folder."""
 
-    def __init__(self, table: ServerTable, core: int, page: CounterPage, commands: int) -> None:
+    def __init__(
+        self, table: ServerTable, core: int, page: CounterPage, owner: int, commands: int
+    ) -> None:
         servers = tuple(server for server in table.servers if server.core == core)
         self.cycle_ns = table.cycle_ns
         self.boundaries = boundaries_of(table.cycle_ns, tuple(s.slots for s in servers))
@@ -81,13 +87,13 @@ class Dispatcher:
         self.ahead: Iterator[tuple[int, Boundary]] = iter(())
         self.unexamined: set[int] = set()
         self.last_tick = self.last_sign = time.monotonic_ns()
-        self.parent = os.getppid()
+        self.owner = owner
 
     def run(self) -> None:
-        """Until the owner, the supervisor or a signal ends it.
+        """Until the owner or a signal ends it.
 
         Raises:
-            OperationError: owner or supervisor are gone.
+            OperationError: the owner is gone.
         """
         while True:
             self._tick_until_boundary()
@@ -173,13 +179,13 @@ class Dispatcher:
         """A sign of life, and all that has waited."""
         self.last_tick = time.monotonic_ns()
         self._give_sign(self.last_tick)
-        if os.getppid() != self.parent:
-            raise OperationError("the supervisor is gone")
+        if os.getppid() != self.owner:
+            raise OperationError("the owner is gone")
         self._examine()
         self._obey()
 
     def _give_sign(self, now: int) -> None:
-        """Show that we live. After long without that, the supervisor has thawed what we closed."""
+        """Show that we live. After long without that, a guardian has thawed what we closed."""
         self.own.beats += 1
         if now - self.last_sign > _THAWED_AFTER_NS and self.open is not None:
             for server in sorted(set(range(len(self.groups))) - self.open):
@@ -298,31 +304,32 @@ def _end(_number: int, _frame: FrameType | None) -> None:
 
 
 def main() -> None:
-    """The process of one core, as the supervisor starts it."""
-    run_directory, core, commands = Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+    """The process of one core, as the owner starts it."""
+    path, owner, core, commands = Path(sys.argv[1]), *map(int, sys.argv[2:5])
     signal.signal(signal.SIGTERM, _end)
     for ignored in (signal.SIGINT, signal.SIGHUP):
         signal.signal(ignored, signal.SIG_IGN)
     os.set_blocking(commands, False)
-    state = load_state(run_directory)
-    if state is None:
-        sys.exit(f"{run_directory} holds no run")
-    page = open_page(run_directory / COUNTERS, state.table)
-    dispatcher = Dispatcher(state.table, core, page, commands)
+    journal = remembered_journal(path)
+    run = run_of(journal)
+    if run is None:
+        sys.exit(f"{path} speaks of no servers")
+    dispatcher = Dispatcher(run.table, core, open_page(run.page, run.table), owner, commands)
     set_thread_name(f"dispatcher/{core}")
     try:
         dispatcher.own.real_time = become_real_time(core)
-        dispatcher.own.process = os.getpid()
         dispatcher.run()
     except OperationError as error:
-        sys.stderr.write(f"dispatcher of core {core}: {error}\n")
         dispatcher.thaw_all()
-        # Nobody else may be left to do it, and it does no harm if somebody is.
-        latest = load_state(run_directory)
-        restore(latest)
+        with contextlib.suppress(OSError):  # the owner may be gone, who would read it
+            sys.stderr.write(shown(str(error)) + "\n")
+        # Guardians have learnt of it earlier. If there is none left, it is for us.
+        from chainshaper.enforcement.runs.undoing import undo_run
+
+        undo_run(journal)
         sys.exit(error.exit_code)
     except ChainshaperError as error:
-        sys.stderr.write(f"{error}\n")
+        sys.stderr.write(shown(str(error)) + "\n")
         sys.exit(error.exit_code)
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)

@@ -1,185 +1,161 @@
-"""What the freezer has changed on this machine, on disk, and putting it back.
+"""What the freezer has changed on this machine, as others find it, and putting it back.
 
-Whoever of the freezer's processes survives must be able to put everything back, and so must a
-stranger after all of them have been killed at once. So the file is written *before* each change.
-It holds the groups: a group is made directly beneath the one from which its threads came, so their
-way back is its parent, for them and for the children that they have had since. And it holds how the
-hierarchy was mounted.
-
-The run's log stands beside it. It is at the same time the lock of the run directory: the owner
-opens it and all its processes inherit it, so it stays locked until the last of them is gone.
+Whoever survives must be able to put everything back, and so must a stranger after all of a run's
+processes have been killed at once. So the journal says, *before* anything is changed, which servers
+there will be and how the hierarchy was mounted. Cgroups of ours need no line each: their names say
+which process made them and for which server, so they are found even where the journal is gone. A
+group is made directly beneath the one from which its threads came: their way back is its parent,
+for them and for the children that they have had since.
 """
 
 import contextlib
-import fcntl
-import json
-import os
-from collections.abc import Iterable
+import re
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import IO
+from typing import Any
 
 from chainshaper.enforcement.freezer.cgroups import (
-    QUICK_MOVES,
     dissolve,
+    has_unseen_threads,
     mount_point,
     moves_are_quick,
     remount,
 )
+from chainshaper.enforcement.runs.journal import Journal
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
-from chainshaper.errors import OperationError
+from chainshaper.enforcement.threads.listing import has_ended, start_of
+from chainshaper.errors import PlatformError
 
 __all__ = [
-    "COUNTERS",
-    "FreezerState",
-    "Group",
-    "clean_up",
-    "load_state",
-    "lock_run_directory",
-    "log_text",
-    "remove_state",
+    "FREEZER",
+    "GROUP_PREFIX",
+    "FreezerRun",
+    "group_name",
+    "groups_of",
+    "note_freezer",
+    "read_run",
     "restore",
-    "save_state",
-    "start_log",
+    "run_of",
+    "stray_groups",
     "thaw",
 ]
 
-STATE, COUNTERS, LOG = "freezer.json", "freezer.counters", "freezer.log"
+FREEZER = "freezer"
+GROUP_PREFIX = "chainshaper-"
+_NAME = re.compile(rf"{GROUP_PREFIX}(\d+)(?:\.(\d+)\.(\d+))?-(\d+)-")
+"""The owner's id; its start and which of its runs (older ones: without); the server's place."""
 
 
 @dataclass(frozen=True)
-class Group:
-    """A cgroup of ours: the threads of one server that came from the folder's parent."""
+class FreezerRun:
+    """The servers that are enforced, and by whom: id and start of the owner.
 
-    folder: Path
-    server: str
-
-
-@dataclass(frozen=True)
-class FreezerState:
-    """A run: the process it belongs to, the table it enforces, the groups it has made.
-
-    ``mount_options`` are those that the hierarchy had, where we have it mounted differently.
+    ``page`` is where the counters are for as long as the owner lives. ``mount_options`` are those
+    that the hierarchy had, where we have it mounted differently.
     """
 
-    owner: int
+    owner: tuple[int, int]
     table: ServerTable
+    page: Path
     mount_options: str | None = None
-    groups: tuple[Group, ...] = ()
 
 
-def save_state(run_directory: Path, state: FreezerState) -> None:
-    """Write the file beside and rename it: it is whole at every instant."""
-    partial = run_directory / f"{STATE}.partial"
-    partial.write_text(json.dumps(asdict(state), indent=1, default=str))
-    partial.replace(run_directory / STATE)
-
-
-def load_state(run_directory: Path) -> FreezerState | None:
-    """The state of the run, None when there is none.
+def note_freezer(journal: Journal, run: FreezerRun) -> None:
+    """Write down that servers are about to be made.
 
     Raises:
-        OperationError: the file is not one of ours.
+        OperationError: it cannot be written.
     """
-    path = run_directory / STATE
-    try:
-        content = json.loads(path.read_text())
-        servers = tuple(
-            ReservationServer(**{**one, "slots": tuple(map(tuple, one["slots"]))})
-            for one in content["table"]["servers"]
-        )
-        groups = tuple(Group(Path(g["folder"]), g["server"]) for g in content["groups"])
-        table = ServerTable(content["table"]["cycle_ns"], servers)
-        return FreezerState(content["owner"], table, content.get("mount_options"), groups)
-    except FileNotFoundError:
-        return None
-    except (ValueError, KeyError, TypeError) as error:
-        raise OperationError(
-            f"{path} does not say which cgroups to restore ({error!r}): thaw and remove those "
-            "named chainshaper-* under /sys/fs/cgroup, then delete the file"
-        ) from error
+    journal.note(FREEZER, **{**asdict(run), "page": str(run.page)})
 
 
-def thaw(groups: Iterable[Group]) -> None:
-    """Let the threads of these groups run; one that is gone holds nobody."""
-    for group in groups:
+def read_run(entry: Mapping[str, Any]) -> FreezerRun:
+    """What :func:`note_freezer` wrote."""
+    table, (pid, started) = entry["table"], entry["owner"]
+    servers = tuple(
+        ReservationServer(**{**one, "slots": tuple((start, end) for start, end in one["slots"])})
+        for one in table["servers"]
+    )
+    return FreezerRun(
+        (int(pid), int(started)),
+        ServerTable(int(table["cycle_ns"]), servers),
+        Path(entry["page"]),
+        entry["mount_options"],
+    )
+
+
+def run_of(journal: Journal) -> FreezerRun | None:
+    """The freezer's run, None where there is none."""
+    return next(iter(journal.read(FREEZER, read_run)), None)
+
+
+def group_name(run: FreezerRun, server: str) -> str:
+    """The name of a server's group: whose it is, the server's place, and what a person reads."""
+    pid, started, page = *run.owner, run.page.name
+    number = [one.name for one in run.table.servers].index(server)
+    readable = re.sub(r"[^A-Za-z0-9_.-]+", "_", server)[:64]
+    return f"{GROUP_PREFIX}{pid}.{started}.{page}-{number}-{readable}"
+
+
+def groups_of(run: FreezerRun | None, core: int | None = None) -> tuple[Path, ...]:
+    """The groups of a run that there are; of the servers of one core, if one is given."""
+    if run is None:
+        return ()
+
+    def belongs(name: "re.Match[str]") -> bool:
+        if name.group(1, 2, 3) != (*map(str, run.owner), run.page.name):
+            return False
+        return core is None or run.table.servers[int(name[4])].core == core
+
+    return _groups(belongs)
+
+
+def stray_groups(journals: Iterable[Journal]) -> tuple[Path, ...]:
+    """Groups of ours of none of these journals, and whose owner has ended.
+
+    Those with threads that cannot be seen from here are not ours to judge: their owner is where
+    they are, outside of this container.
+    """
+    known = {run.owner for journal in journals if (run := run_of(journal)) is not None}
+
+    def is_stray(name: "re.Match[str]") -> bool:
+        pid = int(name[1])
+        started = start_of(pid, pid) if name[2] is None else int(name[2])
+        return (pid, started) not in known and (started is None or has_ended(pid, started))
+
+    return tuple(folder for folder in _groups(is_stray) if not has_unseen_threads(folder))
+
+
+def thaw(groups: Iterable[Path]) -> None:
+    """Let the threads of these groups run; one that is gone holds no thread."""
+    for folder in groups:
         with contextlib.suppress(OSError):
-            (group.folder / "cgroup.freeze").write_text("0")
+            (folder / "cgroup.freeze").write_text("0")
 
 
-def restore(state: FreezerState | None) -> tuple[str, ...]:
+def restore(run: FreezerRun | None) -> tuple[str, ...]:
     """Put every thread back, remove the groups, mount as before; what could not be, in sentences.
 
-    Of several runs at a time, the one that has it mounted differently changes that back.
+    Of several runs at a time, the one that has it mounted differently changes that back; that
+    another has it so again at once is no failure.
     """
-    if state is None:
-        return ()
-    left = tuple(told for group in state.groups if (told := dissolve(group.folder)) is not None)
-    before = state.mount_options
+    groups = groups_of(run)
+    thaw(groups)
+    left = tuple(why for folder in groups if (why := dissolve(folder)) is not None)
+    before = None if run is None else run.mount_options
     if before is not None and moves_are_quick():
         remount(before)
-        if moves_are_quick():
-            left += (f"{mount_point()} is still mounted with {QUICK_MOVES}, and was with {before}",)
     return left
 
 
-def remove_state(run_directory: Path) -> None:
-    """Remove the files of a run, the log excepted."""
-    for name in (STATE, f"{STATE}.partial", COUNTERS):
-        with contextlib.suppress(FileNotFoundError):
-            (run_directory / name).unlink()
-
-
-def lock_run_directory(run_directory: Path) -> IO[str]:
-    """The run's log, open and locked.
-
-    Raises:
-        OperationError: another run holds it.
-    """
-    log = (run_directory / LOG).open("a+")
-    try:
-        fcntl.flock(log, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        log.close()
-        state = load_state(run_directory)
-        whose = "another process" if state is None else f"process {state.owner}"
-        raise OperationError(
-            f"{whose} enforces servers already, from {run_directory}: end it first "
-            "(`chainshaper release`)"
-        ) from None
-    return log
-
-
-def clean_up(run_directory: Path) -> tuple[Path, ...]:
-    """Restore what a run left behind whose processes were all killed; harmless when repeated.
-
-    Returns the groups that were dissolved.
-
-    Raises:
-        OperationError: the run is alive, or something cannot be restored.
-    """
-    if not (run_directory / STATE).exists():
-        return ()
-    with lock_run_directory(run_directory):
-        state = load_state(run_directory)
-        if state is None:
+def _groups(wanted: Callable[["re.Match[str]"], bool]) -> tuple[Path, ...]:
+    while True:
+        try:
+            found = sorted(mount_point().rglob(f"{GROUP_PREFIX}*"))
+        except PlatformError:
             return ()
-        dissolved = tuple(g.folder for g in state.groups if g.folder.is_dir())
-        left = restore(state)
-        if left:
-            raise OperationError("; ".join(left))
-        remove_state(run_directory)
-        return dissolved
-
-
-def log_text(run_directory: Path) -> str:
-    """What the processes of the run had to say about its end."""
-    try:
-        return (run_directory / LOG).read_text().strip()
-    except OSError:
-        return ""
-
-
-def start_log(log: IO[str]) -> None:
-    """A new run begins with an empty log."""
-    os.ftruncate(log.fileno(), 0)
+        except FileNotFoundError:  # one was removed while we looked: once more
+            continue
+        names = ((folder, _NAME.match(folder.name)) for folder in found)
+        return tuple(folder for folder, name in names if name is not None and wanted(name))

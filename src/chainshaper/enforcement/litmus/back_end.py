@@ -10,9 +10,10 @@ one in a reservation run in it as well, so threads are attached one by one, afte
 exist.
 """
 
+import contextlib
 import os
-import shutil
 import subprocess
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +28,7 @@ from chainshaper.enforcement.litmus.resctl import (
     plugin_command,
     reservation_ids,
 )
+from chainshaper.enforcement.own_processes import is_installed, tool_environment
 from chainshaper.enforcement.runs.journal import Journal
 from chainshaper.enforcement.runs.scheduling_memory import note_scheduling, release_threads
 from chainshaper.enforcement.runs.scheduling_state import SchedulingClass, state_of
@@ -58,7 +60,7 @@ def create(table: ServerTable, journal: Journal, proc: Path = PROC) -> "Litmus":
             "or use another back end (`--backend auto`); `--dry-run` prints the commands"
         )
     for tool in ("setsched", "resctl"):
-        if shutil.which(tool) is None:
+        if not is_installed(tool):
             raise PlatformError(
                 f"{tool} is not on $PATH: build liblitmus (github.com/LITMUS-RT/liblitmus) and "
                 "add its folder"
@@ -85,6 +87,7 @@ class Litmus:
         self._members: dict[int, str] = {}
         self._ids: dict[str, int] = {}
         self._generation = 0
+        self._since_ns: int | None = None
 
     def assign(self, tid: int, server: str) -> None:
         """Put a thread into a server; one that has ended is passed over.
@@ -114,10 +117,14 @@ class Litmus:
         for server in self._table.servers:
             _run(create_command(ids[server.name], server, self._table.cycle_ns, anchor_ns))
         moving, self._ids = bool(self._ids), ids
-        for tid in self._members:
-            if moving:
-                _leave_reservation(tid)
-            self._attach(tid)
+        for tid in self._members if moving else ():
+            _leave_reservation(tid)
+        self._attach(*self._members)
+        self._since_ns = time.monotonic_ns()
+
+    def in_force_from(self) -> int | None:
+        """See :meth:`BackEnd.in_force_from`."""
+        return self._since_ns
 
     def counters(self) -> dict[str, ServerCounters]:
         """Nothing is counted: LITMUS^RT does not tell."""
@@ -139,23 +146,24 @@ class Litmus:
         release_threads(self._journal)
         restore_plugin(self._journal)
 
-    def _attach(self, tid: int) -> None:
-        thread = find_thread(tid)
-        if thread is None:
-            return
-        name = self._members[tid]
-        core = next(server.core for server in self._table.servers if server.name == name)
-        try:
-            target = replace(
-                state_of(tid),
-                scheduling_class=SchedulingClass(SCHED_LITMUS, 0, reset_on_fork=False),
-                cores=(core,),
-            )
-            if note_scheduling(self._journal, thread, target):
-                _run(attach_command(tid, self._ids[name], core))
-        except (ProcessLookupError, OperationError):
-            if find_thread(tid) is not None:
-                raise
+    def _attach(self, *tids: int) -> None:
+        cores = {server.name: server.core for server in self._table.servers}
+        reserved = SchedulingClass(SCHED_LITMUS, 0, reset_on_fork=False)
+        targets = []
+        for tid in tids:
+            thread = find_thread(tid)
+            with contextlib.suppress(ProcessLookupError):
+                if thread is not None:
+                    core = cores[self._members[tid]]
+                    target = replace(state_of(tid), scheduling_class=reserved, cores=(core,))
+                    targets.append((thread, target))
+        for thread, target in note_scheduling(self._journal, targets):
+            number = self._ids[self._members[thread.tid]]
+            try:
+                _run(attach_command(thread.tid, number, target.cores[0]))
+            except OperationError:
+                if find_thread(thread.tid) is not None:
+                    raise
 
 
 def restore_plugin(journal: Journal) -> None:
@@ -200,7 +208,12 @@ def _run(command: Command | Sequence[str]) -> None:
     """Run a command of LITMUS^RT's; its complaint becomes ours."""
     try:
         done = subprocess.run(
-            command, capture_output=True, text=True, check=False, timeout=COMMAND_S
+            command,
+            env=tool_environment(),
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=COMMAND_S,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise OperationError(f"`{' '.join(command)}` cannot be run: {error}") from error

@@ -9,42 +9,48 @@ A claim ends with its journal. What a crashed run has claimed is given back by u
 """
 
 import contextlib
-import fcntl
-import os
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 
 from chainshaper.enforcement.runs.journal import (
+    CLAIMS,
     Journal,
     find_journals,
     journals_folder,
     open_journal,
+    read_claim,
 )
-from chainshaper.enforcement.runs.state import undo_run
+from chainshaper.enforcement.runs.locking import holder_of, locked
+from chainshaper.enforcement.runs.undoing import undo_run
 from chainshaper.errors import OperationError, PlatformError
 
 __all__ = ["claim_run"]
 
-KIND = "claims"
+_PATIENCE_S = 20.0
 
 
 def claim_run(
-    cores: Collection[int], nodes: Collection[str], folder: Path | None = None
+    cores: Collection[int],
+    nodes: Collection[str],
+    folder: Path | None = None,
+    go_on: Callable[[], None] = lambda: None,
 ) -> Journal:
     """Begin a run that governs these cores and nodes: the journal for all that it changes.
 
-    ``folder`` is where runs are kept (default: :func:`.journals_folder`).
+    ``folder`` is where runs have their folders (default: :func:`.journals_folder`). While another
+    run begins, ``go_on`` is called again and again, and may raise.
 
     Raises:
-        OperationError: a living run governs one of them, or a crashed one cannot be undone.
+        OperationError: a living run governs one of them, a crashed one cannot be undone, or one
+            that begins does not get on with it.
         PlatformError: nothing may be written to the folder.
     """
     base = journals_folder() if folder is None else folder
-    with _locked(base):
+    with _locked(base, go_on):
         for other in find_journals(base):
             shared = _shared(other, cores, nodes)
             owner = other.owner
-            if owner is None and (shared or not other.entries(KIND)):
+            if owner is None and (shared or not other.entries(CLAIMS)):
                 _undo(other)
             elif shared:
                 name = other.path.parent.name
@@ -53,7 +59,7 @@ def claim_run(
                     f"(`chainshaper release {name}`)"
                 )
         journal = open_journal(base)
-        journal.note(KIND, cores=sorted(cores), nodes=sorted(nodes))
+        journal.note(CLAIMS, cores=sorted(cores), nodes=sorted(nodes))
         return journal
 
 
@@ -61,11 +67,8 @@ def _shared(other: Journal, cores: Collection[int], nodes: Collection[str]) -> s
     """What another run claims of these, in words; empty when nothing."""
     shared = [
         f"{kind} {', '.join(map(str, sorted(both)))}"
-        for claim in other.entries(KIND)
-        for kind, both in (
-            ("core", set(cores) & set(claim["cores"])),
-            ("node", set(nodes) & set(claim["nodes"])),
-        )
+        for its_cores, its_nodes in other.read(CLAIMS, read_claim)
+        for kind, both in (("core", set(cores) & its_cores), ("node", set(nodes) & its_nodes))
         if both
     ]
     return " and ".join(shared)
@@ -81,17 +84,23 @@ def _undo(crashed: Journal) -> None:
 
 
 @contextlib.contextmanager
-def _locked(base: Path) -> Iterator[None]:
-    try:
-        base.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(base, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    except OSError as error:
-        raise PlatformError(
-            f"{base}, where runs keep a journal of what they change, cannot be used "
-            f"({error.strerror}): run as root, or set $XDG_RUNTIME_DIR to a folder of yours"
-        ) from error
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
+def _locked(base: Path, go_on: Callable[[], None]) -> Iterator[None]:
+    def waiting(waited_s: float) -> None:
+        go_on()
+        if waited_s > _PATIENCE_S:
+            holder = holder_of(base)
+            raise OperationError(
+                f"process {holder} begins a run, and has not got on with it for {_PATIENCE_S:g} s: "
+                f"let it go on (`kill -CONT {holder}`), or end it (`kill -KILL {holder}`)"
+            )
+
+    with contextlib.ExitStack() as stack:
+        try:
+            base.mkdir(mode=0o755, parents=True, exist_ok=True)  # ours alone: it is believed
+            stack.enter_context(locked(base, waiting))
+        except OSError as error:
+            raise PlatformError(
+                f"{base}, where runs keep a journal of what they change, cannot be used "
+                f"({error.strerror}): run as root, or set $XDG_RUNTIME_DIR to a folder of yours"
+            ) from error
         yield
-    finally:
-        os.close(descriptor)

@@ -5,21 +5,30 @@ aspect of a thread (:mod:`.scheduling_state`) by itself. One that is as we set i
 it was; one that somebody else has changed since is theirs, and is left and said so. A thread that
 has ended is done with, and one that has its id by now is recognised by its start.
 
-Threads inherit class and cores from those that create them. What an application starts while we
-have changed it is not in the journal, but shows a class that only we have given to its family:
-it gets its parent's original (:func:`restore_inherited`). A daemon has left its family, since the
-process between them has ended; it is known by the cgroup of the thread that was changed, and by
-all that we gave to that one, a real-time class included.
+Threads inherit class and cores from those that create them. What an application starts while it is
+changed is put back as well (:func:`restore_inherited`), if it is the application's beyond doubt:
+
+* a thread of a process in the journal, that process being the same (its id *and* its start);
+* a process that descends from one of these, or did when it was last looked
+  (:func:`note_descendants`), with its threads;
+* a thread that was born in a cgroup of ours.
+
+Of these, what started after the change and has what we gave to its family gets its parent's
+original. Everybody else is a stranger, whatever class, core and cgroup they have, and is left
+alone. So is a daemon whose parent ended before anybody looked; :func:`look_alikes` names both.
 
 SCHED_DEADLINE has parameters that the kernel admits only together with all others: threads under
 it are refused.
 """
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from time import CLOCK_BOOTTIME, clock_gettime_ns
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
-from chainshaper.enforcement.runs.journal import Journal
+from chainshaper.enforcement.freezer.cgroups import threads_in
+from chainshaper.enforcement.freezer.state import groups_of, run_of
+from chainshaper.enforcement.runs.journal import Journal, process_of
 from chainshaper.enforcement.runs.scheduling_state import (
     ASPECTS,
     SchedulingClass,
@@ -36,28 +45,39 @@ from chainshaper.enforcement.threads.listing import (
     TICK_NS,
     Scheduling,
     Thread,
+    find_thread,
     list_threads,
     parents,
-    read_proc,
     start_of,
 )
 from chainshaper.enforcement.threads.processes import descendants
 from chainshaper.errors import OperationError, PlatformError
 
 __all__ = [
+    "DESCENDANTS",
+    "KIND",
+    "Change",
     "Outcome",
+    "change_all",
     "change_scheduling",
-    "is_remembered",
+    "look_alikes",
+    "note_descendants",
     "note_scheduling",
+    "read_change",
     "release_threads",
+    "remembered_threads",
     "restore_inherited",
     "restore_scheduling",
 ]
 
 KIND = "scheduling"
+DESCENDANTS = "descendant"
 
 Fate: TypeAlias = Literal["restored", "unchanged", "ended", "left", "failed"]
 """``unchanged``: it is as it was already; ``left``: somebody else has changed it since."""
+
+
+_GENERATIONS = 5
 
 
 @dataclass(frozen=True)
@@ -71,11 +91,10 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class _Remembered:
+class Change:
     """A thread of the journal: what it had at first, and all that it was given since.
 
-    ``changed_at`` counts clock ticks since the machine booted; ``cgroups`` are those in which it
-    was then, as /proc shows them.
+    ``changed_at`` counts clock ticks since the machine booted.
     """
 
     tid: int
@@ -83,82 +102,111 @@ class _Remembered:
     pid: int
     comm: str
     changed_at: int
-    cgroups: str
     original: SchedulingState
     given: tuple[SchedulingState, ...]
 
+    @property
+    def identity(self) -> tuple[int, int]:
+        """As of :class:`Thread`."""
+        return (self.tid, self.started)
+
 
 def change_scheduling(journal: Journal, thread: Thread, wanted: Scheduling) -> None:
-    """Give a thread its class and cores, with what was there in the journal.
+    """:func:`change_all` for one thread."""
+    change_all(journal, ((thread, wanted),))
 
-    A thread that has ended meanwhile is no error.
+
+def change_all(journal: Journal, changes: Iterable[tuple[Thread, Scheduling]]) -> None:
+    """Give threads their class and cores, with what was there in the journal.
+
+    All is written down together before anything is changed. A thread that has ended meanwhile is
+    no error; one that we gave the same before, and has it, is not written down again.
 
     Raises:
-        OperationError: it runs under SCHED_DEADLINE, the journal cannot be written (then nothing
+        OperationError: one runs under SCHED_DEADLINE, the journal cannot be written (then nothing
             is changed), or the kernel refuses.
-        PlatformError: the privilege to change it is missing.
+        PlatformError: the privilege to change one is missing.
     """
-    try:
-        target = _target(state_of(thread.tid), wanted)
-        if note_scheduling(journal, thread, target):
+    targets = []
+    for thread, wanted in changes:
+        try:
+            targets.append((thread, _target(state_of(thread.tid), wanted)))
+        except ProcessLookupError:
+            continue
+    for thread, target in note_scheduling(journal, targets):
+        try:
             now = state_of(thread.tid)
             set_state(thread.tid, target, [a for a in ASPECTS if _differ(now, target, a)])
-    except ProcessLookupError:
-        return
-    except PermissionError as error:
-        raise PlatformError(
-            f"thread {thread.tid} ({thread.comm}) of process {thread.pid} may not be given "
-            f"{state_text(target)}: run as root or with CAP_SYS_NICE, or as the user of that "
-            "process with an rtprio limit of 98"
-        ) from error
-    except OSError as error:
-        raise OperationError(
-            f"thread {thread.tid} ({thread.comm}) of process {thread.pid}: the kernel refuses "
-            f"{state_text(target)}: {error.strerror}"
-        ) from error
+        except ProcessLookupError:
+            continue
+        except PermissionError as error:
+            raise PlatformError(
+                f"thread {thread.tid} ({thread.comm}) of process {thread.pid} may not be given "
+                f"{state_text(target)}: run as root or with CAP_SYS_NICE, or as the user of that "
+                "process with an rtprio limit of 98"
+            ) from error
+        except OSError as error:
+            raise OperationError(
+                f"thread {thread.tid} ({thread.comm}) of process {thread.pid}: the kernel refuses "
+                f"{state_text(target)}: {error.strerror}"
+            ) from error
 
 
-def note_scheduling(journal: Journal, thread: Thread, target: SchedulingState) -> bool:
-    """Write down what a thread has before it gets ``target``; False when it has ended.
+def note_scheduling(
+    journal: Journal, changes: Iterable[tuple[Thread, SchedulingState]]
+) -> tuple[tuple[Thread, SchedulingState], ...]:
+    """Write down what threads have before each gets its target; those that are to be changed.
 
-    For what is changed by other means than :func:`change_scheduling`.
+    For what is changed by other means than :func:`change_all`.
 
     Raises:
-        OperationError: it runs under SCHED_DEADLINE, or the journal cannot be written.
+        OperationError: one runs under SCHED_DEADLINE, or the journal cannot be written.
     """
-    try:
-        before = state_of(thread.tid)
-    except ProcessLookupError:
-        return False
-    if start_of(thread.pid, thread.tid) != thread.started:
-        return False  # its id belongs to another thread by now
-    if before.scheduling_class.policy == SCHED_DEADLINE:
-        raise OperationError(
-            f"thread {thread.tid} ({thread.comm}) of process {thread.pid} runs under "
-            "SCHED_DEADLINE, whose reservation is left alone: take it out of the plan, or give it "
-            f"another class first (`chrt --other --pid 0 {thread.tid}`)"
-        )
-    if not is_remembered(journal, thread):
-        # What it has from a thread of ours is not what it shall have afterwards.
-        family = [one for one in _remembered(journal) if one.pid == thread.pid]
-        before = _without_inheritance(before, thread.started, family)
-    journal.note(
-        KIND,
-        tid=thread.tid,
-        started=thread.started,
-        pid=thread.pid,
-        comm=thread.comm,
-        at=clock_gettime_ns(CLOCK_BOOTTIME) // TICK_NS,
-        cgroups=_cgroups_of(thread.tid),
-        before=state_as_json(before),
-        given=state_as_json(target),
-    )
-    return True
+    known = {one.identity: one for one in remembered_threads(journal)}
+    families: dict[int, list[Change]] = {}
+    for one in known.values():
+        families.setdefault(one.pid, []).append(one)
+    noted, entries = [], []
+    for thread, target in changes:
+        try:
+            before = state_of(thread.tid)
+        except ProcessLookupError:
+            continue
+        if start_of(thread.pid, thread.tid) != thread.started:
+            continue  # its id belongs to another thread by now
+        if before.scheduling_class.policy == SCHED_DEADLINE:
+            raise OperationError(
+                f"thread {thread.tid} ({thread.comm}) of process {thread.pid} runs under "
+                "SCHED_DEADLINE, whose reservation is left alone: take it out of the plan, or give "
+                f"it another class first (`chrt --other --pid 0 {thread.tid}`)"
+            )
+        earlier = known.get(thread.identity)
+        if earlier is None:
+            # What it has from a thread of ours is not what it shall have afterwards.
+            family = families.get(thread.pid, [])
+            before = _without_inheritance(before, thread.started, family)
+        elif before == target and target in earlier.given:
+            continue
+        noted.append((thread, target))
+        entries.append(_as_entry(thread, before, target))
+    if entries:
+        journal.note_all(KIND, entries)
+    return tuple(noted)
 
 
-def is_remembered(journal: Journal, thread: Thread) -> bool:
-    """Whether a thread's scheduling has been changed by way of this journal."""
-    return any((one.tid, one.started) == thread.identity for one in _remembered(journal))
+def note_descendants(journal: Journal) -> None:
+    """Write down processes that the journal's have started meanwhile, as long as that shows.
+
+    Raises:
+        OperationError: the journal cannot be written.
+    """
+    remembered = remembered_threads(journal)
+    known = {one.pid for one in remembered} | {pid for pid, _ in _descendants_noted(journal)}
+    new = [pid for pid in _families(journal, remembered) if pid not in known]
+    started = ((pid, start_of(pid, pid)) for pid in new)
+    entries = [{"pid": pid, "started": when} for pid, when in started if when is not None]
+    if entries:
+        journal.note_all(DESCENDANTS, entries)
 
 
 def restore_scheduling(journal: Journal) -> tuple[Outcome, ...]:
@@ -169,7 +217,7 @@ def restore_scheduling(journal: Journal) -> tuple[Outcome, ...]:
     """
     if journal.outdated:
         return ()
-    restored = tuple(_restore(one) for one in reversed(_remembered(journal)))
+    restored = tuple(_restore(one) for one in reversed(remembered_threads(journal)))
     return restored + restore_inherited(journal)
 
 
@@ -191,30 +239,91 @@ def release_threads(journal: Journal) -> None:
 def restore_inherited(journal: Journal) -> tuple[Outcome, ...]:
     """Give threads that inherited a class or cores of ours what their parent had before.
 
-    They are threads that started after the change, in a process of the journal, in one that it
-    started, or in a daemon. To be repeated while an application runs; threads in the journal are
-    not touched.
+    To be repeated while an application runs; threads in the journal are not touched.
     """
     if journal.outdated:
         return ()
-    remembered = _remembered(journal)
-    done = {(one.tid, one.started) for one in remembered}
-    parent_of = parents() if remembered else {}
-    outcomes = []
-    for pid in dict.fromkeys(one.pid for one in remembered):
-        family = [one for one in remembered if one.pid == pid]
-        new = (thread for child in descendants(parent_of, pid) for thread in list_threads(child))
-        for thread in new:
-            outcome = None if thread.identity in done else _disinherit(thread, family)
-            if outcome is not None:
-                done.add(thread.identity)
-                outcomes.append(outcome)
-    strangers = (thread for pid in parent_of for thread in list_threads(pid))
-    for daemon in (one for one in strangers if one.identity not in done):
-        outcome = _disinherit(daemon, _forebears(daemon, remembered))
-        if outcome is not None:
-            outcomes.append(outcome)
+    remembered = remembered_threads(journal)
+    done = {one.identity for one in remembered}
+    outcomes: list[Outcome] = []
+    for _ in range(_GENERATIONS if remembered else 0):
+        found = [
+            outcome
+            for thread, family in _born_of(journal, remembered)
+            if thread.identity not in done
+            if (outcome := _disinherit(thread, family)) is not None
+        ]
+        outcomes += found
+        # What starts threads all the time may have started one before it was reached itself.
+        if not any(one.fate == "restored" for one in found):
+            break
     return tuple(outcomes)
+
+
+def look_alikes(journal: Journal) -> tuple[str, ...]:
+    """Threads that have a real-time class and cores as we gave them, and are not known as ours.
+
+    They are strangers, or daemons that left their family before anybody looked: left as they are,
+    and named, in sentences. To be asked before all is undone.
+    """
+    remembered = [] if journal.outdated else remembered_threads(journal)
+    known = {one.identity for one in remembered}
+    known |= {thread.identity for thread, _ in _born_of(journal, remembered)}
+    found = []
+    for pid in parents() if remembered else ():
+        for thread in list_threads(pid):
+            if thread.priority == 0 or thread.identity in known:
+                continue  # cores alone are no likeness
+            try:
+                now = state_of(thread.tid)
+            except ProcessLookupError:
+                continue
+            if any(now in one.given and thread.started >= one.changed_at for one in remembered):
+                found.append(
+                    f"thread {thread.tid} ({thread.comm}) is left as it is: {state_text(now)}, as "
+                    "the application had it, but nothing shows that it is the application's; if "
+                    f"it is, `chrt --other --pid 0 {thread.tid}`"
+                )
+    return tuple(found)
+
+
+def _born_of(journal: Journal, remembered: list[Change]) -> list[tuple[Thread, list[Change]]]:
+    """Threads that are the application's, each with those from whom it may have inherited."""
+    found = [
+        (thread, family)
+        for pid, family in _families(journal, remembered).items()
+        for thread in list_threads(pid)
+    ]
+    for folder in groups_of(run_of(journal)):
+        members = (find_thread(tid) for tid in threads_in(folder))
+        found += [(thread, remembered) for thread in members if thread is not None]
+    return found
+
+
+def _families(journal: Journal, remembered: list[Change]) -> dict[int, list[Change]]:
+    """Processes that are the application's, each with the changes that it may have inherited."""
+    families: dict[int, list[Change]] = {}
+    for one in remembered:
+        families.setdefault(one.pid, []).append(one)
+    # A process that had begun when its thread was changed is still the same.
+    families = {
+        pid: family
+        for pid, family in families.items()
+        if (begun := start_of(pid, pid)) is not None
+        and begun <= min(one.changed_at for one in family)
+    }
+    for pid, started in _descendants_noted(journal):
+        if start_of(pid, pid) == started:
+            families.setdefault(pid, remembered)
+    parent_of = parents() if families else {}
+    for ancestor, family in list(families.items()):
+        for pid in descendants(parent_of, ancestor):
+            families.setdefault(pid, family)
+    return families
+
+
+def _descendants_noted(journal: Journal) -> tuple[tuple[int, int], ...]:
+    return journal.read(DESCENDANTS, process_of)
 
 
 def _target(now: SchedulingState, wanted: Scheduling) -> SchedulingState:
@@ -225,7 +334,7 @@ def _target(now: SchedulingState, wanted: Scheduling) -> SchedulingState:
     return now if wanted.cores is None else replace(now, cores=tuple(sorted(wanted.cores)))
 
 
-def _restore(one: _Remembered) -> Outcome:
+def _restore(one: Change) -> Outcome:
     if start_of(one.pid, one.tid) != one.started:
         return Outcome(one.tid, one.comm, "ended")
     try:
@@ -244,7 +353,7 @@ def _restore(one: _Remembered) -> Outcome:
     return Outcome(one.tid, one.comm, "restored" if ours else "unchanged")
 
 
-def _disinherit(thread: Thread, family: list[_Remembered]) -> Outcome | None:
+def _disinherit(thread: Thread, family: list[Change]) -> Outcome | None:
     """Put back what a thread inherited from one of the family; None when that is nothing."""
     try:
         now = state_of(thread.tid)
@@ -260,29 +369,8 @@ def _disinherit(thread: Thread, family: list[_Remembered]) -> Outcome | None:
     return Outcome(thread.tid, thread.comm, "restored", "it had inherited what we had set")
 
 
-def _forebears(thread: Thread, remembered: list[_Remembered]) -> list[_Remembered]:
-    """Those of whom a thread has everything that we gave them, which no relation would explain."""
-    if thread.priority == 0:
-        return []  # cores alone are no evidence
-    try:
-        now = state_of(thread.tid)
-    except ProcessLookupError:
-        return []
-    return [
-        one for one in remembered if now in one.given and _cgroups_of(thread.tid) == one.cgroups
-    ]
-
-
-def _cgroups_of(tid: int) -> str:
-    """The cgroups of a thread, in all hierarchies; empty when it has ended."""
-    try:
-        return read_proc(f"/proc/{tid}/cgroup").decode(errors="replace")
-    except OSError:
-        return ""
-
-
 def _without_inheritance(
-    state: SchedulingState, started: int, family: list[_Remembered]
+    state: SchedulingState, started: int, family: list[Change]
 ) -> SchedulingState:
     """A thread's scheduling with every aspect that is one of ours replaced by its parent's.
 
@@ -299,32 +387,44 @@ def _without_inheritance(
     return state
 
 
-def _remembered(journal: Journal) -> list[_Remembered]:
+def read_change(entry: Mapping[str, Any]) -> Change:
+    """A line of the journal as a value."""
+    before, given = state_from_json(entry["before"]), state_from_json(entry["given"])
+    tid, started, pid, at = (int(entry[name]) for name in ("tid", "started", "pid", "at"))
+    return Change(tid, started, pid, str(entry["comm"]), at, before, (given,))
+
+
+def _as_entry(thread: Thread, before: SchedulingState, target: SchedulingState) -> dict[str, Any]:
+    """What :func:`read_change` reads."""
+    return {
+        "tid": thread.tid,
+        "started": thread.started,
+        "pid": thread.pid,
+        "comm": thread.comm,
+        "at": clock_gettime_ns(CLOCK_BOOTTIME) // TICK_NS,
+        "before": state_as_json(before),
+        "given": state_as_json(target),
+    }
+
+
+def remembered_threads(journal: Journal) -> list[Change]:
     """The threads of a journal, each with its changes joined, in order of their first change.
 
     Where somebody else changed an aspect between two changes of ours, theirs is the original.
     """
-    threads: dict[tuple[int, int], _Remembered] = {}
-    for entry in journal.entries(KIND):
-        before, given = state_from_json(entry["before"]), state_from_json(entry["given"])
-        key = (entry["tid"], entry["started"])
-        if key not in threads:
-            threads[key] = _Remembered(
-                *key,
-                entry["pid"],
-                entry["comm"],
-                entry["at"],
-                entry["cgroups"],
-                before,
-                (given,),
-            )
+    threads: dict[tuple[int, int], Change] = {}
+    for change in journal.read(KIND, read_change):
+        earlier = threads.get(change.identity)
+        if earlier is None:
+            threads[change.identity] = change
             continue
-        earlier = threads[key]
         original = earlier.original
         for aspect in ASPECTS:
-            if all(_differ(before, known, aspect) for known in (original, *earlier.given)):
-                original = with_aspect(original, aspect, before)
-        threads[key] = replace(earlier, original=original, given=(*earlier.given, given))
+            known = (original, *earlier.given)
+            if all(_differ(change.original, one, aspect) for one in known):
+                original = with_aspect(original, aspect, change.original)
+        given = (*earlier.given, *change.given)
+        threads[change.identity] = replace(earlier, original=original, given=given)
     return list(threads.values())
 
 

@@ -15,8 +15,9 @@ import subprocess
 import threading
 import time
 
+from chainshaper.enforcement.own_processes import what_happened
 from chainshaper.enforcement.realtime import check_cores
-from chainshaper.enforcement.scx.kicker import start_kicker, what_happened
+from chainshaper.enforcement.scx.kicker import start_kicker
 from chainshaper.enforcement.scx.libbpf import delete_element, look_up_element, update_element
 from chainshaper.enforcement.scx.loading import (
     LoadedPolicy,
@@ -87,7 +88,7 @@ class ScxServers:
 
         Raises:
             InputError: the table has no such server.
-            OperationError: the thread has ended, is real-time, or may not run on the core.
+            OperationError: the thread is real-time, or may not run on the core.
         """
         core = next((s.core for s in self._table.servers if s.name == server), None)
         if core is None:
@@ -95,6 +96,8 @@ class ScxServers:
         with self._lock:
             self._check_in_use()
             descriptor = _examine_thread(tid, server, core)
+            if descriptor is None:
+                return
             known = self._members.pop(tid, None)
             if known is not None:
                 os.close(known[0])
@@ -113,6 +116,10 @@ class ScxServers:
             OperationError: the kernel refuses the policy, or it has ended (:meth:`failure`).
         """
         self.change(self._table, anchor_ns)
+
+    def in_force_from(self) -> int | None:
+        """See :meth:`BackEnd.in_force_from`."""
+        return self.in_force_since_ns or None
 
     def change(self, table: ServerTable, anchor_ns: int) -> None:
         """Put another table in force, on all cores at one instant.
@@ -275,12 +282,14 @@ def _check(table: ServerTable) -> None:
     check_cores({server.core: f"server {server.name}" for server in table.servers})
 
 
-def _examine_thread(tid: int, server: str, core: int) -> int:
-    """A descriptor of a thread that the policy can govern on this core."""
+def _examine_thread(tid: int, server: str, core: int) -> int | None:
+    """A descriptor of a thread that the policy can govern on this core; None when it has ended."""
     try:
         descriptor = thread_descriptor(tid)
         policy = os.sched_getscheduler(tid) & ~RESET_ON_FORK
         cores = os.sched_getaffinity(tid)
+    except ProcessLookupError:
+        return None
     except OSError as error:
         raise OperationError(
             f"thread {tid} cannot be put into server {server}: {error.strerror}"

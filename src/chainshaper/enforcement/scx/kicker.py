@@ -16,12 +16,13 @@ import os
 import subprocess
 import sys
 
+from chainshaper.enforcement.own_processes import module_command
 from chainshaper.enforcement.realtime import lock_memory, set_thread_name, stop_garbage_collection
 from chainshaper.enforcement.scx.libbpf import ProgramRun
 from chainshaper.enforcement.scx.table import INSTANT, WAKE
 from chainshaper.errors import OperationError
 
-__all__ = ["start_kicker", "what_happened"]
+__all__ = ["start_kicker"]
 
 PRIORITY = 1
 _CLOCK_MONOTONIC, _TIMER_ABSTIME = 1, 1
@@ -36,7 +37,7 @@ def start_kicker(core: int, program: int) -> subprocess.Popen[bytes]:
         OperationError: it cannot be started.
     """
     process = subprocess.Popen(
-        [sys.executable, "-m", __name__, str(core), str(program)],
+        [*module_command(__name__), str(core), str(program)],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -48,22 +49,6 @@ def start_kicker(core: int, program: int) -> subprocess.Popen[bytes]:
         reason = said.decode(errors="replace").strip().rpartition("\n")[2]
         raise OperationError(f"the kicker of core {core} cannot start: {reason}")
     return process
-
-
-def what_happened(process: subprocess.Popen[bytes]) -> str | None:
-    """Why a kicker is not at work any more, None while it is."""
-    options = os.WEXITED | os.WSTOPPED | os.WNOHANG | os.WNOWAIT
-    try:
-        state = os.waitid(os.P_PID, process.pid, options)
-    except ChildProcessError:
-        return "ended"
-    if state is None:
-        return None
-    if state.si_code == os.CLD_STOPPED:
-        return f"was stopped by signal {state.si_status}"
-    if state.si_code == os.CLD_EXITED:
-        return f"ended with status {state.si_status}"
-    return f"was killed by signal {state.si_status}"
 
 
 def main(core: int, program: int) -> None:

@@ -10,12 +10,15 @@ What no evidence covers stays unknown. Which nodes a process has, a recording sa
 earlier run, where the command line names one of them), or the remap rules of its command line; the
 name of its program is a guess, and called one.
 
+Whoever may say such things of himself: only processes of the users that are asked for are nodes
+(:mod:`.users`). Those of others that repeat a node's name are named, and left alone.
+
 Everything here is a function of what was seen at one instant (:mod:`.processes`). Threads that
 appear later are found by looking again and comparing (:func:`new_and_ended`).
 """
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from chainshaper.enforcement.threads.dds_names import ThreadRole
@@ -26,15 +29,21 @@ from chainshaper.enforcement.threads.node_names import (
     takes_ros_arguments,
 )
 from chainshaper.enforcement.threads.processes import Process, descendants
+from chainshaper.enforcement.threads.users import user_name
 
 __all__ = [
+    "LEFT_ALONE",
     "Allocation",
     "NodeThread",
     "RecordedProcess",
     "RecordedThread",
     "allocate",
     "new_and_ended",
+    "strangers_text",
 ]
+
+LEFT_ALONE = "left alone, since users run them whom this run does not name: "
+_MOST_NAMED = 5
 
 
 @dataclass(frozen=True)
@@ -75,10 +84,14 @@ class NodeThread:
 
 @dataclass(frozen=True)
 class Allocation:
-    """All threads of an application at one instant, and what is not certain about them."""
+    """All threads of an application at one instant, and what is not certain about them.
+
+    ``strangers`` is a line about processes of other users that say they are nodes, if any do.
+    """
 
     threads: tuple[NodeThread, ...]
     notes: tuple[str, ...]
+    strangers: str | None = None
 
 
 @dataclass(frozen=True)
@@ -95,15 +108,24 @@ def allocate(
     processes: Sequence[Process],
     recorded: Sequence[RecordedProcess] = (),
     among: Sequence[Process] | None = None,
+    users: Collection[int] | None = None,
 ) -> Allocation:
     """Find out what each thread of ``processes`` does.
 
     ``among`` are all processes that were looked at, where these are some of them: who started
     whom tells a node from the commands that run it. Two processes that both are a node, as far
-    as can be seen, are a note, and both are given the node.
+    as can be seen, are a note, and both are given the node. Where ``users`` are given, processes
+    of others have no nodes.
     """
     everybody = processes if among is None else among
-    identified = _with_unique_names([_identify(process, recorded) for process in everybody])
+    identified = _with_unique_names(
+        [
+            _identify(process, recorded)
+            if users is None or process.user in users
+            else _Identified(process, (), "", None)
+            for process in everybody
+        ]
+    )
     wanted = {process.pid for process in processes}
     chosen = [one for one in identified if one.process.pid in wanted]
     threads = [thread for one in chosen for thread in _threads_of(one)]
@@ -122,6 +144,28 @@ def new_and_ended(
     )
 
 
+def strangers_text(
+    processes: Iterable[Process], users: Collection[int], nodes: Collection[str] | None = None
+) -> str | None:
+    """One line about processes that are none of the users', and carry a name of one of ``nodes``.
+
+    Of any node if none are given.
+    """
+    found = [
+        f"{', '.join(names[:_MOST_NAMED])} (process {process.pid} of {user_name(process.user)})"
+        for process in processes
+        if process.user not in users
+        and (names := [n for n in _own_words(process)[0] if nodes is None or n in nodes])
+    ]
+    if not found:
+        return None
+    more = f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
+    return (
+        f"{LEFT_ALONE}{', '.join(found[:_MOST_NAMED])}{more}; to take them for nodes, name their "
+        "user (--user)"
+    )
+
+
 def _identify(process: Process, recorded: Sequence[RecordedProcess]) -> _Identified:
     named = named_nodes(process.command)
     match = next((seen for seen in recorded if _is_same(process, named, seen)), None)
@@ -132,11 +176,17 @@ def _identify(process: Process, recorded: Sequence[RecordedProcess]) -> _Identif
         earlier = next((seen.nodes for seen in recorded if set(named) < set(seen.nodes)), None)
         known_by = "command line" if earlier is None else "recording"
         return _Identified(process, earlier or named, known_by, match)
+    return _Identified(process, *_own_words(process), match)
+
+
+def _own_words(process: Process) -> tuple[tuple[str, ...], str]:
+    """The nodes that a process has by its command line, and which part of that says so."""
+    named = named_nodes(process.command)
+    if named:
+        return named, "command line"
     guess = guessed_name(process.command)
     looks_like_a_node = process.participates or takes_ros_arguments(process.command)
-    if guess is not None and looks_like_a_node:
-        return _Identified(process, (guess,), "program's name", match)
-    return _Identified(process, (), "", match)
+    return ((guess,), "program's name") if guess is not None and looks_like_a_node else ((), "")
 
 
 def _is_same(process: Process, named: tuple[str, ...], seen: RecordedProcess) -> bool:

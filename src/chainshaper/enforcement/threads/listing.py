@@ -160,13 +160,13 @@ def parents() -> dict[int, int]:
     return found
 
 
-def read_proc(path: str) -> bytes:
-    """A whole file of /proc.
+def read_proc(path: str, folder: int | None = None) -> bytes:
+    """A whole file of /proc; ``folder`` is an open one that ``path`` begins in.
 
     Raises:
         OSError: what it is about has ended, or belongs to somebody else.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC, dir_fd=folder)
     try:
         content = b""
         while part := os.read(descriptor, 1 << 16):
@@ -241,9 +241,11 @@ def foreign_realtime_processes() -> tuple[str, ...]:
     for pid, parent in parents().items():
         try:
             command = read_proc(f"/proc/{pid}/cmdline")
+            enforces = b"chainshaper.enforcement." in command
+            enforces &= Path(f"/proc/{pid}").stat().st_uid in (0, os.geteuid())
         except OSError:
             continue
-        if os.getpid() in (pid, parent) or not command or b"chainshaper.enforcement." in command:
+        if os.getpid() in (pid, parent) or not command or enforces:
             continue
         realtime = [t for t in list_threads(pid) if t.policy in ("SCHED_FIFO", "SCHED_RR")]
         if realtime:

@@ -18,6 +18,7 @@ from chainshaper.enforcement.threads.listing import (
     read_proc,
 )
 from chainshaper.enforcement.threads.node_names import takes_ros_arguments
+from chainshaper.enforcement.threads.users import process_folder, user_in
 
 __all__ = ["Process", "descendants", "find_applications", "list_processes", "read_process"]
 
@@ -32,7 +33,10 @@ _LIBRARIES_WITHOUT_NAMED_THREADS = (
 
 @dataclass(frozen=True)
 class Process:
-    """A process at one instant; ``inner_pid`` is its id in its own pid namespace."""
+    """A process at one instant; ``inner_pid`` is its id in its own pid namespace.
+
+    ``user`` is whose it is, None if no single user's (:mod:`.users`).
+    """
 
     pid: int
     parent: int
@@ -40,6 +44,7 @@ class Process:
     inner_pid: int
     participates: bool  # in DDS
     threads: tuple[Thread, ...]
+    user: int | None = None
 
 
 def list_processes(pids: Iterable[int] | None = None) -> tuple[Process, ...]:
@@ -50,16 +55,18 @@ def list_processes(pids: Iterable[int] | None = None) -> tuple[Process, ...]:
 
 def read_process(pid: int) -> Process | None:
     """A process, None when it is gone, dead, or the kernel's own."""
-    folder = f"/proc/{pid}"
     try:
-        command = read_proc(f"{folder}/cmdline")
-        if not command:
-            return None
-        status = read_proc(f"{folder}/status").decode(errors="replace")
+        with process_folder(pid) as folder:
+            user = user_in(folder)
+            command = read_proc("cmdline", folder)
+            if not command:
+                return None
+            status = read_proc("status", folder).decode(errors="replace")
+            threads = list_threads(pid)
+            # It is the same process still, and the same user's: its id is no other's by now.
+            if not threads or user_in(folder) != user:
+                return None
     except OSError:
-        return None
-    threads = list_threads(pid)
-    if not threads:
         return None
     parent = next(line.split()[1] for line in status.splitlines() if line.startswith("PPid:"))
     return Process(
@@ -69,6 +76,7 @@ def read_process(pid: int) -> Process | None:
         inner_pid=innermost_id(status) or pid,
         participates=_participates(pid, threads),
         threads=threads,
+        user=user,
     )
 
 

@@ -233,7 +233,7 @@ def _threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThr
         raise OperationError(
             f"node {planned.node} of the plan is not running, or cannot be recognised; running: "
             f"{', '.join(known) or 'no node'}; start it with `--ros-args -r __node:=NAME`, or name "
-            "a recording of it"
+            "a recording of it" + (f"; {allocation.strangers}" if allocation.strangers else "")
         )
     if not found:
         what = "asynchronous publisher" if planned.role == "publisher" else planned.role

@@ -1,7 +1,8 @@
 """The few pieces of HTML that the report's tables are made of; every text is escaped here."""
 
 from collections.abc import Sequence
-from html import escape
+
+from chainshaper.safe_text import escape
 
 __all__ = ["Group", "details", "listed", "paragraph", "section", "table"]
 

@@ -9,7 +9,6 @@ import base64
 import hashlib
 import json
 from collections.abc import Sequence
-from html import escape
 from importlib import resources
 from pathlib import Path
 from string import Template
@@ -23,6 +22,7 @@ from chainshaper.reporting.html.markup import details, paragraph, section
 from chainshaper.reporting.html.series import plan_drawing, recording_data
 from chainshaper.reporting.html.told import Told
 from chainshaper.reporting.timeline import timeline_of
+from chainshaper.safe_text import escape, shown
 from chainshaper.steps import Measurement
 from chainshaper.whole_file import new_file, write_whole
 
@@ -191,5 +191,14 @@ def _filled(title: str, headline: str, sections: Sequence[str], data: dict[str, 
 
 def _embedded(data: dict[str, Any]) -> str:
     """JSON in which nothing can end the block that it stands in."""
-    text = json.dumps(data, ensure_ascii=True, separators=(",", ":"))
+    text = json.dumps(_safe(data), ensure_ascii=True, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
+def _safe(value: Any) -> Any:
+    """Plain data with all its texts as they are shown."""
+    if isinstance(value, str):
+        return shown(value)
+    if isinstance(value, dict):
+        return {key: _safe(one) for key, one in value.items()}
+    return [_safe(one) for one in value] if isinstance(value, list | tuple) else value

@@ -14,6 +14,7 @@ from chainshaper.reporting.breakdown import PARTS, hop_breakdown
 from chainshaper.reporting.cells import (
     ABSENT,
     FIGURES,
+    count,
     min_mean_max,
     ms,
     percent,
@@ -25,7 +26,7 @@ from chainshaper.reporting.cells import (
 from chainshaper.reporting.html.markup import Group, Row, details, paragraph, table
 from chainshaper.reporting.html.told import Told
 from chainshaper.reporting.machine import stall_rows
-from chainshaper.reporting.predictions import band_name
+from chainshaper.reporting.predictions import band_name, late_text, range_ms, verdict
 from chainshaper.steps import Measurement
 
 __all__ = [
@@ -48,10 +49,14 @@ def headline(recordings: Sequence[Told]) -> str:
     """One line per recording: what a reader remembers."""
     lines = []
     for told in recordings:
-        found = told.measurement.analysis.undisturbed
+        found, every = told.measurement.analysis.undisturbed, told.measurement.analysis.statistics
         times = map(ms, (found.jitter_ns, found.mean_ns, found.max_ns))
-        lines.append([told.name, *times, f"{found.count:,}"])
-    return table(["at publication [ms]", "jitter", "average", "maximum", "cycles"], lines)
+        whole = ms(every.max_ns), count(every.late)
+        lines.append([told.name, *times, f"{found.count:,}", *whole])
+    head = ["at publication [ms]", "jitter", "average", "maximum", "cycles"]
+    content = table([*head, "maximum of all", "late of all"], lines)
+    spells = [(told.name, told.measurement.left_out.text) for told in recordings]
+    return content + "".join(paragraph(f"{name}: {text}.") for name, text in spells if text)
 
 
 def comparison_table(recordings: Sequence[Told]) -> str:
@@ -78,6 +83,7 @@ def comparison_table(recordings: Sequence[Told]) -> str:
         ["incomplete", *map(_incomplete, measurements)],
         ["too late for their slot", *map(_overruns, measurements)],
         ["came when it was open", *map(_into_open_slots, measurements)],
+        ["messages lost at the gate", *map(_dropped, measurements)],
         ["begun without publishing", *(str(a.silent) for a in analyses)],
         ["longest stall of the machine [ms]", *(ms(m.longest_stall_ns) for m in measurements)],
     ]
@@ -93,6 +99,7 @@ def _statistics(columns: Sequence[LatencyStatistics | None]) -> list[Row]:
         values = [None if one is None else one.percentiles_ns.get(key) for one in columns]
         rows.append([title, *map(ms, values)])
     rows.append(["cycles", *(ABSENT if one is None else str(one.count) for one in columns)])
+    rows.append(["came late", *(ABSENT if one is None else count(one.late) for one in columns)])
     return rows
 
 
@@ -113,6 +120,14 @@ def _overruns(measurement: Measurement) -> str:
     if measurement.overruns is None:
         return "not gated"
     return str(sum(measurement.overruns.values()))
+
+
+def _dropped(measurement: Measurement) -> str:
+    if measurement.dropped is None:
+        return "not gated"
+    total = sum(measurement.dropped.values())
+    why = ", ".join(f"{count} {reason}" for reason, count in measurement.dropped.items())
+    return f"{total} ({why})" if why else str(total)
 
 
 def _into_open_slots(measurement: Measurement) -> str:
@@ -145,15 +160,18 @@ def prediction_tables(recordings: Sequence[Told]) -> str:
             f"The plan's prediction and {told.name}, undisturbed cycles [ms]. Predicted: outputs"
             " at the start … the end of their slots."
         )
+        if held.counted_from == "cycle":
+            about += " Times count from the start of the cycle."
+        if held.late_of_all is not None:
+            said = late_text(held)
+            about += f" {said[0].upper()}{said[1:]}."
         head = ["", "predicted", "measured", "verdict"]
         parts += [paragraph(about), table(head, rows)]
     return "\n".join(parts)
 
 
 def _held(title: str, figure: FigureHeld) -> list[str]:
-    predicted = f"{ms(figure.at_start_ns)} … {ms(figure.at_end_ns)}"
-    verdict = {True: "as predicted", False: "differs", None: ABSENT}[figure.holds]
-    return [title, predicted, ms(figure.measured_ns), verdict]
+    return [title, range_ms(figure), ms(figure.measured_ns), verdict(figure)]
 
 
 def incomplete_table(recordings: Sequence[Told]) -> str:

@@ -2,7 +2,7 @@
 
 # ruff: noqa: PLR0917 - what is known of a trace on the way down its metadata
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from uuid import UUID
 
@@ -83,9 +83,11 @@ class Assembly:
     program: Program = field(default_factory=Program)
     stream_rows: list[list[int]] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
+    events_of: dict[int, list[Event]] = field(default_factory=dict)  # by the table's number
     # Rows of the stream classes of each folder: first, end.
     folders: list[tuple[int, int]] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
+    table_numbers: dict[Table, int] = field(default_factory=dict)
     ids: list[int] = field(default_factory=list)
     counters: int = 0
     registers: int = len(tb.REGISTERS)
@@ -121,25 +123,28 @@ def attach(assembly: Assembly, table: int, storage: Storage, time: int, cpu: int
 
     ``time`` and ``cpu`` are the addresses of those columns, ``cpu`` 0 for none.
     """
-    for event in assembly.events:
-        if event.table == table:
-            row = event.row
-            start, stop = assembly.program.add(event.steps, storage)
-            row[tb.E_FILL], row[tb.E_FILL_STOP] = start, stop
-            row[tb.E_TIME], row[tb.E_CPU] = time, cpu
-            row[tb.E_CONSTANT] = int(
-                row[tb.E_ALIGN] >= 8
-                and row[tb.E_SIZE] > 0
-                and assembly.program.offsets(start, stop)
-            )
+    for event in assembly.events_of[table]:
+        row = event.row
+        start, stop = assembly.program.add(event.steps, storage)
+        row[tb.E_FILL], row[tb.E_FILL_STOP] = start, stop
+        row[tb.E_TIME], row[tb.E_CPU] = time, cpu
+        row[tb.E_CONSTANT] = int(
+            row[tb.E_ALIGN] >= 8 and row[tb.E_SIZE] > 0 and assembly.program.offsets(start, stop)
+        )
 
 
 def _folder(assembly: Assembly, trace: TraceClass, wanted: Wanted) -> None:
     reader = Reader(big=trace.byte_order == "be", registers=len(tb.REGISTERS))
     header, _ = compile_fields(reader, "trace.packet.header", trace.packet_header, fixed=True)
-    pending: list[tuple[list[int], list[Step], list[Step]]] = []
+    pending: list[tuple[list[int], Iterable[int], list[Step], list[Step]]] = []
     for stream in trace.streams.values():
-        own = Reader(reader.big, reader.registers, dict(reader.roots))
+        own = Reader(
+            reader.big,
+            reader.registers,
+            dict(reader.roots),
+            steps=reader.steps,
+            labels=reader.labels,
+        )
         packet, _ = compile_fields(own, "stream.packet.context", stream.packet_context, fixed=True)
         event, _ = compile_fields(own, "stream.event.header", stream.event_header, fixed=True)
         row = [0] * tb.STREAM_COLUMNS
@@ -155,15 +160,20 @@ def _folder(assembly: Assembly, trace: TraceClass, wanted: Wanted) -> None:
         has_cpu = bool(row[tb.S_KNOWN] >> tb.R_CPU & 1)
         rows = _events(assembly, own, stream, trace, has_cpu, wanted)
         reader.registers = max(reader.registers, own.registers)
+        reader.steps = own.steps
         row[tb.S_ID_FIRST : tb.S_DEFAULT + 1] = _id_table(assembly, rows)
         assembly.stream_rows.append(row)
-        pending.append((row, packet, event))
+        pending.append((row, rows.values(), packet, event))
     # Only now is it known which of the headers' numbers anybody refers to.
-    start, stop = assembly.program.add(header, None)
-    for row, packet, event in pending:
+    program = assembly.program
+    start, stop = program.add(header, None)
+    for row, events, packet, event in pending:
         row[tb.S_HEADER], row[tb.S_HEADER_STOP] = start, stop
-        row[tb.S_CONTEXT], row[tb.S_CONTEXT_STOP] = assembly.program.add(packet, None)
-        row[tb.S_EVENT], row[tb.S_EVENT_STOP] = assembly.program.add(event, None)
+        row[tb.S_CONTEXT], row[tb.S_CONTEXT_STOP] = context = program.add(packet, None)
+        row[tb.S_EVENT], row[tb.S_EVENT_STOP] = own_header = program.add(event, None)
+        row[tb.S_COST] = tb.P_ROW + program.cost(start, stop) + program.cost(*context)
+        for number in events:
+            assembly.events[number].row[tb.E_COST] += program.cost(*own_header)
     assembly.registers = max(assembly.registers, reader.registers)
 
 
@@ -179,19 +189,23 @@ def _events(
     rows: dict[int, int] = {}
     roots = dict(reader.roots)
     for event in stream.events.values():
-        own = Reader(reader.big, reader.registers, dict(roots))
+        own = Reader(
+            reader.big, reader.registers, dict(roots), steps=reader.steps, labels=reader.labels
+        )
         keep = event.name in wanted.names
         steps, columns = _event(own, stream, event, trace, wanted)
-        reader.registers = max(reader.registers, own.registers)
+        reader.registers, reader.steps = max(reader.registers, own.registers), own.steps
         number, storage = -1, None
         row = [0] * tb.EVENT_COLUMNS
         row[tb.E_COUNTER] = -1
         if keep:
             number = _table(assembly, event.name, columns, own, has_cpu)
             table = assembly.tables[number]
-            storage = Storage(table.counter)
+            storage = Storage(table.counter, _row_bytes(table))
             row[tb.E_COUNTER], row[tb.E_LEVELS] = table.counter, table.levels
+            row[tb.E_COST] = storage.costs[0]
         start, stop = row[tb.E_WALK], row[tb.E_WALK_STOP] = assembly.program.add(steps, storage)
+        row[tb.E_COST] += assembly.program.cost(start, stop)
         only = assembly.program.rows[start:stop]
         if not only:
             row[tb.E_ALIGN] = 1
@@ -200,6 +214,7 @@ def _events(
         rows[event.id] = len(assembly.events)
         place = len(assembly.stream_rows)
         assembly.events.append(Event(event.name, row, number, steps, place))
+        assembly.events_of.setdefault(number, []).append(assembly.events[-1])
     return rows
 
 
@@ -279,10 +294,20 @@ def _table(
     """The number of the table for events of this name and shape."""
     slots, counter = tuple(reader.slots), assembly.counters
     table = Table(name, tuple(columns), slots, reader.levels, has_cpu, counter)
-    if table not in assembly.tables:
+    number = assembly.table_numbers.setdefault(table, len(assembly.tables))
+    if number == len(assembly.tables):
         assembly.tables.append(table)
         assembly.counters += reader.levels
-    return assembly.tables.index(table)
+    return number
+
+
+def _row_bytes(table: Table) -> list[int]:
+    """The bytes that a row of each level of a table takes."""
+    found = [0] * table.levels
+    found[0] = 8 + 4 * table.has_cpu
+    for slot in table.slots:
+        found[slot.level] += np.dtype(slot.dtype).itemsize
+    return found
 
 
 def _id_table(assembly: Assembly, rows: dict[int, int]) -> list[int]:
@@ -290,7 +315,7 @@ def _id_table(assembly: Assembly, rows: dict[int, int]) -> list[int]:
     first = len(assembly.ids)
     dense = max((i + 1 for i in rows if i < _DENSE_IDS), default=0)
     assembly.ids += [rows.get(i, -1) for i in range(dense)]
-    pairs = [(i, row) for i, row in rows.items() if i >= dense]
+    pairs = sorted((i, row) for i, row in rows.items() if i >= dense)  # searched by halves
     for identifier, row in pairs:
         assembly.ids += [identifier, row]
     return [first, dense, len(pairs), next(iter(rows)) if len(rows) == 1 else 0]

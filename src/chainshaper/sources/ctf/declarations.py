@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import NoReturn
 
 from chainshaper.sources.ctf.attributes import (
@@ -252,7 +253,9 @@ class Parser:
                     self.fail("more than 10000 fields")
         names = [f.name for f in fields]
         if len(set(names)) != len(names):
-            self.fail(f"field {next(n for n in names if names.count(n) > 1)!r} declared twice")
+            ordered = sorted(names)
+            twice = next(a for a, b in pairwise(ordered) if a == b)
+            self.fail(f"field {twice!r} declared twice")
         return fields
 
     def _declarators(self, kind: Type) -> Iterator[Field]:

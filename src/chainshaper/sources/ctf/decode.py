@@ -27,6 +27,7 @@ __all__ = ["LARGE_BYTES", "Stream", "Walk", "default_threads", "fill", "span_bor
 _walk_events = kernel("chainshaper.sources.ctf.kernels", "walk_events")
 _fill_columns = kernel("chainshaper.sources.ctf.filling", "fill_columns")
 _CHUNK_BYTES = 128 << 20
+_MOST_WARNINGS = 20
 _SMALL_BYTES = 4 << 20
 LARGE_BYTES = 512 << 20
 _FAILURES = {
@@ -35,6 +36,8 @@ _FAILURES = {
     tb.BAD_LENGTH: "an array or sequence is longer than the rest of its packet",
     tb.UNTERMINATED: "a string does not end within its packet",
     tb.UNKNOWN_EVENT: "an event id that the metadata does not declare",
+    tb.OVER_BUDGET: "its fields, most of them of no bits, would take far more memory than its size"
+    f" warrants ({tb.BUDGET} times)",
     tb.FULL_TABLE: "more events than were counted",
 }
 
@@ -123,7 +126,8 @@ def _chunk(packets: NDArray[np.int64], first: int) -> int:
 
 
 def _packet_warnings(stream: Stream) -> list[str]:
-    return [
+    damaged = stream.packets[stream.packets[:, tb.P_ERROR] < 0]
+    warnings = [
         str(
             CtfError(
                 stream.path,
@@ -132,8 +136,13 @@ def _packet_warnings(stream: Stream) -> list[str]:
                 "the rest of this packet is not read",
             )
         )
-        for packet in stream.packets[stream.packets[:, tb.P_ERROR] < 0]
+        for packet in damaged[:_MOST_WARNINGS]
     ]
+    if len(damaged) > _MOST_WARNINGS:
+        warnings.append(
+            f"{stream.path}: {len(damaged) - _MOST_WARNINGS} more packets are like that"
+        )
+    return warnings
 
 
 def fill(

@@ -28,7 +28,7 @@ from chainshaper.compiled.memory import (
 from chainshaper.sources.ctf import tables as tb
 from chainshaper.sources.ctf.texts import digest_text, digest_whole, intern, word_at
 
-__all__ = ["advance_clock", "execute", "move_batch"]
+__all__ = ["advance_clock", "afforded", "execute", "move_batch"]
 
 
 @compiled()
@@ -65,6 +65,14 @@ def keep(op, value, rows):
         store_byte(target, value)
     else:
         store_half(target, value)
+
+
+@compiled(inline=True)
+def afforded(state, cost):
+    """Spend some of the budget; whether it lasts."""
+    left = get(state, tb.X_BUDGET) - cost
+    put(state, tb.X_BUDGET, left)
+    return left >= 0
 
 
 @compiled(inline=True)
@@ -162,15 +170,20 @@ def run_many(machine, op, base, end, position, regs, depth):
     code, register = get(op, tb.O_CODE), get(op, tb.O_REGISTER)
     count = get(op, tb.O_COUNT) if register < 0 else get(regs, register)
     least = get(op, tb.O_LEAST) if code == tb.LOOP else get(op, tb.O_SIZE)
-    if count < 0 or position > end or count > (end - position) // max(least, np.int64(1)):
+    if count < 0 or count >= tb.ENDLESS or position > end:
         return np.int64(tb.BAD_LENGTH)
+    if least > 0 and count > (end - position) // least:
+        return np.int64(tb.BAD_LENGTH)
+    state = get(machine, tb.M_STATE)
+    if not afforded(state, count * get(op, tb.O_COST)):
+        return np.int64(tb.OVER_BUDGET)
     rows, inner = get(machine, tb.M_ROWS), get(op, tb.O_INNER)
     if inner >= 0 and get(rows, inner) + count > get(get(machine, tb.M_CAPS), inner):
         return np.int64(tb.FULL_TABLE)
     if get(op, tb.O_ADDRESS) != 0:
         keep(op, np.uint64(count), rows)
     if code == tb.LOOP:
-        put(get(machine, tb.M_STATE), tb.X_STACK + depth, count)
+        put(state, tb.X_STACK + depth, count)
         return position
     if code == tb.COPY:
         run_copy(op, base, position, count, rows)
@@ -237,7 +250,7 @@ def execute(machine, first, last, base, mapped, end, position, regs, row):
     """
     ops, state = get(machine, tb.M_OPS), get(machine, tb.M_STATE)
     op, stop = ops + (first << 7), ops + (last << 7)
-    depth, turns = np.int64(0), np.int64(0)
+    depth = np.int64(0)
     while op < stop:
         code, align = get(op, tb.O_CODE), get(op, tb.O_ALIGN)
         position = (position + align - 1) & -align
@@ -284,10 +297,6 @@ def execute(machine, first, last, base, mapped, end, position, regs, row):
             if inner >= 0:
                 rows = get(machine, tb.M_ROWS)
                 put(rows, inner, get(rows, inner) + 1)
-            # Elements of no bits must not keep us here for ever.
-            turns += 1
-            if turns > 2 * end + 1024:
-                return np.int64(tb.BAD_LENGTH)
             left = get(state, tb.X_STACK + depth - 1) - 1
             put(state, tb.X_STACK + depth - 1, left)
             if left > 0:

@@ -13,7 +13,7 @@ import numpy as np
 
 from chainshaper.compiled.memory import compiled, get, load_word, put
 from chainshaper.sources.ctf import tables as tb
-from chainshaper.sources.ctf.interpreter import advance_clock, execute
+from chainshaper.sources.ctf.interpreter import advance_clock, afforded, execute
 
 __all__ = [
     "copy_numbers",
@@ -67,7 +67,7 @@ def scan_packets(machine, regs, base, size, packets, room, reached, first, last)
     folder's stream classes are the rows [first, last).  Returns the status; a packet that the
     file cuts short is listed with status CUT.
     """
-    streams = get(machine, tb.M_STREAMS)
+    streams, state = get(machine, tb.M_STREAMS), get(machine, tb.M_STATE)
     leading = streams + first * tb.S_ROW
     while get(reached, 0) < size:
         offset, found = get(reached, 0), get(reached, 1)
@@ -95,6 +95,8 @@ def scan_packets(machine, regs, base, size, packets, room, reached, first, last)
         if stream == last:
             return np.int64(tb.BAD_STREAM)
         row = streams + stream * tb.S_ROW
+        if not afforded(state, get(row, tb.S_COST) + stream - first):
+            return np.int64(tb.COSTLY)
         position = execute(
             machine, get(row, tb.S_CONTEXT), get(row, tb.S_CONTEXT_STOP),
             start, mapped, mapped * 8, position, regs, np.int64(0),
@@ -138,9 +140,16 @@ def event_class(machine, stream, identifier):
     dense = get(stream, tb.S_ID_DENSE)
     if 0 <= identifier < dense:
         return get(ids, identifier)
-    for index in range(dense, dense + 2 * get(stream, tb.S_ID_PAIRS), 2):
-        if get(ids, index) == identifier:
-            return get(ids, index + 1)
+    pairs = ids + 8 * dense
+    low, high = np.int64(0), get(stream, tb.S_ID_PAIRS)
+    while low < high:
+        middle = (low + high) >> 1
+        if get(pairs, 2 * middle) < identifier:
+            low = middle + 1
+        else:
+            high = middle
+    if low < get(stream, tb.S_ID_PAIRS) and get(pairs, 2 * low) == identifier:
+        return get(pairs, 2 * low + 1)
     return np.int64(-1)
 
 
@@ -219,6 +228,7 @@ def walk_events(
         at, end = get(packet, tb.P_BYTE), get(packet, tb.P_END)
         frequency = get(stream, tb.S_FREQUENCY)
         start, mapped = base + at, size - at
+        put(state, tb.X_BUDGET, tb.BUDGET * ((end + 7) >> 3))
         position = open_packet(machine, packet, base, size, regs)
         if position < 0:
             put(packet, tb.P_ERROR, position)
@@ -243,6 +253,8 @@ def walk_events(
                 if levels > 1:
                     copy_numbers(saved, rows + 8 * counter, levels)
                 after = step_over(machine, row, start, mapped, end, after, regs)
+                if not afforded(state, get(row, tb.E_COST)):
+                    after = np.int64(tb.OVER_BUDGET)
             if after < 0 or after == position:
                 if levels > 1:
                     copy_numbers(rows + 8 * counter, saved, levels)

@@ -53,7 +53,8 @@ __all__ = [
 ]
 
 _DEEPEST = 12
-_MOST_STEPS = 100_000
+_MOST_STEPS = 200_000
+"""Types to lay out in a trace: one with all the kernel's events has some 10,000."""
 
 
 class LayoutError(ValueError):
@@ -135,7 +136,8 @@ class Reader:
 
     ``roots`` maps a dynamic scope (``stream.event.context``, …) to the numbers read there so
     far; ``slots`` and ``levels`` grow with every column wanted; ``registers`` is the next free
-    register for a number that a length or a tag refers to.
+    register for a number that a length or a tag refers to. ``steps`` counts the types of the whole
+    trace that were laid out, ``labels`` has its enumerations by label.
     """
 
     big: bool
@@ -145,6 +147,7 @@ class Reader:
     levels: int = 1
     steps: int = 0
     sparse: bool = False
+    labels: dict[int, dict[str, list[tuple[int, int]]]] = field(default_factory=dict)
 
     def slot(self, level: int, dtype: str) -> int:
         """A new slot's index."""
@@ -328,17 +331,29 @@ def _choice(
     tag = reader.number(kind.tag, frames)
     slot = reader.slot(level, "u2") if keep else -1
     outer, reader.sparse = reader.sparse, True
+    ranges_of = _ranges_by_label(reader, tag)
     options: list[tuple[tuple[tuple[int, int], ...], list[Step]]] = []
     columns: list[tuple[str, Shape | None]] = []
     frame: Frame = {}
     frames[-1][name] = frame
     for option in kind.options:
-        ranges = tuple(
-            (m.low, m.high) for m in tag.mappings if option.name in (m.label, "_" + m.label)
-        )
+        bare = option.name.removeprefix("_")
+        ranges = tuple(ranges_of.get(option.name, []))
+        ranges += tuple(ranges_of.get(bare, [])) if bare != option.name else ()
+        reader.steps += len(ranges)
         steps, shape = _compile(reader, option.name, option.type, [*frames, frame], level, keep)
         options.append((ranges, steps))
         columns.append((field_name(option.name), shape))
     reader.sparse = outer
     choice = Choice(tag, options, slot, level)
     return [choice], OptionShape(slot, tuple(columns)) if keep else None
+
+
+def _ranges_by_label(reader: Reader, tag: Number) -> dict[str, list[tuple[int, int]]]:
+    """The values that choose each option of a variant; many variants may share one enumeration."""
+    found = reader.labels.get(id(tag.mappings))
+    if found is None:
+        found = reader.labels[id(tag.mappings)] = {}
+        for mapping in tag.mappings:
+            found.setdefault(mapping.label, []).append((mapping.low, mapping.high))
+    return found

@@ -35,10 +35,12 @@ _CONSTANT = {tb.SKIP, tb.CHARACTERS, *_MOVES.values()}
 class Storage:
     """Where a table's slots lie (addresses and bytes per row) and its first row counter.
 
-    Without addresses (``()``) rows are counted only.
+    Without addresses (``()``) rows are counted only; ``costs`` are then the bytes that a row of
+    each level takes.
     """
 
     counter: int
+    costs: Sequence[int] = ()
     addresses: Sequence[int] = ()
     widths: Sequence[int] = ()
 
@@ -51,12 +53,14 @@ class Program:
     ranges: list[tuple[int, int, int, int]] = field(default_factory=list)
     # Operations may not be joined across a place that is jumped to.
     joint: int = 0
+    _made: tuple[NDArray[np.int64], NDArray[np.int64]] | None = None
 
     def add(self, steps: list[Step], storage: Storage | None) -> tuple[int, int]:
         """Append ``steps``; returns their first operation and the one after their last."""
         start = self.joint = len(self.rows)
         self._emit(steps, storage)
         self.joint = len(self.rows)
+        self._made = None
         return start, len(self.rows)
 
     def offsets(self, start: int, stop: int) -> bool:
@@ -71,10 +75,20 @@ class Program:
             position += 8 * row[tb.O_COUNT] if code == tb.CHARACTERS else row[tb.O_SIZE]
         return True
 
+    def cost(self, start: int, stop: int) -> int:
+        """What running operations once costs at most, the turns of their loops aside."""
+        switches = sum(
+            row[tb.O_LEAST] for row in self.rows[start:stop] if row[tb.O_CODE] == tb.SWITCH
+        )
+        return stop - start + switches
+
     def arrays(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Operations (n x 16) and ranges (m x 4), never empty."""
-        rows = self.rows or [[0] * tb.OPERATION_COLUMNS]
-        return np.array(rows, np.int64), np.array(self.ranges or [(0, 0, 0, 0)], np.int64)
+        if self._made is None:
+            rows = self.rows or [[0] * tb.OPERATION_COLUMNS]
+            ranges = self.ranges or [(0, 0, 0, 0)]
+            self._made = np.array(rows, np.int64), np.array(ranges, np.int64)
+        return self._made
 
     def _row(self, code: int, values: Mapping[int, int]) -> list[int]:
         row = [0] * tb.OPERATION_COLUMNS
@@ -165,6 +179,7 @@ class Program:
             tb.O_REGISTER: register,
             tb.O_COUNT: step.count,
             tb.O_INNER: inner,
+            tb.O_COST: storage.costs[step.inner] if counted and storage and storage.costs else 0,
             **self._place(step.slot, step.level, storage),
         }
         if fixed is not None and even and fixed[1] > 0:
@@ -181,6 +196,7 @@ class Program:
         self._emit(step.body, storage)
         self._row(tb.AGAIN, {tb.O_TARGET: start, tb.O_INNER: inner})
         loop[tb.O_TARGET] = self.joint = len(self.rows)
+        loop[tb.O_COST] += self.cost(start, len(self.rows))
 
     def _copied(self, step: Repeat, storage: Storage | None) -> Number | None:
         """An array's element, if elements lie in the packet just as they lie in its slot."""

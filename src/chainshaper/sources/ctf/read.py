@@ -204,8 +204,8 @@ def _allocate(assembly: Assembly, number: int, total: NDArray[np.int64]) -> _Arr
     arrays = _Arrays(table, total)
     storage = Storage(
         table.counter,
-        [a.ctypes.data for a in arrays.slots],
-        [a.itemsize for a in arrays.slots],
+        addresses=[a.ctypes.data for a in arrays.slots],
+        widths=[a.itemsize for a in arrays.slots],
     )
     cpu = arrays.cpu.ctypes.data if arrays.cpu is not None else 0
     attach(assembly, number, storage, arrays.time.ctypes.data, cpu)

@@ -21,6 +21,7 @@ _REASONS = {
     tb.BAD_STREAM: "packet of a stream class that the metadata does not declare",
     tb.BAD_SIZE: "packet with impossible content or packet size",
     tb.BAD_HEADER: "packet header cut short",
+    tb.COSTLY: "packet headers that take far more work than their size warrants",
     tb.CUT: "last packet cut short by the end of the file",
 }
 
@@ -36,6 +37,7 @@ class Scratch:
         counters = max(assembly.counters, 1)
         ops, ranges = assembly.program.arrays()
         self.state = np.zeros(tb.STATE_WORDS, np.int64)
+        self.state[tb.X_BUDGET] = 1 << 62
         self.rows = np.zeros(counters, np.int64)
         self.caps = np.full(counters, 1 << 62, np.int64)
         self.registers = np.zeros((files, assembly.registers), np.int64)
@@ -127,6 +129,7 @@ def packet_table(
         return np.zeros((0, tb.PACKET_COLUMNS), np.int64), []
     file = MappedFile(path)
     scratch = Scratch(assembly)
+    scratch.state[tb.X_BUDGET] = tb.BUDGET * file.size
     packets = np.zeros((256, tb.PACKET_COLUMNS), np.int64)
     first, last = assembly.folders[folder]
     reached = np.zeros(2, np.int64)

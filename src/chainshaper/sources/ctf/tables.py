@@ -36,8 +36,8 @@ AHEAD = 64
 NEVER = (1 << 63) - 2
 """Later than all times; one more is still a number."""
 
-# The state: what a run reads and advances.
-X_CLOCK, X_STRINGS, X_UNSORTED, X_LATEST, X_STACK = range(5)
+# The state: what a run reads and advances. BUDGET is what may still be spent (see `BUDGET`).
+X_CLOCK, X_STRINGS, X_UNSORTED, X_LATEST, X_BUDGET, X_STACK = range(6)
 STATE_WORDS = X_STACK + 16
 
 # Packets, in order of the file.
@@ -78,8 +78,9 @@ STATE_WORDS = X_STACK + 16
     S_KNOWN,  # bit n: register n is read in the header or context
     S_UUID_LOW,
     S_UUID_HIGH,
+    S_COST,  # of a packet
     STREAM_COLUMNS,
-) = range(20)
+) = range(21)
 
 # Event classes of all stream classes.
 (
@@ -94,8 +95,9 @@ STATE_WORDS = X_STACK + 16
     E_TIME,  # address of row 0
     E_CPU,  # address of row 0 or 0
     E_CONSTANT,  # 1 where every event is laid out alike, SIZE bits of it
+    E_COST,
     EVENT_COLUMNS,
-) = range(12)
+) = range(13)
 
 # Stream files, for one span of time.
 (
@@ -141,7 +143,8 @@ A_TIME, A_EVENT, A_ADDRESS, AHEAD_COLUMNS = range(4)
     O_INNER_ADDRESS,  # where COPY writes
     O_LEAST,  # the least bits an element takes; number of ranges of SWITCH
     O_OFFSET,  # bytes from the aligned start of an event of constant layout
-) = range(14)
+    O_COST,  # of an element of SKIP_MANY, COPY and LOOP
+) = range(15)
 OPERATION_COLUMNS = 16
 
 SKIP, NUMBER, TEXT, CHARACTERS, SKIP_MANY, COPY, LOOP, AGAIN, SWITCH, JUMP = range(10)
@@ -153,12 +156,23 @@ P_ROW, S_ROW, E_ROW = 8 * PACKET_COLUMNS, 8 * STREAM_COLUMNS, 8 * EVENT_COLUMNS
 F_ROW, C_ROW, A_ROW = 8 * FILE_COLUMNS, 8 * CURSOR_COLUMNS, 8 * AHEAD_COLUMNS
 O_ROW, B_ROW = 8 * OPERATION_COLUMNS, 8 * (1 + 2 * BATCH)
 
+BUDGET = 64
+"""What decoding may cost for each byte of a packet, and finding packets for each byte of a file.
+
+An operation costs 1, a byte of a column as well. Fields of no bits would else cost anything: a
+few bytes of a packet could fill the memory. A bit that becomes a number of its own costs 3.
+"""
+
+ENDLESS = 1 << 40
+"""More elements than any packet has, even of no bits; times what one costs it is still a number."""
+
 # Why a run ended early.
+OVER_BUDGET = -8
 FULL_TABLE, FULL_DICTIONARY, UNKNOWN_EVENT = -7, -6, -5
 UNTERMINATED, BAD_LENGTH, NO_OPTION, TRUNCATED = -4, -3, -2, -1
 
 # How a scan for packets ended, and what was wrong where.
-DONE, FULL, BAD_MAGIC, BAD_UUID, BAD_STREAM, BAD_SIZE, BAD_HEADER, CUT = range(8)
+DONE, FULL, BAD_MAGIC, BAD_UUID, BAD_STREAM, BAD_SIZE, BAD_HEADER, CUT, COSTLY = range(9)
 
 # Registers: the numbers that the decoder itself needs.
 R_ID, R_MAGIC, R_STREAM, R_INSTANCE, R_BEGIN, R_END = range(6)

@@ -3,19 +3,49 @@
 Upstream: elf(5).
 """
 
+import os
+import stat
 import struct
 from collections.abc import Iterator
 from pathlib import Path
 
-__all__ = ["exported_functions", "function_offsets"]
+__all__ = ["exported_functions", "function_offsets", "open_regular", "read_regular"]
+
+_LONGEST = 512 << 20
 
 _SYMTAB, _DYNSYM, _FUNCTION, _LOAD = 2, 11, 2, 1  # elf.h: SHT_…, STT_FUNC, PT_LOAD
+
+
+def open_regular(path: Path) -> int:
+    """Open a file at a path that a process of the application has named: no pipe, no device.
+
+    Raises:
+        OSError: it is no ordinary file, or cannot be read.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(f"{path} is no ordinary file")
+    return descriptor
+
+
+def read_regular(path: Path, longest: int = _LONGEST) -> bytes:
+    """The contents of such a file.
+
+    Raises:
+        OSError: as :func:`open_regular`, or it is longer than that.
+    """
+    with open(open_regular(path), "rb") as file:
+        content = file.read(longest + 1)
+    if len(content) > longest:
+        raise OSError(f"{path} has more than {longest} bytes")
+    return content
 
 
 def exported_functions(path: Path) -> frozenset[str]:
     """The functions in a file's dynamic symbol table; none if it is no such file."""
     try:
-        content = path.read_bytes()
+        content = read_regular(path)
         return frozenset(name for _, name in _functions(content, (_DYNSYM,)))
     except (OSError, LookupError, struct.error, ValueError):
         return frozenset()
@@ -24,7 +54,7 @@ def exported_functions(path: Path) -> frozenset[str]:
 def function_offsets(path: Path) -> dict[int, str]:
     """Where functions begin in a file, in bytes, and their names; also of those not exported."""
     try:
-        content = path.read_bytes()
+        content = read_regular(path)
         loaded = list(_segments(content))
         return {
             address - memory + offset: name

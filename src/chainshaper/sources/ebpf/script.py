@@ -25,12 +25,18 @@ RMW's name, of its data and of the topic's name. Before tracetools 8 the former 
 
 Times are of CLOCK_BOOTTIME, as bpftrace takes them.
 
+bpftrace runs the script as root, so nothing stands in it that somebody else may have written:
+events, which we know, numbers, and paths of plain characters only. Who traces a file of another
+name gives it open, as `/proc/PID/fd/N`.
+
 Upstream: bpftrace 0.17 to 0.26; rmw, `rmw/types.h`; rcl, `publisher_impl.h` (Humble, Iron).
 """
 
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
+from chainshaper.errors import InputError
 from chainshaper.sources.ebpf.trace_points import FUNCTION_PREFIX, Argument, TracePoint
 
 __all__ = [
@@ -57,6 +63,7 @@ TEXT_BYTES = 64 * TEXT_LINES - 8
 NAME_PLACE, RMW_PLACE = 8, 9
 """Places, beyond any argument's, of the topic's and the RMW's name of a handle."""
 
+_PLAIN = re.compile(r"[A-Za-z0-9/._+ -]+")
 _WORDS = 8
 _WHO = "\\t%lld\\t%d\\t%d\\t%d"
 _TOPIC_NAME_AT = 16  # in rmw_publisher_t and rmw_subscription_t, on 64-bit machines
@@ -64,15 +71,24 @@ _RMW_HANDLE_AT_HUMBLE, _RMW_HANDLE_AT_IRON = 240, 248  # in rcl_publisher_impl_t
 
 
 def bpftrace_script(
-    points: Sequence[TracePoint], traced: Iterable[int] = (), *, attached: bool = False
+    points: Sequence[TracePoint],
+    traced: Iterable[int] = (),
+    *,
+    users: Collection[int] = (),
+    attached: bool = False,
 ) -> str:
     """The script for some trace points.
 
-    ``traced`` are the processes to which, with all that they start, events are limited; empty: to
-    none. ``attached`` is whether names of handles are read that were created before.
+    ``traced`` are the processes to which, with all that they start, events are limited; without
+    them ``users`` are the user ids to whose processes they are, empty: to none. ``attached`` is
+    whether names of handles are read that were created before.
+
+    Raises:
+        InputError: a file's path is not of plain characters.
     """
     limits = [f"@traced[{pid}] = 1;" for pid in traced]
-    restriction = " /@traced[pid]/" if limits else ""
+    theirs = " || ".join(f"uid == {user}" for user in sorted(users))
+    restriction = " /@traced[pid]/" if limits else f" /{theirs}/" if theirs else ""
     maps = ["@running", *(["@traced"] if limits else [])]
     if attached and any(_named_by(point) for point in points):
         maps.append("@named")
@@ -101,6 +117,11 @@ def _block(probe: str, statements: Iterable[str]) -> str:
 
 def _quoted(path: Path) -> str:
     """A path as bpftrace takes it, which separates probes' parts by colons."""
+    if not _PLAIN.fullmatch(str(path)):
+        raise InputError(
+            f"{str(path)!r}: a path with such characters is not written into a script that root "
+            "runs: rename it, or give the file open, as /proc/PID/fd/N"
+        )
     return f'"{path}"'
 
 

@@ -13,12 +13,12 @@ Upstream: bpftrace(8); `src/bpftrace.cpp` of bpftrace 0.17 to 0.26.
 """
 
 import os
-import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -26,13 +26,16 @@ import polars as pl
 
 from chainshaper import events
 from chainshaper.enforcement.gate import clock_offset
+from chainshaper.enforcement.own_processes import is_installed, tool_environment
 from chainshaper.enforcement.realtime import signalled_with_parent
 from chainshaper.enforcement.threads.listing import parents
 from chainshaper.enforcement.threads.processes import descendants
+from chainshaper.enforcement.threads.users import run_users, user_name, user_of
 from chainshaper.errors import InputError, OperationError, PlatformError
 from chainshaper.events import EventTables
 from chainshaper.recording import RecordingInfo
 from chainshaper.sources.ebpf.callback_functions import callback_functions
+from chainshaper.sources.ebpf.elf_symbols import open_regular
 from chainshaper.sources.ebpf.late_attachment import ADDED, with_found_objects, with_functions
 from chainshaper.sources.ebpf.output import HEADER, Printed, lost_events, read_printed
 from chainshaper.sources.ebpf.script import TEXT_BYTES, bpftrace_script
@@ -70,10 +73,18 @@ _FIRST_PID_NAMESPACE = "pid:[4026531836]"  # linux/proc_ns.h: PROC_PID_INIT_INO
 class EbpfTracer:
     """Records with bpftrace: a :class:`~chainshaper.sources.tracer.Tracer`."""
 
-    def __init__(self, folder: Path, command: Sequence[str], pids: Sequence[int]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        command: Sequence[str],
+        pids: Sequence[int],
+        users: Collection[int] | None = None,
+    ) -> None:
         self._folder = folder.absolute()
         self._attached = not command
         self._pids = tuple(pids)
+        self._users = run_users() if users is None else users
+        self._open: dict[Path, int] = {}
         self._points: tuple[TracePoint, ...] = ()
         self._bpftrace: subprocess.Popen[bytes] | None = None
         self._began_ns = 0
@@ -87,19 +98,36 @@ class EbpfTracer:
     def start(self) -> Mapping[str, str]:
         """Find the libraries, write the script, and wait until its probes are in place."""
         _check_privileges()
-        if shutil.which("bpftrace") is None:
+        if not is_installed("bpftrace"):
             raise PlatformError(
                 "bpftrace is not installed: install it (Debian and Ubuntu: `apt-get install "
                 "bpftrace`; 0.17 or later), or record with `--source lttng`"
             )
         self._points = trace_points(self._libraries())
-        script = bpftrace_script(self._points, self._traced(), attached=self._attached)
+        script = bpftrace_script(
+            self._by_descriptor(), self._traced(), users=self._users, attached=self._attached
+        )
         (self._folder / _SCRIPT).write_text(script)
         self._clock_offset_ns, self._ahead_ns = clock_offset(), _boot_time_ahead()
         self._bpftrace = self._launched()
         self._wait_until_attached(self._bpftrace)
         self._began_ns = time.monotonic_ns()
         return {}
+
+    def _by_descriptor(self) -> tuple[TracePoint, ...]:
+        """The trace points in their files as we have them open, whatever the files are called.
+
+        A path is text that whoever owns a folder chooses, and what it leads to may change.
+        """
+        for file in dict.fromkeys(point.file for point in self._points):
+            try:
+                self._open[file] = open_regular(file)
+            except OSError as error:
+                raise OperationError(f"{file}: cannot be traced: {error}") from error
+        ours = f"/proc/{os.getpid()}/fd"
+        return tuple(
+            replace(point, file=Path(f"{ours}/{self._open[point.file]}")) for point in self._points
+        )
 
     def failure(self) -> str | None:
         """Look whether bpftrace is there."""
@@ -129,13 +157,18 @@ class EbpfTracer:
         with suppress(OSError, pl.exceptions.PolarsError):  # `recording` says what is wrong
             self._printed = self._read()
             # As long as the application runs: its memory tells.
-            self._functions = callback_functions(_callbacks(self._printed.tables))
+            callbacks = _callbacks(self._printed.tables)
+            self._functions = callback_functions(
+                one for one in callbacks if self._pids or user_of(one[0]) in self._users
+            )
 
     def remove(self) -> None:
         """End bpftrace if it still runs; the kernel removes its probes with it."""
         if self._bpftrace is not None and self._bpftrace.poll() is None:
             self._bpftrace.kill()
             self._bpftrace.wait()
+        while self._open:
+            os.close(self._open.popitem()[1])
 
     def recording(self) -> tuple[EventTables, RecordingInfo]:
         """The events that bpftrace printed, and what is known of a system that ran already."""
@@ -178,21 +211,24 @@ class EbpfTracer:
                     "container is started first, then attached to (no COMMAND)"
                 )
         else:
-            mapped = mapped_libraries(parents())
-            strangers = [pid for pid in self._pids if not _family((pid,)) & mapped.keys()]
-            if strangers:
+            family = _family(self._pids)
+            pids = (pid for pid in parents() if pid in family or user_of(pid) in self._users)
+            mapped = mapped_libraries(pids)
+            unsuited = [pid for pid in self._pids if not _family((pid,)) & mapped.keys()]
+            if unsuited:
                 raise InputError(
-                    f"process {', '.join(map(str, strangers))} neither uses {LIBRARY}, as every "
+                    f"process {', '.join(map(str, unsuited))} neither uses {LIBRARY}, as every "
                     "ROS 2 node does, nor has started one that does: give processes of nodes "
                     "(`chainshaper threads` lists them)"
                 )
             if self._pids:
-                mapped = {pid: mapped[pid] for pid in _family(self._pids) & mapped.keys()}
+                mapped = {pid: mapped[pid] for pid in family & mapped.keys()}
             libraries = tuple(dict.fromkeys(one for found in mapped.values() for one in found))
             if not libraries:
                 raise OperationError(
-                    f"no process that runs uses {LIBRARY}, so there is no ROS 2 node to attach to: "
-                    "start the application first, or give the COMMAND that does behind `--`"
+                    f"no process of {', '.join(map(user_name, sorted(self._users)))} uses "
+                    f"{LIBRARY}, so there is no ROS 2 node to attach to: start the application "
+                    "first, give the COMMAND that does behind `--`, or name who runs it (--user)"
                 )
         if not trace_points(libraries):
             paths = ", ".join(str(library.path) for library in libraries)
@@ -210,9 +246,9 @@ class EbpfTracer:
         wanted = self._pids or (os.getpid(),)
         if Path("/proc/self/ns/pid").readlink() != Path(_FIRST_PID_NAMESPACE):
             self._notes.append(
-                "inside a container bpftrace cannot tell which process is which: everything on "
-                "this machine that uses the same libraries was recorded, under the machine's "
-                "process numbers."
+                "inside a container bpftrace cannot tell which process is which: everything of "
+                "the same users on this machine that uses the same libraries was recorded, under "
+                "the machine's process numbers."
             )
             return ()
         return tuple(sorted(_family(wanted)))
@@ -227,7 +263,7 @@ class EbpfTracer:
             printed.flush()
             return subprocess.Popen(
                 command,
-                env={**_SETTINGS, **os.environ},
+                env={**_SETTINGS, **tool_environment()},
                 stdin=subprocess.DEVNULL,
                 stdout=printed,
                 stderr=said,

@@ -18,13 +18,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeAlias
 
-from chainshaper.sources.ebpf.elf_symbols import exported_functions
+from chainshaper.sources.ebpf.elf_symbols import exported_functions, read_regular
 
 __all__ = ["LIBRARY", "TracingLibrary", "installed_libraries", "mapped_libraries"]
 
 LIBRARY = "libtracetools.so"
 _INSTALLATIONS = Path("/opt/ros")
-_VERSION = re.compile(r"<version>\s*((\d+)[^<\s]*)\s*</version>")
+_VERSION = re.compile(r"<version>\s*((\d{1,9})(?!\d)[^<\s]{0,99})\s*</version>")
+_LONGEST_PACKAGE = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,8 @@ def _version(library: Path) -> str | None:
     """The version of tracetools, as its package says beside the library."""
     for folder in library.parents[1:3]:  # `lib`, or `lib/x86_64-linux-gnu`, is in the prefix
         with suppress(OSError):
-            text = (folder / "share/tracetools/package.xml").read_text(errors="replace")
+            package = folder / "share/tracetools/package.xml"
+            text = read_regular(package, _LONGEST_PACKAGE).decode(errors="replace")
             found = _VERSION.search(text)
             if found is not None:
                 return found[1]

@@ -29,7 +29,6 @@ Upstream: lttng-tools, `utils_get_rundir` and `set_session_daemon_path`; lttng-u
 
 import os
 import shlex
-import shutil
 import signal
 import subprocess
 import tempfile
@@ -41,6 +40,7 @@ from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
+from chainshaper.enforcement.own_processes import is_installed, tool_environment
 from chainshaper.enforcement.realtime import signalled_with_parent
 from chainshaper.enforcement.threads.listing import read_proc
 from chainshaper.errors import OperationError, PlatformError
@@ -137,7 +137,7 @@ def connect() -> Lttng:
         PlatformError: LTTng is not installed, or cannot make two recordings at a time here.
         OperationError: the daemon does not start; with its own words.
     """
-    if shutil.which("lttng") is None:
+    if not is_installed("lttng"):
         raise PlatformError(f"the command `lttng` is not there: {_PACKAGES}")
     lttng = _without_daemon()
     try:
@@ -151,7 +151,7 @@ def connect() -> Lttng:
                 "not mount: wait for its end, or record where mounting is permitted (Docker: "
                 "`--privileged`)"
             )
-        if shutil.which("lttng-sessiond") is None:
+        if not is_installed("lttng-sessiond"):
             raise PlatformError(
                 f"no LTTng session daemon runs, and `lttng-sessiond` is not there: {_PACKAGES}"
             )
@@ -194,7 +194,9 @@ def _run_directory_apart(home: Path) -> tuple[str, ...]:
     folder.mkdir()
     inside = (*_APART, str(folder))
     try:
-        trial = subprocess.run([*inside, "true"], capture_output=True, check=False)
+        trial = subprocess.run(
+            [*inside, "true"], env=_environment(home), capture_output=True, check=False
+        )
     except OSError:  # no `unshare` here
         return ()
     return inside if trial.returncode == 0 else ()
@@ -241,4 +243,4 @@ def _last_line(lines: Sequence[str]) -> str:
 
 
 def _environment(home: Path) -> dict[str, str]:
-    return {**os.environ, "LTTNG_HOME": str(home)}
+    return {**tool_environment(), "LTTNG_HOME": str(home)}

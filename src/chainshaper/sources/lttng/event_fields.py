@@ -45,14 +45,6 @@ CARET_INIT = "caret_init"
 """An event that is read, but is no table of ours."""
 
 _PROVIDERS = ("ros2", "ros2_caret")
-_VERSIONS = {
-    "rmw_publish": {"rmw_publisher_handle", "timestamp"},  # since Jazzy
-    "rmw_take": {"taken"},
-    "callback_start": {"is_intra_process"},
-    "rclcpp_ring_buffer_enqueue": {"overwritten"},
-    "dispatch_subscription_callback": {"source_stamp"},
-}
-"""Fields that not every version has, and that the analysis asks for as such."""
 
 
 def table_name(event: str) -> str | None:
@@ -88,7 +80,11 @@ def missing_fields(declared: DeclaredFields, counts: Mapping[str, int]) -> tuple
     notes = []
     for name in sorted(happened & declared.keys() & events.FIELDS.keys()):
         fields = declared[name]
-        wanted = {f: t for f, t in events.FIELDS[name].items() if f not in _VERSIONS.get(name, ())}
+        wanted = {
+            f: t
+            for f, t in events.FIELDS[name].items()
+            if f not in events.VERSION_FIELDS.get(name, ())
+        }
         missing = [f for f, t in wanted.items() if f not in fields or not _fits(fields[f], t)]
         if missing:
             notes.append(
@@ -139,7 +135,7 @@ def event_table(frame: pl.DataFrame, name: str, clock_offset_ns: int) -> pl.Data
     for column, kind in types.items():
         if _castable(frame.schema.get(column), kind):
             columns.append(pl.col(column).cast(kind, strict=False))
-        elif column not in _VERSIONS.get(name, ()):
+        elif column not in events.VERSION_FIELDS.get(name, ()):
             columns.append(pl.lit(None, dtype=kind).alias(column))
     table = frame.select(columns)
     # `sched_switch` names its threads itself.

@@ -12,23 +12,29 @@ import polars as pl
 
 from chainshaper.enforcement.threads.listing import parents, read_proc
 from chainshaper.enforcement.threads.processes import descendants
+from chainshaper.enforcement.threads.users import process_folder, user_in
 from chainshaper.events import EventTables
 from chainshaper.recording import RecordingInfo
 
 __all__ = ["processes_apart", "without_processes"]
 
 
-def processes_apart(mark: str) -> tuple[set[int], set[int]]:
-    """The living processes that somebody else has started, and those that we have."""
+def processes_apart(mark: str, users: Collection[int]) -> tuple[set[int], set[int]]:
+    """The living processes that somebody else has started, and those that we have.
+
+    The ``mark`` counts in processes of these ``users``: others can read and write it as well.
+    """
     parent_of = parents()
     unrelated = set(parent_of) - descendants(parent_of, os.getpid())
-    others = {pid for pid in unrelated if not _is_marked(pid, mark)}
+    others = {pid for pid in unrelated if not _is_marked(pid, mark, users)}
     return others, set(parent_of) - others
 
 
-def _is_marked(pid: int, mark: str) -> bool:
+def _is_marked(pid: int, mark: str, users: Collection[int]) -> bool:
     try:
-        return mark.encode() in read_proc(f"/proc/{pid}/environ").split(b"\0")
+        with process_folder(pid) as folder:
+            marked = mark.encode() in read_proc("environ", folder).split(b"\0")
+            return marked and user_in(folder) in users
     except OSError:  # it has ended, or is another user's
         return False
 

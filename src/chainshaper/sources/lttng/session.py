@@ -23,11 +23,12 @@ Upstream: lttng-enable-channel(1), `tracetools_trace` of ros2_tracing (events, c
 import os
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
 from chainshaper.durations import format_duration
+from chainshaper.enforcement.threads.users import run_users
 from chainshaper.errors import InputError, OperationError
 from chainshaper.events import EventTables
 from chainshaper.recording import RecordingInfo
@@ -60,7 +61,12 @@ class LttngSession:
     """
 
     def __init__(
-        self, folder: Path, command: Sequence[str], pids: Sequence[int], buffer: int | None = None
+        self,
+        folder: Path,
+        command: Sequence[str],
+        pids: Sequence[int],
+        buffer: int | None = None,
+        users: Collection[int] | None = None,
     ) -> None:
         if pids or not command:
             raise InputError(
@@ -69,6 +75,7 @@ class LttngSession:
             )
         self._folder = folder
         self._buffer = buffer_size(wanted=buffer)
+        self._users = run_users() if users is None else users
         self._lttng: Lttng | None = None
         self._kernel = False
         self._strangers: set[int] = set()
@@ -137,7 +144,7 @@ class LttngSession:
     def _look_for_strangers(self, lttng: Lttng) -> None:
         """Note who else runs, if the daemon is somebody's and so hears everybody."""
         if lttng.daemon is None:
-            others, own = processes_apart(f"{MARK}={self._sessions[0]}")
+            others, own = processes_apart(f"{MARK}={self._sessions[0]}", self._users)
             self._strangers = (self._strangers | others) - own
 
     def _kernel_tracer(self, lttng: Lttng) -> bool:

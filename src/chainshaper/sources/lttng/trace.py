@@ -25,6 +25,7 @@ import polars as pl
 
 from chainshaper import events
 from chainshaper.errors import InputError, OperationError
+from chainshaper.events import CREATION
 from chainshaper.recording import Recording, RecordingInfo
 from chainshaper.sources.ctf import CtfTrace, Events, count_events, open_trace, read_events
 from chainshaper.sources.ctf.types import ArrayType
@@ -38,7 +39,7 @@ from chainshaper.sources.lttng.event_fields import (
 )
 from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids, rmw_of_threads
 
-__all__ = ["CREATION", "NEXT_HOST", "Progress", "TraceTables", "open_lttng_trace"]
+__all__ = ["NEXT_HOST", "Progress", "TraceTables", "open_lttng_trace"]
 
 Progress: TypeAlias = Callable[[float, str], None]
 """Told the share of the work that is done, from 0 to 1, and what is being done."""
@@ -48,12 +49,6 @@ NEXT_HOST = 10_000_000
 
 _EXECUTOR = frozenset(name for name in events.FIELDS if name.startswith("rclcpp_executor_"))
 _SWITCHES = frozenset(("sched_switch",))
-CREATION = frozenset(
-    name
-    for name in events.FIELDS
-    if name.endswith(("_init", "_added", "_register", "_link_node", "_to_ipb", "_to_subscription"))
-) | {"rmw_implementation", "rclcpp_construct_ring_buffer"}
-"""The events of objects' creation, which say what all others are about."""
 _UPPER_LAYERS = frozenset(("rclcpp_publish", "rcl_publish", "rcl_take", "rclcpp_take"))
 _MESSAGES = frozenset(events.FIELDS) - _EXECUTOR - _SWITCHES - CREATION - _UPPER_LAYERS
 _GROUPS = (CREATION, _MESSAGES, _UPPER_LAYERS, _EXECUTOR, _SWITCHES)

@@ -2,36 +2,157 @@
 
 The Python that has `rclpy` is seldom ours, and domain and RMW are those of the application's nodes.
 So what has to be asked of ROS 2 is asked by a small script of its own, in a process of its own.
+
+An environment says which programs and libraries are loaded: who wrote it chooses what runs. So this
+is the one place where something is run that was found through another process, and it runs with
+that process's user's rights or not at all:
+
+* as that user, with the groups of the user database, without capabilities, and with no way to get
+  any (`no_new_privs`);
+* in that environment and no other, in a session of its own, with no files of ours but the script,
+  and what it may print into: 8 MiB;
+* for a limited time, and no longer than we run ourselves.
+
+Even the search for the interpreter is that process's. An environment is not taken from a process
+that is no single user's (`sudo` carries that of whoever called it), nor from one in a container or
+a namespace of its own, whose paths lead elsewhere here. What a script prints is a stranger's word.
 """
 
+import ctypes
+import fcntl
 import os
-import shlex
-import shutil
+import pwd
+import signal
 import subprocess
+import time
 from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+from chainshaper.enforcement.realtime import signalled_with_parent
 from chainshaper.enforcement.threads.listing import read_proc
+from chainshaper.enforcement.threads.users import process_folder, user_in, user_name
 from chainshaper.errors import OperationError
 
-__all__ = ["environment_of", "run_with_rclpy", "start_with_rclpy", "why_it_failed"]
+__all__ = [
+    "Environment",
+    "Script",
+    "environment_of",
+    "own_environment",
+    "run_with_rclpy",
+    "start_with_rclpy",
+]
 
 _NOT_FOR_US = ("LD_PRELOAD",)
 """What is loaded into the nodes for tracing shall not trace us."""
 
+_WITH_ITS_PYTHON = """
+set -f
+if ros2=$(command -v ros2) && IFS= read -r first < "$ros2"; then
+    case $first in "#!"*) exec ${first#??} - "$@" ;; esac
+fi
+exec python3 - "$@"
+"""
+"""The Python that the environment's `ros2` runs with: another one cannot load `rclpy`."""
 
-def environment_of(pid: int) -> dict[str, str]:
-    """The environment that a process was started with; empty when it may not be read."""
+_MOST_PRINTED = 8 << 20
+_LOOKS = 5
+_SAME_PLACES = ("ns/user", "ns/mnt", "root")
+_PR_SET_NO_NEW_PRIVS, _CAPABILITY_VERSION_3 = 38, 0x20080522
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+@dataclass(frozen=True)
+class Environment:
+    """An environment, and the user whose rights whatever is found through it gets."""
+
+    variables: Mapping[str, str]
+    user: int
+
+
+@dataclass(frozen=True)
+class Script:
+    """A script that runs, with the files of what it has ``printed`` and ``said`` on its errors."""
+
+    process: "subprocess.Popen[bytes]"
+    printed: int
+    said: int
+
+    def is_over(self) -> bool:
+        """Look whether it has ended."""
+        return self.process.poll() is not None
+
+    def end(self, within_s: float = 0.0) -> tuple[str, str | None]:
+        """Wait for its end, and end it with all of its session's group when that takes longer.
+
+        To be called once.
+
+        Returns:
+            What it printed, and why it failed, if it did.
+        """
+        problem = None
+        try:
+            code = self.process.wait(within_s)
+        except subprocess.TimeoutExpired:
+            problem = f"ROS 2 did not answer within {within_s:g} s"
+            os.killpg(self.process.pid, signal.SIGKILL)  # it has not been waited for: still its id
+            code = self.process.wait()
+        printed, said = _content(self.printed), _content(self.said)
+        if problem is None and code != 0:
+            last = next((line for line in reversed(said.splitlines()) if line.strip()), "")
+            problem = last.strip() or f"the script ended with code {code}"
+        return ("" if problem else printed), problem
+
+
+def environment_of(pid: int) -> Environment:
+    """The environment of a process, as it has it now.
+
+    Raises:
+        OperationError: it has ended, may not be read, or nothing of it may be run by us.
+    """
     try:
-        content = read_proc(f"/proc/{pid}/environ").decode(errors="replace")
-    except OSError:
-        return {}
+        with process_folder(pid) as folder:
+            user = user_in(folder)
+            for _ in range(_LOOKS):
+                if user is not None:
+                    break
+                time.sleep(0.01)  # it may be about to become another program
+                user = user_in(folder)
+            content = read_proc("environ", folder).decode(errors="surrogateescape")
+            elsewhere = any(
+                os.readlink(place, dir_fd=folder) != str(Path("/proc/self", place).readlink())
+                for place in _SAME_PLACES
+            )
+            same = user_in(folder) == user  # nor has it become another program meanwhile
+    except OSError as error:
+        raise OperationError(
+            f"the environment of process {pid} cannot be read: {error.strerror}"
+        ) from error
+    if user is None or not same:
+        raise OperationError(
+            f"process {pid} was started by another user than runs it, so nothing that its "
+            "environment names is run"
+        )
+    if elsewhere:
+        raise OperationError(
+            f"process {pid} is in a container or a namespace of its own, so nothing that its "
+            "environment names is run here: run chainshaper in there"
+        )
+    _becoming(user)
     pairs = (entry.partition("=") for entry in content.split("\0") if "=" in entry)
-    return {name: value for name, _, value in pairs}
+    return Environment({name: value for name, _, value in pairs if name}, user)
+
+
+def own_environment() -> Environment:
+    """The environment that we were started with ourselves."""
+    return Environment(dict(os.environ), os.geteuid())
 
 
 def run_with_rclpy(
-    environment: Mapping[str, str], script: str, *arguments: str, within_s: float
+    environment: Environment, script: str, *arguments: str, within_s: float
 ) -> tuple[str, str | None]:
     """Run a script file in a node's environment, and wait for its end.
 
@@ -39,58 +160,83 @@ def run_with_rclpy(
         What it printed, and why it failed, if it did.
     """
     try:
-        process = start_with_rclpy(environment, script, *arguments)
+        return start_with_rclpy(environment, script, *arguments).end(within_s)
     except OperationError as error:
         return "", str(error)
-    with process:
-        try:
-            printed, said = process.communicate(timeout=within_s)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            return "", f"ROS 2 did not answer within {within_s:g} s"
-    problem = why_it_failed(process, said)
-    return ("" if problem else printed), problem
 
 
-def start_with_rclpy(
-    environment: Mapping[str, str], script: str, *arguments: str
-) -> "subprocess.Popen[str]":
-    """Start a script file in a node's environment; what it prints is for the caller to read.
+def start_with_rclpy(environment: Environment, script: str, *arguments: str) -> Script:
+    """Start a script file in an environment, as the user whose it is.
 
     Raises:
-        OperationError: there is no such Python.
+        OperationError: we may not become that user, or nothing can be started.
     """
-    command = [*_interpreter(environment), script, *arguments]
+    as_user = _becoming(environment.user)
+    variables = {n: text for n, text in environment.variables.items() if n not in _NOT_FOR_US}
+    printed, said = _bounded_file(), _bounded_file()
     try:
-        return subprocess.Popen(
-            command,
-            env={name: text for name, text in environment.items() if name not in _NOT_FOR_US},
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            errors="replace",
-            start_new_session=True,
-        )
+        with Path(script).open("rb") as source:  # that user may not reach the file itself
+            process = subprocess.Popen(
+                ["/bin/sh", "-c", _WITH_ITS_PYTHON, "sh", *arguments],
+                env=variables,
+                cwd="/",
+                stdin=source,
+                stdout=printed,
+                stderr=said,
+                start_new_session=True,
+                preexec_fn=partial(_confine, os.getpid()),  # noqa: PLW1509 - a few system calls
+                **as_user,
+            )
     except OSError as error:
-        raise OperationError(f"{command[0]} cannot be started: {error.strerror}") from error
+        os.close(printed)
+        os.close(said)
+        raise OperationError(
+            f"no script of user {user_name(environment.user)} can be started: {error.strerror}"
+        ) from error
+    return Script(process, printed, said)
 
 
-def why_it_failed(process: "subprocess.Popen[str]", said: str) -> str | None:
-    """The last line of what a script that has ended ``said`` on standard error, if it failed."""
-    if process.returncode == 0:
-        return None
-    last = next((line for line in reversed(said.splitlines()) if line.strip()), "")
-    return last.strip() or f"the script ended with code {process.returncode}"
+def _becoming(user: int) -> dict[str, Any]:
+    """What has `subprocess` start a process as a user with its groups; nothing if we are that."""
+    if user == os.geteuid():
+        return {}
+    try:
+        known = pwd.getpwuid(user)
+    except KeyError:
+        raise OperationError(
+            f"user {user} of the application is not in this machine's user database, so its groups "
+            "are not known and nothing is run as it"
+        ) from None
+    if os.geteuid() != 0:
+        raise OperationError(
+            f"the application is user {known.pw_name}'s, and what its environment names is run by "
+            "that user only: run chainshaper as that user, or as root"
+        )
+    groups = os.getgrouplist(known.pw_name, known.pw_gid)
+    return {"user": user, "group": known.pw_gid, "extra_groups": groups}
 
 
-def _interpreter(environment: Mapping[str, str]) -> list[str]:
-    """The Python that this environment's `ros2` runs with: another one cannot load `rclpy`."""
-    path = environment.get("PATH", os.defpath)
-    ros2 = shutil.which("ros2", path=path)
-    if ros2 is not None:
-        with Path(ros2).open("rb") as script:
-            first = script.readline().decode(errors="replace")
-        if first.startswith("#!"):
-            return shlex.split(first[2:])
-    return [shutil.which("python3", path=path) or "python3"]
+def _confine(parent: int) -> None:
+    """Take from a new process what it has beyond its user's rights; it ends with us."""
+    _libc.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
+    if os.getuid() != 0:
+        header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
+        if _libc.capset(header, (ctypes.c_uint32 * 6)()):
+            os._exit(126)
+    signalled_with_parent(parent, signal.SIGKILL)
+
+
+def _bounded_file() -> int:
+    """A file in memory that cannot grow beyond :data:`_MOST_PRINTED`."""
+    descriptor = os.memfd_create("chainshaper", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    os.ftruncate(descriptor, _MOST_PRINTED)
+    fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_GROW | fcntl.F_SEAL_SHRINK)
+    return descriptor
+
+
+def _content(descriptor: int) -> str:
+    """What was written into such a file, which is closed."""
+    content = os.pread(descriptor, _MOST_PRINTED, 0)
+    with suppress(OSError):
+        os.close(descriptor)
+    return content.rstrip(b"\0").decode(errors="replace")

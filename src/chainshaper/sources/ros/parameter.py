@@ -5,6 +5,10 @@
 This file is run, not imported, like :mod:`chainshaper.sources.ros.graph`. It ends with an error
 that names each node which has no such parameter, refuses the value, or does not answer in time;
 all of them together have five seconds.
+
+Who answers is whoever offers the service under the node's name: DDS does not prove who that is
+without its security plug-ins (SROS 2). All that offer it are asked, the node among them; where
+there are several (rclpy counts them since Jazzy), an answer says nothing, and that is an error.
 """
 
 import importlib
@@ -38,16 +42,20 @@ def main() -> None:
             rclpy.spin_once(node, timeout_sec=LOOK_S)
             if len(answers) == len(nodes) and all(answer.done() for answer in answers.values()):
                 break
+        count = getattr(node, "count_services", lambda _: 1)
+        offered = {one: count(f"{one}/set_parameters") for one in nodes}
     finally:
         node.destroy_node()
         rclpy.shutdown()
-    asked = [_problem(one, name, answers.get(one)) for one in nodes]
+    asked = [_problem(one, name, answers.get(one), offered[one]) for one in nodes]
     problems = [problem for problem in asked if problem is not None]
     if problems:
         sys.exit("; ".join(problems))
 
 
-def _problem(node: str, name: str, answer: Any) -> "str | None":
+def _problem(node: str, name: str, answer: Any, offered: int) -> "str | None":
+    if offered > 1:
+        return f"{offered} participants answer for {node}, so none of them is believed"
     if answer is None:
         return f"{node} offers no parameters"
     if not answer.done():

@@ -6,26 +6,29 @@ of its nodes (domain, RMW, its configuration). One participant for a few seconds
 topics; `ros2 topic info -v` would be one per topic, and leave a daemon behind. It is asked when
 tracing is over, because discovery costs every node some time.
 
+Whoever is in the graph says what it likes, and DDS without its security plug-ins does not prove who
+is: the answer is bounded and checked in its form, and believed in nothing but names, types and QoS.
+
 A snapshot that fails never fails the recording: it is a note.
 """
 
 import json
-from collections.abc import Mapping
-
-from pydantic import ValidationError
+import re
 
 from chainshaper.recording import EndpointInfo
 from chainshaper.sources.ros import graph as ros_graph
-from chainshaper.sources.ros.interpreter import run_with_rclpy
+from chainshaper.sources.ros.interpreter import Environment, run_with_rclpy
 
 __all__ = ["ask_graph"]
 
 _PATIENCE_S = 10
 """Discovery is waited for that long at most, and longer than that for Python and RMW to load."""
 _START_S = 20
+_NAME = re.compile(r"[!-~]{0,255}/[!-~]{1,255}")
+_LARGEST = 1 << 63
 
 
-def ask_graph(environment: Mapping[str, str]) -> tuple[tuple[EndpointInfo, ...], str | None]:
+def ask_graph(environment: Environment) -> tuple[tuple[EndpointInfo, ...], str | None]:
     """All endpoints of the ROS graph that a node with this environment belongs to.
 
     Returns:
@@ -39,6 +42,14 @@ def ask_graph(environment: Mapping[str, str]) -> tuple[tuple[EndpointInfo, ...],
     try:
         # Libraries may have printed something before.
         found = json.loads(said[said.index('{"endpoints"') :])["endpoints"]
-        return tuple(EndpointInfo.model_validate(one) for one in found), None
-    except (ValueError, KeyError, ValidationError) as error:
+        endpoints = (EndpointInfo.model_validate(one) for one in found)
+        return tuple(one for one in endpoints if _is_ros(one)), None
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         return (), str(error)
+
+
+def _is_ros(one: EndpointInfo) -> bool:
+    """Whether an endpoint's names and numbers are such as ROS 2 has; others are no endpoints."""
+    values = one.model_dump(exclude_none=True).values()
+    names = all(_NAME.fullmatch(name) for name in (one.node, one.topic, one.type) if name)
+    return names and all(value < _LARGEST for value in values if isinstance(value, int))

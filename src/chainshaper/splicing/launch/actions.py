@@ -186,12 +186,14 @@ class LaunchFile:
     syntax: object = field(repr=False)
 
 
-def flattened(actions: tuple[Action, ...]) -> Iterator[Action]:
-    """Every action, those inside groups included."""
+def flattened(actions: tuple[Action, ...], seen: set[int] | None = None) -> Iterator[Action]:
+    """Every action, those inside groups included; what is in a group that stands twice once."""
+    seen = set() if seen is None else seen
     for action in actions:
         yield action
-        if isinstance(action, Group):
-            yield from flattened(action.actions)
+        if isinstance(action, Group) and id(action) not in seen:
+            seen.add(id(action))
+            yield from flattened(action.actions, seen)
 
 
 def apply_edits(text: str, edits: list[Edit]) -> str:

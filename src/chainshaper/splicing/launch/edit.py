@@ -75,6 +75,8 @@ class _Work:
     )
     rules: dict[int, list[tuple[str, str]]] = field(default_factory=lambda: defaultdict(list))
     starts: dict[int, list[ShapingProcess]] = field(default_factory=lambda: defaultdict(list))
+    places: dict[int, Counter[object]] = field(default_factory=dict)
+    copyable: dict[int, bool] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
 
@@ -95,7 +97,8 @@ def edited_copies(
         remedies, notes = remedies_for(walk, want)
         work.notes += notes
         if not any(process in started for started in work.starts.values()):
-            work.starts[_root(walk, remedies[0].instance)].append(process)
+            starts = work.starts[_root(walk, remedies[0].instance)]
+            starts += [process] if process.standby is None else [process, process.standby]
         for remedy in remedies:
             _apply(walk, work, remedy)
     _edits_of_nodes(walk, work)
@@ -119,7 +122,7 @@ def _refuse_taken_name(walk: Walk, process: ShapingProcess) -> None:
 def _apply(walk: Walk, work: _Work, remedy: Remedy) -> None:
     """Put one change where it belongs, or at the beginning of the launch file."""
     number = remedy.instance
-    if _reachable(walk, number) and _near(work, walk.instances[number].file, remedy):
+    if _reachable(walk, work, number) and _near(work, walk.instances[number].file, remedy):
         return
     heard_by_owner(walk, remedy)
     root = _root(walk, number)
@@ -134,15 +137,15 @@ def _near(work: _Work, file: LaunchFile, remedy: Remedy) -> bool:
     edits: list[Edit] | None = None
     if rule is not None and rule.scope is not None:
         place: object = rule.scope[1].place
-        if place is not None and _once(file, place):
+        if place is not None and _once(work, file, place):
             edits = language.add_set_remaps(file, place, [remedy.bound])
     elif rule is not None and remedy.sure:
-        if rule.rule.span is not None and _once(file, rule.rule.span):
+        if rule.rule.span is not None and _once(work, file, rule.rule.span):
             edits = [language.replaced(file, rule.rule.span, remedy.wanted.target)]
     elif node is not None and remedy.near and not (rule is not None and rule.from_arguments):
         added = (remedy.match, remedy.wanted.target) if remedy.sure else remedy.bound
         place = node.action.place
-        if place is None or not _once(file, place):
+        if place is None or not _once(work, file, place):
             return False
         if language.add_remaps(file, place, [added]) is None:
             return False
@@ -161,8 +164,15 @@ def _edits_of_nodes(walk: Walk, work: _Work) -> None:
         work.edits[number] += LANGUAGES[file.language].add_remaps(file, place, rules) or []
 
 
-def _once(file: LaunchFile, place: object) -> bool:
+def _once(work: _Work, file: LaunchFile, place: object) -> bool:
     """Whether one action alone stands at a place: a loop's node stands for several."""
+    if id(file) not in work.places:
+        work.places[id(file)] = _places(file)
+    return work.places[id(file)][place if isinstance(place, Span) else id(place)] == 1
+
+
+def _places(file: LaunchFile) -> Counter[object]:
+    """How many actions stand at each place."""
     places: Counter[object] = Counter()
     for action in {id(action): action for action in flattened(file.actions)}.values():
         if isinstance(action, NodeAction):
@@ -172,19 +182,24 @@ def _once(file: LaunchFile, place: object) -> bool:
             places[action.span] += 1
         elif hasattr(action, "place"):
             places[id(action.place)] += 1
-    return places[place if isinstance(place, Span) else id(place)] == 1
+    return places
 
 
-def _reachable(walk: Walk, number: int) -> bool:
+def _reachable(walk: Walk, work: _Work, number: int) -> bool:
     """Whether a copy can be made, and included by copies up to the launch file."""
     instance = walk.instances[number]
-    if LANGUAGES[instance.file.language].keep_folder(instance.file) is None:
+    file = instance.file
+    if id(file) not in work.copyable:
+        work.copyable[id(file)] = LANGUAGES[file.language].keep_folder(file) is not None
+    if not work.copyable[id(file)]:
         return False
     if instance.parent is None or instance.include is None:
         return True
     span = instance.include.span
     parent = walk.instances[instance.parent].file
-    return span is not None and _once(parent, span) and _reachable(walk, instance.parent)
+    return (
+        span is not None and _once(work, parent, span) and _reachable(walk, work, instance.parent)
+    )
 
 
 def _root(walk: Walk, number: int) -> int:

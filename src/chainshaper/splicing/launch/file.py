@@ -15,6 +15,7 @@ from chainshaper.splicing.launch import yaml as launch_yaml
 from chainshaper.splicing.launch.actions import Edit, Language, LaunchFile, Rules, Span
 from chainshaper.splicing.launch.python import editing as launch_python
 from chainshaper.splicing.shaping_process import ShapingProcess
+from chainshaper.yaml_file import read_text as file_text
 
 __all__ = ["LANGUAGES", "is_launch_file", "read_launch_file", "read_text"]
 
@@ -65,7 +66,7 @@ def read_launch_file(path: str | Path) -> LaunchFile:
         raise InputError(
             f"{path}: a launch file's name ends in .py, .xml, .yaml, .yml or .launch: give one"
         )
-    return read_text(path, _content(path))
+    return read_text(path, file_text(path, "what `ros2 launch` starts"))
 
 
 def read_text(path: Path, text: str) -> LaunchFile:
@@ -74,15 +75,3 @@ def read_text(path: Path, text: str) -> LaunchFile:
     if language is None:  # .launch is either of two
         language = "xml" if text.lstrip("\ufeff \t\r\n").startswith("<") else "yaml"
     return LANGUAGES[language].read(path, text)
-
-
-def _content(path: Path) -> str:
-    try:
-        # Not read_text: line ends stay what they are.
-        return path.read_bytes().decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text in UTF-8 ({error}): convert it") from error
-    except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}): name a launch file"
-        ) from error

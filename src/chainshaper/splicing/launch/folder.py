@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from chainshaper.errors import InputError, OperationError
+from chainshaper.whole_file import open_to_all
 
 __all__ = ["LOGS", "NODES", "Manifest", "new_folder", "original_of", "remove_folder", "usable"]
 
@@ -130,7 +131,7 @@ def new_folder(folder: Path, copies: dict[str, str], *, throttled: bool = False)
             "files": files,
         }
         (partial / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
-        partial.chmod(0o755)
+        open_to_all(partial)
         older = _manifest(folder)
         if (
             older is None

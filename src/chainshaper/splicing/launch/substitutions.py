@@ -18,6 +18,8 @@ __all__ = ["UNKNOWN", "Surroundings", "described", "package_share", "parse_templ
 
 UNKNOWN: Template = (Substitution("unknown"),)
 
+_MOST_SUBSTITUTIONS = 100
+_LONGEST_TEXT = 64 << 10
 _IDENTIFIER = re.compile(r"\$\(([A-Za-z][A-Za-z0-9_-]*)")
 
 
@@ -34,6 +36,8 @@ class Surroundings:
 
 def parse_template(text: str) -> Template:
     """The parts of a text as the XML and YAML frontends see them; UNKNOWN where it is malformed."""
+    if text.count("$(") > _MOST_SUBSTITUTIONS:
+        return UNKNOWN
     parts, end = _parts(text, 0, "")
     return parts if end == len(text) else UNKNOWN
 
@@ -81,6 +85,8 @@ def resolve(template: Template, where: Surroundings) -> str | None:
     """The text that a template stands for, or None where only a launch would tell."""
     texts = [part if isinstance(part, str) else _value(part, where) for part in template]
     known = [text for text in texts if text is not None]
+    if sum(map(len, known)) > _LONGEST_TEXT:  # configurations that repeat each other
+        return None
     return "".join(known) if len(known) == len(texts) else None
 
 

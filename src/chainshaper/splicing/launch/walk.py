@@ -6,7 +6,8 @@ file it includes. Conditions are not evaluated: both sides are followed, and nod
 which conditions they run. The same file, included twice, is followed twice.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -30,6 +31,13 @@ from chainshaper.splicing.launch.remaps import PlacedRule, joined
 from chainshaper.splicing.launch.substitutions import Surroundings, resolve
 
 __all__ = ["Instance", "PlacedNode", "Walk", "follow"]
+
+_MOST_ACTIONS = 100_000
+_MOST_NODES = 5_000
+_MOST_FILES = 2_000
+_DEEPEST = 150
+_MOST_COPIES = 5_000_000
+"""What the largest robots need ten times over."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +91,29 @@ class Walk:
 
 
 @dataclass
+class _Patience:
+    """How much a launch has done so far, and the files that it has read."""
+
+    files: dict[Path, LaunchFile] = field(default_factory=dict)
+    real_paths: dict[Path, Path] = field(default_factory=dict)
+    actions: int = 0
+    copies: int = 0
+    depth: int = 0
+
+    def real(self, path: Path) -> Path:
+        """A path without symbolic links."""
+        if path not in self.real_paths:
+            self.real_paths[path] = path.resolve()
+        return self.real_paths[path]
+
+
+@dataclass
 class _Context:
     """What holds where the walk has come to, in the launch file that is instance ``number``."""
 
     walk: Walk
     number: int
+    patience: _Patience
     configurations: dict[str, str | None] = field(default_factory=dict)
     namespace: str | None = ""
     rules: list[PlacedRule] = field(default_factory=list)
@@ -114,19 +140,24 @@ def follow(files: Sequence[LaunchFile], arguments: dict[str, str]) -> Walk:
     Raises:
         InputError: an included file is not a launch file, or includes itself.
     """
-    walk = Walk()
+    walk, patience = Walk(), _Patience()
     for file in files:
         walk.instances.append(Instance(file, None, None))
-        _carry_out(file.actions, _Context(walk, len(walk.instances) - 1, {**arguments}), set())
+        context = _Context(walk, len(walk.instances) - 1, patience, {**arguments})
+        _carry_out(file.actions, context, set())
     return walk
 
 
 def _carry_out(actions: Iterable[Action], context: _Context, done: set[int]) -> None:
     for action in actions:
+        context.patience.actions += 1
+        _refuse_more(context, context.patience.actions, _MOST_ACTIONS, "actions")
         match action:
             case NodeAction() if id(action) not in done:
                 done.add(id(action))  # an event handler's target is the node again
+                _copied(context, len(context.rules))
                 context.walk.nodes.append(_placed(action, context))
+                _refuse_more(context, len(context.walk.nodes), _MOST_NODES, "nodes")
             case SetRemap():
                 scope = (context.number, action)
                 context.rules.append(replace(context.rule(action.rule), scope=scope))
@@ -145,12 +176,14 @@ def _carry_out(actions: Iterable[Action], context: _Context, done: set[int]) -> 
 def _carry_out_group(group: Group, context: _Context, done: set[int]) -> None:
     inner = context
     if group.scoped and group.forwarding:
+        _copied(context, len(context.configurations) + len(context.rules))
         inner = context.copy()
     elif group.scoped:
-        inner = _Context(context.walk, context.number, sheltered=True)
+        inner = _Context(context.walk, context.number, context.patience, sheltered=True)
     before = context.conditions
     inner.conditions = before | group.conditions
-    _carry_out(group.actions, inner, done)
+    with _deeper(context):
+        _carry_out(group.actions, inner, done)
     inner.conditions = before
 
 
@@ -163,23 +196,52 @@ def _include(include: Include, context: _Context) -> None:
     if path is None or not path.is_file() or not is_launch_file(path):
         walk.not_followed.append((number, include))
         return
-    if path.resolve() in _including(walk, number):
+    real = context.patience.real
+    if real(path) in {real(one.file.path) for one in _including(walk, number)}:
         raise InputError(
             f"{context.instance.file.path}:{include.line}: includes {path}, which includes it in"
             " turn: there is no end to that"
         )
-    walk.instances.append(Instance(read_launch_file(path), number, include))
+    files = context.patience.files
+    if path not in files:
+        files[path] = read_launch_file(path)
+    walk.instances.append(Instance(files[path], number, include))
     context.number, context.conditions = len(walk.instances) - 1, before | include.conditions
-    _carry_out(context.instance.file.actions, context, set())
+    _refuse_more(context, len(walk.instances), _MOST_FILES, "included files")
+    with _deeper(context):
+        _carry_out(context.instance.file.actions, context, set())
     context.number, context.conditions = number, before
 
 
-def _including(walk: Walk, number: int | None) -> set[Path]:
-    found: set[Path] = set()
+def _including(walk: Walk, number: int | None) -> Iterator[Instance]:
     while number is not None:
-        found.add(walk.instances[number].file.path.resolve())
+        yield walk.instances[number]
         number = walk.instances[number].parent
-    return found
+
+
+@contextmanager
+def _deeper(context: _Context) -> Iterator[None]:
+    context.patience.depth += 1
+    what = "groups and includes inside each other"
+    _refuse_more(context, context.patience.depth, _DEEPEST, what)
+    yield
+    context.patience.depth -= 1
+
+
+def _copied(context: _Context, count: int) -> None:
+    """Note how many rules and configurations a node or a group hears."""
+    context.patience.copies += count
+    what = "rules and configurations, counted for each group and node that hears them"
+    _refuse_more(context, context.patience.copies, _MOST_COPIES, what)
+
+
+def _refuse_more(context: _Context, found: int, most: int, what: str) -> None:
+    if found > most:
+        first = context.walk.instances[0].file.path
+        raise InputError(
+            f"{context.instance.file.path}: {first} has more than {most} {what}, the most that is"
+            " followed: give a part of it"
+        )
 
 
 def _configure(setting: SetConfiguration, context: _Context) -> None:

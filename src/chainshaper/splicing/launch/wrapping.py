@@ -6,6 +6,7 @@ ROS 2 applies the rule to nodes of this name only, so it needs no scope of its o
 the included file sets for those who include it still gets out.
 """
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -48,8 +49,9 @@ def wrapper_text(
         f"IncludeLaunchDescription(PythonLaunchDescriptionSource({str(included)!r}){arguments})",
     ]
     inside = "".join(f"            {action},\n" for action in actions)
+    name = re.sub(r"[^\w. -]", "_", included.name)  # a file's name cannot end the text it stands in
     return (
-        f'"""Starts {included.name} with nodes added; written by `chainshaper splice`."""\n\n'
+        f'"""Starts {name} with nodes added; written by `chainshaper splice`."""\n\n'
         + "\n".join(imports)
         + "\n\n\ndef generate_launch_description():\n"
         + f"    return LaunchDescription(\n        [\n{inside}        ]\n    )\n"

@@ -17,11 +17,14 @@ from xml.sax.saxutils import escape
 from chainshaper.errors import InputError
 from chainshaper.splicing.launch.actions import Edit, LaunchFile, Rules, Span
 from chainshaper.splicing.launch.elements import Attribute, Element, actions_of, location_edits
-from chainshaper.splicing.shaping_process import ShapingProcess
+from chainshaper.splicing.shaping_process import RESPAWN, ShapingProcess
+from chainshaper.yaml_file import DEEPEST
 
 __all__ = ["add_at_start", "add_remaps", "add_set_remaps", "keep_folder", "read", "replaced"]
 
+_LONGEST_ENTITY = 200
 _ATTRIBUTE = re.compile(r"""([^\s=/>"']+)\s*=\s*("[^"]*"|'[^']*')""")
+_RESPAWN = " ".join(f'{name}="{str(value).lower()}"' for name, value in RESPAWN.items())
 _START_TAG = re.compile(r"""<([^\s/>]+)(?:[^"'>]|"[^"]*"|'[^']*')*>""")
 
 
@@ -56,9 +59,18 @@ def _parse(path: Path, text: str) -> Element:
     parser = expat.ParserCreate("UTF-8")  # the text is decoded already, whatever it declares
     outermost = _Tag("", Span(0, 0), 1, {})
     open_tags = [outermost]
+    bytes_read = characters_read = 0
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        begin = len(data[: parser.CurrentByteIndex].decode())
+        nonlocal bytes_read, characters_read
+        if len(open_tags) > DEEPEST:
+            raise InputError(
+                f"{path}:{parser.CurrentLineNumber}: <{tag}>: more than {DEEPEST} elements inside"
+                " each other: no launch file needs that many"
+            )
+        characters_read += len(data[bytes_read : parser.CurrentByteIndex].decode())
+        bytes_read = parser.CurrentByteIndex
+        begin = characters_read
         found = _START_TAG.match(text, begin)
         if found is None or found[1] != tag:
             raise InputError(
@@ -71,6 +83,14 @@ def _parse(path: Path, text: str) -> Element:
         closed = open_tags.pop()
         open_tags[-1].children.append(_element(closed, text))
 
+    def entity(name: str, parameter: bool, value: str | None, *_: object) -> None:
+        if parameter or value is None or len(value) > _LONGEST_ENTITY or "&" in value:
+            raise InputError(
+                f"{path}:{parser.CurrentLineNumber}: the XML entity {name} is not a text of up to"
+                f" {_LONGEST_ENTITY} characters without another entity: write the text itself"
+            )
+
+    parser.EntityDeclHandler = entity
     parser.StartElementHandler = start
     parser.EndElementHandler = end
     try:
@@ -145,13 +165,13 @@ def _rule(tag: str, rule: tuple[str, str]) -> str:
 def _process(process: ShapingProcess) -> str:
     if process.command is not None:
         command = _written(shlex.join(process.command_line))
-        return f'<executable cmd="{command}" output="screen"/>'
+        return f'<executable cmd="{command}" output="screen" {_RESPAWN}/>'
     inside = [f'<param from="{_written(str(process.parameters_file))}"/>']
     inside += [_rule("remap", rule) for rule in process.remappings]
     return "\n".join(
         [
             f'<node pkg="{process.package}" exec="{process.executable}" name="{process.name}"'
-            f' namespace="{process.namespace}" output="screen">',
+            f' namespace="{process.namespace}" output="screen" {_RESPAWN}>',
             *(f"  {line}" for line in inside),
             "</node>",
         ]

@@ -7,7 +7,7 @@ the style of what surrounds them, before what is there.
 
 import shlex
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, cast
 
@@ -16,9 +16,18 @@ import yaml
 from chainshaper.errors import InputError
 from chainshaper.splicing.launch.actions import Edit, LaunchFile, Rules, Span
 from chainshaper.splicing.launch.elements import Attribute, Element, actions_of, location_edits
-from chainshaper.splicing.shaping_process import ShapingProcess
+from chainshaper.splicing.shaping_process import RESPAWN, ShapingProcess
+from chainshaper.yaml_file import DEEPEST, compose
 
 __all__ = ["add_at_start", "add_remaps", "add_set_remaps", "keep_folder", "read", "replaced"]
+
+_MOST_ELEMENTS = 50_000
+_MERGE = "tag:yaml.org,2002:merge"
+_RESPAWN = {
+    name: str(value).lower() if isinstance(value, bool) else value
+    for name, value in RESPAWN.items()
+}
+"""From Jazzy on, the frontend takes flags as texts only; Humble's takes either."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,16 +45,7 @@ def read(path: Path, text: str) -> LaunchFile:
     Raises:
         InputError: it is not YAML, or not a launch file; the line is named.
     """
-    try:
-        root = yaml.compose(text, Loader=yaml.SafeLoader)
-        return _launch_file(path, text, root)
-    except yaml.MarkedYAMLError as error:
-        line = error.problem_mark.line + 1 if error.problem_mark else 1
-        raise InputError(
-            f"{path}:{line}: not YAML: {error.problem or error.context}; correct the line"
-        ) from error
-    except (yaml.YAMLError, RecursionError) as error:
-        raise InputError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
+    return _launch_file(path, text, compose(text, path))
 
 
 def _launch_file(path: Path, text: str, root: yaml.Node | None) -> LaunchFile:
@@ -87,11 +87,14 @@ class _Reading:
     path: Path
     text: str
     aliased: set[int]
+    inside: list[int] = field(default_factory=list)
+    made: list[int] = field(default_factory=lambda: [0])
 
     def entities(self, items: yaml.SequenceNode) -> Iterator[Element]:
         """The items of a list of actions: mappings of one key, which says what the item is."""
         for item in items.value:
-            if not isinstance(item, yaml.MappingNode) or len(item.value) != 1:
+            pairs = item.value if isinstance(item, yaml.MappingNode) else []
+            if len(pairs) != 1 or not isinstance(pairs[0][0], yaml.ScalarNode):
                 raise InputError(
                     f"{self.path}:{item.start_mark.line + 1}: an action is one key, such as"
                     " `node`, with its attributes below: correct the item"
@@ -104,6 +107,21 @@ class _Reading:
     ) -> Element:
         """One element: its attributes are scalars, its children lists."""
         line = item.start_mark.line + 1
+        self.made[0] += 1
+        if self.made[0] > _MOST_ELEMENTS or len(self.inside) > DEEPEST:
+            raise InputError(
+                f"{self.path}:{line}: with its aliases (*name) the file has more than"
+                f" {_MOST_ELEMENTS} elements, or {DEEPEST} inside each other: write it without them"
+            )
+        self.inside.append(line)
+        element = self._element(tag, value, item, items)
+        self.inside.pop()
+        return element
+
+    def _element(
+        self, tag: str, value: yaml.Node, item: yaml.Node, items: yaml.SequenceNode
+    ) -> Element:
+        line = item.start_mark.line + 1
         place = None
         if isinstance(value, yaml.MappingNode) and id(value) not in self.aliased:
             place = _Place(value, item, items)
@@ -112,8 +130,13 @@ class _Reading:
         attributes: dict[str, Attribute] = {}
         children: list[Element] = []
         if isinstance(value, yaml.MappingNode):
-            yaml.SafeLoader("").flatten_mapping(value)  # `<<: *defaults`
+            value.value = _merged(value, self.path)  # `<<: *defaults`
         for key, content in value.value if isinstance(value, yaml.MappingNode) else []:
+            if not isinstance(key, yaml.ScalarNode):
+                raise InputError(
+                    f"{self.path}:{key.start_mark.line + 1}: an attribute's name is a list or"
+                    " mapping: write a text"
+                )
             if isinstance(content, yaml.ScalarNode):
                 attributes[key.value] = Attribute(content.value, self.span(content))
             elif key.value == "children" and isinstance(content, yaml.SequenceNode):
@@ -128,6 +151,30 @@ class _Reading:
         span = Span(node.start_mark.index + quotes, node.end_mark.index - quotes)
         plain = self.text[span.start : span.end] == node.value
         return span if plain and id(node) not in self.aliased else None
+
+
+def _merged(
+    node: yaml.MappingNode, path: Path, depth: int = 0
+) -> list[tuple[yaml.Node, yaml.Node]]:
+    """A mapping's own keys and values, behind those of the mappings that it merges into it.
+
+    Each key is merged once: PyYAML would repeat it for each of its merges, and theirs.
+    """
+    own = [(key, value) for key, value in node.value if key.tag != _MERGE]
+    sources: list[yaml.Node] = []
+    for key, value in node.value:
+        if key.tag == _MERGE:
+            sources += value.value if isinstance(value, yaml.SequenceNode) else [value]
+    merged: dict[str, tuple[yaml.Node, yaml.Node]] = {}
+    for source in dict.fromkeys(sources):
+        if not isinstance(source, yaml.MappingNode) or depth > DEEPEST:
+            line = source.start_mark.line + 1
+            raise InputError(f"{path}:{line}: not YAML: no mapping to merge; correct the line")
+        source.value = _merged(source, path, depth + 1)
+        for key, value in source.value:
+            merged.setdefault(str(key.value), (key, value))
+    names = {str(key.value) for key, _ in own}
+    return [pair for name, pair in merged.items() if name not in names] + own
 
 
 def replaced(file: LaunchFile, span: Span, value: str) -> Edit:  # noqa: ARG001 - as for Python
@@ -175,7 +222,8 @@ def _set_remaps(rules: Rules) -> list[dict[str, Any]]:
 
 def _process(process: ShapingProcess) -> dict[str, Any]:
     if process.command is not None:
-        return {"executable": {"cmd": shlex.join(process.command_line), "output": "screen"}}
+        command = shlex.join(process.command_line)
+        return {"executable": {"cmd": command, "output": "screen", **_RESPAWN}}
     return {
         "node": {
             "pkg": process.package,
@@ -183,6 +231,7 @@ def _process(process: ShapingProcess) -> dict[str, Any]:
             "name": process.name,
             "namespace": process.namespace,
             "output": "screen",
+            **_RESPAWN,
             "param": [{"from": str(process.parameters_file)}],
             "remap": [{"from": match, "to": target} for match, target in process.remappings],
         }

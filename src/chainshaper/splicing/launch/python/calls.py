@@ -29,6 +29,7 @@ from chainshaper.splicing.launch.python.values import (
     Text,
     actions_in,
     joined_path,
+    leaves,
     template_of,
 )
 from chainshaper.splicing.launch.substitutions import UNKNOWN
@@ -84,7 +85,7 @@ class Call:
         if condition is None:
             return self.conditions
         if not isinstance(condition, Condition):
-            condition = Condition("if", repr(condition))
+            condition = Condition("if", _written(condition))
         return self.conditions | {condition}
 
 
@@ -100,7 +101,7 @@ def constructed(call: Call) -> Any:  # noqa: PLR0911 - one case per kind of acti
         case "LaunchDescription":
             return actions_in(call.argument(0, "initial_entities"), call.line)
         case "IfCondition" | "UnlessCondition":
-            text = repr(call.argument(0, "predicate_expression"))
+            text = _written(call.argument(0, "predicate_expression"))
             return Condition(call.name.removesuffix("Condition").lower(), text)
         case "PushRosNamespace" | "PushROSNamespace":
             return PushNamespace(template_of(call.argument(0, "namespace")))
@@ -144,6 +145,13 @@ def _node(call: Call) -> Any:
     if call.name != "ComposableNodeContainer":
         return node
     return Group((node, *actions_in(composed, call.line)), False, True, call.when())
+
+
+def _written(value: Any) -> str:
+    """The text that distinguishes a condition from others."""
+    for _ in leaves(value):
+        pass  # a value that holds itself many times is given up
+    return repr(value)
 
 
 def _optional(value: Any) -> Template | None:

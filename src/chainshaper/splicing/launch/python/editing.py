@@ -16,7 +16,7 @@ from chainshaper.errors import InputError
 from chainshaper.splicing.launch.actions import Edit, LaunchFile, Rules, Span
 from chainshaper.splicing.launch.python.offsets import Offsets
 from chainshaper.splicing.launch.python.reading import read_actions
-from chainshaper.splicing.shaping_process import ShapingProcess
+from chainshaper.splicing.shaping_process import RESPAWN, ShapingProcess
 
 __all__ = [
     "add_at_start",
@@ -28,6 +28,7 @@ __all__ = [
     "replaced",
 ]
 
+_RESPAWN = ", ".join(f"{name}={value!r}" for name, value in RESPAWN.items())
 _OPENING = re.compile(r"\s*\(")
 _BINDS_TIGHTLY = (ast.Name, ast.Attribute, ast.Call, ast.Subscript, ast.BinOp)
 
@@ -154,12 +155,12 @@ def process_class(process: ShapingProcess) -> str:
 def process_text(process: ShapingProcess, name: str) -> str:
     """The call that starts a shaping node; ``name`` is what its class is called there."""
     if process.command is not None:
-        return f"{name}(cmd={process.command_line!r}, output='screen')"
+        return f"{name}(cmd={process.command_line!r}, output='screen', {_RESPAWN})"
     return (
         f"{name}(package={process.package!r}, executable={process.executable!r},"
         f" name={process.name!r}, namespace={process.namespace!r},"
         f" parameters=[{str(process.parameters_file)!r}],"
-        f" remappings={list(process.remappings)!r}, output='screen')"
+        f" remappings={list(process.remappings)!r}, output='screen', {_RESPAWN})"
     )
 
 

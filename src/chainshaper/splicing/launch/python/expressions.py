@@ -34,26 +34,24 @@ from chainshaper.splicing.launch.python.operations import (
 from chainshaper.splicing.launch.python.values import (
     Bound,
     Function,
+    GivenUpError,
     Named,
     Names,
     Text,
     Unknown,
     actions_in,
     template_of,
+    weighed,
 )
 
-__all__ = ["GivenUpError", "Reading", "bind", "called", "evaluate", "not_editable", "unknown"]
+__all__ = ["Reading", "bind", "called", "evaluate", "not_editable", "spend", "unknown"]
 
 _PATIENCE = 100_000
-"""Expressions to look at before a file is given up: a launch file is not a computation."""
+"""Steps to follow before a file is given up: a launch file is not a computation."""
 
 _LONGEST = 1_000
 _DEEPEST_CALL = 20
 _LIBRARIES = ("launch", "launch_ros", "ament_index_python")
-
-
-class GivenUpError(Exception):
-    """The file computes more than a launch file does."""
 
 
 @dataclass
@@ -100,14 +98,21 @@ def bind(reading: Reading, target: ast.expr, value: Any, names: Names) -> None:
             holder[key] = value
 
 
-def evaluate(reading: Reading, expression: ast.expr, names: Names) -> Any:
-    """What an expression stands for."""
+def spend(reading: Reading) -> None:
+    """Take one more step. Raises GivenUpError where there were too many."""
     reading.steps += 1
     if reading.steps > _PATIENCE:
         raise GivenUpError
+
+
+def evaluate(reading: Reading, expression: ast.expr, names: Names) -> Any:
+    """What an expression stands for."""
+    spend(reading)
     value = _value(reading, expression, names)
     if isinstance(value, str | list | tuple) and len(value) > _LONGEST:
         raise GivenUpError
+    if isinstance(value, Text):
+        weighed(value)
     return unknown(expression) if value is NotImplemented else value
 
 

@@ -19,12 +19,14 @@ from chainshaper.splicing.launch.python.values import (
     Text,
     actions_in,
     joined_path,
+    leaves,
     template_of,
 )
 
 __all__ = ["BUILTINS", "combined", "compared", "is_known", "library_value", "method_value"]
 
 _LONGEST_LOOP = 1_000
+_LONGEST_VALUE = 10_000
 _FIELD_WITH_FORMAT = re.compile(r"%[^sd%]|\{[^{}]*[:.\[!]")  # such as a width of a million
 _TEXT_METHODS = ("format", "join", "replace", "strip", "lstrip", "rstrip", "lower", "upper")
 _COMPARISONS: dict[type[ast.cmpop], Callable[[Any, Any], Any]] = {
@@ -47,12 +49,13 @@ def is_known(value: Any) -> bool:
 
 
 def _plain(value: Any) -> bool:
-    """Whether a value is wholly known."""
-    if isinstance(value, list | tuple):
-        return all(_plain(one) for one in value)
-    if isinstance(value, dict):
-        return all(_plain(one) for one in value.values())
-    return value is None or isinstance(value, bool | int | float | str)
+    """Whether a value is wholly known, and short enough to be compared and printed."""
+    length = 0
+    for leaf in leaves(value):
+        if leaf is not None and not isinstance(leaf, bool | int | float | str):
+            return False
+        length += len(leaf) if isinstance(leaf, str) else 1
+    return length < _LONGEST_VALUE
 
 
 def _is_text(value: Any) -> bool:
@@ -109,7 +112,8 @@ def library_value(name: str, arguments: Sequence[Any]) -> Any:
         return one
     if name == "os.path.dirname" and isinstance(one, str):
         return os.path.dirname(one)  # noqa: PTH120 - the very function that the file calls
-    if name in BUILTINS and all(is_known(argument) for argument in arguments):
+    printable = name != "str" or _plain(arguments)
+    if name in BUILTINS and printable and all(is_known(argument) for argument in arguments):
         return _tried(BUILTINS[name], *arguments)
     return NotImplemented
 

@@ -14,17 +14,24 @@ from typing import Any, Literal, TypeAlias
 
 from chainshaper.splicing.launch.actions import Action, Condition, Unreadable, flattened
 from chainshaper.splicing.launch.python.expressions import (
-    GivenUpError,
     Reading,
     bind,
     called,
     evaluate,
     not_editable,
+    spend,
     unknown,
 )
 from chainshaper.splicing.launch.python.offsets import Offsets
 from chainshaper.splicing.launch.python.operations import BUILTINS, combined, is_known
-from chainshaper.splicing.launch.python.values import Function, Named, Names, Unknown, actions_in
+from chainshaper.splicing.launch.python.values import (
+    Function,
+    GivenUpError,
+    Named,
+    Names,
+    Unknown,
+    actions_in,
+)
 
 __all__ = ["read_actions"]
 
@@ -55,6 +62,7 @@ def read_actions(path: Path, text: str, tree: ast.Module) -> tuple[Action, ...] 
 def _run(reading: Reading, statements: Sequence[ast.stmt], names: Names) -> _End:
     """Follow statements; how they ended, if before their last one."""
     for statement in statements:
+        spend(reading)
         end = _statement(reading, statement, names)
         if end is not None:
             return end

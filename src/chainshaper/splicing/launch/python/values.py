@@ -8,6 +8,7 @@ understood turns into.
 
 import ast
 from collections import ChainMap
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -17,16 +18,26 @@ from chainshaper.splicing.launch.substitutions import UNKNOWN
 __all__ = [
     "Bound",
     "Function",
+    "GivenUpError",
     "Named",
     "Source",
     "Text",
     "Unknown",
     "actions_in",
     "joined_path",
+    "leaves",
     "template_of",
+    "weighed",
 ]
 
 Names: TypeAlias = "ChainMap[str, Any]"
+
+
+_MOST_LEAVES = 10_000
+
+
+class GivenUpError(Exception):
+    """The file computes more than a launch file does."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +90,36 @@ class Source:
     span: Span | None
 
 
+def leaves(value: Any) -> Iterator[Any]:
+    """What lists, tuples and dictionaries hold, at any depth.
+
+    Raises:
+        GivenUpError: too much; a list that holds another twice, and so on, soon has no end.
+    """
+    pending, visited = [value], 0
+    while pending:
+        one = pending.pop()
+        visited += 1
+        if visited > _MOST_LEAVES:
+            raise GivenUpError
+        if isinstance(one, list | tuple):
+            pending.extend(reversed(one))
+        elif isinstance(one, dict):
+            pending.extend(reversed(one.values()))
+        else:
+            yield one
+
+
+def weighed(value: Any) -> None:
+    """Raises GivenUpError where a text for launch has too many parts to be looked at."""
+    parts: list[Any] = list(value.template)
+    for visited, one in enumerate(parts):
+        if visited > _MOST_LEAVES:
+            raise GivenUpError
+        if isinstance(one, Substitution):
+            parts.extend(part for argument in one.arguments for part in argument)
+
+
 def template_of(value: Any) -> Template:
     """A value where launch wants a text: lists are concatenated."""
     if isinstance(value, Text):
@@ -86,7 +127,7 @@ def template_of(value: Any) -> Template:
     if isinstance(value, bool | int | float | str):
         return (str(value),)
     if isinstance(value, list | tuple):
-        return tuple(part for item in value for part in template_of(item))
+        return tuple(part for leaf in leaves(value) for part in template_of(leaf))
     return UNKNOWN
 
 
@@ -102,5 +143,5 @@ def actions_in(value: Any, line: int) -> list[Action]:
     if isinstance(value, Action):
         return [value]
     if isinstance(value, list | tuple):
-        return [action for item in value for action in actions_in(item, line)]
+        return [action for leaf in leaves(value) for action in actions_in(leaf, line)]
     return []

@@ -41,7 +41,7 @@ def create_subscription(
     qos: QoSProfile,
     *,
     raw: bool = False,
-) -> None:
+) -> Any:
     """`Node.create_subscription`, with the events of rclcpp's."""
     emit = trace_points(_TRACE_POINTS)
     seen = _seen(callback, emit)
@@ -53,6 +53,7 @@ def create_subscription(
         emit["rclcpp_callback_register"](id(seen), callback.__qualname__.encode())
     if raw:
         emit_takes(subscription)
+    return subscription
 
 
 def create_timer(node: Node, period_ns: int, callback: Callable[[], None], clock: Clock) -> None:

@@ -33,6 +33,7 @@ __all__ = [
     "offered_by",
     "parameter",
     "run",
+    "wait",
     "wait_for_publisher",
 ]
 
@@ -40,6 +41,19 @@ __all__ = [
 def parameter(node: Node, name: str, otherwise: Any) -> Any:
     """A parameter's value; the types of parameters are those of the file they come from."""
     return node.get_parameter_or(name, Parameter(name, value=otherwise)).value
+
+
+def wait(seconds: float) -> None:
+    """Wait, unless the process is to stop.
+
+    Raises:
+        ExternalShutdownException: it is.
+    """
+    until = time.monotonic() + seconds
+    while rclpy.ok() and (left := until - time.monotonic()) > 0:
+        time.sleep(min(left, 0.05))
+    if not rclpy.ok():
+        raise ExternalShutdownException
 
 
 def wait_for_publisher(node: Node, topic: str) -> Any:
@@ -63,7 +77,7 @@ def wait_for_publisher(node: Node, topic: str) -> Any:
         if not said:
             logger.info(f"waiting for a publisher of {name}")
             said = True
-        time.sleep(0.05)
+        wait(0.01)
     raise ExternalShutdownException
 
 
@@ -153,15 +167,23 @@ def become_realtime(node: Node) -> None:
     gc.disable()
 
 
-def run(name: str, set_up: Callable[[Node], None]) -> None:
-    """Run a node until it is interrupted; ``set_up`` makes its endpoints."""
+def run(name: str, set_up: Callable[[Node], Callable[[], bool]], *, realtime: bool = True) -> None:
+    """Run a node until it is interrupted.
+
+    ``set_up`` makes its endpoints. What it returns is called behind each callback, and says
+    whether it wants to be called again although nothing has come.
+    """
     rclpy.init()
     # What is in the parameter file, is declared.
     node = Node(name, automatically_declare_parameters_from_overrides=True)
     try:
-        set_up(node)
-        become_realtime(node)
-        rclpy.spin(node)
+        work_off = set_up(node)
+        if realtime:
+            become_realtime(node)
+        executor = rclpy.get_global_executor()
+        executor.add_node(node)
+        while rclpy.ok():
+            executor.spin_once(timeout_sec=0 if work_off() else None)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (ValueError, OSError, ImportError) as error:

@@ -14,7 +14,7 @@ from typing import Any
 
 from rclpy.subscription import Subscription
 
-__all__ = ["emit_takes", "publish_function", "trace_points"]
+__all__ = ["emit_takes", "publish_function", "take_event", "trace_points"]
 
 _ADDRESS = ctypes.c_void_p
 _MESSAGE_EVENTS = {
@@ -70,10 +70,7 @@ def emit_takes(subscription: Any) -> None:
     emit = _missing_events()
     if not emit:
         return
-    rcl = ctypes.CDLL("librcl.so", mode=os.RTLD_NOLOAD)
-    rcl.rcl_subscription_get_rmw_handle.argtypes = (_ADDRESS,)
-    rcl.rcl_subscription_get_rmw_handle.restype = _ADDRESS
-    handle = rcl.rcl_subscription_get_rmw_handle(subscription.handle.pointer)
+    handle = _rmw_handle(subscription)
     callback = subscription.callback
 
     def with_event(payload: bytes) -> None:
@@ -81,3 +78,23 @@ def emit_takes(subscription: Any) -> None:
         callback(payload)
 
     subscription.callback = with_event
+
+
+def take_event(subscription: Any) -> Callable[[int | None], None]:
+    """What emits the event of a take once more, when a callback is executed for its message.
+
+    Others were taken meanwhile, and a callback is for the message that was taken last.
+    """
+    emit = {} if _missing_events() else trace_points(_MESSAGE_EVENTS)
+    if not emit:
+        return lambda _: None
+    handle = _rmw_handle(subscription)
+    return lambda source: emit["rmw_take"](handle, id(subscription), source or 0, True)
+
+
+def _rmw_handle(subscription: Any) -> int:
+    rcl = ctypes.CDLL("librcl.so", mode=os.RTLD_NOLOAD)
+    rcl.rcl_subscription_get_rmw_handle.argtypes = (_ADDRESS,)
+    rcl.rcl_subscription_get_rmw_handle.restype = _ADDRESS
+    handle: int = rcl.rcl_subscription_get_rmw_handle(subscription.handle.pointer)
+    return handle

@@ -2,14 +2,14 @@
 
 What it receives on ``input`` it republishes on ``output``, byte for byte, in the slots of its
 server. It has one thread, which receives, holds, publishes, rests so that the message is delivered
-although this thread out-ranks others, and only then notes what it did.
+although this thread out-ranks others, and only then notes what it did. What comes meanwhile it
+takes, too: it waits at the gate, and a callback is executed for it when it is its turn.
 """
 
 import gc
 import os
-import threading
 import time
-from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import rclpy
@@ -19,58 +19,37 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from rclpy.subscription import Subscription
 from std_msgs.msg import String
 
-from chainshaper.enforcement.gate import Gate, Modes, Release, Shaper, sleep_until
+from chainshaper.enforcement.gate import Gate, Modes, Release, Shaper
+from chainshaper.enforcement.handover import Turn
 from chainshaper.splicing.nodes.python.callback_events import create_subscription
 from chainshaper.splicing.nodes.python.endpoints import (
-    asked_of,
     message_class,
-    offered_by,
     parameter,
     run,
+    wait,
     wait_for_publisher,
 )
-from chainshaper.splicing.nodes.python.message_events import publish_function
+from chainshaper.splicing.nodes.python.gate_log import log_of
+from chainshaper.splicing.nodes.python.message_events import publish_function, take_event
 from chainshaper.splicing.nodes.python.readiness import Readiness
+from chainshaper.splicing.nodes.python.room import room_of
 
-LOG_HEADER = (
-    "time,pid,tid,cpu,source_timestamp,arrival,origin,release,slot,cycles_waited,anchor,overrun,"
-    "mode,published,stalled\n"
-)
+DISCOVERY_S, SETTLING_S = 2.0, 0.1
 
 
-class GateLog:
-    """What the gate did, a line of comma-separated values per message.
+class Gaps:
+    """How many messages are missing before each, by the publisher's numbers (None: not known)."""
 
-    Each is handed to the page cache with one write, after the message has left: what was written
-    stays when the process is killed. Lines are added to a file that is there.
-    """
+    def __init__(self) -> None:
+        self._last: int | None = None
 
-    def __init__(self, node: Node, path: str) -> None:
-        self._file = None
-        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
-        try:
-            if path:
-                self._file = os.open(path, flags, 0o644)
-                if os.lseek(self._file, 0, os.SEEK_END) == 0:
-                    os.write(self._file, LOG_HEADER.encode())
-        except OSError as error:
-            node.get_logger().warning(f"no log is written to {path}: {error.strerror}")
-        self._process = f"{os.getpid()},{threading.get_native_id()}"
-
-    def write(self, release: Release, *times: int | None) -> None:
-        """Note a decision: woke at, source time stamp, arrival, published, and for how long the
-        machine stood still behind the release (ns, None: not known)."""
-        if self._file is None:
-            return
-        woke, source_timestamp, arrival, published, stalled = times
-        core = next(iter(os.sched_getaffinity(0)))
-        before = (source_timestamp, arrival, release.origin_ns, release.at_ns, release.slot)
-        after = (release.cycles_waited, release.anchor, release.overrun, release.mode)
-        fields = (*before, *after, published, stalled)
-        texts = ["" if field is None else str(field) for field in fields]
-        # A full disk must not stop the output: a line that cannot be written is missing.
-        with suppress(OSError):
-            os.write(self._file, f"{woke},{self._process},{core},{','.join(texts)}\n".encode())
+    def before(self, info: dict[str, int]) -> int | None:
+        """What is missing between a message and the one before it."""
+        number = info.get("publication_sequence_number")
+        last, self._last = self._last, number
+        if number is None or last is None:
+            return None if number is None else 0
+        return max(0, number - last - 1)  # a publisher that is started again counts anew
 
 
 def gate_from(node: Node) -> Gate:
@@ -94,6 +73,7 @@ def gate_from(node: Node) -> Gate:
         phase_ns=parameter(node, "phase_ns", 0),
         overrun=parameter(node, "overrun", "wait"),
         due_cycles=parameter(node, "due_cycles", 0),
+        messages=parameter(node, "messages", "all-in-order"),
         modes=modes,
     )
 
@@ -145,47 +125,170 @@ def delivery_core(node: Node) -> int | None:
     return None if -1 in taken else min(os.sched_getaffinity(0) - set(taken), default=None)
 
 
-def set_up(node: Node) -> None:
-    """Make the node's endpoints."""
-    log, pause_ns = GateLog(node, parameter(node, "log", "")), parameter(node, "pause_ns", 0)
-    readiness = Readiness(node, delivery_core(node), pause_ns)
-    shaper = Shaper(gate_from(node), parameter(node, "spin_ns", 0), readiness.get_ready)
-    change_phase_with(node, shaper)
-    info = wait_for_publisher(node, "input")
-    offered = offered_by(info, parameter(node, "output_depth", 10))
-    message_type = message_class(info.topic_type)
-    publisher = node.create_publisher(message_type, "output", offered)
-    publish = publish_function(publisher)
-    listen_to_modes(node, shaper)
+def turn_of(node: Node) -> Turn | None:
+    """What is agreed with the standby; None: the node is alone, since nothing names a page.
 
-    def shape(payload: bytes, source_timestamp: int | None) -> None:
-        release, arrival, woke = shaper.hold(payload)
+    After several nodes that failed at once this one waits, so that starting over and over does not
+    take a core. To be called before anything that may fail.
+    """
+    name, logger = parameter(node, "handover", ""), node.get_logger()
+    if not name:
+        return None
+    try:
+        turn = Turn(name, node.resolve_topic_name("output"))
+    except OSError as error:  # the standby has none either
+        logger.error(f"nothing can be agreed with the standby, which does nothing: {error}")
+        return None
+    if turn.wait_s:
+        failed = turn.page["failed_starts"] - 1
+        logger.warning(f"has failed {failed} times: starting in {turn.wait_s:g} s")
+        wait(turn.wait_s)
+    return turn
+
+
+def go_on(shaper: Shaper, turn: Turn) -> None:
+    """Have cycles begin where they did for the node before this one, in its mode."""
+    gate, mode = shaper.gate, turn.page["mode"]
+    if turn.phase_ns is not None:  # from now on, not the next cycle
+        shaper.set_phase(turn.phase_ns, time.monotonic_ns() - gate.cycle_ns)
+    if gate.modes is not None and 0 < mode <= len(gate.modes.bands):
+        shaper.switch(list(gate.modes.bands)[mode - 1], 0)
+
+
+def await_receivers(node: Node, turn: Turn, publisher: Any) -> None:
+    """Leave the output to the standby, if there is one, until its receivers know this node too.
+
+    What is published before is lost to them. How far discovery has come at the other side cannot
+    be seen: it is given a little longer.
+    """
+    topic, give_up = node.resolve_topic_name("output"), time.monotonic() + DISCOVERY_S
+    while turn.page.has_standby and time.monotonic() < give_up:
+        if publisher.get_subscription_count() >= node.count_subscribers(topic):
+            wait(SETTLING_S)
+            return
+        wait(0.01)
+
+
+class Shaping:
+    """The gate of a node, with its endpoints and its log."""
+
+    def __init__(self, node: Node) -> None:
+        self._turn = turn_of(node)
+        self._log = log_of(node)
+        self._pause_ns = parameter(node, "pause_ns", 0)
+        self._readiness = Readiness(node, delivery_core(node), self._pause_ns)
+        gate = gate_from(node)
+        info = wait_for_publisher(node, "input")
+        depth, offered, asked = room_of(node, info)
+        self._shaper = Shaper(
+            replace(gate, depth=depth),
+            parameter(node, "spin_ns", 0),
+            self._readiness.get_ready,
+            self._look,
+            self._decided,
+        )
+        if self._turn is not None:
+            go_on(self._shaper, self._turn)
+        self._gaps = Gaps()
+        self._its_turn = False  # of the oldest message
+        change_phase_with(node, self._shaper)
+        self._type = message_class(info.topic_type)
+        publisher = node.create_publisher(self._type, "output", offered)
+        self._publish = publish_function(publisher)
+        listen_to_modes(node, self._shaper)
+        # Humble gives a callback the message only: the log lacks its source time stamp.
+        self._informed = hasattr(Subscription, "CallbackType")
+        shape = self._shape if self._informed else self._shape_uninformed
+        self._input = create_subscription(node, self._type, "input", shape, asked, raw=True)
+        self._taken_again = take_event(self._input)
+        if self._turn is not None:
+            await_receivers(node, self._turn, publisher)
+
+    def work_off(self) -> bool:
+        """Deal with what waits at the gate, until there is time for the node's other callbacks.
+
+        Each message is the subscription's callback's. Whether some are left.
+        """
+        waiting, overflowed = self._shaper.queue.waiting, self._shaper.overflowed
+        served = False
+        while rclpy.ok():
+            for gone in overflowed:
+                self._log.write(gone)
+            overflowed.clear()
+            if not waiting or (served and self._shaper.nothing_due()):
+                break
+            oldest, self._its_turn = waiting[0], True
+            self._taken_again(oldest.about)
+            self._input.callback(oldest.payload, *([{}] if self._informed else []))
+            self._its_turn, served = False, True
+        return bool(waiting)
+
+    def _shape(self, payload: bytes, info: dict[str, int]) -> None:
+        if not self._its_turn:  # the executor took it
+            alone = not self._shaper.queue.waiting
+            self._arrive(payload, info, waited=False)
+            if not alone:
+                return
+        key, turn = self._shaper.queue.waiting[0].about, self._turn
+        if turn is not None and not turn.take(key):
+            self._shaper.queue.leave(None, time.monotonic_ns())
+            return
+        held = self._shaper.hold()
+        if held is None:
+            return
+        if turn is not None and turn.was_bypassed(key):
+            self._readiness.relax()
+            return
         published = stalled = None
-        if release.at_ns is not None:
+        if held.release.at_ns is not None:
             try:
-                publish(payload)
+                self._publish(held.message.payload)
             except RuntimeError:  # rclpy's RCLError is one
                 if rclpy.ok():
                     raise
                 return  # it was interrupted meanwhile; to ask before publishing would cost time
             published = time.monotonic_ns()
-            stalled = shaper.time_lost(release, woke)
-            if release.overrun is None:  # else the next message may be waiting already
-                sleep_until(published + pause_ns)
-        readiness.relax()
-        log.write(release, woke, source_timestamp, arrival, published, stalled)
-        gc.collect()  # here is time for it; all that is older is frozen
+            if turn is not None:
+                turn.done(key)
+            stalled = self._shaper.time_lost(held.release, held.awake_ns)
+            self._shaper.rest(published, self._pause_ns)
+        elif turn is not None:
+            turn.done(key)
+        self._readiness.relax()
+        self._log.write(held, published, stalled)
+        if not self._shaper.queue.waiting:
+            gc.collect()  # here is time for it; all that is older is frozen
 
-    def with_info(payload: bytes, message_info: Any) -> None:
-        shape(payload, message_info["source_timestamp"])
+    def _shape_uninformed(self, payload: bytes) -> None:
+        self._shape(payload, {})
 
-    def without_info(payload: bytes) -> None:
-        shape(payload, None)
+    def _arrive(self, payload: bytes, info: dict[str, int], *, waited: bool) -> None:
+        source, lost = info.get("source_timestamp"), self._gaps.before(info)
+        now = time.monotonic_ns()
+        overflowed, before = self._shaper.overflowed, len(self._shaper.overflowed)
+        self._shaper.arrive(payload, now, source if waited else None, source, lost)
+        if self._turn is None or len(overflowed) == before:
+            return
+        gone = overflowed[-1].message.about
+        if self._turn.was_bypassed(gone):
+            overflowed.pop()
+        else:
+            self._turn.drop(gone)
 
-    # Humble gives a callback the message only: the log lacks its source time stamp.
-    callback = with_info if hasattr(Subscription, "CallbackType") else without_info
-    create_subscription(node, message_type, "input", callback, asked_of(offered), raw=True)
+    def _decided(self, release: Release, phase_ns: int) -> None:
+        """The standby sees it."""
+        if self._turn is not None:
+            names = [] if self._shaper.gate.modes is None else list(self._shaper.gate.modes.bands)
+            mode = 0 if release.mode is None else names.index(release.mode) + 1
+            self._turn.hold(release.at_ns, phase_ns, mode)
+
+    def _look(self) -> None:
+        """Take all that has come."""
+        handle = self._input.handle
+        with handle:
+            while (taken := handle.take_message(self._type, True)) is not None:
+                self._arrive(*taken, waited=True)
 
 
 if __name__ == "__main__":
-    run("chainshaper_shaping", set_up)
+    run("chainshaper_shaping", lambda node: Shaping(node).work_off)

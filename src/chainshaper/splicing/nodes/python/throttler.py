@@ -72,8 +72,8 @@ class Channel:
         )
 
 
-def set_up(node: Node) -> None:
-    """Make the node's endpoints and timers."""
+def set_up(node: Node) -> Callable[[], bool]:
+    """Make the node's endpoints and timers; behind their callbacks nothing is left to do."""
     inputs, outputs = parameter(node, "inputs", [""]), parameter(node, "outputs", [""])
     period, phase = parameter(node, "period_ns", 0), parameter(node, "phase_ns", 0)
     if not all(inputs) or len(inputs) != len(outputs) or period <= 0:
@@ -95,6 +95,7 @@ def set_up(node: Node) -> None:
     steady = Clock(clock_type=ClockType.STEADY_TIME)
     for channel in channels:
         create_timer(node, period, channel.publish, steady)
+    return lambda: False
 
 
 if __name__ == "__main__":

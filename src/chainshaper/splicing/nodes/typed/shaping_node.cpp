@@ -2,6 +2,7 @@
 // `output` in the slots of its server (Managing End-to-End Timing Jitters in ROS2 Computation
 // Chains, section 3.2.2).
 
+#include <functional>
 #include <memory>
 #include <optional>
 #include <stdexcept>
@@ -40,32 +41,45 @@ std::optional<std::int64_t> stamp_of([[maybe_unused]] const T & message)
 
 int main(int argc, char ** argv)
 {
-  std::optional<chainshaper::Shaping> shaping;
+  std::optional<chainshaper::Shaping<Message>> shaping;
   rclcpp::Publisher<Message>::SharedPtr publisher;
-  rclcpp::Subscription<Message>::SharedPtr subscription;
   return chainshaper::run(
-    argc, argv, "chainshaper_shaping", [&](rclcpp::Node & node) {
-      shaping.emplace(node);
+    argc, argv, "chainshaper_shaping", [&](rclcpp::Node & node) -> std::function<bool()> {
+      auto turn = chainshaper::turn_of(node);
       const auto depth = chainshaper::parameter<std::int64_t>(node, "output_depth", 10);
       const auto offer =
         chainshaper::wait_for_publisher(node, "input", static_cast<std::size_t>(depth));
       if (!offer) {
-        return false;
+        return {};
       }
       if (offer->type != chainshaper::message_type) {
         throw std::invalid_argument(
           "this node was made for " + std::string(chainshaper::message_type) +
           ", but its input is " + offer->type + ": generate it again for that type");
       }
-      publisher = node.create_publisher<Message>("output", offer->publisher);
+      shaping.emplace(node, *offer, std::move(turn));
+      publisher = node.create_publisher<Message>("output", shaping->offered(offer->publisher));
       shaping->listen_to_modes();
-      subscription = node.create_subscription<Message>(
-        "input", offer->subscription,
-        [&](std::shared_ptr<const Message> message, const rclcpp::MessageInfo & info) {
-          shaping->shape(
-            stamp_of(*message), info.get_rmw_message_info().source_timestamp,
-            [&] {publisher->publish(*message);});
+      const auto subscription = node.create_subscription<Message>(
+        "input", shaping->asked(offer->subscription),
+        [&](std::shared_ptr<Message> message, const rclcpp::MessageInfo & info) {
+          shaping->shape(std::move(message), info);
         });
-      return true;
+      shaping->connect(
+        {subscription,
+          [subscription](rclcpp::MessageInfo & info) {
+            auto message = std::make_shared<Message>();
+            return subscription->take(*message, info) ? message : nullptr;
+          },
+          [](const Message & message) {return stamp_of(message);},
+          [&](const Message & message) {publisher->publish(message);},
+          [subscription](const std::shared_ptr<Message> & message, const rclcpp::MessageInfo & info) {
+            std::shared_ptr<void> untyped = message;
+            subscription->handle_message(untyped, info);
+          }});
+      if (!shaping->await_receivers(*publisher)) {
+        return {};
+      }
+      return [&] {return shaping->work_off();};
     });
 }

@@ -14,7 +14,7 @@ def generate_launch_description():
     composed = LaunchConfiguration('composed')
     remappings = [('/tf', 'tf'), ('/tf_static', 'tf_static')]
 
-    ld = LaunchDescription([ExecuteProcess(cmd=['python3', '{AFTER}/shaping_nodes/chainshaper_robot_command.py', '--ros-args', '-r', '__node:=chainshaper_robot_command', '-r', '__ns:=/', '-r', 'input:=/robot/command_tmp', '-r', 'output:=/robot/command', '--params-file', '{AFTER}/shaping_nodes/chainshaper_robot_command.yaml'], output='screen')])
+    ld = LaunchDescription([ExecuteProcess(cmd=['python3', '{AFTER}/shaping_nodes/chainshaper_robot_command.py', '--ros-args', '-r', '__node:=chainshaper_robot_command', '-r', '__ns:=/', '-r', 'input:=/robot/command_tmp', '-r', 'output:=/robot/command', '--params-file', '{AFTER}/shaping_nodes/chainshaper_robot_command.yaml'], output='screen', respawn=True, respawn_delay=0.1), ExecuteProcess(cmd=['python3', '{AFTER}/shaping_nodes/chainshaper_robot_command_standby.py', '--ros-args', '-r', '__node:=chainshaper_robot_command_standby', '-r', '__ns:=/', '-r', 'input:=/robot/command_tmp', '-r', 'output:=/robot/command', '--params-file', '{AFTER}/shaping_nodes/chainshaper_robot_command_standby.yaml'], output='screen', respawn=True, respawn_delay=0.1)])
     ld.add_action(DeclareLaunchArgument('namespace', default_value=''))
     ld.add_action(DeclareLaunchArgument('composed', default_value='False'))
     ld.add_action(GroupAction(

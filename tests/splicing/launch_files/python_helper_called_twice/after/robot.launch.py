@@ -9,7 +9,8 @@ from launch_ros.actions import SetRemap
 def generate_launch_description():
     return LaunchDescription(
         [
-            ExecuteProcess(cmd=['python3', '{AFTER}/shaping_nodes/chainshaper_b_pose.py', '--ros-args', '-r', '__node:=chainshaper_b_pose', '-r', '__ns:=/', '-r', 'input:=/b/pose_tmp', '-r', 'output:=/b/pose', '--params-file', '{AFTER}/shaping_nodes/chainshaper_b_pose.yaml'], output='screen'),
+            ExecuteProcess(cmd=['python3', '{AFTER}/shaping_nodes/chainshaper_b_pose.py', '--ros-args', '-r', '__node:=chainshaper_b_pose', '-r', '__ns:=/', '-r', 'input:=/b/pose_tmp', '-r', 'output:=/b/pose', '--params-file', '{AFTER}/shaping_nodes/chainshaper_b_pose.yaml'], output='screen', respawn=True, respawn_delay=0.1),
+            ExecuteProcess(cmd=['python3', '{AFTER}/shaping_nodes/chainshaper_b_pose_standby.py', '--ros-args', '-r', '__node:=chainshaper_b_pose_standby', '-r', '__ns:=/', '-r', 'input:=/b/pose_tmp', '-r', 'output:=/b/pose', '--params-file', '{AFTER}/shaping_nodes/chainshaper_b_pose_standby.yaml'], output='screen', respawn=True, respawn_delay=0.1),
             SetRemap('ndt:/b/pose', '/b/pose_tmp'),
             IncludeLaunchDescription(PythonLaunchDescriptionSource('{BEFORE}/robot.launch.py')),
         ]

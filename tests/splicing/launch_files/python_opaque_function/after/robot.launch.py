@@ -10,7 +10,8 @@ from launch_ros.actions import SetRemap
 def generate_launch_description():
     return LaunchDescription(
         [
-            ExecuteProcess(cmd=['python3', '{AFTER}/shaping_nodes/chainshaper_localization_pose.py', '--ros-args', '-r', '__node:=chainshaper_localization_pose', '-r', '__ns:=/', '-r', 'input:=/localization/pose_tmp', '-r', 'output:=/localization/pose', '--params-file', '{AFTER}/shaping_nodes/chainshaper_localization_pose.yaml'], output='screen'),
+            ExecuteProcess(cmd=['python3', '{AFTER}/shaping_nodes/chainshaper_localization_pose.py', '--ros-args', '-r', '__node:=chainshaper_localization_pose', '-r', '__ns:=/', '-r', 'input:=/localization/pose_tmp', '-r', 'output:=/localization/pose', '--params-file', '{AFTER}/shaping_nodes/chainshaper_localization_pose.yaml'], output='screen', respawn=True, respawn_delay=0.1),
+            ExecuteProcess(cmd=['python3', '{AFTER}/shaping_nodes/chainshaper_localization_pose_standby.py', '--ros-args', '-r', '__node:=chainshaper_localization_pose_standby', '-r', '__ns:=/', '-r', 'input:=/localization/pose_tmp', '-r', 'output:=/localization/pose', '--params-file', '{AFTER}/shaping_nodes/chainshaper_localization_pose_standby.yaml'], output='screen', respawn=True, respawn_delay=0.1),
             SetRemap('ndt:/localization/out', '/localization/pose_tmp'),
             IncludeLaunchDescription(PythonLaunchDescriptionSource('{BEFORE}/robot.launch.py'), launch_arguments=[('namespace', LaunchConfiguration('namespace'))]),
         ]

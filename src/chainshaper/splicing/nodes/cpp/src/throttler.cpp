@@ -55,7 +55,7 @@ int main(int argc, char ** argv)
 {
   std::vector<std::unique_ptr<Channel>> channels;
   const int code = chainshaper::run(
-    argc, argv, "chainshaper_throttler", [&](rclcpp::Node & node) {
+    argc, argv, "chainshaper_throttler", [&](rclcpp::Node & node) -> std::function<bool()> {
       using Names = std::vector<std::string>;
       const auto inputs = chainshaper::parameter<Names>(node, "inputs", {});
       const auto outputs = chainshaper::parameter<Names>(node, "outputs", {});
@@ -69,7 +69,7 @@ int main(int argc, char ** argv)
         const auto offer =
         chainshaper::wait_for_publisher(node, inputs[i], static_cast<std::size_t>(depth));
         if (!offer) {
-          return false;
+          return {};
         }
         channels.push_back(std::make_unique<Channel>());
         Channel & channel = *channels.back();
@@ -78,7 +78,7 @@ int main(int argc, char ** argv)
         node.create_generic_publisher(outputs[i], offer->type, offer->publisher);
         channel.subscription = chainshaper::subscribe_serialized(
           node, inputs[i], offer->type, offer->subscription,
-          [&channel](std::shared_ptr<const rclcpp::SerializedMessage> message, std::int64_t) {
+          [&channel](std::shared_ptr<rclcpp::SerializedMessage> message, const rclcpp::MessageInfo &) {
             take(channel, std::move(message));
           });
       }
@@ -89,7 +89,7 @@ int main(int argc, char ** argv)
         channel->timer = node.create_wall_timer(
           std::chrono::nanoseconds(period), [&node, &channel] {publish(node, *channel);});
       }
-      return true;
+      return [] {return false;};
     });
   for (const auto & channel : channels) {
     std::printf(

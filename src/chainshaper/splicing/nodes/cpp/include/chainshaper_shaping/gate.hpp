@@ -24,9 +24,14 @@ namespace chainshaper
 
 enum class Anchor {stamp, cycle};
 enum class Policy {wait, discard, publish, next_slot};
+enum class Messages {all_in_order, newest, first};
+enum class Dropped {replaced, surplus, overflowed, discarded};
 
 inline constexpr std::array<const char *, 2> anchor_names{"stamp", "cycle"};
 inline constexpr std::array<const char *, 4> policy_names{"wait", "discard", "publish", "next-slot"};
+inline constexpr std::array<const char *, 3> messages_names{"all-in-order", "newest", "first"};
+inline constexpr std::array<const char *, 4> dropped_names{
+  "replaced", "surplus", "overflowed", "discarded"};
 
 // A half-open interval, counted from the anchor.
 struct Slot
@@ -59,11 +64,13 @@ struct Gate
   std::int64_t cycle_ns{0};
   Anchor anchor{Anchor::stamp};
   std::int64_t phase_ns{0};
-  std::optional<std::int64_t> max_age_ns{};  // none: ten cycles
+  std::optional<std::int64_t> max_age_ns{};  // none: ten cycles and those it is due after
   std::int64_t max_future_ns{1'000'000};
   Policy overrun{Policy::wait};
   std::int64_t due_cycles{0};
   std::optional<Modes> modes{};
+  Messages messages{Messages::all_in_order};
+  std::size_t depth{10};
 };
 
 // A mode that was announced, and when.
@@ -84,8 +91,9 @@ struct Release
 // Throws std::invalid_argument for a gate that makes no sense.
 inline void check(const Gate & gate)
 {
-  if (gate.cycle_ns <= 0 || gate.slots.empty() || gate.due_cycles < 0) {
-    throw std::invalid_argument("a gate needs a cycle, at least one slot, and no negative delay");
+  if (gate.cycle_ns <= 0 || gate.slots.empty() || gate.due_cycles < 0 || gate.depth == 0) {
+    throw std::invalid_argument(
+      "a gate needs a cycle, at least one slot, no negative delay, and room for a message");
   }
   std::int64_t previous_end = 0;
   for (const auto & slot : gate.slots) {
@@ -141,56 +149,67 @@ inline std::pair<std::size_t, std::size_t> open_to(
 
 inline bool usable(const Gate & gate, std::int64_t age_ns)
 {
-  const std::int64_t max_age = gate.max_age_ns.value_or(10 * gate.cycle_ns);
+  const std::int64_t max_age = gate.max_age_ns.value_or((10 + gate.due_cycles) * gate.cycle_ns);
   return -gate.max_future_ns <= age_ns && age_ns <= max_age;
 }
 
 // Decide when a message that arrived at `arrival_ns`, with this stamp (both CLOCK_MONOTONIC), may
-// leave. `changes` are the modes that were announced, ascending in time.
+// leave. `changes` are the modes that were announced, ascending in time. It leaves at `ready_ns` at
+// the earliest, where others are before it.
 inline Release release_of(
   const Gate & gate, std::int64_t arrival_ns, std::optional<std::int64_t> stamp_ns,
-  const std::deque<Change> & changes = {})
+  const std::deque<Change> & changes, std::int64_t ready_ns, std::int64_t phase_ns)
 {
   const std::int64_t cycle_ns = gate.cycle_ns;
   std::int64_t origin{};
   Anchor anchor{};
+  std::int64_t due = gate.due_cycles;
   if (gate.anchor == Anchor::stamp && stamp_ns && usable(gate, arrival_ns - *stamp_ns)) {
     origin = *stamp_ns;
     anchor = Anchor::stamp;
   } else {
-    const std::int64_t rest = (arrival_ns - gate.phase_ns) % cycle_ns;
+    const std::int64_t rest = (arrival_ns - phase_ns) % cycle_ns;
     origin = arrival_ns - (rest < 0 ? rest + cycle_ns : rest);
     anchor = Anchor::cycle;
+    due = std::min<std::int64_t>(due, 1);
   }
   const auto mode = mode_at(gate, origin, changes);
   const auto [first, last] = open_to(gate, mode);
+  const std::int64_t ready = std::max(arrival_ns, ready_ns);
   // A stamp slightly from the future puts the arrival before its own cycle: cycle 0 still.
-  std::int64_t cycle = arrival_ns < origin ? 0 : (arrival_ns - origin) / cycle_ns;
-  const std::int64_t due_from = origin + gate.due_cycles * cycle_ns;
-  const bool overran = arrival_ns >= due_from + gate.slots[last - 1].end;
+  std::int64_t cycle = ready < origin ? 0 : (ready - origin) / cycle_ns;
+  const std::int64_t due_from = origin + due * cycle_ns;
+  const bool overran = ready >= due_from + gate.slots[last - 1].end;
   const Policy policy = policy_of(gate);
   if (overran && policy != Policy::wait) {
     std::optional<std::int64_t> at_once;
     if (policy == Policy::publish) {
-      at_once = arrival_ns;
+      at_once = ready;
     }
     return {at_once, origin, std::nullopt, cycle, anchor, policy, mode};
   }
   std::optional<Policy> treated;
   if (overran) {
     treated = Policy::wait;
-  } else if (mode && arrival_ns >= due_from + gate.slots[first].end) {
+  } else if (mode && ready >= due_from + gate.slots[first].end) {
     treated = Policy::next_slot;
   }
-  for (;; ++cycle) {
+  for (cycle = std::max(due, cycle); ; ++cycle) {
     const std::int64_t cycle_start = origin + cycle * cycle_ns;
     for (std::size_t slot = first; slot < last; ++slot) {
-      if (arrival_ns < cycle_start + gate.slots[slot].end) {
-        const std::int64_t at = std::max(arrival_ns, cycle_start + gate.slots[slot].start);
+      if (ready < cycle_start + gate.slots[slot].end) {
+        const std::int64_t at = std::max(ready, cycle_start + gate.slots[slot].start);
         return {at, origin, slot, cycle, anchor, treated, mode};
       }
     }
   }
+}
+
+inline Release withheld(Release release)
+{
+  release.at_ns.reset();
+  release.slot.reset();
+  return release;
 }
 
 // Whether the slot that a message was to leave in is over.

@@ -5,6 +5,7 @@
 #ifndef CHAINSHAPER_SHAPING__NODE_HPP_
 #define CHAINSHAPER_SHAPING__NODE_HPP_
 
+#include <dlfcn.h>
 #include <sched.h>
 #include <sys/mman.h>
 
@@ -12,6 +13,7 @@
 #include <chrono>
 #include <csignal>
 #include <cstring>
+#include <functional>
 #include <memory>
 #include <optional>
 #include <string>
@@ -19,11 +21,13 @@
 #include <utility>
 #include <vector>
 
+#include "rcl/subscription.h"
 #include "rclcpp/rclcpp.hpp"
 #include "std_msgs/msg/string.hpp"
 
 #include "gate.hpp"
 #include "gate_log.hpp"
+#include "handover.hpp"
 #include "readiness.hpp"
 #include "shaper.hpp"
 
@@ -79,6 +83,16 @@ inline Offer offer_of(const rclcpp::TopicEndpointInfo & info, std::size_t depth)
   return {info.topic_type(), asked, rclcpp::QoS(history, offered)};
 }
 
+// Wait, unless the process is to stop; whether it goes on.
+inline bool wait(double seconds)
+{
+  const auto until = monotonic_ns() + static_cast<std::int64_t>(seconds * 1e9);
+  while (rclcpp::ok() && monotonic_ns() < until) {
+    sleep_until(std::min(until, monotonic_ns() + 50'000'000));
+  }
+  return rclcpp::ok();
+}
+
 // Wait until somebody publishes a topic; none when the process is to stop.
 inline std::optional<Offer> wait_for_publisher(
   rclcpp::Node & node, const std::string & topic, std::size_t depth)
@@ -104,7 +118,7 @@ inline std::optional<Offer> wait_for_publisher(
       RCLCPP_INFO(node.get_logger(), "waiting for a publisher of %s", name.c_str());
       said = true;
     }
-    std::this_thread::sleep_for(std::chrono::milliseconds(50));
+    std::this_thread::sleep_for(std::chrono::milliseconds(10));
   }
   return std::nullopt;
 }
@@ -150,7 +164,17 @@ inline Policy policy_named(const std::string & name)
   throw std::invalid_argument("there is no policy '" + name + "' for late messages");
 }
 
-inline Gate gate_from(rclcpp::Node & node)
+inline Messages messages_named(const std::string & name)
+{
+  for (std::size_t i = 0; i < messages_names.size(); ++i) {
+    if (name == messages_names[i]) {
+      return static_cast<Messages>(i);
+    }
+  }
+  throw std::invalid_argument("there is no choice '" + name + "' of messages");
+}
+
+inline Gate gate_from(rclcpp::Node & node, const rclcpp::QoS & offered)
 {
   using Numbers = std::vector<std::int64_t>;
   Gate gate;
@@ -162,6 +186,9 @@ inline Gate gate_from(rclcpp::Node & node)
   gate.phase_ns = parameter<std::int64_t>(node, "phase_ns", 0);
   gate.due_cycles = parameter<std::int64_t>(node, "due_cycles", 0);
   gate.overrun = policy_named(parameter<std::string>(node, "overrun", "wait"));
+  gate.messages = messages_named(parameter<std::string>(node, "messages", "all-in-order"));
+  const auto depth = parameter<std::int64_t>(node, "depth", 0);
+  gate.depth = depth > 0 ? static_cast<std::size_t>(depth) : std::max(gate.depth, offered.depth());
   const bool by_stamp = parameter<std::string>(node, "anchor", "stamp") == "stamp";
   gate.anchor = by_stamp ? Anchor::stamp : Anchor::cycle;
   if (!parameter<std::string>(node, "mode_topic", "").empty()) {
@@ -196,19 +223,92 @@ inline std::optional<std::size_t> delivery_core(rclcpp::Node & node)
   return std::nullopt;
 }
 
+// What is agreed with the standby; none: the node is alone, since nothing names a page. After
+// several nodes that failed at once this one waits, so that starting over and over does not take a
+// core; so this comes before anything that may fail.
+inline std::optional<Turn> turn_of(rclcpp::Node & node)
+{
+  const auto page = parameter<std::string>(node, "handover", "");
+  if (page.empty()) {
+    return std::nullopt;
+  }
+  std::optional<Turn> turn;
+  try {
+    turn.emplace(page, node.get_node_topics_interface()->resolve_topic_name("output"));
+  } catch (const std::runtime_error & error) {  // the standby has none either
+    RCLCPP_ERROR(
+      node.get_logger(), "nothing can be agreed with the standby, which does nothing: %s",
+      error.what());
+    return std::nullopt;
+  }
+  if (turn->wait_s() > 0) {
+    RCLCPP_WARN(
+      node.get_logger(), "has failed %d times: starting in %g s",
+      static_cast<int>(turn->failed_before()), turn->wait_s());
+    wait(turn->wait_s());
+  }
+  return turn;
+}
+
+// How many messages are missing before each, by its publisher's numbers; none: not known.
+class Gaps
+{
+public:
+  std::optional<std::int64_t> before(const rmw_message_info_t & info)
+  {
+    if (info.publication_sequence_number == RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED) {
+      return std::nullopt;
+    }
+    const auto last = last_;
+    last_ = static_cast<std::int64_t>(info.publication_sequence_number);
+    // A publisher that is started again counts anew.
+    return last ? std::max<std::int64_t>(0, last_.value() - *last - 1) : 0;
+  }
+
+private:
+  std::optional<std::int64_t> last_;
+};
+
+// Emits the event of a take once more, when a callback is executed for its message: others were
+// taken meanwhile, and a callback is for the message that was taken last.
+inline void take_again(
+  const rclcpp::SubscriptionBase & subscription, const void * message,
+  std::optional<std::int64_t> source_timestamp)
+{
+  using Emit = void (*)(const void *, const void *, std::int64_t, bool);
+  static const auto emit = reinterpret_cast<Emit>(dlsym(RTLD_DEFAULT, "ros_trace_rmw_take"));
+  if (emit != nullptr) {
+    const auto handle = subscription.get_subscription_handle();
+    emit(
+      rcl_subscription_get_rmw_handle(handle.get()), message, source_timestamp.value_or(0), true);
+  }
+}
+
 // The gate of a node, with everything around it but the topics of the messages.
+template<typename Message>
 class Shaping
 {
 public:
-  explicit Shaping(rclcpp::Node & node)
-  : node_(node), pause_ns_(parameter<std::int64_t>(node, "pause_ns", 0)),
+  using Pointer = std::shared_ptr<Message>;
+
+  Shaping(rclcpp::Node & node, const Offer & offer, std::optional<Turn> turn)
+  : node_(node), pause_ns_(parameter<std::int64_t>(node, "pause_ns", 0)), turn_(std::move(turn)),
     readiness_(node, delivery_core(node), pause_ns_),
     shaper_(
-      gate_from(node), parameter<std::int64_t>(node, "spin_ns", 0),
-      [this](std::int64_t release_ns) {readiness_.get_ready(release_ns);})
+      gate_from(node, offer.publisher), parameter<std::int64_t>(node, "spin_ns", 0),
+      [this](std::int64_t release_ns) {readiness_.get_ready(release_ns);}, [] {},
+      [this](const Release & release, std::int64_t phase_ns) {
+        if (turn_) {
+          turn_->hold(release.at_ns, phase_ns, release.mode);
+        }
+      })
   {
+    if (turn_) {
+      go_on();
+    }
     const auto log = parameter<std::string>(node, "log", "");
-    if (!log.empty() && !log_.open_file(log)) {
+    const auto most_bytes = parameter<std::int64_t>(node, "log_bytes", 100'000'000);
+    if (!log.empty() && !log_.open_file(log, most_bytes)) {
       RCLCPP_WARN(
         node.get_logger(), "no log is written to %s: %s", log.c_str(), std::strerror(errno));
     }
@@ -223,6 +323,15 @@ public:
         result.successful = true;
         return result;
       });
+  }
+
+  // The gate drops what it has no room for, and so counts it: its reader has more of it. What
+  // leaves in one slot must find room in the writer, too.
+  rclcpp::QoS asked(rclcpp::QoS qos) const {return deeper(qos, std::max(reader_depth, depth()));}
+  rclcpp::QoS offered(rclcpp::QoS qos) const
+  {
+    const bool latched = qos.durability() == rclcpp::DurabilityPolicy::TransientLocal;
+    return latched ? qos : deeper(qos, depth());
   }
 
   // To be called when discovery has had its time. A mode that was announced before is only
@@ -249,19 +358,74 @@ public:
       });
   }
 
-  // Hold a message until its slot, publish it, rest so that it is delivered, and note what was
-  // done. One that waited for another cycle is followed at once by the next: no rest.
-  template<typename Publish>
-  void shape(
-    std::optional<std::int64_t> stamp_ns, std::optional<std::int64_t> source_timestamp,
-    Publish && publish)
+  // Leave the output to the standby, if there is one, until the receivers know this node too: what
+  // is published before is lost to them. How far discovery has come at the other side cannot be
+  // seen: it is given a little longer. Whether the node is to run.
+  template<typename Publisher>
+  bool await_receivers(const Publisher & publisher)
   {
-    const Held held = shaper_.hold(stamp_ns);
+    const auto topic = node_.get_node_topics_interface()->resolve_topic_name("output");
+    const auto give_up = monotonic_ns() + 2'000'000'000;
+    while (turn_ && turn_->has_standby() && rclcpp::ok() && monotonic_ns() < give_up) {
+      if (publisher.get_subscription_count() >= node_.count_subscribers(topic)) {
+        return wait(0.1);
+      }
+      wait(0.01);
+    }
+    return rclcpp::ok();
+  }
+
+  // How to take a message without waiting, to read its stamp, to publish it, and to execute the
+  // subscription's callback for it.
+  struct Topics
+  {
+    std::shared_ptr<rclcpp::SubscriptionBase> subscription;
+    std::function<Pointer(rclcpp::MessageInfo &)> take;
+    std::function<std::optional<std::int64_t>(const Message &)> stamp_of;
+    std::function<void(const Message &)> publish;
+    std::function<void(const Pointer &, const rclcpp::MessageInfo &)> execute;
+  };
+
+  void connect(Topics topics)
+  {
+    topics_ = std::move(topics);
+    shaper_.look = [this] {
+        rclcpp::MessageInfo info;
+        while (const auto message = topics_.take(info)) {
+          arrive(message, info.get_rmw_message_info(), true);
+        }
+      };
+  }
+
+  // The subscription's callback: hold the oldest message until its slot, publish it, rest so that
+  // it is delivered, and note what was done.
+  void shape(Pointer message, const rclcpp::MessageInfo & info)
+  {
+    if (!its_turn_) {  // the executor took it
+      const bool alone = shaper_.queue.waiting.empty();
+      arrive(std::move(message), info.get_rmw_message_info(), false);
+      if (!alone) {
+        return;
+      }
+    }
+    const auto key = shaper_.queue.waiting.front().source_timestamp.value_or(0);
+    if (turn_ && !turn_->take(key)) {
+      shaper_.queue.leave({}, monotonic_ns());
+      return;
+    }
+    const auto held = shaper_.hold();
+    if (!held) {
+      return;
+    }
+    if (turn_ && turn_->was_bypassed(key)) {
+      readiness_.relax();
+      return;
+    }
     std::optional<std::int64_t> published_ns;
     std::optional<std::int64_t> stalled_ns;
-    if (held.release.at_ns) {
+    if (held->release.at_ns) {
       try {
-        publish();
+        topics_.publish(*held->waiting.message);
       } catch (const rclcpp::exceptions::RCLError &) {
         if (rclcpp::ok()) {
           throw;
@@ -269,27 +433,118 @@ public:
         return;  // it was interrupted meanwhile; to ask before publishing would cost time
       }
       published_ns = monotonic_ns();
-      stalled_ns = shaper_.time_lost(held);
-      if (!held.release.overrun) {
-        sleep_until(*published_ns + pause_ns_);
+      if (turn_) {
+        turn_->done(key);
       }
+      stalled_ns = shaper_.time_lost(*held);
+      shaper_.rest(*published_ns, pause_ns_);
+    } else if (turn_) {
+      turn_->done(key);
     }
     readiness_.relax();
-    log_.write(shaper_.gate(), held, source_timestamp, published_ns, stalled_ns);
+    note(*held, published_ns, stalled_ns);
+  }
+
+  // Deal with what waits at the gate, each by the subscription's callback, until there is time for
+  // the node's other callbacks; whether some are left.
+  bool work_off()
+  {
+    for (bool served = false; rclcpp::ok(); served = true) {
+      for (const auto & gone : shaper_.overflowed) {
+        note(gone);
+      }
+      shaper_.overflowed.clear();
+      if (shaper_.queue.waiting.empty() || (served && shaper_.nothing_due())) {
+        break;
+      }
+      const auto oldest = shaper_.queue.waiting.front();
+      take_again(*topics_.subscription, oldest.message.get(), oldest.source_timestamp);
+      its_turn_ = true;
+      topics_.execute(oldest.message, rclcpp::MessageInfo());
+      its_turn_ = false;
+    }
+    return !shaper_.queue.waiting.empty();
   }
 
 private:
+  static constexpr std::size_t reader_depth = 1000;
+
+  std::size_t depth() const {return shaper_.queue.gate.depth;}
+
+  static rclcpp::QoS deeper(rclcpp::QoS qos, std::size_t depth)
+  {
+    if (qos.history() == rclcpp::HistoryPolicy::KeepLast) {
+      qos.keep_last(std::max(depth, qos.depth()));
+    }
+    return qos;
+  }
+
+  void arrive(Pointer message, const rmw_message_info_t & info, bool waited)
+  {
+    const auto stamp = topics_.stamp_of(*message);
+    const auto before = shaper_.overflowed.size();
+    shaper_.arrive(std::move(message), stamp, info.source_timestamp, waited, gaps_.before(info));
+    if (!turn_ || shaper_.overflowed.size() == before) {
+      return;
+    }
+    const auto gone = shaper_.overflowed.back().waiting.source_timestamp.value_or(0);
+    if (turn_->was_bypassed(gone)) {
+      shaper_.overflowed.pop_back();
+    } else {
+      turn_->drop(gone);
+    }
+  }
+
+  // Losses are said when they happen, at most every ten seconds.
+  void note(
+    const Held<Pointer> & held, std::optional<std::int64_t> published_ns = {},
+    std::optional<std::int64_t> stalled_ns = {})
+  {
+    log_.write(shaper_.queue.gate, held, published_ns, stalled_ns);
+    const std::int64_t now = monotonic_ns();
+    if (said_ns_ != 0 && now - said_ns_ < 10'000'000'000) {
+      return;
+    }
+    const std::string losses = log_.losses();
+    if (losses != said_) {
+      RCLCPP_WARN(
+        node_.get_logger(), "of %llu messages so far: %s",
+        static_cast<unsigned long long>(log_.rows), losses.c_str());  // NOLINT(runtime/int)
+      said_ = losses;
+      said_ns_ = now;
+    }
+  }
+
+  // Have cycles begin where they did for the node before this one, in its mode.
+  void go_on()
+  {
+    const auto & gate = shaper_.queue.gate;
+    if (const auto phase = turn_->phase_ns()) {
+      shaper_.set_phase(*phase, monotonic_ns() - gate.cycle_ns);  // from now on, not the next cycle
+    }
+    if (const auto mode = turn_->mode(); gate.modes && mode && *mode < gate.modes->names.size()) {
+      shaper_.announce(gate.modes->names[*mode], 0);
+    }
+  }
+
   rclcpp::Node & node_;
   std::int64_t pause_ns_;
+  std::optional<Turn> turn_;
   Readiness readiness_;
-  Shaper shaper_;
+  Shaper<Pointer> shaper_;
   GateLog log_;
+  Gaps gaps_;
+  Topics topics_;
+  bool its_turn_{false};  // of the oldest message
+  std::string said_;
+  std::int64_t said_ns_{0};
   rclcpp::node_interfaces::OnSetParametersCallbackHandle::SharedPtr phase_;
   rclcpp::Subscription<std_msgs::msg::String>::SharedPtr modes_;
 };
 
-// Run a node until it is interrupted: `set_up` makes its endpoints and returns whether it is to
-// run. The exit code of the process.
+// Run a node until it is interrupted: `set_up` makes its endpoints and returns what is to be called
+// behind each callback, or nothing where it is not to run; that returns whether it wants to be called
+// again although nothing has come. The exit code of the process.
 template<typename SetUp>
 int run(int argc, char ** argv, const std::string & name, SetUp && set_up)
 {
@@ -300,9 +555,14 @@ int run(int argc, char ** argv, const std::string & name, SetUp && set_up)
   auto node = make_node(name);
   int code = 0;
   try {
-    if (set_up(*node)) {
+    const std::function<bool()> work_off = set_up(*node);
+    if (work_off) {
       become_realtime(*node);
-      rclcpp::spin(node);
+      rclcpp::executors::SingleThreadedExecutor executor;
+      executor.add_node(node);
+      while (rclcpp::ok()) {
+        executor.spin_once(std::chrono::nanoseconds(work_off() ? 0 : -1));
+      }
     }
   } catch (const std::exception & error) {
     RCLCPP_FATAL(node->get_logger(), "%s", error.what());

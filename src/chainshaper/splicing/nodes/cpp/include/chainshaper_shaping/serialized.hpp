@@ -24,9 +24,8 @@
 namespace chainshaper
 {
 
-// Called with each message and its source timestamp, ns of CLOCK_REALTIME.
 using Taken =
-  std::function<void(std::shared_ptr<const rclcpp::SerializedMessage>, std::int64_t)>;
+  std::function<void(std::shared_ptr<rclcpp::SerializedMessage>, const rclcpp::MessageInfo &)>;
 
 #if RCLCPP_VERSION_GTE(25, 0, 0)
 
@@ -34,12 +33,7 @@ inline rclcpp::GenericSubscription::SharedPtr subscribe_serialized(
   rclcpp::Node & node, const std::string & topic, const std::string & type,
   const rclcpp::QoS & qos, Taken taken)
 {
-  return node.create_generic_subscription(
-    topic, type, qos,
-    [taken](
-      std::shared_ptr<const rclcpp::SerializedMessage> message, const rclcpp::MessageInfo & info) {
-      taken(message, info.get_rmw_message_info().source_timestamp);
-    });
+  return node.create_generic_subscription(topic, type, qos, taken);
 }
 
 inline void publish_serialized(
@@ -79,7 +73,7 @@ public:
     TRACEPOINT(
       rmw_take, handle, static_cast<const void *>(message.get()), source_timestamp, true);
     TRACEPOINT(callback_start, callback, false);
-    taken_(message, source_timestamp);
+    taken_(message, info);
     TRACEPOINT(callback_end, callback);
   }
 

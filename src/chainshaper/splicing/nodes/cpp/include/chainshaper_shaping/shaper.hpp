@@ -16,14 +16,15 @@
 #include <algorithm>
 #include <cstdint>
 #include <cstdlib>
-#include <deque>
 #include <functional>
 #include <limits>
 #include <optional>
 #include <string>
 #include <utility>
+#include <vector>
 
 #include "gate.hpp"
+#include "queue.hpp"
 
 namespace chainshaper
 {
@@ -120,97 +121,58 @@ private:
   pid_t thread_{-1};
 };
 
-// What became of one message.
-struct Held
-{
-  Release release;
-  std::int64_t arrival_ns;
-  std::int64_t awake_ns;
-};
-
+// `Message` is what the queue holds. `look` takes what has come and has it arrive: it is called
+// while others are held, before each release and behind it.
+template<typename Message>
 class Shaper
 {
 public:
   // `on_waking` is called with the time of a release when it wakes `spin_ns` before that, to watch
-  // the clock from there; what it does there should be over in time.
+  // the clock from there; what it does there should be over in time. `on_decision` is called with
+  // each decision, before it is waited for, and where cycles begin.
   Shaper(
     Gate gate, std::int64_t spin_ns,
-    std::function<void(std::int64_t)> on_waking = [](std::int64_t) {})
-  : gate_(std::move(gate)), spin_ns_(spin_ns), on_waking_(std::move(on_waking)),
-    offset_(clock_offset())
-  {
-    check(gate_);
-  }
+    std::function<void(std::int64_t)> on_waking = [](std::int64_t) {},
+    std::function<void()> look = [] {},
+    std::function<void(const Release &, std::int64_t)> on_decision =
+    [](const Release &, std::int64_t) {})
+  : queue(std::move(gate)), look(std::move(look)), spin_ns_(spin_ns),
+    on_waking_(std::move(on_waking)), on_decision_(std::move(on_decision)), offset_(clock_offset())
+  {}
 
   // Cycles begin elsewhere, from the first such beginning after `now_ns` on.
   void set_phase(std::int64_t phase_ns, std::int64_t now_ns)
   {
-    const std::int64_t rest = (phase_ns - now_ns) % gate_.cycle_ns;
-    const std::int64_t from_ns = now_ns + (rest < 0 ? rest + gate_.cycle_ns : rest);
+    const std::int64_t cycle_ns = queue.gate.cycle_ns;
+    const std::int64_t rest = (phase_ns - now_ns) % cycle_ns;
+    const std::int64_t from_ns = now_ns + (rest < 0 ? rest + cycle_ns : rest);
     next_phase_ = {from_ns, phase_ns};
   }
-
-  const Gate & gate() const {return gate_;}
 
   // A mode is announced, in force from the next cycle on; false: there is none like it.
   bool announce(const std::string & name, std::int64_t now_ns)
   {
-    const auto mode = gate_.modes ? gate_.modes->find(name) : std::nullopt;
+    const auto & modes = queue.gate.modes;
+    const auto mode = modes ? modes->find(name) : std::nullopt;
     if (!mode) {
       return false;
     }
-    if (*mode != (changes_.empty() ? gate_.modes->initial : changes_.back().second)) {
-      changes_.emplace_back(now_ns, *mode);
-      if (changes_.size() > 64) {  // reaches back further than the oldest stamp that is of use
-        changes_.pop_front();
+    auto & changes = queue.changes;
+    if (*mode != (changes.empty() ? modes->initial : changes.back().second)) {
+      changes.emplace_back(now_ns, *mode);
+      if (changes.size() > 64) {  // reaches back further than the oldest stamp that is of use
+        changes.pop_front();
       }
     }
     return true;
   }
 
-  // Wait until a message with this stamp (CLOCK_REALTIME) may leave. One that is to be discarded
-  // is not waited for; where overruns are discarded, so is a message whose slot is over when this
-  // thread wakes.
-  Held hold(std::optional<std::int64_t> stamp_ns)
-  {
-    Held held{{}, monotonic_ns(), 0};
-    held.release = decide(stamp_ns, held.arrival_ns);
-    if (!held.release.at_ns) {
-      held.awake_ns = held.arrival_ns;
-      return held;
-    }
-    waited_ns_ = waiting_.so_far();
-    if (*held.release.at_ns > held.arrival_ns) {
-      sleep_until(*held.release.at_ns - spin_ns_);
-      on_waking_(*held.release.at_ns);
-      if (monotonic_ns() < *held.release.at_ns) {
-        // Awake in time: what other threads took before is of no consequence.
-        waited_ns_ = waiting_.so_far();
-      }
-    }
-    held.awake_ns = watch_until(*held.release.at_ns);
-    if (policy_of(gate_) == Policy::discard && missed(gate_, held.release, held.awake_ns)) {
-      held.release.at_ns.reset();
-      held.release.slot.reset();
-      held.release.overrun = Policy::discard;
-    }
-    return held;
-  }
-
-  // How much of the delay between a release and the time when the thread was awake the machine
-  // itself took: what the kernel does not say that other threads ran. To be called right after
-  // publishing.
-  std::int64_t time_lost(const Held & held)
-  {
-    if (!held.release.at_ns) {
-      return 0;
-    }
-    const std::int64_t others = waiting_.so_far() - waited_ns_;
-    return std::max<std::int64_t>(0, held.awake_ns - *held.release.at_ns - others);
-  }
-
-private:
-  Release decide(std::optional<std::int64_t> stamp_ns, std::int64_t arrival_ns)
+  // A message with this stamp (CLOCK_REALTIME) was taken now. One that `waited` in the reader
+  // counts as having come at its source timestamp, if that is after the last look.
+  void arrive(
+    Message message, std::optional<std::int64_t> stamp_ns,
+    std::optional<std::int64_t> source_timestamp = {}, bool waited = false,
+    std::optional<std::int64_t> lost = {})
   {
     constexpr std::int64_t step_ns = 500'000;  // slewing moves the clock by far less in a cycle
     const std::int64_t offset = clock_offset();
@@ -220,22 +182,127 @@ private:
     if (stamp_ns && !stepped) {
       origin = *stamp_ns - offset;
     }
+    std::int64_t arrival_ns = monotonic_ns();
+    if (waited && source_timestamp && !stepped) {
+      arrival_ns = std::min(arrival_ns, std::max(looked_ns_, *source_timestamp - offset));
+    }
     if (next_phase_ && arrival_ns >= next_phase_->first) {
-      gate_.phase_ns = next_phase_->second;
+      queue.phase_ns = next_phase_->second;
       next_phase_.reset();
     }
-    const Release release = release_of(gate_, arrival_ns, origin, changes_);
-    if (release.anchor == Anchor::stamp) {
-      gate_.phase_ns = release.origin_ns % gate_.cycle_ns;
+    auto full = queue.arrive(std::move(message), arrival_ns, origin, source_timestamp, lost);
+    if (full) {
+      overflowed.push_back(std::move(*full));
     }
-    return release;
   }
 
-  Gate gate_;
+  // Wait until the oldest message leaves, or is dropped; none: it was overflowed meanwhile. One
+  // that is to be discarded is not waited for; where overruns are discarded, so is a message whose
+  // slot is over when this thread wakes.
+  std::optional<Held<Message>> hold()
+  {
+    const std::uint64_t number = queue.waiting.front().number;
+    std::int64_t now = monotonic_ns();
+    auto [release, dropped] = queue.decide();
+    on_decision_(release, queue.phase_ns);
+    bool slept = false;
+    if (release.at_ns) {
+      waited_ns_ = waiting_.so_far();
+      slept = *release.at_ns > now;
+      while (*release.at_ns - spin_ns_ > now) {
+        sleep_until(std::min(*release.at_ns - spin_ns_, now + look_ns));
+        look_again();
+        now = monotonic_ns();
+      }
+      if (!slept && queue.gate.messages == Messages::newest) {
+        look_again();
+      }
+      if (queue.waiting.front().number != number) {
+        return std::nullopt;
+      }
+      if (queue.replaced(release, now)) {
+        release = withheld(release);
+        dropped = Dropped::replaced;
+      }
+    }
+    if (!release.at_ns) {
+      return Held<Message>{queue.leave(release, now), release, now, dropped};
+    }
+    if (slept) {
+      on_waking_(*release.at_ns);
+      if (monotonic_ns() < *release.at_ns) {
+        // Awake in time: what other threads took before is of no consequence.
+        waited_ns_ = waiting_.so_far();
+      }
+    }
+    const std::int64_t awake = watch_until(*release.at_ns);
+    if (policy_of(queue.gate) == Policy::discard && missed(queue.gate, release, awake)) {
+      release = withheld(release);
+      release.overrun = Policy::discard;
+      dropped = Dropped::discarded;
+    }
+    return Held<Message>{queue.leave(release, awake), release, awake, dropped};
+  }
+
+  // Whether there is time for something else before the next release.
+  bool nothing_due()
+  {
+    if (queue.waiting.empty()) {
+      return true;
+    }
+    const Release release = queue.decide().first;
+    return release.at_ns && *release.at_ns > monotonic_ns() + spin_ns_ + others_ns;
+  }
+
+  // Pause behind a publication, unless another message has to leave meanwhile.
+  void rest(std::int64_t published_ns, std::int64_t pause_ns)
+  {
+    queue.free_ns = published_ns;
+    look_again();
+    const std::int64_t until = published_ns + pause_ns;
+    if (!queue.waiting.empty()) {
+      const Release release = queue.decide().first;
+      if (!release.at_ns || *release.at_ns - spin_ns_ <= until) {
+        return;
+      }
+    }
+    sleep_until(until);
+    queue.free_ns = monotonic_ns();
+  }
+
+  // How much of the delay between a release and the time when the thread was awake the machine
+  // itself took: what the kernel does not say that other threads ran. To be called right after
+  // publishing.
+  std::int64_t time_lost(const Held<Message> & held)
+  {
+    if (!held.release.at_ns) {
+      return 0;
+    }
+    const std::int64_t others = waiting_.so_far() - waited_ns_;
+    return std::max<std::int64_t>(0, held.awake_ns - *held.release.at_ns - others);
+  }
+
+  Queue<Message> queue;
+  std::vector<Held<Message>> overflowed;  // since the owner has emptied it
+  std::function<void()> look;
+
+private:
+  // Often enough for the reader's history, seldom enough for the core.
+  static constexpr std::int64_t look_ns = 50'000'000;
+  static constexpr std::int64_t others_ns = 2'000'000;  // an executor's other callbacks take less
+
+  void look_again()
+  {
+    const std::int64_t now = monotonic_ns();
+    look();
+    looked_ns_ = now;
+  }
+
   std::int64_t spin_ns_;
   std::function<void(std::int64_t)> on_waking_;
+  std::function<void(const Release &, std::int64_t)> on_decision_;
   std::int64_t offset_;
-  std::deque<Change> changes_;
+  std::int64_t looked_ns_{0};
   WaitingTime waiting_;
   std::int64_t waited_ns_{0};
   std::optional<std::pair<std::int64_t, std::int64_t>> next_phase_;  // from when on, and which

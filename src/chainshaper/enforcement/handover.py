@@ -1,0 +1,541 @@
+"""Which process publishes a shaped output: the shaping node, or the standby beside it.
+
+A shaping node is a single point in front of the actuator. So a second process, the **standby**,
+receives the same messages and passes them on while no shaping node is in force. For each message
+one of the two is responsible, whenever either is killed, stopped or started:
+
+* The **lock** of a file says whether a shaping node is in force. The kernel frees it at the node's
+  death. The node takes it with the first message that it receives, when its output is ready; the
+  standby takes it for as long as it publishes, and not at all while the node has it.
+* The file itself is a **page** in memory that both map: which messages each of them has dealt with
+  (by their source timestamps), and until when the node may take for the one that it holds.
+
+A message that the node has received and not released when it dies is published by the standby. One
+that the standby has published is left out by the node. A node that is late for its own release by
+more than a given patience hangs, or is stopped: the standby publishes what is due, and the node,
+when it goes on, leaves it out. What is left is the time from a publication until it is noted in
+the page, some microseconds: a process that is killed just there has published a message that the
+other publishes again.
+
+Like the gate, this imports nothing outside the standard library, since it runs inside ROS 2 nodes;
+`handover.hpp` is the node's side in C++, with the same page.
+"""
+
+import fcntl
+import mmap
+import os
+import select
+import stat
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+
+__all__ = ["FIELDS", "Page", "Standby", "Turn", "open_page", "page_folders"]
+
+FIELDS = (
+    "holder",  # the shaping node in force, a process id; 0 while the standby has the lock
+    "taken",  # how many messages shaping nodes have begun with
+    "first",  # the first message of the shaping node in force
+    "acknowledged",  # the same, once the standby has passed on all that came before it
+    "until_ns",  # what the node has in hand is released then; CLOCK_MONOTONIC, as all times here
+    "released",  # how many messages shaping nodes have dealt with: so many are in their ring
+    "phase_ns",  # where cycles begin; a node that starts again goes on from there
+    "phase_known",
+    "mode",  # the mode in force, from 1 in their order; 0: there are no modes
+    "started_ns",  # when a shaping node started last
+    "failed_starts",  # how many did, shortly one after the other, and dealt with no message
+    "starts",
+    "standby",  # the standby, a process id
+    "listening",  # 1: it has received a message, and so receives all that come behind it
+    "silent",  # 1: the standby passes nothing on, it counts what is lost
+    "bypassing_since_ns",  # 0: a shaping node is in force
+    "bypassed",  # how many messages the standby has dealt with: so many are in its ring
+    "bypassed_before",  # how many of these before the present time without a shaping node
+)
+"""Numbers of 8 bytes at the beginning of a page, in this order."""
+
+VERSION = 1  # of the page's layout: part of its name
+RING = 1024
+_AT = {name: place for place, name in enumerate(FIELDS)}
+_RELEASED, _BYPASSED, _TOPIC = 32, 32 + RING, 32 + 2 * RING
+_TOPIC_BYTES = 256
+_SIZE = 8 * _TOPIC + _TOPIC_BYTES
+_PUBLISHING, _STANDING_BY, _PASSING = 0, 1, 2  # the bytes of the file that are locked
+_FLOCK = "hhqqi4x"  # struct flock: type, whence, start, length, process
+
+BACK_OFF_AFTER = 3
+"""So many starts may fail at once; then each waits twice as long as the one before."""
+
+
+def page_folders() -> Iterator[str]:
+    """Where pages are, the best place first: of root, of a login session, of any user.
+
+    `/dev/shm` is in memory and empty after booting, like the others.
+    """
+    user = os.geteuid()
+    session = os.environ.get("XDG_RUNTIME_DIR")
+    if user == 0:
+        yield "/run/chainshaper/outputs"
+    elif session:
+        yield f"{session}/chainshaper/outputs"
+    yield f"/dev/shm/chainshaper-{user}"  # noqa: S108 - owner and mode are checked
+
+
+def open_page(name: str, topic: str) -> "Page":
+    """The page of an output: the one that is there, or else a new one.
+
+    ``name`` tells it from others in this domain; whoever publishes the ``topic`` gives the same.
+
+    Raises:
+        OSError: no folder is ours alone, or the file is not.
+    """
+    domain = os.environ.get("ROS_DOMAIN_ID") or "0"
+    problem = OSError("no folder")
+    for flags in (0, os.O_CREAT):
+        for folder in page_folders():
+            try:
+                file = f"{name}.{int(domain)}.v{VERSION}"
+                return Page(_private(folder), file, topic, os.O_RDWR | flags)
+            except (OSError, ValueError) as error:
+                problem = OSError(f"{folder}: {error}")
+    raise problem
+
+
+def _private(folder: str) -> str:
+    """A folder that is ours alone."""
+    # Not writable by others, whatever the umask: pages of every output are found through it.
+    os.makedirs(os.path.dirname(folder), 0o755, exist_ok=True)  # noqa: PTH103, PTH120 - of a node's file
+    with suppress(FileExistsError):
+        os.mkdir(folder, 0o700)  # noqa: PTH102
+    found = os.lstat(folder)
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:
+        raise PermissionError("it is not a folder of this user alone (mode 0700)")
+    return folder
+
+
+class Page:
+    """A page and its lock; numbers are read and written under the names of :data:`FIELDS`."""
+
+    def __init__(
+        self, folder: str, name: str, topic: str | None = None, flags: int = os.O_RDONLY
+    ) -> None:
+        """With the ``flags`` of `open`; without a ``topic`` the page is only looked at."""
+        self.path = f"{folder}/{name}"
+        flags |= os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+        self._file = os.open(self.path, flags, 0o600)
+        try:
+            found = os.fstat(self._file)
+            if not stat.S_ISREG(found.st_mode) or found.st_uid != os.lstat(folder).st_uid:
+                raise PermissionError(f"{name} is not a file of the folder's owner")
+            if topic is not None:  # memory that a full file system lacks later would be a SIGBUS
+                os.posix_fallocate(self._file, 0, _SIZE)
+            self._memory = mmap.mmap(-1 if topic is None else self._file, _SIZE)
+            if topic is None:  # as it is now: another user's file may become shorter meanwhile
+                content = os.pread(self._file, _SIZE, 0)
+                if len(content) < _SIZE:
+                    raise ValueError(f"{name} is no page of an output")
+                self._memory[:] = content
+        except BaseException:
+            os.close(self._file)
+            raise
+        self._inode = found.st_ino
+        self._numbers = memoryview(self._memory).cast("q")
+        if topic is not None:
+            self._memory[8 * _TOPIC :] = topic.encode()[:_TOPIC_BYTES].ljust(_TOPIC_BYTES, b"\0")
+
+    def __getitem__(self, field: str) -> int:
+        return self._numbers[_AT[field]]
+
+    def __setitem__(self, field: str, value: int) -> None:
+        self._numbers[_AT[field]] = value
+
+    @property
+    def topic(self) -> str:
+        """The output."""
+        return self._memory[8 * _TOPIC :].rstrip(b"\0").decode(errors="replace")
+
+    @property
+    def is_current(self) -> bool:
+        """Whether the page has its name still: folders of a session go when its user logs out."""
+        try:
+            return os.stat(self.path).st_ino == self._inode  # noqa: PTH116
+        except OSError:
+            return False
+
+    def lock(self) -> bool:
+        """Take the right to publish, if no process has it; it ends with the process."""
+        return self._lock(_PUBLISHING, fcntl.F_WRLCK)
+
+    def unlock(self) -> None:
+        """Give the right back."""
+        self._lock(_PUBLISHING, fcntl.F_UNLCK)
+
+    def stand_by(self) -> bool:
+        """Be the standby of this output, if there is no other."""
+        return self._lock(_STANDING_BY, fcntl.F_WRLCK)
+
+    @property
+    def has_standby(self) -> bool:
+        """Whether another process is the standby."""
+        return self._locked(_STANDING_BY)
+
+    def begin_passing(self) -> None:
+        """The standby publishes although the shaping node has the lock."""
+        self._lock(_PASSING, fcntl.F_WRLCK)
+
+    def end_passing(self) -> None:
+        """The standby has published."""
+        self._lock(_PASSING, fcntl.F_UNLCK)
+
+    @property
+    def is_passing(self) -> bool:
+        """Whether the standby publishes although the shaping node has the lock."""
+        return self._locked(_PASSING)
+
+    @property
+    def is_locked(self) -> bool:
+        """Whether another process has the right to publish."""
+        return self._locked(_PUBLISHING)
+
+    def note(self, key: int | None, *, bypassed: bool) -> None:
+        """A message has been dealt with, by the standby or by the shaping node."""
+        count, ring = ("bypassed", _BYPASSED) if bypassed else ("released", _RELEASED)
+        number = self[count]
+        self._numbers[ring + number % RING] = key or 0
+        self[count] = number + 1
+
+    def noted(self, *, bypassed: bool) -> list[int]:
+        """The latest messages that one of the two has dealt with, in no order."""
+        ring = _BYPASSED if bypassed else _RELEASED
+        return self._numbers[ring : ring + RING].tolist()
+
+    def close(self) -> None:
+        """Give up the page, and with it whatever it has locked."""
+        self._numbers.release()
+        self._memory.close()
+        os.close(self._file)
+
+    # Locks of open files (F_OFD_…): several in one file, each visible without taking it.
+
+    def _lock(self, byte: int, kind: int) -> bool:
+        try:
+            fcntl.fcntl(self._file, fcntl.F_OFD_SETLK, struct.pack(_FLOCK, kind, 0, byte, 1, 0))
+        except BlockingIOError:
+            return False
+        return True
+
+    def _locked(self, byte: int) -> bool:
+        asked = struct.pack(_FLOCK, fcntl.F_WRLCK, 0, byte, 1, 0)
+        answer = fcntl.fcntl(self._file, fcntl.F_OFD_GETLK, asked)
+        return bool(struct.unpack(_FLOCK, answer)[0] != fcntl.F_UNLCK)
+
+
+class Turn:
+    """The shaping node's side: whose turn it is to publish a message.
+
+    Messages are named by their source timestamps; where that is not known (None), none is left out.
+    """
+
+    GIVE_UP_NS = 50_000_000  # the standby needs the lock for a fraction of a millisecond
+    AT_ONCE_NS = 30_000_000_000
+
+    def __init__(self, name: str, topic: str) -> None:
+        self._name, self._topic, self._gave_up = name, topic, False
+        self._open()
+        now = time.monotonic_ns()
+        if now - self.page["started_ns"] > self.AT_ONCE_NS:
+            self.page["failed_starts"] = 0
+        self.page["started_ns"] = now
+        self.page["starts"] += 1
+        self.page["failed_starts"] += 1
+
+    def _open(self) -> None:
+        self.page = open_page(self._name, self._topic)
+        self._in_force = False
+        # Of the standby's messages: how many there were at the last look, and which.
+        self._seen, self._bypassed, self._oldest = -1, frozenset[int](), 0
+
+    @property
+    def phase_ns(self) -> int | None:
+        """Where cycles began for the shaping node before this one."""
+        return self.page["phase_ns"] if self.page["phase_known"] else None
+
+    @property
+    def wait_s(self) -> float:
+        """For how long to wait before starting: nodes before this one have failed at once."""
+        failed = self.page["failed_starts"] - 1 - BACK_OFF_AFTER
+        return 0.0 if failed < 0 else min(10.0, 0.5 * 2**failed)
+
+    def take(self, key: int | None) -> bool:
+        """Whether a message that was received is this node's to deal with."""
+        if not self._in_force and not self._come_into_force(key):
+            return False
+        self.page["until_ns"] = time.monotonic_ns()
+        self.page["taken"] += 1
+        return not self.was_bypassed(key)
+
+    def hold(self, until_ns: int | None, phase_ns: int, mode: int = 0) -> None:
+        """The message is released then (None: never); cycles begin at ``phase_ns``.
+
+        ``mode`` is the number of its cycle's, from 1; 0: there are no modes.
+        """
+        self.page["mode"] = mode
+        if until_ns is not None:
+            self.page["until_ns"] = until_ns
+        self.page["phase_ns"], self.page["phase_known"] = phase_ns, 1
+
+    def was_bypassed(self, key: int | None) -> bool:
+        """Whether the standby has dealt with a message."""
+        count = self.page["bypassed"]
+        if count != self._seen:
+            # What the standby is about to publish comes first.
+            give_up = time.monotonic_ns() + self.GIVE_UP_NS
+            while self.page.is_passing and time.monotonic_ns() < give_up:
+                time.sleep(0.0001)
+            self._bypassed = frozenset(self.page.noted(bypassed=True))
+            if self._seen >= 0 and count - self._seen > RING:
+                self._oldest = min(self._bypassed)  # older ones were, too
+            self._seen = count
+        if key is None or (key not in self._bypassed and key >= self._oldest):
+            self._oldest = 0  # what comes now is newer, even if the clock is set back
+            return False
+        self.page["taken"] += 1  # so this node does not hang any more
+        return True
+
+    def done(self, key: int | None) -> None:
+        """A message has been published or discarded."""
+        self.page.note(key, bypassed=False)
+        self.page["until_ns"] = time.monotonic_ns()
+        self.page["failed_starts"] = 0
+        if not self.page.is_current:
+            with suppress(OSError):  # without a folder this page has to do
+                left = self.page
+                self._open()
+                left.close()
+
+    def drop(self, key: int | None) -> None:
+        """A message that was received has no room any more, and is never published."""
+        self.page.note(key, bypassed=False)
+
+    def _come_into_force(self, key: int | None) -> bool:
+        give_up = time.monotonic_ns() + self.GIVE_UP_NS
+        while not self.page.lock():
+            if _is_alive(self.page["holder"]):  # another shaping node
+                return False
+            if self._gave_up or time.monotonic_ns() > give_up:
+                self._gave_up = True  # the standby was stopped while it published
+                break
+            time.sleep(0.001)
+        else:
+            self._in_force, self._gave_up = True, False
+        self.page["until_ns"] = time.monotonic_ns()
+        self.page["first"], self.page["holder"] = key or 0, os.getpid()
+        while self._may_be_acknowledged and not self._is_acknowledged(key):
+            if time.monotonic_ns() > give_up:
+                break
+            time.sleep(0.0002)
+        return True
+
+    @property
+    def _may_be_acknowledged(self) -> bool:
+        return self.page.has_standby and self.page["listening"] > 0
+
+    def _is_acknowledged(self, key: int | None) -> bool:
+        """Whether the standby has dealt with all that came before this node's first message."""
+        return key in (None, self.page["acknowledged"]) or key in self.page.noted(bypassed=True)
+
+
+@dataclass(frozen=True)
+class _Waiting:
+    """A message that is the shaping node's, unless that fails."""
+
+    key: int
+    payload: bytes
+    arrival_ns: int
+
+
+class Standby:
+    """The standby's side: passes messages on while no shaping node is in force.
+
+    ``publish`` is called with the payload, the source timestamp and the arrival of each message
+    that is passed on; ``changed`` when a shaping node goes and when one is back, with a text.
+    ``patience_ns`` is by how much a shaping node may be late before it is taken to hang.
+    """
+
+    def __init__(  # noqa: PLR0917 - each is used once
+        self,
+        name: str,
+        topic: str,
+        publish: Callable[[bytes, int | None, int], None],
+        changed: Callable[[str], None],
+        patience_ns: int,
+        depth: int = 1000,
+    ) -> None:
+        self._name, self._topic, self._publish = name, topic, publish
+        self._changed, self._patience_ns = changed, patience_ns
+        self._pending: deque[_Waiting] = deque(maxlen=depth)
+        self._mutex = threading.Lock()
+        self._why = ""
+        self._stuck_at = -1  # what the node had taken when it was found to hang
+        self._woken, self._wake = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._open()
+
+    def _open(self) -> None:
+        self.page = open_page(self._name, self._topic)
+        give_up = time.monotonic() + 1.0
+        while not self.page.stand_by():
+            if time.monotonic() > give_up:
+                raise OSError(f"{self.page.path}: another process is the standby of this output")
+            time.sleep(0.01)
+        self.page["standby"], self.page["listening"] = os.getpid(), 0
+        self.page["bypassing_since_ns"] = 0
+
+    def arrived(self, payload: bytes, key: int | None) -> None:
+        """A message has come, for the shaping node and for the standby alike."""
+        now = time.monotonic_ns()
+        with self._mutex:
+            if not self.page.is_current and not self.page.is_locked:
+                with suppress(OSError):
+                    left = self.page
+                    self._forget()  # a new page knows of nothing
+                    self._open()
+                    left.close()
+            self.page["listening"] = 1
+            if key is not None:
+                self._pending.append(_Waiting(key, payload, now))
+                self._look(now)
+            elif self._nobody_in_force():
+                self._pass_on([_Waiting(0, payload, now)])
+                self.page.unlock()
+        with suppress(BlockingIOError):
+            os.write(self._wake, b".")
+
+    def look(self) -> None:
+        """See whether the shaping node still does what it has to."""
+        with self._mutex:
+            self._look(time.monotonic_ns())
+
+    def watch(self) -> None:
+        """Look when the shaping node dies, and when it should have released a message; for ever."""
+        watched, died = 0, -1
+        poll = select.poll()
+        poll.register(self._woken, select.POLLIN)
+        while True:
+            holder = self.page["holder"]
+            if holder != watched:
+                if died >= 0:
+                    poll.unregister(died)
+                    os.close(died)
+                watched, died = holder, _end_of(holder)
+                if died >= 0:
+                    poll.register(died, select.POLLIN)
+            ready = poll.poll(self._patience_left_ms())
+            if (self._woken, select.POLLIN) in ready:
+                os.read(self._woken, 4096)
+            self.look()
+            if died >= 0 and (died, select.POLLIN) in ready:
+                poll.unregister(died)
+                os.close(died)
+                died = -1
+
+    def _patience_left_ms(self) -> int:
+        with self._mutex:
+            self._forget()
+            if not self._pending:
+                return -1 if self.page["holder"] else 1000
+            return max(1, (self._due_ns() - time.monotonic_ns()) // 1_000_000 + 1)
+
+    def _due_ns(self) -> int:
+        """When the shaping node is too late with what it has to do."""
+        oldest = self._pending[0].arrival_ns
+        return max(self.page["until_ns"], oldest) + self._patience_ns
+
+    def _look(self, now: int) -> None:
+        if self._nobody_in_force():
+            self._forget()
+            self._gone("is not there")
+            self._pass_on(list(self._pending))
+            self.page.unlock()
+            return
+        self._forget()
+        taken = self.page["taken"]
+        if self._pending and (now > self._due_ns() or taken == self._stuck_at):
+            self._stuck_at = taken
+            self._gone("is late for its own release: it hangs, or was stopped")
+            self.page.begin_passing()
+            for waiting in self._pending:  # the node is there, and could go on at any time
+                self.page.note(waiting.key, bypassed=True)
+            self._pass_on(list(self._pending), noted=True)
+            self.page.end_passing()
+        elif taken != self._stuck_at:
+            self._back()
+            self._pass_on_before_its_first()
+
+    def _nobody_in_force(self) -> bool:
+        """Take the lock, if no shaping node has it."""
+        if not self.page.lock():
+            return False
+        self.page["holder"] = 0
+        return True
+
+    def _forget(self) -> None:
+        """Leave out what was dealt with, and what came before: order is not to be broken."""
+        known = {*self.page.noted(bypassed=False), *self.page.noted(bypassed=True)}
+        for place in range(len(self._pending) - 1, -1, -1):
+            if self._pending[place].key in known:
+                for _ in range(place + 1):
+                    self._pending.popleft()
+                return
+
+    def _pass_on_before_its_first(self) -> None:
+        """Publish what came before the first message of the node in force, and so not to it."""
+        first = self.page["first"]
+        keys = [waiting.key for waiting in self._pending]
+        if first != self.page["acknowledged"] and first in keys:
+            self._pass_on(list(self._pending)[: keys.index(first)])
+            self.page["acknowledged"] = first
+
+    def _pass_on(self, messages: list[_Waiting], *, noted: bool = False) -> None:
+        for waiting in messages:
+            self._publish(waiting.payload, waiting.key or None, waiting.arrival_ns)
+            if not noted:
+                self.page.note(waiting.key, bypassed=True)
+        for _ in range(min(len(messages), len(self._pending))):
+            self._pending.popleft()
+
+    def _gone(self, why: str) -> None:
+        if not self.page["bypassing_since_ns"]:
+            self.page["bypassed_before"] = self.page["bypassed"]
+            self.page["bypassing_since_ns"] = time.monotonic_ns()
+            self._why = ""
+        if why != self._why:
+            self._changed(why)
+            self._why = why
+
+    def _back(self) -> None:
+        since = self.page["bypassing_since_ns"]
+        if since:
+            self.page["bypassing_since_ns"] = 0
+            passed = self.page["bypassed"] - self.page["bypassed_before"]
+            after_s = (time.monotonic_ns() - since) / 1e9
+            self._changed(f"is back after {after_s:.2f} s, in which {passed} messages came")
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except OSError:
+        return False
+    return pid > 0
+
+
+def _end_of(pid: int) -> int:
+    """A descriptor that becomes readable when a process ends; -1: there is no such process."""
+    try:
+        return os.pidfd_open(pid) if pid else -1
+    except OSError:
+        return -1

@@ -1,0 +1,160 @@
+"""The standby: passes an output on while its shaping node is not there.
+
+It receives what the shaping node receives, and publishes it on the same output, byte for byte and
+at once, while no shaping node is in force (:mod:`chainshaper.enforcement.handover`). With the
+fallback ``silence`` it publishes nothing, and counts what does not come. Either way it says so: in
+its log, with the columns of the gate's, by a warning, and on `/diagnostics` where the package
+diagnostic_msgs is installed.
+
+It runs in the ordinary class, and on no core that has a server where there is another, so that it
+takes nothing from a release.
+"""
+
+import importlib
+import os
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rclpy.node import Node
+from rclpy.subscription import Subscription
+
+from chainshaper.enforcement.gate import Held, Release, Waiting
+from chainshaper.enforcement.handover import Standby
+from chainshaper.splicing.nodes.python.endpoints import (
+    message_class,
+    parameter,
+    run,
+    wait,
+    wait_for_publisher,
+)
+from chainshaper.splicing.nodes.python.gate_log import log_of
+from chainshaper.splicing.nodes.python.room import room_of
+
+
+def leave_cores(taken: set[int]) -> None:
+    """Leave these cores to others, with all threads, where there are more."""
+    ours = os.sched_getaffinity(0) - taken
+    for thread in Path("/proc/self/task").iterdir() if ours else ():
+        with suppress(OSError):
+            os.sched_setaffinity(int(thread.name), ours)
+
+
+def watch(node: Node, standby: Standby) -> None:
+    """Look after the shaping node; a standby that cannot is of no use, and is started again."""
+    try:
+        standby.watch()
+    except BaseException as error:
+        if rclpy.ok():
+            node.get_logger().fatal(f"cannot look after the shaping node: {error}")
+            os._exit(1)
+        raise
+
+
+def diagnostics_of(node: Node, standby: Standby, shaping_node: str) -> None:
+    """Publish the state of the output on `/diagnostics`, once a second."""
+    try:
+        messages = importlib.import_module("diagnostic_msgs.msg")
+    except ImportError:
+        return
+    publisher = node.create_publisher(messages.DiagnosticArray, "/diagnostics", 10)
+
+    def report() -> None:
+        page = standby.page
+        level, text = state_of(page)
+        values = {
+            "output": page.topic,
+            "shaping node": shaping_node,
+            "starts": page["starts"],
+            "messages without it": page["bypassed"],
+        }
+        status = messages.DiagnosticStatus(
+            level=bytes([level]),
+            name=f"chainshaper: {page.topic}",
+            message=text,
+            hardware_id="",
+            values=[messages.KeyValue(key=key, value=str(value)) for key, value in values.items()],
+        )
+        array = messages.DiagnosticArray(status=[status])
+        array.header.stamp = node.get_clock().now().to_msg()
+        with suppress(RuntimeError):  # the process is to stop
+            publisher.publish(array)
+
+    node.create_timer(1.0, report)
+
+
+def state_of(page: Any) -> tuple[int, str]:
+    """The state of an output: the level of a `DiagnosticStatus`, and a text."""
+    since = page["bypassing_since_ns"]
+    if not since:
+        return 0, "shaped"
+    word = ("bypassed", "silent")[page["silent"]]
+    messages = page["bypassed"] - page["bypassed_before"]
+    seconds = (time.monotonic_ns() - since) / 1e9
+    return 1 + page["silent"], f"{word} for {seconds:.1f} s, {messages} messages"
+
+
+def set_up(node: Node) -> Callable[[], bool]:
+    """Make the node's endpoints, and begin to watch."""
+    leave_cores({core for core in parameter(node, "server_cores", [-1]) if core >= 0})
+    silent = parameter(node, "fallback", "bypass") == "silence"
+    shaping_node = parameter(node, "shaping_node", "the shaping node")
+    log, logger = log_of(node), node.get_logger()
+    info = wait_for_publisher(node, "input")
+    _, offered, asked = room_of(node, info)
+    message_type, topic = message_class(info.topic_type), node.resolve_topic_name("output")
+    publisher = None if silent else node.create_publisher(message_type, "output", offered)
+
+    def publish(payload: bytes, source_timestamp: int | None, arrival: int) -> None:
+        published = None
+        if publisher is not None:
+            try:
+                publisher.publish(payload)
+            except RuntimeError:  # rclpy's RCLError is one
+                if rclpy.ok():
+                    raise
+                return  # it is to stop
+            published = time.monotonic_ns()
+        treated = "silence" if silent else "bypass"
+        release = Release(None if silent else arrival, arrival, None, 0, "cycle", treated)
+        message = Waiting(payload, arrival, None, 0, about=source_timestamp)
+        log.write(Held(message, release, time.monotonic_ns()), published)
+
+    def changed(what: str) -> None:
+        until = "nothing is published" if silent else "messages go around it"
+        back = what.startswith("is back")
+        logger.warning(f"{shaping_node} {what}" + ("" if back else f": {topic}: {until}"))
+
+    standby = None
+    while standby is None:
+        try:
+            standby = Standby(
+                *(parameter(node, "handover", ""), topic, publish, changed),
+                patience_ns=parameter(node, "patience_ns", 0),
+                depth=asked.depth,
+            )
+        except OSError as error:
+            logger.error(f"{topic} falls silent when {shaping_node} does: {error}")
+            wait(10.0)
+    standby.page["silent"] = int(silent)
+
+    def with_info(payload: bytes, message_info: Any) -> None:
+        standby.arrived(payload, message_info["source_timestamp"])
+
+    def without_info(payload: bytes) -> None:
+        standby.arrived(payload, None)
+
+    # Humble gives a callback the message only: what the shaping node holds is lost with it there.
+    callback = with_info if hasattr(Subscription, "CallbackType") else without_info
+    node.create_subscription(message_type, "input", callback, asked, raw=True)
+    threading.Thread(target=watch, args=(node, standby), name="watch", daemon=True).start()
+    diagnostics_of(node, standby, shaping_node)
+    return lambda: False
+
+
+if __name__ == "__main__":
+    run("chainshaper_standby", set_up, realtime=False)

@@ -1,0 +1,330 @@
+"""Damaged files of every kind: a verb does its work, or says in one message what is wrong.
+
+A small campaign, seeded, by calls of the command line's entry point. ``CHAINSHAPER_FUZZ_CASES``
+asks for a larger one, of so many cases of each kind; a failure names its case, which
+``CHAINSHAPER_FUZZ_FIRST`` begins a campaign at.
+"""
+
+import json
+import os
+import random
+import re
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import polars as pl
+import pytest
+from command_line import called
+from small_chain import small_chain_text
+
+from chainshaper import simulate
+from chainshaper.planning import Plan, dump_plan
+from chainshaper.recording import Recording
+from chainshaper.sources.lttng.writing import write_lttng_trace
+from chainshaper.workload.description import load_application
+
+CASES = int(os.environ.get("CHAINSHAPER_FUZZ_CASES", "25"))
+FIRST = int(os.environ.get("CHAINSHAPER_FUZZ_FIRST", "0"))
+SECONDS = 60  # of one case, on a machine that does other things
+MEMORY = 1 << 30  # that all cases of one kind may add
+
+Arguments: TypeAlias = tuple[str | Path, ...]
+SCALARS = (
+    "", "~", "0", "-1", "1", "99999999999", str(2**63), str(10**40), "9" * 5000, "1e999", ".nan",
+    ".inf", "-.inf", "true", "2020-01-01", "12:30:00", "0x", "0b2", "1ms", "-1ms", "0ms", "1e30ms",
+    "/x", "/", "..", "/t1..", "/t1../t3", "''", "'\x85'", "[]", "{}", "[[]]", "{a: {b: c}}",
+    "&a [*a]", "*a", "!!int ''", "!!bool x", "!!timestamp x", "!!float x", "!!binary x",
+    "!!set {a}", "!!python/name:os.system ''", "[" * 200, "{? [a] : b}", "<<: 1", "| \n x", "@",
+    "%", "\t", "\0", "\ud7ff", "'\U0010ffff'", "- 1", "#", "a: b: c", "9223372036854775807ns",
+)  # fmt: skip
+VALUES: tuple[Any, ...] = (
+    None, True, 0, -1, 1, 2**31, 2**63 - 1, 2**63, 10**30, 1.5, float("nan"), float("inf"), "",
+    "x", "1", "/t1../t3", [], [1], ["x"], [[]], {}, {"x": 1}, {"1": "x"}, "\x1b[31m", "[bold]",
+)  # fmt: skip
+DTYPES = (
+    pl.String, pl.Float64, pl.Int8, pl.UInt8, pl.Int64, pl.UInt64, pl.Boolean, pl.Datetime("ns"),
+    pl.List(pl.Int64), pl.Null, pl.Categorical, pl.Binary, pl.Decimal(20, 2), pl.Duration("ns"),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """A short simulated run of the small chain."""
+    folder = tmp_path_factory.mktemp("fuzzing")
+    (folder / "application.yaml").write_text(small_chain_text())
+    application = load_application(folder / "application.yaml")
+    return simulate(application, folder / "recording", cycles=20)
+
+
+def _looked_at(chance: random.Random, source: Path) -> Arguments:
+    """A verb that reads a recording or a trace."""
+    return chance.choice([
+        ("info", source), ("info", source, "--json"), ("callbacks", source), ("graph", source),
+        ("latency", source, "--chain", "/t1../t3"), ("latency", source, "--json", "--instances"),
+        ("chains", source), ("plan", source, "--chain", "/t1../t3"), ("compare", source, source),
+        ("convert", source, "-o", source.with_name("converted")),
+        ("export", source, "-o", source.with_name("out.pftrace")),
+    ])  # fmt: skip
+
+
+def _damaged_bytes(chance: random.Random, file: Path) -> None:
+    data = bytearray(file.read_bytes())
+    for _ in range(chance.choice([1, 1, 1, 2, 8])):
+        kind = chance.random()
+        place = chance.randrange(len(data)) if data else 0
+        if kind < 0.7 and data:
+            data[place] = chance.choice([0, 255, data[place] ^ (1 << chance.randrange(8))])
+        elif kind < 0.85:
+            del data[place:]
+        else:
+            data[place:place] = chance.randbytes(chance.choice([1, 8, 100]))
+    file.write_bytes(data)
+
+
+def _without_checksums(folder: Path) -> None:
+    file = folder / "recording.json"
+    values = json.loads(file.read_text())
+    values["checksums"] = None
+    file.write_text(json.dumps(values))
+
+
+def bytes_of_tables(chance: random.Random, folder: Path, recording: Recording) -> Arguments:
+    """A bit or more of a Parquet file flipped, also where there are no checksums."""
+    source = Path(shutil.copytree(recording.path, folder / "source"))
+    if chance.random() < 0.5:
+        _without_checksums(source)
+    _damaged_bytes(chance, chance.choice(sorted(source.glob("*.parquet"))))
+    return _looked_at(chance, source)
+
+
+def columns_of_tables(chance: random.Random, folder: Path, recording: Recording) -> Arguments:
+    """Columns dropped, renamed, of another type, with nulls, with other values; tables lost."""
+    source = Path(shutil.copytree(recording.path, folder / "source"))
+    _without_checksums(source)
+    file = chance.choice(sorted(source.glob("*.parquet")))
+    frame = pl.read_parquet(file, glob=False)
+    column = chance.choice(frame.columns)
+    kind = chance.randrange(8)
+    try:
+        if kind == 0:
+            frame = frame.drop(column)
+        elif kind == 1:
+            frame = frame.rename({column: chance.choice(["x", "times", column.upper()])})
+        elif kind == 2:
+            frame = frame.with_columns(pl.col(column).cast(chance.choice(DTYPES), strict=False))
+        elif kind == 3:
+            frame = frame.with_columns(pl.when(pl.col("time") % 3 > 0).then(column).alias(column))
+        elif kind == 4:
+            extreme = chance.choice([0, -1, 2**31 - 1, 2**63 - 1, -(2**63)])
+            frame = frame.with_columns(pl.lit(extreme).alias(column))
+        elif kind == 5:
+            frame = frame.sample(fraction=chance.choice([0, 1, 2]), with_replacement=True, seed=1)
+        elif kind == 6:
+            frame = frame.select(chance.sample(frame.columns, len(frame.columns)))
+    except pl.exceptions.PolarsError:
+        frame = frame.drop(column)  # a cast that does not exist
+    frame.write_parquet(file)
+    if kind == 7:
+        file.unlink()
+    return _looked_at(chance, source)
+
+
+def facts_of_recordings(chance: random.Random, folder: Path, recording: Recording) -> Arguments:
+    """Values of `recording.json` of every other type, keys lost, bytes flipped."""
+    source = Path(shutil.copytree(recording.path, folder / "source"))
+    file = source / "recording.json"
+    values = json.loads(file.read_text())
+    for _ in range(chance.choice([1, 1, 3])):
+        place: Any = values
+        while True:
+            key: Any = chance.choice(list(place) if isinstance(place, dict) else range(len(place)))
+            if not isinstance(place[key], dict | list) or not place[key] or chance.random() < 0.4:
+                break
+            place = place[key]
+        if chance.random() < 0.2:
+            del place[key]
+        else:
+            place[key] = chance.choice(VALUES)
+        if not values:
+            break
+    file.write_text(json.dumps(values))
+    if chance.random() < 0.1:
+        _damaged_bytes(chance, file)
+    return _looked_at(chance, source)
+
+
+def traces(chance: random.Random, folder: Path, recording: Recording) -> Arguments:
+    """Streams and metadata of a CTF trace."""
+    source = write_lttng_trace(folder / "source", recording.events)
+    files = [path for path in sorted(source.rglob("*")) if path.is_file()]
+    file = chance.choice(files)
+    if file.name == "metadata" and chance.random() < 0.7:
+        data = file.read_bytes()
+        words = [m.span() for m in re.finditer(rb"[0-9]{1,4}|[a-z_]{3,}|[;{}\[\]]", data)]
+        start, end = chance.choice(words)
+        other = data[slice(*chance.choice(words))]
+        file.write_bytes(data[:start] + other.rjust(end - start)[: end - start] + data[end:])
+    else:
+        _damaged_bytes(chance, file)
+    return _looked_at(chance, source)
+
+
+def _damaged_text(chance: random.Random, text: str) -> str:
+    for _ in range(chance.choice([1, 1, 1, 2, 4])):
+        lines = text.split("\n")
+        place = chance.randrange(len(lines))
+        kind = chance.random()
+        if kind < 0.6 and (found := list(re.finditer(r"(?<=[:\[,\-] )[^\s,\]}]+", text))):
+            start, end = chance.choice(found).span()
+            text = text[:start] + chance.choice(SCALARS) + text[end:]
+        elif kind < 0.7:
+            text = "\n".join([*lines[:place], *lines[place + 1 :]])
+        elif kind < 0.8:
+            text = "\n".join([*lines[:place], lines[place], *lines[place:]])
+        elif kind < 0.9:
+            indented = " " * chance.randrange(1, 9) + lines[place].lstrip(" ")
+            text = "\n".join([*lines[:place], indented, *lines[place + 1 :]])
+        else:
+            at = chance.randrange(len(text))
+            text = text[:at] + chance.choice(":[]{}&*!|>'\"%@`,#?-<\x00\x85\udcff") + text[at + 1 :]
+    return text
+
+
+def _write_damaged(chance: random.Random, file: Path, text: str) -> Path:
+    file.write_bytes(_damaged_text(chance, text).encode("utf-8", "surrogateescape"))
+    return file
+
+
+def applications(chance: random.Random, folder: Path, recording: Recording) -> Arguments:
+    """The description of an application."""
+    file = _write_damaged(chance, folder / "application.yaml", small_chain_text())
+    return ("simulate", file, "-o", folder / "out", "--cycles", "3")
+
+
+def plans(chance: random.Random, folder: Path, recording: Recording, plan: Plan) -> Arguments:
+    """A plan, in use with an application and with a recording."""
+    (folder / "application.yaml").write_text(small_chain_text())
+    file = _write_damaged(chance, folder / "plan.yaml", dump_plan(plan))
+    output = ("-o", folder / "out")
+    launch = folder / "robot.launch.xml"
+    launch.write_text('<launch><node pkg="p" exec="e" name="third"/></launch>')
+    return chance.choice([
+        ("simulate", folder / "application.yaml", file, *output, "--cycles", "3"),
+        ("splice", file, launch, *output),
+        ("apply", file, "--dry-run"),
+    ])  # fmt: skip
+
+
+def axes(chance: random.Random, folder: Path, recording: Recording) -> Arguments:
+    """An axis of a sweep."""
+    (folder / "application.yaml").write_text(small_chain_text())
+    names = ["seed", "epsilon", "bands", "policy", "publish-slot", "interference", "nodes.first",
+             "nodes.first.core", "scheduling", "topics./t3.depth", "x", ""]  # fmt: skip
+    values = ",".join(chance.choice(SCALARS) for _ in range(chance.choice([1, 1, 2])))
+    axis = f"{chance.choice(names)}={values}".replace("\0", "")
+    output = folder / "out.parquet"
+    return ("sweep", folder / "application.yaml", "--vary", axis, "-o", output, "--cycles", "3",
+            "--workers", "1")  # fmt: skip
+
+
+LAUNCH_XML = """<launch>
+  <arg name="pose" default="/pose"/>
+  <let name="twice" value="$(var pose)_$(env HOME x)"/>
+  <group scoped="true" if="$(var pose)">
+    <push_ros_namespace namespace="/robot"/>
+    <set_remap from="/a" to="/b"/>
+    <node pkg="l" exec="n" name="third" args="-r /c:=/d"><remap from="out" to="/t3"/></node>
+  </group>
+  <include file="$(dirname)/other.launch.yaml"><arg name="x" value="1"/></include>
+</launch>
+"""
+LAUNCH_YAML = """launch:
+- arg: {name: pose, default: /pose}
+- group:
+    - push_ros_namespace: {namespace: /robot}
+    - node: {pkg: l, exec: n, name: third, remap: [{from: out, to: /t3}]}
+- include: {file: $(dirname)/other.launch.py}
+"""
+LAUNCH_PYTHON = """import os
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, GroupAction
+from launch_ros.actions import Node
+def generate_launch_description():
+    names = ['third', 'fourth']
+    made = [Node(package='l', executable='n', name=name) for name in names[:1]]
+    for number in range(3):
+        made.append(Node(package='l', executable='n', name='n%d' % number))
+    return LaunchDescription([
+        DeclareLaunchArgument('pose', default_value=os.path.join('/a', 'b')),
+        GroupAction(made),
+    ])
+"""
+
+
+def launch_files(
+    chance: random.Random, folder: Path, recording: Recording, plan: Plan
+) -> Arguments:
+    """Launch files in three languages."""
+    texts = {"xml": LAUNCH_XML, "yaml": LAUNCH_YAML, "py": LAUNCH_PYTHON}
+    damaged = chance.choice([*texts])
+    for ending, text in texts.items():
+        file = folder / f"other.launch.{ending}"
+        file.write_text(text)
+        if ending == damaged:
+            if chance.random() < 0.7:
+                words = re.findall(r"[\w/$()]+|\W", text)
+                for _ in range(chance.choice([1, 1, 2, 4])):
+                    words[chance.randrange(len(words))] = chance.choice([*words, *SCALARS, ""])
+                file.write_bytes("".join(words).encode("utf-8", "surrogateescape"))
+            else:
+                _damaged_bytes(chance, file)
+    (folder / "plan.yaml").write_text(dump_plan(plan))
+    first = folder / f"other.launch.{damaged}"
+    return ("splice", folder / "plan.yaml", first, "-o", folder / "out")
+
+
+KINDS: tuple[Callable[..., Arguments], ...] = (
+    bytes_of_tables, columns_of_tables, facts_of_recordings, traces, applications, plans, axes,
+    launch_files,
+)  # fmt: skip
+
+
+def _peak() -> int:
+    status = Path("/proc/self/status").read_text()
+    return int(re.findall(r"VmHWM:\s+(\d+)", status)[0]) << 10
+
+
+@contextmanager
+def _case(kind: str, number: int, folder: Path) -> Iterator[Path]:
+    folder.mkdir()
+    try:
+        yield folder
+    except BaseException as error:
+        raise AssertionError(f"case {number} of {kind}, in {folder}: {error!r}") from error
+    shutil.rmtree(folder)
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=lambda kind: str(kind.__name__))
+def test_whatever_is_damaged_there_is_a_result_or_one_message(
+    kind: Callable[..., Arguments], tmp_path: Path, recording: Recording, plan: Plan
+) -> None:
+    before, codes = _peak(), set()
+    for number in range(FIRST, FIRST + CASES):
+        with _case(kind.__name__, number, tmp_path / str(number)) as folder:
+            chance = random.Random(f"{kind.__name__} {number}")
+            needs_plan = kind in (plans, launch_files)
+            arguments = kind(chance, folder, recording, *([plan] if needs_plan else []))
+            started = time.monotonic()
+            finished = called(*arguments)
+            assert time.monotonic() - started < SECONDS, arguments
+            assert finished.code in (0, 1, 2, 3), (arguments, finished)
+            assert "Traceback" not in finished.err, (arguments, finished)
+            if finished.code:
+                assert "error: " in finished.err or "Usage: " in finished.err, finished
+            codes.add(finished.code)
+    assert _peak() - before < MEMORY
+    assert codes - {0}, "some of the damage is seen"

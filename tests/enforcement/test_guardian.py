@@ -1,0 +1,317 @@
+"""Whoever of a run's processes dies, hangs or is stopped: no thread stays frozen, or changed.
+
+Threads are gated by slots of 2 ms in a cycle of a minute, so within a test only the restoring can
+make them run again.
+"""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from applied_plans import Governed, needs_fifo, node_to_govern
+from gated import CORE, MS, cpu_ns, groups_left, kill, needs_cgroups
+from processes import children_of, wait_for
+
+from chainshaper.enforcement.freezer.cgroups import cgroup_of, mount_options, mount_point
+from chainshaper.enforcement.runs.guardian import GROUP
+from chainshaper.enforcement.runs.journal import find_journals
+from chainshaper.enforcement.runs.scheduling_state import state_of
+from chainshaper.enforcement.runs.undoing import undo_run
+from chainshaper.enforcement.threads.listing import list_threads
+
+pytestmark = [needs_cgroups, needs_fifo]
+
+MINUTE = 60_000
+OWNER = Path(__file__).with_name("servers_owner.py")
+KILL, STOP = signal.SIGKILL, signal.SIGSTOP
+
+
+@dataclass
+class Run:
+    """An owner in a process of its own, the processes it has, and the node that it governs."""
+
+    owner: subprocess.Popen[str]
+    guardians: list[int]
+    dispatchers: list[int]
+    runs: Path
+    node: Governed
+    mounted: str  # how the hierarchy was
+
+    def ask(self, line: str) -> str:
+        assert self.owner.stdin is not None
+        assert self.owner.stdout is not None
+        self.owner.stdin.write(line + "\n")
+        self.owner.stdin.flush()
+        return self.owner.stdout.readline().strip()
+
+    def is_frozen(self) -> bool:
+        groups = groups_left(self.owner.pid)
+        return any("frozen 1" in (group / "cgroup.events").read_text() for group in groups)
+
+    def pids(self, name: str) -> list[int]:
+        """``owner``, ``guardian`` (the first), ``guardians`` (both) or ``dispatcher``."""
+        return {
+            "owner": [self.owner.pid],
+            "guardian": self.guardians[:1],
+            "guardians": self.guardians,
+            "dispatcher": self.dispatchers,
+        }[name]
+
+    def wait_until_restored(self) -> None:
+        """The node runs, where it was, as it was, and no group is left; mounted as before."""
+        wait_for(lambda: groups_left(self.owner.pid) == [], "its group to be removed")
+        ran = cpu_ns(self.node.pid)
+        wait_for(lambda: cpu_ns(self.node.pid) > ran, "the node to run again")
+        wait_for(lambda: state_of(self.node.pid).scheduling_class.priority == 0, "its class")
+        assert list(map(str, list_threads(self.node.pid)))
+        assert cgroup_of(self.node.pid) == self.node.cgroup
+        wait_for(lambda: mount_options() == self.mounted, "the former mount options")
+
+    def end(self) -> None:
+        """End all that is left, and see that nothing is."""
+        ours = [self.owner.pid, *self.guardians, *self.dispatchers]
+        for pid in ours:
+            kill(pid)
+        self.owner.wait()
+        wait_for(lambda: not any(map(alive, ours)), "our processes to end")
+        for journal in find_journals(self.runs):
+            assert undo_run(journal) == ()
+        assert list(self.runs.iterdir()) == []
+        assert groups_left(self.owner.pid) == []
+
+
+def alive(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state not in {"Z", "X"}
+
+
+@contextmanager
+def owner_of(folder: Path, *arguments: object) -> Iterator[subprocess.Popen[str]]:
+    with subprocess.Popen(
+        [sys.executable, str(OWNER), *map(str, arguments)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=(folder / "said").open("w"),
+        text=True,
+    ) as owner:
+        try:
+            yield owner
+        finally:
+            kill(owner.pid)
+
+
+@contextmanager
+def run_on(
+    node: Governed, back_end: str = "freezer", cycle_ms: int = MINUTE, slot_ms: int = 2
+) -> Iterator[Run]:
+    runs, mounted = node.folder / f"runs-{time.monotonic_ns()}", mount_options()
+    arguments = (back_end, runs, CORE, cycle_ms, slot_ms, node.pid)
+    with owner_of(node.folder, *arguments) as owner:
+        assert owner.stdout is not None
+        said = owner.stdout.readline()
+        assert said.startswith("in force"), (node.folder / "said").read_text()
+        first, second, *dispatchers = map(int, said.split()[3:])
+        run = Run(owner, [first, second], dispatchers, runs, node, mounted)
+        try:
+            if cycle_ms == MINUTE and back_end == "freezer":
+                wait_for(run.is_frozen, "the node to be frozen")
+            yield run
+        finally:
+            run.end()
+
+
+@pytest.fixture
+def node(tmp_path: Path) -> Iterator[Governed]:
+    with node_to_govern(tmp_path) as governed:
+        yield governed
+
+
+FAULTS: tuple[tuple[tuple[str, signal.Signals], ...], ...] = (
+    (("owner", KILL),),
+    (("owner", signal.SIGTERM),),
+    (("dispatcher", KILL),),
+    (("dispatcher", STOP),),
+    (("owner", KILL), ("guardian", KILL)),
+    (("owner", KILL), ("guardian", STOP)),
+    (("owner", KILL), ("guardians", KILL)),
+    (("owner", KILL), ("guardians", STOP)),
+    (("owner", KILL), ("dispatcher", KILL)),
+    (("owner", KILL), ("dispatcher", STOP)),
+    (("owner", STOP), ("dispatcher", KILL)),
+    (("owner", STOP), ("dispatcher", STOP)),
+    (("dispatcher", KILL), ("guardian", KILL)),
+    (("dispatcher", KILL), ("guardian", STOP)),
+    (("dispatcher", STOP), ("guardian", KILL)),
+    (("dispatcher", STOP), ("guardian", STOP)),
+)
+"""All that take the servers away. With ``fifo``, which has no dispatcher, those without one do, and
+an owner that is lost together with both guardians leaves the class to `release`."""
+
+
+@pytest.mark.parametrize("back_end", ["freezer", "fifo"])
+def test_whichever_two_are_killed_or_stopped_all_is_as_before(
+    node: Governed, back_end: str
+) -> None:
+    for faults in FAULTS:
+        if back_end == "fifo" and {"dispatcher", "guardians"} & {name for name, _ in faults}:
+            continue
+        with run_on(node, back_end) as run:
+            assert state_of(node.pid).scheduling_class.priority > 0
+            for name, number in faults:
+                for pid in run.pids(name):
+                    kill(pid, number)
+            run.wait_until_restored()
+
+
+@pytest.mark.parametrize(("name", "number"), [("guardian", KILL), ("guardians", STOP)])
+def test_what_loses_guardians_only_goes_on_being_served(
+    node: Governed, name: str, number: signal.Signals
+) -> None:
+    with run_on(node) as run:
+        for pid in run.pids(name):
+            kill(pid, number)
+        time.sleep(1)
+        assert run.is_frozen()
+        assert run.ask("failure") == "None"
+
+
+def test_a_release_restores_everything(node: Governed) -> None:
+    with run_on(node) as run:
+        assert run.ask("failure") == "None"
+        assert run.owner.stdin is not None
+        run.owner.stdin.close()
+        assert run.owner.wait(timeout=30) == 0
+        assert list(run.runs.iterdir()) == []
+        run.wait_until_restored()
+
+
+def test_an_owner_that_raises_leaves_nothing(node: Governed) -> None:
+    with run_on(node) as run:
+        assert run.ask("raise") == ""
+        assert run.owner.wait(timeout=20) == 1
+        run.wait_until_restored()
+
+
+@pytest.mark.parametrize(
+    ("number", "reason"), [(KILL, "was killed by SIGKILL"), (STOP, "hung, or somebody stopped it")]
+)
+def test_a_lost_dispatcher_is_named(node: Governed, number: signal.Signals, reason: str) -> None:
+    with run_on(node) as run:
+        kill(run.dispatchers[0], number)
+        wait_for(lambda: run.ask("failure") != "None", "the failure")
+        assert f"dispatcher of core {CORE} {reason}" in run.ask("failure")
+
+
+def test_a_dispatcher_that_is_asked_to_end_thaws_first(node: Governed) -> None:
+    with run_on(node) as run:
+        for pid in run.guardians:  # they cannot help
+            kill(pid, STOP)
+        kill(run.dispatchers[0], signal.SIGTERM)
+        wait_for(lambda: not run.is_frozen(), "the thread to be thawed")
+
+
+def test_threads_of_a_silent_dispatcher_are_let_go_first_and_closed_again_if_it_comes_back(
+    node: Governed,
+) -> None:
+    with run_on(node) as run:
+        groups = groups_left(run.owner.pid)
+        kill(run.dispatchers[0], STOP)
+        wait_for(lambda: not run.is_frozen(), "the thread to be let go", pause=0.001)
+        kill(run.dispatchers[0], signal.SIGCONT)
+        wait_for(run.is_frozen, "it to be closed again")
+        assert groups_left(run.owner.pid) == groups
+        assert run.ask("failure") == "None"
+
+
+def test_an_owner_that_is_stopped_goes_on_being_served(node: Governed) -> None:
+    with run_on(node) as run:
+        kill(run.owner.pid, STOP)
+        time.sleep(1)
+        assert run.is_frozen()
+        kill(run.owner.pid, signal.SIGCONT)
+        assert run.ask("failure") == "None"
+
+
+def test_what_is_left_when_all_are_killed_at_once_can_be_undone(node: Governed) -> None:
+    with run_on(node) as run:
+        ours = [run.owner.pid, *run.guardians, *run.dispatchers]
+        for number in (STOP, KILL):  # each is stopped before it sees another die
+            for pid in ours:
+                kill(pid, number)
+        run.owner.wait()
+        wait_for(lambda: not any(map(alive, ours)), "their end")
+        assert run.is_frozen()
+        (journal,) = find_journals(run.runs)
+        assert undo_run(journal) == ()
+        run.wait_until_restored()
+        assert undo_run(journal) == (), "once more does no harm"
+
+
+def test_guardians_are_out_of_reach_of_what_befalls_the_owner(node: Governed) -> None:
+    """They have a session, a cgroup and a priority of their own, and hear no terminal."""
+    with run_on(node) as run:
+        for pid in run.guardians:
+            assert os.getsid(pid) == pid
+            assert cgroup_of(pid) == mount_point() / GROUP
+            (thread,) = list_threads(pid)
+            (dispatcher,) = list_threads(run.dispatchers[0])
+            assert thread.priority > dispatcher.priority
+            for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
+                kill(pid, number)
+        time.sleep(0.2)
+        assert all(map(alive, run.guardians))
+        assert run.ask("failure") == "None"
+
+
+def test_a_process_that_is_killed_while_frozen_is_no_failure(tmp_path: Path) -> None:
+    with node_to_govern(tmp_path) as node, run_on(node) as run:
+        node.process.kill()
+        node.process.wait(timeout=20)
+        assert run.ask("failure") == "None"
+        assert run.owner.stdin is not None
+        run.owner.stdin.close()
+        assert run.owner.wait(timeout=20) == 0
+        assert groups_left(run.owner.pid) == []
+
+
+@pytest.mark.parametrize("victim", ["owner", "dispatcher"])
+def test_killed_at_any_moment_of_a_cycle_they_leave_nothing(node: Governed, victim: str) -> None:
+    chance = random.Random(victim)
+    for _ in range(4):
+        with run_on(node, cycle_ms=20, slot_ms=8) as run:
+            time.sleep(chance.uniform(0, 0.1))
+            kill(run.pids(victim)[0])
+            run.wait_until_restored()
+
+
+def test_killed_while_the_servers_are_made_the_owner_leaves_nothing(node: Governed) -> None:
+    chance = random.Random(7)
+    for attempt in range(8):
+        runs = node.folder / str(attempt)
+        with ExitStack() as stack:
+            arguments = ("freezer", runs, CORE, MINUTE, 2, node.pid)
+            owner = stack.enter_context(owner_of(node.folder, *arguments))
+            time.sleep(chance.uniform(0.1, 1.2))
+            children = children_of(owner.pid)
+            kill(owner.pid)
+            owner.wait()
+        wait_for(lambda: not any(map(alive, children)), "our processes to end")  # noqa: B023
+        # Killed between opening its journal and starting guardians, it has changed nothing.
+        for journal in find_journals(runs):
+            assert not journal.entries("scheduling")
+            assert undo_run(journal) == ()
+        assert groups_left(owner.pid) == []
+        assert cgroup_of(node.pid) == node.cgroup
+    ran = cpu_ns(node.pid)
+    wait_for(lambda: cpu_ns(node.pid) > ran + MS, "the node to run")

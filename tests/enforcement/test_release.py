@@ -1,0 +1,238 @@
+"""`status` and `release` do what they can, whoever died, and whatever became of a run's folder."""
+
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from applied_plans import (
+    CLI,
+    FREEZER,
+    MODULES,
+    Governed,
+    applied,
+    leftovers,
+    needs_fifo,
+    node_to_govern,
+    one_server_plan,
+    processes_of,
+    scheduling,
+)
+from gated import CORE, cpu_ns, groups_left, kill, needs_cgroups, own_cgroup
+from processes import wait_for
+
+from chainshaper.applying import apply_plan
+from chainshaper.enforcement.freezer.cgroups import cgroup_of, mount_point
+from chainshaper.enforcement.runs.guardian import GROUP
+from chainshaper.enforcement.runs.journal import find_journals
+from chainshaper.enforcement.runs.scheduling_state import state_of
+from chainshaper.enforcement.runs.state import RunState
+from chainshaper.enforcement.threads.listing import list_threads
+
+pytestmark = [needs_fifo, needs_cgroups]
+
+
+def verb(*arguments: str) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run(
+        [*CLI, *arguments], capture_output=True, text=True, check=False, timeout=100
+    )
+
+
+def ours(run: "subprocess.Popen[str]") -> list[int]:
+    return [pid for name in MODULES for pid in processes_of(run, name)]
+
+
+def kill_all(run: "subprocess.Popen[str]") -> None:
+    """Without any of them seeing another die."""
+    pids = [*ours(run), run.pid]
+    for number in (signal.SIGSTOP, signal.SIGKILL):
+        for pid in pids:
+            kill(pid, number)
+    run.wait()
+
+
+@contextmanager
+def in_force(folder: Path, *options: str) -> "Iterator[tuple[Governed, subprocess.Popen[str]]]":
+    with (
+        node_to_govern(folder) as governed,
+        applied(one_server_plan(), folder, *(options or FREEZER)) as run,
+    ):
+        yield governed, run
+
+
+@pytest.mark.parametrize("by", ["release", "apply"])
+def test_what_a_killed_run_and_its_stopped_processes_left_is_undone(
+    tmp_path: Path, by: str
+) -> None:
+    with in_force(tmp_path) as (governed, run):
+        left = ours(run)
+        for pid in left:
+            kill(pid, signal.SIGSTOP)
+        run.kill()
+        run.wait()
+        if by == "release":
+            done = verb("release")
+            assert done.returncode == 0, done.stderr
+        else:
+            with applied(one_server_plan(), tmp_path, *FREEZER) as following:
+                following.send_signal(signal.SIGINT)
+                assert following.wait(timeout=20) == 0
+        governed.check_as_before()
+        assert not [pid for pid in left if Path(f"/proc/{pid}/exe").exists()]
+
+
+def test_a_run_whose_folder_is_removed_has_it_again_and_can_be_released(tmp_path: Path) -> None:
+    with in_force(tmp_path) as (governed, run):
+        (journal,) = find_journals()
+        shutil.rmtree(journal.path.parent)
+        wait_for(journal.path.exists, "the journal to be written again")
+        assert str(run.pid) in verb("status").stdout
+        assert verb("release").returncode == 0
+        assert run.wait(timeout=20) == 0
+        governed.check_as_before()
+
+
+def test_without_a_journal_threads_run_again_and_what_cannot_be_put_back_is_named(
+    tmp_path: Path,
+) -> None:
+    with in_force(tmp_path) as (governed, run):
+        kill_all(run)
+        for journal in find_journals():
+            shutil.rmtree(journal.path.parent)
+        (group,) = groups_left(run.pid)
+        assert f"{group} was left by a run whose journal is gone" in verb("status").stderr
+        done = verb("release")
+        assert f"{group}, of a run whose journal is gone: its threads run again" in done.stdout
+        assert done.returncode == 1
+        assert f"thread {governed.pid}" in done.stderr
+        assert f"chrt --other --pid 0 {governed.pid}" in done.stderr
+        assert cgroup_of(governed.pid) == governed.cgroup
+        ran = cpu_ns(governed.pid)
+        wait_for(lambda: cpu_ns(governed.pid) > ran, "the node to run on")
+        assert "nothing was left behind" in verb("release").stdout
+
+
+def test_a_strange_line_of_a_journal_is_named_and_all_else_undone(tmp_path: Path) -> None:
+    with in_force(tmp_path) as (governed, run):
+        (journal,) = find_journals()
+        with journal.path.open("a") as file:
+            file.write('hello\n{"kind": "scheduling", "tid": "x"}\n{"kind": "freezer"}\n')
+        seen = verb("status")
+        assert seen.returncode == 0
+        assert seen.stderr.count("is not a line of a journal") == 3
+        kill_all(run)
+        done = verb("release")
+        assert done.returncode == 1
+        assert "'hello'" in done.stderr
+        assert "Traceback" not in done.stderr
+        governed.check_as_before()
+        assert "nothing was left behind" in verb("release").stdout
+
+
+def test_a_full_disk_does_not_end_a_plan_in_force(full_disk: Path, tmp_path: Path) -> None:
+    filling = full_disk / "filling"
+    filling.unlink()
+    seen: list[RunState] = []
+    stop = threading.Event()
+    with node_to_govern(tmp_path) as governed:
+        options = {"back_end": "freezer", "phase_ns": 0, "folder": full_disk, "stop": stop}
+        run = threading.Thread(
+            target=lambda: apply_plan(one_server_plan(), watch=seen.append, **options)  # type: ignore[arg-type]
+        )
+        run.start()
+        wait_for(lambda: bool(seen), "the plan to be in force")
+        with pytest.raises(OSError, match="No space left"):
+            filling.write_bytes(bytes(1_000_000))
+        looks = len(seen)
+        wait_for(lambda: len(seen) >= looks + 3, "the run to go on")
+        assert run.is_alive()
+        assert scheduling(governed.pid) != governed.scheduling
+        assert any("No space left" in note for note in seen[-1].notes)
+        stop.set()
+        run.join(timeout=30)
+        filling.unlink()
+        assert list(full_disk.iterdir()) == []
+        governed.check_as_before()
+
+
+@pytest.mark.skipif(
+    (mount_point() / "cgroup.type").exists(), reason="the hierarchy's root is not to be seen here"
+)
+def test_killing_a_whole_cgroup_leaves_guardians_to_undo_the_run(tmp_path: Path) -> None:
+    for _ in range(3):
+        with own_cgroup("owner") as group, in_force(tmp_path) as (governed, run):
+            assert all(cgroup_of(pid).name == GROUP for pid in processes_of(run, "guardian"))
+            for pid in (run.pid, *processes_of(run, "dispatcher")):
+                (group / "cgroup.procs").write_text(str(pid))
+            (group / "cgroup.kill").write_text("1")
+            run.wait(timeout=20)
+            governed.check_as_before()
+
+
+@contextmanager
+def stranger(group: Path) -> "Iterator[int]":
+    """A process of somebody else's: in the node's cgroup, as what `fifo` gives to the node."""
+    command = ["taskset", "-c", str(CORE), "chrt", "-f", "87", "sleep", "60"]
+    with subprocess.Popen(command) as process:
+        try:
+            (group / "cgroup.procs").write_text(str(process.pid))
+            wait_for(lambda: Path(f"/proc/{process.pid}/comm").read_text() == "sleep\n", "sleep")
+            yield process.pid
+        finally:
+            process.kill()
+
+
+@pytest.mark.skipif(not shutil.which("chrt") or not shutil.which("taskset"), reason="no util-linux")
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize("back_end", ["fifo", "freezer"])
+def test_a_process_that_was_never_ours_stays_as_it_is(
+    tmp_path: Path, back_end: str, end: signal.Signals
+) -> None:
+    with (
+        in_force(tmp_path, "--backend", back_end, "--phase", "0ms") as (governed, run),
+        stranger(governed.cgroup) as pid,
+    ):
+        before = state_of(pid)
+        assert before == state_of(governed.pid), "it looks just like ours"
+        run.send_signal(end)
+        _, said = run.communicate(timeout=20)
+        wait_for(lambda: not leftovers(), "the undoing")
+        assert state_of(pid) == before
+        governed.check_as_before()
+        if end == signal.SIGINT:
+            assert f"thread {pid} (sleep) is left as it is" in said
+
+
+def test_what_a_node_forks_under_fifo_is_put_back_and_found_although_its_parent_has_ended(
+    tmp_path: Path,
+) -> None:
+    trigger, output = tmp_path / "trigger", tmp_path / "pids"
+    script = Path(__file__).with_name("forking_node.py")
+    command = [sys.executable, str(script), str(trigger), str(output), "dds"]
+    with subprocess.Popen([*command, "--ros-args", "-r", "__node:=origin"]) as parent:
+        forked: list[int] = []
+        try:
+            wait_for(lambda: len(list_threads(parent.pid)) == 2, "the node")
+            before = state_of(parent.pid)
+            with applied(one_server_plan(), tmp_path, "--backend", "fifo", "--phase", "0ms") as run:
+                trigger.touch()
+                wait_for(output.exists, "the processes to be forked")
+                child, daemon = forked = [int(pid) for pid in output.read_text().split()]
+                inherited = state_of(child)
+                assert inherited == state_of(daemon) != before
+                (journal,) = find_journals()
+                wait_for(lambda: bool(journal.entries("descendant")), "the child to be seen")
+                parent.kill()
+                parent.wait()
+                said = run.communicate(timeout=30)[1]
+            assert state_of(child) == before, "it was written down while that showed"
+            assert state_of(daemon) == inherited, "nothing has ever shown whose it is"
+            assert f"thread {daemon}" in said
+        finally:
+            for pid in (*forked, parent.pid):
+                kill(pid)

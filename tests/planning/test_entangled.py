@@ -1,0 +1,189 @@
+"""Which chains are planned together: right, as the simulator shows, or refused with the reason."""
+
+from pathlib import Path
+
+import pytest
+
+from chainshaper import measure_latency, simulate
+from chainshaper.errors import InputError
+from chainshaper.planning import Plan, PlanRequest, place_chains, plan_chains, publish_slots
+from chainshaper.recording import Recording
+from chainshaper.steps import plan_recording, profile_chains
+from chainshaper.workload.description import Application, load_application
+
+MS = 1_000_000
+REQUEST = PlanRequest(epsilon_ns=2 * MS)
+
+TEXT = """\
+name: chains in one graph
+chain: /t1../t3
+scheduling:
+  executors: {core: 1, priority: 80}
+  dds: {core: 0, priority: 90}
+nodes:
+  first:
+    callbacks:
+      - {timer: 100ms, execution: {uniform: [1ms, 3ms]}, publishes: [/t1]}
+  second:
+    callbacks:
+      - {subscription: /t1, execution: {uniform: [2ms, 9ms]}, publishes: [/t2, /twin]}
+  third:
+    callbacks:
+      - {subscription: /t2, execution: {uniform: [2ms, 9ms]}, publishes: [/t3]}
+  fork:
+    callbacks:
+      - {subscription: /t1, execution: {uniform: [1ms, 4ms]}, publishes: [/forked]}
+  behind:
+    callbacks:
+      - {subscription: /t3, execution: {uniform: [1ms, 2ms]}, publishes: [/end]}
+  meeting:
+    callbacks:
+      - {synchronises: [/t3, /forked], execution: {uniform: [1ms, 2ms]}, publishes: [/met]}
+  other:
+    core: 0
+    callbacks:
+      - {timer: 100ms, execution: {uniform: [1ms, 3ms]}, publishes: [/o1]}
+      - {timer: 200ms, execution: {constant: 1ms}, publishes: [/slow]}
+  other2:
+    core: 0
+    callbacks:
+      - {subscription: /o1, execution: {uniform: [2ms, 9ms]}, publishes: [/o2]}
+  beside:
+    callbacks:
+      - {timer: 100ms, execution: {uniform: [1ms, 3ms]}, publishes: [/b1]}
+  beside2:
+    callbacks:
+      - {subscription: /b1, execution: {uniform: [2ms, 9ms]}, publishes: [/b2]}
+  listener:
+    callbacks:
+      - {subscription: /o2}
+      - {subscription: /b2}
+      - {subscription: /end}
+      - {subscription: /met}
+      - {subscription: /forked}
+      - {subscription: /twin}
+      - {subscription: /slow}
+"""
+
+
+@pytest.fixture(scope="module")
+def application(tmp_path_factory: pytest.TempPathFactory) -> Application:
+    path = tmp_path_factory.mktemp("graph") / "graph.yaml"
+    path.write_text(TEXT)
+    return load_application(path)
+
+
+@pytest.fixture(scope="module")
+def recording(application: Application, tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    pytest.importorskip("numba")
+    return simulate(application, tmp_path_factory.mktemp("unshaped") / "rec", cycles=300)
+
+
+def _outputs(application: Application, plan: Plan, chain: str, folder: Path) -> tuple[int, int]:
+    """First and last place of a chain's output from its start, simulated with the plan in force."""
+    of_chain = application.model_copy(update={"chain": plan.chain.spec or chain})
+    measured = measure_latency(simulate(of_chain, folder, plan, cycles=300), chain).analysis
+    assert measured.statistics.count == 300
+    assert measured.statistics.late == 0
+    return measured.statistics.min_ns or 0, measured.statistics.max_ns or 0
+
+
+@pytest.mark.parametrize(
+    ("sink", "receivers"),
+    [("/t1../forked", ("/listener", "/meeting")), ("/t1../twin", ("/listener",))],
+)
+def test_a_sink_that_forks_off_is_planned_right(
+    sink: str,
+    receivers: tuple[str, ...],
+    application: Application,
+    recording: Recording,
+    tmp_path: Path,
+) -> None:
+    plan = plan_recording(recording, "/t1../t3", REQUEST, sinks=[sink])
+    for server, chain in zip(plan.servers[-2:], ("/t1../t3", sink), strict=True):
+        ((opens, closes),) = server.slots
+        first, last = _outputs(application, plan, chain, tmp_path / chain.replace("/", "_"))
+        assert opens <= first <= last < closes
+    assert plan.predicted.jitter_ns == MS
+    (node,) = plan.further_shaping_nodes
+    assert (node.output, node.receivers) == (sink.rpartition("..")[2], receivers)
+
+
+@pytest.mark.parametrize("second", ["/o1../o2", "/b1../b2"])
+def test_chains_that_share_no_more_than_a_core_are_planned_right(
+    second: str, application: Application, recording: Recording, tmp_path: Path
+) -> None:
+    """The second chain has a core of its own, or takes turns with the first."""
+    chains = ("/t1../t3", second)
+    plans, remarks = place_chains(plan_chains(profile_chains(recording, chains), REQUEST))
+    assert not remarks
+    assert (plans[1].offset_ns > 0) == (second == "/b1../b2")
+    for plan, chain in zip(plans, chains, strict=True):
+        ((opens, closes),) = publish_slots(plan)
+        first, last = _outputs(application, plan, chain, tmp_path / chain.replace("/", "_"))
+        assert opens <= first <= last < closes
+
+
+@pytest.mark.parametrize(
+    ("chains", "words"),
+    [
+        (("/t1../t3", "/t1../t2"), "/t1../t3 waits for /t2, which the plan for /t1../t2"),
+        (("/t1../t2", "/t1../t3"), "/t1../t3 waits for /t2, which the plan for /t1../t2"),
+        (("/t1../t2../t3../end", "/t1../t3"), "waits for /t3, which"),
+        (("/t1../t3", "/t1../t3"), "both publish /t3"),
+        (("/t1../t3", "second../t3"), "both publish /t3"),
+        # What a synchronising callback waits for is on a branch of the chain to it.
+        (("/t1../t2../t3../met", "/t1../forked"), "waits for /forked, which"),
+    ],
+)
+@pytest.mark.parametrize("as_sink", [False, True])
+def test_a_chain_that_waits_for_what_another_has_shaped_is_refused(
+    chains: tuple[str, str], words: str, as_sink: bool, recording: Recording
+) -> None:
+    with pytest.raises(InputError) as refused:
+        if as_sink:
+            plan_recording(recording, chains[0], period_ns=100 * MS, sinks=chains[1:])
+        else:
+            plan_chains(profile_chains(recording, chains, period_ns=100 * MS))
+    assert words in str(refused.value)
+    assert all(chain in str(refused.value) for chain in chains)
+
+
+def test_a_chain_that_begins_with_what_another_has_shaped_is_refused(recording: Recording) -> None:
+    profiles = profile_chains(recording, ("/t1../t3", "behind../end"), period_ns=100 * MS)
+    with pytest.raises(InputError, match=r"behind\.\./end waits for /t3, which"):
+        plan_chains(profiles)
+
+
+@pytest.mark.parametrize(
+    ("second", "words"),
+    [
+        ("/t1../forked", "share /first: a thread runs in the servers of one plan"),
+        ("/t1../twin", "share /first, /second"),
+    ],
+)
+def test_chains_that_share_nodes_are_sinks_of_one_or_refused(
+    second: str, words: str, recording: Recording
+) -> None:
+    profiles = profile_chains(recording, ("/t1../t3", second))
+    with pytest.raises(InputError, match="as its --sink") as refused:
+        plan_chains(profiles)
+    assert words in str(refused.value)
+    one_by_one = [plan_recording(recording, chain) for chain in ("/t1../t3", second)]
+    with pytest.raises(InputError, match="a thread runs in the servers of one plan"):
+        place_chains(one_by_one)
+    with pytest.raises(InputError, match="both publish /t3"):
+        place_chains(one_by_one[:1] * 2)
+
+
+def test_a_sink_that_begins_elsewhere_is_refused(recording: Recording) -> None:
+    with pytest.raises(InputError, match=r"/o1\.\./o2 begins at /other every 100ms"):
+        plan_recording(recording, "/t1../t3", sinks=["/o1../o2"])
+
+
+def test_let_of_every_callback_shapes_what_lies_on_the_way_too(recording: Recording) -> None:
+    with pytest.raises(InputError, match=r"/t1\.\./forked waits for /t1, which the plan for"):
+        plan_chains(
+            profile_chains(recording, ("/t1../t3", "/t1../forked")),
+            PlanRequest(policy="let-per-callback"),
+        )

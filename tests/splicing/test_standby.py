@@ -1,0 +1,356 @@
+"""Shaping node and standby, both as they are written for a launch, on a stand-in for rclpy."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from node_run import RELIABLE, NodeRun, running_node, stamped
+from processes import wait_for
+
+from chainshaper.enforcement.handover import Page, open_page
+from chainshaper.planning import Modes, Plan
+from chainshaper.planning.plan import revised
+from chainshaper.splicing.gate_log import read_gate_log, releases_so_far
+from chainshaper.splicing.shaped_outputs import find_outputs, output_text
+from chainshaper.splicing.shaping_process import ShapingProcess, write_shaping_process
+
+MS = 1_000_000
+PUBLISHERS = {"/t3_tmp": [{"type": "sensor_msgs/msg/Image", "qos": RELIABLE}]}
+
+
+def written(
+    plan: Plan, folder: Path, patience_ns: int = 20_000 * MS
+) -> tuple[ShapingProcess, ShapingProcess]:
+    """A shaping node and its standby, for which a node on a busy machine is late only then."""
+    assert plan.shaping_node is not None
+    process = write_shaping_process(
+        plan, plan.shaping_node, "python", folder, log=folder / "gate.csv"
+    )
+    assert process.standby is not None
+    parameters = process.standby.parameters_file
+    own = f"patience_ns: {max(plan.cycle_ns // 2, 10 * MS)}\n"
+    text = parameters.read_text()
+    assert own in text
+    parameters.write_text(text.replace(own, f"patience_ns: {patience_ns}\n"))
+    return process, process.standby
+
+
+@contextmanager
+def running(process: ShapingProcess, folder: Path, **more: str) -> Iterator[NodeRun]:
+    with running_node(process, folder, PUBLISHERS, **more) as run:
+        run.hear(lambda words: words.get("event") == "spinning")
+        yield run
+
+
+def came(run: NodeRun) -> list[int]:
+    """The numbers of the messages that a node has published."""
+    return [int(words["payload"][-2:], 16) for words in run.said if words.get("published") == "/t3"]
+
+
+def say(number: int, *runs: NodeRun) -> None:
+    payload = stamped(bytes([number])).hex()
+    for run in runs:
+        run.tell(topic="/t3_tmp", payload=payload, source=1000 + number)
+
+
+def take_over(number: int, folder: Path, shaping: NodeRun) -> None:
+    """Give a message to a shaping node, which comes into force with it."""
+    say(number, shaping)
+    wait_for(lambda: outputs(folder)[0].shaping_node == shaping.process.pid, "it to be in force")
+
+
+def outputs(folder: Path) -> Any:
+    return find_outputs(iter([str(folder / "outputs"), str(folder / "chainshaper" / "outputs")]))
+
+
+def test_what_a_killed_node_had_in_hand_goes_around_it_until_it_is_back(
+    tmp_path: Path, plan: Plan
+) -> None:
+    process, beside = written(plan, tmp_path)
+    with running(beside, tmp_path) as standby:
+        with running(process, tmp_path) as shaping:
+            take_over(1, tmp_path, shaping)
+            say(1, standby)
+            shaping.hear(lambda words: words.get("published") == "/t3")
+            (output,) = outputs(tmp_path)
+            assert (output.topic, output.state) == ("/t3", "shaped")
+            assert (output.shaping_node, output.standby) == (
+                shaping.process.pid,
+                standby.process.pid,
+            )
+            say(2, shaping, standby)
+            time.sleep(0.005)  # the node holds it for 21 ms
+            shaping.process.kill()
+            standby.hear(lambda words: words.get("published") == "/t3")
+        say(3, standby)
+        standby.hear(lambda words: words.get("published") == "/t3")
+        wait_for(lambda: outputs(tmp_path)[0].messages == 2, "both to be counted")
+        (output,) = outputs(tmp_path)
+        assert (output.state, output.shaping_node) == ("bypassed", None)
+        assert "/t3 is bypassed for " in output_text(output)
+        standby.tell(tick=1)
+        report = standby.hear(lambda words: "diagnostics" in words)
+        assert (report["diagnostics"], report["level"]) == ("chainshaper: /t3", 1)
+        assert report["message"].endswith("2 messages")
+        with running(process, tmp_path) as again:
+            take_over(3, tmp_path, again)
+            say(4, again, standby)
+            again.hear(lambda words: words.get("published") == "/t3")
+            say(5, again, standby)
+            again.hear(lambda words: words.get("published") == "/t3")
+            standby.tell(tick=2)
+            report = standby.hear(lambda words: "diagnostics" in words)
+            assert (report["level"], report["message"]) == (0, "shaped")
+            again.end()
+        standby.end()
+    assert (came(shaping), came(standby), came(again)) == ([1], [2, 3], [4, 5])
+    logged = [words["log"] for words in standby.said if "log" in words]
+    assert "chainshaper_t3 is not there: /t3: messages go around it" in logged
+    assert any("is back after " in text and "2 messages came" in text for text in logged)
+    gate = read_gate_log(tmp_path / "gate.csv")
+    assert gate["source_timestamp"].to_list() == [1001, 1004, 1005]
+    bypass = read_gate_log(tmp_path / "chainshaper_t3_standby.csv")
+    assert bypass["source_timestamp"].to_list() == [1002, 1003]
+    assert bypass["overrun"].to_list() == ["bypass"] * 2
+    logs = [tmp_path / "gate.csv", tmp_path / "chainshaper_t3_standby.csv"]
+    assert releases_so_far(logs).size == gate.height, "the others left in no slot"
+    assert (bypass["published"] >= bypass["release"]).all()
+
+
+def change(process: ShapingProcess, **parameters: object) -> None:
+    """Other parameters than the plan's."""
+    values = yaml.safe_load(process.parameters_file.read_text())
+    values["/**"]["ros__parameters"] |= parameters
+    process.parameters_file.write_text(yaml.safe_dump(values))
+
+
+def dealt_with(folder: Path) -> int:
+    """How many messages the shaping node has published or dropped."""
+    (output,) = outputs(folder)
+    return Page(*output.page.rsplit("/", 1))["released"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "dropped"),
+    [({"depth": 20}, 0), ({"depth": 3}, 5), ({"overrun": "discard", "slots_ns": [0, 1]}, 8)],
+    ids=["room", "overflowed", "discarded"],
+)
+def test_what_waits_in_a_killed_node_goes_around_it_but_not_what_it_has_dropped(
+    tmp_path: Path, plan: Plan, changes: dict[str, Any], dropped: int
+) -> None:
+    process, beside = written(plan, tmp_path)
+    slot = [59_000 * MS, 59_500 * MS]
+    timing = {"cycle_ns": 60_000 * MS, "slots_ns": slot, "anchor": "cycle"}
+    phase = (time.monotonic_ns() - 1000 * MS) % (60_000 * MS)
+    change(process, **{**timing, "phase_ns": phase, "overrun": "wait", **changes})
+    with running(beside, tmp_path) as standby, running(process, tmp_path) as shaping:
+        take_over(1, tmp_path, shaping)
+        say(1, standby)
+        for number in range(2, 9):
+            say(number, shaping, standby)
+        wait_for(lambda: dealt_with(tmp_path) == dropped, f"{dropped} to be dropped")
+        time.sleep(0.2)  # the node takes what has come, every 50 ms
+        shaping.process.kill()
+        say(9, standby)
+        for _ in range(dropped + 1, 10):
+            standby.hear(lambda words: words.get("published") == "/t3")
+        standby.end()
+    assert (came(shaping), came(standby)) == ([], list(range(dropped + 1, 10)))
+
+
+def test_what_a_stopped_node_finds_when_it_goes_on_is_neither_doubled_nor_counted_as_lost(
+    tmp_path: Path, plan: Plan
+) -> None:
+    process, beside = written(plan, tmp_path, patience_ns=300 * MS)
+    change(process, depth=3, cycle_ns=1000 * MS, slots_ns=[500 * MS, 700 * MS])
+    with running(beside, tmp_path) as standby, running(process, tmp_path) as shaping:
+        take_over(1, tmp_path, shaping)
+        shaping.process.send_signal(signal.SIGSTOP)  # while it waits for the slot
+        say(1, standby)
+        for number in range(2, 9):
+            say(number, shaping, standby)
+        for _ in range(1, 9):
+            standby.hear(lambda words: words.get("published") == "/t3")
+        shaping.process.send_signal(signal.SIGCONT)
+        number = 8
+        while not shaping.heard(lambda words: words.get("published") == "/t3", within_s=0.9):
+            number += 1
+            say(number, shaping, standby)
+        shaping.end()
+        standby.end()
+    assert came(standby)[:8] == list(range(1, 9))
+    assert sorted(came(shaping) + came(standby)) == list(range(1, number + 1))
+    assert read_gate_log(tmp_path / "gate.csv")["dropped"].to_list() == [None] * len(came(shaping))
+
+
+def test_with_the_fallback_silence_nothing_is_published_and_all_is_counted(
+    tmp_path: Path, plan: Plan
+) -> None:
+    _, beside = written(revised(plan, fallback="silence"), tmp_path)
+    with running(beside, tmp_path) as standby:
+        for number in range(3):
+            say(number, standby)
+        wait_for(lambda: outputs(tmp_path)[0].messages == 3, "all to be counted")
+        (output,) = outputs(tmp_path)
+        assert output.state == "silent"
+        assert "3 messages were not published" in output_text(output)
+        standby.tell(tick=1)
+        report = standby.hear(lambda words: "diagnostics" in words)
+        assert (report["level"], report["message"].partition(" ")[0]) == (2, "silent")
+        standby.end()
+    assert not [words for words in standby.said if "publisher" in words and "t3" in str(words)]
+    assert came(standby) == []
+    log = read_gate_log(tmp_path / "chainshaper_t3_standby.csv")
+    assert log["overrun"].to_list() == ["silence"] * 3
+    assert log["release"].null_count() == 3
+
+
+def test_a_node_that_is_stopped_is_gone_around(tmp_path: Path, plan: Plan) -> None:
+    process, beside = written(plan, tmp_path, patience_ns=500 * MS)
+    with running(beside, tmp_path) as standby, running(process, tmp_path) as shaping:
+        take_over(1, tmp_path, shaping)
+        say(1, standby)
+        shaping.hear(lambda words: words.get("published") == "/t3")
+        shaping.process.send_signal(signal.SIGSTOP)
+        for number in (2, 3):
+            say(number, shaping, standby)
+            standby.hear(lambda words: words.get("published") == "/t3")
+        shaping.process.send_signal(signal.SIGCONT)
+        number = 3
+        while not shaping.heard(lambda words: words.get("published") == "/t3", within_s=0.6):
+            number += 1  # a busy machine is late again
+            say(number, shaping, standby)
+        shaping.end()
+        standby.end()
+    assert came(standby)[:2] == [2, 3]
+    assert sorted(came(shaping) + came(standby)) == list(range(1, number + 1))
+    assert any("it hangs, or was stopped" in words.get("log", "") for words in standby.said)
+
+
+def test_a_node_that_starts_again_goes_on_in_its_cycle_and_mode(tmp_path: Path, plan: Plan) -> None:
+    slots = ((15 * MS, 25 * MS), (30 * MS, 45 * MS))
+    servers = tuple(
+        server.model_copy(update={"slots": slots}) if server.name == "output" else server
+        for server in plan.servers
+    )
+    modes = Modes(topic="/mode", default="city", bands={"city": 2, "highway": 1}, late="next-slot")
+    plan = revised(plan, servers=servers, modes=modes, anchor="cycle")
+    process, _ = written(plan, tmp_path)
+    for announced in (True, False):
+        with running(process, tmp_path) as run:
+            if announced:
+                run.tell(set=["phase_ns", 13 * MS])
+                run.tell(topic="/mode", data="highway")
+                time.sleep(0.15)  # it is in force from the next cycle on
+            say(int(announced), run)
+            run.hear(lambda words: "published" in words)
+            seen = 2 - int(announced)
+            wait_for(lambda: read_gate_log(tmp_path / "gate.csv").height == seen, "its log")  # noqa: B023
+            run.process.kill()
+    log = read_gate_log(tmp_path / "gate.csv")
+    assert [origin % (50 * MS) for origin in log["origin"]] == [13 * MS] * log.height
+    assert set(log["mode"]) == {"highway"}
+
+
+def test_a_node_that_fails_at_once_waits_longer_each_time_and_says_so(
+    tmp_path: Path, plan: Plan
+) -> None:
+    process, _ = written(plan, tmp_path)
+    text = process.parameters_file.read_text()
+    for failed in range(4):
+        if failed == 2:  # for another reason
+            process.parameters_file.write_text(text.replace("cycle_ns: 50000000", "cycle_ns: 5"))
+        with running_node(process, tmp_path, {"/t3_tmp": [{"type": "no/msg/T", "qos": {}}]}) as run:
+            assert run.end() == 1
+        said = any(
+            f"has failed {failed} times: starting in 0.5 s" in words.get("log", "")
+            for words in run.said
+        )
+        assert said == (failed == 3)
+
+
+def test_without_a_folder_the_node_works_alone_and_the_standby_says_that_it_cannot(
+    tmp_path: Path, plan: Plan
+) -> None:
+    process, beside = written(plan, tmp_path)
+    for one in (process, beside):
+        assert one.command is not None
+        script = Path(one.command[1])
+        text = script.read_text().replace("/dev/shm/chainshaper-", f"{tmp_path}/no/such/folder-")
+        script.write_text(text)
+    (tmp_path / "outputs").touch()
+    (tmp_path / "chainshaper").touch()
+    (tmp_path / "no").touch()
+    with running_node(beside, tmp_path, PUBLISHERS) as standby:
+        standby.hear(lambda words: "/t3 falls silent when" in words.get("log", ""))
+        with running(process, tmp_path) as shaping:
+            say(1, shaping)
+            shaping.hear(lambda words: words.get("published") == "/t3")
+            assert any("nothing can be agreed" in words.get("log", "") for words in shaping.said)
+        wait_for(lambda: standby.process.poll() is None, "the standby to be there")
+        standby.process.kill()
+
+
+def test_the_standby_leaves_the_cores_of_servers_alone(tmp_path: Path, plan: Plan) -> None:
+    _, beside = written(plan, tmp_path)
+    servers = {server.core for server in plan.servers}
+    parameters = yaml.safe_load(beside.parameters_file.read_text())["/**"]["ros__parameters"]
+    assert set(parameters["server_cores"]) == servers
+    with running(beside, tmp_path) as standby:
+        say(1, standby)
+        standby.hear(lambda words: words.get("published") == "/t3")
+        ours = os.sched_getaffinity(0)
+        assert os.sched_getaffinity(standby.process.pid) == (ours - servers or ours)
+        assert os.sched_getscheduler(standby.process.pid) == os.SCHED_OTHER
+
+
+def test_pages_of_others_are_looked_at_without_trust(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "outputs"
+    monkeypatch.setattr(
+        "chainshaper.enforcement.handover.page_folders", lambda: iter([str(folder)])
+    )
+    good, bad = open_page("good", "/t5"), open_page("bad", "/t5\x1b[31m")
+    assert find_outputs(iter([str(folder)])) == (), "none of their processes lives"
+    for page in (good, bad):
+        assert page.lock()
+        page["holder"] = os.getpid()
+    (folder / "short").write_bytes(b"x")
+    (folder / "link").symlink_to(good.path)
+    os.mkfifo(folder / "fifo")
+    (output,) = find_outputs(iter([str(folder), str(tmp_path / "missing")]))
+    assert (output.topic, output.state) == ("/t5", "no standby")
+    assert "it falls silent when that ends" in output_text(output)
+
+
+def test_a_program_is_started_again_until_it_is_to_end(tmp_path: Path, plan: Plan) -> None:
+    written(plan, tmp_path)
+    (tmp_path / "child.py").write_text(
+        "import os, signal, sys\nprint(os.getpid(), *sys.argv[1:], flush=True)\nsignal.pause()\n"
+    )
+    command = [sys.executable, str(tmp_path / "respawning.py"), "child.py", "--ros-args"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as run:
+        assert run.stdout is not None
+        first = _started(run.stdout.readline())
+        os.kill(first, signal.SIGKILL)
+        second = _started(run.stdout.readline())
+        assert second != first
+        run.send_signal(signal.SIGINT)
+        assert run.wait(20) != 0
+    with pytest.raises(ProcessLookupError):
+        os.kill(second, 0)
+
+
+def _started(line: str) -> int:
+    pid, argument = line.split()
+    assert argument == "--ros-args"
+    return int(pid)

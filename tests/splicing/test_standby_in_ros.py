@@ -1,0 +1,164 @@
+"""Killing the shaping node, its standby, or both, on a real `ros2 launch`.
+
+``CHAINSHAPER_KILLS=100`` kills so often (default: 3 times); ``pytest -s`` shows the figures.
+"""
+
+import itertools
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from processes import wait_for
+from ros2 import ros2_environment
+
+from chainshaper import splice_launch_files
+from chainshaper.planning import Plan, plan_shaping
+from chainshaper.splicing.generated_package import build_package
+from chainshaper.splicing.launch.folder import NODES
+from chainshaper.splicing.shaped_outputs import ShapedOutput, find_outputs
+from chainshaper.splicing.shaping_process import NodeKind
+
+pytestmark = [pytest.mark.ros2, pytest.mark.timeout(1200)]
+
+OUTPUT = Path(__file__).parent / "ros_output.py"
+KILLS = int(os.environ.get("CHAINSHAPER_KILLS", "3"))
+DOMAIN = "93"
+
+
+@dataclass(frozen=True)
+class Launched:
+    """An application that `ros2 launch` runs from a spliced copy."""
+
+    folder: Path
+    process: "subprocess.Popen[bytes]"
+
+    @property
+    def output(self) -> ShapedOutput | None:
+        """The state of its output."""
+        found = [one for one in find_outputs() if f".{DOMAIN}.v" in one.page]
+        return next((one for one in found if one.topic == "/t5"), None)
+
+    def numbers(self, who: str) -> list[tuple[int, int]]:
+        """The messages that a node has published or received, with the times (ns)."""
+        lines = (self.folder / who).read_text().splitlines()
+        return [(int(number), int(at)) for number, at in map(str.split, lines)]
+
+
+def plan() -> Plan:
+    """Every output 50 ms after its stamp."""
+    return plan_shaping(
+        np.array([5_000_000, 49_000_000]),
+        100_000_000,
+        spec="/t1../t5",
+        output="/t5",
+        publisher="/node5",
+        nodes=("/node5",),
+        core=0,
+        publish_slot_ns=20_000_000,
+    )
+
+
+@pytest.fixture(params=["python", "cpp"])
+def launched(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Launched]:
+    environment = {**ros2_environment(), "ROS_DOMAIN_ID": DOMAIN, "CHAINSHAPER_TEST": str(tmp_path)}
+    environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    kind: NodeKind = request.param
+    if kind == "cpp" and shutil.which("colcon", path=environment["PATH"]) is None:
+        pytest.skip("colcon is not on the PATH, so no package can be built")
+    robot = tmp_path / "robot.launch.py"
+    nodes = "".join(
+        f"        Node(executable='python3', name={name!r},\n"
+        f"             arguments=[{str(OUTPUT)!r}, {what!r}, {str(tmp_path / what)!r}],\n"
+        "             remappings=[('output', '/t5')]),\n"
+        for name, what in (("node5", "publisher"), ("actuator", "receiver"))
+    )
+    robot.write_text(
+        "from launch import LaunchDescription\nfrom launch_ros.actions import Node\n"
+        f"def generate_launch_description():\n    return LaunchDescription([\n{nodes}    ])\n"
+    )
+    splicing = splice_launch_files(plan(), [robot], tmp_path / "spliced", node=kind)
+    command = ["ros2", "launch", str(splicing.launch[robot])]
+    if kind == "cpp":
+        with pytest.MonkeyPatch.context() as monkeypatch:
+            for name, value in environment.items():
+                monkeypatch.setenv(name, value)
+            setup = build_package(splicing.folder / NODES)
+        command = ["bash", "-c", 'source "$0" && exec "$@"', str(setup), *command]
+    with (tmp_path / "said").open("wb") as said:
+        process = subprocess.Popen(
+            ["env", *command], env=environment, stdout=said, stderr=said, start_new_session=True
+        )
+    try:
+        yield Launched(tmp_path, process)
+        process.send_signal(signal.SIGINT)
+        process.wait(30)
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def await_shaped(app: Launched, *without: int | None) -> ShapedOutput:
+    """Its output, once it is shaped and has a standby, by other processes than those."""
+
+    def shaped() -> bool:
+        output = app.output
+        return (
+            output is not None
+            and output.state == "shaped"
+            and None not in (output.shaping_node, output.standby)
+            and {output.shaping_node, output.standby}.isdisjoint(without)
+        )
+
+    wait_for(shaped, f"/t5 to be shaped: {(app.folder / 'said').read_text()[-3000:]}", 60, 0.005)
+    output = app.output
+    assert output is not None
+    return output
+
+
+@pytest.mark.parametrize("victims", [("shaping_node",), ("standby",), ("shaping_node", "standby")])
+def test_whichever_is_killed_the_output_goes_on_and_both_are_back(
+    launched: Launched, victims: tuple[str, ...]
+) -> None:
+    await_shaped(launched)
+    time.sleep(1)  # whoever takes part has found the others
+    begun, dice, back_s = time.monotonic_ns(), random.Random(13), []
+    for _ in range(KILLS):
+        time.sleep(0.8 + dice.random() * 0.7)
+        output = await_shaped(launched)
+        killed = [getattr(output, victim) for victim in victims]
+        since = time.monotonic()
+        for pid in killed:
+            os.kill(pid, signal.SIGKILL)
+        await_shaped(launched, *killed)
+        back_s.append(time.monotonic() - since)
+    time.sleep(1)
+    until = time.monotonic_ns() - 500_000_000
+    sent = [number for number, at in launched.numbers("publisher") if begun < at < until]
+    received = [(number, at) for number, at in launched.numbers("receiver") if number in set(sent)]
+    came = [number for number, _ in received]
+    times = np.array([at for _, at in received])
+    figures = {
+        "victims": victims,
+        "kills": KILLS,
+        "sent": len(sent),
+        "lost": len(set(sent) - set(came)),
+        "doubled": len(came) - len(set(came)),
+        "reordered": sum(after < before for before, after in itertools.pairwise(came)),
+        "longest_gap_ms": round(float(np.diff(times).max()) / 1e6),
+        "back_s": {"p50": round(float(np.median(back_s)), 2), "max": round(max(back_s), 2)},
+    }
+    print(json.dumps(figures))  # noqa: T201
+    assert figures["doubled"] == figures["reordered"] == 0
+    if len(victims) == 1:
+        assert figures["lost"] == 0
+    assert came[-1] == sent[-1], "it goes on"
