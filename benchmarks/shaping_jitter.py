@@ -20,9 +20,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from chainshaper.demo import run_demo
-from chainshaper.durations import milliseconds
-from chainshaper.steps import Measurement
+from chainshaper.flow.demo import run_demo
+from chainshaper.flow.steps import Measurement
+from chainshaper.values.durations import milliseconds
 
 SOURCE = "".join(
     f"#include <stdio.h>\nint f{i}(int x) {{ return x * {i} + (x >> {i % 31}); }}\n"

@@ -13,8 +13,8 @@ from typing import Any
 
 import polars as pl
 
-from chainshaper import events
 from chainshaper.sources.lttng.writing import write_lttng_trace
+from chainshaper.values import events
 
 CYCLES = 40
 PERIOD_NS = 50_000_000

@@ -37,13 +37,13 @@ from chainshaper import (
     shape_application,
     simulate,
 )
-from chainshaper.enforcement.realtime import available_cores, may_use_fifo
 from chainshaper.enforcement.runs.state import RunState
-from chainshaper.errors import OperationError
+from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.planning import Plan, Slot
 from chainshaper.planning.publisher_threads import publisher_servers
-from chainshaper.recording import Recording
 from chainshaper.splicing.application import splice_application
+from chainshaper.values.errors import OperationError
+from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application, application_as_written
 
 __all__ = [

@@ -20,7 +20,7 @@ from table_3 import FIFO, run_under_fifo
 
 from chainshaper import load_application, open_recording, simulate
 from chainshaper.analysis import callback_statistics, data_flow
-from chainshaper.recording import Recording
+from chainshaper.values.recording import Recording
 
 CALLBACKS = {
     "throttler, rear": ("/throttler", "/lidar_rear/points_raw"),

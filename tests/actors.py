@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from chainshaper.enforcement.threads.listing import Thread, list_threads
+from chainshaper.linux.threads import Thread, list_threads
 
 __all__ = ["Actor", "acting"]
 

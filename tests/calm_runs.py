@@ -10,7 +10,7 @@ from pathlib import Path
 from small_chain import PERIOD_NS
 
 from chainshaper import measure_latency
-from chainshaper.recording import Recording
+from chainshaper.values.recording import Recording
 
 __all__ = ["calm_run"]
 

@@ -13,7 +13,7 @@ from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain, small_chain_text
 
 from chainshaper import run_application, shape_application
 from chainshaper.planning import Plan, plan_shaping
-from chainshaper.recording import Recording
+from chainshaper.values.recording import Recording
 
 CYCLES = 12
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper.enforcement.gate import sleep_until
-from chainshaper.enforcement.threads.listing import list_threads
+from chainshaper.gate.decision import sleep_until
+from chainshaper.linux.threads import list_threads
 from chainshaper.workload.live import Enforcement, StartedNodes
 
 __all__ = ["freezing_publisher_of", "need_threaded_cgroups"]

@@ -2,7 +2,7 @@
 
 import time
 
-from chainshaper.enforcement.gate import Held, Release, Shaper
+from chainshaper.gate.decision import Held, Release, Shaper
 
 __all__ = ["decided", "held"]
 

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from chainshaper.enforcement.threads.listing import list_threads
+from chainshaper.linux.threads import list_threads
 
 __all__ = ["children_of", "marked_processes", "real_time_threads", "wait_for"]
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from chainshaper import events
 from chainshaper.sources import open_source
 from chainshaper.sources.ctf import open_trace, read_events
+from chainshaper.values import events
 
 __all__ = ["CHAINS", "DATA", "TRACES", "ReferenceTrace", "reference_folder", "reference_trace"]
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from chainshaper.enforcement.realtime import available_cores
+from chainshaper.linux.scheduling import available_cores
 from chainshaper.workload.description import Application, load_application
 
 __all__ = ["DDS_CORE", "EXECUTOR_CORE", "NODES", "PERIOD_NS", "small_chain", "small_chain_text"]

@@ -9,7 +9,7 @@ from typing import Any
 
 import polars as pl
 
-from chainshaper import events
+from chainshaper.values import events
 
 __all__ = ["OFFSET", "Callback", "Node", "Publisher", "Story"]
 

@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from chainshaper.enforcement.realtime import available_cores
 from chainshaper.enforcement.servers import ReservationServer
+from chainshaper.linux.scheduling import available_cores
 
 __all__ = ["Exactness", "compare_with_slots", "load_beside", "read_windows", "spinners"]
 

@@ -26,27 +26,38 @@ if TYPE_CHECKING:
         find_chain,
         load_named_paths,
     )
-    from chainshaper.applying import apply_plan
-    from chainshaper.doctor import examine_machine
-    from chainshaper.dry_run import planned_changes
     from chainshaper.enforcement.runs.state import find_runs
     from chainshaper.enforcement.runs.undoing import end_run
-    from chainshaper.errors import ChainshaperError, InputError, OperationError, PlatformError
-    from chainshaper.exploration import (
+    from chainshaper.flow.apply import apply_plan
+    from chainshaper.flow.doctor import examine_machine
+    from chainshaper.flow.dry_run import planned_changes
+    from chainshaper.flow.exploration import (
         ApplicationDescription,
         convert_recording,
         describe_application,
         event_counts,
         list_chains,
     )
-    from chainshaper.launch_shaping import ShapedLaunch, shape_launch
-    from chainshaper.launch_splicing import (
+    from chainshaper.flow.launch_shaping import ShapedLaunch, shape_launch
+    from chainshaper.flow.launch_splicing import (
         Splicing,
         ThrottledInput,
         splice_launch_files,
         splice_throttlers,
         undo_splice,
     )
+    from chainshaper.flow.profiling import profiling_condition
+    from chainshaper.flow.record import Recorded, record_command
+    from chainshaper.flow.steps import (
+        Comparison,
+        Measurement,
+        compare_recordings,
+        measure_latency,
+        plan_recording,
+        profile_chains,
+        shape_application,
+    )
+    from chainshaper.flow.thread_search import find_threads
     from chainshaper.planning import (
         Plan,
         PlanRequest,
@@ -57,29 +68,23 @@ if TYPE_CHECKING:
         plan_shaping,
         save_plan,
     )
-    from chainshaper.profiling import profiling_condition
-    from chainshaper.record import Recorded, record_command
-    from chainshaper.recording import Recording, open_recording
     from chainshaper.reporting.application_graph import write_picture
     from chainshaper.reporting.breakdown import hop_breakdown
     from chainshaper.reporting.figures import draw_distribution, draw_latency
     from chainshaper.reporting.html import write_report
     from chainshaper.reporting.perfetto import export_perfetto
     from chainshaper.simulation import simulate, simulate_latencies
+    from chainshaper.simulation.sweeping import sweep
     from chainshaper.sources import open_source
-    from chainshaper.splicing.gate_log import read_gate_log
+    from chainshaper.sources.gate_log import read_gate_log
     from chainshaper.splicing.shaping_process import write_shaping_process, write_throttler
-    from chainshaper.steps import (
-        Comparison,
-        Measurement,
-        compare_recordings,
-        measure_latency,
-        plan_recording,
-        profile_chains,
-        shape_application,
+    from chainshaper.values.errors import (
+        ChainshaperError,
+        InputError,
+        OperationError,
+        PlatformError,
     )
-    from chainshaper.sweeping import sweep
-    from chainshaper.thread_search import find_threads
+    from chainshaper.values.recording import Recording, open_recording
     from chainshaper.workload.description import Application, load_application
     from chainshaper.workload.live import run_application
 
@@ -93,21 +98,26 @@ _HOMES = {
         "find_chain",
         "load_named_paths",
     ),
-    "chainshaper.applying": ("apply_plan",),
-    "chainshaper.doctor": ("examine_machine",),
+    "chainshaper.flow.apply": ("apply_plan",),
+    "chainshaper.flow.doctor": ("examine_machine",),
     "chainshaper.enforcement.runs.state": ("find_runs",),
     "chainshaper.enforcement.runs.undoing": ("end_run",),
-    "chainshaper.errors": ("ChainshaperError", "InputError", "OperationError", "PlatformError"),
-    "chainshaper.exploration": (
+    "chainshaper.values.errors": (
+        "ChainshaperError",
+        "InputError",
+        "OperationError",
+        "PlatformError",
+    ),
+    "chainshaper.flow.exploration": (
         "ApplicationDescription",
         "convert_recording",
         "describe_application",
         "event_counts",
         "list_chains",
     ),
-    "chainshaper.dry_run": ("planned_changes",),
-    "chainshaper.launch_shaping": ("ShapedLaunch", "shape_launch"),
-    "chainshaper.launch_splicing": (
+    "chainshaper.flow.dry_run": ("planned_changes",),
+    "chainshaper.flow.launch_shaping": ("ShapedLaunch", "shape_launch"),
+    "chainshaper.flow.launch_splicing": (
         "Splicing",
         "ThrottledInput",
         "splice_launch_files",
@@ -124,9 +134,9 @@ _HOMES = {
         "plan_shaping",
         "save_plan",
     ),
-    "chainshaper.profiling": ("profiling_condition",),
-    "chainshaper.record": ("Recorded", "record_command"),
-    "chainshaper.recording": ("Recording", "open_recording"),
+    "chainshaper.flow.profiling": ("profiling_condition",),
+    "chainshaper.flow.record": ("Recorded", "record_command"),
+    "chainshaper.values.recording": ("Recording", "open_recording"),
     "chainshaper.reporting.application_graph": ("write_picture",),
     "chainshaper.reporting.breakdown": ("hop_breakdown",),
     "chainshaper.reporting.figures": ("draw_distribution", "draw_latency"),
@@ -134,9 +144,9 @@ _HOMES = {
     "chainshaper.reporting.perfetto": ("export_perfetto",),
     "chainshaper.simulation": ("simulate", "simulate_latencies"),
     "chainshaper.sources": ("open_source",),
-    "chainshaper.splicing.gate_log": ("read_gate_log",),
+    "chainshaper.sources.gate_log": ("read_gate_log",),
     "chainshaper.splicing.shaping_process": ("write_shaping_process", "write_throttler"),
-    "chainshaper.steps": (
+    "chainshaper.flow.steps": (
         "Comparison",
         "Measurement",
         "compare_recordings",
@@ -145,8 +155,8 @@ _HOMES = {
         "profile_chains",
         "shape_application",
     ),
-    "chainshaper.sweeping": ("sweep",),
-    "chainshaper.thread_search": ("find_threads",),
+    "chainshaper.simulation.sweeping": ("sweep",),
+    "chainshaper.flow.thread_search": ("find_threads",),
     "chainshaper.workload.description": ("Application", "load_application"),
     "chainshaper.workload.live": ("run_application",),
 }

@@ -18,8 +18,8 @@ from chainshaper.analysis import (
     load_named_paths,
     parse_chain,
 )
-from chainshaper.app import ApplicationGraph, Callback, Node
-from chainshaper.errors import InputError
+from chainshaper.values.application import ApplicationGraph, Callback, Node
+from chainshaper.values.errors import InputError
 
 Edges = tuple[str | None, tuple[str, ...]]
 

@@ -5,7 +5,7 @@ import polars as pl
 from chainshaper import analyse_latency
 from chainshaper.analysis import data_flow
 from chainshaper.analysis.departures import gate_decisions
-from chainshaper.recording import Recording
+from chainshaper.values.recording import Recording
 
 
 def test_a_shaping_node_that_knows_no_handles_is_told_by_its_process(shaped: Recording) -> None:

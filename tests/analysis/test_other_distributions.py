@@ -11,7 +11,7 @@ import pytest
 from reference_traces import CHAINS, ReferenceTrace, reference_trace
 
 from chainshaper.analysis import analyse_latency, data_flow
-from chainshaper.events import EventTables
+from chainshaper.values.events import EventTables
 
 LATER = 10**12  # ns
 

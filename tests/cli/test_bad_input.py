@@ -13,7 +13,7 @@ from command_line import called, chainshaper, message_of, refused
 from small_chain import small_chain_text
 
 from chainshaper.planning import Plan, save_plan
-from chainshaper.recording import Recording
+from chainshaper.values.recording import Recording
 
 
 @pytest.mark.parametrize(

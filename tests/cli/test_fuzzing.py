@@ -23,8 +23,8 @@ from small_chain import small_chain_text
 
 from chainshaper import simulate
 from chainshaper.planning import Plan, dump_plan
-from chainshaper.recording import Recording
 from chainshaper.sources.lttng.writing import write_lttng_trace
+from chainshaper.values.recording import Recording
 from chainshaper.workload.description import load_application
 
 CASES = int(os.environ.get("CHAINSHAPER_FUZZ_CASES", "25"))

@@ -10,8 +10,8 @@ from command_line import Running, chainshaper, message_of
 from processes import wait_for
 from small_chain import NODES
 
-from chainshaper.enforcement.realtime import may_use_fifo
-from chainshaper.recording import Recording
+from chainshaper.linux.scheduling import may_use_fifo
+from chainshaper.values.recording import Recording
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from command_line import called, json_of, refused
 
 from chainshaper import load_plan, plan_shaping, save_plan
 from chainshaper.planning import Modes
-from chainshaper.recording import Recording
+from chainshaper.values.recording import Recording
 
 MS = 1_000_000
 

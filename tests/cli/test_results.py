@@ -9,7 +9,7 @@ from command_line import called, chainshaper, json_of
 from small_chain import DDS_CORE, EXECUTOR_CORE, small_chain_text
 
 from chainshaper import load_plan, measure_latency, open_recording
-from chainshaper.recording import Recording
+from chainshaper.values.recording import Recording
 
 VERBS = (
     "demo",

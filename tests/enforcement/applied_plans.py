@@ -12,11 +12,11 @@ import pytest
 from gated import cpu_ns, groups_left, own_cgroup
 from processes import children_of, wait_for
 
-from chainshaper.enforcement.freezer import cgroups
-from chainshaper.enforcement.realtime import available_cores, may_use_fifo
 from chainshaper.enforcement.runs.journal import find_journals
-from chainshaper.enforcement.threads.listing import list_threads, parents, start_of
-from chainshaper.enforcement.threads.processes import descendants
+from chainshaper.linux import cgroups
+from chainshaper.linux.processes import descendants
+from chainshaper.linux.scheduling import available_cores, may_use_fifo
+from chainshaper.linux.threads import list_threads, parents, start_of
 from chainshaper.planning import Plan, save_plan
 from chainshaper.planning.plan_parts import (
     ChainOfPlan,

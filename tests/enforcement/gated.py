@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 from processes import wait_for
 
-from chainshaper.enforcement.freezer.cgroups import cgroup_of, mount_point
-from chainshaper.enforcement.realtime import available_cores, may_use_fifo
-from chainshaper.errors import PlatformError
+from chainshaper.linux.cgroups import cgroup_of, mount_point
+from chainshaper.linux.scheduling import available_cores, may_use_fifo
+from chainshaper.values.errors import PlatformError
 
 MS = 1_000_000
 CORE = available_cores()[-1]

@@ -20,8 +20,8 @@ from chainshaper.enforcement.runs.journal import open_journal
 from chainshaper.enforcement.runs.scheduling_memory import change_scheduling
 from chainshaper.enforcement.runs.undoing import undo_run
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
-from chainshaper.enforcement.threads.listing import Scheduling, find_thread
-from chainshaper.errors import PlatformError
+from chainshaper.linux.threads import Scheduling, find_thread
+from chainshaper.values.errors import PlatformError
 
 MS = 1_000_000
 GIVEN = 5

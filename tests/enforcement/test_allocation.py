@@ -14,9 +14,9 @@ from chainshaper.enforcement.threads.allocation import (
     allocate,
     new_and_ended,
 )
-from chainshaper.enforcement.threads.dds_names import dds_kind, role_of
-from chainshaper.enforcement.threads.listing import Thread
-from chainshaper.enforcement.threads.processes import Process, read_process
+from chainshaper.linux.dds_threads import dds_kind, role_of
+from chainshaper.linux.processes import Process, read_process
+from chainshaper.linux.threads import Thread
 
 CYCLONE = ("gc", "dq.builtins", "dq.user", "tev", "recv")
 

@@ -25,8 +25,8 @@ from applied_plans import (
 from gated import needs_cgroups
 from processes import wait_for
 
-from chainshaper.enforcement.realtime import available_cores
-from chainshaper.enforcement.threads.listing import list_threads
+from chainshaper.linux.scheduling import available_cores
+from chainshaper.linux.threads import list_threads
 from chainshaper.planning import save_plan
 
 

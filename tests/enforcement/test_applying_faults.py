@@ -40,7 +40,7 @@ from gated import cpu_ns, kill, needs_cgroups
 from processes import wait_for
 
 from chainshaper import enforcement
-from chainshaper.enforcement.freezer import cgroups
+from chainshaper.linux import cgroups
 from chainshaper.planning import save_plan
 
 pytestmark = [needs_fifo, needs_cgroups]

@@ -23,7 +23,7 @@ from applied_plans import (
 from processes import wait_for
 
 from chainshaper.enforcement.runs.journal import journals_folder
-from chainshaper.enforcement.threads.listing import list_threads
+from chainshaper.linux.threads import list_threads
 from chainshaper.planning import Plan
 
 pytestmark = needs_fifo

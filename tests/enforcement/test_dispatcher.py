@@ -24,13 +24,13 @@ from gated import (
 )
 from processes import wait_for
 
-from chainshaper.enforcement.freezer import cgroups
 from chainshaper.enforcement.freezer.back_end import Freezer, create
 from chainshaper.enforcement.freezer.slot_dispatcher import PRIORITY, overrun
-from chainshaper.enforcement.realtime import may_use_fifo
 from chainshaper.enforcement.runs.journal import discard_journal, open_journal
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
-from chainshaper.enforcement.threads.listing import list_threads
+from chainshaper.linux import cgroups
+from chainshaper.linux.scheduling import may_use_fifo
+from chainshaper.linux.threads import list_threads
 
 pytestmark = needs_cgroups
 

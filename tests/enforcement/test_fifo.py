@@ -8,13 +8,13 @@ import pytest
 from actors import Actor, acting
 
 from chainshaper.enforcement.fifo import create
-from chainshaper.enforcement.realtime import available_cores, may_use_fifo
 from chainshaper.enforcement.runs.journal import Journal, open_journal
 from chainshaper.enforcement.runs.scheduling_memory import change_scheduling
-from chainshaper.enforcement.runs.scheduling_state import state_of
 from chainshaper.enforcement.servers import BackEnd, ReservationServer, ServerTable
-from chainshaper.enforcement.threads.listing import Scheduling
-from chainshaper.errors import InputError
+from chainshaper.linux.scheduling import available_cores, may_use_fifo
+from chainshaper.linux.scheduling_state import state_of
+from chainshaper.linux.threads import Scheduling
+from chainshaper.values.errors import InputError
 
 pytestmark = pytest.mark.skipif(
     not may_use_fifo(), reason="SCHED_FIFO is not permitted here: run as root to have this tested"

@@ -25,17 +25,17 @@ from gated import (
 from processes import children_of, wait_for
 
 from chainshaper.enforcement.freezer.back_end import Freezer, create
-from chainshaper.enforcement.freezer.cgroups import (
+from chainshaper.enforcement.runs.journal import discard_journal, open_journal
+from chainshaper.enforcement.servers import ReservationServer, ServerTable
+from chainshaper.linux.cgroups import (
     QUICK_MOVES,
     cgroup_of,
     mount_options,
     moves_are_quick,
     remount,
 )
-from chainshaper.enforcement.realtime import may_use_fifo
-from chainshaper.enforcement.runs.journal import discard_journal, open_journal
-from chainshaper.enforcement.servers import ReservationServer, ServerTable
-from chainshaper.errors import InputError, OperationError, PlatformError
+from chainshaper.linux.scheduling import may_use_fifo
+from chainshaper.values.errors import InputError, OperationError, PlatformError
 
 pytestmark = needs_cgroups
 

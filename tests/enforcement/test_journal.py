@@ -19,7 +19,7 @@ from chainshaper.enforcement.runs.journal import (
     process_of,
     remembered_journal,
 )
-from chainshaper.errors import OperationError, PlatformError
+from chainshaper.values.errors import OperationError, PlatformError
 
 
 def test_what_is_noted_can_be_read_back_in_order(tmp_path: Path) -> None:

@@ -12,12 +12,12 @@ from litmus_stand_in import StandIn, install
 
 from chainshaper.enforcement.litmus import back_end as litmus
 from chainshaper.enforcement.litmus.back_end import create, restore_plugin
-from chainshaper.enforcement.realtime import available_cores
 from chainshaper.enforcement.runs.journal import Journal, find_journals, open_journal
 from chainshaper.enforcement.runs.scheduling_memory import restore_scheduling
-from chainshaper.enforcement.runs.scheduling_state import state_of
 from chainshaper.enforcement.servers import BackEnd, ReservationServer, ServerTable
-from chainshaper.errors import InputError, OperationError, PlatformError
+from chainshaper.linux.scheduling import available_cores
+from chainshaper.linux.scheduling_state import state_of
+from chainshaper.values.errors import InputError, OperationError, PlatformError
 
 MS = 1_000_000
 CORE = available_cores()[-1]

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from chainshaper.enforcement.phase import find_drift, find_phase, measure_phase, watch_wake_ups
-from chainshaper.errors import OperationError
+from chainshaper.values.errors import OperationError
 
 MS = 1_000_000
 CYCLE = 100 * MS

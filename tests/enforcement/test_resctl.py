@@ -19,7 +19,7 @@ from chainshaper.enforcement.litmus.resctl import (
     turned,
 )
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
-from chainshaper.errors import InputError
+from chainshaper.values.errors import InputError
 
 MS = 1_000_000
 CHAIN = ReservationServer("chain", core=1, priority=2, slots=((0, 86 * MS),))

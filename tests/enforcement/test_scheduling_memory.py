@@ -14,7 +14,6 @@ import pytest
 from actors import Actor, acting
 from processes import wait_for
 
-from chainshaper.enforcement.realtime import available_cores, may_use_fifo
 from chainshaper.enforcement.runs import journal as journal_module
 from chainshaper.enforcement.runs.journal import Journal, find_journals, open_journal
 from chainshaper.enforcement.runs.scheduling_memory import (
@@ -26,9 +25,10 @@ from chainshaper.enforcement.runs.scheduling_memory import (
     restore_inherited,
     restore_scheduling,
 )
-from chainshaper.enforcement.runs.scheduling_state import SchedulingState, set_state, state_of
-from chainshaper.enforcement.threads.listing import RESET_ON_FORK, Scheduling, list_threads
-from chainshaper.errors import OperationError
+from chainshaper.linux.scheduling import available_cores, may_use_fifo
+from chainshaper.linux.scheduling_state import SchedulingState, set_state, state_of
+from chainshaper.linux.threads import RESET_ON_FORK, Scheduling, list_threads
+from chainshaper.values.errors import OperationError
 
 pytestmark = pytest.mark.skipif(
     not may_use_fifo(), reason="SCHED_FIFO is not permitted here: run as root to have this tested"
@@ -185,9 +185,9 @@ def test_a_new_thread_of_a_class_of_its_own_is_left_alone(tmp_path: Path, journa
 _APPLIER = """
 import random, sys, time
 from chainshaper.enforcement.runs.journal import open_journal
-from chainshaper.enforcement.realtime import available_cores
+from chainshaper.linux.scheduling import available_cores
 from chainshaper.enforcement.runs.scheduling_memory import change_scheduling
-from chainshaper.enforcement.threads.listing import Scheduling, list_threads
+from chainshaper.linux.threads import Scheduling, list_threads
 
 journal = open_journal(sys.argv[2])
 cores = available_cores()

@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper.enforcement.own_processes import what_happened
 from chainshaper.enforcement.scx import back_end as scx
 from chainshaper.enforcement.scx import libbpf
 from chainshaper.enforcement.scx import requirements as scx_requirements
 from chainshaper.enforcement.scx.loading import POLICY
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
-from chainshaper.errors import InputError, OperationError, PlatformError
+from chainshaper.linux.own_processes import what_happened
+from chainshaper.values.errors import InputError, OperationError, PlatformError
 
 ROOT = Path(__file__).parent.parent.parent
 CORE = min(os.sched_getaffinity(0))

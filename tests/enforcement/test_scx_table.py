@@ -21,7 +21,7 @@ from chainshaper.enforcement.scx.table import (
     unpack_exit,
 )
 from chainshaper.enforcement.servers import ReservationServer, ServerCounters, ServerTable
-from chainshaper.errors import InputError
+from chainshaper.values.errors import InputError
 
 ABI = Path(scx_table.__file__).with_name("policy") / "table_abi.h"
 MS = 1_000_000

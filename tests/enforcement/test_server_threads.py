@@ -9,8 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from chainshaper.enforcement.threads.allocation import Allocation, NodeThread
-from chainshaper.enforcement.threads.dds_names import ThreadRole
-from chainshaper.enforcement.threads.listing import Scheduling, Thread
 from chainshaper.enforcement.threads.server_threads import (
     DDS_PRIORITY,
     WantedScheduling,
@@ -19,10 +17,12 @@ from chainshaper.enforcement.threads.server_threads import (
     server_members,
     server_priorities,
 )
-from chainshaper.errors import InputError, OperationError
+from chainshaper.linux.dds_threads import ThreadRole
+from chainshaper.linux.threads import Scheduling, Thread
 from chainshaper.planning import Plan, plan_shaping
 from chainshaper.planning.plan import Server, ShapingNode, revised
 from chainshaper.planning.plan import Thread as PlannedThread
+from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000
 

@@ -16,15 +16,16 @@ from command_line import called, json_of, refused
 from processes import wait_for
 from strangers import NOBODY, named, needs_root, open_folder, strange
 
-from chainshaper import applying, find_threads
+from chainshaper import find_threads
 from chainshaper.enforcement.runs.state import RunState
-from chainshaper.enforcement.threads.listing import has_ended, list_threads, start_of
-from chainshaper.enforcement.threads.processes import read_process
-from chainshaper.enforcement.threads.users import run_users, user_of
-from chainshaper.errors import ChainshaperError, InputError, OperationError
+from chainshaper.flow import apply as applying
+from chainshaper.linux.processes import read_process
+from chainshaper.linux.threads import has_ended, list_threads, start_of
+from chainshaper.linux.users import run_users, user_of
 from chainshaper.planning import Plan, save_plan
 from chainshaper.sources.ros import interpreter
 from chainshaper.sources.ros.interpreter import environment_of, own_environment, start_with_rclpy
+from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 
 __all__ = ["open_folder"]
 pytestmark = needs_root

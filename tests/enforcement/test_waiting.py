@@ -10,7 +10,7 @@ import time
 import pytest
 from passing import held
 
-from chainshaper.enforcement.gate import Gate, Shaper, clock_offset, sleep_until, watch_until
+from chainshaper.gate.decision import Gate, Shaper, clock_offset, sleep_until, watch_until
 
 MS = 1_000_000
 

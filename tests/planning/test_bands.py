@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from chainshaper.errors import InputError, OperationError
-from chainshaper.plan_choices import Goal
 from chainshaper.planning.bands import (
     BandProblem,
     band_problem,
@@ -20,6 +18,8 @@ from chainshaper.planning.bands import (
     place_bands,
     placement_curve,
 )
+from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.plan_choices import Goal
 
 MS = 1_000_000
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.baselines import (
     CallbackTimes,
     let_per_callback,
@@ -24,6 +23,7 @@ from chainshaper.planning.plan import (
 )
 from chainshaper.planning.plan_file import dump_plan
 from chainshaper.planning.shaping import plan_shaping
+from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000
 NODES = ("/throttler", "/rear_filter", "/fusion", "/voxel_grid", "/localizer")

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 from chainshaper import measure_latency, simulate
-from chainshaper.errors import InputError
+from chainshaper.flow.steps import plan_recording, profile_chains
 from chainshaper.planning import Plan, PlanRequest, place_chains, plan_chains, publish_slots
-from chainshaper.recording import Recording
-from chainshaper.steps import plan_recording, profile_chains
+from chainshaper.values.errors import InputError
+from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application, load_application
 
 MS = 1_000_000

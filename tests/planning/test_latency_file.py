@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chainshaper.errors import InputError
 from chainshaper.planning import check_latencies, read_latencies
+from chainshaper.values.errors import InputError
 
 
 def test_one_duration_a_line(tmp_path: Path) -> None:

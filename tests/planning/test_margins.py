@@ -5,7 +5,6 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from chainshaper.errors import InputError, OperationError
 from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain
 from chainshaper.planning.margins import (
     covered_latency,
@@ -16,6 +15,7 @@ from chainshaper.planning.margins import (
 )
 from chainshaper.planning.plan_file import dump_plan
 from chainshaper.planning.shaping import plan_shaping, plan_warnings
+from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000
 

@@ -8,7 +8,6 @@ from importlib.util import find_spec
 
 import pytest
 
-from chainshaper.errors import InputError, OperationError
 from chainshaper.planning import offsets
 from chainshaper.planning.offsets import place_chains, with_offsets
 from chainshaper.planning.plan import (
@@ -20,6 +19,7 @@ from chainshaper.planning.plan import (
     Server,
     revised,
 )
+from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000
 

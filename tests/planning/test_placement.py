@@ -5,12 +5,12 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from chainshaper.errors import InputError, OperationError
-from chainshaper.plan_choices import Solver
 from chainshaper.planning.baselines import server_per_chain
 from chainshaper.planning.placement import choose_bands, with_bands, with_long_slot
 from chainshaper.planning.plan import Plan, publish_slots
 from chainshaper.planning.shaping import plan_shaping
+from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.plan_choices import Solver
 
 MS = 1_000_000
 LATENCIES = (np.random.default_rng(3).triangular(33, 68, 85, 2000) * MS).astype(np.int64)

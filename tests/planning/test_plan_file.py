@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chainshaper.errors import InputError, OperationError
 from chainshaper.planning import (
     ChainOfPlan,
     Evidence,
@@ -24,6 +23,7 @@ from chainshaper.planning import (
     save_plan,
     server_of,
 )
+from chainshaper.values.errors import InputError, OperationError
 
 GOOD = """\
 # edited by hand: keys in another order, flow style, comments

@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_publisher_threads import LATENCIES, MS, asynchronous
 
-from chainshaper.errors import InputError
 from chainshaper.planning import (
     PlanRequest,
     Profile,
@@ -21,6 +20,7 @@ from chainshaper.planning import (
 from chainshaper.planning.overruns import cycles_until_output, output_lifespan
 from chainshaper.planning.plan import publish_slots, revised
 from chainshaper.planning.publication import Writer, check_publication, publication_warnings
+from chainshaper.values.errors import InputError
 
 OUTPUT = Writer("/n5", "/t5", depth=10, asynchronous=True)
 SYNCHRONOUS = plan_shaping(LATENCIES, 100 * MS, output="/t5", publisher="/n5", nodes=["/n5"])

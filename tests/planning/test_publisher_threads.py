@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from chainshaper.errors import InputError
 from chainshaper.planning import (
     Plan,
     let_per_callback_asynchronous,
@@ -21,6 +20,7 @@ from chainshaper.planning import (
 )
 from chainshaper.planning.plan import output_server, revised
 from chainshaper.planning.publisher_threads import messages_held, publisher_servers
+from chainshaper.values.errors import InputError
 
 MS = 1_000_000
 LATENCIES = np.array([26, 40, 50, 58]) * MS

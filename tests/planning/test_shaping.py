@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chainshaper.errors import InputError, OperationError
 from chainshaper.planning import (
     Plan,
     Thread,
@@ -21,6 +20,7 @@ from chainshaper.planning import (
     server_per_chain,
     with_bands,
 )
+from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000
 

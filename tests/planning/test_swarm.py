@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.bands import (
     BandProblem,
     Placement,
@@ -17,6 +16,7 @@ from chainshaper.planning.bands import (
     place_bands,
 )
 from chainshaper.planning.swarm import place_by_swarm, place_randomly
+from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000
 

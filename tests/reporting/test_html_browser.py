@@ -15,7 +15,7 @@ from matplotlib import image
 from told_run import LATENCY_NS, told_run
 
 from chainshaper import measure_latency, write_report
-from chainshaper.durations import milliseconds
+from chainshaper.values.durations import milliseconds
 
 CHARTS = ("over-time", "histogram", "cdf", "breakdown", "timeline", "slots-0")
 

@@ -21,12 +21,12 @@ from chainshaper import (
     simulate,
     write_report,
 )
-from chainshaper.durations import milliseconds
-from chainshaper.errors import OperationError
+from chainshaper.flow.steps import Measurement
 from chainshaper.planning import publish_slots
-from chainshaper.recording import Recording
 from chainshaper.reporting.html.page import distinct_names, report_page
-from chainshaper.steps import Measurement
+from chainshaper.values.durations import milliseconds
+from chainshaper.values.errors import OperationError
+from chainshaper.values.recording import Recording
 
 
 class _Reader(HTMLParser):

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from told_run import LATENCY_NS, MS, PERIOD_NS, told_run
 
 from chainshaper import data_flow, measure_latency
-from chainshaper.recording import Recording
 from chainshaper.reporting.html import cycles as cycles_of_page
 from chainshaper.reporting.html.cycles import timeline_data
 from chainshaper.reporting.html.series import latency_histogram, latency_points
 from chainshaper.reporting.timeline import timeline_of
+from chainshaper.values.recording import Recording
 
 
 def _traversals(latencies: Sequence[int | None], disturbed: Sequence[bool]) -> pl.DataFrame:

@@ -7,7 +7,7 @@ from command_line import called, json_of
 from told_run import LATENCY_NS, MS, PERIOD_NS, told_run
 
 from chainshaper import measure_latency, open_recording
-from chainshaper.recording import InForceInfo
+from chainshaper.values.recording import InForceInfo
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ from told_run import MS, PERIOD_NS, told_plan, told_run
 from chainshaper import data_flow, measure_latency
 from chainshaper.planning import Plan, publish_slots
 from chainshaper.planning.plan import revised
-from chainshaper.recording import Recording
 from chainshaper.reporting.timeline import Timeline, timeline_of
+from chainshaper.values.recording import Recording
 
 
 def _timeline(recording: Recording, plan: Plan | None = None) -> Timeline:

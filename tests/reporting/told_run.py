@@ -14,7 +14,7 @@ import numpy as np
 from story import OFFSET, Story
 
 from chainshaper.planning import Plan, plan_shaping
-from chainshaper.recording import (
+from chainshaper.values.recording import (
     Recording,
     RecordingInfo,
     StallMeterInfo,

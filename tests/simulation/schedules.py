@@ -12,14 +12,14 @@ import polars as pl
 import yaml
 
 from chainshaper.analysis import data_flow
-from chainshaper.durations import parse_duration
 from chainshaper.planning import Plan
-from chainshaper.recording import Recording
 from chainshaper.simulation import simulate
 from chainshaper.simulation.simulating import START_NS
+from chainshaper.values.durations import parse_duration
+from chainshaper.values.recording import Recording
+from chainshaper.values.yaml_file import AS_YAML
 from chainshaper.workload.description import Application
 from chainshaper.workload.live import WARM_UP_CYCLES
-from chainshaper.yaml_file import AS_YAML
 
 FREE: dict[str, Any] = {
     **{name: {"constant": "0ms"} for name in ("wake_up", "take", "publish", "delivery")},

@@ -7,7 +7,7 @@ import pytest
 from schedules import application, simulated
 
 from chainshaper.analysis import data_flow
-from chainshaper.recording import Recording
+from chainshaper.values.recording import Recording
 
 BUSY = """
 chain: source

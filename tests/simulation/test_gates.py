@@ -11,14 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from schedules import MS, application, begin_of, simulated
 
-from chainshaper import events, plan_recording, simulate
+from chainshaper import plan_recording, simulate
 from chainshaper.analysis import analyse_latency
-from chainshaper.enforcement.gate import Gate, Modes, Overrun, missed, release_of
+from chainshaper.gate.decision import Gate, Modes, Overrun, missed, release_of
 from chainshaper.planning import PlanRequest
-from chainshaper.recording import Recording
 from chainshaper.simulation import layout as at
 from chainshaper.simulation import simulate_latencies
 from chainshaper.simulation.gate_kernel import decide, missed_slot, switch_mode
+from chainshaper.values import events
+from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application
 from chainshaper.workload.event_log import WORDS
 

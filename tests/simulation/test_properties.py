@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from schedules import application
 from test_servers import MS, plan
 
-from chainshaper import events
 from chainshaper.analysis import data_flow
 from chainshaper.planning.plan import Server, Thread
-from chainshaper.recording import Recording
 from chainshaper.simulation import simulate
 from chainshaper.simulation.simulating import START_NS
+from chainshaper.values import events
+from chainshaper.values.recording import Recording
 
 SETTINGS = settings(
     max_examples=15,

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from schedules import application, callbacks, ran, simulated
 
-from chainshaper.errors import InputError
 from chainshaper.planning import Plan
 from chainshaper.planning.plan import ChainOfPlan, Evidence, Margin, Prediction, Server, Thread
+from chainshaper.values.errors import InputError
 
 MS = 1_000_000
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from schedules import application, callbacks, simulated
 
-from chainshaper import events
-from chainshaper.recording import Recording
+from chainshaper.values import events
+from chainshaper.values.recording import Recording
 
 BEGIN = 1_500_000_000  # the sixth period of 100 ms
 

@@ -17,13 +17,13 @@ from processes import children_of, wait_for
 from strangers import NOBODY, named, open_folder, strange
 from traced_program import Program, Traced, build, skip_without_bpftrace, traced
 
-from chainshaper import events
 from chainshaper.analysis.flow import DataFlow, data_flow
-from chainshaper.errors import InputError, OperationError, PlatformError
-from chainshaper.record import record_command
-from chainshaper.recording import EndpointInfo, open_recording
+from chainshaper.flow.record import record_command
 from chainshaper.sources.ebpf.found_nodes import with_found_nodes
 from chainshaper.sources.ebpf.session import EbpfTracer
+from chainshaper.values import events
+from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.recording import EndpointInfo, open_recording
 
 __all__ = ["open_folder"]
 
@@ -372,7 +372,7 @@ def test_without_privileges_the_error_names_them_and_what_to_do(tmp_path: Path) 
         pytest.skip("giving up root needs root")
     code = (
         "import os, pathlib\n"
-        "from chainshaper.errors import PlatformError\n"
+        "from chainshaper.values.errors import PlatformError\n"
         "from chainshaper.sources.ebpf.session import EbpfTracer\n"
         "os.setuid(65534)\n"
         "try:\n"

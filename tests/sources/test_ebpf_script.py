@@ -10,8 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from traced_program import build, skip_without_bpftrace
 
-from chainshaper import events
-from chainshaper.errors import InputError
 from chainshaper.sources.ebpf.output import HEADER, lost_events, read_printed
 from chainshaper.sources.ebpf.script import (
     FIRST_POINT,
@@ -24,6 +22,8 @@ from chainshaper.sources.ebpf.script import (
 )
 from chainshaper.sources.ebpf.trace_points import FUNCTION_PREFIX, TracePoint, trace_points
 from chainshaper.sources.ebpf.tracing_libraries import TracingLibrary, installed_libraries
+from chainshaper.values import events
+from chainshaper.values.errors import InputError
 
 ALL = frozenset(FUNCTION_PREFIX + event for event in events.FIELDS)
 

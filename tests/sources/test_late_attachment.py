@@ -5,13 +5,13 @@ from typing import Any
 
 import polars as pl
 
-from chainshaper import events
 from chainshaper.analysis.flow import data_flow
 from chainshaper.analysis.graph import application_graph
-from chainshaper.enforcement.threads.processes import Process
-from chainshaper.recording import EndpointInfo, RecordingInfo
+from chainshaper.linux.processes import Process
 from chainshaper.sources.ebpf.found_nodes import with_found_nodes
 from chainshaper.sources.ebpf.late_attachment import with_found_objects, with_functions
+from chainshaper.values import events
+from chainshaper.values.recording import EndpointInfo, RecordingInfo
 
 PID, THREAD, OTHER = 10, 10, 11
 TIMER, READER, LAMBDA = 0x7A, 0x7B, 0x7C

@@ -12,10 +12,10 @@ import pytest
 from lttng_daemon import lttng, users_daemon
 from lttng_node import required_node
 
-from chainshaper.errors import InputError, OperationError, PlatformError
-from chainshaper.events import EventTables
-from chainshaper.recording import RecordingInfo
 from chainshaper.sources.lttng.session import MIB, LttngSession, buffer_size
+from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.events import EventTables
+from chainshaper.values.recording import RecordingInfo
 
 DEPTH = 7  # of every queue in chain_node.c
 

@@ -9,13 +9,13 @@ from command_line import called, json_of, refused
 from reference import babeltrace
 from story import OFFSET, Story
 
-from chainshaper import events
 from chainshaper.analysis import analyse_latency, application_graph, callback_statistics, data_flow
-from chainshaper.errors import InputError
 from chainshaper.sources import open_source
 from chainshaper.sources.ctf.lttng_text import lttng_metadata
 from chainshaper.sources.ctf.writer import write_trace
 from chainshaper.sources.lttng.writing import write_lttng_trace
+from chainshaper.values import events
+from chainshaper.values.errors import InputError
 
 START = 1 << 40  # a machine has been running for a while when its trace begins
 SECOND = 1_000_000_000

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper.errors import OperationError
-from chainshaper.recording import EndpointInfo
 from chainshaper.sources.ros.interpreter import Environment, environment_of
 from chainshaper.sources.ros.snapshot import ask_graph
+from chainshaper.values.errors import OperationError
+from chainshaper.values.recording import EndpointInfo
 
 RCLPY = '''
 """As much of rclpy 7.1 (Jazzy) as is used, telling what two nodes over Cyclone DDS told."""

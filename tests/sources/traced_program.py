@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper.events import EventTables
-from chainshaper.recording import RecordingInfo
 from chainshaper.sources.ebpf.session import EbpfTracer
+from chainshaper.values.events import EventTables
+from chainshaper.values.recording import RecordingInfo
 
 __all__ = ["Program", "Traced", "build", "skip_without_bpftrace", "skip_without_gcc", "traced"]
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import yaml
 
-from chainshaper.launch_splicing import Splicing, splice_launch_files
+from chainshaper.flow.launch_splicing import Splicing, splice_launch_files
 from chainshaper.planning import Plan, plan_shaping
 
 __all__ = ["CASES", "PACKAGES", "ROBOTS", "Case", "plan_for", "splice_case", "texts_of"]

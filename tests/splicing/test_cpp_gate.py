@@ -10,7 +10,7 @@ import pytest
 from gate_table import PUBLISHING_NS, Case, Outcome, cases, walk
 
 from chainshaper import splicing
-from chainshaper.enforcement.gate import (
+from chainshaper.gate.decision import (
     ANCHORS,
     DROPPED,
     LATE,
@@ -20,7 +20,7 @@ from chainshaper.enforcement.gate import (
     Modes,
     origin_of,
 )
-from chainshaper.splicing.gate_log import read_gate_log
+from chainshaper.sources.gate_log import read_gate_log
 
 HEADERS = Path(splicing.__file__).parent / "nodes" / "cpp" / "include"
 CASES = 5000

@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from chainshaper import splicing
-from chainshaper.errors import InputError, OperationError, PlatformError
 from chainshaper.splicing.generated_package import (
     build_package,
     generic_package,
     message_type_named,
     typed_package,
 )
+from chainshaper.values.errors import InputError, OperationError, PlatformError
 
 EXPECTED = Path(__file__).parent / "typed_package"
 NODES = Path(splicing.__file__).parent / "nodes"

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 from launch_cases import plan_for
 
-from chainshaper.errors import ChainshaperError, InputError
-from chainshaper.launch_splicing import splice_launch_files
+from chainshaper.flow.launch_splicing import splice_launch_files
+from chainshaper.values.errors import ChainshaperError, InputError
 
 NODE = '<node pkg="p" exec="e" name="ndt"/>'
 TOP = "from launch import LaunchDescription\nfrom launch_ros.actions import Node\n"

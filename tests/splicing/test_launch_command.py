@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper.errors import InputError
 from chainshaper.splicing.launch.command import parse_launch_command
+from chainshaper.values.errors import InputError
 
 ROS2 = "/opt/ros/jazzy/bin/ros2"
 

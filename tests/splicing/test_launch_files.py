@@ -11,11 +11,11 @@ import yaml
 from launch_cases import CASES, Case, plan_for, splice_case, texts_of
 
 from chainshaper import Plan, splice_launch_files
-from chainshaper.errors import InputError
 from chainshaper.planning.plan import revised
-from chainshaper.recording import open_recording
 from chainshaper.splicing.launch.actions import NodeAction, SetRemap, flattened
 from chainshaper.splicing.launch.file import read_launch_file, read_text
+from chainshaper.values.errors import InputError
+from chainshaper.values.recording import open_recording
 
 LAUNCH = Path(__file__).parent / "launch_files"
 

@@ -9,8 +9,8 @@ import pytest
 from launch_cases import plan_for
 
 from chainshaper import Plan, Splicing, splice_launch_files, undo_splice
-from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.plan import revised
+from chainshaper.values.errors import InputError, OperationError
 
 NDT = '<launch>\n  <node pkg="l" exec="n" name="ndt"/>\n</launch>\n'
 

@@ -8,8 +8,8 @@ import pytest
 from launch_cases import plan_for
 
 from chainshaper import Splicing, splice_launch_files
-from chainshaper.errors import ChainshaperError, InputError, OperationError
 from chainshaper.planning.plan import revised
+from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 
 NDT = '<launch>\n  <node pkg="l" exec="n" name="ndt"/>\n</launch>\n'
 PYTHON = """

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from launch_cases import plan_for
 
 from chainshaper import splice_launch_files
-from chainshaper.errors import InputError
 from chainshaper.splicing.launch.actions import NodeAction, Unreadable, flattened
 from chainshaper.splicing.launch.file import read_text
 from chainshaper.splicing.launch.substitutions import Surroundings, resolve
+from chainshaper.values.errors import InputError
 
 FILE = Path("/robot/launch/robot.launch.py")
 IMPORTS = """

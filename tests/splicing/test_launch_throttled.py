@@ -8,9 +8,9 @@ import yaml
 from launch_cases import ROBOTS, plan_for
 
 from chainshaper import splice_launch_files, splice_throttlers, undo_splice
-from chainshaper.errors import InputError
-from chainshaper.launch_splicing import Splicing, ThrottledInput
-from chainshaper.recording import Recording, open_recording
+from chainshaper.flow.launch_splicing import Splicing, ThrottledInput
+from chainshaper.values.errors import InputError
+from chainshaper.values.recording import Recording, open_recording
 
 MS = 1_000_000
 REAR = ThrottledInput(topic="/rear", period_ns=100 * MS)

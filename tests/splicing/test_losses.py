@@ -15,7 +15,7 @@ from processes import wait_for
 
 from chainshaper.planning import Plan
 from chainshaper.planning.plan import revised
-from chainshaper.splicing.gate_log import read_gate_log, rows_missing
+from chainshaper.sources.gate_log import read_gate_log, rows_missing
 from chainshaper.splicing.shaping_process import ShapingProcess, write_shaping_process
 
 MS = 1_000_000

@@ -17,17 +17,17 @@ from node_run import RELIABLE, running_node, stamped
 from processes import wait_for
 from small_chain import EXECUTOR_CORE
 
-from chainshaper.enforcement import gate
-from chainshaper.enforcement.gate import READER_DEPTH
-from chainshaper.errors import InputError, OperationError
+from chainshaper.gate import decision as gate
+from chainshaper.gate.decision import READER_DEPTH
 from chainshaper.planning import Modes, Plan, ShapingNode, let_per_callback
 from chainshaper.planning.plan import revised
-from chainshaper.splicing.gate_log import read_gate_log
+from chainshaper.sources.gate_log import read_gate_log
 from chainshaper.splicing.shaping_process import (
     ShapingProcess,
     write_shaping_process,
     write_throttler,
 )
+from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000
 # Wide enough that a busy machine wakes the node within them.

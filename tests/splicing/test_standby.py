@@ -15,10 +15,10 @@ import yaml
 from node_run import RELIABLE, NodeRun, running_node, stamped
 from processes import wait_for
 
-from chainshaper.enforcement.handover import Page, open_page
+from chainshaper.gate.handover import Page, open_page
 from chainshaper.planning import Modes, Plan
 from chainshaper.planning.plan import revised
-from chainshaper.splicing.gate_log import read_gate_log, releases_so_far
+from chainshaper.sources.gate_log import read_gate_log, releases_so_far
 from chainshaper.splicing.shaped_outputs import find_outputs, output_text
 from chainshaper.splicing.shaping_process import ShapingProcess, write_shaping_process
 
@@ -316,9 +316,7 @@ def test_pages_of_others_are_looked_at_without_trust(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = tmp_path / "outputs"
-    monkeypatch.setattr(
-        "chainshaper.enforcement.handover.page_folders", lambda: iter([str(folder)])
-    )
+    monkeypatch.setattr("chainshaper.gate.handover.page_folders", lambda: iter([str(folder)]))
     good, bad = open_page("good", "/t5"), open_page("bad", "/t5\x1b[31m")
     assert find_outputs(iter([str(folder)])) == (), "none of their processes lives"
     for page in (good, bad):

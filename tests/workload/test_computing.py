@@ -9,8 +9,8 @@ from small_chain import DDS_CORE, EXECUTOR_CORE
 
 from chainshaper import run_application, simulate
 from chainshaper.analysis import analyse_latency
-from chainshaper.errors import InputError, OperationError
 from chainshaper.simulation.samples import with_recorded_times
+from chainshaper.values.errors import InputError, OperationError
 from chainshaper.workload import dds
 from chainshaper.workload.computing import computing, load_function
 from chainshaper.workload.description import Application, load_application
@@ -36,7 +36,7 @@ FUNCTIONS = """\
 import itertools, time
 import numpy as np
 from chainshaper.workload.dds import data_message, data_of, number_in
-from chainshaper.enforcement.gate import origin_of
+from chainshaper.gate.decision import origin_of
 
 COUNT = itertools.count()
 

@@ -6,8 +6,8 @@ from typing import Any
 import polars as pl
 import pytest
 
-from chainshaper import events
-from chainshaper.enforcement.gate import ANCHORS, DROPPED, LATE, MESSAGES
+from chainshaper.gate.decision import ANCHORS, DROPPED, LATE, MESSAGES
+from chainshaper.values import events
 from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS, EventLog, number_of
 from chainshaper.workload.event_reading import ProcessLog, event_tables, meter_tables
 from chainshaper.workload.stall_meter import NO_PACE

@@ -12,7 +12,7 @@ from unittest import mock
 import pytest
 from processes import children_of, wait_for
 
-from chainshaper.errors import OperationError
+from chainshaper.values.errors import OperationError
 from chainshaper.workload.launcher import Child, end_all, first_casualty, start_child
 
 BODIES = {
@@ -36,7 +36,7 @@ BODIES = {
     ),
     "bound": (
         "import json, time\n"
-        "import signal\nfrom chainshaper.enforcement.realtime import signalled_with_parent\n"
+        "import signal\nfrom chainshaper.linux.scheduling import signalled_with_parent\n"
         "signalled_with_parent(json.loads(input())['parent'], signal.SIGKILL)\n"
         "print('{}', flush=True)\n"
         "while True:\n"

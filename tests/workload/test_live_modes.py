@@ -8,11 +8,11 @@ from calm_runs import calm_run
 from small_chain import EXECUTOR_CORE, small_chain_text
 
 from chainshaper import measure_latency, shape_application
-from chainshaper.errors import InputError
 from chainshaper.planning import Modes, Plan
 from chainshaper.planning.plan import revised
-from chainshaper.recording import Recording
 from chainshaper.splicing.application import splice_application
+from chainshaper.values.errors import InputError
+from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application, load_application
 
 MS = 1_000_000

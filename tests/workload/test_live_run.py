@@ -13,11 +13,11 @@ from processes import children_of, real_time_threads
 from small_chain import DDS_CORE, EXECUTOR_CORE, NODES, PERIOD_NS, small_chain, small_chain_text
 
 from chainshaper import measure_latency, run_application, shape_application
-from chainshaper.enforcement.realtime import may_use_fifo
-from chainshaper.errors import InputError, OperationError, PlatformError
+from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.planning import Plan, publish_slots
 from chainshaper.planning.plan import revised
-from chainshaper.recording import Recording, ThreadInfo
+from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.recording import Recording, ThreadInfo
 from chainshaper.workload import live
 from chainshaper.workload.description import Application, load_application
 from chainshaper.workload.execution import ExecutionTimes

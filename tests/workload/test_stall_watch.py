@@ -5,7 +5,7 @@ import time
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chainshaper.enforcement.realtime import available_cores
+from chainshaper.linux.scheduling import available_cores
 from chainshaper.workload.stall_meter import PERIOD_NS
 from chainshaper.workload.stall_watch import far_from, stalls_watched
 

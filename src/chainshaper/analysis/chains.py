@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from chainshaper.analysis.close_names import close_names
 from chainshaper.analysis.objects import INTERNAL_TOPICS
 from chainshaper.analysis.paths import Path, PathSearch, Stage, Vertex
-from chainshaper.app import ApplicationGraph, Callback, Chain
-from chainshaper.errors import InputError
+from chainshaper.values.application import ApplicationGraph, Callback, Chain
+from chainshaper.values.errors import InputError
 
 __all__ = [
     "ChainEnumeration",

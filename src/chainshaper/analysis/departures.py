@@ -11,9 +11,9 @@ Which decision was about which message of a chain stands here, once: see :func:`
 
 import polars as pl
 
-from chainshaper import events
 from chainshaper.analysis.matching import by_number
 from chainshaper.analysis.objects import Objects
+from chainshaper.values import events
 
 __all__ = [
     "discarded_instances",

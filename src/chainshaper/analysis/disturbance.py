@@ -24,9 +24,9 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper import events
 from chainshaper.analysis.flow import DataFlow
-from chainshaper.enforcement.gate import STALL_NS
+from chainshaper.gate.decision import STALL_NS
+from chainshaper.values import events
 
 __all__ = [
     "COMPUTING_THRESHOLD_NS",

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from chainshaper import events
 from chainshaper.analysis.assumed import with_assumed_readers, with_assumed_writers
 from chainshaper.analysis.departures import with_departures
 from chainshaper.analysis.instances import callback_instances
 from chainshaper.analysis.matching import by_number, latest_before
 from chainshaper.analysis.messages import link_takes, publications, takes
 from chainshaper.analysis.objects import Objects, resolve_objects
+from chainshaper.values import events
 
 __all__ = ["DataFlow", "data_flow"]
 

@@ -20,10 +20,10 @@ from typing import Any
 
 import polars as pl
 
-from chainshaper import events
 from chainshaper.analysis.flow import DataFlow, data_flow
 from chainshaper.analysis.objects import INTERNAL_TOPICS
-from chainshaper.app import ApplicationGraph, Callback, Node
+from chainshaper.values import events
+from chainshaper.values.application import ApplicationGraph, Callback, Node
 
 __all__ = [
     "INTERNAL_TOPICS",

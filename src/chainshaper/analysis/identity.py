@@ -8,8 +8,8 @@ two, however alike they look.
 
 import polars as pl
 
-from chainshaper import events
 from chainshaper.analysis.matching import latest_before
+from chainshaper.values import events
 
 __all__ = ["numbered"]
 

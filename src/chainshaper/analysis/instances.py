@@ -7,9 +7,9 @@ An instance runs from `callback_start` to `callback_end` of the same callback on
 import numpy as np
 import polars as pl
 
-from chainshaper import events
 from chainshaper.analysis.matching import Keys, key_table, latest_before
-from chainshaper.compiled import kernel
+from chainshaper.values import events
+from chainshaper.values.compiled import kernel
 
 __all__ = ["callback_instances", "cpu_time", "ends_of_starts"]
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from chainshaper import events
 from chainshaper.analysis.chains import find_chain
 from chainshaper.analysis.disturbance import disturbed, stalled_after
 from chainshaper.analysis.flow import DataFlow, data_flow
@@ -14,8 +13,9 @@ from chainshaper.analysis.punctuality import Due, with_punctuality
 from chainshaper.analysis.statistics import LatencyStatistics, latency_statistics
 from chainshaper.analysis.subscriber import reception
 from chainshaper.analysis.traversals import traverse
-from chainshaper.app import ApplicationGraph, Chain
-from chainshaper.recording import Recording
+from chainshaper.values import events
+from chainshaper.values.application import ApplicationGraph, Chain
+from chainshaper.values.recording import Recording
 
 __all__ = ["LatencyAnalysis", "analyse_latency"]
 

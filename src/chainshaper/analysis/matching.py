@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper.compiled import kernel
+from chainshaper.values.compiled import kernel
 
 __all__ = [
     "Keys",

@@ -21,7 +21,6 @@ Publications and takes under handles that nobody initialised are left out
 
 import polars as pl
 
-from chainshaper import events
 from chainshaper.analysis.matching import (
     by_number,
     first_after,
@@ -30,6 +29,7 @@ from chainshaper.analysis.matching import (
     latest_before,
 )
 from chainshaper.analysis.objects import Objects
+from chainshaper.values import events
 
 __all__ = ["link_takes", "overwritten_in", "publications", "takes"]
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from chainshaper.errors import InputError
-from chainshaper.yaml_file import PlainData, compose, read_text
+from chainshaper.values.errors import InputError
+from chainshaper.values.yaml_file import PlainData, compose, read_text
 
 __all__ = ["load_named_paths"]
 

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from chainshaper import events
 from chainshaper.analysis.identity import numbered
 from chainshaper.analysis.matching import first_after, latest_before, nearest
+from chainshaper.values import events
 
 __all__ = ["CALLBACK_SCHEMA", "INTERNAL_TOPICS", "Objects", "named_nodes", "resolve_objects"]
 

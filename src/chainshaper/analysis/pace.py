@@ -12,8 +12,8 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from chainshaper import events
-from chainshaper.events import EventTables
+from chainshaper.values import events
+from chainshaper.values.events import EventTables
 
 __all__ = ["ordinary_pace", "relative_pace"]
 

@@ -18,7 +18,7 @@ one was open before that nanosecond.
 import numpy as np
 
 from chainshaper.analysis.asof import KEY_ROW, place_of
-from chainshaper.compiled.memory import compiled, get, put, store_word
+from chainshaper.values.compiled.memory import compiled, get, put, store_word
 
 __all__ = ["walk_pairs"]
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 
 from chainshaper.analysis.objects import INTERNAL_TOPICS
 from chainshaper.analysis.ordering import depth_first_order, greedy_order
-from chainshaper.app import ApplicationGraph, Callback
+from chainshaper.values.application import ApplicationGraph, Callback
 
 __all__ = ["Listing", "Path", "PathSearch", "Stage", "Vertex"]
 

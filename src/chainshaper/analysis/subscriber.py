@@ -9,7 +9,7 @@ import polars as pl
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.matching import by_number
 from chainshaper.analysis.traversals import Traversals
-from chainshaper.app import ApplicationGraph
+from chainshaper.values.application import ApplicationGraph
 
 __all__ = ["reception"]
 

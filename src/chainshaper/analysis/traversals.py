@@ -31,7 +31,7 @@ from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.graph import MESSAGE_FILTER, goes_on_elsewhere, graph_of
 from chainshaper.analysis.matching import by_number, first_after, in_order
 from chainshaper.analysis.messages import overwritten_in
-from chainshaper.app import ApplicationGraph, Callback, Chain
+from chainshaper.values.application import ApplicationGraph, Callback, Chain
 
 __all__ = ["REASONS", "Traversals", "traverse"]
 

@@ -20,7 +20,7 @@ def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
     """
     from chainshaper.cli.exhaustion import catch_aborts, exhausted
     from chainshaper.cli.output import say
-    from chainshaper.errors import ChainshaperError
+    from chainshaper.values.errors import ChainshaperError
 
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) == signal.SIG_DFL:  # under nohup it stays ignored
@@ -60,7 +60,7 @@ def _show_usage(error: Any) -> None:
     """As Typer does it, but with what the user, or a file's name, has written made safe."""
     from typer.rich_utils import rich_format_error
 
-    from chainshaper.safe_text import shown
+    from chainshaper.values.safe_text import shown
 
     error.message = shown(error.message, but="\n")
     rich_format_error(error)

@@ -15,7 +15,7 @@ from chainshaper.cli.signals import stop_on_signals
 if TYPE_CHECKING:
     from chainshaper.enforcement.runs.state import RunState
     from chainshaper.planning import Plan
-    from chainshaper.recording import Recording
+    from chainshaper.values.recording import Recording
 
 __all__ = ["apply"]
 
@@ -74,11 +74,11 @@ def apply(
     """
     from dataclasses import asdict
 
-    from chainshaper.applying import apply_plan
     from chainshaper.cli.output import notes, print_json, show
-    from chainshaper.errors import OperationError
+    from chainshaper.flow.apply import apply_plan
     from chainshaper.planning import load_plan, plan_warnings
     from chainshaper.reporting.servers import servers_table
+    from chainshaper.values.errors import OperationError
 
     planned, recorded = load_plan(plan), None
     if recording is not None:
@@ -127,7 +127,7 @@ def _show_changes(
     from dataclasses import asdict
 
     from chainshaper.cli.output import notes, print_json, show, show_line
-    from chainshaper.dry_run import planned_changes
+    from chainshaper.flow.dry_run import planned_changes
     from chainshaper.reporting.servers import changes_table
 
     changes = planned_changes(plan, backend, recording=recording, phase_ns=phase_ns, users=users)

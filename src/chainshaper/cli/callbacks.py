@@ -9,7 +9,7 @@ def callbacks(trace: TraceArgument, json: JsonOption = False) -> None:
     """Show every callback of a recording or trace: kind, count, execution and response time."""
     from chainshaper.analysis import callback_statistics, data_flow
     from chainshaper.cli.output import late_progress, notes, print_json, show, show_line
-    from chainshaper.exploration import lost_events
+    from chainshaper.flow.exploration import lost_events
     from chainshaper.reporting.tables import callback_rows, callback_table
     from chainshaper.sources import open_source
 

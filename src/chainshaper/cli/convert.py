@@ -8,9 +8,9 @@ __all__ = ["convert"]
 def convert(trace: TraceArgument, output: RecordingOutput) -> None:
     """Write a trace as a recording: one Parquet file per event table."""
     from chainshaper.cli.output import late_progress, notes, show_line
-    from chainshaper.exploration import convert_recording, lost_events
-    from chainshaper.recording import refuse_existing
+    from chainshaper.flow.exploration import convert_recording, lost_events
     from chainshaper.sources import open_source
+    from chainshaper.values.recording import refuse_existing
 
     refuse_existing(output)
     with late_progress("convert") as report:

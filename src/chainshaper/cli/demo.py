@@ -40,7 +40,7 @@ def demo(
     and a half. Needs no ROS 2.
     """
     from chainshaper.cli.output import notes, print_json, progress, show, show_line
-    from chainshaper.demo import run_demo
+    from chainshaper.flow.demo import run_demo
     from chainshaper.planning import PlanRequest, plan_warnings
     from chainshaper.reporting.tables import (
         callback_table,

@@ -15,7 +15,7 @@ def doctor(
 ) -> None:
     """Examine this machine: scheduling, privileges, tracing, DDS, and its own stalls."""
     from chainshaper.cli.output import print_json, progress, show
-    from chainshaper.doctor import examine_machine
+    from chainshaper.flow.doctor import examine_machine
     from chainshaper.reporting.machine import machine_json, machine_tables
 
     with progress("examining this machine") as report:

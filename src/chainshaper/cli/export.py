@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from chainshaper.cli.options import ChainOption, TraceArgument
-from chainshaper.errors import InputError
+from chainshaper.values.errors import InputError
 
 __all__ = ["export"]
 
@@ -40,12 +40,12 @@ def export(
     if not perfetto:
         raise InputError("the format is missing: add --perfetto")
     from chainshaper.cli.output import late_progress, notes, show_line
-    from chainshaper.exploration import lost_events
+    from chainshaper.flow.exploration import lost_events
+    from chainshaper.flow.steps import measure_latency
     from chainshaper.planning import load_plan
     from chainshaper.reporting.perfetto import ENDINGS, export_perfetto
     from chainshaper.sources import open_source
-    from chainshaper.steps import measure_latency
-    from chainshaper.whole_file import new_file
+    from chainshaper.values.whole_file import new_file
 
     new_file(output, ENDINGS)
     in_force = None if plan is None else load_plan(plan)

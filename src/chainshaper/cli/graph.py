@@ -33,7 +33,7 @@ def graph(
 ) -> None:
     """Show the application: nodes, callbacks with kind, period and function, topics, services."""
     from chainshaper.cli.output import late_progress, notes, print_json, show, show_line
-    from chainshaper.exploration import describe_application, lost_events
+    from chainshaper.flow.exploration import describe_application, lost_events
     from chainshaper.reporting.application_graph import (
         ENDINGS,
         application_json,
@@ -42,7 +42,7 @@ def graph(
         write_picture,
     )
     from chainshaper.sources import open_source
-    from chainshaper.whole_file import new_file
+    from chainshaper.values.whole_file import new_file
 
     if output is not None:
         new_file(output, ENDINGS)

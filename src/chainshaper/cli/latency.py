@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from chainshaper.cli.options import ChainOption, JsonOption, TraceArgument
-from chainshaper.errors import InputError
+from chainshaper.values.errors import InputError
 
 __all__ = ["latency"]
 
@@ -32,12 +32,12 @@ def latency(
     last topic, message by message. A second table shows in which hop the time went.
     """
     from chainshaper.cli.output import late_progress, notes, print_json, show, show_line
-    from chainshaper.exploration import lost_events, named_chain
-    from chainshaper.overruns import dropped_text, overruns_text
+    from chainshaper.flow.exploration import lost_events, named_chain
+    from chainshaper.flow.steps import measure_latency
     from chainshaper.reporting.breakdown import breakdown_json, breakdown_table
     from chainshaper.reporting.tables import latency_json, latency_table
     from chainshaper.sources import open_source
-    from chainshaper.steps import measure_latency
+    from chainshaper.verify.overruns import dropped_text, overruns_text
 
     if instances and not json:
         raise InputError("--instances goes with --json: add it")

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from chainshaper.errors import InputError
+from chainshaper.values.errors import InputError
 
 __all__ = [
     "ApplicationArgument",
@@ -70,7 +70,7 @@ UsersOption = Annotated[
 
 
 def _parse(text: str) -> int:
-    from chainshaper.durations import parse_duration
+    from chainshaper.values.durations import parse_duration
 
     try:
         value = parse_duration(text)

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
-from chainshaper.errors import OperationError
-from chainshaper.safe_text import shown
+from chainshaper.values.errors import OperationError
+from chainshaper.values.safe_text import shown
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

@@ -8,9 +8,9 @@ import typer
 
 from chainshaper.cli import plan_options as options
 from chainshaper.cli.options import JsonOption, duration_option
-from chainshaper.enforcement.gate import Anchor, Late
-from chainshaper.errors import InputError
-from chainshaper.plan_choices import Goal, Policy, Publication, Solver
+from chainshaper.gate.decision import Anchor, Late
+from chainshaper.values.errors import InputError
+from chainshaper.values.plan_choices import Goal, Policy, Publication, Solver
 
 if TYPE_CHECKING:
     from chainshaper.planning import Plan, PlanRequest, Profile
@@ -137,8 +137,8 @@ def plan(
 def _profiles(
     recording: Path | None, latencies: Path | None, period: int | None, chains: Sequence[str | None]
 ) -> "tuple[Profile, ...]":
+    from chainshaper.flow.steps import profile_chains
     from chainshaper.planning import Profile, read_latencies
-    from chainshaper.steps import profile_chains
 
     if recording is not None:
         return profile_chains(recording, chains, period_ns=period)

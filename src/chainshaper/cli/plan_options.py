@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from chainshaper.cli.options import duration_option
-from chainshaper.enforcement.gate import Late, Messages, Overrun
-from chainshaper.errors import InputError
-from chainshaper.plan_choices import Fallback
+from chainshaper.gate.decision import Late, Messages, Overrun
+from chainshaper.values.errors import InputError
+from chainshaper.values.plan_choices import Fallback
 
 if TYPE_CHECKING:
     from chainshaper.planning import Modes

@@ -13,7 +13,7 @@ from chainshaper.cli.record import (
     SourceOption,
     record_and_show,
 )
-from chainshaper.errors import InputError
+from chainshaper.values.errors import InputError
 
 __all__ = ["profile"]
 
@@ -60,10 +60,10 @@ def profile(
     This is how the latencies are measured that a plan is computed from. Whatever ends it, all
     threads are as before. What happened before the priorities were in force is left out.
     """
-    from chainshaper.command_process import check_command
-    from chainshaper.profiling import chain_nodes, check_profiling, profiling_condition
-    from chainshaper.recording import refuse_existing
+    from chainshaper.flow.profiling import chain_nodes, check_profiling, profiling_condition
+    from chainshaper.linux.command_process import check_command
     from chainshaper.sources import open_source
+    from chainshaper.values.recording import refuse_existing
 
     if not command:
         raise InputError("no command given: `chainshaper profile -o REC -- ros2 launch …`")

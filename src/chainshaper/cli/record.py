@@ -9,10 +9,10 @@ import typer
 
 from chainshaper.cli.options import JsonOption, RecordingOutput, UsersOption, duration_option
 from chainshaper.cli.signals import stop_on_signals
-from chainshaper.errors import InputError, OperationError
+from chainshaper.values.errors import InputError, OperationError
 
 if TYPE_CHECKING:
-    from chainshaper.record import Scheduling
+    from chainshaper.flow.record import Scheduling
 
 __all__ = [
     "BufferOption",
@@ -119,9 +119,9 @@ def record_and_show(
         OperationError: the application failed; what was recorded until then is there.
     """
     from chainshaper.cli.output import notes, print_json, show_line, stage_lines
-    from chainshaper.enforcement.own_processes import end_in_words
-    from chainshaper.exploration import event_counts, lost_events
-    from chainshaper.record import record_command
+    from chainshaper.flow.exploration import event_counts, lost_events
+    from chainshaper.flow.record import record_command
+    from chainshaper.linux.own_processes import end_in_words
 
     stop = threading.Event()
     with stop_on_signals(stop):

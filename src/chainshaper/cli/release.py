@@ -20,7 +20,7 @@ def release(
     from chainshaper.enforcement.runs.journal import find_journals
     from chainshaper.enforcement.runs.scheduling_memory import look_alikes
     from chainshaper.enforcement.runs.undoing import end_run, release_strays
-    from chainshaper.errors import InputError, OperationError
+    from chainshaper.values.errors import InputError, OperationError
 
     runs = find_journals()
     chosen = [journal for journal in runs if run in (None, journal.path.parent.name)]

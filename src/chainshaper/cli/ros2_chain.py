@@ -8,7 +8,7 @@ lines are the same, help included. Upstream: ros2cli, `ros2cli/command/__init__.
 import argparse
 from typing import Any
 
-from chainshaper.errors import PlatformError
+from chainshaper.values.errors import PlatformError
 
 __all__ = ["ChainCommand"]
 

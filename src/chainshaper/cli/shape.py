@@ -30,13 +30,13 @@ from chainshaper.cli.plan_options import (
 )
 from chainshaper.cli.record import Source, SourceOption
 from chainshaper.cli.splice import NodeKind
-from chainshaper.errors import InputError
+from chainshaper.values.errors import InputError
 
 if TYPE_CHECKING:
     from chainshaper.analysis import ChainEnumeration
-    from chainshaper.app import ApplicationGraph
-    from chainshaper.launch_shaping import ShapedLaunch
+    from chainshaper.flow.launch_shaping import ShapedLaunch
     from chainshaper.planning import PlanRequest
+    from chainshaper.values.application import ApplicationGraph
 
 __all__ = ["shape"]
 
@@ -138,9 +138,9 @@ def _shape_described(
     application: Path, plan: Path, output: Path, cycles: int, realtime: bool | None
 ) -> None:
     from chainshaper.cli.output import notes, progress, show_line
-    from chainshaper.overruns import dropped_in, dropped_text, overruns_in, overruns_text
+    from chainshaper.flow.steps import shape_application
     from chainshaper.planning import load_plan, plan_warnings
-    from chainshaper.steps import shape_application
+    from chainshaper.verify.overruns import dropped_in, dropped_text, overruns_in, overruns_text
     from chainshaper.workload.description import load_application
 
     description, planned = load_application(application), load_plan(plan)
@@ -180,7 +180,7 @@ def _shape_launched(
 ) -> None:
     from chainshaper.cli.output import notes, print_json, stage_lines
     from chainshaper.cli.signals import stop_on_signals
-    from chainshaper.launch_shaping import shape_launch
+    from chainshaper.flow.launch_shaping import shape_launch
     from chainshaper.planning import plan_warnings
     from chainshaper.reporting.tables import comparison_json
 
@@ -224,7 +224,7 @@ def _show(shaped: "ShapedLaunch") -> None:
 def _ask(graph: "ApplicationGraph", found: "ChainEnumeration") -> str:
     from chainshaper.cli.output import show
     from chainshaper.reporting.chain_list import chain_table
-    from chainshaper.safe_text import shown
+    from chainshaper.values.safe_text import shown
 
     show(chain_table(graph, found))
     default = (found.heaviest or found.chains[0]).spec

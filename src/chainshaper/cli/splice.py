@@ -7,13 +7,13 @@ import typer
 
 from chainshaper.cli.options import JsonOption
 from chainshaper.cli.plan_options import FallbackOption
-from chainshaper.errors import InputError
-from chainshaper.plan_choices import Fallback
+from chainshaper.values.errors import InputError
+from chainshaper.values.plan_choices import Fallback
 
 if TYPE_CHECKING:
-    from chainshaper.launch_splicing import Splicing, ThrottledInput
+    from chainshaper.flow.launch_splicing import Splicing, ThrottledInput
     from chainshaper.planning import Plan
-    from chainshaper.recording import Recording
+    from chainshaper.values.recording import Recording
 
 __all__ = ["splice"]
 
@@ -106,7 +106,7 @@ def splice(
     the originals stay as they are.
     """
     from chainshaper.cli.output import print_json, show_line
-    from chainshaper.launch_splicing import undo_splice
+    from chainshaper.flow.launch_splicing import undo_splice
     from chainshaper.splicing.generated_package import check_build_tools
 
     if undo:
@@ -138,7 +138,7 @@ def splice(
 
 def _shaped(plan: Path, launched: _Launched) -> "Splicing":
     from chainshaper.cli.output import notes
-    from chainshaper.launch_splicing import splice_launch_files
+    from chainshaper.flow.launch_splicing import splice_launch_files
     from chainshaper.planning import load_plan, plan_warnings
 
     planned = load_plan(plan)
@@ -154,7 +154,7 @@ def _shaped(plan: Path, launched: _Launched) -> "Splicing":
 
 
 def _throttled(inputs: list[str], launched: _Launched) -> "Splicing":
-    from chainshaper.launch_splicing import splice_throttlers
+    from chainshaper.flow.launch_splicing import splice_throttlers
 
     if launched.fallback is not None:
         raise InputError("a throttler has no fallback: --fallback goes with a plan")
@@ -172,9 +172,9 @@ def _throttled(inputs: list[str], launched: _Launched) -> "Splicing":
 
 def _input(text: str) -> "ThrottledInput":
     """One input to be throttled, as it is written: ``/fusion:/points_raw=100ms``."""
-    from chainshaper.durations import parse_duration
-    from chainshaper.launch_splicing import ThrottledInput
+    from chainshaper.flow.launch_splicing import ThrottledInput
     from chainshaper.planning.plan import wrong_values_refused
+    from chainshaper.values.durations import parse_duration
 
     where, equals, period = text.rpartition("=")
     if not equals:

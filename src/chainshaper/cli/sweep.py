@@ -60,12 +60,12 @@ def sweep(
     command goes on with the others.
     """
     from chainshaper.cli.output import notes, print_json, progress, show, show_line
-    from chainshaper.errors import InputError
     from chainshaper.planning import load_plan
     from chainshaper.reporting.sweeps import draw_sweep, sweep_table
-    from chainshaper.sweeping import parse_axis, rows_beside
-    from chainshaper.sweeping import sweep as run_sweep
-    from chainshaper.whole_file import new_file
+    from chainshaper.simulation.sweeping import parse_axis, rows_beside
+    from chainshaper.simulation.sweeping import sweep as run_sweep
+    from chainshaper.values.errors import InputError
+    from chainshaper.values.whole_file import new_file
     from chainshaper.workload.description import load_application
 
     if workers is not None and scheduler is not None:

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 from chainshaper.enforcement import fifo
 from chainshaper.enforcement.freezer import back_end as freezer
-from chainshaper.enforcement.freezer import cgroups
 from chainshaper.enforcement.litmus import back_end as litmus
-from chainshaper.enforcement.realtime import may_use_fifo
 from chainshaper.enforcement.runs.journal import Journal
 from chainshaper.enforcement.scx import back_end as scx
 from chainshaper.enforcement.servers import BackEnd, ServerTable
-from chainshaper.errors import InputError, PlatformError
+from chainshaper.linux import cgroups
+from chainshaper.linux.scheduling import may_use_fifo
+from chainshaper.values.errors import InputError, PlatformError
 
 __all__ = [
     "BACK_ENDS",

@@ -19,13 +19,13 @@ from chainshaper.enforcement.runs.scheduling_memory import (
 )
 from chainshaper.enforcement.servers import ServerCounters, ServerTable
 from chainshaper.enforcement.threads.allocation import NodeThread
-from chainshaper.enforcement.threads.listing import find_thread
 from chainshaper.enforcement.threads.server_threads import (
     below_their_siblings,
     server_priorities,
     wanted_of_members,
 )
-from chainshaper.errors import InputError
+from chainshaper.linux.threads import find_thread
+from chainshaper.values.errors import InputError
 
 __all__ = ["Fifo", "create"]
 

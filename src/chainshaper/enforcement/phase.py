@@ -20,9 +20,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from chainshaper.durations import format_duration
-from chainshaper.enforcement.threads.listing import has_ended, start_of
-from chainshaper.errors import OperationError
+from chainshaper.linux.threads import has_ended, start_of
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import OperationError
 
 __all__ = [
     "DriftWatch",

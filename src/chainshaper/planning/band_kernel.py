@@ -1,4 +1,4 @@
-"""The inner loops of exact band placement, compiled (:mod:`chainshaper.compiled`).
+"""The inner loops of exact band placement, compiled (:mod:`chainshaper.values.compiled`).
 
 :mod:`chainshaper.planning.bands`, where the equations and the proof are, calls them. Everything
 here is about positions on a grid: position k is the instant ``ends[k]``, and ``counts[k]``
@@ -11,8 +11,8 @@ latencies are not longer. Tables are of int64, given by their addresses.
 
 import numpy as np
 
-from chainshaper.compiled.memory import compiled, store_word, table_at
 from chainshaper.planning.bands import UNREACHABLE
+from chainshaper.values.compiled.memory import compiled, store_word, table_at
 
 __all__ = ["fill_costs"]
 

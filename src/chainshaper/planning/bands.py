@@ -30,10 +30,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.durations import format_duration
-from chainshaper.errors import InputError, OperationError
-from chainshaper.plan_choices import Goal
 from chainshaper.planning.latency_file import check_latencies
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.plan_choices import Goal
 
 __all__ = [
     "BandProblem",
@@ -274,7 +274,7 @@ def _solve(problem: BandProblem, bands: int) -> _Tables:
     successors = np.full(costs.shape, -1, dtype=np.int32)
     if layers > 2:
         # What loads machine code takes a moment to import, and two bands do without it.
-        from chainshaper.compiled import kernel
+        from chainshaper.values.compiled import kernel
 
         fill_costs = kernel("chainshaper.planning.band_kernel", "fill_costs")
         grid_rows, windows = np.stack([counts, ends]), np.stack([nearest, farthest])

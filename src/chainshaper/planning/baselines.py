@@ -9,8 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 
-from chainshaper.durations import format_duration
-from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.plan import (
     Plan,
     Prediction,
@@ -23,6 +21,8 @@ from chainshaper.planning.plan import (
     wrong_values_refused,
 )
 from chainshaper.planning.shaping import OUTPUT_PRIORITY, shaping_node_like
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError, OperationError
 
 __all__ = [
     "CallbackTimes",

@@ -11,9 +11,9 @@ from collections.abc import Iterable, Sequence
 from itertools import combinations, permutations
 from typing import TYPE_CHECKING
 
-from chainshaper.durations import format_duration
-from chainshaper.errors import InputError
-from chainshaper.plan_choices import Policy
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError
+from chainshaper.values.plan_choices import Policy
 
 if TYPE_CHECKING:
     from chainshaper.planning.plan import Plan

@@ -3,7 +3,7 @@
 import importlib
 from typing import Any
 
-from chainshaper.errors import PlatformError
+from chainshaper.values.errors import PlatformError
 
 __all__ = ["extra_library"]
 

@@ -10,8 +10,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.durations import format_duration
-from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.latency_file import check_latencies
 from chainshaper.planning.plan import (
     Plan,
@@ -26,6 +24,8 @@ from chainshaper.planning.plan import (
 )
 from chainshaper.planning.publisher_threads import below_executors
 from chainshaper.planning.shaping import OUTPUT_PRIORITY, shaping_node_like
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError, OperationError
 
 __all__ = ["over_cores", "with_first_node_apart", "with_sink"]
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.durations import format_duration, parse_duration
-from chainshaper.errors import InputError
+from chainshaper.values.durations import format_duration, parse_duration
+from chainshaper.values.errors import InputError
 
 __all__ = ["check_latencies", "read_latencies"]
 

@@ -38,10 +38,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.durations import format_duration
-from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.latency_file import check_latencies
 from chainshaper.planning.plan import Margin
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError, OperationError
 
 __all__ = [
     "EPSILON_NS",

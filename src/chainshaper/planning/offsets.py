@@ -30,12 +30,12 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.durations import format_duration
-from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.entangled import refuse_shared_parts
 from chainshaper.planning.extras import extra_library
 from chainshaper.planning.plan import Plan, publishing_servers, revised
 from chainshaper.planning.shaping import OUTPUT_PRIORITY
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError, OperationError
 
 __all__ = ["place_chains", "with_offsets"]
 

@@ -1,6 +1,6 @@
 """Overruns: outputs that come behind the last slot they were due in (section 6).
 
-A shaping node sees them and treats them as the plan says (:mod:`chainshaper.enforcement.gate`).
+A shaping node sees them and treats them as the plan says (:mod:`chainshaper.gate.decision`).
 The thread of an asynchronous publisher cannot tell an overrun from an output that came early, but
 DDS can, by its age: with a **lifespan** on the topic, what waited for the slot of a later cycle
 has expired when the thread may run again.
@@ -8,7 +8,6 @@ has expired when the thread may run again.
 
 from itertools import pairwise
 
-from chainshaper.errors import InputError
 from chainshaper.planning.plan import (
     PER_CALLBACK,
     Plan,
@@ -20,6 +19,7 @@ from chainshaper.planning.plan import (
 )
 from chainshaper.planning.plan_parts import ShapingNode, Thread
 from chainshaper.planning.publisher_threads import below_executors, publisher_servers
+from chainshaper.values.errors import InputError
 
 __all__ = ["cycles_until_output", "open_until_done", "output_lifespan"]
 

@@ -11,9 +11,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.durations import format_duration
-from chainshaper.errors import InputError
-from chainshaper.plan_choices import Goal, Solver
 from chainshaper.planning.bands import (
     BandProblem,
     Placement,
@@ -34,6 +31,9 @@ from chainshaper.planning.plan import (
 from chainshaper.planning.publisher_threads import below_executors
 from chainshaper.planning.shaping import predict_bands
 from chainshaper.planning.swarm import place_by_swarm, place_randomly
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError
+from chainshaper.values.plan_choices import Goal, Solver
 
 __all__ = ["BandChoice", "choose_bands", "with_bands", "with_long_slot"]
 

@@ -17,10 +17,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
-from chainshaper.durations import format_duration
-from chainshaper.enforcement.gate import Anchor, Messages, Overrun
-from chainshaper.errors import InputError
-from chainshaper.plan_choices import Fallback, Policy
+from chainshaper.gate.decision import Anchor, Messages, Overrun
 from chainshaper.planning.plan_parts import (
     PER_CALLBACK,
     BandPrediction,
@@ -36,7 +33,10 @@ from chainshaper.planning.plan_parts import (
     slot_text,
 )
 from chainshaper.planning.publisher_threads import check_publisher_threads
-from chainshaper.yaml_file import (
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError
+from chainshaper.values.plan_choices import Fallback, Policy
+from chainshaper.values.yaml_file import (
     Duration,
     Part,
     PositiveDuration,

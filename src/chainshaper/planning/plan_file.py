@@ -11,10 +11,10 @@ from typing import Any
 
 import yaml
 
-from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.plan import Plan, band_predictions, publish_slots
-from chainshaper.whole_file import new_file, write_whole
-from chainshaper.yaml_file import AS_YAML, read_model
+from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.whole_file import new_file, write_whole
+from chainshaper.values.yaml_file import AS_YAML, read_model
 
 __all__ = ["Plan", "dump_plan", "load_plan", "plan_json", "save_plan", "save_plans"]
 

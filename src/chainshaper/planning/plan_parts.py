@@ -10,9 +10,9 @@ from typing import Annotated, Literal, NamedTuple, TypeAlias
 
 from pydantic import AfterValidator, Field, model_validator
 
-from chainshaper.durations import format_duration
-from chainshaper.enforcement.gate import Late
-from chainshaper.yaml_file import Duration, FullName, Part, PositiveDuration, wrong_value
+from chainshaper.gate.decision import Late
+from chainshaper.values.durations import format_duration
+from chainshaper.values.yaml_file import Duration, FullName, Part, PositiveDuration, wrong_value
 
 __all__ = [
     "PER_CALLBACK",

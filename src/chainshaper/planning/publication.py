@@ -8,11 +8,11 @@ publishes what, and how, only the application itself can tell.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from chainshaper.durations import format_duration
-from chainshaper.errors import InputError
 from chainshaper.planning.overruns import open_until_done, output_lifespan
 from chainshaper.planning.plan import Plan
 from chainshaper.planning.publisher_threads import messages_held, publisher_servers
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError
 
 __all__ = ["Writer", "check_publication", "publication_warnings"]
 

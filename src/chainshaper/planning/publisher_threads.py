@@ -17,9 +17,9 @@ from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-from chainshaper.durations import format_duration
 from chainshaper.planning.plan_parts import Server, slot_text
-from chainshaper.yaml_file import wrong_value
+from chainshaper.values.durations import format_duration
+from chainshaper.values.yaml_file import wrong_value
 
 if TYPE_CHECKING:
     from chainshaper.planning.plan import Plan

@@ -13,10 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.durations import format_duration
-from chainshaper.enforcement.gate import Anchor, Messages, Overrun
-from chainshaper.errors import InputError, OperationError
-from chainshaper.plan_choices import Fallback, Goal, Policy, Publication, Solver
+from chainshaper.gate.decision import Anchor, Messages, Overrun
 from chainshaper.planning.baselines import (
     CallbackTimes,
     let_per_callback,
@@ -52,6 +49,9 @@ from chainshaper.planning.plan import (
     revised,
 )
 from chainshaper.planning.shaping import evidence_of, plan_shaping
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.plan_choices import Fallback, Goal, Policy, Publication, Solver
 
 __all__ = ["PlanRequest", "Profile", "band_choice", "plan_chain", "plan_chains"]
 

@@ -12,10 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.durations import format_duration, milliseconds
-from chainshaper.enforcement.gate import Anchor, Messages, Overrun
-from chainshaper.errors import InputError, OperationError
-from chainshaper.plan_choices import Publication
+from chainshaper.gate.decision import Anchor, Messages, Overrun
 from chainshaper.planning.latency_file import check_latencies
 from chainshaper.planning.margins import EPSILON_NS, OVERRUN_PROBABILITY, cycles_needed
 from chainshaper.planning.plan import (
@@ -31,6 +28,9 @@ from chainshaper.planning.plan import (
     wrong_values_refused,
 )
 from chainshaper.planning.publication import publication_warnings
+from chainshaper.values.durations import format_duration, milliseconds
+from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.plan_choices import Publication
 
 __all__ = ["evidence_of", "plan_shaping", "plan_warnings", "predict_bands", "shaping_node_like"]
 

@@ -13,8 +13,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.durations import format_duration
-from chainshaper.errors import OperationError
 from chainshaper.planning.bands import (
     BandProblem,
     Placement,
@@ -23,6 +21,8 @@ from chainshaper.planning.bands import (
     refuse_more_than_fit,
 )
 from chainshaper.planning.extras import extra_library
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import OperationError
 
 __all__ = ["place_by_swarm", "place_randomly"]
 

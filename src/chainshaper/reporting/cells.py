@@ -5,9 +5,9 @@ from typing import Any
 
 from rich.table import Table
 
-from chainshaper.durations import format_duration, milliseconds
 from chainshaper.planning.plan_parts import Server
 from chainshaper.reporting.terminal import PlainTable
+from chainshaper.values.durations import format_duration, milliseconds
 
 __all__ = [
     "ABSENT",

@@ -5,9 +5,9 @@ from typing import Any
 from rich.table import Table
 
 from chainshaper.analysis import ChainEnumeration
-from chainshaper.app import ApplicationGraph, Chain
-from chainshaper.durations import milliseconds
 from chainshaper.reporting.cells import terminal_table
+from chainshaper.values.application import ApplicationGraph, Chain
+from chainshaper.values.durations import milliseconds
 
 __all__ = ["chain_table", "chains_json", "count_text"]
 

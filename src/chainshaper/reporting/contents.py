@@ -4,9 +4,9 @@ from typing import Any
 
 from rich.table import Table
 
-from chainshaper.exploration import event_counts
-from chainshaper.recording import INFO_FILE, Recording
+from chainshaper.flow.exploration import event_counts
 from chainshaper.reporting.terminal import PlainTable
+from chainshaper.values.recording import INFO_FILE, Recording
 
 __all__ = ["contents_json", "contents_table"]
 

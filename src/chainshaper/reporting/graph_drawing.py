@@ -9,11 +9,11 @@ callbacks, or for subscriptions without callback events.
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from chainshaper.app import Callback
-from chainshaper.exploration import ApplicationDescription, lost_text
+from chainshaper.flow.exploration import ApplicationDescription, lost_text
 from chainshaper.reporting.application_graph import callback_text, short_symbol
 from chainshaper.reporting.layered_layout import Box, Edge, Layout, lay_out
-from chainshaper.safe_text import escape
+from chainshaper.values.application import Callback
+from chainshaper.values.safe_text import escape
 
 __all__ = ["application_svg"]
 

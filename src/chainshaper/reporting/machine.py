@@ -5,11 +5,11 @@ from typing import Any
 import polars as pl
 from rich.table import Table
 
-from chainshaper.doctor import MachineReport
-from chainshaper.durations import format_duration, milliseconds
-from chainshaper.recording import StallMeterInfo
+from chainshaper.flow.doctor import MachineReport
 from chainshaper.reporting.cells import terminal_table
 from chainshaper.reporting.terminal import plain
+from chainshaper.values.durations import format_duration, milliseconds
+from chainshaper.values.recording import StallMeterInfo
 
 __all__ = ["machine_json", "machine_tables", "stall_rows"]
 

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import polars as pl
 
-from chainshaper import events
 from chainshaper.analysis import DataFlow, LatencyAnalysis, data_flow, graph_of
-from chainshaper.recording import Recording
+from chainshaper.flow.steps import Measurement
 from chainshaper.reporting.perfetto_format import Slice, Track, encode_trace
 from chainshaper.reporting.timeline import Timeline, timeline_of
-from chainshaper.safe_text import shown
-from chainshaper.steps import Measurement
-from chainshaper.whole_file import new_file, write_whole
+from chainshaper.values import events
+from chainshaper.values.recording import Recording
+from chainshaper.values.safe_text import shown
+from chainshaper.values.whole_file import new_file, write_whole
 
 __all__ = ["ENDINGS", "export_perfetto"]
 

@@ -4,10 +4,10 @@ from typing import Any
 
 from rich.table import Table
 
-from chainshaper.durations import milliseconds
 from chainshaper.planning import BandChoice
-from chainshaper.predictions import BandHeld, FigureHeld, PredictionHeld
 from chainshaper.reporting.cells import ABSENT, ms, percent, slot_ms, terminal_table
+from chainshaper.values.durations import milliseconds
+from chainshaper.verify.predictions import BandHeld, FigureHeld, PredictionHeld
 
 __all__ = [
     "band_name",

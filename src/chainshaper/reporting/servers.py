@@ -5,13 +5,13 @@ from typing import Any
 
 from rich.table import Table
 
-from chainshaper.durations import format_duration
 from chainshaper.enforcement.runs.journal import Journal
 from chainshaper.enforcement.runs.state import RunState, ServerState
-from chainshaper.enforcement.threads.listing import POLICIES, Scheduling
 from chainshaper.enforcement.threads.server_threads import WantedScheduling
+from chainshaper.linux.threads import POLICIES, Scheduling
 from chainshaper.planning.plan_parts import slot_text
 from chainshaper.reporting.cells import terminal_table
+from chainshaper.values.durations import format_duration
 
 __all__ = ["changes_table", "run_line", "runs_table", "servers_table"]
 

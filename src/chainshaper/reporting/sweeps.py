@@ -6,10 +6,10 @@ from typing import Any
 import polars as pl
 from rich.table import Table
 
-from chainshaper.durations import format_duration
 from chainshaper.reporting.cells import ABSENT, ms, terminal_table
 from chainshaper.reporting.figures import new_figure, save_figure
-from chainshaper.safe_text import shown
+from chainshaper.values.durations import format_duration
+from chainshaper.values.safe_text import shown
 
 __all__ = ["draw_sweep", "sweep_table"]
 

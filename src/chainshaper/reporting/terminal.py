@@ -10,7 +10,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from chainshaper.safe_text import shown
+from chainshaper.values.safe_text import shown
 
 __all__ = ["PlainTable", "plain"]
 

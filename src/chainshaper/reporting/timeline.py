@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from chainshaper import events
 from chainshaper.analysis import DataFlow, LatencyAnalysis
 from chainshaper.analysis.punctuality import lateness_in_cycle
 from chainshaper.planning import Plan
-from chainshaper.predictions import due_of
-from chainshaper.recording import Recording
+from chainshaper.values import events
+from chainshaper.values.recording import Recording
+from chainshaper.verify.predictions import due_of
 
 __all__ = ["Timeline", "timeline_of"]
 

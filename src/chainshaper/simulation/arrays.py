@@ -5,13 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from chainshaper.errors import InputError
 from chainshaper.planning.plan import Plan, Server, Thread, shaping_nodes
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.layout import FOREVER, NONE, Int64s, Machine
 from chainshaper.simulation.memory import Memory, refer_to_places
 from chainshaper.simulation.streams import AHEAD, Streams
 from chainshaper.simulation.system import Entity, SimulatedThread, System
+from chainshaper.values.errors import InputError
 from chainshaper.workload.event_log import WORDS
 
 __all__ = ["Timing", "build_machine"]

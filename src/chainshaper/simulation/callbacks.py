@@ -6,7 +6,6 @@ CPU time it needs next and what follows (`T_LEFT`, `T_STEP`), or let the thread 
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
 
-from chainshaper.compiled.memory import compiled
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.gate_kernel import (
     decide,
@@ -27,6 +26,7 @@ from chainshaper.simulation.queues import (
     put_newest,
     take_oldest,
 )
+from chainshaper.values.compiled.memory import compiled
 
 __all__ = ["begin_body", "go_on_publishing", "pass_gate", "sleep"]
 

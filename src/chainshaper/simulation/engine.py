@@ -13,11 +13,11 @@ what they needed go on; and only then slots open and close: work that fills a sl
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
 
-from chainshaper.compiled.memory import compiled, table_at
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.executor import advance, expire
 from chainshaper.simulation.messages import deliver, wake
 from chainshaper.simulation.queues import log, pop_event
+from chainshaper.values.compiled.memory import compiled, table_at
 
 __all__ = ["run"]
 

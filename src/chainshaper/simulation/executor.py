@@ -14,7 +14,6 @@ their entities from the first to the last.
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
 
-from chainshaper.compiled.memory import compiled
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.callbacks import begin_body, go_on_publishing, pass_gate
 from chainshaper.simulation.messages import arrive, mark_event, send, wake
@@ -27,6 +26,7 @@ from chainshaper.simulation.queues import (
     push_event,
     take_oldest,
 )
+from chainshaper.values.compiled.memory import compiled
 
 __all__ = ["advance", "expire"]
 

@@ -1,4 +1,4 @@
-"""The gate's decisions, compiled: `Queue` of :mod:`chainshaper.enforcement.gate` once more.
+"""The gate's decisions, compiled: `Queue` of :mod:`chainshaper.gate.decision` once more.
 
 They are written down a second time because the engine cannot call Python; tests hold the two
 against each other, on random gates and messages and on `tests/gate_conformance.yaml`.
@@ -6,8 +6,8 @@ against each other, on random gates and messages and on `tests/gate_conformance.
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
 
-from chainshaper.compiled.memory import compiled
 from chainshaper.simulation import layout as at
+from chainshaper.values.compiled.memory import compiled
 
 __all__ = ["decide", "drop", "left", "missed_slot", "replaces", "switch_mode"]
 

@@ -10,7 +10,6 @@ history keeps those that are not sent yet; see :mod:`chainshaper.workload.asynch
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
 
-from chainshaper.compiled.memory import compiled
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.queues import (
     append,
@@ -21,6 +20,7 @@ from chainshaper.simulation.queues import (
     push_event,
     put_newest,
 )
+from chainshaper.values.compiled.memory import compiled
 
 __all__ = ["arrive", "deliver", "mark_event", "publish", "send", "wake"]
 

@@ -6,8 +6,8 @@ left at the next safe place; limits keep enough in reserve for what happens unti
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
 
-from chainshaper.compiled.memory import compiled
 from chainshaper.simulation import layout as at
+from chainshaper.values.compiled.memory import compiled
 
 __all__ = [
     "append",

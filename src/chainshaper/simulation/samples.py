@@ -13,13 +13,13 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper import events
 from chainshaper.analysis import data_flow
 from chainshaper.analysis.disturbance import stalled_after
 from chainshaper.analysis.flow import DataFlow
-from chainshaper.errors import InputError
-from chainshaper.recording import Recording
 from chainshaper.sources import open_source
+from chainshaper.values import events
+from chainshaper.values.errors import InputError
+from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application, CallbackDescription
 from chainshaper.workload.distributions import ExecutionTime, SimulationDescription
 

@@ -6,20 +6,9 @@ from pathlib import Path
 
 import polars as pl
 
-from chainshaper.compiled import kernel
-from chainshaper.durations import format_duration
-from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.overruns import open_until_done
 from chainshaper.planning.plan import Plan
 from chainshaper.planning.publisher_threads import publisher_servers
-from chainshaper.recording import (
-    InForceInfo,
-    Recording,
-    RecordingInfo,
-    ThreadInfo,
-    refuse_existing,
-    write_recording,
-)
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.arrays import Timing, build_machine
 from chainshaper.simulation.layout import Int64s, Machine
@@ -27,6 +16,17 @@ from chainshaper.simulation.streams import Streams
 from chainshaper.simulation.system import System, build_system
 from chainshaper.simulation.tables import Names, created_objects, event_frames, name_objects
 from chainshaper.splicing.application import splice_application
+from chainshaper.values.compiled import kernel
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.recording import (
+    InForceInfo,
+    Recording,
+    RecordingInfo,
+    ThreadInfo,
+    refuse_existing,
+    write_recording,
+)
 from chainshaper.workload.description import Application, application_as_written
 from chainshaper.workload.live import WARM_UP_CYCLES, completion_ns, origin_timer
 

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 from chainshaper.analysis.chains import find_chain
-from chainshaper.app import ApplicationGraph, Callback, Chain, Node
+from chainshaper.values.application import ApplicationGraph, Callback, Chain, Node
 from chainshaper.workload.description import Application, CallbackDescription
 from chainshaper.workload.live import node_name
 

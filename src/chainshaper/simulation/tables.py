@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper import events
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.layout import NONE, Machine
 from chainshaper.simulation.system import System
+from chainshaper.values import events
 from chainshaper.workload.event_log import WORDS
 
 __all__ = ["Names", "created_objects", "event_frames", "name_objects"]

@@ -1,14 +1,14 @@
 """Where events come from: recordings of our own, and the traces that others write.
 
 :func:`open_source` is the one door: whatever it opens is a
-:class:`~chainshaper.recording.Recording`, so no verb and no analysis needs to know the difference.
+:class:`~chainshaper.values.recording.Recording`, so no verb and no analysis needs to know the difference.
 """
 
 from collections.abc import Callable
 from pathlib import Path
 
-from chainshaper.errors import InputError
-from chainshaper.recording import INFO_FILE, Recording, open_recording
+from chainshaper.values.errors import InputError
+from chainshaper.values.recording import INFO_FILE, Recording, open_recording
 
 __all__ = ["open_source"]
 

@@ -20,7 +20,7 @@ from collections.abc import Iterable, Mapping
 
 import polars as pl
 
-from chainshaper.events import EventTables
+from chainshaper.values.events import EventTables
 
 __all__ = ["distribution_of", "processes_of", "rmw_of_gids", "rmw_of_threads"]
 

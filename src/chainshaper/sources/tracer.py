@@ -10,14 +10,14 @@ what it leaves in there is kept with the recording as `trace/`. There are two,
 processes to attach to (empty: those that the command starts; both empty: all that run).
 
 Everything that concerns the application itself (starting and ending it, its threads, its QoS) is
-:mod:`chainshaper.record`'s.
+:mod:`chainshaper.flow.record`'s.
 """
 
 from collections.abc import Mapping
 from typing import Protocol
 
-from chainshaper.events import EventTables
-from chainshaper.recording import RecordingInfo
+from chainshaper.values.events import EventTables
+from chainshaper.values.recording import RecordingInfo
 
 __all__ = ["Tracer"]
 

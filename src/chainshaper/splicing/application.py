@@ -11,11 +11,12 @@ lifespan by which DDS discards what overran.
 
 from pydantic import ValidationError
 
-from chainshaper.errors import InputError
 from chainshaper.planning.overruns import cycles_until_output, output_lifespan
 from chainshaper.planning.plan import Modes, Plan, ShapingNode, server_of
 from chainshaper.planning.publication import Writer, check_publication
 from chainshaper.planning.publisher_threads import publisher_servers
+from chainshaper.values.errors import InputError
+from chainshaper.values.yaml_file import explanations, key_text
 from chainshaper.workload.description import (
     Application,
     CallbackDescription,
@@ -23,7 +24,6 @@ from chainshaper.workload.description import (
     ModesDescription,
     NodeDescription,
 )
-from chainshaper.yaml_file import explanations, key_text
 
 __all__ = ["splice_application", "writers_of"]
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from chainshaper.analysis.close_names import close_names
-from chainshaper.errors import InputError, OperationError, PlatformError
+from chainshaper.values.errors import InputError, OperationError, PlatformError
 
 __all__ = [
     "GENERIC_PACKAGE",

@@ -1,7 +1,7 @@
 """Which outputs are shaped on this machine at the moment, and which go around their shaping node.
 
 Shaping nodes and their standbys share a page of memory for each output
-(:mod:`chainshaper.enforcement.handover`). Here it is only looked at: nothing is locked or changed.
+(:mod:`chainshaper.gate.handover`). Here it is only looked at: nothing is locked or changed.
 """
 
 import os
@@ -14,9 +14,9 @@ from typing import Literal, TypeAlias
 
 from pydantic import TypeAdapter, ValidationError
 
-from chainshaper.durations import format_duration
-from chainshaper.enforcement.handover import Page, page_folders
-from chainshaper.yaml_file import FullName
+from chainshaper.gate.handover import Page, page_folders
+from chainshaper.values.durations import format_duration
+from chainshaper.values.yaml_file import FullName
 
 __all__ = ["ShapedOutput", "find_outputs", "output_text"]
 

@@ -2,7 +2,7 @@
 
 Three kinds do the same: ``python`` needs no building, ``cpp`` is one package for all types,
 ``typed`` is the paper's package, generated for one type. All read the same parameters, which say
-what the plan says, and write the same log (:mod:`chainshaper.splicing.gate_log`).
+what the plan says, and write the same log (:mod:`chainshaper.sources.gate_log`).
 """
 
 import ast
@@ -14,7 +14,6 @@ from typing import Any, Literal, TypeAlias
 
 import yaml
 
-from chainshaper.errors import InputError, OperationError
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.plan import Plan, ShapingNode, server_of
 from chainshaper.splicing.generated_package import (
@@ -23,7 +22,8 @@ from chainshaper.splicing.generated_package import (
     message_type_named,
     typed_package,
 )
-from chainshaper.whole_file import write_whole
+from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.whole_file import write_whole
 
 __all__ = [
     "RESPAWN",

@@ -20,7 +20,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import TypeAlias
 
-from chainshaper.enforcement.realtime import set_thread_name
+from chainshaper.linux.scheduling import set_thread_name
 from chainshaper.workload.event_log import number_of
 
 __all__ = ["AsynchronousWriter", "Note", "PublisherThread", "noting_sends"]
@@ -30,7 +30,7 @@ THREAD_NAME = "dds.asyn.0.1"  # Fast DDS's for user data
 Note: TypeAlias = Callable[[int, int, str, int], None]
 """Records what became of a message: time, source timestamp, outcome, duration of sending (ns).
 
-The outcomes are those of `asynchronous_send` in :mod:`chainshaper.events`.
+The outcomes are those of `asynchronous_send` in :mod:`chainshaper.values.events`.
 """
 
 

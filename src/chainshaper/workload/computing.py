@@ -15,9 +15,9 @@ from collections.abc import Callable, Iterable, Sequence
 from itertools import cycle
 from pathlib import Path
 
-from chainshaper.enforcement.gate import origin_of
-from chainshaper.enforcement.own_processes import named_folders
-from chainshaper.trusted_files import why_distrusted
+from chainshaper.gate.decision import origin_of
+from chainshaper.linux.own_processes import named_folders
+from chainshaper.values.trusted_files import why_distrusted
 from chainshaper.workload import dds
 from chainshaper.workload.execution import ExecutionTimes, spend
 

@@ -13,7 +13,7 @@ import struct
 from dataclasses import dataclass
 from typing import Any
 
-from chainshaper.errors import OperationError, PlatformError
+from chainshaper.values.errors import OperationError, PlatformError
 
 try:
     from cyclonedds._clayer import ddspy_take, ddspy_write_ts

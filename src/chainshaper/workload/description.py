@@ -25,10 +25,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from chainshaper.enforcement.gate import Anchor, Gate, Late, Messages, Modes, Overrun
-from chainshaper.plan_choices import Publication
-from chainshaper.workload.distributions import ExecutionTime, SimulationDescription
-from chainshaper.yaml_file import (
+from chainshaper.gate.decision import Anchor, Gate, Late, Messages, Modes, Overrun
+from chainshaper.values.plan_choices import Publication
+from chainshaper.values.yaml_file import (
     AS_YAML,
     Duration,
     FullName,
@@ -37,6 +36,7 @@ from chainshaper.yaml_file import (
     read_model,
     wrong_value,
 )
+from chainshaper.workload.distributions import ExecutionTime, SimulationDescription
 
 __all__ = [
     "Application",
@@ -57,7 +57,7 @@ _NODE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 
 
 class ModesDescription(Part):
-    """The modes of a gate, as :class:`~chainshaper.enforcement.gate.Modes` has them.
+    """The modes of a gate, as :class:`~chainshaper.gate.decision.Modes` has them.
 
     The active one's name is read from ``topic``, which a callback ``announces`` it on.
     """
@@ -71,7 +71,7 @@ class ModesDescription(Part):
 class GateDescription(Part):
     """A gate in a callback: the received message is republished inside ``slots`` only.
 
-    The fields are those of :class:`~chainshaper.enforcement.gate.Gate`.
+    The fields are those of :class:`~chainshaper.gate.decision.Gate`.
     """
 
     slots: Annotated[tuple[tuple[Duration, Duration], ...], Field(min_length=1)]

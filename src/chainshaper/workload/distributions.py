@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from chainshaper.yaml_file import Duration, Part, PositiveDuration, wrong_value
+from chainshaper.values.yaml_file import Duration, Part, PositiveDuration, wrong_value
 
 __all__ = ["ExecutionTime", "SimulationDescription"]
 

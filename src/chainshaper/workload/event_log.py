@@ -4,7 +4,7 @@ A trace point appends a few integers to an array in locked memory, in one step, 
 may share the log; names are written once, at start-up. Nothing touches a file or a pipe before
 the run is over. The layout is read back by
 :mod:`chainshaper.workload.event_reading`, which turns it into the tables of
-:mod:`chainshaper.events`.
+:mod:`chainshaper.values.events`.
 """
 
 from array import array

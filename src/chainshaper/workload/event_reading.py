@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from chainshaper import events
+from chainshaper.values import events
 from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS
 from chainshaper.workload.stall_meter import NO_PACE
 

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import IO, Any
 
-from chainshaper.enforcement.own_processes import end_in_words, module_command
-from chainshaper.errors import OperationError
+from chainshaper.linux.own_processes import end_in_words, module_command
+from chainshaper.values.errors import OperationError
 
 __all__ = ["Child", "end_all", "first_casualty", "start_child"]
 

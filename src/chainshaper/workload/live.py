@@ -14,19 +14,19 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from chainshaper.durations import format_duration
-from chainshaper.enforcement.gate import clock_offset
-from chainshaper.enforcement.own_processes import LIBRARIES
-from chainshaper.enforcement.realtime import check_cores, may_use_fifo
 from chainshaper.enforcement.runs.governing import Governed, governing, in_force_throughout
-from chainshaper.enforcement.threads.listing import (
+from chainshaper.gate.decision import clock_offset
+from chainshaper.linux.own_processes import LIBRARIES
+from chainshaper.linux.scheduling import check_cores, may_use_fifo
+from chainshaper.linux.threads import (
     Scheduling,
     apply_scheduling,
     foreign_realtime_processes,
     list_threads,
 )
-from chainshaper.errors import InputError, OperationError, PlatformError
-from chainshaper.recording import (
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.recording import (
     InForceInfo,
     Recording,
     RecordingInfo,

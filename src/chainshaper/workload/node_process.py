@@ -14,9 +14,9 @@ from functools import partial
 from itertools import count
 from typing import Any
 
-from chainshaper.enforcement.gate import READER_DEPTH, STALL_NS, Gate, Held, Modes, Shaper, text_of
-from chainshaper.enforcement.kept_core import KeptCore
-from chainshaper.enforcement.realtime import (
+from chainshaper.gate.clear_core import KeptCore
+from chainshaper.gate.decision import READER_DEPTH, STALL_NS, Gate, Held, Modes, Shaper, text_of
+from chainshaper.linux.scheduling import (
     lock_memory,
     set_thread_name,
     signalled_with_parent,

@@ -14,8 +14,8 @@ import time
 from array import array
 from collections.abc import Callable
 
-from chainshaper.enforcement.gate import STALL_NS, sleep_until
-from chainshaper.enforcement.realtime import (
+from chainshaper.gate.decision import STALL_NS, sleep_until
+from chainshaper.linux.scheduling import (
     lock_memory,
     set_thread_name,
     signalled_with_parent,

@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper.enforcement.gate import STALL_NS
-from chainshaper.enforcement.threads.listing import Scheduling, apply_scheduling, list_threads
-from chainshaper.recording import StallMeterInfo
+from chainshaper.gate.decision import STALL_NS
+from chainshaper.linux.threads import Scheduling, apply_scheduling, list_threads
+from chainshaper.values.recording import StallMeterInfo
 from chainshaper.workload import stall_meter
 from chainshaper.workload.event_reading import meter_tables
 from chainshaper.workload.launcher import Child, end_all, start_child

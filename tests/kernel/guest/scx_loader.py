@@ -11,7 +11,7 @@ from typing import Any
 
 from chainshaper.enforcement.scx.back_end import create
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
-from chainshaper.errors import ChainshaperError
+from chainshaper.values.errors import ChainshaperError
 
 
 def table_of(text: dict[str, Any]) -> ServerTable:

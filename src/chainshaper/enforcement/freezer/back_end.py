@@ -22,7 +22,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from chainshaper.enforcement.freezer import cgroups
 from chainshaper.enforcement.freezer.counters import create_page, read_counters
 from chainshaper.enforcement.freezer.slot_boundaries import (
     Anchoring,
@@ -37,13 +36,14 @@ from chainshaper.enforcement.freezer.state import (
     restore,
     thaw,
 )
-from chainshaper.enforcement.own_processes import end_in_words, module_command
 from chainshaper.enforcement.runs.journal import Journal
 from chainshaper.enforcement.runs.processes import DISPATCHER, note_process
 from chainshaper.enforcement.runs.scheduling_memory import release_threads
 from chainshaper.enforcement.servers import ServerCounters, ServerTable
-from chainshaper.enforcement.threads.listing import has_ended, start_of
-from chainshaper.errors import InputError, OperationError, PlatformError
+from chainshaper.linux import cgroups
+from chainshaper.linux.own_processes import end_in_words, module_command
+from chainshaper.linux.threads import has_ended, start_of
+from chainshaper.values.errors import InputError, OperationError, PlatformError
 
 __all__ = ["Freezer", "create"]
 

@@ -40,12 +40,12 @@ from chainshaper.enforcement.freezer.slot_boundaries import (
     moved,
 )
 from chainshaper.enforcement.freezer.state import run_of
-from chainshaper.enforcement.gate import sleep_until, watch_until
-from chainshaper.enforcement.realtime import lock_memory, set_thread_name, stop_garbage_collection
 from chainshaper.enforcement.runs.journal import remembered_journal
 from chainshaper.enforcement.servers import ServerTable
-from chainshaper.errors import ChainshaperError, OperationError, PlatformError
-from chainshaper.safe_text import shown
+from chainshaper.gate.decision import sleep_until, watch_until
+from chainshaper.linux.scheduling import lock_memory, set_thread_name, stop_garbage_collection
+from chainshaper.values.errors import ChainshaperError, OperationError, PlatformError
+from chainshaper.values.safe_text import shown
 
 __all__ = ["Dispatcher", "main"]
 

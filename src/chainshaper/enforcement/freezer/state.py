@@ -15,17 +15,17 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from chainshaper.enforcement.freezer.cgroups import (
+from chainshaper.enforcement.runs.journal import Journal
+from chainshaper.enforcement.servers import ReservationServer, ServerTable
+from chainshaper.linux.cgroups import (
     dissolve,
     has_unseen_threads,
     mount_point,
     moves_are_quick,
     remount,
 )
-from chainshaper.enforcement.runs.journal import Journal
-from chainshaper.enforcement.servers import ReservationServer, ServerTable
-from chainshaper.enforcement.threads.listing import has_ended, start_of
-from chainshaper.errors import PlatformError
+from chainshaper.linux.threads import has_ended, start_of
+from chainshaper.values.errors import PlatformError
 
 __all__ = [
     "FREEZER",

@@ -28,13 +28,13 @@ from chainshaper.enforcement.litmus.resctl import (
     plugin_command,
     reservation_ids,
 )
-from chainshaper.enforcement.own_processes import is_installed, tool_environment
 from chainshaper.enforcement.runs.journal import Journal
 from chainshaper.enforcement.runs.scheduling_memory import note_scheduling, release_threads
-from chainshaper.enforcement.runs.scheduling_state import SchedulingClass, state_of
 from chainshaper.enforcement.servers import ServerCounters, ServerTable
-from chainshaper.enforcement.threads.listing import find_thread
-from chainshaper.errors import InputError, OperationError, PlatformError
+from chainshaper.linux.own_processes import is_installed, tool_environment
+from chainshaper.linux.scheduling_state import SchedulingClass, state_of
+from chainshaper.linux.threads import find_thread
+from chainshaper.values.errors import InputError, OperationError, PlatformError
 
 __all__ = ["Litmus", "create", "restore_plugin"]
 

@@ -20,9 +20,9 @@ LITMUS^RT, `litmus/reservations/alloc.c`.
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from chainshaper.durations import format_duration
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
-from chainshaper.errors import InputError
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError
 
 __all__ = [
     "Command",

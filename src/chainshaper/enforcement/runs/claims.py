@@ -22,7 +22,7 @@ from chainshaper.enforcement.runs.journal import (
 )
 from chainshaper.enforcement.runs.locking import holder_of, locked
 from chainshaper.enforcement.runs.undoing import undo_run
-from chainshaper.errors import OperationError, PlatformError
+from chainshaper.values.errors import OperationError, PlatformError
 
 __all__ = ["claim_run"]
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from chainshaper.enforcement.runs.state import find_runs
-from chainshaper.enforcement.threads.listing import find_thread
-from chainshaper.errors import OperationError, PlatformError
+from chainshaper.linux.threads import find_thread
+from chainshaper.values.errors import OperationError, PlatformError
 
 __all__ = ["PLAN_FILE", "Governed", "governing", "in_force_throughout"]
 

@@ -29,11 +29,8 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from chainshaper.enforcement.freezer import cgroups
 from chainshaper.enforcement.freezer.counters import CounterPage, open_page
 from chainshaper.enforcement.freezer.state import groups_of, run_of, thaw
-from chainshaper.enforcement.own_processes import module_command, what_happened
-from chainshaper.enforcement.realtime import set_thread_name
 from chainshaper.enforcement.runs.claims import claim_run
 from chainshaper.enforcement.runs.journal import FILE, Journal, remembered_journal
 from chainshaper.enforcement.runs.processes import (
@@ -44,7 +41,10 @@ from chainshaper.enforcement.runs.processes import (
     own_processes,
 )
 from chainshaper.enforcement.runs.undoing import undo_run
-from chainshaper.errors import OperationError
+from chainshaper.linux import cgroups
+from chainshaper.linux.own_processes import module_command, what_happened
+from chainshaper.linux.scheduling import set_thread_name
+from chainshaper.values.errors import OperationError
 
 __all__ = ["Guardians", "run_claimed", "start_guardians"]
 

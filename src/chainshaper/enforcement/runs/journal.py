@@ -22,8 +22,8 @@ from io import FileIO
 from pathlib import Path
 from typing import Any, TypeVar
 
-from chainshaper.enforcement.threads.listing import has_ended, start_of
-from chainshaper.errors import OperationError, PlatformError
+from chainshaper.linux.threads import has_ended, start_of
+from chainshaper.values.errors import OperationError, PlatformError
 
 __all__ = [
     "CLAIMS",

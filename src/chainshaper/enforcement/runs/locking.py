@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from chainshaper.enforcement.threads.listing import read_proc
+from chainshaper.linux.threads import read_proc
 
 __all__ = ["holder_of", "locked", "wake"]
 

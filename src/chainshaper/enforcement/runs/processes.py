@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from chainshaper.enforcement.runs.journal import Journal, process_of
-from chainshaper.enforcement.threads.listing import start_of
+from chainshaper.linux.threads import start_of
 
 __all__ = [
     "DISPATCHER",

@@ -26,10 +26,11 @@ from dataclasses import dataclass, replace
 from time import CLOCK_BOOTTIME, clock_gettime_ns
 from typing import Any, Literal, TypeAlias
 
-from chainshaper.enforcement.freezer.cgroups import threads_in
 from chainshaper.enforcement.freezer.state import groups_of, run_of
 from chainshaper.enforcement.runs.journal import Journal, process_of
-from chainshaper.enforcement.runs.scheduling_state import (
+from chainshaper.linux.cgroups import threads_in
+from chainshaper.linux.processes import descendants
+from chainshaper.linux.scheduling_state import (
     ASPECTS,
     SchedulingClass,
     SchedulingState,
@@ -40,7 +41,7 @@ from chainshaper.enforcement.runs.scheduling_state import (
     state_text,
     with_aspect,
 )
-from chainshaper.enforcement.threads.listing import (
+from chainshaper.linux.threads import (
     SCHED_DEADLINE,
     TICK_NS,
     Scheduling,
@@ -50,8 +51,7 @@ from chainshaper.enforcement.threads.listing import (
     parents,
     start_of,
 )
-from chainshaper.enforcement.threads.processes import descendants
-from chainshaper.errors import OperationError, PlatformError
+from chainshaper.values.errors import OperationError, PlatformError
 
 __all__ = [
     "DESCENDANTS",

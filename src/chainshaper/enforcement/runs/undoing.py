@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from chainshaper.enforcement.freezer import cgroups
 from chainshaper.enforcement.freezer import state as freezer
 from chainshaper.enforcement.litmus import back_end as litmus
 from chainshaper.enforcement.runs.journal import (
@@ -39,9 +38,10 @@ from chainshaper.enforcement.runs.scheduling_memory import (
     read_change,
     release_threads,
 )
-from chainshaper.enforcement.runs.scheduling_state import state_of, state_text
-from chainshaper.enforcement.threads.listing import find_thread
-from chainshaper.errors import OperationError, PlatformError
+from chainshaper.linux import cgroups
+from chainshaper.linux.scheduling_state import state_of, state_text
+from chainshaper.linux.threads import find_thread
+from chainshaper.values.errors import OperationError, PlatformError
 
 __all__ = ["end_run", "release_strays", "remove_run", "strange_lines", "undo_run"]
 

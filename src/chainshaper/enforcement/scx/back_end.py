@@ -15,8 +15,6 @@ import subprocess
 import threading
 import time
 
-from chainshaper.enforcement.own_processes import what_happened
-from chainshaper.enforcement.realtime import check_cores
 from chainshaper.enforcement.scx.kicker import start_kicker
 from chainshaper.enforcement.scx.libbpf import delete_element, look_up_element, update_element
 from chainshaper.enforcement.scx.loading import (
@@ -37,8 +35,10 @@ from chainshaper.enforcement.scx.table import (
     unpack_exit,
 )
 from chainshaper.enforcement.servers import ServerCounters, ServerTable
-from chainshaper.enforcement.threads.listing import POLICIES, RESET_ON_FORK
-from chainshaper.errors import InputError, OperationError, PlatformError
+from chainshaper.linux.own_processes import what_happened
+from chainshaper.linux.scheduling import check_cores
+from chainshaper.linux.threads import POLICIES, RESET_ON_FORK
+from chainshaper.values.errors import InputError, OperationError, PlatformError
 
 __all__ = ["ScxServers", "create", "missing"]
 

@@ -16,11 +16,11 @@ import os
 import subprocess
 import sys
 
-from chainshaper.enforcement.own_processes import module_command
-from chainshaper.enforcement.realtime import lock_memory, set_thread_name, stop_garbage_collection
 from chainshaper.enforcement.scx.libbpf import ProgramRun
 from chainshaper.enforcement.scx.table import INSTANT, WAKE
-from chainshaper.errors import OperationError
+from chainshaper.linux.own_processes import module_command
+from chainshaper.linux.scheduling import lock_memory, set_thread_name, stop_garbage_collection
+from chainshaper.values.errors import OperationError
 
 __all__ = ["start_kicker"]
 

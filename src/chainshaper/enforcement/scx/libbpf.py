@@ -16,7 +16,7 @@ import struct
 from pathlib import Path
 from typing import Any
 
-from chainshaper.errors import PlatformError
+from chainshaper.values.errors import PlatformError
 
 __all__ = [
     "BpfObject",

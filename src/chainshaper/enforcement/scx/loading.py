@@ -32,7 +32,7 @@ from chainshaper.enforcement.scx.table import (
     pack_servers,
 )
 from chainshaper.enforcement.servers import ServerTable
-from chainshaper.errors import OperationError
+from chainshaper.values.errors import OperationError
 
 __all__ = [
     "LoadedPolicy",

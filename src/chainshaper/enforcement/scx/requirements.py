@@ -4,9 +4,9 @@ import os
 import resource
 from pathlib import Path
 
-from chainshaper.enforcement.realtime import may_use_fifo
 from chainshaper.enforcement.scx.libbpf import load_libbpf
-from chainshaper.errors import PlatformError
+from chainshaper.linux.scheduling import may_use_fifo
+from chainshaper.values.errors import PlatformError
 
 __all__ = ["is_realtime_kernel", "missing", "scheduler_in_force"]
 

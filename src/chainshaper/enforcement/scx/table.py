@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from chainshaper.enforcement.servers import ReservationServer, ServerCounters, ServerTable
-from chainshaper.errors import InputError
+from chainshaper.values.errors import InputError
 
 __all__ = [
     "MAX_CORES",

@@ -3,7 +3,7 @@
 What is known of a thread, the stronger evidence first:
 
 1. a recording saw it: the callbacks that it ran say which nodes it executes;
-2. its name, which DDS implementations choose (:mod:`chainshaper.enforcement.threads.dds_names`);
+2. its name, which DDS implementations choose (:mod:`chainshaper.linux.dds_threads`);
 3. its place: executors spin on the main thread, unless the program arranges it otherwise.
 
 What no evidence covers stays unknown. Which nodes a process has, a recording says (also one of an
@@ -21,15 +21,15 @@ import time
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from chainshaper.enforcement.threads.dds_names import ThreadRole
-from chainshaper.enforcement.threads.listing import TICK_NS, Thread
-from chainshaper.enforcement.threads.node_names import (
+from chainshaper.linux.dds_threads import ThreadRole
+from chainshaper.linux.node_names import (
     guessed_name,
     named_nodes,
     takes_ros_arguments,
 )
-from chainshaper.enforcement.threads.processes import Process, descendants
-from chainshaper.enforcement.threads.users import user_name
+from chainshaper.linux.processes import Process, descendants
+from chainshaper.linux.threads import TICK_NS, Thread
+from chainshaper.linux.users import user_name
 
 __all__ = [
     "LEFT_ALONE",

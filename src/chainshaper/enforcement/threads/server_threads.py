@@ -23,10 +23,10 @@ from itertools import chain as joined
 
 from chainshaper.enforcement.servers import ReservationServer
 from chainshaper.enforcement.threads.allocation import Allocation, NodeThread
-from chainshaper.enforcement.threads.listing import Scheduling
-from chainshaper.errors import InputError, OperationError
+from chainshaper.linux.threads import Scheduling
 from chainshaper.planning.plan import Plan, Server, shaping_nodes
 from chainshaper.planning.plan import Thread as PlannedThread
+from chainshaper.values.errors import InputError, OperationError
 
 __all__ = [
     "DDS_PRIORITY",

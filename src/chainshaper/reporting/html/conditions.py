@@ -6,11 +6,11 @@ from datetime import datetime, timezone
 
 import polars as pl
 
-from chainshaper.exploration import event_counts, lost_text
-from chainshaper.recording import Recording, ThreadInfo
+from chainshaper.flow.exploration import event_counts, lost_text
+from chainshaper.flow.steps import Measurement
 from chainshaper.reporting.html.markup import details, listed, table
 from chainshaper.reporting.html.told import Told
-from chainshaper.steps import Measurement
+from chainshaper.values.recording import Recording, ThreadInfo
 
 __all__ = ["condition_tables", "note_lists"]
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from chainshaper.safe_text import escape
+from chainshaper.values.safe_text import escape
 
 __all__ = ["Group", "details", "listed", "paragraph", "section", "table"]
 

@@ -15,16 +15,16 @@ from string import Template
 from typing import Any
 
 from chainshaper.analysis import data_flow
-from chainshaper.errors import InputError
+from chainshaper.flow.steps import Measurement
 from chainshaper.planning import Plan, dump_plan
 from chainshaper.reporting.html import conditions, tables
 from chainshaper.reporting.html.markup import details, paragraph, section
 from chainshaper.reporting.html.series import plan_drawing, recording_data
 from chainshaper.reporting.html.told import Told
 from chainshaper.reporting.timeline import timeline_of
-from chainshaper.safe_text import escape, shown
-from chainshaper.steps import Measurement
-from chainshaper.whole_file import new_file, write_whole
+from chainshaper.values.errors import InputError
+from chainshaper.values.safe_text import escape, shown
+from chainshaper.values.whole_file import new_file, write_whole
 
 __all__ = ["ENDINGS", "report_page", "write_report"]
 

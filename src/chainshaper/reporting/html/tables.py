@@ -5,10 +5,8 @@ from collections.abc import Sequence
 import polars as pl
 
 from chainshaper.analysis import REASONS, LatencyStatistics, callback_statistics
-from chainshaper.durations import format_duration
-from chainshaper.overruns import overruns_text
+from chainshaper.flow.steps import Measurement
 from chainshaper.planning import Plan
-from chainshaper.predictions import FigureHeld
 from chainshaper.reporting.application_graph import short_symbol
 from chainshaper.reporting.breakdown import PARTS, hop_breakdown
 from chainshaper.reporting.cells import (
@@ -27,7 +25,9 @@ from chainshaper.reporting.html.markup import Group, Row, details, paragraph, ta
 from chainshaper.reporting.html.told import Told
 from chainshaper.reporting.machine import stall_rows
 from chainshaper.reporting.predictions import band_name, late_text, range_ms, verdict
-from chainshaper.steps import Measurement
+from chainshaper.values.durations import format_duration
+from chainshaper.verify.overruns import overruns_text
+from chainshaper.verify.predictions import FigureHeld
 
 __all__ = [
     "breakdown_table",

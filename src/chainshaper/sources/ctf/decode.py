@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.compiled import kernel
 from chainshaper.sources.ctf import tables as tb
 from chainshaper.sources.ctf.assembly import Assembly
 from chainshaper.sources.ctf.errors import CtfError
 from chainshaper.sources.ctf.streams import MappedFile, Scratch
 from chainshaper.sources.ctf.trace import CtfStream
+from chainshaper.values.compiled import kernel
 
 __all__ = ["LARGE_BYTES", "Stream", "Walk", "default_threads", "fill", "span_borders", "walk"]
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from chainshaper.errors import InputError
+from chainshaper.values.errors import InputError
 
 __all__ = ["CtfError"]
 

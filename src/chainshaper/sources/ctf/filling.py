@@ -10,7 +10,6 @@ See `kernels` for the passes before it.
 
 import numpy as np
 
-from chainshaper.compiled.memory import compiled, get, put, store_long, store_word
 from chainshaper.sources.ctf import tables as tb
 from chainshaper.sources.ctf.interpreter import execute, move_batch
 from chainshaper.sources.ctf.kernels import (
@@ -20,6 +19,7 @@ from chainshaper.sources.ctf.kernels import (
     read_header,
     step_over,
 )
+from chainshaper.values.compiled.memory import compiled, get, put, store_long, store_word
 
 __all__ = ["fill_columns"]
 

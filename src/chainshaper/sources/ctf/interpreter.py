@@ -13,7 +13,9 @@ start; a failed check ends the run with one of the negative codes of `Failure`.
 
 import numpy as np
 
-from chainshaper.compiled.memory import (
+from chainshaper.sources.ctf import tables as tb
+from chainshaper.sources.ctf.texts import digest_text, digest_whole, intern, word_at
+from chainshaper.values.compiled.memory import (
     compiled,
     get,
     load_byte,
@@ -25,8 +27,6 @@ from chainshaper.compiled.memory import (
     store_word,
     swap_bytes,
 )
-from chainshaper.sources.ctf import tables as tb
-from chainshaper.sources.ctf.texts import digest_text, digest_whole, intern, word_at
 
 __all__ = ["advance_clock", "afforded", "execute", "move_batch"]
 

@@ -11,9 +11,9 @@ operations mean.  `filling` holds the pass that writes columns.
 
 import numpy as np
 
-from chainshaper.compiled.memory import compiled, get, load_word, put
 from chainshaper.sources.ctf import tables as tb
 from chainshaper.sources.ctf.interpreter import advance_clock, afforded, execute
+from chainshaper.values.compiled.memory import compiled, get, load_word, put
 
 __all__ = [
     "copy_numbers",

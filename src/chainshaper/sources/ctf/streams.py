@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.compiled import kernel
 from chainshaper.sources.ctf import tables as tb
 from chainshaper.sources.ctf.assembly import Assembly
 from chainshaper.sources.ctf.errors import CtfError
+from chainshaper.values.compiled import kernel
 
 __all__ = ["MappedFile", "Scratch", "packet_table", "stream_paths"]
 

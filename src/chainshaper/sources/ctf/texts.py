@@ -7,7 +7,8 @@
 
 import numpy as np
 
-from chainshaper.compiled.memory import (
+from chainshaper.sources.ctf import tables as tb
+from chainshaper.values.compiled.memory import (
     compiled,
     get,
     load_byte,
@@ -16,7 +17,6 @@ from chainshaper.compiled.memory import (
     store_word,
     trailing_zeros,
 )
-from chainshaper.sources.ctf import tables as tb
 
 __all__ = ["digest_text", "digest_whole", "intern", "rehash", "word_at"]
 

@@ -15,13 +15,13 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import polars as pl
 
-from chainshaper import events
 from chainshaper.analysis.objects import INTERNAL_TOPICS
-from chainshaper.enforcement.threads.node_names import named_nodes
-from chainshaper.enforcement.threads.processes import Process
-from chainshaper.recording import EndpointInfo, RecordingInfo
+from chainshaper.linux.node_names import named_nodes
+from chainshaper.linux.processes import Process
 from chainshaper.sources.ebpf.late_attachment import added_rows
 from chainshaper.sources.system import processes_of
+from chainshaper.values import events
+from chainshaper.values.recording import EndpointInfo, RecordingInfo
 
 __all__ = ["with_found_nodes"]
 

@@ -21,7 +21,7 @@ from collections.abc import Mapping
 
 import polars as pl
 
-from chainshaper import events
+from chainshaper.values import events
 
 __all__ = ["ADDED", "added_rows", "with_found_objects", "with_functions"]
 

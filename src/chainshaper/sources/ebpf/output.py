@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from chainshaper import events
 from chainshaper.sources.ebpf.script import (
     CODE,
     FIRST_POINT,
@@ -25,6 +24,7 @@ from chainshaper.sources.ebpf.script import (
     VALUES,
 )
 from chainshaper.sources.ebpf.trace_points import TracePoint
+from chainshaper.values import events
 
 __all__ = ["HEADER", "Printed", "lost_events", "read_printed"]
 

@@ -36,8 +36,8 @@ import re
 from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
-from chainshaper.errors import InputError
 from chainshaper.sources.ebpf.trace_points import FUNCTION_PREFIX, Argument, TracePoint
+from chainshaper.values.errors import InputError
 
 __all__ = [
     "CODE",

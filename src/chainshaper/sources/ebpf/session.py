@@ -24,16 +24,12 @@ from pathlib import Path
 
 import polars as pl
 
-from chainshaper import events
-from chainshaper.enforcement.gate import clock_offset
-from chainshaper.enforcement.own_processes import is_installed, tool_environment
-from chainshaper.enforcement.realtime import signalled_with_parent
-from chainshaper.enforcement.threads.listing import parents
-from chainshaper.enforcement.threads.processes import descendants
-from chainshaper.enforcement.threads.users import run_users, user_name, user_of
-from chainshaper.errors import InputError, OperationError, PlatformError
-from chainshaper.events import EventTables
-from chainshaper.recording import RecordingInfo
+from chainshaper.gate.decision import clock_offset
+from chainshaper.linux.own_processes import is_installed, tool_environment
+from chainshaper.linux.processes import descendants
+from chainshaper.linux.scheduling import signalled_with_parent
+from chainshaper.linux.threads import parents
+from chainshaper.linux.users import run_users, user_name, user_of
 from chainshaper.sources.ebpf.callback_functions import callback_functions
 from chainshaper.sources.ebpf.elf_symbols import open_regular
 from chainshaper.sources.ebpf.late_attachment import ADDED, with_found_objects, with_functions
@@ -47,6 +43,10 @@ from chainshaper.sources.ebpf.tracing_libraries import (
     mapped_libraries,
 )
 from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids
+from chainshaper.values import events
+from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.events import EventTables
+from chainshaper.values.recording import RecordingInfo
 
 __all__ = ["EbpfTracer"]
 

@@ -2,7 +2,7 @@
 
 Every ROS 2 build with tracing compiled in calls `ros_trace_<event>(arguments…)` of that library,
 whether or not LTTng is there. The arguments are the fields of the event's table
-(:mod:`chainshaper.events`) in the same order, with these exceptions:
+(:mod:`chainshaper.values.events`) in the same order, with these exceptions:
 
 * `rcl_init` has no version among them: that is the library's own, from its `package.xml`;
 * `rclcpp_publish` has the publisher's address before the message's, mostly null, and no column;
@@ -20,8 +20,8 @@ from typing import Literal, TypeAlias
 
 import polars as pl
 
-from chainshaper import events
 from chainshaper.sources.ebpf.tracing_libraries import TracingLibrary
+from chainshaper.values import events
 
 __all__ = ["FUNCTION_PREFIX", "Argument", "TracePoint", "trace_points"]
 

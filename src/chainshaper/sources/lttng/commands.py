@@ -40,10 +40,10 @@ from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
-from chainshaper.enforcement.own_processes import is_installed, tool_environment
-from chainshaper.enforcement.realtime import signalled_with_parent
-from chainshaper.enforcement.threads.listing import read_proc
-from chainshaper.errors import OperationError, PlatformError
+from chainshaper.linux.own_processes import is_installed, tool_environment
+from chainshaper.linux.scheduling import signalled_with_parent
+from chainshaper.linux.threads import read_proc
+from chainshaper.values.errors import OperationError, PlatformError
 
 __all__ = ["Lttng", "connect"]
 

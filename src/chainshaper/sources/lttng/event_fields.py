@@ -1,6 +1,6 @@
 """How a trace's events become event tables: their providers, fields and types.
 
-Tables have the columns of :mod:`chainshaper.events`. A trace may declare other events of the same
+Tables have the columns of :mod:`chainshaper.values.events`. A trace may declare other events of the same
 name (another provider's), other types (a narrower integer), and fewer fields: older distributions
 do, and so does damaged metadata. Integers are widened; a field that is absent, or of a kind that
 no cast brings right, becomes a column of nulls, which the analysis takes for "not known", and is
@@ -14,7 +14,6 @@ from collections.abc import Mapping, Sequence
 
 import polars as pl
 
-from chainshaper import events
 from chainshaper.sources.ctf import CtfTrace
 from chainshaper.sources.ctf.types import (
     ArrayType,
@@ -27,6 +26,7 @@ from chainshaper.sources.ctf.types import (
     VariantType,
     field_name,
 )
+from chainshaper.values import events
 
 __all__ = [
     "CARET_INIT",

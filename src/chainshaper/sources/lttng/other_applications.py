@@ -10,11 +10,11 @@ from collections.abc import Collection
 
 import polars as pl
 
-from chainshaper.enforcement.threads.listing import parents, read_proc
-from chainshaper.enforcement.threads.processes import descendants
-from chainshaper.enforcement.threads.users import process_folder, user_in
-from chainshaper.events import EventTables
-from chainshaper.recording import RecordingInfo
+from chainshaper.linux.processes import descendants
+from chainshaper.linux.threads import parents, read_proc
+from chainshaper.linux.users import process_folder, user_in
+from chainshaper.values.events import EventTables
+from chainshaper.values.recording import RecordingInfo
 
 __all__ = ["processes_apart", "without_processes"]
 

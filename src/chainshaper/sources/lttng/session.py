@@ -27,13 +27,13 @@ from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from chainshaper.durations import format_duration
-from chainshaper.enforcement.threads.users import run_users
-from chainshaper.errors import InputError, OperationError
-from chainshaper.events import EventTables
-from chainshaper.recording import RecordingInfo
+from chainshaper.linux.users import run_users
 from chainshaper.sources.lttng.commands import Lttng, connect
 from chainshaper.sources.lttng.other_applications import processes_apart, without_processes
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.events import EventTables
+from chainshaper.values.recording import RecordingInfo
 
 __all__ = ["LttngSession", "buffer_size"]
 

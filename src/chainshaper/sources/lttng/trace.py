@@ -1,7 +1,7 @@
 """LTTng traces as recordings: the folders that `ros2 trace` writes.
 
 Events keep their names without the provider (``ros2:callback_start`` → ``callback_start``) and get
-the columns and types of :mod:`chainshaper.events`; what the analysis does not know is left out
+the columns and types of :mod:`chainshaper.values.events`; what the analysis does not know is left out
 (:mod:`~chainshaper.sources.lttng.event_fields`). Tables are decoded in groups that are used
 together, because one pass over a trace costs nearly the same for one table as for twenty: those
 of the objects' creation, of callbacks and of messages at once, since every analysis needs them
@@ -23,10 +23,6 @@ from typing import TypeAlias
 
 import polars as pl
 
-from chainshaper import events
-from chainshaper.errors import InputError, OperationError
-from chainshaper.events import CREATION
-from chainshaper.recording import Recording, RecordingInfo
 from chainshaper.sources.ctf import CtfTrace, Events, count_events, open_trace, read_events
 from chainshaper.sources.ctf.types import ArrayType
 from chainshaper.sources.lttng.event_fields import (
@@ -38,6 +34,10 @@ from chainshaper.sources.lttng.event_fields import (
     table_name,
 )
 from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids, rmw_of_threads
+from chainshaper.values import events
+from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.events import CREATION
+from chainshaper.values.recording import Recording, RecordingInfo
 
 __all__ = ["NEXT_HOST", "Progress", "TraceTables", "open_lttng_trace"]
 

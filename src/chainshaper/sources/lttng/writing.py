@@ -11,10 +11,10 @@ from typing import Any
 
 import polars as pl
 
-from chainshaper import events
 from chainshaper.sources.ctf.lttng_text import lttng_metadata
 from chainshaper.sources.ctf.tsdl import parse_tsdl
 from chainshaper.sources.ctf.writer import EventRecord, encode_packet, write_trace
+from chainshaper.values import events
 
 __all__ = ["write_lttng_trace"]
 

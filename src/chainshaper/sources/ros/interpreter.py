@@ -32,10 +32,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from chainshaper.enforcement.realtime import signalled_with_parent
-from chainshaper.enforcement.threads.listing import read_proc
-from chainshaper.enforcement.threads.users import process_folder, user_in, user_name
-from chainshaper.errors import OperationError
+from chainshaper.linux.scheduling import signalled_with_parent
+from chainshaper.linux.threads import read_proc
+from chainshaper.linux.users import process_folder, user_in, user_name
+from chainshaper.values.errors import OperationError
 
 __all__ = [
     "Environment",

@@ -15,9 +15,9 @@ A snapshot that fails never fails the recording: it is a note.
 import json
 import re
 
-from chainshaper.recording import EndpointInfo
 from chainshaper.sources.ros import graph as ros_graph
 from chainshaper.sources.ros.interpreter import Environment, run_with_rclpy
+from chainshaper.values.recording import EndpointInfo
 
 __all__ = ["ask_graph"]
 

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from chainshaper.errors import InputError
 from chainshaper.splicing.launch.substitutions import package_share
+from chainshaper.values.errors import InputError
 
 __all__ = ["LaunchCommand", "parse_launch_command"]
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
 
-from chainshaper.errors import InputError, OperationError
 from chainshaper.splicing.launch.actions import (
     Edit,
     Include,
@@ -36,6 +35,7 @@ from chainshaper.splicing.launch.targets import (
 from chainshaper.splicing.launch.walk import Walk
 from chainshaper.splicing.launch.wrapping import wrapper_text
 from chainshaper.splicing.shaping_process import ShapingProcess
+from chainshaper.values.errors import InputError, OperationError
 
 __all__ = ["Copies", "Copy", "edited_copies", "unified_diff"]
 

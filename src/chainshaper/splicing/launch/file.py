@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Protocol
 
-from chainshaper.errors import InputError
 from chainshaper.splicing.launch import xml as launch_xml
 from chainshaper.splicing.launch import yaml as launch_yaml
 from chainshaper.splicing.launch.actions import Edit, Language, LaunchFile, Rules, Span
 from chainshaper.splicing.launch.python import editing as launch_python
 from chainshaper.splicing.shaping_process import ShapingProcess
-from chainshaper.yaml_file import read_text as file_text
+from chainshaper.values.errors import InputError
+from chainshaper.values.yaml_file import read_text as file_text
 
 __all__ = ["LANGUAGES", "is_launch_file", "read_launch_file", "read_text"]
 

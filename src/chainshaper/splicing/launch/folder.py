@@ -14,8 +14,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from chainshaper.errors import InputError, OperationError
-from chainshaper.whole_file import open_to_all
+from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.whole_file import open_to_all
 
 __all__ = ["LOGS", "NODES", "Manifest", "new_folder", "original_of", "remove_folder", "usable"]
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Literal
 
-from chainshaper.errors import InputError, OperationError
 from chainshaper.splicing.launch.remaps import FullName, PlacedRule, rules_in_force
 from chainshaper.splicing.launch.substitutions import described
 from chainshaper.splicing.launch.walk import PlacedNode, Walk
+from chainshaper.values.errors import InputError, OperationError
 
 __all__ = ["Remedy", "Wanted", "heard_by_owner", "notes_of_bound_rule", "remedies_for"]
 

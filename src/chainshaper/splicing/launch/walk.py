@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from chainshaper.errors import InputError
 from chainshaper.splicing.launch.actions import (
     Action,
     Conditions,
@@ -29,6 +28,7 @@ from chainshaper.splicing.launch.actions import (
 from chainshaper.splicing.launch.file import is_launch_file, read_launch_file
 from chainshaper.splicing.launch.remaps import PlacedRule, joined
 from chainshaper.splicing.launch.substitutions import Surroundings, resolve
+from chainshaper.values.errors import InputError
 
 __all__ = ["Instance", "PlacedNode", "Walk", "follow"]
 

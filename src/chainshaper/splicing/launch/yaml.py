@@ -13,11 +13,11 @@ from typing import Any, cast
 
 import yaml
 
-from chainshaper.errors import InputError
 from chainshaper.splicing.launch.actions import Edit, LaunchFile, Rules, Span
 from chainshaper.splicing.launch.elements import Attribute, Element, actions_of, location_edits
 from chainshaper.splicing.shaping_process import RESPAWN, ShapingProcess
-from chainshaper.yaml_file import DEEPEST, compose
+from chainshaper.values.errors import InputError
+from chainshaper.values.yaml_file import DEEPEST, compose
 
 __all__ = ["add_at_start", "add_remaps", "add_set_remaps", "keep_folder", "read", "replaced"]
 

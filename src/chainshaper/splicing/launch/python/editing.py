@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
-from chainshaper.errors import InputError
 from chainshaper.splicing.launch.actions import Edit, LaunchFile, Rules, Span
 from chainshaper.splicing.launch.python.offsets import Offsets
 from chainshaper.splicing.launch.python.reading import read_actions
 from chainshaper.splicing.shaping_process import RESPAWN, ShapingProcess
+from chainshaper.values.errors import InputError
 
 __all__ = [
     "add_at_start",

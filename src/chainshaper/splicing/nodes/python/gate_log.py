@@ -19,7 +19,7 @@ from contextlib import suppress
 
 from rclpy.node import Node
 
-from chainshaper.enforcement.gate import Held
+from chainshaper.gate.decision import Held
 from chainshaper.splicing.nodes.python.endpoints import parameter
 
 LOG_HEADER = (

@@ -17,7 +17,7 @@ from contextlib import suppress
 from rclpy.node import Node
 from std_msgs.msg import Empty
 
-from chainshaper.enforcement.kept_core import KeptCore
+from chainshaper.gate.clear_core import KeptCore
 
 __all__ = ["Readiness"]
 

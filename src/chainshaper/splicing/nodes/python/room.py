@@ -5,7 +5,7 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
-from chainshaper.enforcement.gate import READER_DEPTH, Gate
+from chainshaper.gate.decision import READER_DEPTH, Gate
 from chainshaper.splicing.nodes.python.endpoints import asked_of, offered_by, parameter
 
 __all__ = ["room_of"]

@@ -19,8 +19,8 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from rclpy.subscription import Subscription
 from std_msgs.msg import String
 
-from chainshaper.enforcement.gate import Gate, Modes, Release, Shaper
-from chainshaper.enforcement.handover import Turn
+from chainshaper.gate.decision import Gate, Modes, Release, Shaper
+from chainshaper.gate.handover import Turn
 from chainshaper.splicing.nodes.python.callback_events import create_subscription
 from chainshaper.splicing.nodes.python.endpoints import (
     message_class,

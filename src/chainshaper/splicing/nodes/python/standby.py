@@ -1,7 +1,7 @@
 """The standby: passes an output on while its shaping node is not there.
 
 It receives what the shaping node receives, and publishes it on the same output, byte for byte and
-at once, while no shaping node is in force (:mod:`chainshaper.enforcement.handover`). With the
+at once, while no shaping node is in force (:mod:`chainshaper.gate.handover`). With the
 fallback ``silence`` it publishes nothing, and counts what does not come. Either way it says so: in
 its log, with the columns of the gate's, by a warning, and on `/diagnostics` where the package
 diagnostic_msgs is installed.
@@ -23,8 +23,8 @@ import rclpy
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 
-from chainshaper.enforcement.gate import Held, Release, Waiting
-from chainshaper.enforcement.handover import Standby
+from chainshaper.gate.decision import Held, Release, Waiting
+from chainshaper.gate.handover import Standby
 from chainshaper.splicing.nodes.python.endpoints import (
     message_class,
     parameter,

@@ -22,7 +22,7 @@ from typing import Any
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
-from chainshaper.enforcement.gate import sleep_until
+from chainshaper.gate.decision import sleep_until
 from chainshaper.splicing.nodes.python.callback_events import create_subscription, create_timer
 from chainshaper.splicing.nodes.python.endpoints import (
     asked_of,

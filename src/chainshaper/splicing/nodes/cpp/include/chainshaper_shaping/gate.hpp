@@ -1,6 +1,6 @@
 // The gate: when may a message of the chain's output leave?
 //
-// The same decisions as chainshaper/enforcement/gate.py, which explains them: slots repeat every
+// The same decisions as chainshaper/gate/decision.py, which explains them: slots repeat every
 // cycle from an anchor, an early message waits for its slot, one that comes behind the last slot
 // it was due in is an overrun, and with modes each mode has its own slot. No ROS 2 here, no
 // clocks, no allocation per message. All times are nanoseconds.

@@ -1,5 +1,5 @@
 // The messages that wait at a gate, and which of them leave: the same as Queue in
-// chainshaper/enforcement/gate.py, which explains it. No ROS 2 here, and no clock.
+// chainshaper/gate/decision.py, which explains it. No ROS 2 here, and no clock.
 
 #ifndef CHAINSHAPER_SHAPING__QUEUE_HPP_
 #define CHAINSHAPER_SHAPING__QUEUE_HPP_

@@ -1,0 +1,133 @@
+"""The demonstration: the whole flow on a live application, everything kept in one folder.
+
+DIR/application.yaml   what ran
+DIR/before             the recording of the unshaped run
+DIR/plan.yaml          what was planned from it
+DIR/after              the recording of the shaped run
+DIR/latency.png        latency of every cycle, before and after
+DIR/distribution.png   their distributions, with the publish slot
+DIR/comparison.json    every figure of the printed table
+"""
+
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+
+import polars as pl
+
+from chainshaper.analysis import callback_statistics, data_flow
+from chainshaper.flow.steps import (
+    Comparison,
+    compare_recordings,
+    plan_recording,
+    shape_application,
+)
+from chainshaper.planning import Plan, PlanRequest, save_plan
+from chainshaper.reporting.comparison_files import write_comparison
+from chainshaper.values.errors import OperationError
+from chainshaper.values.recording import refuse_existing
+from chainshaper.workload.description import load_application
+from chainshaper.workload.live import Progress, run_application
+
+__all__ = ["DemoResult", "run_demo", "synthetic_chain"]
+
+_STANDARD = PlanRequest()
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What the demonstration found; all of it can be recomputed from ``folder``."""
+
+    folder: Path
+    callbacks: pl.DataFrame
+    plan: Plan
+    comparison: Comparison
+    notes: tuple[str, ...]
+
+
+def synthetic_chain() -> Path:
+    """The description of the paper's synthetic chain (section 2.5)."""
+    return Path(str(resources.files("chainshaper") / "examples" / "synthetic_chain.yaml"))
+
+
+def run_demo(
+    folder: str | Path,
+    *,
+    application: str | Path | None = None,
+    cycles: int = 320,
+    request: PlanRequest = _STANDARD,
+    realtime: bool | None = None,
+    command: Sequence[str] = (),
+    planned: Callable[[Plan], None] = lambda _: None,
+    progress: Progress = lambda *_: None,
+) -> DemoResult:
+    """Run an application, plan, shape, run again and compare.
+
+    ``planned`` gets the plan before it is used, to say what is doubtful about it.
+
+    Raises:
+        InputError: ``folder`` exists and is not empty, or the application is not right.
+        PlatformError, OperationError: a step failed; recordings that are complete are kept. If
+            there is none, nothing is left.
+    """
+    folder = refuse_existing(folder)
+    path = synthetic_chain() if application is None else Path(application)
+    description = load_application(path)
+    with _prepared(folder, path):
+        before = run_application(
+            description,
+            folder / "before",
+            cycles=cycles,
+            realtime=realtime,
+            command=command,
+            progress=_part(progress, 0.0, 0.48, "unshaped run"),
+        )
+    progress(0.48, "planning")
+    plan = plan_recording(before, request=request)
+    save_plan(plan, folder / "plan.yaml")
+    planned(plan)
+    after = shape_application(
+        description,
+        plan,
+        folder / "after",
+        cycles=cycles,
+        realtime=realtime,
+        command=command,
+        progress=_part(progress, 0.5, 0.48, "shaped run"),
+    )
+    progress(0.98, "comparing")
+    comparison = compare_recordings([before, after])
+    write_comparison(comparison, folder)
+    return DemoResult(
+        folder=folder,
+        callbacks=callback_statistics(data_flow(before.events, before.info.clock_offset_ns)),
+        plan=plan,
+        comparison=comparison,
+        notes=tuple(dict.fromkeys([*before.info.notes, *after.info.notes])),
+    )
+
+
+@contextmanager
+def _prepared(folder: Path, application: Path) -> Iterator[None]:
+    """The folder with the application in it; gone again when nothing comes to stand beside it."""
+    made = not folder.exists()
+    copy = folder / "application.yaml"
+    try:
+        folder.mkdir(exist_ok=True)
+        shutil.copyfile(application, copy)
+        yield
+    except OSError as error:
+        raise OperationError(f"{folder}: cannot be written: {error}") from error
+    finally:
+        if not (folder / "before").exists():
+            copy.unlink(missing_ok=True)
+            if made and folder.exists():
+                folder.rmdir()
+
+
+def _part(progress: Progress, start: float, share: float, title: str) -> Progress:
+    """Progress of one run as a part of the whole."""
+    return lambda done, what: progress(start + share * done, f"{title}, {what}")

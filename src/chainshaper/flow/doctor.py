@@ -1,0 +1,127 @@
+"""What this machine can do for latency shaping, and how badly it stalls.
+
+Each check names what was found and, where something is missing, the remedy. Nothing is changed.
+"""
+
+import importlib.metadata
+import os
+import platform
+import resource
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import polars as pl
+
+from chainshaper.enforcement.back_ends import offered_back_ends
+from chainshaper.linux.scheduling import available_cores, may_use_fifo, throttle_fraction
+from chainshaper.linux.threads import foreign_realtime_processes
+from chainshaper.values.recording import StallMeterInfo
+
+__all__ = ["Check", "MachineReport", "examine_machine"]
+
+State: TypeAlias = Literal["good", "limited", "absent"]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One ability: ``needed_for`` says what goes without it, ``remedy`` what would bring it."""
+
+    name: str
+    state: State
+    found: str
+    needed_for: str
+    remedy: str = ""
+
+
+@dataclass(frozen=True)
+class MachineReport:
+    """All checks, and the stalls seen while watching every core (`machine_stall` table)."""
+
+    checks: tuple[Check, ...]
+    stalls: pl.DataFrame
+    stall_meter: StallMeterInfo
+    watched_ns: int
+
+
+def examine_machine(watch_ns: int = 5_000_000_000) -> MachineReport:
+    """Examine this machine; the stalls take ``watch_ns``."""
+    from chainshaper.workload.stall_watch import measure_stalls
+
+    realtime = may_use_fifo()
+    stalls, meter = measure_stalls(available_cores(), watch_ns, realtime)
+    return MachineReport(tuple(_checks(realtime)), stalls, meter, watch_ns)
+
+
+def _checks(realtime: bool) -> Iterator[Check]:
+    cores, throttled = available_cores(), throttle_fraction()
+    lockable, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    others = foreign_realtime_processes()
+    text = f"{len(cores)} ({', '.join(map(str, cores))}), kernel {platform.release()}"
+    yield _check(
+        "cores",
+        "DDS threads beside executors",
+        text if len(cores) >= 2 else None,
+        ("limited", text, "use a machine with two cores or more"),
+    )
+    remedy = "run as root, or give your user an rtprio limit of 98 in /etc/security/limits.conf"
+    yield _check(
+        "SCHED_FIFO",
+        "measuring and shaping with real-time scheduling",
+        "permitted" if realtime else None,
+        ("absent", "not permitted", remedy),
+    )
+    found = f"real-time threads are stopped at {throttled:.0%} of a core"
+    yield _check(
+        "real-time throttling",
+        "cores that real-time threads fill",
+        "off" if throttled >= 1.0 else None,
+        ("limited", found, "stay below it, or: sysctl kernel.sched_rt_runtime_us=-1"),
+    )
+    remedy = "give your user an unlimited memlock limit in /etc/security/limits.conf"
+    yield _check(
+        "memory locking",
+        "no page faults while a gate waits",
+        "permitted" if os.geteuid() == 0 or lockable == resource.RLIM_INFINITY else None,
+        ("limited", f"up to {lockable // 1024} KiB", remedy),
+    )
+    remedy = "end them while you measure, unless they belong to the application"
+    yield _check(
+        "other real-time processes",
+        "undisturbed measurements",
+        None if others else "none",
+        ("limited", ", ".join(others), remedy),
+    )
+    yield _dds()
+    for offer in offered_back_ends():  # what `chainshaper apply` can use here, strongest first
+        found, _, remedy = (offer.missing or "").partition(": ")
+        good = "can be used" if offer.missing is None else None
+        yield _check(f"back end {offer.name}", offer.strength, good, ("absent", found, remedy))
+    for name, purpose, remedy in (
+        ("bpftrace", "recording ROS 2 without LTTng", "apt install bpftrace"),
+        ("lttng", "recording ROS 2 with LTTng", "apt install lttng-tools"),
+        ("ros2", "shaping ROS 2 applications", "install ROS 2, and source its setup.bash"),
+    ):
+        yield _check(name, purpose, shutil.which(name), ("absent", "not found", remedy))
+
+
+def _check(name: str, purpose: str, good: str | None, lacking: tuple[State, str, str]) -> Check:
+    """``good`` is what was found, None where it is ``lacking``: state, what was found, remedy."""
+    if good is not None:
+        return Check(name, "good", good, purpose)
+    state, found, remedy = lacking
+    return Check(name, state, found, purpose, remedy)
+
+
+def _dds() -> Check:
+    found: str | None = None
+    problem = ""
+    try:
+        found = importlib.metadata.version("cyclonedds")
+        from chainshaper.workload import dds  # noqa: F401 - loading it is the check
+    except Exception as error:
+        found, problem = None, str(error)
+    remedy = "use Python 3.10 to 3.13 on x86-64, for which a wheel exists"
+    purpose = "the live workload and `chainshaper demo`"
+    return _check("Cyclone DDS for Python", purpose, found, ("absent", problem, remedy))

@@ -1,0 +1,176 @@
+"""Looking into a recording or a trace: what is in it, which services, which chains.
+
+The functions behind `chainshaper info`, `graph`, `chains` and `convert`. All of them take whatever
+:func:`chainshaper.sources.open_source` opened.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import polars as pl
+
+from chainshaper.analysis import (
+    ChainEnumeration,
+    DataFlow,
+    callback_statistics,
+    data_flow,
+    enumerate_chains,
+    graph_of,
+    load_named_paths,
+)
+from chainshaper.analysis.close_names import close_names
+from chainshaper.analysis.matching import latest_before
+from chainshaper.analysis.objects import named_nodes
+from chainshaper.sources import open_source
+from chainshaper.sources.lttng.event_fields import table_name
+from chainshaper.values import events
+from chainshaper.values.application import ApplicationGraph
+from chainshaper.values.errors import InputError
+from chainshaper.values.recording import Recording, RecordingInfo, write_recording
+
+__all__ = [
+    "ApplicationDescription",
+    "convert_recording",
+    "describe_application",
+    "event_counts",
+    "list_chains",
+    "lost_events",
+    "lost_text",
+    "named_chain",
+    "services",
+    "with_trace_events",
+]
+
+
+def event_counts(recording: Recording) -> pl.DataFrame:
+    """How often each event happened: ``event, count``, ordered by event.
+
+    Names are the tracer's own, with the provider (``ros2:callback_start``), also of events that the
+    analysis makes no use of, and also in a recording that was converted from a trace; where we
+    recorded ourselves they are the names of the tables.
+    """
+    counts = getattr(recording.events, "counts", recording.info.trace_events)
+    if not counts:
+        counts = {name: frame.height for name, frame in recording.events.items()}
+    rows = sorted((name, count) for name, count in counts.items() if count)
+    return pl.DataFrame(rows, schema={"event": pl.String, "count": pl.Int64}, orient="row")
+
+
+def lost_events(info: RecordingInfo) -> str:
+    """What was lost while recording, in words for below a table; "nothing" is said as well."""
+    return lost_text(info.lost)
+
+
+def lost_text(lost: Mapping[str, int]) -> str:
+    """The same from the counts by reason."""
+    reasons = [f"{count} {what.replace('_', ' ')}" for what, count in lost.items() if count]
+    return f"lost while recording: {', '.join(reasons) or 'nothing'}"
+
+
+def services(tables: events.EventTables) -> pl.DataFrame:
+    """All services: ``service, role, node, pid``, one row per server and client."""
+    nodes = named_nodes(tables).rename({"handle": "node_handle", "valid_from": "created"})
+    found = []
+    for role, name in (("server", "rcl_service_init"), ("client", "rcl_client_init")):
+        ends = events.table(tables, name).select(
+            "time", "pid", "node_handle", service="service_name", role=pl.lit(role)
+        )
+        joined = latest_before(ends, nodes, ["pid", "node_handle"], "time", "created")
+        found.append(joined.select("service", "role", "node", "pid"))
+    return pl.concat(found).unique().sort("service", "role", "node", "pid")
+
+
+def list_chains(
+    source: Recording | DataFlow,
+    start: str | None = None,
+    end: str | None = None,
+    limit: int = 100,
+) -> ChainEnumeration:
+    """The computation chains of a recording, the heaviest by mean response times among them.
+
+    See :func:`~chainshaper.analysis.chains.enumerate_chains`.
+    """
+    if isinstance(source, Recording):
+        source = data_flow(source.events, source.info.clock_offset_ns)
+    statistics = callback_statistics(source).drop_nulls("response_ns")
+    mean = statistics["response_ns"].struct.field("mean")
+    weights = dict(zip(statistics["callback_id"], mean, strict=True))
+    return enumerate_chains(graph_of(source), start, end, limit, weights)
+
+
+def named_chain(file: str | Path, name: str | None = None) -> str:
+    """The chain that a CARET architecture file calls ``name``, as we write it.
+
+    Raises:
+        InputError: no such path in the file, or several and no ``name``.
+    """
+    paths = load_named_paths(file)
+    if name is None and len(paths) == 1:
+        return next(iter(paths.values()))
+    known = ", ".join(paths) or "none"
+    if name is None:
+        raise InputError(f"{file}: choose one of its named_paths with --chain: {known}")
+    if name not in paths:
+        close = close_names(name, paths)
+        hint = f"did you mean {' or '.join(close)}?" if close else f"its named_paths: {known}"
+        raise InputError(f"{file}: no path is named {name!r}; {hint}")
+    return paths[name]
+
+
+def convert_recording(recording: Recording | str | Path, output: str | Path) -> Recording:
+    """Write an open trace as a recording of ours: Parquet tables that are read in no time.
+
+    All events that the analysis knows are kept, so every figure stays the same to the nanosecond;
+    a note names the others.
+
+    Raises:
+        InputError: ``output`` exists already.
+    """
+    if not isinstance(recording, Recording):
+        recording = open_source(recording)
+    if not len(recording.events):
+        raise InputError(f"{recording.path}: no event in it is one that chainshaper knows")
+    return write_recording(output, recording.events, with_trace_events(recording))
+
+
+def with_trace_events(recording: Recording) -> RecordingInfo:
+    """A trace's description with the events it had, and a note about those that are not kept."""
+    info = recording.info
+    if info.source != "lttng" or info.trace_events:
+        return info
+    counts = dict(event_counts(recording).iter_rows())
+    left = [name for name in counts if table_name(name) not in recording.events]
+    notes = info.notes
+    if left:
+        count = sum(counts[name] for name in left)
+        notes += (f"{count} events of kinds that chainshaper makes no use of were not kept: "
+                  f"{', '.join(left)}.",)  # fmt: skip
+    return info.model_copy(update={"trace_events": counts, "notes": notes})
+
+
+@dataclass(frozen=True)
+class ApplicationDescription:
+    """Everything that a picture of an application shows.
+
+    ``services`` is the frame of :func:`services`; ``lost`` and ``notes`` are what a reader must
+    know about how complete it is.
+    """
+
+    graph: ApplicationGraph
+    services: pl.DataFrame
+    lost: dict[str, int]
+    notes: tuple[str, ...]
+
+
+def describe_application(recording: Recording | str | Path) -> ApplicationDescription:
+    """The application that a recording or trace shows: its graph and its services."""
+    if not isinstance(recording, Recording):
+        recording = open_source(recording)
+    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    return ApplicationDescription(
+        graph=graph_of(flow),
+        services=services(recording.events),
+        lost=recording.info.lost,
+        notes=(*recording.info.notes, *flow.notes),
+    )

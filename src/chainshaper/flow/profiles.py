@@ -1,0 +1,341 @@
+"""What the planner needs of a recorded chain: latencies, callbacks, cores, conditions.
+
+A chain in a graph waits at synchronising callbacks for branches that are not part of it (paper,
+section 2.3). Whoever plans slots for its callbacks has to plan for those branches too, so they
+are followed backwards here, from every input of a synchronising callback to what starts it, or to
+the node with which the chain begins: what feeds a subscription there is not planned for.
+"""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+
+from chainshaper.analysis import DataFlow, LatencyAnalysis
+from chainshaper.analysis.disturbance import overlapping
+from chainshaper.analysis.graph import goes_on_elsewhere
+from chainshaper.planning import CallbackTimes, Profile
+from chainshaper.values import events
+from chainshaper.values.application import ApplicationGraph, Callback, Chain
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.recording import Recording
+
+__all__ = ["profile_of"]
+
+DEFAULT_CORE = 1
+DEFAULT_PRIORITY = 80
+
+
+def profile_of(
+    recording: Recording,
+    flow: DataFlow,
+    analysis: LatencyAnalysis,
+    *,
+    period_ns: int | None = None,
+    longest_stall_ns: int | None = None,
+) -> Profile:
+    """The profile of one analysed chain.
+
+    L̄ and all other times but ``every_latency_ns`` are over cycles that the machine did not disturb:
+    a stall of the machine is not part of the chain's latency, but its output is late nevertheless.
+    ``period_ns`` is for chains that no timer starts.
+
+    Raises:
+        InputError: the chain's period is not known, or known and given as well.
+        OperationError: fewer than two complete undisturbed traversals.
+    """
+    every = analysis.traversals.filter("complete")
+    complete = every.filter(~pl.col("disturbed"))
+    if complete.height < 2:
+        raise OperationError(
+            f"{recording.path}: of {analysis.traversals.height} traversals of {analysis.chain.spec}"
+            f" {complete.height or 'none'} is complete and undisturbed by the machine"
+            f" ({analysis.statistics.incomplete} incomplete, {analysis.statistics.disturbed}"
+            " disturbed), too few to plan from: see `chainshaper latency`, and record again, longer"
+            " or on a calmer machine"
+        )
+    graph, chain = analysis.graph, analysis.chain
+    period = _period(analysis, period_ns)
+    stages = _stages(graph, chain)
+    cores, priority = _executors(recording, graph)
+    nodes = dict.fromkeys(stage.node for stage in stages)
+    core_of = {node: cores.get(node, DEFAULT_CORE) for node in nodes}
+    calm = _undisturbed_instances(flow, analysis.traversals)
+    return Profile(
+        latencies_ns=complete["latency_ns"].to_numpy().astype(np.int64),
+        every_latency_ns=every["latency_ns"].to_numpy().astype(np.int64),
+        period_ns=period,
+        spec=chain.spec,
+        nodes=tuple(graph.callbacks[number].node for number in chain.callbacks),
+        topics=chain.topics,
+        begins=(chain.callbacks[0], graph.callbacks[chain.callbacks[0]].label),
+        upstream=_upstream(graph, chain, stages),
+        core_of=core_of,
+        receivers=_receivers(graph, chain, nodes),
+        callbacks=tuple(_times(flow, calm, stage, core_of[stage.node]) for stage in stages),
+        fifo_priority=min(97, priority.get(stages[-1].node, DEFAULT_PRIORITY) + 5),
+        recording=str(recording.path),
+        incomplete=analysis.statistics.incomplete,
+        disturbed=analysis.statistics.disturbed,
+        realtime=recording.info.realtime,
+        longest_stall_ns=longest_stall_ns,
+        utilisation=_utilisation(flow, graph, core_of),
+        longest_send_ns=_longest_send(flow),
+        lost_events=sum(recording.info.lost.values()) or None,
+        output_depth=_output_depth(flow, stages[-1].node, chain.topics[-1]),
+    )
+
+
+def _period(analysis: LatencyAnalysis, given: int | None) -> int:
+    first = analysis.graph.callbacks[analysis.chain.callbacks[0]]
+    if first.period_ns is not None:
+        if given not in (None, first.period_ns):
+            raise InputError(
+                "--period goes with --latencies, or with a chain that no timer starts:"
+                f" {first.label} has its own period, leave it out"
+            )
+        return first.period_ns
+    if given is not None:
+        return given
+    starts = analysis.traversals["start"].unique().sort().to_numpy()
+    seen = f" (starts are {format_duration(int(np.median(np.diff(starts))))} apart, mostly)"
+    raise InputError(
+        f"chain {analysis.chain.spec} starts at {first.label}, which is no timer, so its period is"
+        f" not known{seen if len(starts) > 1 else ''}: add --period, or begin the chain at the"
+        " timer callback that starts it"
+    )
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """One step of the graph: a callback, or the inputs of a synchronising one, as one.
+
+    ``after`` are the places of the stages that it waits for.
+    """
+
+    node: str
+    topic: str
+    members: tuple[int, ...]
+    after: tuple[int, ...]
+
+
+_Key = tuple[tuple[int, ...], str]
+"""A stage while it is looked for: its callbacks, and the topic it publishes."""
+
+
+def _stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
+    """The chain and the branches it waits for, along the graph; the chain's last stands last."""
+    outside = _feeding(graph, chain)
+    planned = [callback for callback in graph.callbacks if callback.node not in outside]
+    needs: dict[_Key, set[_Key]] = {}
+    of_chain: dict[int, _Key] = {}
+
+    def writers_of(number: int, above: set[_Key]) -> set[_Key]:
+        """The stages that publish what a callback reads; new ones are added to ``needs``."""
+        topic, found = graph.callbacks[number].topic, set()
+        for writer in planned:
+            if topic is None or topic not in writer.publishes:
+                continue
+            key = of_chain.get(writer.id) or (_inputs(graph, writer, topic), topic)
+            if key in above:  # a loop in the graph: what feeds back comes from a cycle before
+                continue
+            found.add(key)
+            if key not in needs:
+                needs[key] = set()
+                for member in key[0]:
+                    needs[key] |= writers_of(member, above | {key})
+        return found
+
+    previous: _Key | None = None
+    for place, (number, topic) in enumerate(zip(chain.callbacks, chain.topics, strict=True)):
+        key = (_inputs(graph, graph.callbacks[number], topic) if place else (number,), topic)
+        needs[key] = set() if previous is None else {previous}
+        of_chain.update(dict.fromkeys(key[0], key))
+        previous = key
+    along = list(needs)
+    for place, key in enumerate(along):
+        for number in key[0]:
+            if number not in chain.callbacks:
+                # What comes from further down the chain feeds back, from a cycle before.
+                needs[key] |= writers_of(number, {*along[place:]})
+    level: dict[_Key, int] = {}
+    for key in needs:
+        _level(key, needs, level)
+    in_chain = set(of_chain.values())
+    order = sorted(needs, key=lambda key: (level[key], key not in in_chain))
+    return [
+        _Stage(
+            node=graph.callbacks[members[0]].node,
+            topic=topic,
+            members=members,
+            after=tuple(sorted(order.index(before) for before in needs[members, topic])),
+        )
+        for members, topic in order
+    ]
+
+
+def _upstream(graph: ApplicationGraph, chain: Chain, stages: list[_Stage]) -> frozenset[str]:
+    """The topics that the chain's output waits for, those before its first callback included."""
+    found = {stage.topic for stage in stages}
+    first = graph.callbacks[chain.callbacks[0]].topic
+    ahead = set() if first is None else {first}
+    while ahead:
+        found |= ahead
+        writers = [
+            (callback, topic)
+            for callback in graph.callbacks
+            for topic in ahead.intersection(callback.publishes)
+        ]
+        inputs = [number for one, topic in writers for number in _inputs(graph, one, topic)]
+        read = {graph.callbacks[number].topic for number in inputs}
+        ahead = {topic for topic in read if topic is not None} - found
+    return frozenset(found - {chain.topics[-1]})
+
+
+def _feeding(graph: ApplicationGraph, chain: Chain) -> set[str]:
+    """All nodes that feed the node with which a chain begins, if it begins with a subscription."""
+    first = graph.callbacks[chain.callbacks[0]]
+    own = {graph.callbacks[number].node for number in chain.callbacks}
+    found: set[str] = set()
+    fed = set() if first.topic is None else {first.node}
+    while fed:
+        topics = {callback.topic for callback in graph.callbacks if callback.node in fed}
+        fed = {writer.node for writer in graph.callbacks if topics.intersection(writer.publishes)}
+        fed -= found | own
+        found |= fed
+    return found
+
+
+def _inputs(graph: ApplicationGraph, callback: Callback, topic: str) -> tuple[int, ...]:
+    """The callback and, where it is an input of a synchronising one, the other inputs."""
+    if not goes_on_elsewhere(graph, callback, topic):
+        return (callback.id,)
+    return tuple(
+        other.id
+        for other in graph.callbacks
+        if (other.pid, other.node) == (callback.pid, callback.node) and topic in other.publishes
+    )
+
+
+def _level(key: _Key, needs: dict[_Key, set[_Key]], level: dict[_Key, int]) -> int:
+    if key not in level:
+        level[key] = 0  # ends a loop
+        level[key] = 1 + max((_level(before, needs, level) for before in needs[key]), default=-1)
+    return level[key]
+
+
+def _times(flow: DataFlow, calm: pl.DataFrame, stage: _Stage, core: int) -> CallbackTimes:
+    """Response times of a stage: those of the instances that publish.
+
+    At a synchronising callback the other inputs' instances come before, in the same slot.
+    """
+    published = flow.publications.filter(pl.col("topic") == stage.topic)["instance"].drop_nulls()
+    own = calm.filter(pl.col("callback_id").is_in(stage.members))
+    publishing = own.filter(pl.col("instance").is_in(published.implode()))
+    chosen = publishing if publishing.height else own
+    if not chosen.height:
+        raise OperationError(
+            f"no execution of {stage.node} that publishes {stage.topic} was recorded undisturbed:"
+            " record again"
+        )
+    response = chosen["response"]
+    waiting = 0
+    if len(stage.members) > 1:
+        others = own.filter(~pl.col("instance").is_in(published.implode()))
+        waiting = sum(others.group_by("callback_id").agg(pl.col("response").max())["response"])
+    return CallbackTimes(
+        node=stage.node,
+        core=core,
+        min_response_ns=int(response.min()),  # type: ignore[arg-type]
+        mean_response_ns=round(float(response.mean())),  # type: ignore[arg-type]
+        max_response_ns=int(response.max()) + waiting,  # type: ignore[arg-type]
+        after=stage.after,
+    )
+
+
+def _undisturbed_instances(flow: DataFlow, traversals: pl.DataFrame) -> pl.DataFrame:
+    """Finished instances, with their response time, that began in no disturbed traversal."""
+    seen = flow.instances.filter(pl.col("end").is_not_null() & ~pl.col("assumed"))
+    disturbed = traversals.filter(pl.col("disturbed") & pl.col("complete"))
+    began = seen["start"].to_numpy()
+    # An instance that begins just as a traversal ends is hit by it as well.
+    hit = overlapping(began, began, disturbed["start"].to_numpy(), disturbed["end"].to_numpy() + 1)
+    return seen.filter(~pl.Series(hit)).select(
+        "instance", "callback_id", response=pl.col("end") - pl.col("start")
+    )
+
+
+def _receivers(graph: ApplicationGraph, chain: Chain, nodes: Collection[str]) -> tuple[str, ...]:
+    """Who subscribes to the chain's output, and has no part in the chain.
+
+    Nodes with a hidden name are tools such as `ros2 topic echo`, which come and go.
+    """
+    return tuple(
+        node
+        for node in graph.subscribers.get(chain.topics[-1], ())
+        if node not in nodes and not node.rpartition("/")[2].startswith("_")
+    )
+
+
+def _executors(
+    recording: Recording, graph: ApplicationGraph
+) -> tuple[dict[str, int], dict[str, int]]:
+    """Core and SCHED_FIFO priority of every node's executor, where the recording knows them."""
+    by_pid = {thread.pid: thread for thread in recording.info.threads if thread.role == "executor"}
+    found = {node.name: by_pid[node.pid] for node in graph.nodes if node.pid in by_pid}
+    return (
+        {name: thread.cores[0] for name, thread in found.items() if len(thread.cores) == 1},
+        {name: thread.priority for name, thread in found.items() if thread.priority},
+    )
+
+
+def _longest_send(flow: DataFlow) -> int | None:
+    """How long asynchronous publishers were busy sending one message, at most (ns).
+
+    Without sends that a stall of the machine fell into: it says nothing about sending.
+    """
+    sends = events.table(flow.events, "asynchronous_send").filter(pl.col("outcome") == "sent")
+    if not sends.height:
+        return None
+    stalls = events.table(flow.events, "machine_stall")
+    began = sends["time"].to_numpy()
+    stalled = overlapping(
+        began,
+        began + sends["duration"].to_numpy(),
+        stalls["time"].to_numpy(),
+        (stalls["time"] + stalls["duration"]).to_numpy(),
+    )
+    calm = sends.filter(~pl.Series(stalled))
+    return int((calm if calm.height else sends)["duration"].max())  # type: ignore[arg-type]
+
+
+def _output_depth(flow: DataFlow, node: str, topic: str) -> int | None:
+    """The history (keep last) of the writer of the chain's output."""
+    writers = flow.objects.publishers.filter((pl.col("node") == node) & (pl.col("topic") == topic))
+    depths = (
+        events.table(flow.events, "rcl_publisher_init", ["queue_depth"])
+        .join(writers.select("pid", publisher_handle="handle"), on=["pid", "publisher_handle"])
+        .filter(pl.col("queue_depth") > 0)["queue_depth"]
+    )
+    return int(depths.min()) if depths.len() else None  # type: ignore[arg-type]
+
+
+def _utilisation(flow: DataFlow, graph: ApplicationGraph, core_of: dict[str, int]) -> float | None:
+    """The largest share of a core that the executors of the chain's nodes take."""
+    core = {
+        callback.id: core_of[callback.node]
+        for callback in graph.callbacks
+        if callback.node in core_of
+    }
+    ran = flow.instances.filter(
+        pl.col("callback_id").is_in(list(core)) & pl.col("execution_ns").is_not_null()
+    )
+    if not ran.height:
+        return None
+    lasted = int(ran["end"].max()) - int(ran["start"].min())  # type: ignore[arg-type]
+    busy = ran.group_by(pl.col("callback_id").replace_strict(core)).agg(
+        pl.col("execution_ns").sum()
+    )
+    return float(busy["execution_ns"].max()) / max(1, lasted)  # type: ignore[arg-type]

@@ -1,0 +1,1 @@
+"""What the kernel shows and takes: processes, threads, scheduling, cgroups."""

@@ -1,0 +1,308 @@
+"""Control groups of version 2, as far as stopping single threads needs them.
+
+Writing ``1`` to a group's ``cgroup.freeze`` stops every thread in it on its way back to user
+space, and ``0`` lets them go on: no signal is delivered, and futexes, condition variables, sleeps
+and polls do not notice. A group holds whole processes by default. A **threaded** group may hold
+some threads of a process while the others stay where they are, on one condition: all groups that
+share a process lie in one *threaded domain* (kernel: Documentation/admin-guide/cgroup-v2.rst,
+"Threads"). So a thread's new group is made directly beneath the group in which the thread is
+now, which has two more merits: the thread keeps every limit that its group puts on it, and the
+way back is always the same, up to the parent. Until the child is removed the parent's type reads
+``domain threaded``; the kernel itself makes it ``domain`` again.
+"""
+
+import contextlib
+import ctypes
+import errno
+import os
+import time
+from pathlib import Path
+
+from chainshaper.values.errors import OperationError, PlatformError
+
+__all__ = [
+    "QUICK_MOVES",
+    "cgroup_of",
+    "dissolve",
+    "enter_own_group",
+    "has_unseen_threads",
+    "leave_own_group",
+    "make_threaded_child",
+    "mount_options",
+    "mount_point",
+    "move_thread",
+    "moves_are_quick",
+    "remount",
+    "remove_own_group",
+    "threads_in",
+]
+
+MOUNTS = Path("/proc/mounts")
+QUICK_MOVES = "favordynmods"
+"""A mount option since Linux 6.0 (Documentation/admin-guide/cgroup-v2.rst, "Mounting").
+
+Without it whoever moves a process to another group (a service manager, a container engine) waits
+for a grace period of RCU, which is 10 to 30 ms, and holds meanwhile what freezing needs as well:
+a slot opens so much later. Forks and exits become a little slower with it.
+"""
+_REMOUNT = 32
+_MOUNT_FLAGS = {
+    "rw": 0,
+    "ro": 1,
+    "nosuid": 2,
+    "nodev": 4,
+    "noexec": 8,
+    "noatime": 1 << 10,
+    "nodiratime": 1 << 11,
+    "relatime": 1 << 21,
+}
+"""Of mount(2); an option that is none of them is the file system's own."""
+_ATTEMPTS = 3
+_THREADED_CONTROLLERS = {"cpu", "cpuset", "perf_event", "pids"}
+_REMEDY = (
+    "run as root, or start the application in a group that is yours "
+    "(`systemd-run --user --scope`, or a unit with Delegate=yes)"
+)
+
+
+def mount_point() -> Path:
+    """Where the version 2 hierarchy is mounted.
+
+    Raises:
+        PlatformError: it is not.
+    """
+    return _mount()[0]
+
+
+def mount_options() -> str:
+    """How the version 2 hierarchy is mounted: ``rw,nosuid,nodev,noexec,relatime,nsdelegate``.
+
+    Raises:
+        PlatformError: it is not.
+    """
+    return _mount()[1]
+
+
+def moves_are_quick() -> bool:
+    """Whether the hierarchy is mounted with :data:`QUICK_MOVES`."""
+    return QUICK_MOVES in mount_options().split(",")
+
+
+def remount(options: str) -> None:
+    """Have the hierarchy mounted with these options, if the kernel knows and permits them.
+
+    By a call of the kernel, since `mount` would go on when we are killed meanwhile.
+    """
+    names = options.split(",")
+    flags = _REMOUNT | sum(_MOUNT_FLAGS.get(name, 0) for name in names)
+    own = ",".join(name for name in names if name not in _MOUNT_FLAGS)
+    folder = os.fsencode(mount_point())
+    ctypes.CDLL(None).mount(b"none", folder, b"cgroup2", ctypes.c_ulong(flags), own.encode())
+
+
+def _mount() -> tuple[Path, str]:
+    # Beside version 1 hierarchies it usually stands at /sys/fs/cgroup/unified.
+    for line in MOUNTS.read_text().splitlines():
+        _, folder, kind, options, *_ = line.split()
+        if kind == "cgroup2":
+            return Path(folder.encode().decode("unicode_escape")), options
+    raise PlatformError(
+        "no cgroup v2 hierarchy is mounted here, so threads cannot be frozen: "
+        "`mount -t cgroup2 none /sys/fs/cgroup/unified`, or boot with "
+        "systemd.unified_cgroup_hierarchy=1"
+    )
+
+
+def cgroup_of(tid: int) -> Path:
+    """The folder of the group in which a thread is.
+
+    Raises:
+        OperationError: there is no such thread.
+        PlatformError: its group cannot be seen from here.
+    """
+    try:
+        lines = Path(f"/proc/{tid}/cgroup").read_text().splitlines()
+    except OSError:
+        raise OperationError(f"there is no thread {tid}: it has ended, or never was") from None
+    path = next((line[len("0::") :] for line in lines if line.startswith("0::")), "")
+    root = mount_point()
+    folder = root / path.lstrip("/")
+    # A thread outside our cgroup namespace shows as "/../…", or as a path that is not here.
+    if not path or ".." in folder.parts or not folder.is_dir():
+        raise PlatformError(
+            f"thread {tid} is in the cgroup {path or '(none)'}, which is not to be seen under "
+            f"{root}: run on the host, or in the thread's own container"
+        )
+    return folder
+
+
+def make_threaded_child(parent: Path, name: str) -> Path:
+    """Make an empty threaded group directly beneath the group of the threads it is for.
+
+    Raises:
+        OperationError: the name is taken.
+        PlatformError: the machine or the privileges do not allow it; nothing is left behind.
+    """
+    folder = parent / name
+    try:
+        folder.mkdir()
+    except FileExistsError:
+        raise OperationError(
+            f"the cgroup {folder} exists already, left by a run that ended badly: "
+            "`chainshaper release` removes it"
+        ) from None
+    except OSError as error:
+        reason = os.strerror(error.errno or 0)
+        raise PlatformError(f"no cgroup can be made in {parent} ({reason}): {_REMEDY}") from error
+    try:
+        (folder / "cgroup.type").write_text("threaded")
+    except OSError as error:
+        folder.rmdir()
+        raise PlatformError(_why_not_threaded(parent, error)) from error
+    return folder
+
+
+def _why_not_threaded(parent: Path, error: OSError) -> str:
+    """What stands in the way of threaded groups: the kernel only says EOPNOTSUPP."""
+    told = f"threads of the cgroup {parent} cannot be frozen one by one"
+    controllers = set(_read(parent / "cgroup.subtree_control").split()) - _THREADED_CONTROLLERS
+    if controllers:
+        names = ", ".join(sorted(controllers))
+        return (
+            f"{told}: it hands the controllers {names} down to its children, which rules threaded "
+            f"groups out; run the application in a group that does not (its own scope or unit)"
+        )
+    for child in sorted(parent.iterdir()):
+        kind = _read(child / "cgroup.type").strip()
+        if kind == "domain" and "populated 1" in _read(child / "cgroup.events"):
+            return (
+                f"{told}: its child {child.name} holds processes of its own; run the application "
+                f"in a group without others beneath it (its own scope or unit)"
+            )
+    return f"{told} ({os.strerror(error.errno or 0)}): {_REMEDY}"
+
+
+def move_thread(tid: int, folder: Path) -> bool:
+    """Put one thread into a group; False when the thread has ended.
+
+    Raises:
+        PlatformError: the group is of another process, or the privilege is missing.
+        OperationError: the group is gone, or the kernel refuses for a reason of its own.
+    """
+    try:
+        (folder / "cgroup.threads").write_text(str(tid))
+    except OSError as error:
+        if error.errno == errno.ESRCH:
+            return False
+        reason = os.strerror(error.errno or 0)
+        if error.errno in {errno.EACCES, errno.EPERM, errno.EROFS}:
+            raise PlatformError(
+                f"thread {tid} cannot be moved to {folder} ({reason}): {_REMEDY}"
+            ) from error
+        raise OperationError(
+            f"thread {tid} cannot be moved to the cgroup {folder} ({reason}): is it a thread of "
+            "the kernel, or has its process been moved to another group meanwhile?"
+        ) from error
+    return True
+
+
+def threads_in(folder: Path) -> tuple[int, ...]:
+    """The living threads of a group; none when the group is gone.
+
+    Those that cannot be seen from our process namespace (0 for the kernel) are not among them.
+    """
+    return tuple(int(tid) for tid in _read(folder / "cgroup.threads").split() if tid != "0")
+
+
+def has_unseen_threads(folder: Path) -> bool:
+    """Whether there are some that cannot be seen from our process namespace."""
+    return "0" in _read(folder / "cgroup.threads").split()
+
+
+def dissolve(folder: Path, within_s: float = 1.0) -> str | None:
+    """Thaw a group, put its threads back into the parent, remove it; harmless when repeated.
+
+    Returns None, or what is left in a sentence: this is called where nothing must be raised,
+    since the next group waits for its turn.
+    """
+    with contextlib.suppress(OSError):
+        (folder / "cgroup.freeze").write_text("0")
+    deadline = time.monotonic() + within_s
+    reason = ""
+    while folder.is_dir():
+        # Children may be born while their parents are being moved, and a process that is being
+        # killed holds its group for a moment longer: once is not always enough.
+        for tid in threads_in(folder):
+            try:
+                # Moving to a group that is not frozen thaws, whatever became of cgroup.freeze.
+                move_thread(tid, folder.parent)
+            except (OperationError, PlatformError) as error:
+                reason = str(error)
+        try:
+            folder.rmdir()
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            reason = reason or os.strerror(error.errno or 0)
+            if time.monotonic() > deadline:
+                return f"the cgroup {folder} is left behind: {reason}"
+            time.sleep(0.001)
+    return None
+
+
+def enter_own_group(name: str) -> bool:
+    """Put this process into a group of that name, out of reach of what befalls its present one.
+
+    That is directly beneath the root of the hierarchy, or as near to it as we may; not beneath a
+    group with processes, which could have no threaded children then. False where it has to stay
+    where it is, as in a container: what ends the container ends it, too.
+    """
+    for folder in _own_groups(name):
+        for _ in range(_ATTEMPTS):  # the last to leave may just be removing it
+            try:
+                folder.mkdir(exist_ok=True)
+                (folder / "cgroup.procs").write_text(str(os.getpid()))
+                return True
+            except FileNotFoundError:
+                continue
+            except OSError:
+                break
+    return False
+
+
+def leave_own_group(name: str) -> None:
+    """Go back to the group above, and remove ours if it is empty then."""
+    with contextlib.suppress(OSError, OperationError, PlatformError):
+        folder = cgroup_of(os.getpid())
+        if folder.name == name:
+            (folder.parent / "cgroup.procs").write_text(str(os.getpid()))
+            folder.rmdir()
+
+
+def remove_own_group(name: str) -> None:
+    """Remove the group of that name, unless other processes are in it."""
+    for folder in _own_groups(name):
+        with contextlib.suppress(OSError):
+            folder.rmdir()
+
+
+def _own_groups(name: str) -> list[Path]:
+    """Where a group of ours may be that is not in reach of our present one, the best first."""
+    try:
+        root, own = mount_point(), cgroup_of(os.getpid())
+    except (OperationError, PlatformError):
+        return []
+    above = [folder for folder in (own, *own.parents) if folder.is_relative_to(root)]
+    return [
+        folder / name
+        for folder in reversed(above)
+        if not (folder / "cgroup.type").exists()  # the machine's own root, where all is allowed
+        or (folder != own and not _read(folder / "cgroup.procs").strip())
+    ]
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text()
+    except OSError:  # gone, or a file that this kind of group does not have
+        return ""

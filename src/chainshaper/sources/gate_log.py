@@ -1,0 +1,132 @@
+"""The log of a shaping node as a table: what it did with each message.
+
+A node in ROS 2 is not recorded like one of the live workload, so it notes its decisions itself:
+lines of comma-separated values with the columns of the event ``gate_release``
+(:mod:`chainshaper.values.events`), to which this turns them.
+"""
+
+import contextlib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import polars as pl
+
+from chainshaper.gate.decision import STALL_NS
+from chainshaper.values import events
+from chainshaper.values.errors import InputError
+
+__all__ = ["read_gate_log", "releases_so_far", "rows_missing", "with_gate_logs"]
+
+_LATER = ("dropped", "lost", "row")
+"""Columns that logs have since messages may wait at a gate."""
+
+
+def read_gate_log(path: str | Path) -> pl.DataFrame:
+    """The event table ``gate_release`` of a shaping node's log, sorted by time.
+
+    The file before it, ``….1``, is a part of it. ``callback`` is null: a node does not know its
+    callback's handle. A last line that is not whole, as of a node before there was a writer of its
+    own, is left out.
+
+    Raises:
+        InputError: no such file, or it is no shaping node's log.
+    """
+    path = Path(path)
+    before = path.with_name(f"{path.name}.1")
+    parts = [before, path] if path.exists() or not before.exists() else [before]
+    tables = [_read_part(part) for part in parts if part is path or part.exists()]
+    return pl.concat(tables).sort("time", maintain_order=True)
+
+
+def _read_part(path: Path) -> pl.DataFrame:
+    types = {
+        **events.COMMON_COLUMNS,
+        **events.FIELDS["gate_release"],
+        **events.OPTIONAL_FIELDS["gate_release"],
+    }
+    try:
+        text = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    whole = text[: text.rfind(b"\n") + 1]
+    names = whole.split(b"\n", 1)[0].decode(errors="replace").split(",")
+    if types.keys() - {"callback", *_LATER} - set(names) or set(names) - types.keys():
+        raise InputError(
+            f"{path}:1: this is not the log of a shaping node, which begins with the names of its "
+            "columns: name the file that the parameter `log` of the node names"
+        )
+    try:
+        table = pl.read_csv(whole, schema={name: types[name] for name in names})
+    except pl.exceptions.PolarsError as error:
+        raise InputError(f"{path}: a line is not as a shaping node writes it: {error}") from error
+    unknown = [pl.lit(None, dtype=types[n]).alias(n) for n in types.keys() - set(names)]
+    return table.with_columns(unknown).select(*types)
+
+
+def rows_missing(releases: pl.DataFrame) -> tuple[int, int]:
+    """How many rows of logs are in no file: removed to make room, and never written.
+
+    Rows are numbered from 1 since a node started; logs of before are taken to be whole.
+    """
+    removed = unwritten = 0
+    numbered = releases.drop_nulls("row")
+    spans = numbered.group_by("pid").agg(first=pl.min("row"), last=pl.max("row"), there=pl.len())
+    for _, first, last, there in spans.iter_rows():
+        removed += first - 1
+        unwritten += last - first + 1 - there
+    return removed, unwritten
+
+
+def releases_so_far(logs: Iterable[Path]) -> npt.NDArray[np.int64]:
+    """The latest planned releases (ns) of shaping nodes that are at work, at most 100 of each."""
+    found = [np.empty(0, dtype=np.int64)]
+    for log in logs:
+        with contextlib.suppress(InputError):  # not there yet, or nothing is in it
+            releases = read_gate_log(log).filter(pl.col("slot").is_not_null())
+            found.append(releases["release"].drop_nulls().tail(100).to_numpy())
+    return np.concatenate(found)
+
+
+def with_gate_logs(
+    tables: events.EventTables, logs: Sequence[Path], since_ns: int, until_ns: int
+) -> tuple[events.EventTables, tuple[str, ...]]:
+    """Event tables with `gate_release` from the logs of shaping nodes, and which are not there.
+
+    A node writes its log for as long as it runs. Of that, the cycles count that began at
+    ``since_ns`` or later, and whose message was let go before ``until_ns``: those are in the other
+    tables too (both CLOCK_MONOTONIC).
+
+    Raises:
+        InputError: a file is no shaping node's log.
+    """
+    there = [log for log in logs if log.is_file()]
+    missing = tuple(
+        f"the shaping node's log {log} is not there: it has let nothing through, or did not start."
+        for log in logs
+        if log not in there
+    )
+    if not there:
+        return tables, missing
+    releases = pl.concat([read_gate_log(log) for log in there]).sort("time", maintain_order=True)
+    removed, unwritten = rows_missing(releases)
+    if removed:
+        missing += (
+            f"{removed} rows of shaping nodes' logs were removed to make room for newer ones.",
+        )
+    if unwritten:
+        missing += (
+            f"{unwritten} rows of shaping nodes' logs could not be written: what became of those "
+            "messages is not known. See to room on the disk.",
+        )
+    releases = releases.filter(pl.col("origin") >= since_ns, pl.col("time") < until_ns)
+    stalls = pl.concat([events.table(tables, "machine_stall"), _stalls(releases)], how="diagonal")
+    stalls = stalls.sort("time", maintain_order=True)
+    return {**tables, "gate_release": releases, "machine_stall": stalls}, missing
+
+
+def _stalls(releases: pl.DataFrame) -> pl.DataFrame:
+    """The rows of `machine_stall` that gates saw: each watches the clock at its releases."""
+    seen = releases.filter(pl.col("stalled") >= STALL_NS)
+    return seen.select("pid", "tid", "cpu", time="release", duration="stalled")

@@ -1,0 +1,1 @@
+"""What every room may know: errors, durations, files, the application, events, recordings."""

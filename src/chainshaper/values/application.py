@@ -1,0 +1,88 @@
+"""What an application is: nodes, callbacks, topics and chains (paper, sections 2.1 and 2.3).
+
+These are values found in a recording or read from a description; they hold no behaviour of the
+running system. A callback is a vertex of the paper's graph G; it is connected to another when
+it publishes a topic that the other subscribes to.
+"""
+
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+from chainshaper.values.durations import format_duration
+
+__all__ = ["ApplicationGraph", "Callback", "CallbackKind", "Chain", "Node"]
+
+CallbackKind: TypeAlias = Literal["timer", "subscription", "service", "client", "unknown"]
+"""``unknown``: it was seen to run, but not to be created (tracing started after it), or only its
+publications were seen (``handle`` 0: a thread of the node's own)."""
+
+
+@dataclass(frozen=True)
+class Node:
+    """A ROS 2 node: a name in a process. ``name`` includes the namespace (``/front/filter``)."""
+
+    name: str
+    pid: int
+
+
+@dataclass(frozen=True)
+class Callback:
+    """One callback of one node.
+
+    ``id`` numbers the callbacks of one graph from 0 and is the key that analysis tables use;
+    ``handle`` is its address in the traced process, which other processes may use as well.
+    """
+
+    id: int
+    kind: CallbackKind
+    node: str
+    pid: int
+    handle: int
+    topic: str | None = None  # subscribed topic, or the service's name
+    period_ns: int | None = None  # timers only
+    symbol: str | None = None  # the registered function, demangled where possible
+    publishes: tuple[str, ...] = ()  # topics written by its instances (and, synchronised, for it)
+    passes_on: tuple[str, ...] = ()  # those of `publishes` that another callback writes for it
+
+    @property
+    def label(self) -> str:
+        """A short text that tells callbacks apart: ``/node2 ← /t1`` or ``/node1 every 100ms``."""
+        if self.kind == "timer":
+            return f"{self.node} every {format_duration(self.period_ns or 0)}"
+        if self.kind == "unknown" and not self.handle:
+            return f"{self.node} outside callbacks"
+        if self.kind == "unknown":
+            return f"{self.node} callback {self.handle:#x}"
+        return f"{self.node} ← {self.topic}"
+
+
+@dataclass(frozen=True)
+class ApplicationGraph:
+    """The directed graph of callbacks and topics of one application.
+
+    ``publishers`` and ``subscribers`` name the nodes of each topic, also of topics that no
+    callback was seen to publish (a node may publish outside its callbacks).
+    """
+
+    nodes: tuple[Node, ...]
+    callbacks: tuple[Callback, ...]
+    publishers: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    subscribers: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        return tuple(sorted(self.publishers.keys() | self.subscribers.keys()))
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A computation chain: callbacks connected by topics (paper, section 2.3).
+
+    ``callbacks[i]`` publishes ``topics[i]``, which ``callbacks[i + 1]`` subscribes to; the last
+    topic is the chain's output. Both tuples have the same length. ``callbacks`` are ids in the
+    graph the chain was found in; ``spec`` is how a person wrote it (``/t1../t5``).
+    """
+
+    spec: str
+    callbacks: tuple[int, ...]
+    topics: tuple[str, ...]

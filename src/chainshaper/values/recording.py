@@ -1,0 +1,367 @@
+"""A recording on disk: a folder with one Parquet file per event table and a `recording.json`.
+
+The folder is written beside its final place and renamed when it is complete, so a recording
+that exists is whole. `recording.json` says under which conditions the events were taken, and
+what was lost on the way: figures computed from a recording are only as good as these facts. It
+also has a checksum of every other file, which is compared when the file is read; the columns of
+all tables are looked at when the recording is opened.
+"""
+
+import io
+import json
+import os
+import platform
+import shutil
+import tempfile
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+import polars as pl
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.events import EventTables, as_table, column_problems
+from chainshaper.values.whole_file import open_to_all
+from chainshaper.values.yaml_file import explanations, key_text
+
+__all__ = [
+    "EndpointInfo",
+    "InForceInfo",
+    "Recording",
+    "RecordingInfo",
+    "StallMeterInfo",
+    "ThreadInfo",
+    "open_recording",
+    "refuse_existing",
+    "write_recording",
+]
+
+INFO_FILE = "recording.json"
+FORMAT = 1
+MOST_ROWS = 1_000_000
+MOST_ROWS_PER_BYTE = 16
+"""A file has no more rows than both together; events as regular as a clock take four bytes each."""
+UNREADABLE = (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError)
+
+Integer: TypeAlias = Annotated[int, Field(ge=-(1 << 63), lt=1 << 63)]
+
+
+class ThreadInfo(BaseModel):
+    """One thread as the kernel reported it while the application ran (not as it was asked for)."""
+
+    model_config = ConfigDict(frozen=True)
+
+    tid: Integer
+    pid: Integer
+    comm: str
+    node: str
+    role: str  # executor, dds, publisher, stall-meter, unknown
+    policy: str  # SCHED_FIFO, SCHED_OTHER, ...
+    priority: Integer
+    cores: tuple[Integer, ...]
+
+
+class EndpointInfo(BaseModel):
+    """A publisher or subscription with its QoS, as DDS discovery and the trace show them.
+
+    What neither tells is None: without ROS 2 at hand only the trace does, and not every RMW tells
+    others about its history. Durations are ns, None also where there is no limit. QoS words are
+    those of `ros2 topic info -v` in lower case.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    node: str
+    topic: str
+    kind: Literal["publisher", "subscription"]
+    type: str | None = None  # std_msgs/msg/Header
+    reliability: str | None = None
+    durability: str | None = None
+    history: str | None = None
+    depth: Integer | None = None
+    deadline_ns: Integer | None = None
+    lifespan_ns: Integer | None = None
+    liveliness: str | None = None
+    liveliness_lease_ns: Integer | None = None
+
+
+class StallMeterInfo(BaseModel):
+    """How the machine was watched: a sleeper on every core of ``cores`` (ns throughout).
+
+    Stalls shorter than ``threshold_ns`` are not recorded. ``median_lateness_ns`` is what an
+    ordinary wake-up took on each core; ``realtime`` is false when the sleeper itself could be
+    pre-empted, so that its stalls may be ordinary scheduling.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    cores: tuple[Integer, ...]
+    period_ns: Integer
+    threshold_ns: Integer
+    wakeups: Integer
+    median_lateness_ns: tuple[Integer, ...]
+    realtime: bool
+
+
+class InForceInfo(BaseModel):
+    """When the plan was in force, of the time that was recorded (ns of CLOCK_MONOTONIC).
+
+    From the start of the first cycle that was governed as a whole; ``until_ns`` is None where it
+    was in force to the end.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    since_ns: int
+    until_ns: int | None = None
+
+
+class RecordingInfo(BaseModel):
+    """The facts of a recording that are not events. Times are ns of CLOCK_MONOTONIC.
+
+    ``clock_offset_ns`` is what to add to event times for CLOCK_REALTIME. ``lost`` counts events
+    that are known to be missing, by reason. ``realtime`` says whether SCHED_FIFO was in force
+    for every thread it was asked for, ``notes`` what a reader of the figures must know.
+    ``trace_events`` are the events, by their full names, of the trace that it was converted from,
+    those included that no table keeps.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    format: Integer = FORMAT
+    source: str  # live, simulated, lttng, ebpf
+    host: str = Field(default_factory=platform.node)
+    kernel: str = Field(default_factory=platform.release)
+    distribution: str | None = None  # of ROS 2
+    rmw: str | None = None
+    clock_offset_ns: Integer
+    command: tuple[str, ...] = ()
+    processes: dict[Integer, str] = {}  # pid → the node or command it runs
+    threads: tuple[ThreadInfo, ...] = ()
+    endpoints: tuple[EndpointInfo, ...] = ()
+    realtime: bool | None = None  # None: unknown
+    notes: tuple[str, ...] = ()
+    lost: dict[str, Integer] = {}
+    trace_events: dict[str, Integer] = {}
+    stall_meter: StallMeterInfo | None = None
+    chain: str | None = None  # the chain the application's description names first
+    application: dict[str, Any] | None = None  # the description that ran, when we ran it
+    plan: dict[str, Any] | None = None  # the plan in force, when one was
+    in_force: InForceInfo | None = None  # None: no plan was, or the recording is from before
+    # File → its CRC-32, as `crc32:89abcdef`; None in recordings from before there were any.
+    checksums: dict[str, str] | None = None
+
+
+@dataclass(frozen=True)
+class Recording:
+    """An open recording: ``info`` and the event tables, read from disk when first asked for.
+
+    ``events`` behaves like a dictionary of frames, so every analysis function takes it as it is.
+    A trace that another tracer wrote is opened as a recording too
+    (:func:`chainshaper.sources.open_source`): what follows does not care.
+    """
+
+    path: Path
+    info: RecordingInfo
+    events: EventTables = field(repr=False)
+
+
+class _TablesOnDisk(Mapping[str, pl.DataFrame]):
+    def __init__(self, path: Path, checksums: Mapping[str, str]) -> None:
+        self._path = path
+        self._checksums = checksums
+        self._files = {
+            file.stem: sorted(file.glob("*.parquet")) if file.is_dir() else [file]
+            for file in sorted(path.glob("*.parquet"))
+        }
+        self._read: dict[str, pl.DataFrame] = {}
+        known = {str(file.relative_to(path)) for files in self._files.values() for file in files}
+        if missing := sorted(checksums.keys() - known):
+            raise InputError(
+                f"{path / missing[0]}: no such file, but {INFO_FILE} names it: copy the recording"
+                " whole, or record the run again"
+            )
+        for name, files in self._files.items():
+            for file in files:
+                _check_columns(file, name)
+
+    def __getitem__(self, name: str) -> pl.DataFrame:
+        if name not in self._read:
+            self._read[name] = self._table(name).sort("time", maintain_order=True)
+        return self._read[name]
+
+    def _table(self, name: str) -> pl.DataFrame:
+        """A table's rows, once it is sure that they are what was written."""
+        files = self._files[name]
+        file = files[0].parent if len(files) > 1 else files[0]
+        try:
+            parts: list[Any] = [io.BytesIO(self._content(part)) for part in files]
+            lazy = pl.scan_parquet(parts, glob=False)
+            rows = lazy.select(pl.len()).collect().item()
+            size = sum(part.getbuffer().nbytes for part in parts)
+            if rows > MOST_ROWS + MOST_ROWS_PER_BYTE * size:
+                raise InputError(
+                    f"{file}: {rows} rows in {size} bytes are more than any run has; record the"
+                    " run again"
+                )
+            return as_table(lazy.collect(), name)
+        except UNREADABLE as error:
+            raise _unreadable(file, error) from error
+
+    def _content(self, file: Path) -> bytes:
+        content = file.read_bytes()
+        expected = self._checksums.get(str(file.relative_to(self._path)))
+        if expected is not None and expected != _checksum(content):
+            raise InputError(
+                f"{file}: damaged: its checksum is {_checksum(content)}, {INFO_FILE} says"
+                f" {expected}; copy the recording again, or record the run again"
+            )
+        return content
+
+    def __iter__(self) -> Any:
+        return iter(self._files)
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+
+def _check_columns(file: Path, name: str) -> None:
+    """Refuse a table whose columns are not those of its event."""
+    try:
+        with file.open("rb") as stream:
+            problems = column_problems(pl.read_parquet_schema(stream), name)
+    except UNREADABLE as error:
+        raise _unreadable(file, error) from error
+    if problems:
+        raise InputError(f"{file}: {'; '.join(problems)}; record the run again")
+
+
+def _unreadable(file: Path, error: BaseException) -> InputError:
+    reason = " ".join(str(error).split())
+    return InputError(f"{file}: not a readable event table ({reason}); record the run again")
+
+
+def _checksum(content: bytes | memoryview) -> str:
+    return f"crc32:{zlib.crc32(content):08x}"
+
+
+def open_recording(path: str | Path) -> Recording:
+    """Open a recording folder.
+
+    Raises:
+        InputError: no such folder, no or an unreadable `recording.json`, a newer format, a table
+            that is missing or has not the columns of its event.
+    """
+    path = Path(path)
+    file = path / INFO_FILE
+    if not file.is_file():
+        what = "a folder without recording.json" if path.is_dir() else "no such folder"
+        if path.is_file():
+            what = "a file, where the folder of a recording is wanted"
+        raise InputError(
+            f"{path}: {what}; a recording is made with `chainshaper run APP.yaml -o {path}`, a "
+            "trace, which is accepted as well, with `ros2 trace`"
+        )
+    info = _read_info(file)
+    return Recording(path, info, _TablesOnDisk(path, info.checksums or {}))
+
+
+def _read_info(file: Path) -> RecordingInfo:
+    try:
+        values = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{file}: not readable as JSON ({error}); record the run again") from error
+    # The format first: what else a newer one holds is not ours to judge.
+    format_ = values.get("format", FORMAT) if isinstance(values, dict) else FORMAT
+    if format_ != FORMAT:
+        raise InputError(
+            f"{file}: format {format_}, this chainshaper reads format {FORMAT}; update it"
+        )
+    try:
+        return RecordingInfo.model_validate_json(json.dumps(values), strict=True)
+    except ValidationError as error:
+        problems = [
+            f"{key_text(where)}: {reason}" for where, reason in explanations(error, RecordingInfo)
+        ]
+        raise InputError(f"{file}: not a recording's description: {'; '.join(problems)}") from error
+
+
+def refuse_existing(path: str | Path) -> Path:
+    """The path, once it is sure that nothing of the user's is there to be overwritten.
+
+    Asked before a run begins, so that nobody loses a minute to learn it at the end.
+    """
+    path = Path(path)
+    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+        raise InputError(
+            f"{path} exists already and is not overwritten: name another, or remove it"
+        )
+    if os.path.ismount(path) or (path.exists() and path.samefile(".")):
+        raise InputError(f"{path} cannot be replaced by a new folder: name one inside it")
+    parent = path.absolute().parent
+    if not parent.is_dir():
+        raise InputError(f"{parent}: no such folder to write {path.name} into")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise InputError(f"{parent}: no permission to write {path.name} into it: name another")
+    return path
+
+
+def write_recording(
+    path: str | Path, tables: EventTables | Iterable[EventTables], info: RecordingInfo
+) -> Recording:
+    """Write a recording, whole or not at all, and open it.
+
+    ``tables`` may come in parts, one after the other in time, for a recording that is larger than
+    memory. A table of several parts is a folder of Parquet files, which readers take for one.
+
+    Raises:
+        InputError: ``path`` exists already.
+        OperationError: it cannot be written (disk full, no permission); nothing is left behind.
+    """
+    path = refuse_existing(path)
+    partial: Path | None = None
+    try:
+        partial = Path(
+            tempfile.mkdtemp(prefix=f".{path.name}.partial-", dir=path.absolute().parent)
+        )
+        checksums: dict[str, str] = {}
+        for part in [tables] if isinstance(tables, Mapping) else tables:
+            for name, frame in part.items():
+                file = _next_part(partial / f"{name}.parquet", checksums)
+                checksums[str(file.relative_to(partial))] = _write_table(file, frame)
+        info = info.model_copy(update={"checksums": checksums})
+        (partial / INFO_FILE).write_text(info.model_dump_json(indent=2) + "\n")
+        open_to_all(partial)
+        partial.rename(path)
+    except (OSError, pl.exceptions.PolarsError) as error:
+        raise OperationError(f"{path}: the recording cannot be written: {error}") from error
+    finally:
+        if partial is not None and partial.exists():
+            shutil.rmtree(partial, ignore_errors=True)
+    return open_recording(path)
+
+
+def _next_part(file: Path, checksums: dict[str, str]) -> Path:
+    """Where the next part of a table goes: the first one is a file, several are a folder."""
+    if file.is_file():
+        first = file.rename(file.with_suffix(".first"))
+        file.mkdir()
+        first.rename(file / "000000.parquet")
+        checksums[f"{file.name}/000000.parquet"] = checksums.pop(file.name)
+    return file / f"{len(list(file.iterdir())):06}.parquet" if file.is_dir() else file
+
+
+def _write_table(file: Path, frame: pl.DataFrame) -> str:
+    """Write a file; returns its checksum."""
+    # By way of memory: writing to a file itself, Polars reports a full disk as a file that is out
+    # of specification.
+    content = io.BytesIO()
+    frame.write_parquet(content, compression="zstd", compression_level=1, statistics=False)
+    with file.open("xb") as stream:
+        stream.write(content.getbuffer())
+        stream.flush()
+        os.fsync(stream.fileno())
+    return _checksum(content.getbuffer())

@@ -1,0 +1,67 @@
+"""A new file, written whole or not at all, and never over another."""
+
+import os
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+
+from chainshaper.values.errors import InputError, OperationError
+
+__all__ = ["new_file", "open_to_all", "write_whole"]
+
+
+def new_file(path: str | Path, endings: tuple[str, ...] = ()) -> Path:
+    """The path, once it is sure that a file of this kind can be made there.
+
+    Asked before long work begins, so that nobody waits to learn it at the end.
+
+    Raises:
+        InputError: it exists, its folder does not, or it ends in none of ``endings``, if
+            there are any.
+    """
+    path = Path(path)
+    if endings and path.suffix not in endings:
+        raise InputError(f"{path}: write to a file that ends in {' or '.join(endings)}")
+    if path.exists():
+        raise InputError(
+            f"{path} exists already and is not overwritten: name another, or remove it"
+        )
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{path.absolute().parent}: no such folder to write {path.name} into")
+    return path
+
+
+def write_whole(path: Path, parts: Iterable[bytes]) -> Path:
+    """Write beside the final place, then rename.
+
+    Raises:
+        OperationError: it cannot be written; nothing is left behind.
+    """
+    partial: Path | None = None
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.partial-", dir=path.absolute().parent)
+        partial = Path(name)
+        with os.fdopen(handle, "wb") as stream:
+            stream.writelines(parts)
+            stream.flush()
+            os.fsync(stream.fileno())
+            os.fchmod(stream.fileno(), 0o644)  # the name may be a link of a folder's owner by now
+        partial.rename(path)
+    except OSError as error:
+        if partial is not None:
+            partial.unlink(missing_ok=True)
+        raise OperationError(f"{path}: the file cannot be written: {error.strerror}") from error
+    return path
+
+
+def open_to_all(folder: Path) -> None:
+    """Let everybody read a folder that we have made; never what a link in its place leads to.
+
+    Raises:
+        OSError: it is no folder any more.
+    """
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        os.fchmod(descriptor, 0o755)
+    finally:
+        os.close(descriptor)

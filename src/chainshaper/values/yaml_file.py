@@ -1,0 +1,375 @@
+"""YAML files that people write: read them, and say exactly where they are wrong.
+
+A message such as ``robot.yaml:14: nodes.node3.callbacks[0].execution: …`` saves its reader the
+search. PyYAML knows the line of every key, Pydantic knows the path of every wrong value; here
+the two are put together.
+"""
+
+import difflib
+import re
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Annotated, TypeAlias, TypeVar
+
+import yaml
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    PlainSerializer,
+    SerializationInfo,
+    ValidationError,
+    ValidationInfo,
+)
+from pydantic_core import ErrorDetails, PydanticCustomError
+
+from chainshaper.values.durations import format_duration, parse_duration
+from chainshaper.values.errors import InputError
+
+__all__ = [
+    "AS_YAML",
+    "Duration",
+    "FullName",
+    "Part",
+    "PlainData",
+    "PositiveDuration",
+    "compose",
+    "explanations",
+    "key_text",
+    "read_model",
+    "read_text",
+    "scalar",
+    "wrong_value",
+]
+
+Model = TypeVar("Model", bound=BaseModel)
+_Path: TypeAlias = tuple[str | int, ...]
+
+_WANTED = {
+    "tuple_type": "a list in [square brackets]",
+    "model_type": "a mapping of keys and values",
+    "string_type": "a text",
+    "int_type": "a whole number",
+    "float_type": "a number",
+    "finite_number": "a finite number",
+    "bool_type": "true or false",
+}
+
+_SAID = {
+    "missing": "is missing: add it",
+    "too_short": "is too short: write one element at least",
+}
+
+AS_YAML = "yaml"
+"""The Pydantic context in which durations are texts with units, on the way in and out."""
+
+LONGEST_DURATION_NS = 2**63 - 1
+LARGEST_FILE = 8 << 20
+DEEPEST = 100
+MOST_VALUES = 200_000
+_MOST_PROBLEMS = 20
+
+
+def _duration_in(value: object, info: ValidationInfo) -> object:
+    if isinstance(value, str):
+        try:
+            value = parse_duration(value)
+        except InputError as error:
+            raise ValueError(str(error)) from error
+    elif info.context == AS_YAML and value != 0:
+        raise ValueError(f"{value!r} is not a duration: write a number and a unit, such as 59ms")
+    if isinstance(value, int) and value < 0:
+        raise ValueError(f"{format_duration(value)} is negative: a duration here is 0ms or more")
+    if isinstance(value, int) and value > LONGEST_DURATION_NS:
+        raise ValueError("longer than 292 years, which no clock here counts: write a shorter one")
+    return value
+
+
+def _duration_out(value: int, info: SerializationInfo) -> int | str:
+    return format_duration(value) if info.context == AS_YAML else value
+
+
+def _above_zero(value: int) -> int:
+    if value == 0:
+        raise ValueError("is zero: write a duration longer than 0ms")
+    return value
+
+
+def _full_name(value: str) -> str:
+    if not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", value):
+        raise ValueError(
+            f"{value!r} is not a full ROS 2 name: write /name or /namespace/name, of letters,"
+            " digits and underscores, no part beginning with a digit"
+        )
+    return value
+
+
+Duration = Annotated[int, BeforeValidator(_duration_in), PlainSerializer(_duration_out)]
+"""Nanoseconds; with the context :data:`AS_YAML` a text with a unit, on the way in and out."""
+PositiveDuration = Annotated[Duration, AfterValidator(_above_zero)]
+FullName = Annotated[str, AfterValidator(_full_name)]
+
+
+class Part(BaseModel):
+    """A part of a YAML file: frozen, strict, no unknown keys.
+
+    Fields that end in ``_ns`` stand in YAML without the suffix, their values with a unit.
+    """
+
+    model_config = ConfigDict(
+        frozen=True,
+        strict=True,
+        extra="forbid",
+        allow_inf_nan=False,
+        populate_by_name=True,
+        alias_generator=lambda name: name.removesuffix("_ns"),
+    )
+
+
+def wrong_value(reason: str, *where: str | int) -> PydanticCustomError:
+    """The error for a wrong value that a validator found.
+
+    ``where`` leads from the model that is being checked to the value at fault.
+    """
+    return PydanticCustomError("wrong_value", "{reason}", {"reason": reason, "where": where})
+
+
+def read_model(path: str | Path, model: type[Model], *, made_by: str) -> Model:
+    """A YAML file as a Pydantic model.
+
+    ``made_by`` completes the sentence "such a file is …" for those who have none.
+
+    Raises:
+        InputError: no such file, not YAML, or wrong values; each is named with its line, key,
+            reason and remedy.
+    """
+    path = Path(path)
+    root = compose(read_text(path, made_by), path)
+    if root is None:
+        raise InputError(f"{path}:1: the file is empty; such a file is {made_by}")
+    plain = PlainData(path)
+    values = plain.of(root)
+    if not isinstance(values, dict):
+        raise InputError(
+            f"{path}:1: expected a YAML mapping (key: value); such a file is {made_by}"
+        )
+    try:
+        return model.model_validate(values, context=AS_YAML)
+    except ValidationError as error:
+        raise plain.problems(error, model) from error
+
+
+def read_text(path: Path, made_by: str) -> str:
+    """The text of a file that a person writes.
+
+    Raises:
+        InputError: it cannot be read, is no text in UTF-8, or larger than any such file.
+    """
+    try:
+        with path.open("rb") as file:
+            content = file.read(LARGEST_FILE + 1)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); such a file is {made_by}"
+        ) from error
+    if len(content) > LARGEST_FILE:
+        raise InputError(
+            f"{path}: larger than {LARGEST_FILE >> 20} MiB, the most that is read of such a file;"
+            f" such a file is {made_by}"
+        )
+    try:
+        return content.decode()
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise InputError(
+            f"{path}:{line}: not a text in UTF-8 ({error.reason}); such a file is {made_by}"
+        ) from error
+
+
+def compose(text: str, name: str | Path) -> yaml.Node | None:
+    """The YAML nodes of a text, which ``name`` stands for in messages; None of an empty one.
+
+    Raises:
+        InputError: it is not YAML, or nested too deeply; the line is named.
+    """
+    try:
+        return yaml.compose(text, Loader=_Loader)
+    except yaml.MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 1
+        reason = error.problem or error.context
+    except yaml.reader.ReaderError as error:
+        line = text.count("\n", 0, error.position) + 1
+        reason = f"the character {error.character:#06x} may not stand here"
+    raise InputError(f"{name}:{line}: not YAML: {reason}; correct the line")
+
+
+class _Loader(yaml.SafeLoader):
+    depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.depth > DEEPEST:
+            reason = f"more than {DEEPEST} lists and mappings inside each other"
+            mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
+            raise yaml.composer.ComposerError(None, None, reason, mark)
+        self.depth += 1
+        node: yaml.Node | None = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
+
+
+def scalar(node: yaml.ScalarNode) -> str | int | float | bool | None:
+    """A scalar's value. Dates and other things that no file of ours has are texts.
+
+    Raises:
+        ValueError: its tag says that it is something that it is not (``!!int ""``), or a number
+            is too large for any use; in words.
+    """
+    try:
+        value = _SCALARS.construct_object(node)
+    except Exception as error:
+        # PyYAML's constructors raise whatever int, re or a dictionary does.
+        implicit = _SCALARS.resolve(  # type: ignore[no-untyped-call]
+            yaml.ScalarNode, node.value, (True, False)
+        )
+        if node.tag == implicit:
+            return str(node.value)  # nothing in the file claims what it is: a malformed date
+        tag = node.tag.replace("tag:yaml.org,2002:", "!!")
+        raise ValueError(f"{node.value!r} is no {tag}: write the value without a tag") from error
+    if isinstance(value, int) and not -(1 << 63) <= value < 1 << 64:
+        raise ValueError("a number of more than 64 bits: write a smaller one")
+    return value if isinstance(value, str | int | float | None) else str(node.value)
+
+
+_SCALARS = yaml.SafeLoader("")
+
+
+@dataclass
+class PlainData:
+    """The plain data of YAML nodes; ``lines`` learns the line of every value on the way.
+
+    In files of ``ours`` each collection is used once, and a key with a unit has it in its value.
+    Aliases could make any file refer to itself, or be a billion values on a page.
+    """
+
+    name: str | Path
+    ours: bool = True
+    lines: dict[_Path, int] = field(default_factory=dict)
+    _seen: set[int] = field(default_factory=set)
+
+    def of(self, node: yaml.Node, where: _Path = ()) -> object:
+        """The value of a node that stands at a place.
+
+        Raises:
+            InputError: a value that cannot be, or a key that stands twice; the line is named.
+        """
+        self.lines[where] = node.start_mark.line + 1
+        if isinstance(node, yaml.ScalarNode):
+            try:
+                return scalar(node)
+            except ValueError as error:
+                raise self._wrong(node, where, str(error)) from error
+        if id(node) in self._seen and self.ours:
+            reason = "refers to this by a YAML alias (*name): write the value out"
+            raise self._wrong(node, where, reason)
+        if len(self.lines) > MOST_VALUES or len(where) > DEEPEST:
+            reason = f"with its aliases (*name) the file has more than {MOST_VALUES} values: write"
+            raise self._wrong(node, where, f"{reason} it without them")
+        self._seen.add(id(node))
+        if isinstance(node, yaml.SequenceNode):
+            return tuple(self.of(item, (*where, number)) for number, item in enumerate(node.value))
+        return self._mapping(node, where)
+
+    def _mapping(self, node: yaml.Node, where: _Path) -> dict[str, object]:
+        values: dict[str, object] = {}
+        for key_node, value_node in node.value:
+            if not isinstance(key_node, yaml.ScalarNode):
+                raise self._wrong(key_node, where, "a key here is a list or mapping: write a text")
+            key = str(key_node.value)
+            place = (*where, key)
+            if key in values:
+                raise self._wrong(key_node, place, "stands here a second time: remove one")
+            if self.ours and key.endswith("_ns"):
+                reason = (
+                    f"unknown key: write {key.removesuffix('_ns')!r}, and its value with a unit"
+                )
+                raise self._wrong(key_node, place, reason)
+            values[key] = self.of(value_node, place)
+            self.lines[place] = key_node.start_mark.line + 1
+        return values
+
+    def _wrong(self, node: yaml.Node, where: _Path, reason: str) -> InputError:
+        line = node.start_mark.line + 1
+        return InputError(f"{self.name}:{line}: {key_text(where)}: {reason}")
+
+    def problems(self, error: ValidationError, model: type[BaseModel]) -> InputError:
+        """What a model refused, each with its line."""
+        said = [
+            f"{self.name}:{_line(self.lines, where)}: {key_text(where)}: {reason}"
+            for where, reason in explanations(error, model)
+        ]
+        return InputError("\n".join(said))
+
+
+def _line(lines: dict[_Path, int], where: _Path) -> int:
+    # A missing key has no line of its own: the mapping it is missing from has.
+    while where and where not in lines:
+        where = where[:-1]
+    return lines.get(where, 1)
+
+
+def key_text(where: _Path) -> str:
+    """``servers[1].slots[0]``"""
+    text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in where)
+    return text.removeprefix(".") or "the file"
+
+
+def explanations(error: ValidationError, model: type[BaseModel]) -> list[tuple[_Path, str]]:
+    """Each wrong value once: a list is not too short because one of its elements is wrong.
+
+    Only the first ones of very many.
+    """
+    details = error.errors()
+    places = [detail["loc"] for detail in details]
+    wrong = [
+        detail
+        for detail in details
+        if detail["type"] != "too_short"
+        or not any(place[:-1][: len(detail["loc"])] == detail["loc"] for place in places)
+    ]
+    found = [_explain(detail, model) for detail in wrong[:_MOST_PROBLEMS]]
+    if len(wrong) > _MOST_PROBLEMS:
+        found.append(((), f"{len(wrong) - _MOST_PROBLEMS} more values are wrong"))
+    return found
+
+
+def _explain(error: ErrorDetails, model: type[BaseModel]) -> tuple[_Path, str]:
+    """Where a value is wrong, and why and what to do, in words."""
+    where = tuple(error["loc"])
+    kind, context, found = error["type"], error.get("ctx", {}), error["input"]
+    if kind == "wrong_value":
+        return where + tuple(context["where"]), str(context["reason"])
+    if kind == "value_error":
+        return where, str(context["error"])
+    if kind in _SAID:
+        return where, _SAID[kind]
+    if kind == "extra_forbidden":
+        near = difflib.get_close_matches(str(where[-1]), _known_keys(model), n=1, cutoff=0.75)
+        return where, "unknown key: " + (f"did you mean {near[0]!r}?" if near else "remove it")
+    shown = repr(found) if isinstance(found, str | int | float | None) else "what stands here"
+    if kind in _WANTED:
+        return where, f"{shown} is not {_WANTED[kind]}: write one"
+    reason = error["msg"].removeprefix("Input ")
+    return where, f"{shown} {reason}: correct it" if reason.startswith("should") else reason
+
+
+@cache
+def _known_keys(model: type[BaseModel]) -> list[str]:
+    keys: set[str] = set()
+    pending = [model.model_json_schema(by_alias=True)]
+    while pending:
+        schema = pending.pop()
+        keys.update(schema.get("properties", {}))
+        pending.extend(schema.get("$defs", {}).values())
+    return sorted(keys)

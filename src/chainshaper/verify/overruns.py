@@ -1,0 +1,120 @@
+"""Overruns in a recording: outputs that came behind the slot they were due in, and what was done.
+
+One that comes when its slot has opened already is in time, but a gate cannot hold it until the
+slot's start: it leaves at once, and later than all others. Those are counted, too.
+
+A gate records its decision for every message. The thread of an asynchronous publisher decides
+nothing; there the messages that were never sent count as discarded, and those that were sent in a
+later cycle than due as having waited.
+"""
+
+import polars as pl
+
+from chainshaper.analysis import LatencyAnalysis
+from chainshaper.analysis.departures import with_overrun
+from chainshaper.gate.decision import DROPPED
+from chainshaper.planning import Plan
+from chainshaper.planning.overruns import cycles_until_output
+from chainshaper.planning.publisher_threads import publisher_servers
+from chainshaper.values import events
+from chainshaper.values.recording import Recording
+
+__all__ = [
+    "dropped_in",
+    "dropped_text",
+    "gate_releases",
+    "into_open_slots",
+    "overruns_in",
+    "overruns_text",
+]
+
+_DONE = {
+    "wait": "waited for the next slot",
+    "discard": "discarded",
+    "publish": "published at once",
+    "next-slot": "left in the slot behind their mode's",
+}
+_WITHOUT_NODE = {
+    "bypass": "went around the shaping node, which was not there",
+    "silence": "were not published, since the shaping node was not there",
+}
+
+
+def gate_releases(recording: Recording, plan: Plan | None) -> pl.DataFrame:
+    """The table `gate_release` with ``overrun``, which older recordings lack."""
+    due = 0 if plan is None else cycles_until_output(plan)
+    return with_overrun(events.table(recording.events, "gate_release"), due)
+
+
+def overruns_in(
+    recording: Recording, plan: Plan | None, analysis: LatencyAnalysis | None = None
+) -> dict[str, int] | None:
+    """How many outputs overran, per policy that was applied to them; None: nothing was gated.
+
+    Those that a standby dealt with, while the shaping node was not there, count as overruns too.
+    ``analysis`` is that of the plan's chain; without it, outputs of an asynchronous publisher that
+    waited cannot be counted.
+    """
+    gated = plan is not None and any(publisher_servers(plan))
+    if "gate_release" not in recording.events and not gated:
+        return None
+    treated = gate_releases(recording, plan)["overrun"].drop_nulls()
+    counts = {policy: int((treated == policy).sum()) for policy in (*_DONE, *_WITHOUT_NODE)}
+    if gated and plan is not None:
+        outcomes = events.table(recording.events, "asynchronous_send")["outcome"]
+        counts["discard"] += int((outcomes != "sent").sum())
+        if analysis is not None:
+            due_until = (cycles_until_output(plan) + 1) * plan.cycle_ns
+            late = analysis.traversals["latency_ns"].drop_nulls() >= due_until
+            counts["wait"] += int(late.sum())
+    return {policy: count for policy, count in counts.items() if count}
+
+
+def into_open_slots(recording: Recording, plan: Plan | None) -> int | None:
+    """How many outputs came into their slot when it was open already; None: no gate decided.
+
+    They took longer than the plan's L̄ + ε, and make up the jitter that a wide slot lets through.
+    """
+    if "gate_release" not in recording.events:
+        return None
+    table = gate_releases(recording, plan).filter(pl.col("overrun").is_null())
+    return int((table["release"] == table["arrival"]).sum())
+
+
+def dropped_in(recording: Recording) -> dict[str, int] | None:
+    """How many messages gates received and did not let out, per reason, and how many DDS lost
+    before they reached one, where its numbers say so; None: no gate decided.
+
+    The reasons are those of ``dropped`` in :mod:`chainshaper.values.events`.
+    """
+    if "gate_release" not in recording.events:
+        return None
+    table = events.table(recording.events, "gate_release", ["dropped", "lost", "overrun"])
+    discarded = pl.col("release").is_null() & (pl.col("overrun") == "discard")
+    reasons = table.select(
+        pl.coalesce("dropped", pl.when(discarded).then(pl.lit("discarded")))
+    ).to_series()
+    counts = {reason: int((reasons == reason).sum()) for reason in DROPPED}
+    counts["lost by DDS"] = int(table["lost"].sum())
+    return {reason: count for reason, count in counts.items() if count}
+
+
+def dropped_text(dropped: dict[str, int]) -> str:
+    """``3 messages were lost at the gate (2 replaced, 1 overflowed)``."""
+    total = sum(dropped.values())
+    why = ", ".join(f"{count} {reason}" for reason, count in dropped.items())
+    return f"{total} {'message was' if total == 1 else 'messages were'} lost at the gate ({why})"
+
+
+def overruns_text(overruns: dict[str, int]) -> str:
+    """``3 outputs were too late for their slot (2 discarded, 1 published at once)``."""
+    without = [
+        f"{n} {_WITHOUT_NODE[what]}" for what, n in overruns.items() if what in _WITHOUT_NODE
+    ]
+    treated = {policy: count for policy, count in overruns.items() if policy in _DONE}
+    if without and not treated:
+        return "; ".join(without)
+    total = sum(treated.values())
+    done = ", ".join(f"{count} {_DONE[policy]}" for policy, count in treated.items())
+    late = "output was too late for its" if total == 1 else "outputs were too late for their"
+    return "; ".join([f"{total} {late} slot ({done})", *without])

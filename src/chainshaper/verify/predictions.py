@@ -1,0 +1,285 @@
+"""Holding a plan's prediction against what was measured.
+
+**The convention.** Eq. 5 represents a latency band by the end of its slot, x_α. A gate lets a
+message that waits go when its slot starts, at x_α − Δ; only one that arrives inside the slot
+leaves later. So every figure is predicted twice: as if each output left at the start of its
+slot, and at its end. A measurement should lie between the two, near the first.
+
+With **modes** an output leaves in the slot of its cycle's mode, and what comes behind that slot is
+late for it although there are others. Each mode is then held by itself against the share of
+latencies that fit; the whole depends on how long each was in force, which no plan knows.
+
+**What is promised.** With the anchor `stamp` a gate counts its slots from the message's own origin,
+and promises the latency. With the anchor `cycle`, and where a back end holds back a publisher's
+thread, slots count from the start of the cycle: the place in the cycle is promised then, and it is
+what is judged, whenever in the cycle the chain began.
+
+A verdict is found from the range and the figure that are printed, as they are printed. A range
+has room for what two finite samples may differ by, and no band is expected that so few outputs may
+well not have come in.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import polars as pl
+
+from chainshaper.analysis import LatencyAnalysis, LatencyStatistics, latency_statistics
+from chainshaper.analysis.punctuality import Due
+from chainshaper.planning import Plan, publish_slots
+from chainshaper.planning.overruns import cycles_until_output
+from chainshaper.planning.plan import server_of
+from chainshaper.planning.publisher_threads import publisher_servers
+from chainshaper.values.durations import milliseconds
+
+__all__ = ["BandHeld", "FigureHeld", "PredictionHeld", "due_of", "hold_prediction"]
+
+STANDARD_ERRORS = 3  # beyond so many, an average is not what was predicted
+MISSING = 0.003  # a band that is empty with no more than this probability is expected
+
+
+@dataclass(frozen=True)
+class FigureHeld:
+    """One figure: predicted with outputs at slot starts and at slot ends, and measured (ns).
+
+    ``holds``: the measured figure lies from ``from_ns`` to ``to_ns``, to the printed digit (None:
+    nothing was measured, or the plan has modes, and it depends on them).
+    """
+
+    at_start_ns: int
+    at_end_ns: int
+    from_ns: int
+    to_ns: int
+    measured_ns: int | None
+    holds: bool | None
+
+
+@dataclass(frozen=True)
+class BandHeld:
+    """One latency band, over undisturbed cycles whose output came in the cycle it was due.
+
+    ``inside`` counts outputs that left while the slot was open. Of a plan with modes it is the band
+    of ``mode``: ``late`` counts the mode's outputs that came behind its slot, and the shares are
+    those of its outputs that did not.
+    """
+
+    slot_start_ns: int
+    slot_end_ns: int
+    predicted_share: float | None
+    count: int
+    share: float | None
+    inside: int
+    min_ns: int | None
+    mean_ns: int | None
+    max_ns: int | None
+    jitter_ns: int | None
+    mode: str | None = None
+    late: int = 0
+
+
+@dataclass(frozen=True)
+class PredictionHeld:
+    """A plan's prediction beside the measurement, over undisturbed cycles.
+
+    The figures are latencies, or with ``counted_from`` the cycle places in it. ``late`` counts
+    outputs that missed their last slot; they are in the figures, not in the bands. ``late_of_all``
+    counts those of ``cycles``, in which no cycle is left out (None: not known). ``bands`` is empty
+    for policies without publish slots.
+    """
+
+    mean: FigureHeld
+    max: FigureHeld
+    jitter: FigureHeld
+    bands: tuple[BandHeld, ...]
+    late: int
+    late_of_all: int | None
+    cycles: int
+    counted_from: Literal["chain", "cycle"]
+
+
+def due_of(plan: Plan) -> tuple[Due, ...]:
+    """When a plan has its outputs leave, as the analysis needs it: the chain's, other sinks'."""
+    modes = plan.modes
+    last = {} if modes is None else {mode: band - 1 for mode, band in modes.bands.items()}
+    own = Due(
+        cycle_ns=plan.cycle_ns,
+        cycles=cycles_until_output(plan),
+        slots=publish_slots(plan),
+        last_slot={} if modes is not None and modes.late == "next-slot" else last,
+        from_cycle=_from_cycle(plan),
+        margin_ns=plan.margin.epsilon_ns,
+        output=plan.chain.output,
+    )
+    sinks = (
+        replace(
+            own,
+            cycles=cycles_until_output(plan, node),
+            slots=server.slots,
+            last_slot={},
+            output=node.output,
+        )
+        for node in plan.further_shaping_nodes
+        if (server := server_of(plan, node.thread)) is not None
+    )
+    return own, *sinks
+
+
+def _from_cycle(plan: Plan) -> bool:
+    """Whether slots count from the start of the cycle, whenever in it the chain began."""
+    return any(publisher_servers(plan)) or (
+        plan.shaping_node is not None and plan.anchor == "cycle"
+    )
+
+
+def hold_prediction(plan: Plan, analysis: LatencyAnalysis) -> PredictionHeld:
+    """Hold the prediction of the plan in force against the analysis of a recording.
+
+    The analysis knows from :func:`due_of` when outputs were due.
+    """
+    delay = cycles_until_output(plan) * plan.cycle_ns
+    slots = [(start + delay, end + delay) for start, end in publish_slots(plan)]
+    from_cycle = _from_cycle(plan)
+    outputs = _outputs(slots, analysis, "place_ns" if from_cycle else "latency_ns")
+    in_time = outputs.filter(~pl.col("late"))
+    shares = plan.predicted.shares if _represented(plan) else [None] * len(slots)
+    if plan.modes is None:
+        bands = tuple(
+            _band(slot, share, in_time.filter(pl.col("slot") == number), in_time.height)
+            for number, (slot, share) in enumerate(zip(slots, shares, strict=True))
+        )
+    else:
+        bands = tuple(
+            _band_of_mode(mode, slots[band - 1], sum(plan.predicted.shares[:band]), outputs)
+            for mode, band in plan.modes.bands.items()
+        )
+    mean, longest, jitter = _figures(plan, slots, latency_statistics(outputs["judged_ns"]))
+    return PredictionHeld(
+        mean=mean,
+        max=longest,
+        jitter=jitter,
+        bands=bands,
+        late=outputs.height - in_time.height,
+        late_of_all=analysis.statistics.late,
+        cycles=analysis.statistics.count,
+        counted_from="cycle" if from_cycle else "chain",
+    )
+
+
+def _figures(
+    plan: Plan, slots: list[tuple[int, int]], measured: LatencyStatistics
+) -> tuple[FigureHeld, FigureHeld, FigureHeld]:
+    """Average, maximum and jitter: with outputs at slot starts and ends, with room, measured."""
+    predicted = plan.predicted
+    mean, longest, jitter = predicted.mean_ns, predicted.max_ns, predicted.jitter_ns
+    lowest_max, lowest_jitter = mean, 0  # of outputs that leave when they are ready
+    if _represented(plan):
+        starts = [start for start, _ in slots]
+        mean = round(sum(s * at for s, at in zip(predicted.shares, starts, strict=True)))
+        longest, jitter = starts[-1], starts[-1] - starts[0]
+        sure = [
+            start
+            for start, share in zip(starts, predicted.shares, strict=True)
+            if (1 - share) ** measured.count <= MISSING
+        ] or starts[:1]
+        lowest_max, lowest_jitter = sure[-1], sure[-1] - sure[0]
+    elif slots:
+        longest, jitter = min(longest, slots[-1][0]), 0
+        lowest_max = longest
+    room = round(STANDARD_ERRORS * _standard_error(plan, slots, measured.count))
+    judged = plan.modes is None  # with modes it depends on how long each was in force
+    return (
+        _figure(mean, predicted.mean_ns, measured.mean_ns, mean - room, room, judged),
+        _figure(longest, predicted.max_ns, measured.max_ns, lowest_max, 0, judged),
+        _figure(jitter, predicted.jitter_ns, measured.jitter_ns, lowest_jitter, 0, judged),
+    )
+
+
+def _figure(  # noqa: PLR0917 - the parts of a figure, each used once
+    at_start: int, at_end: int, measured: int | None, lowest: int, above: int, judged: bool
+) -> FigureHeld:
+    low, high = min(lowest, at_start), at_end + above
+    holds = None
+    if judged and measured is not None:
+        holds = _printed(low) <= _printed(measured) <= _printed(high)
+    return FigureHeld(at_start, at_end, low, high, measured, holds)
+
+
+def _printed(nanoseconds: int) -> float:
+    return float(milliseconds(nanoseconds))
+
+
+def _standard_error(plan: Plan, slots: list[tuple[int, int]], count: int) -> float:
+    """How far the average may be off because both samples, before and after, are finite.
+
+    Where outputs do not come in bands, their variance is not in the plan; between two limits it
+    is at most (max − mean)·(mean − min).
+    """
+    if not count:
+        return 0.0
+    predicted = plan.predicted
+    if _represented(plan):
+        ends = [end for _, end in slots]
+        mean = sum(share * end for share, end in zip(predicted.shares, ends, strict=True))
+        variance = sum(
+            share * (end - mean) ** 2 for share, end in zip(predicted.shares, ends, strict=True)
+        )
+    else:
+        shortest = predicted.max_ns - predicted.jitter_ns
+        above, below = predicted.max_ns - predicted.mean_ns, predicted.mean_ns - shortest
+        variance = float(max(0, above) * max(0, below))
+    samples = 1 / plan.evidence.samples + 1 / count
+    return float((variance * samples) ** 0.5)
+
+
+def _represented(plan: Plan) -> bool:
+    """Whether a slot's end stands for the outputs in it, as in eq. 5."""
+    slots = publish_slots(plan)
+    return plan.policy != "one-long-slot" and 0 < len(slots) == len(plan.predicted.shares)
+
+
+def _outputs(slots: list[tuple[int, int]], analysis: LatencyAnalysis, judged: str) -> pl.DataFrame:
+    """Undisturbed complete traversals: ``judged_ns, place_ns, slot, mode, late``.
+
+    The slot is the one that the gate says it released the message in. Without a gate's events it
+    is the last that had started when the output came.
+    """
+    chosen = analysis.traversals.filter(pl.col("complete") & ~pl.col("disturbed"))
+    decided = analysis.releases.filter(pl.col("hop") == len(analysis.chain.callbacks) - 1)
+    started = [(pl.col("place_ns") >= start).cast(pl.Int32) for start, _ in slots]
+    return chosen.join(
+        decided.select("traversal", "slot", "mode", gated=True), on="traversal", how="left"
+    ).select(
+        "place_ns",
+        "mode",
+        pl.col("late").fill_null(False),
+        judged_ns=judged,
+        slot=pl.when(pl.col("gated")).then("slot").otherwise(pl.sum_horizontal(-1, *started)),
+    )
+
+
+def _band(
+    slot: tuple[int, int], predicted: float | None, own: pl.DataFrame, total: int
+) -> BandHeld:
+    found, place = latency_statistics(own["judged_ns"]), pl.col("place_ns")
+    inside = own.filter((place >= slot[0]) & (place < slot[1])).height
+    return BandHeld(
+        slot_start_ns=slot[0],
+        slot_end_ns=slot[1],
+        predicted_share=predicted,
+        count=found.count,
+        share=found.count / total if total else None,
+        inside=inside,
+        min_ns=found.min_ns,
+        mean_ns=found.mean_ns,
+        max_ns=found.max_ns,
+        jitter_ns=found.jitter_ns,
+    )
+
+
+def _band_of_mode(
+    mode: str, slot: tuple[int, int], predicted: float, outputs: pl.DataFrame
+) -> BandHeld:
+    own = outputs.filter(pl.col("mode") == mode)
+    in_time = own.filter(~pl.col("late"))
+    band = _band(slot, predicted or None, in_time, own.height)
+    return replace(band, mode=mode, late=own.height - in_time.height)

@@ -1,0 +1,44 @@
+"""Shaping a `ros2 launch`: what is refused before anything is launched.
+
+The flow itself needs ROS 2 and minutes; every step of it is tested where it is at home.
+"""
+
+from pathlib import Path
+
+import pytest
+from command_line import refused
+
+from chainshaper import shape_launch
+from chainshaper.values.errors import InputError, PlatformError
+
+
+@pytest.fixture
+def launch_file(tmp_path: Path) -> Path:
+    path = tmp_path / "robot.launch.xml"
+    path.write_text("<launch/>\n")
+    return path
+
+
+def test_what_is_not_launched_by_ros2_cannot_be_shaped_so(tmp_path: Path) -> None:
+    assert "is not `ros2 launch" in refused(2, "shape", "-o", tmp_path / "out", "--", "sleep", "1")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_description_needs_its_plan(tmp_path: Path) -> None:
+    said = refused(2, "shape", "robot.yaml", "-o", tmp_path / "out")
+    assert "chainshaper shape APP.yaml plan.yaml -o REC" in said
+
+
+def test_a_folder_with_something_in_it_is_left_alone(tmp_path: Path, launch_file: Path) -> None:
+    with pytest.raises(InputError, match="exists already and is not overwritten"):
+        shape_launch(["ros2", "launch", str(launch_file)], tmp_path)
+    assert [entry.name for entry in tmp_path.iterdir()] == [launch_file.name]
+
+
+def test_missing_build_tools_are_named_before_minutes_are_spent(
+    tmp_path: Path, launch_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(PlatformError, match="colcon, which building the shaping node needs"):
+        shape_launch(["ros2", "launch", str(launch_file)], tmp_path / "out", node="cpp")
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,249 @@
+"""What the planner is told of a recorded chain: the story of a graph that synchronises."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from reference_traces import DATA
+from story import OFFSET, Callback, Publisher, Story
+
+from chainshaper.flow.steps import plan_recording, profile_chains
+from chainshaper.planning import PlanRequest, Profile, plan_chain, plan_warnings
+from chainshaper.planning.plan import revised
+from chainshaper.values import events
+from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.recording import Recording, RecordingInfo, ThreadInfo
+
+MS = 1_000_000
+CHAIN = "/rear_raw../fused../pose"
+
+
+def _graph(story: Story) -> tuple[dict[str, Callback], dict[str, Publisher]]:
+    """Valet parking in small: two timers → two filters → fusion → voxel → localizer."""
+    callbacks: dict[str, Callback] = {}
+    publishers: dict[str, Publisher] = {}
+    throttler = story.node("/throttler", 1)
+    for side in ("rear", "front"):
+        callbacks[f"throttle_{side}"] = story.timer(throttler, period=100 * MS)
+        publishers[f"throttle_{side}"] = story.publisher(throttler, f"/{side}_raw")
+    for pid, side in ((2, "rear"), (3, "front")):
+        node = story.node(f"/{side}_filter", pid)
+        callbacks[side] = story.subscription(node, f"/{side}_raw")
+        publishers[side] = story.publisher(node, f"/{side}_filtered")
+    fusion = story.node("/fusion", 4)
+    for side in ("rear", "front"):
+        callbacks[f"fuse_{side}"] = story.subscription(
+            fusion, f"/{side}_filtered", symbol="message_filters::Subscriber::add"
+        )
+    publishers["fusion"] = story.publisher(fusion, "/fused")
+    for pid, name, source, output in (
+        (5, "voxel", "/fused", "/small"),
+        (6, "ndt", "/small", "/pose"),
+    ):
+        node = story.node(f"/{name}", pid)
+        callbacks[name] = story.subscription(node, source)
+        publishers[name] = story.publisher(node, output)
+    return callbacks, publishers
+
+
+def _recorded(cycles: int = 3) -> Recording:
+    """Response times in ms: 1, 1, 20, 31, 1 and 3 (fusion), 9, 51 minus the cycle's number."""
+    story = Story()
+    callbacks, publishers = _graph(story)
+
+    def run(name: str, writer: str | None, start: float, end: float, reads: int | None) -> int:
+        sent = int(end * MS) - 1
+        writes = () if writer is None else ((publishers[writer], sent),)
+        story.runs(callbacks[name], int(start * MS), int(end * MS), reads=reads, writes=writes)
+        return sent
+
+    for cycle in range(cycles):
+        t = 1000 + 100 * cycle
+        rear = run("throttle_rear", "throttle_rear", t, t + 1, None)
+        front = run("throttle_front", "throttle_front", t + 1, t + 2, None)
+        rear = run("rear", "rear", t + 2, t + 22, rear)
+        front = run("front", "front", t + 2, t + 33, front)
+        run("fuse_rear", None, t + 22, t + 23, rear)
+        fused = run("fuse_front", "fusion", t + 33, t + 36, front)
+        small = run("voxel", "voxel", t + 36, t + 45, fused)
+        run("ndt", "ndt", t + 45, t + 96 - cycle, small)
+    cores = {1: 1, 2: 1, 3: 0, 4: 1, 5: 1, 6: 1}
+    threads = tuple(
+        ThreadInfo(
+            tid=pid,
+            pid=pid,
+            comm="node",
+            node="",
+            role="executor",
+            policy="SCHED_FIFO",
+            priority=70,
+            cores=(core,),
+        )
+        for pid, core in cores.items()
+    )
+    info = RecordingInfo(source="simulated", clock_offset_ns=OFFSET, threads=threads)
+    return Recording(Path("parking"), info, story.tables())
+
+
+def _profile() -> Profile:
+    (profile,) = profile_chains(_recorded(), [CHAIN])
+    return profile
+
+
+def test_branches_that_the_chain_waits_for_are_found() -> None:
+    profile = _profile()
+    assert [callback.node for callback in profile.callbacks] == [
+        *("/throttler", "/throttler", "/rear_filter", "/front_filter"),
+        *("/fusion", "/voxel", "/ndt"),
+    ]
+    assert [callback.after for callback in profile.callbacks] == [
+        *((), (), (0,), (1,), (2, 3), (4,), (5,))
+    ]
+    assert [callback.max_response_ns // MS for callback in profile.callbacks] == [
+        *(1, 1, 20, 31),
+        4,  # the first input, and the one that completes the set
+        *(9, 51),
+    ]
+    assert profile.core_of["/front_filter"] == 0
+    assert profile.fifo_priority == 75
+    assert profile.latencies_ns.tolist() == [(96 - cycle) * MS - 1 for cycle in range(3)]
+
+
+def test_what_feeds_the_first_node_of_a_chain_that_no_timer_starts_is_left_out() -> None:
+    """The throttler feeds the rear filter, and the front filter's branch is followed so far."""
+    (profile,) = profile_chains(_recorded(), ["/rear_filtered../fused../pose"], period_ns=100 * MS)
+    assert [callback.node for callback in profile.callbacks] == [
+        *("/rear_filter", "/front_filter", "/fusion", "/voxel", "/ndt")
+    ]
+    assert [callback.after for callback in profile.callbacks] == [(), (), (0, 1), (2,), (3,)]
+    assert "/throttler" not in profile.core_of
+
+
+def test_a_server_per_callback_is_the_papers_table_4_row_1() -> None:
+    plan = plan_chain(_profile(), PlanRequest(policy="server-per-callback", epsilon_ns=0))
+    slots = {server.name: [(a // MS, b // MS) for a, b in server.slots] for server in plan.servers}
+    assert slots == {
+        "throttler": [(0, 2)],
+        "rear_filter": [(2, 22)],
+        "front_filter": [(2, 33)],
+        "fusion": [(33, 37)],
+        "voxel": [(37, 46)],
+        "ndt": [(46, 97)],
+    }
+    assert {server.name: server.core for server in plan.servers}["front_filter"] == 0
+
+
+def test_the_margin_is_every_callbacks() -> None:
+    slower = replace(_profile(), period_ns=200 * MS)
+    plan = plan_chain(slower, PlanRequest(policy="server-per-callback", epsilon_ns=MS // 2))
+    slots = {server.name: [(a // MS, b // MS) for a, b in server.slots] for server in plan.servers}
+    assert slots["throttler"] == [(0, 4)], "two callbacks, each rounded up to whole ms"
+    assert slots["rear_filter"] == [(4, 25)]
+    with pytest.raises(OperationError, match=r"takes \d+ms, .* plan with a smaller margin"):
+        plan_chain(_profile(), PlanRequest(policy="server-per-callback", epsilon_ns=2 * MS))
+
+
+def test_shaping_opens_a_server_on_each_core_of_the_graph() -> None:
+    plan = plan_recording(_recorded(), CHAIN, PlanRequest(epsilon_ns=2 * MS))
+    assert [(server.name, server.core) for server in plan.servers] == [
+        ("chain_core0", 0),
+        ("chain_core1", 1),
+        ("output", 1),
+    ]
+    assert [thread.node for thread in plan.servers[0].threads] == ["/front_filter"]
+    apart = plan_recording(_recorded(), CHAIN, PlanRequest(epsilon_ns=2 * MS, first_slot_ns=2 * MS))
+    assert ("first", ((0, 2 * MS),)) in [(server.name, server.slots) for server in apart.servers]
+
+
+def test_a_sink_that_the_chain_waits_for_is_refused() -> None:
+    with pytest.raises(InputError, match=r"pose waits for /small, which"):
+        plan_recording(_recorded(), CHAIN, sinks=["/rear_raw../small"])
+    with pytest.raises(InputError, match="further sinks are shaped"):
+        plan_recording(
+            _recorded(), CHAIN, PlanRequest(policy="server-per-chain"), sinks=["/rear_raw../small"]
+        )
+
+
+def test_who_subscribes_to_the_output_and_is_not_in_the_chain_receives_it() -> None:
+    recording = _recorded()
+    plan = plan_recording(recording, "/rear_raw../fused")
+    assert plan.shaping_node is not None
+    assert plan.shaping_node.receivers == ("/voxel",)
+    left = plan_recording(recording, "/rear_raw../fused", PlanRequest(with_receivers=False))
+    assert left == revised(
+        plan, shaping_node=plan.shaping_node.model_copy(update={"receivers": ()})
+    )
+    whole = plan_recording(recording, CHAIN)
+    assert whole.shaping_node is not None
+    assert whole.shaping_node.receivers == (), "no node takes /pose"
+
+
+def test_asynchronous_publication_gates_the_last_nodes_thread() -> None:
+    request = PlanRequest(publication="asynchronous")
+    plan = plan_recording(_recorded(), CHAIN, request)
+    assert plan.shaping_node is None
+    (thread,) = plan.servers[-1].threads
+    assert (thread.node, thread.role) == ("/ndt", "publisher")
+
+
+def test_let_per_callback_has_a_node_per_topic() -> None:
+    plan = plan_recording(_recorded(), CHAIN, PlanRequest(policy="let-per-callback"))
+    assert len(plan.further_shaping_nodes) == 4
+    assert plan.predicted.max_ns == 501 * MS
+
+
+def test_a_chain_that_no_timer_starts_needs_its_period() -> None:
+    with pytest.raises(InputError, match=r"starts are 100ms apart, mostly\): add --period"):
+        profile_chains(_recorded(), ["/rear_filtered../fused../pose"])
+    given = profile_chains(_recorded(), ["/rear_filtered../fused../pose"], period_ns=100 * MS)
+    assert given[0].period_ns == 100 * MS
+    with pytest.raises(InputError, match="--period goes with --latencies, or with a chain"):
+        profile_chains(_recorded(), [CHAIN], period_ns=50 * MS)
+
+
+def test_stalled_cycles_are_left_out() -> None:
+    recording = _recorded()
+    stall = pl.DataFrame(
+        [{"time": 1050 * MS, "cpu": 1, "duration": 5 * MS}],
+        schema_overrides={**events.COMMON_COLUMNS, **events.FIELDS["machine_stall"]},
+    )
+    stalled = Recording(
+        recording.path, recording.info, {**recording.events, "machine_stall": stall}
+    )
+    (profile,) = profile_chains(stalled, [CHAIN])
+    assert profile.disturbed == 1
+    assert profile.latencies_ns.max() == 95 * MS - 1
+    assert profile.callbacks[-1].max_response_ns == 50 * MS
+    for stalls, left in ((2, "1 is complete and undisturbed"), (3, "none is complete")):
+        often = pl.concat(
+            stall.with_columns(time=pl.lit((1050 + 100 * n) * MS)) for n in range(stalls)
+        )
+        events_then = {**recording.events, "machine_stall": often}
+        with pytest.raises(OperationError, match=f"of 3 traversals of .* {left}.* {stalls} dist"):
+            profile_chains(Recording(recording.path, recording.info, events_then), [CHAIN])
+
+
+def test_executions_that_span_cycles_can_be_planned_callback_by_callback() -> None:
+    long = replace(_profile(), latencies_ns=np.array([60, 141]) * MS)
+    with pytest.raises(OperationError, match="pipeline over several cores"):
+        plan_chain(long, PlanRequest())
+    for policy in ("server-per-callback", "let-per-callback"):
+        plan = plan_chain(long, PlanRequest(policy=policy, epsilon_ns=0))
+        assert plan.evidence.max_latency_ns == 141 * MS
+        assert any("is not shorter than the cycle" in text for text in plan_warnings(plan))
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the reference traces are not here")
+def test_the_fusion_of_a_real_trace_waits_for_both_filters() -> None:
+    trace = DATA / "jazzy_avp_cyclonedds" / "trace"
+    (profile,) = profile_chains(
+        trace, ["/lidar_rear/points_raw../points_fused../localization/ndt_pose"]
+    )
+    fusion = profile.callbacks[4]
+    assert fusion.node == "/point_cloud_fusion"
+    assert {profile.callbacks[place].node for place in fusion.after} == {
+        "/filter_transform_rear",
+        "/filter_transform_front",
+    }

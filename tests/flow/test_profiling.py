@@ -1,0 +1,188 @@
+"""The paper's profiling condition on real processes that are named like nodes."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from command_line import called, json_of, refused
+from lttng_node import chain_command, required_node
+from processes import wait_for
+
+from chainshaper import InputError, OperationError, PlatformError, open_recording
+from chainshaper.enforcement.threads.allocation import RecordedProcess, RecordedThread, allocate
+from chainshaper.flow import profiling
+from chainshaper.flow.profiling import chain_nodes, executors_of, profiling_condition
+from chainshaper.linux.processes import list_processes
+from chainshaper.linux.scheduling import available_cores, may_use_fifo
+from chainshaper.linux.scheduling_state import SchedulingState, state_of
+from chainshaper.linux.threads import Thread, list_threads
+
+pytestmark = pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here")
+
+
+@pytest.fixture(scope="module")
+def node() -> Path:
+    return required_node()
+
+
+@pytest.fixture
+def nodes(node: Path) -> Iterator[dict[str, int]]:
+    """Two nodes that run, with threads named as Cyclone DDS names its own."""
+    started = {
+        name: subprocess.Popen(
+            [node, "flood", "1000000", "10000", "--ros-args", "-r", f"__node:={name}"]
+        )
+        for name in ("front", "rear")
+    }
+    pids = {f"/{name}": process.pid for name, process in started.items()}
+    try:
+        for pid in pids.values():
+            wait_for(lambda pid=pid: len(_dds(pid)) == 2, "the node's threads")  # type: ignore[misc]
+        yield pids
+    finally:
+        for process in started.values():
+            process.kill()
+            process.wait()
+
+
+def _dds(pid: int) -> list[Thread]:
+    return [thread for thread in list_threads(pid) if thread.role == "dds"]
+
+
+def _states(nodes: dict[str, int]) -> dict[int, SchedulingState]:
+    return {t.tid: state_of(t.tid) for pid in nodes.values() for t in list_threads(pid)}
+
+
+def test_the_chains_threads_are_high_and_apart_and_afterwards_as_before(
+    nodes: dict[str, int], tmp_path: Path
+) -> None:
+    core = available_cores()[-1]
+    others = [one for one in available_cores() if one != core]
+    before = _states(nodes)
+    with profiling_condition(["/front"], folder=tmp_path) as see_to_it:
+        assert not see_to_it(list_processes(nodes.values()))  # it was not yet
+        assert see_to_it(list_processes(nodes.values()))
+        executor = list_threads(nodes["/front"])[0]
+        assert (executor.policy, executor.priority) == ("SCHED_FIFO", 87)
+        assert executor.cores == (core,)
+        for thread in _dds(nodes["/front"]):
+            assert thread.priority == (91 if thread.kind == "receive" else 90)
+            assert thread.policy == "SCHED_FIFO"
+            assert list(thread.cores) == (others or [core])
+        rear = {t.tid: state_of(t.tid) for t in list_threads(nodes["/rear"])}
+        assert rear == {tid: before[tid] for tid in rear}
+        (run,) = tmp_path.iterdir()
+        assert (run / "journal.jsonl").is_file()
+    assert _states(nodes) == before
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_all_is_as_before_when_the_run_fails(nodes: dict[str, int], tmp_path: Path) -> None:
+    before = _states(nodes)
+    with (
+        pytest.raises(ZeroDivisionError),
+        profiling_condition(folder=tmp_path) as see_to_it,
+    ):
+        see_to_it(list_processes(nodes.values()))
+        assert _states(nodes) != before
+        raise ZeroDivisionError
+    assert _states(nodes) == before
+
+
+def test_what_starts_the_nodes_is_not_profiled_with_them(node: Path, tmp_path: Path) -> None:
+    """Without names all nodes are meant; `ros2 launch`, which is a node too, is not."""
+    launcher = subprocess.Popen(
+        ["sh", "-c", f"{node} flood 1000000 10000 --ros-args -r __node:=one; true"]
+    )
+    try:
+        wait_for(lambda: len(_family(launcher.pid)) == 2, "the node")
+        child = next(pid for pid in _family(launcher.pid) if pid != launcher.pid)
+        wait_for(lambda: len(_dds(child)) == 2, "its threads")
+        with profiling_condition(folder=tmp_path) as see_to_it:
+            see_to_it(list_processes(_family(launcher.pid)))
+            assert list_threads(child)[0].policy == "SCHED_FIFO"
+            assert list_threads(launcher.pid)[0].policy == "SCHED_OTHER"
+    finally:
+        for pid in _family(launcher.pid):
+            os.kill(pid, 9)
+        launcher.wait()
+
+
+def _family(pid: int) -> list[int]:
+    children = Path(f"/proc/{pid}/task/{pid}/children")
+    return [pid, *map(int, children.read_text().split())]
+
+
+def test_a_node_that_does_not_appear_is_named(
+    nodes: dict[str, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(profiling, "START_NS", 0)
+    with (
+        pytest.raises(OperationError, match=r"node /lost has not .* running: /front, /rear"),
+        profiling_condition(["/front", "/lost"], folder=tmp_path) as see_to_it,
+    ):
+        time.sleep(0.001)
+        see_to_it(list_processes(nodes.values()))
+
+
+def test_an_executor_that_had_several_threads_has_them_again() -> None:
+    program = "import threading; threading.Thread(target=input, daemon=True).start(); input()"
+    command = [sys.executable, "-c", program, "--ros-args", "-r", "__node:=box"]
+    threads = tuple(RecordedThread(number, "executor", ("/part",)) for number in (1, 2))
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
+        wait_for(lambda: len(list_threads(process.pid)) == 2, "the threads")
+        running = list_processes([process.pid])
+        for count in (1, 2):
+            earlier = [RecordedProcess(1, ("/box", "/part"), threads[:count], seen_ns=0)]
+            found = allocate(running, earlier)
+            for nodes in (frozenset(["/part"]), frozenset[str]()):
+                assert len(executors_of(found, nodes, running, earlier)) == count
+        assert executors_of(found, frozenset(["/other"]), running, earlier) == []
+        process.communicate(b"\n\n")
+
+
+def test_a_core_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    with (
+        pytest.raises(PlatformError, match="core 4000, which the chain asks for"),
+        profiling_condition(core=4000, folder=tmp_path),
+    ):
+        pass
+
+
+def test_profile_records_the_chain_under_its_condition(node: Path, tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    command = chain_command(node, 100_000)
+    assert called("record", "-o", first, "--duration", "1s", "--", *command).code == 0
+    assert chain_nodes(open_recording(first), "/x../y") == ("/source", "/relay")
+    with pytest.raises(InputError, match="/nowhere"):
+        chain_nodes(open_recording(first), "/x../nowhere")
+    chain: tuple[str | Path, ...] = ("--chain", "/x../y", "--like", first)
+    arguments = ("-o", second, *chain, "--duration", "3s", "--", *command)
+    assert called("profile", *arguments).code == 0
+    recording = open_recording(second)
+    executors = [thread for thread in recording.info.threads if thread.role == "executor"]
+    assert {thread.policy for thread in executors} == {"SCHED_FIFO"}
+    assert {thread.cores for thread in executors} == {(available_cores()[-1],)}
+    assert recording.info.realtime is True
+    # Objects are from before the priorities were in force, what happened is from after that.
+    created = recording.events["rcl_node_init"]["time"]
+    happened = recording.events["callback_start"]["time"]
+    assert int(happened.min()) - int(created.max()) > 400_000_000  # type: ignore[arg-type]
+    assert any("were left out: the scheduling was not in force" in n for n in recording.info.notes)
+    assert json_of("latency", second)["count"] > 0  # it names its chain itself
+
+
+def test_profile_says_what_it_needs(tmp_path: Path) -> None:
+    path, command = tmp_path / "rec", ("--", "sleep", "1")
+    assert "no command given" in refused(2, "profile", "-o", path)
+    said = refused(2, "profile", "-o", path, "--chain", "/a../b", *command)
+    assert "an earlier recording knows: name it with --like" in said
+    assert "no such folder" in refused(
+        2, "profile", "-o", path, "--chain", "/a../b", "--like", tmp_path / "no", *command
+    )
+    assert "core 4000" in refused(3, "profile", "-o", path, "--core", "4000", *command)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,303 @@
+"""`chainshaper record`, from the command line to the recording, with a real LTTng."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+from command_line import Running, called, chainshaper, json_of, refused
+from lttng_node import chain_command, required_node
+from processes import wait_for
+from ros2 import ros2_environment
+
+from chainshaper import open_recording
+from chainshaper.flow import record
+from chainshaper.values.errors import OperationError
+from chainshaper.values.events import EventTables
+from chainshaper.values.recording import RecordingInfo
+
+CYCLES = 30
+
+
+@pytest.fixture(scope="module")
+def node() -> Path:
+    return required_node()
+
+
+@pytest.fixture(scope="module")
+def recorded(node: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A chain of two nodes, /source → /x → /relay → /y, recorded to its own end."""
+    path = tmp_path_factory.mktemp("recorded") / "rec"
+    said = json_of_recording("-o", path, "--", *chain_command(node, CYCLES, period_us=40_000))
+    assert said["recording"] == str(path)
+    assert said["exit_code"] == 0
+    assert said["lost"] == {"discarded_events": 0, "lost_packets": 0}
+    return path
+
+
+def json_of_recording(*arguments: str | Path) -> Mapping[str, object]:
+    finished = called("record", "--json", *arguments)
+    assert finished.code == 0, finished
+    found: Mapping[str, object] = json.loads(finished.out)
+    return found
+
+
+def files_in(folder: Path) -> list[str]:
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+def test_a_recorded_chain_has_the_latency_of_every_cycle(recorded: Path) -> None:
+    figures = json_of("latency", recorded, "--chain", "/x../y")
+    assert (figures["count"], figures["incomplete"]) == (CYCLES, 0)
+    callbacks = json_of("callbacks", recorded)
+    assert {(one["node"], one["count"]) for one in callbacks} == {
+        ("/source", CYCLES),
+        ("/relay", CYCLES),
+    }
+
+
+def test_the_trace_itself_is_kept_and_gives_the_same_figures(recorded: Path) -> None:
+    chain = ("--chain", "/x../y", "--instances")
+    from_trace = json_of("latency", recorded / "trace", *chain)
+    assert json_of("latency", recorded, *chain)["instances"] == from_trace["instances"]
+    assert json_of("info", recorded)["events"] == json_of("info", recorded / "trace")["events"]
+
+
+def test_the_recording_says_who_ran_how(recorded: Path, node: Path) -> None:
+    info = open_recording(recorded).info
+    assert info.command == chain_command(node, CYCLES, period_us=40_000)
+    assert (info.distribution, info.rmw) == ("jazzy", "rmw_cyclonedds_cpp")
+    assert sorted(info.processes.values()) == ["/relay", "/source"]
+    for name in ("/source", "/relay"):
+        threads = [thread for thread in info.threads if thread.node == name]
+        roles = {thread.comm: thread.role for thread in threads}
+        assert (roles["recvUC"], roles["tev"]) == ("dds", "dds")
+        (executor,) = (thread for thread in threads if thread.role == "executor")
+        assert (executor.tid, executor.policy) == (executor.pid, "SCHED_OTHER")
+    assert info.realtime is False
+    ends = {(one.node, one.topic, one.kind, one.depth) for one in info.endpoints}
+    assert ends == {
+        ("/source", "/x", "publisher", 7),
+        ("/relay", "/x", "subscription", 7),
+        ("/relay", "/y", "publisher", 7),
+    }
+    assert any("types and QoS" in note and "ended by itself" in note for note in info.notes)
+
+
+def test_the_machine_itself_is_watched_where_that_is_asked_for(node: Path, tmp_path: Path) -> None:
+    path = tmp_path / "rec"
+    command = chain_command(node, CYCLES, period_us=40_000)
+    said = json_of_recording("-o", path, "--watch-stalls", "--", *command)
+    assert said["exit_code"] == 0
+    recording = open_recording(path)
+    meter = recording.info.stall_meter
+    assert meter is not None
+    assert meter.wakeups > CYCLES * 40 // 2
+    assert recording.events["machine_stall"].columns == ["time", "pid", "tid", "cpu", "duration"]
+    cycles = json_of("latency", path, "--chain", "/x../y", "--instances")["instances"]
+    assert all(one["disturbed"] in (True, False) for one in cycles)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_ctrl_c_ends_the_application_and_the_recording_is_whole(
+    node: Path, tmp_path: Path, number: signal.Signals
+) -> None:
+    path, sent = tmp_path / "rec", tmp_path / "sent"
+    (shell, option, pipe) = chain_command(node, 100_000)
+    pipe = pipe.replace("|", f"| tee {sent} |")
+    running = Running.start("record", "-o", path, "--", shell, option, pipe)
+    wait_for(lambda: sent.exists() and sent.stat().st_size > 100, "the chain's first messages")
+    running.process.send_signal(number)
+    finished = running.end()  # waits for the end of all its descendants
+    assert finished.code == 0, finished
+    assert finished.out == f"{path}\n"
+    figures = json_of("latency", path, "--chain", "/x../y")
+    assert figures["count"] > 0
+    assert files_in(tmp_path) == ["rec", "sent"]
+
+
+def test_a_recording_ends_after_its_duration(node: Path, tmp_path: Path) -> None:
+    path = tmp_path / "rec"
+    command = chain_command(node, 100_000)
+    assert json_of_recording("-o", path, "--duration", "1s", "--", *command)["exit_code"] is None
+    recording = open_recording(path)
+    started = recording.events["callback_start"]["time"]
+    lasted = int(started.max()) - int(started.min())  # type: ignore[arg-type]
+    assert 0 < lasted < 30_000_000_000
+    # The application was there to be asked; who answers is no ROS 2.
+    assert any("types and QoS of topics could not be asked for" in n for n in recording.info.notes)
+
+
+@pytest.mark.parametrize(
+    ("end", "words"), [("exit 3", "ended with code 3"), ("kill -SEGV $$", "was killed by SIGSEGV")]
+)
+def test_an_application_that_fails_is_reported_and_what_was_recorded_is_kept(
+    node: Path, tmp_path: Path, end: str, words: str
+) -> None:
+    path = tmp_path / "rec"
+    finished = called("record", "-o", path, "--", "sh", "-c", f"{node} flood 10 0; {end}")
+    assert finished.code == 1
+    assert f"error: the command {words}; what was recorded until then is in {path}" in finished.err
+    recording = open_recording(path)
+    assert recording.events["callback_start"].height == 10
+    assert any(f"the command {words} after" in note for note in recording.info.notes)
+
+
+def test_an_application_that_is_not_traced_leaves_no_recording(node: Path, tmp_path: Path) -> None:
+    said = refused(1, "record", "-o", tmp_path / "rec", "--", "sh", "-c", "exit 4")
+    assert "no process with LTTng trace points was seen" in said
+    assert "; the command ended with code 4 after" in said
+    assert files_in(tmp_path) == []
+
+
+def test_lost_events_are_named_wherever_figures_are(node: Path, tmp_path: Path) -> None:
+    path = tmp_path / "rec"
+    command = ("--buffer", "1", "--", node, "flood", "300000", "0")
+    finished = called("record", "-o", path, *command)
+    assert finished.code == 0
+    lost = json.loads((path / "recording.json").read_text())["lost"]["discarded_events"]
+    assert lost > 0
+    assert f"lost while recording: {lost} discarded events" in finished.err
+    assert f"{lost} events were lost: buffers were too small. Record again with" in finished.err
+    assert json_of("info", path)["lost"]["discarded_events"] == lost
+    latency = called("latency", path, "--chain", "/flood../x")
+    assert f"{lost} discarded events" in latency.out + latency.err
+
+
+def test_an_ordinary_user_records_with_a_daemon_of_their_own(
+    node: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("only root can become another user")
+    with tempfile.TemporaryDirectory() as readable:  # pytest's own folders are root's alone
+        folder = Path(readable)
+        folder.chmod(0o777)
+        program = folder / "node"
+        shutil.copy(node, program)
+        program.chmod(0o755)
+        monkeypatch.setenv("HOME", readable)
+        nobody = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
+        arguments = ("-o", folder / "rec", "--", program, "flood", "20", "0")
+        run = chainshaper("record", *arguments, prefix=nobody)
+        assert run.code == 0, run
+        assert open_recording(folder / "rec").events["callback_start"].height == 20
+        assert "root or the group `tracing`" in run.err  # for sched_switch
+
+
+def test_what_is_wrong_is_said_before_anything_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, program = tmp_path / "rec", ("--", "true")
+    assert "no command given" in refused(2, "record", "-o", path)
+    assert "no_such: no such command" in refused(2, "record", "-o", path, "--", "no_such", "launch")
+    said = refused(2, "record", "-o", path, "--source", "ebpf", "--pid", "1", *program)
+    assert "give one of them" in said
+    said = refused(2, "record", "-o", path, "--source", "ebpf", "--buffer", "8", *program)
+    assert "--buffer is about LTTng's buffers" in said
+    (tmp_path / "mine").write_text("mine")
+    said = refused(2, "record", "-o", tmp_path / "mine", *program)
+    assert "exists already and is not overwritten" in said
+    assert files_in(tmp_path) == ["mine"]
+    (tmp_path / "true").symlink_to("/bin/true")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    said = refused(3, "record", "-o", path, *program)
+    assert "install LTTng" in said
+    assert "--source ebpf" in said
+    assert files_in(tmp_path) == ["mine", "true"]
+
+
+def test_a_disk_that_fills_up_ends_the_run(
+    node: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(record, "SPARE_DISK", 1 << 60)
+    done = record.record_command(tmp_path / "rec", chain_command(node, 100_000))
+    assert done.exit_code is None
+    assert any("the disk of" in note and "is full" in note for note in done.recording.info.notes)
+
+
+class BrokenTracer:
+    """A tracer whose trace cannot be read."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.removed = 0
+
+    def start(self) -> Mapping[str, str]:
+        (self.folder / "events").write_text("what was traced")
+        return {}
+
+    def failure(self) -> str | None:
+        return "it broke"
+
+    def stop(self) -> None:
+        pass
+
+    def remove(self) -> None:
+        self.removed += 1
+
+    def recording(self) -> tuple[EventTables, RecordingInfo]:
+        raise OperationError("it cannot be read")
+
+
+def test_a_trace_that_cannot_be_read_is_kept_and_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[BrokenTracer] = []
+
+    def tracer(_source: str, folder: Path, *_: object, **_how: object) -> BrokenTracer:
+        made.append(BrokenTracer(folder))
+        return made[0]
+
+    monkeypatch.setattr(record, "_tracer", tracer)
+    with pytest.raises(OperationError) as caught:
+        record.record_command(tmp_path / "rec", ["sleep", "60"])
+    (kept,) = tmp_path.iterdir()
+    assert str(caught.value) == (
+        "it cannot be read; tracing ended before the application did: it broke; what was traced is "
+        f"kept in {kept}"
+    )
+    assert kept.name.startswith("rec.tracing-")
+    assert (kept / "events").read_text() == "what was traced"
+    assert made[0].removed == 1
+
+
+def test_a_full_disk_is_named(node: Path, full_disk: Path) -> None:
+    said = refused(1, "record", "-o", full_disk / "rec", "--", node, "flood", "100000", "1000")
+    assert f"the disk of {full_disk} is full" in said
+    assert "rec" not in files_in(full_disk)
+
+
+@pytest.mark.ros2
+def test_real_nodes_are_recorded_with_types_and_qos(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in ros2_environment().items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    package = ["ros2", "pkg", "prefix", "demo_nodes_cpp"]
+    if subprocess.run(package, capture_output=True, check=False).returncode:
+        pytest.skip("the package demo_nodes_cpp is not installed in this ROS 2")
+    path = tmp_path / "rec"
+    nodes = "ros2 run demo_nodes_cpp talker & ros2 run demo_nodes_cpp listener"
+    json_of_recording("-o", path, "--duration", "8s", "--", "sh", "-c", nodes)
+    info = open_recording(path).info
+    assert sorted(info.processes.values()) == ["/listener", "/talker"]
+    chatter = {one.kind: one for one in info.endpoints if one.topic == "/chatter"}
+    assert chatter["publisher"].node == "/talker"
+    assert chatter["subscription"].node == "/listener"
+    for one in chatter.values():
+        # from Lyrical on the latter
+        assert one.type in ("std_msgs/msg/String", "example_interfaces/msg/String")
+        assert one.reliability == "reliable"
+        assert one.depth
+    # A ROS 2 that was built from source need not say its name.
+    assert info.distribution == os.environ.get("ROS_DISTRO", info.distribution)
+    assert info.distribution is not None
+    executors = {thread.node for thread in info.threads if thread.role == "executor"}
+    assert executors == {"/talker", "/listener"}
+    assert json_of("latency", path, "--chain", "/talker../chatter")["count"] >= 3

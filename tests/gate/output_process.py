@@ -1,0 +1,55 @@
+"""A shaping node or a standby without ROS 2: takes datagrams, writes what it publishes to stdout.
+
+Arguments: the folder of pages, ``shaping`` or ``standby``, the name of the page, the port to
+listen at, and for how long the shaping node holds a message (ns). A message is its number, which
+names it as well.
+"""
+
+import os
+import socket
+import sys
+import threading
+import time
+from contextlib import suppress
+
+from chainshaper.gate import handover
+
+
+def publish(word: bytes, number: int) -> None:
+    os.write(1, word + number.to_bytes(8, "little"))
+
+
+def main() -> None:
+    folder, what, name, port, hold = sys.argv[1:]
+    handover.page_folders = lambda: iter([folder])
+    inbox = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    if what == "shaping":
+        turn = handover.Turn(name, "/t5")
+        inbox.bind(("127.0.0.1", int(port)))
+        with suppress(PermissionError):  # else who receives may run before it has noted what it did
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        publish(b"R", os.getpid())
+        while True:
+            number = int.from_bytes(inbox.recv(8), "little")
+            if not turn.take(number):
+                continue
+            until = time.monotonic_ns() + int(hold)
+            turn.hold(until, 0)
+            time.sleep(int(hold) / 1e9)
+            if not turn.was_bypassed(number):
+                publish(b"S", number)
+                turn.done(number)
+    standby = handover.Standby(
+        *(name, "/t5", lambda payload, *_: publish(b"B", int.from_bytes(payload, "little"))),
+        lambda _: None,
+        patience_ns=10 * int(hold),
+    )
+    threading.Thread(target=standby.watch, daemon=True).start()
+    inbox.bind(("127.0.0.1", int(port)))
+    publish(b"R", os.getpid())
+    while True:
+        payload = inbox.recv(8)
+        standby.arrived(payload, int.from_bytes(payload, "little"))
+
+
+main()

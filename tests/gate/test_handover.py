@@ -1,0 +1,313 @@
+"""Who publishes a shaped output while shaping node and standby are killed, stopped and started."""
+
+import os
+import random
+import select
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from chainshaper import splicing
+from chainshaper.gate.handover import RING, Page, Standby, Turn, open_page
+
+MS = 1_000_000
+PROCESS = Path(__file__).parent / "output_process.py"
+HEADERS = Path(splicing.__file__).parent / "nodes" / "cpp" / "include"
+KILLS = int(os.environ.get("CHAINSHAPER_KILLS", "20"))
+PERIOD_S, HOLD_NS = 0.004, 2 * MS
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Pages of these tests, and of the processes that they start, in a folder of their own."""
+    monkeypatch.setattr(
+        "chainshaper.gate.handover.page_folders", lambda: iter([str(tmp_path / "outputs")])
+    )
+    return tmp_path / "outputs"
+
+
+@dataclass
+class Output:
+    """An output with its two processes, a publisher before it and a subscriber behind it."""
+
+    command: dict[str, list[str]]
+    sender: socket.socket = field(
+        default_factory=lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    )
+    running: dict[str, "subprocess.Popen[bytes]"] = field(default_factory=dict)
+    ports: dict[str, int] = field(default_factory=dict)
+    came: list[tuple[str, int, float]] = field(default_factory=list)
+    sent: int = 0
+
+    def __post_init__(self) -> None:
+        self.reading, self.writing = os.pipe()
+
+    def start(self, what: str) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+            free.bind(("127.0.0.1", 0))
+            self.ports[what] = free.getsockname()[1]
+        command = [*self.command[what], what, "t5", str(self.ports[what]), str(HOLD_NS)]
+        self.running[what] = subprocess.Popen(command, stdout=self.writing)
+
+    def kill(self, what: str) -> None:
+        self.running[what].kill()
+        self.running[what].wait()
+
+    def send(self) -> None:
+        """Publish one message, to all that listen by now."""
+        self.sent += 1
+        for port in self.ports.values():
+            self.sender.sendto(self.sent.to_bytes(8, "little"), ("127.0.0.1", port))
+        self.receive(PERIOD_S)
+
+    def receive(self, seconds: float) -> None:
+        until = time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0:
+            if select.select([self.reading], [], [], left)[0]:
+                record = os.read(self.reading, 9)
+                number = int.from_bytes(record[1:], "little")
+                self.came.append((chr(record[0]), number, time.monotonic()))
+
+    def await_ready(self, what: str) -> None:
+        while not any((word, n) == ("R", self.running[what].pid) for word, n, _ in self.came):
+            self.send()
+
+    def send_many(self, count: int) -> None:
+        for _ in range(count):
+            self.send()
+
+    def check(self, since: int) -> None:
+        """Every message sent behind that one has come once, in order."""
+        self.receive(0.2)
+        came = [number for number in self.numbers if number > since]
+        assert came == sorted(came), f"out of order: {self.came[-30:]}"
+        assert len(came) == len(set(came)), "twice"
+        assert came == list(range(since + 1, self.sent + 1)), "lost"
+
+    @property
+    def numbers(self) -> list[int]:
+        return [number for word, number, _ in self.came if word in "SB"]
+
+    def by(self, word: str) -> list[int]:
+        return [number for found, number, _ in self.came if found == word]
+
+
+@pytest.fixture(scope="module")
+def in_cpp(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shaping node in C++."""
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("g++ is not installed, so the shaping node in C++ cannot be compiled")
+    program = tmp_path_factory.mktemp("cpp") / "output_process"
+    source = PROCESS.with_suffix(".cpp")
+    warnings = ["-Wall", "-Wextra", "-Wconversion", "-Werror"]
+    options = ["-std=c++17", "-O1", *warnings, f"-I{HEADERS}"]
+    subprocess.run([compiler, *options, source, "-o", program], check=True, timeout=150)
+    return program
+
+
+@pytest.fixture(params=["python", "cpp"])
+def output(
+    request: pytest.FixtureRequest, tmp_path: Path, folder: Path, in_cpp: Path
+) -> Iterator[Output]:
+    """The two processes of an output, with a shaping node in either language."""
+    python = [sys.executable, str(PROCESS), str(folder)]
+    shaping = python if request.param == "python" else [str(in_cpp), str(folder)]
+    made = Output({"shaping": shaping, "standby": python})
+    try:
+        for what in ("standby", "shaping"):
+            made.start(what)
+            made.await_ready(what)
+        yield made
+    finally:
+        for process in made.running.values():
+            process.kill()
+            process.wait()
+
+
+def test_a_node_that_is_killed_at_random_loses_doubles_and_reorders_nothing(output: Output) -> None:
+    begun, dice = output.sent, random.Random(13)
+    for number in range(KILLS):
+        what = "standby" if number % 5 == 4 else "shaping"
+        output.send_many(dice.randrange(5, 12))
+        output.receive(dice.random() * PERIOD_S)
+        output.kill(what)
+        output.start(what)
+        output.await_ready(what)
+    output.check(begun)
+    assert output.by("B")
+    assert output.by("S")
+
+
+def test_a_node_that_is_stopped_is_gone_around_until_it_goes_on(output: Output) -> None:
+    begun, shaping = output.sent, output.running["shaping"]
+    for _ in range(4):
+        output.send_many(5)
+        bypassed = len(output.by("B"))
+        shaping.send_signal(signal.SIGSTOP)
+        output.send_many(30)
+        assert len(output.by("B")) > bypassed + 10
+        shaping.send_signal(signal.SIGCONT)
+        output.send_many(20)
+        assert output.by("S")[-1] > output.by("B")[-1], "shaped again"
+    output.check(begun)
+
+
+def test_a_standby_that_is_stopped_is_in_nobody_s_way(output: Output) -> None:
+    begun, standby = output.sent, output.running["standby"]
+    output.send_many(5)
+    standby.send_signal(signal.SIGSTOP)
+    output.send_many(5)
+    output.kill("shaping")
+    output.start("shaping")
+    output.await_ready("shaping")
+    output.send_many(30)
+    assert output.by("S")[-1] > output.sent - 3, "the new node publishes"
+    standby.send_signal(signal.SIGCONT)
+    output.send_many(20)
+    output.receive(0.2)
+    late = [number for number in output.numbers if number > begun]
+    assert len(late) == len(set(late)), "twice"
+
+
+def test_when_both_are_killed_nothing_comes_twice_and_either_goes_on(output: Output) -> None:
+    dice = random.Random(13)
+    for _ in range(KILLS // 5):
+        output.send_many(dice.randrange(5, 12))
+        for what in ("standby", "shaping"):
+            output.kill(what)
+        for what in ("standby", "shaping"):
+            output.start(what)
+        for what in ("standby", "shaping"):
+            output.await_ready(what)
+        begun = output.sent
+        output.send_many(5)
+        output.check(begun)
+    assert output.numbers == sorted(set(output.numbers)), "twice, or out of order"
+
+
+def test_of_two_shaping_nodes_one_publishes(output: Output) -> None:
+    begun, first = output.sent, output.running["shaping"]
+    output.running["another"] = first
+    output.ports["another"] = output.ports["shaping"]
+    output.start("shaping")
+    output.await_ready("shaping")
+    output.send_many(10)
+    output.check(begun)
+    first.kill()
+    first.wait()
+    del output.ports["another"]
+    killed = output.sent
+    output.send_many(20)
+    output.check(begun)
+    assert output.by("S")[-1] > killed, "the other has taken over"
+
+
+def test_a_page_that_is_removed_while_it_is_used_is_made_again(
+    output: Output, folder: Path
+) -> None:
+    begun = output.sent
+    output.send_many(5)
+    shutil.rmtree(folder)
+    output.send_many(10)
+    output.kill("shaping")
+    output.send_many(5)
+    output.check(begun)
+    assert [path.name for path in folder.iterdir()] == ["t5.0.v1"]
+
+
+# Pages ------------------------------------------------------------------------------------------
+
+
+def test_starting_over_and_over_takes_longer_each_time_until_a_message_is_dealt_with(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    waits = [Turn("t5", "/t5").wait_s for _ in range(9)]
+    assert waits == [0, 0, 0, 0.5, 1, 2, 4, 8, 10]
+    turn = Turn("t5", "/t5")
+    assert turn.take(1)
+    turn.done(1)
+    assert Turn("t5", "/t5").wait_s == 0
+    for _ in range(5):
+        turn = Turn("t5", "/t5")
+    assert turn.wait_s > 0
+    turn.page["started_ns"] -= 60_000 * MS
+    assert Turn("t5", "/t5").wait_s == 0, "that was long ago"
+
+
+def test_a_node_that_starts_again_goes_on_where_cycles_began(folder: Path) -> None:
+    turn = Turn("t5", "/t5")
+    assert turn.phase_ns is None
+    turn.hold(None, 12_345, 2)
+    assert (Turn("t5", "/t5").phase_ns, turn.page["mode"]) == (12_345, 2)
+    assert turn.page.topic == "/t5"
+
+
+@pytest.mark.parametrize("how", ["mode", "owner", "link", "file", "foreign page"])
+def test_a_folder_that_is_not_ours_alone_is_not_used(
+    tmp_path: Path, folder: Path, how: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if how in ("owner", "foreign page") and os.geteuid():
+        pytest.skip("giving files to another user takes root")
+    if how == "link":
+        (tmp_path / "elsewhere").mkdir(mode=0o700)
+        folder.symlink_to(tmp_path / "elsewhere")
+    elif how == "file":
+        folder.touch()
+    else:
+        folder.mkdir(mode=0o777 if how == "mode" else 0o700)
+        if how == "mode":
+            folder.chmod(0o777)
+        elif how == "owner":
+            os.chown(folder, 65534, -1)
+        else:
+            (folder / "t5.0.v1").touch()
+            os.chown(folder / "t5.0.v1", 65534, -1)
+    with pytest.raises(OSError, match=r"outputs: .*(not a folder|exists|not a file of)"):
+        open_page("t5", "/t5")
+    spare = tmp_path / "spare"
+    monkeypatch.setattr(
+        "chainshaper.gate.handover.page_folders", lambda: iter([str(folder), str(spare)])
+    )
+    assert open_page("t5", "/t5").path == f"{spare}/t5.0.v1"
+
+
+def test_a_page_for_which_there_is_no_room_is_made_elsewhere_and_found_there(
+    full_disk: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders = [f"{full_disk}/outputs", str(folder)]
+    monkeypatch.setattr("chainshaper.gate.handover.page_folders", lambda: iter(folders))
+    page = open_page("t5", "/t5")
+    assert page.path == f"{folder}/t5.0.v1"
+    folders[0] = f"{folder.parent}/room"
+    assert open_page("t5", "/t5").path == page.path
+
+
+def test_only_what_is_a_page_is_looked_at(folder: Path) -> None:
+    open_page("t5", "/t5")["starts"] = 3
+    assert Page(str(folder), "t5.0.v1")["starts"] == 3
+    (folder / "other").write_bytes(b"short")
+    with pytest.raises(ValueError, match="no page"):
+        Page(str(folder), "other")
+
+
+def test_a_message_that_is_too_old_for_the_ring_is_left_out_too() -> None:
+    turn, passed = Turn("t5", "/t5"), list[int]()
+    assert turn.take(1)
+    turn.done(1)
+    standby = Standby("t5", "/t5", lambda _, key, __: passed.append(key or 0), lambda _: None, 0)
+    numbers = range(2, RING + 10)
+    for number in numbers:  # the node has the lock, and is later than it may be
+        standby.arrived(b"", number)
+        standby.look()
+    assert passed == list(numbers)
+    assert not any(turn.take(number) for number in numbers)
+    assert turn.take(RING + 10)

@@ -1,0 +1,204 @@
+"""Processes of ours run our code, wherever they are started and whatever the environment says."""
+
+import os
+import pwd
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from unittest import mock
+
+import pytest
+from small_chain import small_chain_text
+
+import chainshaper
+from chainshaper.linux import own_processes
+from chainshaper.linux.own_processes import is_installed, module_command
+
+SOURCES = Path(chainshaper.__file__).parent
+MODULES = [
+    "chainshaper.enforcement.freezer.slot_dispatcher",
+    "chainshaper.enforcement.runs.guardian",
+    "chainshaper.enforcement.scx.kicker",
+    "chainshaper.simulation.sweeping.worker",
+    "chainshaper.workload.node_process",
+    "chainshaper.workload.stall_meter",
+]
+as_root = pytest.mark.skipif(os.geteuid() != 0, reason="giving files to another user needs root")
+
+
+@pytest.fixture
+def evil(tmp_path: Path) -> Path:
+    """A folder with a module of every name that Python has, and of ours: each leaves a mark."""
+    folder = tmp_path / "evil"
+    (folder / "chainshaper").mkdir(parents=True)
+    leaves_mark = f"open({str(tmp_path / 'marks')!r}, 'a').write(__name__ + '\\n')\n"
+    names = {*sys.stdlib_module_names, "sitecustomize", "usercustomize", "numpy", "cyclonedds"}
+    for name in {f"{name}.py" for name in names} | {"chainshaper/__init__.py"}:
+        (folder / name).write_text(leaves_mark)
+    return folder
+
+
+def marks(evil: Path) -> str:
+    file = evil.with_name("marks")
+    return file.read_text() if file.exists() else ""
+
+
+def test_one_place_starts_python() -> None:
+    """And the processes of ROS 2 nodes, which run without our package: those have a line each.
+
+    What starts a node again starts it as `ros2 launch` does: rclpy is where PYTHONPATH leads.
+    """
+    starting = {
+        path.relative_to(SOURCES).as_posix(): path.read_text()
+        for path in SOURCES.rglob("*.py")
+        if re.search(r"sys\.executable|multiprocessing|ProcessPool", path.read_text())
+    }
+    in_nodes = {"enforcement/kept_core.py", "splicing/nodes/python/gate_log.py"}
+    again = "splicing/nodes/python/respawning.py"
+    assert starting.keys() == {"enforcement/own_processes.py", *in_nodes, again}
+    for name in in_nodes:
+        assert '[sys.executable, "-I", "-S", "-c"' in starting[name]
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_nothing_of_the_current_folder_or_of_python_variables_runs(module: str, evil: Path) -> None:
+    variables = ("PYTHONPATH", "PYTHONHOME", "PYTHONUSERBASE", "PYTHONSTARTUP", "HOME")
+    with mock.patch.dict(os.environ, dict.fromkeys(variables, str(evil))):
+        command = module_command(module, own_processes.LIBRARIES)
+        run = subprocess.run(
+            command, cwd=evil, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False
+        )
+    assert marks(evil) == ""
+    assert "No module named" not in run.stderr
+    # It came as far as its arguments, which are missing.
+    assert not run.stderr or "argv" in run.stderr
+
+
+@pytest.mark.parametrize("verb", ["run", "sweep"])
+def test_a_command_that_starts_processes_runs_nothing_of_the_current_folder(
+    verb: str, evil: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "application.yaml").write_text(small_chain_text())
+    more = {
+        "run": ["--cycles", "3", "-o", str(tmp_path / "rec")],
+        "sweep": [
+            *("--vary", "bands=1,2", "--cycles", "20", "--workers", "2"),
+            *("-o", str(tmp_path / "out.parquet")),
+        ],
+    }
+    program = "import sys; from chainshaper.cli import main; main(sys.argv[1:])"
+    command = [sys.executable, "-I", "-c", program, verb, str(tmp_path / "application.yaml")]
+    run = subprocess.run(
+        [*command, *more[verb]], cwd=evil, capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stderr
+    assert marks(evil) == ""
+
+
+def test_python_dash_m_imports_from_no_current_folder(tmp_path: Path) -> None:
+    """What was imported before the package's own first line is Python's affair."""
+    (tmp_path / "typer.py").write_text("raise SystemExit('evil')")
+    run = subprocess.run(
+        [sys.executable, "-m", "chainshaper", "--help"],
+        cwd=tmp_path,
+        capture_output=True,
+        check=False,
+    )
+    assert (run.returncode, run.stderr) == (0, b"")
+
+
+def copied(folder: Path) -> Path:
+    """The package where nothing but PYTHONPATH leads to, as colcon installs it."""
+    root = folder / "install"
+    names = ["__init__.py", "errors.py", "trusted_files.py", "enforcement/__init__.py"]
+    for name in (*names, "enforcement/own_processes.py"):
+        place = root / "chainshaper" / name
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_bytes((SOURCES / name).read_bytes())
+    (root / "chainshaper" / "said.py").write_text("print(__file__); import library")
+    (root / "library.py").write_text("print('library')")
+    (root / "json.py").write_text("raise SystemExit('no module of Python is hidden')")
+    return root
+
+
+_STARTS = (
+    "import subprocess, sys; sys.path[:0] = [{root!r}]; "
+    "from chainshaper.linux.own_processes import module_command; "
+    "sys.exit(subprocess.run(module_command('chainshaper.said', ['library'])).returncode)"
+)
+
+
+def started(root: Path, python: str = sys.executable) -> "subprocess.CompletedProcess[str]":
+    return subprocess.run(
+        [python, "-B", "-c", _STARTS.format(root=str(root))],
+        env={**os.environ, "PYTHONPATH": str(root)},
+        cwd="/",
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize("version", ["3.10", "3.11", "3.12", "3.13", "3.14"])
+def test_a_package_that_only_pythonpath_leads_to_is_the_one_that_runs(
+    version: str, tmp_path: Path
+) -> None:
+    of_pyenv = (Path.home() / ".pyenv" / "versions").glob(f"{version}.*/bin/python3")
+    python = next((str(path) for path in of_pyenv), shutil.which(f"python{version}"))
+    if python is None:
+        pytest.skip(f"Python {version} is not here")
+    root = copied(tmp_path)
+    run = started(root, python)
+    assert run.stdout.splitlines() == [str(root / "chainshaper" / "said.py"), "library"], run.stderr
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda root: root.chmod(0o777), "is writable by others than"),
+        (lambda root: (root / "chainshaper").chmod(0o775), "is writable by others than"),
+        pytest.param(
+            lambda root: os.chown(root, pwd.getpwnam("nobody").pw_uid, -1),
+            "belongs to nobody",
+            marks=as_root,
+        ),
+    ],
+)
+def test_a_package_that_others_may_change_is_refused_with_the_reason(
+    tmp_path: Path, spoil: Callable[[Path], None], said: str
+) -> None:
+    root = copied(tmp_path)
+    os.chown(root / "chainshaper", -1, 1)  # a group that is not only its user's own
+    spoil(root)
+    run = started(root)
+    assert f"chainshaper's own processes do not run from {root}" in run.stderr
+    assert said in run.stderr
+    assert run.stdout == ""
+
+
+def test_libraries_that_others_may_change_are_not_handed_on(tmp_path: Path) -> None:
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    (theirs / "a_library.py").touch()
+    with mock.patch.object(sys, "path", [*sys.path, str(theirs)]):
+        assert str(theirs) in module_command("any", ["a_library", "numpy", "absent"])
+        theirs.chmod(0o777)
+        assert str(theirs) not in module_command("any", ["a_library", "numpy", "absent"])
+
+
+def test_tools_are_not_found_in_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tool = tmp_path / "chainshaper-tool"
+    tool.write_text("#!/bin/sh")
+    tool.chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+    for path in (".", "", f":{os.environ['PATH']}", f"./:{os.environ['PATH']}:."):
+        monkeypatch.setenv("PATH", path)
+        assert not is_installed(tool.name)
+        assert all(map(os.path.isabs, own_processes.tool_environment()["PATH"].split(":")))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert is_installed(tool.name)

@@ -1,0 +1,140 @@
+"""Threads as the kernel shows them, and what is asked of it for them."""
+
+import os
+import threading
+from pathlib import Path
+
+import pytest
+from actors import acting
+from processes import wait_for
+
+from chainshaper.linux.scheduling import (
+    available_cores,
+    check_cores,
+    may_use_fifo,
+    set_thread_name,
+    throttle_fraction,
+)
+from chainshaper.linux.threads import (
+    Scheduling,
+    Thread,
+    apply_scheduling,
+    find_thread,
+    foreign_realtime_processes,
+    innermost_id,
+    list_threads,
+    start_of,
+)
+from chainshaper.values.errors import OperationError, PlatformError
+
+
+def test_a_process_has_its_main_thread_first_and_named_threads_by_name() -> None:
+    ready, done = threading.Event(), threading.Event()
+
+    def body() -> None:
+        set_thread_name("xmit.user with a long name")
+        ready.set()
+        done.wait()
+
+    thread = threading.Thread(target=body)
+    thread.start()
+    ready.wait()
+    try:
+        threads = list_threads(os.getpid())
+    finally:
+        done.set()
+        thread.join()
+    assert threads[0].tid == os.getpid()
+    assert threads[0].role == "executor"
+    assert set(threads[0].cores) == os.sched_getaffinity(0)
+    sender = next(t for t in threads if t.tid == thread.native_id)
+    assert (sender.comm, sender.role) == ("xmit.user with ", "dds")  # the kernel keeps 15 bytes
+    assert sender.kind == "transmit"
+    assert sender.started >= threads[0].started
+    assert sender.identity == (thread.native_id, sender.started)
+
+
+def test_a_process_that_is_gone_has_no_threads() -> None:
+    pid = os.posix_spawn("/bin/true", ["true"], {})
+    os.waitpid(pid, 0)
+    assert list_threads(pid) == ()
+
+
+def test_a_thread_is_found_by_its_id_alone(tmp_path: Path) -> None:
+    with acting(tmp_path, "a") as actor:
+        found = find_thread(actor.tids["a"])
+        assert found == actor.thread("a")
+        assert found is not None
+        assert found.pid == actor.pid
+        assert start_of(actor.pid, actor.tids["a"]) == found.started
+        actor.end("a")
+        wait_for(lambda: find_thread(actor.tids["a"]) is None, "the end of a thread")
+        assert start_of(actor.pid, actor.tids["a"]) is None
+
+
+def test_a_name_with_brackets_and_spaces_does_not_confuse(tmp_path: Path) -> None:
+    with acting(tmp_path, ") R 1 2 (") as actor:
+        thread = actor.thread(") R 1 2 (")
+        assert thread.comm == ") R 1 2 ("
+        assert thread.started >= actor.thread("main").started
+
+
+def test_in_a_container_a_thread_has_an_id_of_its_own() -> None:
+    assert innermost_id("Name:\tx\nNSpid:\t4711\t12\t3\n") == 3
+    assert innermost_id("Name:\tx\nNSpid:\t4711\n") == 4711
+    assert innermost_id("Name:\tx\n") is None  # a kernel without pid namespaces
+
+
+def _thread(tid: int) -> Thread:
+    return Thread(tid, os.getpid(), "recv", "dds", "SCHED_OTHER", 0, (0,))
+
+
+def test_scheduling_a_thread_that_has_ended_is_no_error() -> None:
+    thread = threading.Thread(target=lambda: None)
+    thread.start()
+    thread.join()
+    assert thread.native_id is not None
+    apply_scheduling(_thread(thread.native_id), Scheduling(None, (available_cores()[0],)))
+
+
+def test_what_the_kernel_refuses_names_the_thread() -> None:
+    thread = _thread(threading.get_native_id())
+    with pytest.raises(OperationError, match=rf"thread {thread.tid} \(recv\).*priority 500"):
+        apply_scheduling(thread, Scheduling(500, None))
+    with pytest.raises(OperationError, match=r"cores \(1023,\)"):
+        apply_scheduling(thread, Scheduling(None, (1023,)))
+
+
+def test_asking_for_real_time_scheduling_changes_nothing() -> None:
+    before = (os.sched_getscheduler(0), os.sched_getparam(0), os.sched_getaffinity(0))
+    may_use_fifo()
+    assert (os.sched_getscheduler(0), os.sched_getparam(0), os.sched_getaffinity(0)) == before
+
+
+def test_a_missing_core_is_named_with_who_wants_it_and_what_there_is() -> None:
+    check_cores({available_cores()[0]: "scheduling.dds"})
+    with pytest.raises(PlatformError) as refused:
+        check_cores({available_cores()[0]: "scheduling.dds", 1023: "node lidar"})
+    text = str(refused.value)
+    assert "core 1023" in text
+    assert "node lidar" in text
+    assert ", ".join(map(str, available_cores())) in text
+
+
+def test_throttling_is_a_share_of_a_core() -> None:
+    assert 0.0 < throttle_fraction() <= 1.0
+
+
+def test_our_own_real_time_threads_are_not_foreign() -> None:
+    if not may_use_fifo():
+        pytest.skip("SCHED_FIFO is not permitted here")
+    listed: list[tuple[str, ...]] = []
+
+    def body() -> None:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        listed.append(foreign_realtime_processes())
+
+    thread = threading.Thread(target=body)
+    thread.start()
+    thread.join()
+    assert not any(f"({os.getpid()})" in name for name in listed[0])

@@ -1,0 +1,125 @@
+"""A sweep on a Dask cluster: a real scheduler and real workers, each a process of this machine."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+import pytest
+from processes import wait_for
+from quick_chain import quick_chain
+
+from chainshaper import sweep
+from chainshaper.simulation.sweeping import rows_beside, workers
+from chainshaper.values.errors import InputError, OperationError
+
+pytest.importorskip("distributed", reason="Dask's `distributed` is not installed")
+
+AXES: dict[str, list[Any]] = {"bands": [1, 2, 3], "seed": [1, 2]}
+Start = Callable[..., "subprocess.Popen[bytes]"]
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Start]:
+    """Start a part of a cluster; all of them end with the test."""
+    parts: list[subprocess.Popen[bytes]] = []
+
+    def start_one(part: str, *arguments: str, path: Path | None = None) -> Any:
+        command = [sys.executable, "-m", f"distributed.cli.dask_{part}", *arguments]
+        environment = {**os.environ, **({} if path is None else {"PYTHONPATH": str(path)})}
+        with (tmp_path / f"{part}_{len(parts)}.log").open("wb") as log:
+            process = subprocess.Popen(
+                [*command, "--no-dashboard"], stdout=log, stderr=log, cwd=tmp_path, env=environment
+            )
+        parts.append(process)
+        return process
+
+    yield start_one
+    for process in parts:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture
+def scheduler(start: Start, tmp_path: Path) -> str:
+    """The address of a scheduler without workers."""
+    file = tmp_path / "scheduler.json"
+    start("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file))
+    wait_for(lambda: file.exists() and file.stat().st_size > 0, "the scheduler")
+    return str(json.loads(file.read_text())["address"])
+
+
+def worker(start: Start, scheduler: str, path: Path | None = None) -> Any:
+    return start("worker", scheduler, "--no-nanny", "--nthreads", "1", path=path)
+
+
+def swept(output: Path, **wishes: Any) -> pl.DataFrame:
+    application = quick_chain(*[{"uniform": ["1ms", "6ms"]}] * 2)
+    return sweep(application, AXES, output, cycles=50, **wishes).drop("seconds")
+
+
+def test_the_rows_are_the_same_although_a_worker_is_killed(
+    start: Start, scheduler: str, tmp_path: Path
+) -> None:
+    both = [worker(start, scheduler), worker(start, scheduler)]
+
+    def kill_one(share: float, _: str) -> None:
+        if share:
+            both[0].send_signal(signal.SIGKILL)
+
+    on_cluster = swept(tmp_path / "cluster.parquet", scheduler=scheduler, progress=kill_one)
+    assert both[0].wait() == -signal.SIGKILL
+    assert on_cluster.equals(swept(tmp_path / "here.parquet", workers=1))
+
+
+def test_a_worker_with_another_version_is_named(
+    start: Start, scheduler: str, tmp_path: Path
+) -> None:
+    information = tmp_path / "other" / "chainshaper-9.9.dist-info"
+    information.mkdir(parents=True)
+    (information / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: chainshaper\nVersion: 9.9\n"
+    )
+    worker(start, scheduler, path=tmp_path / "other")
+    with pytest.raises(OperationError) as refused:
+        swept(tmp_path / "out.parquet", scheduler=scheduler)
+    assert "the Dask worker at tcp://127.0.0.1:" in str(refused.value)
+    assert "has chainshaper 9.9, not " in str(refused.value)
+    assert "numpy" not in str(refused.value)
+    assert not rows_beside(tmp_path / "out.parquet").exists()
+
+
+def test_without_any_worker_that_can_compute_it_does_not_wait_for_ever(
+    start: Start, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Dask's worker ends when it cannot load what it is sent: here it has no chainshaper."""
+    monkeypatch.setattr(workers, "WITHOUT_WORKERS_S", 1)
+    (tmp_path / "other" / "chainshaper").mkdir(parents=True)
+    (tmp_path / "other" / "chainshaper" / "__init__.py").touch()
+    ended = worker(start, scheduler, path=tmp_path / "other")
+    # It may take its time to come, too.
+    wait_for(lambda: "Register worker" in (tmp_path / "scheduler_0.log").read_text(), "a worker")
+    with pytest.raises(OperationError, match="it has had no workers for 1 s") as refused:
+        swept(tmp_path / "out.parquet", scheduler=scheduler)
+    assert f"the Dask cluster at {scheduler} failed" in str(refused.value)
+    assert ended.wait() is not None
+
+
+def test_where_no_scheduler_answers_the_address_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(workers, "CONNECT_S", 1)
+    with socket.socket() as reserved:
+        reserved.bind(("127.0.0.1", 0))  # nobody listens there
+        address = f"tcp://127.0.0.1:{reserved.getsockname()[1]}"
+        with pytest.raises(OperationError, match=f"no Dask scheduler answers at {address}"):
+            swept(tmp_path / "out.parquet", scheduler=address)
+    with pytest.raises(InputError, match="'nowhere' is no scheduler's address"):
+        swept(tmp_path / "out.parquet", scheduler="nowhere")
+    assert not list(tmp_path.iterdir())

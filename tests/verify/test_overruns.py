@@ -1,0 +1,293 @@
+"""Outputs that missed their slot: counted by what was done about them, recorded live."""
+
+import json
+import os
+import re
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from command_line import called, json_of
+from small_chain import PERIOD_NS, small_chain
+
+from chainshaper import measure_latency, save_plan, shape_application, simulate
+from chainshaper.gate.decision import sleep_until
+from chainshaper.planning import Plan, let_per_chain, plan_shaping, publish_slots
+from chainshaper.planning.plan import revised
+from chainshaper.reporting.tables import latency_json
+from chainshaper.values.recording import Recording
+from chainshaper.verify.overruns import (
+    dropped_in,
+    dropped_text,
+    gate_releases,
+    into_open_slots,
+    overruns_in,
+    overruns_text,
+)
+from chainshaper.workload.live import StartedNodes
+
+MS = 1_000_000
+
+
+def _too_early() -> Plan:
+    """A publish slot in the midst of the small chain's latencies: every other output overruns."""
+    return plan_shaping(
+        np.array([4, 6]) * MS,
+        PERIOD_NS,
+        spec="/t1../t3",
+        output="/t3",
+        publisher="/third",
+        nodes=("/first", "/second", "/third"),
+    )
+
+
+def _shaped(folder: Path, overrun: str) -> Recording:
+    plan = revised(_too_early(), overrun=overrun)
+    return shape_application(small_chain(folder), plan, folder / overrun, cycles=24)
+
+
+def test_discarded_outputs_are_not_published_and_not_lost(tmp_path: Path) -> None:
+    recording = _shaped(tmp_path, "discard")
+    measured = measure_latency(recording)
+    releases = recording.events["gate_release"]
+    discarded = releases.filter(pl.col("overrun") == "discard")
+    assert 0 < discarded.height < releases.height
+    assert measured.overruns == {"discard": discarded.height}
+    assert discarded["release"].null_count() == discarded["slot"].null_count() == discarded.height
+    assert measured.analysis.incomplete == {"discarded": discarded.height}
+    assert measured.analysis.statistics.count == releases.height - discarded.height
+    # Nothing was let go outside the slot of its own cycle.
+    let_go = releases.filter(pl.col("release").is_not_null())
+    ((start, end),) = publish_slots(_too_early())
+    within = let_go["time"] - let_go["origin"]
+    assert ((within >= start) & (within < end)).all()
+    assert measured.held is not None
+    # What was let go as the slot ended leaves a moment later, and is late.
+    at_the_end = measured.analysis.traversals.filter(pl.col("latency_ns") >= end - MS // 10)
+    assert measured.held.late <= at_the_end.height
+
+
+def test_outputs_published_at_once_wait_for_nothing(tmp_path: Path) -> None:
+    recording = _shaped(tmp_path, "publish")
+    measured = measure_latency(recording)
+    late = recording.events["gate_release"].filter(pl.col("overrun").is_not_null())
+    assert measured.overruns == {"publish": late.height}
+    assert late.height > 0
+    assert measured.analysis.incomplete == {}
+    assert (late["release"] == late["arrival"]).all()
+    assert late["slot"].null_count() == late.height
+    assert measured.held is not None
+    assert measured.held.late > 0
+
+
+def test_what_comes_into_an_open_slot_leaves_at_once_and_is_counted(tmp_path: Path) -> None:
+    early = _too_early()
+    ((start, _),) = publish_slots(early)
+    wide = tuple(
+        server.model_copy(update={"slots": ((server.slots[0][0], PERIOD_NS),)})
+        for server in early.servers
+    )
+    plan = revised(early, servers=wide)
+    recording = shape_application(small_chain(tmp_path), plan, tmp_path / "wide", cycles=24)
+    releases = recording.events["gate_release"]
+    behind = releases["arrival"] - releases["origin"] - start
+    measured = measure_latency(recording)
+    assert 0 < (behind > 0).sum() < releases.height
+    assert measured.into_open_slots == (behind > 0).sum()
+    assert measured.overruns == {}
+    shown = called("compare", recording.path, recording.path).out
+    assert re.search(rf"came when it was open +│ +{measured.into_open_slots} │", shown)
+    assert json_of("latency", recording.path)["into_open_slots"] == measured.into_open_slots
+
+
+def test_what_was_done_is_reported_wherever_the_latency_is(tmp_path: Path) -> None:
+    plan_file, output = tmp_path / "plan.yaml", tmp_path / "rec"
+    application = tmp_path / "small_chain.yaml"
+    small_chain(tmp_path)
+    latencies = tmp_path / "latencies.txt"
+    latencies.write_text("4ms\n6ms\n")
+    made = called(
+        "plan", "--latencies", latencies, "--period", "50ms", "--overrun", "discard", "--json"
+    )
+    assert json.loads(made.out)["overrun"] == "discard"
+    save_plan(revised(_too_early(), overrun="discard"), plan_file)
+    shaped = called("shape", application, plan_file, "-o", output, "--cycles", "24")
+    assert shaped.code == 0, shaped
+    count = (measure_latency(output).overruns or {})["discard"]
+    said = overruns_text({"discard": count})
+    assert said in shaped.err
+    assert said in called("latency", output).out
+    values = json_of("latency", output)
+    assert (values["overruns"], values["overruns_by_policy"]) == (count, {"discard": count})
+    assert f"{count} ({count} discard)" in called("compare", output, output).out
+    both = json_of("compare", output, output)["recordings"]
+    assert [one["overruns_by_policy"] for one in both] == [{"discard": count}] * 2
+
+
+def test_what_a_gate_lost_is_shown_wherever_recordings_are_compared(tmp_path: Path) -> None:
+    """An overrun that waits meets the output of the next cycle, which takes its place."""
+    application = small_chain(tmp_path)
+    profile = simulate(application, tmp_path / "profile", cycles=24)
+    plan = revised(_too_early(), overrun="wait", messages="newest")
+    shaped = simulate(application, tmp_path / "shaped", plan, cycles=24)
+    count = (dropped_in(shaped) or {})["replaced"]
+    assert dropped_in(shaped) == {"replaced": count}
+    assert dropped_in(profile) is None
+
+    said = dropped_text({"replaced": count})
+    assert said in " ".join(called("latency", shaped.path).out.split())
+    both = json_of("compare", profile.path, shaped.path, "--json")["recordings"]
+    assert [one["dropped"] for one in both] == [None, count]
+    assert both[1]["dropped_by_reason"] == {"replaced": count}
+    table = called("compare", profile.path, shaped.path).out
+    assert re.search(rf"messages lost at the gate .*{count} \(", table)
+    page = tmp_path / "page.html"
+    called("report", profile.path, shaped.path, "-o", page)
+    assert f"{count} ({count} replaced)" in page.read_text()
+
+
+@pytest.mark.parametrize(
+    ("dropped", "said"),
+    [
+        ({"overflowed": 1}, "1 message was lost at the gate (1 overflowed)"),
+        (
+            {"surplus": 2, "lost by DDS": 1},
+            "3 messages were lost at the gate (2 surplus, 1 lost by DDS)",
+        ),
+    ],
+)
+def test_losses_in_words(dropped: dict[str, int], said: str) -> None:
+    assert dropped_text(dropped) == said
+
+
+def test_an_unshaped_recording_has_no_overruns(unshaped: Recording) -> None:
+    assert overruns_in(unshaped, None) is None
+    assert measure_latency(unshaped).overruns is None
+    assert into_open_slots(unshaped, None) is None
+
+
+def _without_column(recording: Recording, cycles_waited: list[int]) -> Recording:
+    """A recording from before there was a choice."""
+    table = recording.events["gate_release"].drop("overrun").head(len(cycles_waited))
+    waited = pl.Series("cycles_waited", cycles_waited, dtype=pl.Int32)
+    return replace(
+        recording, events={**recording.events, "gate_release": table.with_columns(waited)}
+    )
+
+
+def test_older_recordings_are_read_by_the_cycles_their_outputs_waited(
+    shaped: Recording, plan: Plan
+) -> None:
+    old = _without_column(shaped, [0, 1, 2, 0])
+    assert gate_releases(old, plan)["overrun"].to_list() == [None, "wait", "wait", None]
+    assert overruns_in(old, plan) == {"wait": 2}
+    assert overruns_in(old, None) == {"wait": 2}
+    assert overruns_in(old, let_per_chain(plan)) == {"wait": 1}, "they are due a cycle later"
+
+
+def test_of_a_gated_publisher_what_was_not_sent_was_discarded(unshaped: Recording) -> None:
+    plan = plan_shaping(
+        np.array([4, 20]) * MS,
+        PERIOD_NS,
+        output="/t3",
+        publisher="/third",
+        publication="asynchronous",
+        overrun="discard",
+    )
+    outcomes = ["sent", "expired", "sent", "overwritten"]
+    sends = pl.DataFrame({"outcome": outcomes})
+    gated = replace(unshaped, events={**unshaped.events, "asynchronous_send": sends})
+    assert overruns_in(gated, plan) == {"discard": 2}
+    analysis = measure_latency(unshaped).analysis
+    later = analysis.traversals.with_columns(
+        latency_ns=pl.Series([PERIOD_NS - 1, PERIOD_NS]).extend_constant(
+            5 * MS, analysis.traversals.height - 2
+        )
+    )
+    late = replace(analysis, traversals=later)
+    assert overruns_in(gated, plan, late) == {"wait": 1, "discard": 2}
+
+
+@pytest.mark.parametrize(
+    ("overruns", "said"),
+    [
+        ({"wait": 1}, "1 output was too late for its slot (1 waited for the next slot)"),
+        (
+            {"discard": 2, "publish": 3},
+            "5 outputs were too late for their slot (2 discarded, 3 published at once)",
+        ),
+    ],
+)
+def test_overruns_in_words(overruns: dict[str, int], said: str) -> None:
+    assert overruns_text(overruns) == said
+
+
+@contextmanager
+def _stopped_once(nodes: StartedNodes) -> Iterator[None]:
+    """/second stands still from the start of cycle 15 on, for more than two periods."""
+
+    def stop() -> None:
+        sleep_until(nodes.anchor_ns + 15 * PERIOD_NS)
+        os.kill(nodes.pids["/second"], signal.SIGSTOP)
+        sleep_until(nodes.anchor_ns + 17 * PERIOD_NS + 20 * MS)
+        os.kill(nodes.pids["/second"], signal.SIGCONT)
+
+    thread = threading.Thread(target=stop)
+    thread.start()
+    yield
+    thread.join()
+
+
+def test_a_late_output_is_not_hidden_by_a_stall_after_it_was_due(
+    tmp_path: Path, plan: Plan
+) -> None:
+    """A node is stopped; the machine is said to stall while its output waits."""
+    recording = shape_application(
+        small_chain(tmp_path), plan, tmp_path / "rec", cycles=24, enforcement=_stopped_once
+    )
+    cycles = measure_latency(recording).analysis.traversals
+    stopped = cycles.filter("late").row(0, named=True)
+    assert stopped["latency_ns"] > PERIOD_NS
+    ((opens, _),) = publish_slots(plan)
+    assert abs(stopped["due_at"] - stopped["start"] - opens) < 2 * MS
+    stall = pl.DataFrame(
+        {
+            "time": [stopped["due_at"] + 2 * MS],
+            "pid": [1],
+            "tid": [1],
+            "cpu": [1],
+            "duration": [15 * MS],
+        },
+        schema_overrides={"pid": pl.Int32, "tid": pl.Int32, "cpu": pl.Int32},
+    )
+    stalled = replace(recording, events={**recording.events, "machine_stall": stall})
+    found = measure_latency(stalled).analysis
+    (same,) = found.traversals.filter(found.traversals["start"] == stopped["start"]).rows(
+        named=True
+    )
+    assert not same["disturbed"]
+    assert found.undisturbed.late
+    values = latency_json(measure_latency(stalled))
+    late = int(found.traversals["late"].sum())
+    assert values["late"] == late >= 1
+    assert values["max_all_ns"] == found.traversals["latency_ns"].max()
+    assert values["max_all_ns"] >= stopped["latency_ns"]
+    assert values["jitter_all_ns"] == values["max_all_ns"] - values["min_ns"]
+    measured = measure_latency(recording)
+    assert measured.held is not None
+    assert (measured.held.late_of_all, measured.held.cycles) == (late, values["count"])
+
+
+def test_what_went_around_the_shaping_node_is_said_apart() -> None:
+    around = "2 went around the shaping node, which was not there"
+    assert overruns_text({"bypass": 2}) == around
+    assert overruns_text({"wait": 1, "bypass": 2}) == (
+        f"1 output was too late for its slot (1 waited for the next slot); {around}"
+    )
+    assert "3 were not published" in overruns_text({"silence": 3})

@@ -1,0 +1,289 @@
+"""Prediction beside measurement: known answers, and a live run with three bands."""
+
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+from small_chain import small_chain
+
+from chainshaper import compare_recordings, measure_latency, plan_recording, shape_application
+from chainshaper.analysis import LatencyAnalysis, latency_statistics
+from chainshaper.planning import (
+    Modes,
+    Plan,
+    PlanRequest,
+    Profile,
+    plan_chain,
+    publish_slots,
+)
+from chainshaper.planning.overruns import cycles_until_output
+from chainshaper.planning.plan import revised
+from chainshaper.reporting.predictions import late_text, prediction_json, prediction_table
+from chainshaper.values.recording import Recording
+from chainshaper.verify.predictions import PredictionHeld, hold_prediction
+
+MS = 1_000_000
+PROFILE = Profile(np.array([40, 50, 60, 61, 69, 84]) * MS, 100 * MS)
+
+
+def _measured(
+    latencies: list[int],
+    like: LatencyAnalysis,
+    due: int = 100 * MS,
+    places: list[int] | None = None,
+) -> LatencyAnalysis:
+    """An analysis with other latencies, one traversal each, and no gate; late from ``due`` on."""
+    values = np.array(latencies, dtype=np.int64)
+    placed = values if places is None else np.array(places, dtype=np.int64)
+    late = placed >= due
+    return replace(
+        like,
+        traversals=pl.DataFrame(
+            {
+                "traversal": np.arange(values.size, dtype=np.uint32),
+                "latency_ns": values,
+                "place_ns": placed,
+                "late": late,
+                "complete": np.ones(values.size, dtype=bool),
+                "disturbed": np.zeros(values.size, dtype=bool),
+            }
+        ),
+        releases=like.releases.clear(),
+        statistics=latency_statistics(values, late=int(late.sum())),
+    )
+
+
+@pytest.fixture
+def like(unshaped: Recording) -> LatencyAnalysis:
+    return measure_latency(unshaped).analysis
+
+
+def _bands(bands: int = 3) -> Plan:
+    return plan_chain(PROFILE, PlanRequest(bands=bands, publish_slot_ns=MS))
+
+
+def test_outputs_at_slot_starts_are_as_predicted(like: LatencyAnalysis) -> None:
+    plan = _bands()
+    starts = [start for start, _ in publish_slots(plan)]
+    counts = [round(share * 6) for share in plan.predicted.shares]
+    latencies = [
+        start + 50_000 for start, count in zip(starts, counts, strict=True) for _ in range(count)
+    ]
+    held = hold_prediction(plan, _measured(latencies, like))
+    assert (held.mean.holds, held.max.holds, held.jitter.holds) == (True, True, True)
+    assert held.mean.at_end_ns == plan.predicted.mean_ns
+    assert held.mean.at_start_ns == pytest.approx(plan.predicted.mean_ns - MS, abs=2)
+    assert held.max.at_start_ns == starts[-1]
+    assert held.jitter.at_start_ns == starts[-1] - starts[0]
+    assert [band.count for band in held.bands] == counts
+    assert [band.inside for band in held.bands] == counts
+    assert [band.share for band in held.bands] == pytest.approx(plan.predicted.shares)
+    assert [band.jitter_ns for band in held.bands] == [0, 0, 0]
+    assert held.late == 0
+
+
+def test_what_differs_is_said_to_differ(like: LatencyAnalysis) -> None:
+    plan = _bands(1)
+    held = hold_prediction(plan, _measured([85 * MS, 97 * MS, 203 * MS], like))
+    assert (held.max.holds, held.jitter.holds) == (False, False)
+    assert held.bands[0].inside == 1
+    assert held.bands[0].jitter_ns == 12 * MS
+    assert held.late == 1
+    nothing = hold_prediction(plan, _measured([], like))
+    assert (nothing.mean.holds, nothing.bands[0].share) == (None, None)
+    assert prediction_json(nothing)["bands"][0]["jitter_ns"] is None
+
+
+def test_let_publishes_a_cycle_later(like: LatencyAnalysis) -> None:
+    plan = plan_chain(PROFILE, PlanRequest(policy="let-per-chain"))
+    assert cycles_until_output(plan) == 1
+    held = hold_prediction(plan, _measured([100 * MS + 10, 100 * MS + 20], like, 200 * MS))
+    assert (held.mean.at_start_ns, held.mean.at_end_ns) == (100 * MS, 101 * MS)
+    assert (held.mean.holds, held.max.holds, held.late) == (True, True, 0)
+    assert held.bands[0].count == held.bands[0].inside == 2
+
+
+def test_policies_without_slots_predict_one_figure(like: LatencyAnalysis) -> None:
+    for policy, start in (("server-per-chain", None), ("one-long-slot", 62 * MS)):
+        request = PlanRequest(policy=policy, slot_start_ns=start)  # type: ignore[arg-type]
+        plan = plan_chain(PROFILE, request)
+        held = hold_prediction(plan, _measured([63 * MS, 85 * MS], like))
+        assert held.mean.at_start_ns == held.mean.at_end_ns == plan.predicted.mean_ns
+
+
+def test_each_mode_is_held_by_its_own_band(like: LatencyAnalysis) -> None:
+    """Two of the six latencies are behind the slot of the mode `fast`: one such output waits."""
+    chain = replace(PROFILE, nodes=("/a", "/b"), topics=("/x", "/y"))
+    plan = revised(
+        plan_chain(chain, PlanRequest(bands=2, publish_slot_ns=MS)),
+        modes=Modes(topic="/m", default="slow", bands={"slow": 2, "fast": 1}),
+    )
+    (first, _), (last, _) = publish_slots(plan)
+    outputs = [
+        ("slow", 1, None, last + 10),
+        ("slow", 1, None, last + 40),
+        ("fast", 0, None, first + 20),
+        ("fast", 0, "wait", first + 100 * MS),
+    ]
+    analysis = _measured([latency for *_, latency in outputs], like)
+    last_hop = len(like.chain.callbacks) - 1
+    releases = pl.DataFrame(
+        {
+            "traversal": range(4),
+            "hop": [last_hop] * 4,
+            **{
+                name: [output[place] for output in outputs]
+                for place, name in enumerate(("mode", "slot", "overrun"))
+            },
+        },
+        schema_overrides={"traversal": pl.UInt32(), "slot": pl.Int32()},
+    )
+    held = hold_prediction(plan, replace(analysis, releases=releases))
+    slow, fast = held.bands
+    assert (slow.mode, slow.count, slow.inside, slow.late, slow.jitter_ns) == ("slow", 2, 2, 0, 30)
+    assert (fast.mode, fast.count, fast.inside, fast.late, fast.jitter_ns) == ("fast", 1, 1, 1, 0)
+    assert (slow.share, fast.share) == (1, 0.5)
+    assert (slow.predicted_share, fast.predicted_share) == (1, plan.predicted.shares[0])
+    assert (slow.slot_start_ns, fast.slot_start_ns) == (last, first)
+    assert held.late == 1
+    assert {held.mean.holds, held.max.holds, held.jitter.holds} == {None}, "the modes decide"
+    assert [one["mode"] for one in prediction_json(held)["bands"]] == ["slow", "fast"]
+    with io.StringIO() as text:
+        Console(file=text, width=120).print(prediction_table(held))
+        assert "fast, 1 late" in text.getvalue()
+
+
+def test_three_bands_live(tmp_path: Path, unshaped: Recording) -> None:
+    pytest.importorskip("numba")
+    plan = plan_recording(
+        unshaped, request=PlanRequest(bands=3, publish_slot_ns=100_000, epsilon_ns=3 * MS)
+    )
+    after = shape_application(small_chain(tmp_path), plan, tmp_path / "after", cycles=12)
+    held = compare_recordings([unshaped, after]).measurements[1].held
+    assert held is not None
+    assert [(band.slot_start_ns, band.slot_end_ns) for band in held.bands] == [*publish_slots(plan)]
+    undisturbed = measure_latency(after).analysis.undisturbed
+    assert sum(band.count for band in held.bands) + held.late == undisturbed.count
+    for band in held.bands:
+        assert band.min_ns is None or band.min_ns >= band.slot_start_ns, "before its slot"
+
+
+def test_the_plan_may_be_named_where_the_recording_does_not(
+    unshaped: Recording, plan: Plan
+) -> None:
+    comparison = compare_recordings([unshaped, unshaped], plan=plan)
+    first, second = comparison.measurements
+    assert first.held is None
+    assert second.held is not None
+    assert second.held.mean.holds is False
+
+
+def _shown(held: PredictionHeld) -> list[list[str]]:
+    """The rows of the printed table, as their cells."""
+    with io.StringIO() as text:
+        Console(file=text, width=200).print(prediction_table(held))
+        lines = text.getvalue().splitlines()
+    return [[cell.strip() for cell in line.split("│")[1:-1]] for line in lines if "│" in line]
+
+
+PLACES = st.integers(84 * MS, 87 * MS)
+
+
+@given(places=st.lists(PLACES, min_size=1, max_size=20), bands=st.integers(1, 3))
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_verdict_is_what_its_printed_figures_say(
+    places: list[int], bands: int, like: LatencyAnalysis
+) -> None:
+    held = hold_prediction(_bands(bands), _measured(places, like))
+    rows = _shown(held)
+    for title, figure in (("average", held.mean), ("maximum", held.max), ("jitter", held.jitter)):
+        _, predicted, measured, verdict, *_ = next(row for row in rows if row[0].startswith(title))
+        low, _, high = predicted.partition(" … ")
+        inside = float(low) <= float(measured) <= float(high or low)
+        assert verdict == ("as predicted" if inside else "differs")
+        assert figure.holds is inside
+
+
+def test_with_the_anchor_cycle_the_place_in_the_cycle_is_judged(like: LatencyAnalysis) -> None:
+    """Chains begin up to 5 ms late in their cycle; every output leaves as its slot starts."""
+    chain = replace(PROFILE, nodes=("/a", "/b"), topics=("/x", "/y"))
+    plan = plan_chain(chain, PlanRequest(anchor="cycle"))
+    ((start, _),) = publish_slots(plan)
+    latencies = [start - behind for behind in range(0, 5 * MS, MS // 2)]
+    analysis = _measured(latencies, like, places=[start + 40] * len(latencies))
+    held = hold_prediction(plan, analysis)
+    assert held.counted_from == "cycle"
+    assert (held.mean.holds, held.max.holds, held.jitter.holds) == (True, True, True)
+    assert (held.bands[0].inside, held.bands[0].count) == (10, 10)
+    assert (held.mean.measured_ns, held.bands[0].jitter_ns) == (start + 40, 0)
+    assert any("from the start of the cycle" in row for row in [prediction_table(held).title or ""])
+    # With the anchor `stamp` the latency is promised, and it is not constant.
+    other = hold_prediction(revised(plan, anchor="stamp"), analysis)
+    assert (other.counted_from, other.jitter.holds) == ("chain", False)
+
+
+def test_of_a_gated_publisher_too_the_place_is_judged_and_no_average_is_as_predicted_below_it(
+    like: LatencyAnalysis,
+) -> None:
+    """56.8 ms beside 58.5 … 68.5 ms was called as predicted, since chains began late."""
+    profile = replace(
+        PROFILE,
+        latencies_ns=np.array([40, 57.5]) * MS,
+        nodes=("/a", "/b"),
+        topics=("/x", "/y"),
+    )
+    profile = replace(profile, latencies_ns=profile.latencies_ns.astype(np.int64))
+    plan = plan_chain(
+        profile, PlanRequest(publication="asynchronous", publish_slot_ns=10 * MS, epsilon_ns=MS)
+    )
+    assert publish_slots(plan) == ((58_500_000, 68_500_000),)
+    latencies = [56_800_000] * 20
+    early = hold_prediction(plan, _measured(latencies, like))
+    assert (early.mean.from_ns, early.mean.to_ns) == (58_500_000, 68_500_000)
+    assert (early.mean.measured_ns, early.mean.holds) == (56_800_000, False)
+    places = hold_prediction(plan, _measured(latencies, like, places=[58_600_000] * 20))
+    assert (places.mean.measured_ns, places.mean.holds, places.max.holds) == (
+        58_600_000,
+        True,
+        True,
+    )
+    assert places.bands[0].inside == 20
+
+
+def test_a_band_that_may_well_be_empty_is_not_expected(like: LatencyAnalysis) -> None:
+    """One of six latencies is in the last band: two outputs say nothing, sixty do."""
+    plan = _bands(2)
+    (first, _), (last, _) = publish_slots(plan)
+    assert plan.predicted.shares[0] > 0.5
+    few = hold_prediction(plan, _measured([first + 10] * 2, like))
+    assert (few.max.from_ns, few.max.holds, few.jitter.from_ns, few.jitter.holds) == (
+        *(first, True),
+        *(0, True),
+    )
+    many = hold_prediction(plan, _measured([first + 10] * 60, like))
+    assert (many.max.from_ns, many.max.holds, many.jitter.holds) == (last, False, False)
+
+
+def test_a_baseline_predicts_at_most(like: LatencyAnalysis) -> None:
+    """Outputs leave when they are ready: a maximum below the predicted one is as predicted."""
+    plan = plan_chain(PROFILE, PlanRequest(policy="server-per-chain"))
+    held = hold_prediction(plan, _measured([50 * MS, 60 * MS, 71 * MS], like))
+    assert (held.max.holds, held.jitter.holds) == (True, True)
+    longer = hold_prediction(plan, _measured([50 * MS, 60 * MS, 85 * MS], like))
+    assert longer.max.holds is False
+
+
+def test_late_outputs_are_counted_in_all_cycles(like: LatencyAnalysis) -> None:
+    """One of two late outputs was in a disturbed cycle; both are said."""
+    analysis = _measured([85 * MS, 85 * MS, 185 * MS, 185 * MS], like)
+    hidden = analysis.traversals.with_columns(disturbed=pl.Series([False, False, False, True]))
+    held = hold_prediction(_bands(1), replace(analysis, traversals=hidden))
+    assert (held.late, held.late_of_all, held.cycles) == (1, 2, 4)
+    assert late_text(held) == "of all 4 outputs 2 came late, 1 of them in disturbed cycles"
+    assert prediction_json(held)["late_of_all"] == 2
