@@ -24,8 +24,15 @@ settings.load_profile("chainshaper")
 
 # Folders whose tests only compute: `make test` runs them beside all others, which follow each other
 # in one process, because they need the machine's cores or tracers for themselves.
-COMPUTING = {"analysis", "compiled", "experiments", "planning", "reporting", "simulation"}
-COMPUTING |= {"sources/ctf", "splicing", "sweeping"}
+COMPUTING = {
+    "analysis",
+    "experiments",
+    "planning",
+    "reporting",
+    "simulation",
+    "simulation/sweeping",
+}
+COMPUTING |= {"sources/ctf", "splicing", "values"}
 LIVE_RUNS = {"unshaped", "shaped"}
 
 

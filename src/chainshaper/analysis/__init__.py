@@ -5,8 +5,8 @@
                                         └──► traversals ─► disturbance ─► latency, statistics
 
 Nothing here knows where the events came from: LTTng, eBPF, the live workload and the simulator
-write the same tables (:mod:`chainshaper.values.events`). :func:`analyse_latency` does all of it for one
-chain; every step is a function of its own.
+write the same tables (:mod:`chainshaper.values.events`). :func:`analyse_latency` does all of it for
+one chain; every step is a function of its own.
 """
 
 from chainshaper.analysis.chains import (

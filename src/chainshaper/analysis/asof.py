@@ -4,10 +4,11 @@ Events come sorted by time, so one walk over both tables that remembers the late
 is enough. Keys are few (threads, handles) and times many: a lookup stays in the processor's
 nearest cache, and a row costs some ten nanoseconds, a fraction of grouping both tables by key.
 
-Columns are read where they lie (:mod:`chainshaper.values.compiled.memory`): what a step costs is mostly
-the fresh memory that it touches. A key is a table of three rows (address, bytes per value), of
-which those that are not used have 0 bytes. The table of keys has ``slots`` rows, a power of two, of
-(three numbers, whether it is taken, the latest row), and one more whose first number counts them.
+Columns are read where they lie (:mod:`chainshaper.values.compiled.memory`): what a step costs is
+mostly the fresh memory that it touches. A key is a table of three rows (address, bytes per value),
+of which those that are not used have 0 bytes. The table of keys has ``slots`` rows, a power of two,
+of (three numbers, whether it is taken, the latest row), and one more whose first number counts
+them.
 """
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False

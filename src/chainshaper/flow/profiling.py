@@ -49,9 +49,9 @@ def profiling_condition(
 ) -> Iterator[Callable[[Sequence[Process]], bool]]:
     """Have the threads of ``nodes`` (default: of all) run as the paper profiles a chain.
 
-    It gives what :func:`chainshaper.flow.record.record_command` wants for its ``scheduling``. ``core``
-    is where the executors run; by default the last that we may use. ``folder`` is where runs keep
-    their journals (default: `/run/chainshaper`). ``like`` is an earlier recording of the
+    It gives what :func:`chainshaper.flow.record.record_command` wants for its ``scheduling``.
+    ``core`` is where the executors run; by default the last that we may use. ``folder`` is where
+    runs keep their journals (default: `/run/chainshaper`). ``like`` is an earlier recording of the
     application: it tells what a container's components are, and which executors have several
     threads.
 

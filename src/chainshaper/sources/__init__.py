@@ -1,7 +1,8 @@
 """Where events come from: recordings of our own, and the traces that others write.
 
 :func:`open_source` is the one door: whatever it opens is a
-:class:`~chainshaper.values.recording.Recording`, so no verb and no analysis needs to know the difference.
+:class:`~chainshaper.values.recording.Recording`, so no verb and no analysis needs to know the
+difference.
 """
 
 from collections.abc import Callable

@@ -40,18 +40,19 @@ def sweep(
 ) -> pl.DataFrame:
     """Simulate an application at every combination of some values, planned and shaped for each.
 
-    ``vary`` has the values of each axis (:mod:`chainshaper.simulation.sweeping.grid`), durations as texts.
-    With a ``plan``, this one is in force everywhere. Each point is a run of ``cycles`` periods to
-    plan from, and another one with the plan in force; ``seed`` replaces the description's.
+    ``vary`` has the values of each axis (:mod:`chainshaper.simulation.sweeping.grid`), durations as
+    texts. With a ``plan``, this one is in force everywhere. Each point is a run of ``cycles``
+    periods to plan from, and another one with the plan in force; ``seed`` replaces the
+    description's.
 
     ``workers`` processes compute (default: one per core that we may use), or a Dask cluster, whose
     ``scheduler`` is at that address.
 
     The frame has a row for each point, in the order of the axes: a column for each axis (durations
     in ns, with ``_ns`` behind the name), ``cycles``, ``seed``, and the figures of
-    :data:`chainshaper.simulation.sweeping.points.FIGURES`. A point that cannot be has an ``error``. The same
-    frame is in ``output``, a Parquet file. Until it is whole, finished rows are kept beside it,
-    and the same call goes on with what is missing.
+    :data:`chainshaper.simulation.sweeping.points.FIGURES`. A point that cannot be has an ``error``.
+    The same frame is in ``output``, a Parquet file. Until it is whole, finished rows are kept
+    beside it, and the same call goes on with what is missing.
 
     Raises:
         InputError: unknown axes or impossible values; ``output`` exists, or rows beside it are of

@@ -1,10 +1,10 @@
 """How a trace's events become event tables: their providers, fields and types.
 
-Tables have the columns of :mod:`chainshaper.values.events`. A trace may declare other events of the same
-name (another provider's), other types (a narrower integer), and fewer fields: older distributions
-do, and so does damaged metadata. Integers are widened; a field that is absent, or of a kind that
-no cast brings right, becomes a column of nulls, which the analysis takes for "not known", and is
-said in words unless that is how a distribution is.
+Tables have the columns of :mod:`chainshaper.values.events`. A trace may declare other events of the
+same name (another provider's), other types (a narrower integer), and fewer fields: older
+distributions do, and so does damaged metadata. Integers are widened; a field that is absent, or of
+a kind that no cast brings right, becomes a column of nulls, which the analysis takes for "not
+known", and is said in words unless that is how a distribution is.
 
 CARET keeps the events of an application's start and emits them again when tracing begins; those
 carry ``init_timestamp``, the time at which they really happened, and are put there.

@@ -1,12 +1,12 @@
 """LTTng traces as recordings: the folders that `ros2 trace` writes.
 
 Events keep their names without the provider (``ros2:callback_start`` → ``callback_start``) and get
-the columns and types of :mod:`chainshaper.values.events`; what the analysis does not know is left out
-(:mod:`~chainshaper.sources.lttng.event_fields`). Tables are decoded in groups that are used
-together, because one pass over a trace costs nearly the same for one table as for twenty: those
-of the objects' creation, of callbacks and of messages at once, since every analysis needs them
-(an overview only creation); what the upper layers say about the same messages, `sched_switch` and
-the executor's when somebody asks for them.
+the columns and types of :mod:`chainshaper.values.events`; what the analysis does not know is left
+out (:mod:`~chainshaper.sources.lttng.event_fields`). Tables are decoded in groups that are used
+together, because one pass over a trace costs nearly the same for one table as for twenty: those of
+the objects' creation, of callbacks and of messages at once, since every analysis needs them (an
+overview only creation); what the upper layers say about the same messages, `sched_switch` and the
+executor's when somebody asks for them.
 
 Times stay what the tracer wrote, ns of CLOCK_MONOTONIC. Process numbers do too, with one exception:
 containers number their processes independently of each other, so folders of several hosts are

@@ -38,7 +38,8 @@ def compiled(*, inline: bool = False) -> Callable[[Callable[..., Any]], Any]:
     """``njit`` for functions of numbers, as they are called by each other.
 
     ``inline`` has the compiler put the function into its callers, where a call would cost more
-    than what it does. Python calls them by way of :func:`~chainshaper.values.compiled.loading.kernel`.
+    than what it does. Python calls them by way of
+    :func:`~chainshaper.values.compiled.loading.kernel`.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
