@@ -24,13 +24,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from chainshaper.sources.ctf import count_events, open_trace, read_events
-from chainshaper.sources.ctf.lttng_text import lttng_metadata
 from chainshaper.sources.ctf.metadata import read_metadata_text
 from chainshaper.sources.ctf.tsdl import parse_tsdl
-from chainshaper.sources.ctf.writer import (
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+from ctf_writing import (
     EncodedPacket,
     EventRecord,
     encode_packet,
+    lttng_metadata,
     repeat_packets,
     write_trace,
 )

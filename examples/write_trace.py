@@ -9,12 +9,15 @@ and then; the kernel's `sched_switch` lies beside the events of user space.
 
 import random
 import sys
+from pathlib import Path
 from typing import Any
 
 import polars as pl
 
-from chainshaper.sources.lttng.writing import write_lttng_trace
 from chainshaper.values import events
+
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+from ctf_writing import write_lttng_trace
 
 CYCLES = 40
 PERIOD_NS = 50_000_000

@@ -56,6 +56,8 @@ def as_in_a_clone(folder: Path) -> None:
         shutil.copytree(ROOT / name, folder / name)
     for file in ("Makefile", "pyproject.toml"):
         shutil.copyfile(ROOT / file, folder / file)
+    (folder / "tests").mkdir()
+    shutil.copyfile(ROOT / "tests/ctf_writing.py", folder / "tests/ctf_writing.py")
 
 
 def executed(command: list[str], folder: Path) -> subprocess.CompletedProcess[str]:

@@ -19,11 +19,11 @@ from typing import Any, TypeAlias
 import polars as pl
 import pytest
 from command_line import called
+from ctf_writing import write_lttng_trace
 from small_chain import small_chain_text
 
 from chainshaper import simulate
 from chainshaper.planning import Plan, dump_plan
-from chainshaper.sources.lttng.writing import write_lttng_trace
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import load_application
 

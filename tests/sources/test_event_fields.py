@@ -5,12 +5,11 @@ from typing import Any
 
 import pytest
 from command_line import called, json_of
+from ctf_writing import EventRecord, encode_packet, lttng_metadata, write_trace
 from test_lttng_trace import START, chain_story, written
 
 from chainshaper.sources import open_source
-from chainshaper.sources.ctf.lttng_text import lttng_metadata
 from chainshaper.sources.ctf.tsdl import parse_tsdl
-from chainshaper.sources.ctf.writer import EventRecord, encode_packet, write_trace
 
 
 def one_event(folder: Path, name: str, kinds: dict[str, str], payload: dict[str, Any]) -> None:

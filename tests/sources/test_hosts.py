@@ -4,13 +4,13 @@ from pathlib import Path
 
 import polars as pl
 from command_line import json_of
+from ctf_writing import write_lttng_trace
 from story import OFFSET
 from test_lttng_trace import chain_story, shifted, written
 
 from chainshaper.analysis import analyse_latency, application_graph
 from chainshaper.sources import open_source
 from chainshaper.sources.lttng.trace import NEXT_HOST
-from chainshaper.sources.lttng.writing import write_lttng_trace
 
 
 def container(folder: Path, host: str, names: tuple[str, str], shift: int) -> None:

@@ -6,14 +6,12 @@ from typing import Any
 import polars as pl
 import pytest
 from command_line import called, json_of, refused
+from ctf_writing import lttng_metadata, write_lttng_trace, write_trace
 from reference import babeltrace
 from story import OFFSET, Story
 
 from chainshaper.analysis import analyse_latency, application_graph, callback_statistics, data_flow
 from chainshaper.sources import open_source
-from chainshaper.sources.ctf.lttng_text import lttng_metadata
-from chainshaper.sources.ctf.writer import write_trace
-from chainshaper.sources.lttng.writing import write_lttng_trace
 from chainshaper.values import events
 from chainshaper.values.errors import InputError
 

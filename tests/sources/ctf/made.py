@@ -5,9 +5,9 @@
 import random
 from typing import Any
 
-from chainshaper.sources.ctf.lttng_text import lttng_metadata
+from ctf_writing import EventRecord, encode_packet, lttng_metadata, write_trace
+
 from chainshaper.sources.ctf.tsdl import parse_tsdl
-from chainshaper.sources.ctf.writer import EventRecord, encode_packet, write_trace
 
 USER_EVENTS = {
     "ros2:callback_start": {"callback": "x64", "is_intra_process": "s32"},

@@ -13,13 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from ctf_writing import lttng_metadata, metadata_packets
 from made import make_trace
 from test_bytes import PLAIN
 
 from chainshaper.sources.ctf import CtfError, count_events, open_trace, read_events
-from chainshaper.sources.ctf.lttng_text import lttng_metadata
 from chainshaper.sources.ctf.metadata import read_metadata
-from chainshaper.sources.ctf.writer import metadata_packets
 
 UUID = "2a6422d0-6cee-11e0-8c08-cb07d7b3a564"
 

@@ -4,12 +4,11 @@ import random
 from pathlib import Path
 
 import pytest
+from ctf_writing import EventRecord, encode_packet, lttng_metadata, write_trace
 
 from chainshaper.sources.ctf import open_trace, read_events
-from chainshaper.sources.ctf.lttng_text import lttng_metadata
 from chainshaper.sources.ctf.tables import AHEAD
 from chainshaper.sources.ctf.tsdl import parse_tsdl
-from chainshaper.sources.ctf.writer import EventRecord, encode_packet, write_trace
 
 EVENTS = {"ros2:number": {"place": "u64"}, "ros2:text": {"place": "u64", "text": "string"}}
 

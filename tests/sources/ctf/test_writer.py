@@ -4,18 +4,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from ctf_writing import (
+    EventRecord,
+    encode_packet,
+    lttng_metadata,
+    repeat_packets,
+    write_trace,
+)
 from made import START, USER_CONTEXT, USER_EVENTS, make_trace, records
 from reference import actual_rows, assert_equal_to_babeltrace, lean
 
 from chainshaper.sources.ctf import count_events, open_trace, read_events
-from chainshaper.sources.ctf.lttng_text import lttng_metadata
 from chainshaper.sources.ctf.tsdl import parse_tsdl
-from chainshaper.sources.ctf.writer import (
-    EventRecord,
-    encode_packet,
-    repeat_packets,
-    write_trace,
-)
 
 
 def expected(made: Any) -> Any:
