@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from chainshaper.sources.ctf import count_events, open_trace, read_events
-from chainshaper.sources.ctf.metadata import read_metadata_text
+from chainshaper.sources.ctf.trace import read_metadata_text
 from chainshaper.sources.ctf.tsdl import parse_tsdl
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))

@@ -18,8 +18,8 @@ from uuid import UUID
 
 import polars as pl
 
-from chainshaper.sources.ctf.metadata import METADATA_MAGIC
 from chainshaper.sources.ctf.tables import MAGIC
+from chainshaper.sources.ctf.trace import METADATA_MAGIC
 from chainshaper.sources.ctf.tsdl import parse_tsdl
 from chainshaper.sources.ctf.types import (
     ArrayType,

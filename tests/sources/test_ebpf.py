@@ -19,7 +19,7 @@ from traced_program import Program, Traced, build, skip_without_bpftrace, traced
 
 from chainshaper.analysis.flow import DataFlow, data_flow
 from chainshaper.flow.record import record_command
-from chainshaper.sources.ebpf.found_nodes import with_found_nodes
+from chainshaper.sources.ebpf.late_attachment import with_found_nodes
 from chainshaper.sources.ebpf.session import EbpfTracer
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError
@@ -401,7 +401,7 @@ def test_a_machine_without_ros_2_is_told_to_set_it_up(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     skip_without_bpftrace()
-    monkeypatch.setattr("chainshaper.sources.ebpf.tracing_libraries._INSTALLATIONS", tmp_path)
+    monkeypatch.setattr("chainshaper.sources.ebpf.trace_points._INSTALLATIONS", tmp_path)
     with pytest.raises(PlatformError, match=r"no libtracetools.so in AMENT_PREFIX_PATH"):
         EbpfTracer(tmp_path, ("any",), ()).start()
 
@@ -412,7 +412,7 @@ def test_tracing_that_was_compiled_out_is_named_with_the_library(
     skip_without_bpftrace()
     disabled = build(tmp_path / "prefix", "-DDISABLED")
     monkeypatch.setenv("LD_LIBRARY_PATH", str(disabled.tracetools.parent))
-    monkeypatch.setattr("chainshaper.sources.ebpf.tracing_libraries._INSTALLATIONS", tmp_path)
+    monkeypatch.setattr("chainshaper.sources.ebpf.trace_points._INSTALLATIONS", tmp_path)
     with pytest.raises(PlatformError, match=r"libtracetools.so: exports no trace point.*DISABLED"):
         EbpfTracer(tmp_path, ("any",), ()).start()
 

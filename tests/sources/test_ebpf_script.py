@@ -10,18 +10,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 from traced_program import build, skip_without_bpftrace
 
-from chainshaper.sources.ebpf.output import HEADER, lost_events, read_printed
-from chainshaper.sources.ebpf.script import (
+from chainshaper.sources.ebpf.printing import (
     FIRST_POINT,
+    HEADER,
     NAME_PLACE,
     RMW_PLACE,
     TEXT_BYTES,
     TEXT_CODE,
     TEXT_LINES,
     bpftrace_script,
+    lost_events,
+    read_printed,
 )
-from chainshaper.sources.ebpf.trace_points import FUNCTION_PREFIX, TracePoint, trace_points
-from chainshaper.sources.ebpf.tracing_libraries import TracingLibrary, installed_libraries
+from chainshaper.sources.ebpf.trace_points import (
+    FUNCTION_PREFIX,
+    TracePoint,
+    TracingLibrary,
+    installed_libraries,
+    trace_points,
+)
 from chainshaper.values import events
 from chainshaper.values.errors import InputError
 

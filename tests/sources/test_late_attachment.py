@@ -8,8 +8,11 @@ import polars as pl
 from chainshaper.analysis.flow import data_flow
 from chainshaper.analysis.graph import application_graph
 from chainshaper.linux.processes import Process
-from chainshaper.sources.ebpf.found_nodes import with_found_nodes
-from chainshaper.sources.ebpf.late_attachment import with_found_objects, with_functions
+from chainshaper.sources.ebpf.late_attachment import (
+    with_found_nodes,
+    with_found_objects,
+    with_functions,
+)
 from chainshaper.values import events
 from chainshaper.values.recording import EndpointInfo, RecordingInfo
 

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper.sources.ros.interpreter import Environment, environment_of
-from chainshaper.sources.ros.snapshot import ask_graph
+from chainshaper.sources.ros.interpreter import Environment, ask_graph, environment_of
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import EndpointInfo
 

@@ -8,9 +8,12 @@ from pathlib import Path
 import pytest
 from traced_program import build
 
-from chainshaper.sources.ebpf import tracing_libraries
-from chainshaper.sources.ebpf.elf_symbols import exported_functions
-from chainshaper.sources.ebpf.tracing_libraries import installed_libraries, mapped_libraries
+from chainshaper.sources.ebpf import trace_points as tracing_libraries
+from chainshaper.sources.ebpf.trace_points import (
+    exported_functions,
+    installed_libraries,
+    mapped_libraries,
+)
 
 
 def test_exported_functions_are_those_that_nm_shows(tmp_path: Path) -> None:

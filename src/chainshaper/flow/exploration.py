@@ -23,7 +23,7 @@ from chainshaper.analysis.close_names import close_names
 from chainshaper.analysis.matching import latest_before
 from chainshaper.analysis.objects import named_nodes
 from chainshaper.sources import open_source
-from chainshaper.sources.lttng.event_fields import table_name
+from chainshaper.sources.lttng.trace import table_name
 from chainshaper.values import events
 from chainshaper.values.application import ApplicationGraph
 from chainshaper.values.errors import InputError

@@ -48,8 +48,7 @@ from chainshaper.linux.threads import parents
 from chainshaper.linux.users import run_users
 from chainshaper.planning import Plan
 from chainshaper.sources.gate_log import releases_so_far, with_gate_logs
-from chainshaper.sources.ros.interpreter import Environment, environment_of
-from chainshaper.sources.ros.snapshot import ask_graph
+from chainshaper.sources.ros.interpreter import Environment, ask_graph, environment_of
 from chainshaper.sources.tracer import Tracer
 from chainshaper.values import events
 from chainshaper.values.durations import format_duration
@@ -319,7 +318,7 @@ def _written(
     tables, missing = with_gate_logs(tables, run.gate_logs, since_ns, run.ended_ns)
     run.notes += missing
     if run.command is None:  # its nodes were created before tracing began
-        from chainshaper.sources.ebpf.found_nodes import with_found_nodes
+        from chainshaper.sources.ebpf.late_attachment import with_found_nodes
 
         tables, info = with_found_nodes(tables, info, run.endpoints, run.processes)
     recording = Recording(output, info, tables)

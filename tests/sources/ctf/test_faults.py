@@ -18,7 +18,7 @@ from made import make_trace
 from test_bytes import PLAIN
 
 from chainshaper.sources.ctf import CtfError, count_events, open_trace, read_events
-from chainshaper.sources.ctf.metadata import read_metadata
+from chainshaper.sources.ctf.trace import read_metadata
 
 UUID = "2a6422d0-6cee-11e0-8c08-cb07d7b3a564"
 

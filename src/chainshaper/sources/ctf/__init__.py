@@ -1,15 +1,18 @@
-"""LTTng traces (Common Trace Format 1.8) as data frames.
+"""LTTng traces (Common Trace Format 1.8, https://diamon.org/ctf/v1.8.3/) as data frames.
 
     trace = open_trace("~/lttng-traces/session")
     count_events(trace)                       # {"ros2:callback_start": 4711, …}
     read_events(trace, {"ros2:callback_start"})["ros2:callback_start"]
 
-The format is that of the CTF 1.8 specification (https://diamon.org/ctf/v1.8.3/).
+From a folder to frames: `tsdl` reads the metadata (`types`), `program` and `assembly` make
+operations of them, `decode` runs these (`kernels`, `interpreter`) over the files, and `read` makes
+columns of what they write. `trace` opens, `tables` has the numbers that all share.
 """
 
-from chainshaper.sources.ctf.errors import CtfError
+from chainshaper.sources.ctf.decode import CtfStream
 from chainshaper.sources.ctf.read import Events, count_events, read_events
-from chainshaper.sources.ctf.trace import CtfFolder, CtfStream, CtfTrace, open_trace
+from chainshaper.sources.ctf.trace import CtfTrace, open_trace
+from chainshaper.sources.ctf.types import CtfError, CtfFolder
 
 __all__ = [
     "CtfError",

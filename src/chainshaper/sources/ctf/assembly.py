@@ -10,12 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.sources.ctf import tables as tb
-from chainshaper.sources.ctf.errors import CtfError
-from chainshaper.sources.ctf.layout import LayoutError, Number, Reader, Step, compile_fields
-from chainshaper.sources.ctf.metadata import CtfFolder
-from chainshaper.sources.ctf.program import Program, Storage
-from chainshaper.sources.ctf.shapes import Shape, Slot
+from chainshaper.sources.ctf.program import (
+    LayoutError,
+    Number,
+    Program,
+    Reader,
+    Shape,
+    Slot,
+    Step,
+    Storage,
+    compile_fields,
+)
 from chainshaper.sources.ctf.types import (
+    CtfError,
+    CtfFolder,
     EnumType,
     EventClass,
     IntegerType,

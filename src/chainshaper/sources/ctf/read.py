@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from chainshaper.sources.ctf import tables as tb
 from chainshaper.sources.ctf.assembly import Assembly, Table, Wanted, assemble, attach
-from chainshaper.sources.ctf.columns import column
 from chainshaper.sources.ctf.decode import (
     LARGE_BYTES,
+    CtfStream,
+    MappedFile,
     Stream,
     Walk,
     default_threads,
@@ -23,15 +24,22 @@ from chainshaper.sources.ctf.decode import (
     span_borders,
     walk,
 )
-from chainshaper.sources.ctf.program import Storage
-from chainshaper.sources.ctf.shapes import TextShape
-from chainshaper.sources.ctf.streams import MappedFile
-from chainshaper.sources.ctf.trace import CtfStream, CtfTrace
+from chainshaper.sources.ctf.program import (
+    ListShape,
+    OptionShape,
+    RecordShape,
+    ScalarShape,
+    Shape,
+    Storage,
+    TextShape,
+)
+from chainshaper.sources.ctf.trace import CtfTrace
 
 __all__ = ["Events", "count_events", "read_events"]
 
 _HUGE_PAGE = 2 << 20
 _NULL_COLUMNS = {"cpu": pl.Int32, "pid": pl.Int32, "tid": pl.Int32}
+_Progress = Callable[[float], None]
 
 
 class Events(dict[str, pl.DataFrame]):
@@ -64,13 +72,13 @@ def read_events(
     context: bool = False,
     nameless: Collection[str] = (),
     threads: int | None = None,
-    progress: Callable[[float], None] = lambda _: None,
+    progress: _Progress = lambda _: None,
 ) -> Events:
     """Read events into one frame per name, ordered by name of event.
 
     Every name of ``names`` (None: all) that the metadata declares is in the result, without
-    rows where it never happened.  Rows are sorted by ``time``; equal times stand in the order
-    of the stream files, and in one file as recorded.  Columns:
+    rows where it never happened. Rows are sorted by ``time``; equal times stand in the order
+    of the stream files, and in one file as recorded. Columns:
 
     * ``time``: Int64, ns on the trace's own clock (CLOCK_MONOTONIC for LTTng), its offset not
       added; ``cpu``: Int32; ``pid``, ``tid``: integers as recorded (``vpid``, ``vtid`` in user
@@ -78,14 +86,14 @@ def read_events(
     * ``procname``: Categorical, where recorded; not for the events that are ``nameless``, since
       reading it is most of the work for an event without other texts.
     * the payload under its own names without LTTng's leading underscore; a field called like
-      one of the above is ``payload.<name>``.  Integers and floats keep their width and sign,
+      one of the above is ``payload.<name>``. Integers and floats keep their width and sign,
       enumerations their integer; strings and text arrays are String (bytes that are not UTF-8
       as ``\\xNN``); arrays are Array, sequences List, structures Struct, variants Struct with
       all but the chosen option null.
     * with ``context``, the other context fields as ``context.<name>``.
 
     Events that cannot be read end their packet; the result's ``warnings`` say which and why.
-    ``progress`` is told the share that is done, from 0 to 1.
+    ``progress`` gets the share that is done, from 0 to 1.
     Raises `CtfError` where a file is gone or changes while it is read.
     """
     asked = frozenset(trace.event_names if names is None else names)
@@ -98,13 +106,7 @@ def read_events(
         total = sum((w.reached[-1] for w in walks), np.zeros(max(assembly.counters, 1), np.int64))
         storage = [_allocate(assembly, number, total) for number in range(len(assembly.tables))]
         texts = _fill(
-            streams,
-            walks,
-            assembly,
-            storage,
-            len(borders) + 1,
-            threads,
-            lambda share: progress((1 + 2 * share) / 3),
+            streams, walks, assembly, storage, threads, lambda share: progress((1 + 2 * share) / 3)
         )
     unsorted = not all(w.sorted for w in walks)
     events = Events(_frames(assembly, storage, texts, unsorted))
@@ -140,7 +142,7 @@ def _walks(
     assembly: Assembly,
     borders: NDArray[np.int64],
     threads: int | None,
-    progress: Callable[[float], None] = lambda _: None,
+    progress: _Progress = lambda _: None,
 ) -> list[Walk]:
     size = sum(stream.file.size for stream in streams)
     # Read twice, a trace that fits into memory had better stay there in between.
@@ -217,14 +219,14 @@ def _fill(
     walks: list[Walk],
     assembly: Assembly,
     storage: list[_Arrays],
-    spans: int,
     threads: int | None,
-    progress: Callable[[float], None],
+    progress: _Progress,
 ) -> list[str]:
     """Pass 2 over all spans; returns the strings that text slots then hold codes of."""
     if not streams:
         return []
     packets = np.concatenate([stream.packets for stream in streams])
+    spans = len(walks[0].reached) - 1
     codes: dict[bytes, int] = {}
     with ThreadPoolExecutor(threads or default_threads()) as pool:
         found = pool.map(lambda s: fill(s, streams, walks, packets, assembly), range(spans))
@@ -246,29 +248,25 @@ def _recode(
     """Replace one span's own codes of strings by those of the whole."""
     before, after = (sum(w.reached[border] for w in walks) for border in (span, span + 1))
     for table, arrays in zip(assembly.tables, storage, strict=True):
-        for place in _text_slots(table):
+        for place in (place for _, shape in table.columns for place in _text_slots(shape)):
             counter = table.counter + table.slots[place].level
             part = arrays.slots[place][before[counter] : after[counter]]
             part[:] = codes[part]
 
 
-def _text_slots(table: Table) -> list[int]:
-    def inside(shape: Any) -> Iterator[int]:
-        if isinstance(shape, TextShape):
-            yield shape.slot
-        elif hasattr(shape, "element"):
-            yield from inside(shape.element)
-        for _, part in getattr(shape, "fields", ()) or getattr(shape, "options", ()):
-            yield from inside(part)
-
-    return [slot for _, shape in table.columns for slot in inside(shape)]
+def _text_slots(shape: Shape | None) -> Iterator[int]:
+    match shape:
+        case TextShape(slot=slot):
+            yield slot
+        case ListShape(element=element):
+            yield from _text_slots(element)
+        case RecordShape(fields=parts) | OptionShape(options=parts):
+            for _, part in parts:
+                yield from _text_slots(part)
 
 
 def _frames(
-    assembly: Assembly,
-    storage: list[_Arrays],
-    texts: list[str],
-    unsorted: bool,
+    assembly: Assembly, storage: list[_Arrays], texts: list[str], unsorted: bool
 ) -> dict[str, pl.DataFrame]:
     strings = pl.Series("", texts or [""], dtype=pl.String)
     categories = strings.cast(pl.Categorical)
@@ -295,9 +293,81 @@ def _frame(
         found["cpu"] = pl.Series("cpu", arrays.cpu)
     for name, shape in table.columns:
         texts = categories if name == "procname" else strings
-        found[name] = column(name, shape, arrays.slots, rows, texts)
+        found[name] = _column(name, shape, arrays.slots, rows, texts)
     for name, kind in _NULL_COLUMNS.items():
         if name not in found:
             found[name] = pl.Series(name, [None], dtype=kind).new_from_index(0, rows[0])
     leading = ["time", "cpu", "pid", "tid", *(["procname"] if "procname" in found else [])]
     return pl.DataFrame([found[n] for n in leading + [n for n in found if n not in leading]])
+
+
+def _column(
+    name: str,
+    shape: Shape,
+    slots: Sequence[NDArray[Any]],
+    rows: Sequence[int],
+    texts: pl.Series,
+    level: int = 0,
+) -> pl.Series:
+    """One column of a table.
+
+    ``slots`` are the table's arrays, ``rows`` the rows of each level, ``texts`` the strings
+    that text slots hold codes of. Numbers keep their type; arrays become Polars arrays,
+    sequences lists, structures and variants structs, an absent option null.
+    """
+    match shape:
+        case ScalarShape(slot=slot):
+            return pl.Series(name, slots[slot])
+        case TextShape(slot=slot):
+            return texts.gather(pl.Series(slots[slot])).alias(name)
+        case ListShape(slot=slot, level=inner, count=count, element=element):
+            values = _column(name, element, slots, rows, texts, inner)
+            if slot < 0 and count > 0:
+                deeper = values.dtype.shape if isinstance(values.dtype, pl.Array) else ()
+                return values.reshape((rows[level], count, *deeper))
+            return _ragged(values, slots[slot] if slot >= 0 else np.zeros(rows[level], np.uint32))
+        case RecordShape(fields=fields):
+            parts = [_column(n, s, slots, rows, texts, level) for n, s in fields]
+        case OptionShape(slot=slot, options=options):
+            chosen = pl.Series(slots[slot])
+            parts = []
+            for number, (option, inside) in enumerate(options, start=1):
+                if inside is not None:
+                    values = _column(option, inside, slots, rows, texts, level)
+                    present = pl.when(pl.Series(chosen == number)).then(pl.lit(values))
+                    parts.append(pl.select(present.otherwise(None).alias(option)).to_series())
+            if not parts:
+                return pl.Series(name, [None] * rows[level], dtype=pl.Null)
+    return pl.DataFrame(_distinct(parts)).to_struct(name)
+
+
+def _ragged(values: pl.Series, lengths: NDArray[Any]) -> pl.Series:
+    """``values`` cut into lists of the given lengths, in order."""
+    full = np.flatnonzero(lengths)
+    if not len(full):
+        return pl.Series(values.name, [[]] * len(lengths), dtype=pl.List(values.dtype))
+    owner = pl.Series("owner", np.repeat(full, lengths[full])).set_sorted()
+    lists = (
+        pl.DataFrame([owner, values.alias("value")])
+        .group_by("owner", maintain_order=True)
+        .agg("value")["value"]
+        .alias(values.name)
+    )
+    if len(full) == len(lengths):
+        return lists
+    # Rows without an element point at an empty list behind the others.
+    empty = pl.Series(values.name, [[]], dtype=lists.dtype)
+    places = np.full(len(lengths), len(full), np.uint32)
+    places[full] = np.arange(len(full), dtype=np.uint32)
+    return pl.concat([lists, empty]).gather(pl.Series(places))
+
+
+def _distinct(parts: list[pl.Series]) -> list[pl.Series]:
+    """Columns with a name each: ``_a`` and ``a`` of one structure are both shown as ``a``."""
+    found: dict[str, pl.Series] = {}
+    for part in parts:
+        name = part.name
+        while name in found:
+            name = "_" + name
+        found[name] = part.alias(name)
+    return list(found.values())

@@ -1,39 +1,31 @@
 """What a trace's metadata says: field types, event, stream and trace classes (CTF 1.8).
 
-All of it is immutable plain data.  Names are kept as TSDL writes them, with LTTng's leading
-underscore; `field_name` gives the name that users see.  Sizes and alignments are in bits.
+All of it is immutable plain data. Names stay as TSDL writes them, with LTTng's leading underscore;
+`field_name` gives the name that users see. Sizes and alignments are in bits.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
-__all__ = [
-    "ArrayType",
-    "ByteOrder",
-    "Clock",
-    "Encoding",
-    "EnumMapping",
-    "EnumType",
-    "EventClass",
-    "Field",
-    "FloatType",
-    "IntegerType",
-    "SequenceType",
-    "StreamClass",
-    "StringType",
-    "StructType",
-    "TraceClass",
-    "Type",
-    "VariantType",
-    "alignment",
-    "field_name",
-]
+from chainshaper.values.errors import InputError
 
 ByteOrder = Literal["native", "le", "be"]
 Encoding = Literal["none", "utf8", "ascii"]
+
+
+class CtfError(InputError):
+    """A trace that cannot be read: which file or folder, where in it (bytes), why, what to do."""
+
+    def __init__(self, path: Path | str, offset: int | None, reason: str, remedy: str = "") -> None:
+        self.path = Path(path)
+        self.offset = offset
+        self.reason = reason
+        place = f"{path}" if offset is None else f"{path}, byte {offset}"
+        super().__init__(f"{place}: {reason}" + (f" ({remedy})" if remedy else ""))
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +91,7 @@ class SequenceType:
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A named member of a structure or option of a variant, named as TSDL writes it."""
+    """A named member of a structure or option of a variant."""
 
     name: str
     type: Type
@@ -107,10 +99,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class StructType:
-    """``struct { … } align(n)`` (section 4.2.1).
-
-    ``align`` is that of the whole: at least ``n``, and at least each field's.
-    """
+    """``struct { … } align(n)`` (section 4.2.1); ``align`` is at least ``n`` and each field's."""
 
     fields: tuple[Field, ...] = ()
     align: int = 1
@@ -177,6 +166,18 @@ class TraceClass:
     env: Mapping[str, str | int]
     clocks: Mapping[str, Clock]
     streams: Mapping[int, StreamClass]
+
+
+@dataclass(frozen=True)
+class CtfFolder:
+    """A folder with a ``metadata`` file: what it declares, and its clock (1 GHz without one)."""
+
+    path: Path
+    declared: TraceClass = field(repr=False)
+
+    @property
+    def clock(self) -> Clock:
+        return next(iter(self.declared.clocks.values()), Clock("none"))
 
 
 def field_name(name: str) -> str:

@@ -24,7 +24,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from chainshaper.sources.ebpf.elf_symbols import function_offsets
+from chainshaper.sources.ebpf.trace_points import function_offsets
 
 __all__ = ["callback_functions", "demangled", "type_argument"]
 

@@ -31,16 +31,23 @@ from chainshaper.linux.scheduling import signalled_with_parent
 from chainshaper.linux.threads import parents
 from chainshaper.linux.users import run_users, user_name, user_of
 from chainshaper.sources.ebpf.callback_functions import callback_functions
-from chainshaper.sources.ebpf.elf_symbols import open_regular
 from chainshaper.sources.ebpf.late_attachment import ADDED, with_found_objects, with_functions
-from chainshaper.sources.ebpf.output import HEADER, Printed, lost_events, read_printed
-from chainshaper.sources.ebpf.script import TEXT_BYTES, bpftrace_script
-from chainshaper.sources.ebpf.trace_points import TracePoint, trace_points
-from chainshaper.sources.ebpf.tracing_libraries import (
+from chainshaper.sources.ebpf.printing import (
+    HEADER,
+    TEXT_BYTES,
+    Printed,
+    bpftrace_script,
+    lost_events,
+    read_printed,
+)
+from chainshaper.sources.ebpf.trace_points import (
     LIBRARY,
+    TracePoint,
     TracingLibrary,
     installed_libraries,
     mapped_libraries,
+    open_regular,
+    trace_points,
 )
 from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids
 from chainshaper.values import events

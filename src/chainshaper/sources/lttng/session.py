@@ -1,23 +1,7 @@
-"""Tracing with LTTng: a recording session of our own, from its buffers to the trace on disk.
+"""What a trace's metadata says: field types, event, stream and trace classes (CTF 1.8).
 
-Events go through ring buffers in shared memory, one per core and user, from which a consumer
-daemon writes them to disk. When a buffer is full, events are discarded and counted. `ros2 trace`
-has 64 KiB a core; here it is 4 MiB where there is that much shared memory: at 60 bytes an event,
-70,000 events a core that the consumer, an ordinary thread beside real-time ones, may be late with.
-
-When events are lost all the same, tracing moves to a session with buffers four times as large while
-the application runs on: LTTng cannot add buffers to a session that has been started. What was lost
-until then stays lost and is counted, and what happens between the two sessions (some milliseconds)
-is not recorded, which a note says.
-
-A session daemon that ran before ours may trace other applications too (:mod:`.commands`).
-What they did is left out of the tables: a second run of the same nodes would make two of every
-chain.
-
-`sched_switch`, for execution times, comes from the kernel tracer where there is one and we may use
-it.
-
-Upstream: lttng-enable-channel(1), `tracetools_trace` of ros2_tracing (events, contexts, buffers).
+All of it is immutable plain data. Names stay as TSDL writes them, with LTTng's leading underscore;
+`field_name` gives the name that users see. Sizes and alignments are in bits.
 """
 
 import os
@@ -27,15 +11,64 @@ from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from chainshaper.linux.users import run_users
-from chainshaper.sources.lttng.commands import Lttng, connect
-from chainshaper.sources.lttng.other_applications import processes_apart, without_processes
+import polars as pl
+
+from chainshaper.linux.processes import descendants
+from chainshaper.linux.threads import parents, read_proc
+from chainshaper.linux.users import process_folder, run_users, user_in
+from chainshaper.sources.lttng.daemon import Lttng, connect
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import RecordingInfo
 
-__all__ = ["LttngSession", "buffer_size"]
+
+def processes_apart(mark: str, users: Collection[int]) -> tuple[set[int], set[int]]:
+    """The living processes that somebody else has started, and those that we have.
+
+    The ``mark`` counts in processes of these ``users``: others can read and write it as well.
+    """
+    parent_of = parents()
+    unrelated = set(parent_of) - descendants(parent_of, os.getpid())
+    others = {pid for pid in unrelated if not _is_marked(pid, mark, users)}
+    return others, set(parent_of) - others
+
+
+def _is_marked(pid: int, mark: str, users: Collection[int]) -> bool:
+    try:
+        with process_folder(pid) as folder:
+            marked = mark.encode() in read_proc("environ", folder).split(b"\0")
+            return marked and user_in(folder) in users
+    except OSError:  # it has ended, or is another user's
+        return False
+
+
+def without_processes(
+    strangers: Collection[int], tables: EventTables, info: RecordingInfo
+) -> tuple[EventTables, RecordingInfo]:
+    """The events without those of processes that are none of the command's, if there are any."""
+    traced = (frame["pid"].drop_nulls().unique() for frame in tables.values())
+    foreign = sorted({pid for pids in traced for pid in pids} & set(strangers))
+    if not foreign:
+        return tables, info
+    own = {
+        name: frame.filter(~pl.col("pid").is_in(foreign).fill_null(False))
+        for name, frame in tables.items()
+    }
+    names = ", ".join(f"{pid} {info.processes.get(pid, '')}".strip() for pid in foreign)
+    facts = {
+        "processes": {pid: name for pid, name in info.processes.items() if pid not in foreign},
+        "notes": (
+            *info.notes,
+            f"processes that the command has not started are left out: {names}.",
+        ),
+        "trace_events": {
+            name if name == "sched_switch" else f"ros2:{name}": frame.height
+            for name, frame in own.items()
+        },
+    }
+    return own, info.model_copy(update=facts)
+
 
 EVENTS = ("ros2:*", "ros2_caret:*", "dds:*")
 """Everything that `tracetools` of any distribution, CARET, and a traced Cyclone DDS emit."""

@@ -1,27 +1,15 @@
-"""Running a script with the `rclpy` of an application that runs: its Python, its environment.
+"""What a trace's metadata says: field types, event, stream and trace classes (CTF 1.8).
 
-The Python that has `rclpy` is seldom ours, and domain and RMW are those of the application's nodes.
-So what has to be asked of ROS 2 is asked by a small script of its own, in a process of its own.
-
-An environment says which programs and libraries are loaded: who wrote it chooses what runs. So this
-is the one place where something is run that was found through another process, and it runs with
-that process's user's rights or not at all:
-
-* as that user, with the groups of the user database, without capabilities, and with no way to get
-  any (`no_new_privs`);
-* in that environment and no other, in a session of its own, with no files of ours but the script,
-  and what it may print into: 8 MiB;
-* for a limited time, and no longer than we run ourselves.
-
-Even the search for the interpreter is that process's. An environment is not taken from a process
-that is no single user's (`sudo` carries that of whoever called it), nor from one in a container or
-a namespace of its own, whose paths lead elsewhere here. What a script prints is a stranger's word.
+All of it is immutable plain data. Names stay as TSDL writes them, with LTTng's leading underscore;
+`field_name` gives the name that users see. Sizes and alignments are in bits.
 """
 
 import ctypes
 import fcntl
+import json
 import os
 import pwd
+import re
 import signal
 import subprocess
 import time
@@ -35,16 +23,9 @@ from typing import Any
 from chainshaper.linux.scheduling import signalled_with_parent
 from chainshaper.linux.threads import read_proc
 from chainshaper.linux.users import process_folder, user_in, user_name
+from chainshaper.sources.ros import graph as ros_graph
 from chainshaper.values.errors import OperationError
-
-__all__ = [
-    "Environment",
-    "Script",
-    "environment_of",
-    "own_environment",
-    "run_with_rclpy",
-    "start_with_rclpy",
-]
+from chainshaper.values.recording import EndpointInfo
 
 _NOT_FOR_US = ("LD_PRELOAD",)
 """What is loaded into the nodes for tracing shall not trace us."""
@@ -240,3 +221,37 @@ def _content(descriptor: int) -> str:
     with suppress(OSError):
         os.close(descriptor)
     return content.rstrip(b"\0").decode(errors="replace")
+
+
+_PATIENCE_S = 10
+"""Discovery is waited for that long at most, and longer than that for Python and RMW to load."""
+_START_S = 20
+_NAME = re.compile(r"[!-~]{0,255}/[!-~]{1,255}")
+_LARGEST = 1 << 63
+
+
+def ask_graph(environment: Environment) -> tuple[tuple[EndpointInfo, ...], str | None]:
+    """All endpoints of the ROS graph that a node with this environment belongs to.
+
+    Returns:
+        The endpoints, and why there are none, if so.
+    """
+    said, problem = run_with_rclpy(
+        environment, ros_graph.__file__, str(_PATIENCE_S), within_s=_PATIENCE_S + _START_S
+    )
+    if problem is not None:
+        return (), problem
+    try:
+        # Libraries may have printed something before.
+        found = json.loads(said[said.index('{"endpoints"') :])["endpoints"]
+        endpoints = (EndpointInfo.model_validate(one) for one in found)
+        return tuple(one for one in endpoints if _is_ros(one)), None
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        return (), str(error)
+
+
+def _is_ros(one: EndpointInfo) -> bool:
+    """Whether an endpoint's names and numbers are such as ROS 2 has; others are no endpoints."""
+    values = one.model_dump(exclude_none=True).values()
+    names = all(_NAME.fullmatch(name) for name in (one.node, one.topic, one.type) if name)
+    return names and all(value < _LARGEST for value in values if isinstance(value, int))
