@@ -15,7 +15,8 @@ from dataclasses import replace
 
 import polars as pl
 
-from chainshaper.analysis.objects import CALLBACK_SCHEMA, INTERNAL_TOPICS, Objects
+from chainshaper.analysis.objects import CALLBACK_SCHEMA, Objects
+from chainshaper.values.application import INTERNAL_TOPICS
 
 __all__ = ["with_assumed_readers", "with_assumed_writers"]
 

@@ -11,9 +11,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from chainshaper.analysis.close_names import close_names
-from chainshaper.analysis.objects import INTERNAL_TOPICS
 from chainshaper.analysis.paths import Path, PathSearch, Stage, Vertex
-from chainshaper.values.application import ApplicationGraph, Callback, Chain
+from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Callback, Chain
 from chainshaper.values.errors import InputError
 
 __all__ = [

@@ -21,9 +21,8 @@ from typing import Any
 import polars as pl
 
 from chainshaper.analysis.flow import DataFlow, data_flow
-from chainshaper.analysis.objects import INTERNAL_TOPICS
 from chainshaper.values import events
-from chainshaper.values.application import ApplicationGraph, Callback, Node
+from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Callback, Node
 
 __all__ = [
     "INTERNAL_TOPICS",

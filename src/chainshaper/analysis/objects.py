@@ -21,10 +21,7 @@ from chainshaper.analysis.identity import numbered
 from chainshaper.analysis.matching import first_after, latest_before, nearest
 from chainshaper.values import events
 
-__all__ = ["CALLBACK_SCHEMA", "INTERNAL_TOPICS", "Objects", "named_nodes", "resolve_objects"]
-
-INTERNAL_TOPICS = frozenset(("/parameter_events", "/rosout", "/clock", "/_chainshaper_rehearsal"))
-"""Topics that every node has for itself, or every shaping node: they connect no computation."""
+__all__ = ["CALLBACK_SCHEMA", "Objects", "named_nodes", "resolve_objects"]
 
 CALLBACK_SCHEMA: dict[str, pl.DataType] = {
     "callback_id": pl.UInt32(),
@@ -109,14 +106,13 @@ def _name_types(*owners: pl.DataFrame) -> list[pl.Expr]:
 
 def named_nodes(tables: events.EventTables) -> pl.DataFrame:
     """The frame ``nodes`` of :class:`Objects`."""
-    namespace = pl.col("namespace").fill_null("").str.strip_chars_end("/")
     return (
         events.table(tables, "rcl_node_init")
         .select(
             "pid",
             pl.col("node_handle").alias("handle"),
             pl.col("time").alias("valid_from"),
-            (namespace + "/" + pl.col("node_name")).alias("node"),
+            events.NODE_NAME.alias("node"),
         )
         .drop_nulls("handle")
     )

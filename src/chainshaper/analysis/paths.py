@@ -18,9 +18,8 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
-from chainshaper.analysis.objects import INTERNAL_TOPICS
 from chainshaper.analysis.ordering import depth_first_order, greedy_order
-from chainshaper.values.application import ApplicationGraph, Callback
+from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Callback
 
 __all__ = ["Listing", "Path", "PathSearch", "Stage", "Vertex"]
 

@@ -56,10 +56,7 @@ def recorded_processes(recording: Recording) -> tuple[tuple[RecordedProcess, ...
 
 
 def _nodes(tables: events.EventTables) -> dict[int, list[str]]:
-    namespace = pl.col("namespace").fill_null("").str.strip_chars_end("/")
-    created = events.table(tables, "rcl_node_init").select(
-        "pid", node=namespace + "/" + pl.col("node_name")
-    )
+    created = events.table(tables, "rcl_node_init").select("pid", node=events.NODE_NAME)
     found: dict[int, list[str]] = {}
     for pid, node in created.unique(maintain_order=True).iter_rows():
         found.setdefault(pid, []).append(node)

@@ -1,17 +1,19 @@
-"""Where events come from: recordings of our own, and the traces that others write.
+"""Where events come from: recordings of our own, the traces that others write, and tracers.
 
 :func:`open_source` is the one door: whatever it opens is a
 :class:`~chainshaper.values.recording.Recording`, so no verb and no analysis needs to know the
-difference.
+difference. A :class:`Tracer` is the part of recording that differs between LTTng and eBPF.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Protocol
 
 from chainshaper.values.errors import InputError
-from chainshaper.values.recording import INFO_FILE, Recording, open_recording
+from chainshaper.values.events import EventTables
+from chainshaper.values.recording import INFO_FILE, Recording, RecordingInfo, open_recording
 
-__all__ = ["open_source"]
+__all__ = ["Tracer", "open_source"]
 
 
 def open_source(
@@ -22,8 +24,8 @@ def open_source(
     """Open a recording folder, or an LTTng trace (CTF 1.8): one folder, or several of one trace.
 
     ``overview`` is for who wants to know what is in it only: a trace's callbacks and messages are
-    then not decoded before they are used. ``progress`` is told the share that is done, from 0 to
-    1, and what is being done.
+    then not decoded before they are used. ``progress`` gets the share that is done, from 0 to 1,
+    and what is being done.
 
     Raises:
         InputError: there is nothing that can be read.
@@ -47,3 +49,60 @@ def _is_trace(folder: Path) -> bool:
     if (folder / INFO_FILE).exists() or not folder.is_dir():
         return False
     return any(path.is_file() for path in folder.rglob("metadata"))
+
+
+class Tracer(Protocol):
+    """A way of recording events, made for one run.
+
+        start() ─► the application runs; failure() is asked now and then ─► stop() ─► remove()
+                                                                                ─► recording()
+
+    It gets a folder of its own, empty and on the disk of the recording, whose content becomes the
+    recording's `trace/`; the application's command (empty: it runs already), and the processes to
+    attach to (empty: those that the command starts; both empty: all that run). The application
+    itself (starting and ending it, its threads, its QoS) is :mod:`chainshaper.flow.record`'s.
+    """
+
+    def start(self) -> Mapping[str, str]:
+        """Begin; tracing is on when this returns. What to add to the application's environment.
+
+        Raises:
+            PlatformError: the machine lacks the tracer or a privilege; names the remedy.
+            OperationError: it does not start.
+        """
+        ...
+
+    def failure(self) -> str | None:
+        """Why nothing is traced any more, as half a sentence; None while all is well.
+
+        Asked every few seconds while the application runs, so also the place to look after
+        losses. A failure ends the run; what was traced until then is recorded with it as a note.
+        """
+        ...
+
+    def stop(self) -> None:
+        """End tracing; everything is on disk when this returns.
+
+        Raises:
+            OperationError: it cannot be ended in order; `remove` is still called.
+        """
+        ...
+
+    def remove(self) -> None:
+        """Leave nothing of ours behind: sessions, daemons, processes.
+
+        Called however the run ends, also when `start` failed halfway, and perhaps twice.
+        """
+        ...
+
+    def recording(self) -> tuple[EventTables, RecordingInfo]:
+        """The events, and what they tell, from the folder; called after `stop` and `remove`.
+
+        A tracer fills in what it knows: ``source``, ``clock_offset_ns``, ``distribution``,
+        ``rmw``, ``processes``, ``lost``, ``notes``, ``trace_events``. Command, threads, endpoints
+        and scheduling are added to that.
+
+        Raises:
+            OperationError: what was traced cannot be read.
+        """
+        ...

@@ -1,12 +1,10 @@
 """What the events of a trace tell about the system it was taken on: distribution, RMW, processes.
 
-No event names the distribution. Three kinds of evidence do:
-
-* CARET's `caret_init` says it in so many words;
-* `rcl_init` carries the version of tracetools, and every distribution released another one;
-* without it (tracing began later) the fields of the events do: `rmw_publish` has a source
-  timestamp since Jazzy, a gid 16 bytes instead of 24 since Kilted, intra-process events came with
-  Iron. Declared fields prove presence; what a session did not enable proves nothing.
+Three kinds of evidence tell the distribution: CARET's `caret_init` says it; `rcl_init` carries the
+version of tracetools, and every distribution released another one; without it (tracing began later)
+the fields of the events do: `rmw_publish` has a source timestamp since Jazzy, a gid 16 bytes
+instead of 24 since Kilted, intra-process events came with Iron. Declared fields prove presence;
+what a session did not enable proves nothing.
 
 The RMW is known from CARET's `rmw_implementation`, from the gids of publishers and subscriptions,
 which begin with the DDS vendor's number (RTPS 2.5, section 9.3.1.5: guidPrefix[0:2] = vendorId), or
@@ -20,21 +18,14 @@ from collections.abc import Iterable, Mapping
 
 import polars as pl
 
-from chainshaper.values.events import EventTables
+from chainshaper.values.events import NODE_NAME, EventTables
 
 __all__ = ["distribution_of", "processes_of", "rmw_of_gids", "rmw_of_threads"]
 
-_RELEASES: tuple[tuple[tuple[int, int], str], ...] = (
-    # Versions of tracetools below the first column's belong to the distribution beside it.
-    ((1, 0), "eloquent"),
-    ((2, 0), "foxy"),
-    ((3, 0), "galactic"),
-    ((5, 0), "humble"),
-    ((7, 0), "iron"),
-    ((8, 3), "jazzy"),
-    ((8, 7), "kilted"),
-    ((8, 11), "lyrical"),
-)
+_RELEASES = {  # Versions of tracetools below these belong to the distribution.
+    **{"eloquent": (1, 0), "foxy": (2, 0), "galactic": (3, 0), "humble": (5, 0), "iron": (7, 0)},
+    **{"jazzy": (8, 3), "kilted": (8, 7), "lyrical": (8, 11)},
+}
 _LATER = "rolling"
 
 _VENDORS = {
@@ -63,11 +54,10 @@ def distribution_of(tables: EventTables, fields: Mapping[str, Mapping[str, int]]
         found = re.match(r"(\d+)\.(\d+)", version_text)
         if found is not None:
             version = int(found[1]), int(found[2])
-            return next((name for below, name in _RELEASES if version < below), _LATER)
-    publish = fields.get("rmw_publish")
-    if publish is None:
+            return next((name for name, below in _RELEASES.items() if version < below), _LATER)
+    if "rmw_publish" not in fields:
         return None
-    if "timestamp" in publish:
+    if "timestamp" in fields["rmw_publish"]:
         length = fields.get("rmw_publisher_init", {}).get("gid", 0)
         return {24: "jazzy", 16: "kilted"}.get(length)
     if "rclcpp_intra_publish" in fields and "rclcpp_ring_buffer_enqueue" in fields:
@@ -113,10 +103,8 @@ def processes_of(tables: EventTables, commands: Mapping[int, str]) -> dict[int, 
     processes = dict(commands)
     nodes = tables.get("rcl_node_init")
     if nodes is not None and nodes.height:
-        namespace = pl.col("namespace").fill_null("").str.strip_chars_end("/")
-        named = nodes.select("pid", node=namespace + "/" + pl.col("node_name")).drop_nulls()
-        grouped = named.group_by("pid", maintain_order=True).agg(
-            pl.col("node").unique(maintain_order=True)
-        )
+        named = nodes.select("pid", node=NODE_NAME).drop_nulls()
+        names = pl.col("node").unique(maintain_order=True)
+        grouped = named.group_by("pid", maintain_order=True).agg(names)
         processes |= {pid: ", ".join(names) for pid, names in grouped.iter_rows()}
     return dict(sorted(processes.items()))

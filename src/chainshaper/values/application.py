@@ -10,7 +10,10 @@ from typing import Literal, TypeAlias
 
 from chainshaper.values.durations import format_duration
 
-__all__ = ["ApplicationGraph", "Callback", "CallbackKind", "Chain", "Node"]
+__all__ = ["INTERNAL_TOPICS", "ApplicationGraph", "Callback", "CallbackKind", "Chain", "Node"]
+
+INTERNAL_TOPICS = frozenset(("/parameter_events", "/rosout", "/clock", "/_chainshaper_rehearsal"))
+"""Topics that every node has for itself, or every shaping node: they connect no computation."""
 
 CallbackKind: TypeAlias = Literal["timer", "subscription", "service", "client", "unknown"]
 """``unknown``: it was seen to run, but not to be created (tracing started after it), or only its

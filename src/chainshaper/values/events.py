@@ -30,6 +30,7 @@ __all__ = [
     "COMMON_COLUMNS",
     "CREATION",
     "FIELDS",
+    "NODE_NAME",
     "OPTIONAL_FIELDS",
     "VERSION_FIELDS",
     "EventTables",
@@ -233,6 +234,10 @@ CREATION = frozenset(
     if name.endswith(("_init", "_added", "_register", "_link_node", "_to_ipb", "_to_subscription"))
 ) | {"rmw_implementation", "rclcpp_construct_ring_buffer"}
 """The events of objects' creation, which say what all others are about."""
+
+
+NODE_NAME = pl.col("namespace").fill_null("").str.strip_chars_end("/") + "/" + pl.col("node_name")
+"""The full name of the node that a row of `rcl_node_init` is about: ``/front/filter``."""
 
 
 def happened(tables: EventTables, since_ns: int, until_ns: int | None = None) -> EventTables:

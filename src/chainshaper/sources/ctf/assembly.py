@@ -19,13 +19,13 @@ from chainshaper.sources.ctf.program import (
     Slot,
     Step,
     Storage,
-    compile_fields,
 )
 from chainshaper.sources.ctf.types import (
     CtfError,
     CtfFolder,
     EnumType,
     EventClass,
+    Field,
     IntegerType,
     StreamClass,
     StructType,
@@ -86,13 +86,16 @@ class Event:
 
 @dataclass
 class Assembly:
-    """Tables for the kernels, and what their rows mean."""
+    """Tables for the kernels, and what their rows mean.
+
+    ``events_of`` is by a table's number, ``folders`` the rows of each folder's stream classes:
+    first, end.
+    """
 
     program: Program = field(default_factory=Program)
     stream_rows: list[list[int]] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
-    events_of: dict[int, list[Event]] = field(default_factory=dict)  # by the table's number
-    # Rows of the stream classes of each folder: first, end.
+    events_of: dict[int, list[Event]] = field(default_factory=dict)
     folders: list[tuple[int, int]] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
     table_numbers: dict[Table, int] = field(default_factory=dict)
@@ -118,7 +121,7 @@ def assemble(folders: Sequence[CtfFolder], wanted: Wanted) -> Assembly:
     for folder in folders:
         first = len(assembly.stream_rows)
         try:
-            _folder(assembly, folder.declared, wanted)
+            _add_folder(assembly, folder.declared, wanted)
         except LayoutError as error:
             file = folder.path / "metadata"
             raise CtfError(file, None, str(error), "the trace cannot be read") from None
@@ -141,23 +144,17 @@ def attach(assembly: Assembly, table: int, storage: Storage, time: int, cpu: int
         )
 
 
-def _folder(assembly: Assembly, trace: TraceClass, wanted: Wanted) -> None:
+def _add_folder(assembly: Assembly, trace: TraceClass, wanted: Wanted) -> None:
     reader = Reader(big=trace.byte_order == "be", registers=len(tb.REGISTERS))
-    header, _ = compile_fields(reader, "trace.packet.header", trace.packet_header, fixed=True)
+    header, _ = reader.scope("trace.packet.header", trace.packet_header, fixed=True)
     pending: list[tuple[list[int], Iterable[int], list[Step], list[Step]]] = []
     for stream in trace.streams.values():
-        own = Reader(
-            reader.big,
-            reader.registers,
-            dict(reader.roots),
-            steps=reader.steps,
-            labels=reader.labels,
-        )
-        packet, _ = compile_fields(own, "stream.packet.context", stream.packet_context, fixed=True)
-        event, _ = compile_fields(own, "stream.event.header", stream.event_header, fixed=True)
+        own = reader.child()
+        packet, _ = own.scope("stream.packet.context", stream.packet_context, fixed=True)
+        event, _ = own.scope("stream.event.header", stream.event_header, fixed=True)
         row = [0] * tb.STREAM_COLUMNS
         row[tb.S_ID] = stream.id
-        row[tb.S_ALIGN : tb.S_CLOCK_BITS + 1] = _quick_header(stream.event_header, reader.big)
+        row[tb.S_ALIGN : tb.S_CLOCK_BITS + 1] = _quick_header(stream.event_header, own.big)
         row[tb.S_FREQUENCY] = _frequency(stream, trace)
         known = {n.register for n in [*header, *packet] if isinstance(n, Number)}
         row[tb.S_KNOWN] = sum(1 << r for r in known if 0 <= r < len(tb.REGISTERS))
@@ -166,13 +163,12 @@ def _folder(assembly: Assembly, trace: TraceClass, wanted: Wanted) -> None:
         else:
             row[tb.S_KNOWN] &= ~(1 << tb.R_UUID_LOW)
         has_cpu = bool(row[tb.S_KNOWN] >> tb.R_CPU & 1)
-        rows = _events(assembly, own, stream, trace, has_cpu, wanted)
-        reader.registers = max(reader.registers, own.registers)
-        reader.steps = own.steps
+        rows = _add_events(assembly, own, stream, trace, has_cpu, wanted)
+        reader.join(own)
         row[tb.S_ID_FIRST : tb.S_DEFAULT + 1] = _id_table(assembly, rows)
         assembly.stream_rows.append(row)
         pending.append((row, rows.values(), packet, event))
-    # Only now is it known which of the headers' numbers anybody refers to.
+    # Only now is it known which of the headers' numbers lengths and tags refer to.
     program = assembly.program
     start, stop = program.add(header, None)
     for row, events, packet, event in pending:
@@ -185,7 +181,7 @@ def _folder(assembly: Assembly, trace: TraceClass, wanted: Wanted) -> None:
     assembly.registers = max(assembly.registers, reader.registers)
 
 
-def _events(
+def _add_events(
     assembly: Assembly,
     reader: Reader,
     stream: StreamClass,
@@ -195,18 +191,14 @@ def _events(
 ) -> dict[int, int]:
     """Lay out a stream class's events; returns their rows by event id."""
     rows: dict[int, int] = {}
-    roots = dict(reader.roots)
     for event in stream.events.values():
-        own = Reader(
-            reader.big, reader.registers, dict(roots), steps=reader.steps, labels=reader.labels
-        )
-        keep = event.name in wanted.names
-        steps, columns = _event(own, stream, event, trace, wanted)
-        reader.registers, reader.steps = max(reader.registers, own.registers), own.steps
+        own = reader.child()
+        steps, columns = _laid_out(own, stream, event, trace, wanted)
+        reader.join(own)
         number, storage = -1, None
         row = [0] * tb.EVENT_COLUMNS
         row[tb.E_COUNTER] = -1
-        if keep:
+        if event.name in wanted.names:
             number = _table(assembly, event.name, columns, own, has_cpu)
             table = assembly.tables[number]
             storage = Storage(table.counter, _row_bytes(table))
@@ -220,39 +212,40 @@ def _events(
         elif len(only) == 1 and only[0][tb.O_CODE] == tb.SKIP:
             row[tb.E_ALIGN], row[tb.E_SIZE] = only[0][tb.O_ALIGN], only[0][tb.O_SIZE]
         rows[event.id] = len(assembly.events)
-        place = len(assembly.stream_rows)
-        assembly.events.append(Event(event.name, row, number, steps, place))
-        assembly.events_of.setdefault(number, []).append(assembly.events[-1])
+        laid_out = Event(event.name, row, number, steps, len(assembly.stream_rows))
+        assembly.events.append(laid_out)
+        assembly.events_of.setdefault(number, []).append(laid_out)
     return rows
 
 
-def _event(
-    reader: Reader,
-    stream: StreamClass,
-    event: EventClass,
-    trace: TraceClass,
-    asked: Wanted,
+def _laid_out(
+    reader: Reader, stream: StreamClass, event: EventClass, trace: TraceClass, asked: Wanted
 ) -> tuple[list[Step], list[tuple[str, Shape]]]:
     """The steps of an event behind its header, and its columns by their final names."""
     keep = event.name in asked.names
-    names = _standard_names(stream, event, trace) if keep else {}
+    contexts = (
+        ("stream.event.context", stream.event_context),
+        ("event.context", event.context),
+    )
+    names: dict[tuple[str, str], str] = {}
+    if keep:
+        present: dict[str, tuple[str, str]] = {}
+        for scope, kind in contexts:
+            for member in kind.fields if kind is not None else ():
+                present.setdefault(field_name(member.name), (scope, member.name))
+        names = _standard_names(present, trace.env.get("domain") == "kernel")
     if event.name in asked.nameless:
         names = {place: name for place, name in names.items() if name != "procname"}
     columns: list[tuple[str, Shape]] = []
     steps: list[Step] = []
-    for scope, kind in (
-        ("stream.event.context", stream.event_context),
-        ("event.context", event.context),
-    ):
+    for scope, kind in contexts:
         wanted = None if keep and asked.context else frozenset(n for s, n in names if s == scope)
-        more, found = compile_fields(reader, scope, kind, wanted)
+        more, found = reader.scope(scope, kind, wanted)
         steps += more
         for name, shape in found:
             standard = names.get((scope, name)) or names.get((scope, "_" + name))
             columns.append((standard or f"context.{name}", shape))
-    more, found = compile_fields(
-        reader, "event.fields", event.fields, None if keep else frozenset()
-    )
+    more, found = reader.scope("event.fields", event.fields, None if keep else frozenset())
     taken = {"time", "cpu", "pid", "tid", "procname", *(name for name, _ in columns)}
     for own, shape in found:
         name = own
@@ -264,40 +257,25 @@ def _event(
 
 
 def _standard_names(
-    stream: StreamClass, event: EventClass, trace: TraceClass
+    present: dict[str, tuple[str, str]], kernel: bool
 ) -> dict[tuple[str, str], str]:
     """Which context fields (scope, TSDL name) are the columns pid, tid and procname.
 
     A kernel trace's own pid and tid are those of the initial namespace; user space traces have
     ``vpid`` and ``vtid`` of the process's namespace only.
     """
-    kernel = trace.env.get("domain") == "kernel"
-    present: dict[str, tuple[str, str]] = {}
-    for scope, kind in (
-        ("stream.event.context", stream.event_context),
-        ("event.context", event.context),
-    ):
-        for member in kind.fields if kind is not None else ():
-            present.setdefault(field_name(member.name), (scope, member.name))
     found: dict[tuple[str, str], str] = {}
-    for column, candidates in (
-        ("pid", ("pid", "vpid") if kernel else ("vpid", "pid")),
-        ("tid", ("tid", "vtid") if kernel else ("vtid", "tid")),
-        ("procname", ("procname",)),
-    ):
-        for candidate in candidates:
-            if candidate in present:
-                found[present[candidate]] = column
-                break
+    for column in ("pid", "tid"):
+        candidates = (column, f"v{column}") if kernel else (f"v{column}", column)
+        for candidate in [name for name in candidates if name in present][:1]:
+            found[present[candidate]] = column
+    if "procname" in present:
+        found[present["procname"]] = "procname"
     return found
 
 
 def _table(
-    assembly: Assembly,
-    name: str,
-    columns: list[tuple[str, Shape]],
-    reader: Reader,
-    has_cpu: bool,
+    assembly: Assembly, name: str, columns: list[tuple[str, Shape]], reader: Reader, has_cpu: bool
 ) -> int:
     """The number of the table for events of this name and shape."""
     slots, counter = tuple(reader.slots), assembly.counters
@@ -333,33 +311,28 @@ def _quick_header(header: StructType | None, big: bool) -> list[int]:
     """Alignment, id bits, clock shift and clock bits of LTTng's compact and large headers.
 
     Both put an id of few bits and the clock's low bits into one load, and announce anything
-    larger by an id of all ones.  Zeros for every other header, which is then interpreted.
+    larger by an id of all ones. Zeros for every other header, which is then interpreted.
     """
     none = [0, 0, 0, 0]
-    if header is None or big or len(header.fields) != 2:
-        return none
-    identifier, variant = header.fields
-    if not isinstance(identifier.type, EnumType) or not isinstance(variant.type, VariantType):
-        return none
-    number = identifier.type.container
-    options = {option.name: option.type for option in variant.type.options}
-    last = (1 << number.size) - 1
-    ranges = {m.label: (m.low, m.high) for m in identifier.type.mappings}
-    compact = options.get("compact")
+    match header:
+        case StructType(
+            fields=(
+                Field("id", EnumType(container=IntegerType(signed=False) as number) as labels),
+                Field(_, VariantType(tag="id", options=options)),
+            )
+        ) if not big:
+            last = (1 << number.size) - 1
+            ranges = {m.label: (m.low, m.high) for m in labels.mappings}
+            compact = next((o.type for o in options if o.name == "compact"), None)
+        case _:
+            return none
+    match compact:
+        case StructType(fields=(Field(_, IntegerType(signed=False, clock=str()) as clock),)):
+            pass
+        case _:
+            return none
     if (
-        identifier.name != "id"
-        or variant.type.tag != "id"
-        or ranges != {"compact": (0, last - 1), "extended": (last, last)}
-        or not isinstance(compact, StructType)
-        or len(compact.fields) != 1
-    ):
-        return none
-    clock = compact.fields[0].type
-    if (
-        not isinstance(clock, IntegerType)
-        or clock.clock is None
-        or number.signed
-        or clock.signed
+        ranges != {"compact": (0, last - 1), "extended": (last, last)}
         or clock.size > 63
         or "be" in (number.byte_order, clock.byte_order)
     ):
@@ -373,13 +346,9 @@ def _quick_header(header: StructType | None, big: bool) -> list[int]:
 
 def _clock_names(kind: Type | None) -> list[str]:
     match kind:
-        case IntegerType(clock=str(name)):
+        case IntegerType(clock=str(name)) | EnumType(container=IntegerType(clock=str(name))):
             return [name]
-        case EnumType(container=IntegerType(clock=str(name))):
-            return [name]
-        case StructType(fields=fields):
-            return [name for f in fields for name in _clock_names(f.type)]
-        case VariantType(options=fields):
+        case StructType(fields=fields) | VariantType(options=fields):
             return [name for f in fields for name in _clock_names(f.type)]
     return []
 
@@ -391,7 +360,7 @@ def _frequency(stream: StreamClass, trace: TraceClass) -> int:
         if name not in trace.clocks:
             raise LayoutError(f"stream {stream.id} is mapped to the undeclared clock {name!r}")
     names += list(trace.clocks)
-    return trace.clocks[names[0]].frequency if names else 1_000_000_000
+    return trace.clocks[names[0]].frequency if names else tb.BILLION
 
 
 def _uuid_words(text: str) -> tuple[int, int]:

@@ -64,7 +64,7 @@ _ESCAPE = re.compile(r"\\(x[0-9a-fA-F]{1,2}|[0-7]{1,3}|.)", re.DOTALL)
 _ESCAPES = {"n": "\n", "t": "\t", "r": "\r", "a": "\a", "b": "\b", "f": "\f", "v": "\v"}
 
 
-def tokenize(text: str) -> list[Token]:
+def _tokens(text: str) -> list[Token]:
     """The tokens of ``text`` without white space and comments, closed by one of kind ``end``.
 
     Raises `TsdlError` at the first character that begins no token.
@@ -84,28 +84,23 @@ def tokenize(text: str) -> list[Token]:
         kind, found = matched.lastgroup, matched.group()
         match kind:
             case "string":
-                found = _unescape(found[found.index('"') + 1 : -1])
-                tokens.append(Token("string", found, position))
+                tokens.append(Token(kind, _unescape(found[found.index('"') + 1 : -1]), position))
             case "character":
                 tokens.append(Token("integer", str(ord(_unescape(found[1:-1])[:1])), position))
             case "integer":
                 if len(found) > 80:
                     raise TsdlError(position, "integer out of range")
-                tokens.append(Token("integer", str(_integer_of(found)), position))
+                tokens.append(Token(kind, str(_integer_of(found)), position))
             case "word" | "mark":
                 tokens.append(Token(kind, found, position))
         position = matched.end()
-    tokens.append(Token("end", "", position))
-    return tokens
+    return [*tokens, Token("end", "", position)]
 
 
 def _integer_of(text: str) -> int:
     digits = text.rstrip("uUlL") if text[:2].lower() != "0b" else text
-    if len(digits) > 1 and digits[0] == "0" and digits[1].isdigit():
-        try:
-            return int(digits, 8)
-        except ValueError:
-            return int(digits, 10)
+    if re.fullmatch("0[0-9]+", digits):
+        return int(digits, 10 if set(digits) & {"8", "9"} else 8)
     return int(digits, 0)
 
 
@@ -122,50 +117,41 @@ def _unescape(text: str) -> str:
 
 
 Value = int | str
-
 Attributes = dict[str, tuple[Value, int]]
 """Name → value and its character offset."""
 
 _T = TypeVar("_T")
-_BYTE_ORDERS: dict[Value, ByteOrder] = {
-    "le": "le",
-    "be": "be",
-    "network": "be",
-    "native": "native",
-}
+_BYTE_ORDERS: dict[Value, ByteOrder] = {"le": "le", "be": "be", "network": "be", "native": "native"}
 _SIGNED: dict[Value, bool] = {
-    0: False,
-    "false": False,
-    "FALSE": False,
-    1: True,
-    "true": True,
-    "TRUE": True,
+    **dict.fromkeys((0, "false", "FALSE"), False),
+    **dict.fromkeys((1, "true", "TRUE"), True),
 }
-_BASES: dict[Value, int] = {
-    **dict.fromkeys(("decimal", "dec", "d", "i", "u", 10), 10),
-    **dict.fromkeys(("hexadecimal", "hex", "x", "X", "p", 16), 16),
-    **dict.fromkeys(("octal", "oct", "o", 8), 8),
-    **dict.fromkeys(("binary", "b", 2), 2),
+_BASES = {
+    name: name  # how a person would like to see it
+    for name in (
+        *("decimal", "dec", "d", "i", "u", 10, "hexadecimal", "hex", "x", "X", "p", 16),
+        *("octal", "oct", "o", 8, "binary", "b", 2),
+    )
 }
 _ENCODINGS: dict[Value, Encoding] = {"none": "none", "utf8": "utf8", "ascii": "ascii"}
 
 
-def checked_alignment(align: int, offset: int) -> int:
+def _checked_alignment(align: int, offset: int) -> int:
     """``align`` in bits, if it is one; else `TsdlError`."""
     if not 0 < align <= 1 << 20 or align & (align - 1):
         raise TsdlError(offset, f"alignment {align} is not a power of two")
     return align
 
 
-def integer_type(found: Attributes, offset: int) -> IntegerType:
+def _integer_type(found: Attributes, offset: int) -> IntegerType:
     """``integer { … }``, which begins at character ``offset``; raises `TsdlError`."""
     size = _number(found, "size", 0)
     if not 0 < size <= 64:
         raise TsdlError(offset, f"integer of {size} bits; 1 to 64 are supported")
-    _one_of(_BASES, found, "base", 10)  # how a person would like to see it
+    _one_of(_BASES, found, "base", 10)
     return IntegerType(
         size=size,
-        align=checked_alignment(_number(found, "align", 1 if size % 8 else 8), offset),
+        align=_checked_alignment(_number(found, "align", 1 if size % 8 else 8), offset),
         signed=_one_of(_SIGNED, found, "signed", 0),
         byte_order=_one_of(_BYTE_ORDERS, found, "byte_order", "native"),
         encoding=_encoding(found, "none"),
@@ -183,20 +169,20 @@ def _clock(found: Attributes) -> str | None:
     return parts[1]
 
 
-def float_type(found: Attributes, offset: int) -> FloatType:
+def _float_type(found: Attributes, offset: int) -> FloatType:
     """``floating_point { … }``, which begins at character ``offset``; raises `TsdlError`."""
     exponent, mantissa = _number(found, "exp_dig", 0), _number(found, "mant_dig", 0)
     if (exponent, mantissa) not in ((8, 24), (11, 53)):
         raise TsdlError(
             offset, f"floating point of {exponent} + {mantissa} bits; IEEE 32 or 64 supported"
         )
-    align = checked_alignment(_number(found, "align", 8), offset)
+    align = _checked_alignment(_number(found, "align", 8), offset)
     return FloatType(
         exponent + mantissa, align, _one_of(_BYTE_ORDERS, found, "byte_order", "native")
     )
 
 
-def string_type(found: Attributes) -> StringType:
+def _string_type(found: Attributes) -> StringType:
     """``string``, with or without attributes; raises `TsdlError`."""
     return StringType(_encoding(found, "utf8"))
 
@@ -228,15 +214,15 @@ _DEEPEST = 32
 
 
 @dataclass
-class Scope:
+class _Scope:
     """Type names visible at one place: ``struct x``, ``enum x``, ``variant x`` and aliases."""
 
-    parent: Scope | None = None
+    parent: _Scope | None = None
     names: dict[str, Type] = field(default_factory=dict)
 
     def find(self, name: str) -> Type | None:
         """The innermost declaration of ``name``."""
-        scope: Scope | None = self
+        scope: _Scope | None = self
         while scope is not None:
             if name in scope.names:
                 return scope.names[name]
@@ -245,23 +231,19 @@ class Scope:
 
 
 @dataclass
-class Parser:
+class _Parser:
     """A position in a list of tokens and the type names known there."""
 
     tokens: list[Token]
     position: int = 0
-    scope: Scope = field(default_factory=Scope)
+    scope: _Scope = field(default_factory=_Scope)
     depth: int = 0
-
-    # Tokens
 
     @property
     def token(self) -> Token:
-        """The token at the position."""
         return self.tokens[self.position]
 
     def fail(self, reason: str) -> NoReturn:
-        """Raise `TsdlError` at the position."""
         raise TsdlError(self.token.offset, reason)
 
     def at(self, text: str) -> bool:
@@ -275,7 +257,6 @@ class Parser:
         return found
 
     def expect(self, text: str) -> None:
-        """Step over ``text``, or fail."""
         if not self.accept(text):
             self.fail(f"expected {text!r}, found {self.token.text!r}")
 
@@ -294,13 +275,11 @@ class Parser:
         if self.depth >= _DEEPEST:
             self.fail(f"more than {_DEEPEST} nested blocks")
         self.depth += 1
-        outer, self.scope = self.scope, Scope(self.scope)
+        outer, self.scope = self.scope, _Scope(self.scope)
         yield
         self.scope = outer
         self.depth -= 1
         self.expect("}")
-
-    # Values and attributes
 
     def path(self) -> str:
         """A dotted path such as ``packet.header`` or ``clock.monotonic.value``."""
@@ -311,7 +290,6 @@ class Parser:
         return ".".join(parts)
 
     def integer(self) -> int:
-        """An integer with its sign."""
         negative = False
         while self.at("-") or self.at("+"):
             negative ^= self.at("-")
@@ -342,8 +320,6 @@ class Parser:
                 self.expect(";")
         return found
 
-    # Types
-
     def type(self, *, declares: bool) -> Type:
         """A type specifier; ``declares`` says that a declarator's name follows it."""
         while self.accept("const"):
@@ -359,11 +335,11 @@ class Parser:
             return self._enum()
         if word == "string":
             self.position += 1
-            return string_type(self.attributes() if self.at("{") else {})
+            return _string_type(self.attributes() if self.at("{") else {})
         if following == "{" and word in ("integer", "floating_point"):
             offset = self.token.offset
             self.position += 1
-            build = integer_type if word == "integer" else float_type
+            build = _integer_type if word == "integer" else _float_type
             return build(self.attributes(), offset)
         return self._alias(declares)
 
@@ -406,7 +382,7 @@ class Parser:
         align = 1
         if self.accept("align"):
             self.expect("(")
-            align = checked_alignment(self.integer(), self.token.offset)
+            align = _checked_alignment(self.integer(), self.token.offset)
             self.expect(")")
         kind = StructType(tuple(fields), max([align, *(alignment(f.type) for f in fields)]))
         if name:
@@ -504,8 +480,6 @@ class Parser:
             self.scope.names[name] = kind
         return kind
 
-    # Declarations without a field
-
     def declaration(self) -> bool:
         """Read ``typealias``, ``typedef`` or a lone named type; False where none stands here."""
         if self.accept("typealias"):
@@ -545,7 +519,7 @@ def parse_tsdl(text: str) -> TraceClass:
     Raises `TsdlError` with the character offset and the reason where the text is no TSDL, names
     something undeclared, or declares something twice.
     """
-    parser = Parser(tokenize(text))
+    parser = _Parser(_tokens(text))
     reader = _Blocks(parser)
     while parser.token.kind != "end":
         reader.block()
@@ -555,7 +529,7 @@ def parse_tsdl(text: str) -> TraceClass:
 class _Blocks:
     """The blocks read so far; classes are put together at the end, in any order of blocks."""
 
-    def __init__(self, parser: Parser) -> None:
+    def __init__(self, parser: _Parser) -> None:
         self.parser = parser
         self.trace: dict[str, Value | Type] | None = None
         self.env: dict[str, str | int] = {}

@@ -1,13 +1,14 @@
 """Which functions callbacks are, found in the memory of the processes that run them.
 
-LTTng is told by `rclcpp_callback_register`, uprobes are not. But a callback's handle is an address,
-and what stands around it tells (on 64-bit machines, for objects made by GCC's library):
+With LTTng `rclcpp_callback_register` says it, with uprobes no event does. But a callback's handle
+is an address, and what stands around it tells (on 64-bit machines, for objects made by GCC's
+library):
 
 * that of a timer is a member of `rclcpp::WallTimer<F, …>` or `GenericTimer<F, …>`. The object
   begins with the address of its class's table, which leads to the class's name, stripped or not;
-* that of a subscription or service begins with a `std::function`, which holds the address of
+* that of a subscription or service begins with a `std::function`, which has the address of
   `std::_Function_handler<…, F>::_M_invoke`. Files name it unless they were stripped; what was
-  stripped keeps the names of what others may use as well, which lambdas are not.
+  stripped still has the names of what others may use as well, which lambdas are not.
 
 In both, F is the type whose name `rclcpp_callback_register` has.
 
@@ -21,7 +22,7 @@ import struct
 from bisect import bisect
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from chainshaper.sources.ebpf.trace_points import function_offsets
@@ -48,9 +49,15 @@ class _Region:
 
 @dataclass
 class _Process:
+    """A process whose memory is open; ``invokers`` are those that were found in files so far."""
+
     pid: int
     memory: int
-    regions: list[_Region]
+    invokers: dict[str, dict[int, str]]
+    regions: list[_Region] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.regions = list(_regions(self.pid))
 
     def words(self, address: int, count: int) -> tuple[int, ...]:
         """Eight-byte words; raises OSError where nothing is mapped."""
@@ -77,11 +84,11 @@ def callback_functions(callbacks: Iterable[tuple[int, int]]) -> dict[tuple[int, 
         with suppress(OSError):  # it has ended, or is another user's
             memory = os.open(f"/proc/{pid}/mem", os.O_RDONLY)
             try:
-                process = _Process(pid, memory, list(_regions(pid)))
+                process = _Process(pid, memory, invokers)
                 for address in addresses:
                     name = _timer(process, address)
                     if name is None or name.startswith("std::function<"):
-                        name = _function(process, address, invokers)
+                        name = _function(process, address)
                     if name is not None:
                         found[pid, address] = name
             finally:
@@ -108,7 +115,7 @@ def _class(process: _Process, table: int) -> str | None:
             (address,) = process.words(address + ahead, 1)
         if process.region(address) is not None:
             name = os.pread(process.memory, _LONGEST_NAME, address).partition(b"\0")[0]
-            return demangled(name.removeprefix(b"*"))  # marks names that nobody else may use
+            return demangled(name.removeprefix(b"*"))  # marks names that no other file may use
     return None
 
 
@@ -122,29 +129,29 @@ def _timer(process: _Process, callback: int) -> str | None:
     return None
 
 
-def _function(process: _Process, callback: int, invokers: dict[str, dict[int, str]]) -> str | None:
-    """The function in the `std::function` behind this address; ``invokers`` of files are kept."""
+def _function(process: _Process, callback: int) -> str | None:
+    """The function in the `std::function` behind this address."""
     with suppress(OSError):
         for word in process.words(callback, _BEHIND):
             region = process.region(word)
             if region is None or not region.executable:
                 continue
-            if region.path not in invokers:
+            if region.path not in process.invokers:
                 # In a container the path leads elsewhere from here.
                 functions = function_offsets(Path(f"/proc/{process.pid}/root{region.path}"))
-                invokers[region.path] = {
+                process.invokers[region.path] = {
                     offset: name
                     for offset, name in functions.items()
                     if name.startswith(_INVOKER) and "9_M_invoke" in name
                 }
-            mangled = invokers[region.path].get(word - region.start + region.offset)
+            mangled = process.invokers[region.path].get(word - region.start + region.offset)
             if mangled is not None:
                 return type_argument(demangled(mangled.encode()), 1)
     return None
 
 
 def demangled(name: bytes) -> str | None:
-    """A function or class as C++ writes it; None if that is no name, or nobody can tell."""
+    """A function or class as C++ writes it; None if that is no name, or libstdc++ is not there."""
     if len(name) < _SHORTEST_NAME:  # built-in types have such
         return None
     try:

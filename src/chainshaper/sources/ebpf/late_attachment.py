@@ -1,18 +1,36 @@
-"""What a trace's metadata says: field types, event, stream and trace classes (CTF 1.8).
+"""Who exists in an application that ran before tracing began, as far as it can be found out.
 
-All of it is immutable plain data. Names stay as TSDL writes them, with LTTng's leading underscore;
-`field_name` gives the name that users see. Sizes and alignments are in bits.
+Objects say who they are when they are created. For those created before, the same tables are filled
+with what is known otherwise, so that the analysis does with it what it always does:
+
+* **Topics**: what a tracer read from the objects behind the handles of `rmw_publish`, `rmw_take`
+  and `rcl_publish`. This is certain.
+* **Subscriptions' callbacks**: an executor takes a message and at once starts the callback that it
+  is for, on the same thread. A callback that nearly always starts like that is its subscription's.
+* **Timers**: callbacks that start without a message, at regular distances. Services' callbacks
+  rarely are regular, and stay unknown, like everything that gets its messages within its process.
+* **Nodes**: no event that is repeated names one. DDS discovery shows which nodes publish and
+  subscribe which topics: a topic that one node only publishes tells whose publisher it is, and
+  which node lives in that process. The command line of a process names nodes (remap rules, which
+  `ros2 launch` makes). Where several nodes have a topic (`/rosout`), it is the one that is known to
+  live in that process. A timer belongs to its process's only node, or to that of the publisher it
+  uses. What is not certain is left open.
+
+All are taken to exist from the beginning of the recording. Their handles are the real ones where
+events carry them, and addresses of other things of the same object where not; nodes are numbered
+from 1, where no object's address can be. This is about rclcpp: rclpy emits no callback events, its
+endpoints are found all the same.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 
 import polars as pl
 
-from chainshaper.analysis.objects import INTERNAL_TOPICS
 from chainshaper.linux.node_names import named_nodes
 from chainshaper.linux.processes import Process
 from chainshaper.sources.system import processes_of
 from chainshaper.values import events
+from chainshaper.values.application import INTERNAL_TOPICS
 from chainshaper.values.recording import EndpointInfo, RecordingInfo
 
 ADDED = (
@@ -30,6 +48,8 @@ _FEWEST_STARTS = 4
 _PERIOD_GRID_NS = 100_000
 
 _CALLBACK = ["pid", "callback"]
+_THREAD = ["time", "pid", "tid"]
+_KINDS = ("publisher", "subscription")
 
 
 def with_found_objects(
@@ -44,7 +64,9 @@ def with_found_objects(
         The tables, and in words what was found and how.
     """
     handles = handles.filter(pl.col("topic").str.starts_with("/"))  # others are the RMW's own
-    publishers, subscriptions = _publishers(tables, handles), _subscriptions(tables, handles)
+    publishers = _publishers(tables, handles)
+    known = events.table(tables, "rcl_subscription_init")
+    subscriptions = _of(handles, "rmw_take", "rmw_subscription_handle", known)
     starts = _unregistered_starts(tables)
     readers = _readers(starts).join(
         subscriptions.select("pid", "rmw_subscription_handle"),
@@ -113,11 +135,11 @@ def added_rows(
     return added
 
 
-def _of(handles: pl.DataFrame, event: str, column: str) -> pl.DataFrame:
-    """``pid, <column>, topic_name`` of the handles that were read at an event."""
-    return handles.filter(event=event).select(
-        "pid", pl.col("handle").alias(column), topic_name="topic"
-    )
+def _of(handles: pl.DataFrame, event: str, column: str, known: pl.DataFrame) -> pl.DataFrame:
+    """``pid, <column>, topic_name`` of the handles read at an event that are not yet known."""
+    named = pl.col("handle").alias(column)
+    found = handles.filter(event=event).select("pid", named, topic_name="topic")
+    return found.join(known, on=["pid", column], how="anti")
 
 
 def _publishers(tables: events.EventTables, handles: pl.DataFrame) -> pl.DataFrame:
@@ -127,34 +149,23 @@ def _publishers(tables: events.EventTables, handles: pl.DataFrame) -> pl.DataFra
     """
     key = ["pid", "rmw_publisher_handle"]
     known = events.table(tables, "rcl_publisher_init")
-    by_rmw = _of(handles, "rmw_publish", key[1]).join(known, on=key, how="anti")
+    published = events.table(tables, "rcl_publish")
     written = events.table(tables, "rmw_publish", [key[1], "timestamp"])
+    marks = [
+        published.select(*_THREAD, "message", "publisher_handle"),
+        written.select(*_THREAD, "message", key[1]),
+    ]
     both = (
-        pl.concat(
-            [
-                events.table(tables, "rcl_publish").select(
-                    "time", "pid", "tid", "message", "publisher_handle"
-                ),
-                written.select("time", "pid", "tid", "message", key[1]),
-            ],
-            how="diagonal",
-        )
+        pl.concat(marks, how="diagonal")
         .sort("time", maintain_order=True)
         .with_columns(pl.col("publisher_handle").shift(1).over("pid", "tid", "message"))
         .drop_nulls([key[1], "publisher_handle"])
         .group_by(key)
         .agg(pl.col("publisher_handle").mode().first())
     )
-    by_rmw = by_rmw.join(both, on=key, how="left")
-    by_rcl = _of(handles, "rcl_publish", "publisher_handle")
-    by_rcl = by_rcl.join(known, on=["pid", "publisher_handle"], how="anti")
+    by_rmw = _of(handles, "rmw_publish", key[1], known).join(both, on=key, how="left")
+    by_rcl = _of(handles, "rcl_publish", "publisher_handle", known)
     return pl.concat([by_rmw, by_rcl], how="diagonal")
-
-
-def _subscriptions(tables: events.EventTables, handles: pl.DataFrame) -> pl.DataFrame:
-    key = ["pid", "rmw_subscription_handle"]
-    known = events.table(tables, "rcl_subscription_init")
-    return _of(handles, "rmw_take", key[1]).join(known, on=key, how="anti")
 
 
 def _unregistered_starts(tables: events.EventTables) -> pl.DataFrame:
@@ -166,9 +177,9 @@ def _unregistered_starts(tables: events.EventTables) -> pl.DataFrame:
     takes = events.table(tables, "rmw_take", ["taken"]).filter(pl.col("taken").fill_null(1) != 0)
     starts = events.table(tables, "callback_start", ["is_intra_process"])
     marks = [
-        takes.select("time", "pid", "tid", handle="rmw_subscription_handle"),
-        starts.select("time", "pid", "tid", "callback", "is_intra_process"),
-        events.table(tables, "callback_end").select("time", "pid", "tid"),
+        takes.select(*_THREAD, handle="rmw_subscription_handle"),
+        starts.select(*_THREAD, "callback", "is_intra_process"),
+        events.table(tables, "callback_end").select(*_THREAD),
     ]
     rows = pl.concat(marks, how="diagonal").sort("time", maintain_order=True)
     rows = rows.with_columns(taken=pl.col("handle").shift(1).over("pid", "tid"))
@@ -215,9 +226,6 @@ def _timers(starts: pl.DataFrame) -> pl.DataFrame:
     ).select(*_CALLBACK, period=pl.when(period > 0).then(period).otherwise("period").cast(pl.Int64))
 
 
-_KINDS = ("publisher", "subscription")
-
-
 def with_found_nodes(
     tables: events.EventTables,
     info: RecordingInfo,
@@ -259,18 +267,13 @@ def with_found_nodes(
     }
     changed |= added_rows(changed, new, began)
     names = processes_of(changed, info.processes)
-    notes = (*info.notes, *_about_unknown(key[2] for key in wanted if key not in owners))
+    notes = info.notes
+    if unknown := sorted({key[2] for key in wanted if key not in owners} - INTERNAL_TOPICS):
+        notes += (
+            f"which nodes publish or subscribe {', '.join(unknown)} is not certain: neither the "
+            "ROS graph nor a command line tells.",
+        )
     return changed, info.model_copy(update={"processes": names, "notes": notes})
-
-
-def _about_unknown(topics: Iterable[str]) -> tuple[str, ...]:
-    unknown = sorted(set(topics) - INTERNAL_TOPICS)
-    if not unknown:
-        return ()
-    return (
-        f"which nodes publish or subscribe {', '.join(unknown)} is not certain: neither the ROS "
-        "graph nor a command line tells.",
-    )
 
 
 def _nameless(tables: events.EventTables, kind: str) -> pl.DataFrame:
@@ -304,17 +307,13 @@ def _owners(
 
 
 def _node_rows(numbers: Mapping[tuple[int, str], int]) -> pl.DataFrame:
-    split = [(pid, handle, *node.rsplit("/", 1)) for (pid, node), handle in numbers.items()]
-    return pl.DataFrame(
-        [(pid, handle, namespace or "/", name) for pid, handle, namespace, name in split],
-        schema={
-            "pid": pl.Int32,
-            "node_handle": pl.UInt64,
-            "namespace": pl.String,
-            "node_name": pl.String,
-        },
-        orient="row",
-    )
+    rows = []
+    for (pid, node), handle in numbers.items():
+        namespace, name = node.rsplit("/", 1)
+        rows.append((pid, handle, namespace or "/", name))
+    types = {**events.COMMON_COLUMNS, **events.FIELDS["rcl_node_init"]}
+    columns = ("pid", "node_handle", "namespace", "node_name")
+    return pl.DataFrame(rows, schema={name: types[name] for name in columns}, orient="row")
 
 
 def _timer_links(
@@ -343,15 +342,15 @@ def _timer_links(
 
 def _publishing(tables: events.EventTables) -> pl.DataFrame:
     """``pid, callback, node_handle``: whose publishers callbacks use, mostly."""
-    starts = events.table(tables, "callback_start").select("time", "pid", "tid", "callback")
-    ends = events.table(tables, "callback_end").select(
-        "time", "pid", "tid", callback=pl.lit(0, pl.UInt64)
-    )
-    published = events.table(tables, "rcl_publish").select("time", "pid", "tid", "publisher_handle")
-    owners = events.table(tables, "rcl_publisher_init").select(
-        "pid", "publisher_handle", "node_handle"
-    )
-    rows = pl.concat([starts, ends, published], how="diagonal").sort("time", maintain_order=True)
+    no_callback = pl.lit(0, pl.UInt64).alias("callback")
+    marks = [
+        events.table(tables, "callback_start").select(*_THREAD, "callback"),
+        events.table(tables, "callback_end").select(*_THREAD, no_callback),
+        events.table(tables, "rcl_publish").select(*_THREAD, "publisher_handle"),
+    ]
+    created = events.table(tables, "rcl_publisher_init")
+    owners = created.select("pid", "publisher_handle", "node_handle")
+    rows = pl.concat(marks, how="diagonal").sort("time", maintain_order=True)
     rows = rows.with_columns(pl.col("callback").forward_fill().over("pid", "tid"))
     inside = rows.drop_nulls(["publisher_handle", "callback"]).filter(pl.col("callback") != 0)
     return (

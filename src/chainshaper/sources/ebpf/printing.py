@@ -1,7 +1,38 @@
-"""What a trace's metadata says: field types, event, stream and trace classes (CTF 1.8).
+"""The bpftrace script that prints the events, and what it printed as event tables.
 
-All of it is immutable plain data. Names stay as TSDL writes them, with LTTng's leading underscore;
-`field_name` gives the name that users see. Sizes and alignments are in bits.
+The script sets uprobes on the trace points, and `sched_switch`. Every line that it prints is
+numbers separated by tabs (:data:`CODE` to :data:`VALUES`; what is further right is left out), which
+costs the traced thread little and is read at the speed of CSV:
+
+    code  time  pid  tid  cpu  value 0 … value 9  [prev_comm  next_comm]
+
+* The code says which of the trace points it is, :data:`FIRST_POINT` being the first one.
+* A number or a flag is one value, a gid two: the first 16 of its bytes, which are those that mean
+  anything.
+* A text is printed as the eight-byte words it lies in, in lines of its own (:data:`TEXT_CODE`) with
+  the time and thread of the event: 16 × the argument's place + the line's number, how many bytes
+  before the text the first word begins, and eight words. So a name may be of any length and
+  contain anything, in every version of bpftrace: its `str()` cuts at 64 bytes or less than 200.
+  Aligned words never reach into a page where the text is not.
+* `sched_switch` (:data:`SWITCH_CODE`) is printed where a thread that has emitted events goes or
+  comes. The first of these events shows a thread at work that came unseen, so a line like that
+  stands before it, which says nothing of the thread that went.
+
+Other lines are bpftrace's own: what it attaches, and how many events it lost. Every core has a
+buffer of its own, so lines of different cores are in no order; the tables are sorted. Times are of
+CLOCK_BOOTTIME, as bpftrace takes them.
+
+Where the application runs already, its publishers and subscriptions were created unseen. Their
+topics are read where they are used first: the handles of `rmw_publish` and `rmw_take` are the
+addresses of a `rmw_publisher_t` and a `rmw_subscription_t`, which begin with the addresses of the
+RMW's name, of its data and of the topic's name. Before tracetools 8 the former is found from
+`rcl_publish`'s `rcl_publisher_t`.
+
+bpftrace runs the script as root, so nothing stands in it that a stranger may have written:
+events, which we know, numbers, and paths of plain characters only. Who traces a file of another
+name gives it open, as `/proc/PID/fd/N`.
+
+Upstream: bpftrace 0.17 to 0.26; rmw, `rmw/types.h`; rcl, `publisher_impl.h` (Humble, Iron).
 """
 
 import mmap
@@ -34,6 +65,21 @@ _WORDS = 8
 _WHO = "\\t%lld\\t%d\\t%d\\t%d"
 _TOPIC_NAME_AT = 16  # in rmw_publisher_t and rmw_subscription_t, on 64-bit machines
 _RMW_HANDLE_AT_HUMBLE, _RMW_HANDLE_AT_IRON = 240, 248  # in rcl_publisher_impl_t
+
+
+_COMMS = ("prev_comm", "next_comm")
+_SCHEMA: dict[str, pl.DataType] = {
+    **dict.fromkeys((*CODE, *VALUES), pl.Int64()),
+    **dict.fromkeys(_COMMS, pl.String()),
+}
+HEADER = "\t".join(_SCHEMA) + "\n"
+"""What the file begins with that bpftrace prints into: lines may have fewer columns, not more."""
+
+_SWITCH_COLUMNS = ("prev_tid", "prev_prio", "prev_state", "next_tid", "next_prio")
+_LOST = re.compile(rb"^Lost (\d+) events", re.MULTILINE)
+
+_Texts = dict[tuple[int, int, int], str]
+"""(time, tid, place) → text."""
 
 
 def bpftrace_script(
@@ -93,24 +139,23 @@ def _quoted(path: Path) -> str:
 
 def _statements(point: TracePoint, code: int, attached: bool) -> list[str]:
     values = [value for argument in point.arguments for value in _values(argument)]
-    statements = ["$now = nsecs;", *_first_sight(), _printf(code, values)]
+    came = f'printf("{SWITCH_CODE}{_WHO}\\t\\t\\t\\t%d\\n", $now, pid, tid, cpu, tid);'
+    first_sight = f"if (@running[tid] == 0) {{ @running[tid] = 1; {came} }}"
+    statements = ["$now = nsecs;", first_sight, _printf(code, values)]
     for argument in point.arguments:
         if argument.kind == "text":
             statements += _text(f"arg{argument.place}", argument.place)
     handle = _named_by(point) if attached else None
     if handle is not None:
-        statements.append(f"$handle = {handle};")
-        statements.append("if (@named[pid, $handle] == 0) {")
-        statements.append("@named[pid, $handle] = 1;")
-        statements += _text(f"*(uint64 *)($handle + {_TOPIC_NAME_AT})", NAME_PLACE)
-        statements += _text("*(uint64 *)$handle", RMW_PLACE)
-        statements.append("}")
+        statements += [
+            f"$handle = {handle};",
+            "if (@named[pid, $handle] == 0) {",
+            "@named[pid, $handle] = 1;",
+            *_text(f"*(uint64 *)($handle + {_TOPIC_NAME_AT})", NAME_PLACE),
+            *_text("*(uint64 *)$handle", RMW_PLACE),
+            "}",
+        ]
     return statements
-
-
-def _first_sight() -> list[str]:
-    line = f'printf("{SWITCH_CODE}{_WHO}\\t\\t\\t\\t%d\\n", $now, pid, tid, cpu, tid);'
-    return [f"if (@running[tid] == 0) {{ @running[tid] = 1; {line} }}"]
 
 
 def _values(argument: Argument) -> tuple[str, ...]:
@@ -168,21 +213,6 @@ def _switches() -> str:
         "tracepoint:sched:sched_switch /@running[args->prev_pid] || @running[args->next_pid]/",
         [f'printf("{template}", nsecs, pid, tid, cpu, {values});'],
     )
-
-
-_COMMS = ("prev_comm", "next_comm")
-_SCHEMA: dict[str, pl.DataType] = {
-    **dict.fromkeys((*CODE, *VALUES), pl.Int64()),
-    **dict.fromkeys(_COMMS, pl.String()),
-}
-HEADER = "\t".join(_SCHEMA) + "\n"
-"""What the file begins with that bpftrace prints into: lines may have fewer columns, not more."""
-
-_SWITCH_COLUMNS = ("prev_tid", "prev_prio", "prev_state", "next_tid", "next_prio")
-_LOST = re.compile(rb"^Lost (\d+) events", re.MULTILINE)
-
-_Texts = dict[tuple[int, int, int], str]
-"""(time, tid, place) → text."""
 
 
 @dataclass(frozen=True)

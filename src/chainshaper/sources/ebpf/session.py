@@ -78,7 +78,7 @@ _FIRST_PID_NAMESPACE = "pid:[4026531836]"  # linux/proc_ns.h: PROC_PID_INIT_INO
 
 
 class EbpfTracer:
-    """Records with bpftrace: a :class:`~chainshaper.sources.tracer.Tracer`."""
+    """Records with bpftrace: a :class:`~chainshaper.sources.Tracer`."""
 
     def __init__(
         self,
@@ -193,9 +193,11 @@ class EbpfTracer:
             tables, found = with_found_objects(tables, printed.handles, self._began_ns)
             notes += found
         tables = with_functions(tables, self._functions, self._began_ns)
+        # What `rcl_init` would say of the library's version, whether or not it was traced.
+        versions = [point.version for point in self._points[:1]]
         info = RecordingInfo(
             source="ebpf",
-            distribution=distribution_of(_started_with(self._points), {}),
+            distribution=distribution_of({"rcl_init": pl.DataFrame({"version": versions})}, {}),
             rmw=printed.rmw or rmw_of_gids(tables),
             clock_offset_ns=self._clock_offset_ns,
             processes=processes_of(tables, _commands(tables)),
@@ -308,10 +310,8 @@ class EbpfTracer:
     def _whole(self, tables: Mapping[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
         """The tables without what happened while not all probes were in place."""
         ended = self._ended_ns or time.monotonic_ns()
-        within = {
-            name: t.filter(pl.col("time").is_between(self._began_ns, ended))
-            for name, t in tables.items()
-        }
+        in_place = pl.col("time").is_between(self._began_ns, ended)
+        within = {name: table.filter(in_place) for name, table in tables.items()}
         return {name: table for name, table in within.items() if table.height}
 
     def _about(self, tables: EventTables, printed: Printed, lost: int) -> list[str]:
@@ -409,19 +409,10 @@ def _boot_time_ahead() -> int:
     return ahead if ahead > _SHORTEST_SUSPENSION_NS else 0
 
 
-def _started_with(points: Sequence[TracePoint]) -> EventTables:
-    """What `rcl_init` says of each library's version, whether or not it was traced."""
-    return {"rcl_init": pl.DataFrame({"version": [point.version for point in points[:1]]})}
-
-
 def _commands(tables: EventTables) -> dict[int, str]:
     """Process → the name of its main thread as `sched_switch` has it, empty if unknown."""
-    names = {}
-    if "sched_switch" in tables:
-        switches = (
-            tables["sched_switch"].select("next_tid", "next_comm").unique("next_tid", keep="last")
-        )
-        names = dict(switches.iter_rows())
+    switches = events.table(tables, "sched_switch").select("next_tid", "next_comm")
+    names = dict(switches.iter_rows())
     pids = {
         pid for name, t in tables.items() if name != "sched_switch" for pid in t["pid"].unique()
     }

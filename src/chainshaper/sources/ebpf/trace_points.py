@@ -1,7 +1,23 @@
-"""What a trace's metadata says: field types, event, stream and trace classes (CTF 1.8).
+"""The trace points of `libtracetools.so` as C functions: which libraries export which of them.
 
-All of it is immutable plain data. Names stay as TSDL writes them, with LTTng's leading underscore;
-`field_name` gives the name that users see. Sizes and alignments are in bits.
+Every ROS 2 build with tracing compiled in calls `ros_trace_<event>(arguments…)` of that library,
+whether or not LTTng is there. The arguments are the fields of the event's table
+(:mod:`chainshaper.values.events`) in the same order, with these exceptions:
+
+* `rcl_init` has no version among them: that is the library's own, from its `package.xml`;
+* `rclcpp_publish` has the publisher's address before the message's, mostly null, and no column;
+* `rmw_publish` had the message only, before tracetools 8 (Humble and Iron).
+
+`rclcpp_callback_register` is not called from Iron on, except under an LTTng session.
+
+An application to be started finds the library as the dynamic linker will: below the prefixes of the
+environment that ROS 2's set-up files make. Applications that run already have mapped it; what they
+mapped is reached through `/proc/PID/root` where they run in a container. The same file found twice
+counts once, because uprobes belong to the file. Distributions differ in what they trace, so what a
+library exports is read from its symbol table.
+
+Upstream: ros2_tracing, `tracetools/include/tracetools/tracetools.h`, tags 4.1.1 to 8.10.1;
+elf(5); proc(5).
 """
 
 import os
@@ -18,104 +34,13 @@ import polars as pl
 
 from chainshaper.values import events
 
-_LONGEST = 512 << 20
-
-_SYMTAB, _DYNSYM, _FUNCTION, _LOAD = 2, 11, 2, 1  # elf.h: SHT_…, STT_FUNC, PT_LOAD
-
-
-def open_regular(path: Path) -> int:
-    """Open a file at a path that a process of the application has named: no pipe, no device.
-
-    Raises:
-        OSError: it is no ordinary file, or cannot be read.
-    """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise OSError(f"{path} is no ordinary file")
-    return descriptor
-
-
-def read_regular(path: Path, longest: int = _LONGEST) -> bytes:
-    """The contents of such a file.
-
-    Raises:
-        OSError: as :func:`open_regular`, or it is longer than that.
-    """
-    with open(open_regular(path), "rb") as file:
-        content = file.read(longest + 1)
-    if len(content) > longest:
-        raise OSError(f"{path} has more than {longest} bytes")
-    return content
-
-
-def exported_functions(path: Path) -> frozenset[str]:
-    """The functions in a file's dynamic symbol table; none if it is no such file."""
-    try:
-        content = read_regular(path)
-        return frozenset(name for _, name in _functions(content, (_DYNSYM,)))
-    except (OSError, LookupError, struct.error, ValueError):
-        return frozenset()
-
-
-def function_offsets(path: Path) -> dict[int, str]:
-    """Where functions begin in a file, in bytes, and their names; also of those not exported."""
-    try:
-        content = read_regular(path)
-        loaded = list(_segments(content))
-        return {
-            address - memory + offset: name
-            for address, name in _functions(content, (_DYNSYM, _SYMTAB))
-            for offset, memory, size in loaded
-            if memory <= address < memory + size
-        }
-    except (OSError, LookupError, struct.error, ValueError):
-        return {}
-
-
-def _order(content: bytes) -> str:
-    if content[:5] != b"\x7fELF\x02":
-        raise ValueError("no ELF-64 file")
-    return {1: "<", 2: ">"}[content[5]]
-
-
-def _segments(content: bytes) -> Iterator[tuple[int, int, int]]:
-    """What is loaded: place in the file, address, and length there."""
-    order = _order(content)
-    (begin,) = struct.unpack_from(f"{order}Q", content, 32)
-    size, count = struct.unpack_from(f"{order}HH", content, 54)
-    for number in range(count):
-        kind, _, offset, address, _, length, _, _ = struct.unpack_from(
-            f"{order}IIQQQQQQ", content, begin + size * number
-        )
-        if kind == _LOAD:
-            yield offset, address, length
-
-
-def _functions(content: bytes, tables: tuple[int, ...]) -> Iterator[tuple[int, str]]:
-    """Addresses and names of the functions that a file's symbol tables define."""
-    order = _order(content)
-    (sections_at,) = struct.unpack_from(f"{order}Q", content, 40)
-    size, count = struct.unpack_from(f"{order}HH", content, 58)
-    sections = [
-        struct.unpack_from(f"{order}IIQQQQIIQQ", content, sections_at + size * number)
-        for number in range(count)
-    ]
-    for _, kind, _, _, start, length, names, *_ in sections:
-        if kind not in tables:
-            continue
-        names_at = sections[names][4]
-        for at in range(start, start + length, 24):
-            name, info, _, section, address = struct.unpack_from(f"{order}IBBHQ", content, at)
-            if info & 0xF == _FUNCTION and section:  # of section 0: imported, not defined
-                begin = names_at + name
-                yield address, content[begin : content.index(b"\0", begin)].decode()
-
-
+FUNCTION_PREFIX = "ros_trace_"
 LIBRARY = "libtracetools.so"
 _INSTALLATIONS = Path("/opt/ros")
 _VERSION = re.compile(r"<version>\s*((\d{1,9})(?!\d)[^<\s]{0,99})\s*</version>")
-_LONGEST_PACKAGE = 1 << 20
+_LONGEST, _LONGEST_PACKAGE = 512 << 20, 1 << 20  # bytes
+_SYMTAB, _DYNSYM, _FUNCTION, _LOAD = 2, 11, 2, 1  # elf.h: SHT_…, STT_FUNC, PT_LOAD
+_UNREADABLE = (OSError, LookupError, struct.error, ValueError)
 
 
 @dataclass(frozen=True)
@@ -127,13 +52,74 @@ class TracingLibrary:
     version: str | None
 
     @property
-    def major(self) -> int | None:
-        """The first number of the version."""
-        return None if self.version is None else int(self.version.partition(".")[0])
+    def handles_at_rmw(self) -> bool:
+        """Whether `rmw_publish` of this version names its publisher."""
+        return self.version is None or int(self.version.partition(".")[0]) >= 8
+
+
+@dataclass(frozen=True)
+class Argument:
+    """A function's argument that becomes a column; ``place`` counts from 0."""
+
+    column: str
+    place: int
+    kind: Literal["number", "flag", "text", "gid"]
+
+
+@dataclass(frozen=True)
+class TracePoint:
+    """One event's function in one library, which is ``file`` of this ``version`` (None: unknown).
+
+    ``handles_at_rmw`` is whether `rmw_publish` of this version names its publisher.
+    """
+
+    event: str
+    file: Path
+    arguments: tuple[Argument, ...]
+    version: str | None
+    handles_at_rmw: bool
 
 
 _Known: TypeAlias = dict[tuple[int, int], TracingLibrary]
 """Libraries by device and inode."""
+
+
+def trace_points(libraries: Sequence[TracingLibrary]) -> tuple[TracePoint, ...]:
+    """All trace points that the libraries export and a table is for, in the tables' order."""
+    return tuple(
+        TracePoint(
+            event=event,
+            file=library.path,
+            arguments=_arguments(event, library),
+            version=library.version,
+            handles_at_rmw=library.handles_at_rmw,
+        )
+        for event in events.FIELDS
+        for library in libraries
+        if FUNCTION_PREFIX + event in library.functions
+    )
+
+
+def _arguments(event: str, library: TracingLibrary) -> tuple[Argument, ...]:
+    columns: tuple[str | None, ...] = tuple(events.FIELDS[event])
+    if event == "rcl_init":
+        columns = ("context_handle",)
+    elif event == "rclcpp_publish":
+        columns = (None, "message")
+    elif event == "rmw_publish" and not library.handles_at_rmw:
+        columns = ("message",)
+    found = []
+    for place, column in enumerate(columns):
+        match events.FIELDS[event].get(column or ""):
+            case pl.String():
+                found.append(Argument(str(column), place, "text"))
+            case pl.List():
+                found.append(Argument(str(column), place, "gid"))
+            case pl.Int32():
+                found.append(Argument(str(column), place, "flag"))
+            case pl.DataType():
+                found.append(Argument(str(column), place, "number"))
+    return tuple(found)
 
 
 def installed_libraries(environment: Mapping[str, str]) -> tuple[TracingLibrary, ...]:
@@ -185,80 +171,91 @@ def _version(library: Path) -> str | None:
     for folder in library.parents[1:3]:  # `lib`, or `lib/x86_64-linux-gnu`, is in the prefix
         with suppress(OSError):
             package = folder / "share/tracetools/package.xml"
-            text = read_regular(package, _LONGEST_PACKAGE).decode(errors="replace")
+            text = _read_regular(package, _LONGEST_PACKAGE).decode(errors="replace")
             found = _VERSION.search(text)
             if found is not None:
                 return found[1]
     return None
 
 
-FUNCTION_PREFIX = "ros_trace_"
+def open_regular(path: Path) -> int:
+    """Open a file at a path that a process of the application has named: no pipe, no device.
 
-Kind: TypeAlias = Literal["number", "flag", "text", "gid"]
-
-
-@dataclass(frozen=True)
-class Argument:
-    """A function's argument that becomes a column; ``place`` counts from 0."""
-
-    column: str
-    place: int
-    kind: Kind
-
-
-@dataclass(frozen=True)
-class TracePoint:
-    """One event's function in one library, which is ``file``.
-
-    ``handles_at_rmw`` is whether `rmw_publish` of this version names its publisher;
-    ``version`` is that of the library, None if unknown.
+    Raises:
+        OSError: it is no ordinary file, or cannot be read.
     """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(f"{path} is no ordinary file")
+    return descriptor
 
-    event: str
-    file: Path
-    arguments: tuple[Argument, ...]
-    version: str | None
-    handles_at_rmw: bool
+
+def _read_regular(path: Path, longest: int = _LONGEST) -> bytes:
+    with open(open_regular(path), "rb") as file:
+        content = file.read(longest + 1)
+    if len(content) > longest:
+        raise OSError(f"{path} has more than {longest} bytes")
+    return content
 
 
-def trace_points(libraries: Sequence[TracingLibrary]) -> tuple[TracePoint, ...]:
-    """All trace points that the libraries export and a table is for, in the tables' order."""
-    return tuple(
-        TracePoint(
-            event=event,
-            file=library.path,
-            arguments=_arguments(event, library),
-            version=library.version,
-            handles_at_rmw=_handles_at_rmw(library),
+def exported_functions(path: Path) -> frozenset[str]:
+    """The functions in an ELF-64 file's dynamic symbol table; none if it is no such file."""
+    try:
+        return frozenset(name for _, name in _functions(_read_regular(path), (_DYNSYM,)))
+    except _UNREADABLE:
+        return frozenset()
+
+
+def function_offsets(path: Path) -> dict[int, str]:
+    """Where functions begin in a file, in bytes, and their names; also of those not exported."""
+    try:
+        content = _read_regular(path)
+        loaded = list(_segments(content))
+        return {
+            address - memory + offset: name
+            for address, name in _functions(content, (_DYNSYM, _SYMTAB))
+            for offset, memory, size in loaded
+            if memory <= address < memory + size
+        }
+    except _UNREADABLE:
+        return {}
+
+
+def _order(content: bytes) -> str:
+    if content[:5] != b"\x7fELF\x02":
+        raise ValueError("no ELF-64 file")
+    return {1: "<", 2: ">"}[content[5]]
+
+
+def _segments(content: bytes) -> Iterator[tuple[int, int, int]]:
+    """What is loaded: place in the file, address, and length there."""
+    order = _order(content)
+    (begin,) = struct.unpack_from(f"{order}Q", content, 32)
+    size, count = struct.unpack_from(f"{order}HH", content, 54)
+    for number in range(count):
+        kind, _, offset, address, _, length, _, _ = struct.unpack_from(
+            f"{order}IIQQQQQQ", content, begin + size * number
         )
-        for event in events.FIELDS
-        for library in libraries
-        if FUNCTION_PREFIX + event in library.functions
-    )
+        if kind == _LOAD:
+            yield offset, address, length
 
 
-def _handles_at_rmw(library: TracingLibrary) -> bool:
-    return library.major is None or library.major >= 8
-
-
-def _arguments(event: str, library: TracingLibrary) -> tuple[Argument, ...]:
-    columns: tuple[str | None, ...] = tuple(events.FIELDS[event])
-    if event == "rcl_init":
-        columns = ("context_handle",)
-    elif event == "rclcpp_publish":
-        columns = (None, "message")
-    elif event == "rmw_publish" and not _handles_at_rmw(library):
-        columns = ("message",)
-    return tuple(
-        Argument(column, place, _kind(events.FIELDS[event][column]))
-        for place, column in enumerate(columns)
-        if column is not None
-    )
-
-
-def _kind(dtype: pl.DataType) -> Kind:
-    if isinstance(dtype, pl.String):
-        return "text"
-    if isinstance(dtype, pl.List):
-        return "gid"
-    return "flag" if isinstance(dtype, pl.Int32) else "number"
+def _functions(content: bytes, tables: tuple[int, ...]) -> Iterator[tuple[int, str]]:
+    """Addresses and names of the functions that a file's symbol tables define."""
+    order = _order(content)
+    (sections_at,) = struct.unpack_from(f"{order}Q", content, 40)
+    size, count = struct.unpack_from(f"{order}HH", content, 58)
+    sections = [
+        struct.unpack_from(f"{order}IIQQQQIIQQ", content, sections_at + size * number)
+        for number in range(count)
+    ]
+    for _, kind, _, _, start, length, names, *_ in sections:
+        if kind not in tables:
+            continue
+        names_at = sections[names][4]
+        for at in range(start, start + length, 24):
+            name, info, _, section, address = struct.unpack_from(f"{order}IBBHQ", content, at)
+            if info & 0xF == _FUNCTION and section:  # of section 0: imported, not defined
+                begin = names_at + name
+                yield address, content[begin : content.index(b"\0", begin)].decode()

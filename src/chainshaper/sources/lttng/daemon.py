@@ -1,8 +1,8 @@
 """Talking to LTTng: its command-line client, and the session daemon that must be there.
 
-The client is what every LTTng installation has; its Python bindings are not always there, and
-`ros2 trace` needs them. It is asked for machine-readable answers (`--mi xml`) and never finds out
-which session is the user's "current" one, because it works in a home directory of its own.
+The client is what every LTTng installation has; its Python bindings, which `ros2 trace` needs, are
+not always there. It gives machine-readable answers (`--mi xml`) and never learns which session is
+the user's "current" one, because it works in a home directory of its own.
 
 Which session daemon traces an application depends on who runs it:
 
@@ -17,10 +17,10 @@ Recordings that run at the same time, and daemons that others start meanwhile, s
 daemon of ours: its run directory, where clients look for it, is in our home directory. Root's is
 /var/run/lttng whatever its environment says, so root's daemon and clients have that directory
 mounted there, in mount namespaces that they alone see. Where root may not mount (most containers),
-the daemon is in everybody's place, and there can be one recording at a time.
+the daemon is where all look for it, and there can be one recording at a time.
 
-We may be killed at any moment. A daemon of ours is told so by the kernel; everything else is left
-to a shell that waits for our end, destroys our sessions in somebody's daemon and removes the home
+We may be killed at any moment. The kernel then ends a daemon of ours; everything else is left to a
+shell that waits for our end, destroys our sessions in another's daemon and removes the home
 directory.
 
 Upstream: lttng-tools, `utils_get_rundir` and `set_session_daemon_path`; lttng-ust,
@@ -186,7 +186,7 @@ def _hears_one_command_only() -> bool:
 def _run_directory_apart(home: Path) -> tuple[str, ...]:
     """What root's commands begin with that see a run directory of our own; empty if not permitted.
 
-    Everybody else's is in the home directory anyway.
+    All other users' is in the home directory anyway.
     """
     if os.getuid() != 0:
         return ()

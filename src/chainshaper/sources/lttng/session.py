@@ -1,7 +1,25 @@
-"""What a trace's metadata says: field types, event, stream and trace classes (CTF 1.8).
+"""Tracing with LTTng: a recording session of our own, from its buffers to the trace on disk.
 
-All of it is immutable plain data. Names stay as TSDL writes them, with LTTng's leading underscore;
-`field_name` gives the name that users see. Sizes and alignments are in bits.
+Events go through ring buffers in shared memory, one per core and user, from which a consumer
+daemon writes them to disk. When a buffer is full, events are discarded and counted. `ros2 trace`
+has 64 KiB a core; here it is 4 MiB where there is that much shared memory: at 60 bytes an event,
+70,000 events a core that the consumer, an ordinary thread beside real-time ones, may be late with.
+
+When events are lost all the same, tracing moves to a session with buffers four times as large while
+the application runs on: LTTng cannot add buffers to a session that has been started. What was lost
+until then stays lost and is counted, and what happens between the two sessions (some milliseconds)
+is not recorded, which a note says.
+
+A session daemon that ran before ours may trace other applications too (:mod:`.daemon`). What they
+did is left out of the tables: a second run of the same nodes would make two of every chain. A
+process is the command's if it descends from us, or has a mark of ours in its environment: a
+daemon process, whose parent is gone, still has that, and what `sudo` starts, which has lost it,
+descends.
+
+`sched_switch`, for execution times, comes from the kernel tracer where there is one and we may use
+it.
+
+Upstream: lttng-enable-channel(1), `tracetools_trace` of ros2_tracing (events, contexts, buffers).
 """
 
 import os
@@ -22,53 +40,7 @@ from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import RecordingInfo
 
-
-def processes_apart(mark: str, users: Collection[int]) -> tuple[set[int], set[int]]:
-    """The living processes that somebody else has started, and those that we have.
-
-    The ``mark`` counts in processes of these ``users``: others can read and write it as well.
-    """
-    parent_of = parents()
-    unrelated = set(parent_of) - descendants(parent_of, os.getpid())
-    others = {pid for pid in unrelated if not _is_marked(pid, mark, users)}
-    return others, set(parent_of) - others
-
-
-def _is_marked(pid: int, mark: str, users: Collection[int]) -> bool:
-    try:
-        with process_folder(pid) as folder:
-            marked = mark.encode() in read_proc("environ", folder).split(b"\0")
-            return marked and user_in(folder) in users
-    except OSError:  # it has ended, or is another user's
-        return False
-
-
-def without_processes(
-    strangers: Collection[int], tables: EventTables, info: RecordingInfo
-) -> tuple[EventTables, RecordingInfo]:
-    """The events without those of processes that are none of the command's, if there are any."""
-    traced = (frame["pid"].drop_nulls().unique() for frame in tables.values())
-    foreign = sorted({pid for pids in traced for pid in pids} & set(strangers))
-    if not foreign:
-        return tables, info
-    own = {
-        name: frame.filter(~pl.col("pid").is_in(foreign).fill_null(False))
-        for name, frame in tables.items()
-    }
-    names = ", ".join(f"{pid} {info.processes.get(pid, '')}".strip() for pid in foreign)
-    facts = {
-        "processes": {pid: name for pid, name in info.processes.items() if pid not in foreign},
-        "notes": (
-            *info.notes,
-            f"processes that the command has not started are left out: {names}.",
-        ),
-        "trace_events": {
-            name if name == "sched_switch" else f"ros2:{name}": frame.height
-            for name, frame in own.items()
-        },
-    }
-    return own, info.model_copy(update=facts)
-
+__all__ = ["LttngSession", "buffer_size"]
 
 EVENTS = ("ros2:*", "ros2_caret:*", "dds:*")
 """Everything that `tracetools` of any distribution, CARET, and a traced Cyclone DDS emit."""
@@ -87,7 +59,7 @@ _ENLARGED_BY = 4
 
 
 class LttngSession:
-    """Records with LTTng: a :class:`~chainshaper.sources.tracer.Tracer`.
+    """Records with LTTng: a :class:`~chainshaper.sources.Tracer`.
 
     ``buffer`` is the size of the ring buffer of each core in bytes; by default what is enough for
     most applications and fits into the machine's shared memory.
@@ -162,22 +134,28 @@ class LttngSession:
             from chainshaper.sources.lttng.trace import open_lttng_trace
 
             trace = open_lttng_trace([self._folder])
-            tables, info = without_processes(self._strangers, trace.events, trace.info)
+            tables, info = _without_processes(self._strangers, trace.events, trace.info)
         if not any(tables[name].height for name in tables):
-            shutil.rmtree(self._folder)  # it holds other applications' events at most
+            shutil.rmtree(self._folder)  # other applications' events are in it at most
             self._folder.mkdir()
             raise OperationError(
                 "no process with LTTng trace points was seen: is tracing compiled into this ROS 2 "
                 "(`ros2 run tracetools status`), and do the nodes run as your user, here and not "
                 "in a container? `--source ebpf` does not need LTTng"
             )
-        notes = (*info.notes, *self._notes, *self._loss(info.lost))
-        return tables, info.model_copy(update={"notes": notes})
+        notes = [*info.notes, *self._notes]
+        if lost := sum(info.lost.values()):
+            larger = self._buffer * (1 if len(self._sessions) > 1 else _ENLARGED_BY)
+            notes.append(
+                f"{lost} events were lost: buffers were too small. Record again with `--buffer "
+                f"{max(1, larger // MIB)}` (MiB a core)."
+            )
+        return tables, info.model_copy(update={"notes": tuple(notes)})
 
     def _look_for_strangers(self, lttng: Lttng) -> None:
-        """Note who else runs, if the daemon is somebody's and so hears everybody."""
+        """Note who else runs, if the daemon is not ours and so hears every application."""
         if lttng.daemon is None:
-            others, own = processes_apart(f"{MARK}={self._sessions[0]}", self._users)
+            others, own = _processes_apart(f"{MARK}={self._sessions[0]}", self._users)
             self._strangers = (self._strangers | others) - own
 
     def _kernel_tracer(self, lttng: Lttng) -> bool:
@@ -198,21 +176,21 @@ class LttngSession:
         number = len(self._sessions) + 1
         name = f"{lttng.home.name}-{number}"
         output = self._folder.absolute() / f"session-{number}"
-        # LTTng 2.15 began to write CTF 2, which nobody else reads yet.
+        # LTTng 2.15 began to write CTF 2, which no analysis reads yet.
         old_format = ("--trace-format=ctf-1.8",) if _version(lttng) >= (2, 15) else ()
         lttng.ask("create", name, f"--output={output}", *old_format)
         self._sessions.append(name)
         size = f"--subbuf-size={self._buffer // _SUB_BUFFERS}"
-        channel = (size, f"--num-subbuf={_SUB_BUFFERS}", f"--session={name}", "--discard")
+        # The application need not wake the consumer, which looks every 200 ms.
+        channel: tuple[str, ...] = (size, f"--num-subbuf={_SUB_BUFFERS}", f"--session={name}")
+        channel += ("--discard", "--switch-timer=0", "--read-timer=200000", "events")
         of_channel = (f"--session={name}", "--channel=events")
-        # Nobody needs to be woken by the application: the consumer looks every 200 ms.
-        polled = ("--switch-timer=0", "--read-timer=200000")
-        lttng.ask("enable-channel", "--userspace", "--buffers-uid", *channel, *polled, "events")
+        lttng.ask("enable-channel", "--userspace", "--buffers-uid", *channel)
         lttng.ask("enable-event", "--userspace", *of_channel, ",".join(EVENTS))
         contexts = [f"--type={context}" for context in CONTEXTS]
         lttng.ask("add-context", "--userspace", *of_channel, *contexts)
         if self._kernel:
-            lttng.ask("enable-channel", "--kernel", *channel, *polled, "events")
+            lttng.ask("enable-channel", "--kernel", *channel)
             lttng.ask("enable-event", "--kernel", *of_channel, "sched_switch")
         return name
 
@@ -240,16 +218,6 @@ class LttngSession:
             f"{format_duration(round(gap, -6))} meanwhile."
         )
 
-    def _loss(self, lost: Mapping[str, int]) -> tuple[str, ...]:
-        count = sum(lost.values())
-        if not count:
-            return ()
-        larger = self._buffer * (1 if len(self._sessions) > 1 else _ENLARGED_BY)
-        return (
-            f"{count} events were lost: buffers were too small. Record again with `--buffer "
-            f"{max(1, larger // MIB)}` (MiB a core).",
-        )
-
 
 def buffer_size(
     wanted: int | None = None, free: int | None = None, cores: int | None = None
@@ -271,3 +239,46 @@ def _version(lttng: Lttng) -> tuple[int, int]:
     answer = lttng.ask("version")
     major, minor = (answer.findtext(f".//{{*}}{name}") for name in ("major", "minor"))
     return int(major or 0), int(minor or 0)
+
+
+def _processes_apart(mark: str, users: Collection[int]) -> tuple[set[int], set[int]]:
+    """The living processes that others have started, and those that we have.
+
+    The ``mark`` counts in processes of these ``users``: others can read and write it as well.
+    """
+    parent_of = parents()
+    unrelated = set(parent_of) - descendants(parent_of, os.getpid())
+    others = {pid for pid in unrelated if not _is_marked(pid, mark, users)}
+    return others, set(parent_of) - others
+
+
+def _is_marked(pid: int, mark: str, users: Collection[int]) -> bool:
+    try:
+        with process_folder(pid) as folder:
+            marked = mark.encode() in read_proc("environ", folder).split(b"\0")
+            return marked and user_in(folder) in users
+    except OSError:  # it has ended, or is another user's
+        return False
+
+
+def _without_processes(
+    strangers: Collection[int], tables: EventTables, info: RecordingInfo
+) -> tuple[EventTables, RecordingInfo]:
+    """The events without those of processes that are none of the command's, if there are any."""
+    traced = (frame["pid"].drop_nulls().unique() for frame in tables.values())
+    foreign = sorted({pid for pids in traced for pid in pids} & set(strangers))
+    if not foreign:
+        return tables, info
+    is_own = ~pl.col("pid").is_in(foreign).fill_null(False)
+    own = {name: frame.filter(is_own) for name, frame in tables.items()}
+    names = ", ".join(f"{pid} {info.processes.get(pid, '')}".strip() for pid in foreign)
+    note = f"processes that the command has not started are left out: {names}."
+    facts = {
+        "processes": {pid: name for pid, name in info.processes.items() if pid not in foreign},
+        "notes": (*info.notes, note),
+        "trace_events": {
+            name if name == "sched_switch" else f"ros2:{name}": frame.height
+            for name, frame in own.items()
+        },
+    }
+    return own, info.model_copy(update=facts)

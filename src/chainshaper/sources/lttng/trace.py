@@ -1,7 +1,24 @@
-"""What a trace's metadata says: field types, event, stream and trace classes (CTF 1.8).
+"""LTTng traces as recordings: the folders that `ros2 trace` writes.
 
-All of it is immutable plain data. Names stay as TSDL writes them, with LTTng's leading underscore;
-`field_name` gives the name that users see. Sizes and alignments are in bits.
+Events keep their names without the provider (``ros2:callback_start`` → ``callback_start``) and get
+the columns and types of :mod:`chainshaper.values.events`; events that no table is for are left
+out. A trace may declare other events of the same name (another provider's), other types (a narrower
+integer), and fewer fields: older distributions do, and so does damaged metadata. Integers are
+widened; a field that is absent, or of a kind that no cast brings right, becomes a column of nulls,
+which the analysis takes for "not known", and a note says so unless that is how a distribution is.
+
+Tables are decoded in groups that are used together, because one pass over a trace costs nearly the
+same for one table as for twenty: those of the objects' creation, of callbacks and of messages at
+once, since every analysis needs them (an overview only creation); what the upper layers say about
+the same messages, `sched_switch` and the executor's at their first use.
+
+Times stay what the tracer wrote, ns of CLOCK_MONOTONIC. Process numbers do too, with one exception:
+containers number their processes independently of each other, so folders of several hosts are
+read host by host, and where two of them use the same number, the later host's are moved
+(:data:`NEXT_HOST`).
+
+CARET keeps the events of an application's start and emits them again when tracing begins; those
+carry ``init_timestamp``, the time at which they really happened, and are put there.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,13 +33,12 @@ import polars as pl
 from chainshaper.sources.ctf import CtfTrace, Events, count_events, open_trace, read_events
 from chainshaper.sources.ctf.types import (
     ArrayType,
-    FloatType,
+    EnumType,
     IntegerType,
     SequenceType,
     StringType,
     StructType,
     Type,
-    VariantType,
     field_name,
 )
 from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids, rmw_of_threads
@@ -31,287 +47,26 @@ from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.events import CREATION
 from chainshaper.values.recording import Recording, RecordingInfo
 
-DeclaredFields = Mapping[str, Mapping[str, Type]]
-"""Table → the fields that the trace declares for its event."""
-
-CARET_INIT = "caret_init"
-"""An event that is read, but is no table of ours."""
-
-_PROVIDERS = ("ros2", "ros2_caret")
-
-
-def table_name(event: str) -> str | None:
-    """The table that an event belongs to: ``ros2:callback_start`` → ``callback_start``.
-
-    None for events that no table is for, and for another provider's event of the same name. The
-    kernel's events have no provider.
-    """
-    provider, _, name = event.rpartition(":")
-    if name == "sched_switch":
-        return None if provider else name
-    known = provider in _PROVIDERS and (name in events.FIELDS or name == CARET_INIT)
-    return name if known else None
-
-
-def declared_fields(trace: CtfTrace) -> dict[str, dict[str, Type]]:
-    """The fields of every event of the trace that a table is for."""
-    declared: dict[str, dict[str, Type]] = {}
-    for folder in trace.folders:
-        for stream in folder.declared.streams.values():
-            for event in stream.events.values():
-                name = table_name(event.name)
-                if name is not None:
-                    kind = event.fields or StructType()
-                    fields = {field_name(f.name): f.type for f in kind.fields}
-                    declared.setdefault(name, {}).update(fields)
-    return declared
-
-
-def missing_fields(declared: DeclaredFields, counts: Mapping[str, int]) -> tuple[str, ...]:
-    """In words, which fields of events that happened are absent, or of a kind without use."""
-    happened = {str(table_name(event)) for event, count in counts.items() if count}
-    notes = []
-    for name in sorted(happened & declared.keys() & events.FIELDS.keys()):
-        fields = declared[name]
-        wanted = {
-            f: t
-            for f, t in events.FIELDS[name].items()
-            if f not in events.VERSION_FIELDS.get(name, ())
-        }
-        missing = [f for f, t in wanted.items() if f not in fields or not _fits(fields[f], t)]
-        if missing:
-            notes.append(
-                f"the trace's {name} has no usable field {', '.join(missing)}: what depends on "
-                "it cannot be known."
-            )
-    return tuple(notes)
-
-
-def _fits(declared: Type, wanted: pl.DataType) -> bool:
-    """Whether the values of a declared field can be those of a column."""
-    match declared:
-        case StructType() | VariantType():
-            return False
-        case StringType():
-            return isinstance(wanted, pl.String)
-        case ArrayType(element=element) | SequenceType(element=element):
-            if not isinstance(element, IntegerType):
-                return False
-            text = element.encoding != "none" and element.size == element.align == 8
-            return isinstance(wanted, pl.String if text else pl.List)
-        case FloatType():
-            return False
-        case _:
-            return wanted.is_integer()
-
-
-def _castable(found: pl.DataType | None, wanted: pl.DataType) -> bool:
-    """The same for a column that was decoded."""
-    if isinstance(found, pl.List | pl.Array):
-        return isinstance(wanted, pl.List) and found.inner.is_integer()
-    if isinstance(wanted, pl.String):
-        return isinstance(found, pl.String)
-    return found is not None and found.is_integer() and wanted.is_integer()
-
-
-def event_table(frame: pl.DataFrame, name: str, clock_offset_ns: int) -> pl.DataFrame:
-    """A decoded event's frame as an event table, without events of nobody knows which thread."""
-    types = {**events.COMMON_COLUMNS, **events.FIELDS.get(name, {})}
-    if "init_timestamp" in frame.columns and frame.schema["init_timestamp"].is_integer():
-        happened = pl.col("init_timestamp")
-        wall_clock = happened > clock_offset_ns
-        at = pl.when(wall_clock).then(happened - clock_offset_ns).otherwise(happened)
-        frame = frame.with_columns(time=at.cast(pl.Int64)).sort("time", maintain_order=True)
-    if name not in events.FIELDS:
-        return frame
-    columns = []
-    for column, kind in types.items():
-        if _castable(frame.schema.get(column), kind):
-            columns.append(pl.col(column).cast(kind, strict=False))
-        elif column not in events.VERSION_FIELDS.get(name, ()):
-            columns.append(pl.lit(None, dtype=kind).alias(column))
-    table = frame.select(columns)
-    # `sched_switch` names its threads itself.
-    nameless = name != "sched_switch" and (table["pid"].null_count() or table["tid"].null_count())
-    return table.drop_nulls(["pid", "tid"]) if nameless else table
-
-
-def merged(parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
-    """Several providers' events of one name, by time; CARET's copy of an event is not another."""
-    together = pl.concat(parts, how="diagonal_relaxed").sort("time", maintain_order=True)
-    return together.unique(maintain_order=True) if together.height else together
-
+__all__ = ["NEXT_HOST", "Progress", "TraceTables", "open_lttng_trace", "table_name"]
 
 Progress: TypeAlias = Callable[[float, str], None]
-"""Told the share of the work that is done, from 0 to 1, and what is being done."""
+"""Gets the share of the work that is done, from 0 to 1, and what is being done."""
 
 NEXT_HOST = 10_000_000
 """Added to the process and thread numbers of the next host; Linux goes up to 4,194,304."""
 
+_PROVIDERS = ("ros2", "ros2_caret")
+_CARET_INIT = "caret_init"
+"""An event that is read with the creation, but is no table of ours."""
 _EXECUTOR = frozenset(name for name in events.FIELDS if name.startswith("rclcpp_executor_"))
 _SWITCHES = frozenset(("sched_switch",))
 _UPPER_LAYERS = frozenset(("rclcpp_publish", "rcl_publish", "rcl_take", "rclcpp_take"))
 _MESSAGES = frozenset(events.FIELDS) - _EXECUTOR - _SWITCHES - CREATION - _UPPER_LAYERS
 _GROUPS = (CREATION, _MESSAGES, _UPPER_LAYERS, _EXECUTOR, _SWITCHES)
-_ALSO = frozenset((CARET_INIT,))  # read with the creation
 _WHO_RUNS = ("callback_start", "rmw_publish", "rmw_take", "rclcpp_publish")
 
-
-class TraceTables(Mapping[str, pl.DataFrame]):
-    """The event tables of an open trace, decoded on first use.
-
-    ``counts`` are the events per full name, provider included. Only events that happened are in
-    the mapping.
-    """
-
-    def __init__(self, trace: CtfTrace, progress: Progress, overview: bool) -> None:
-        self._trace = trace
-        self._hosts = _by_host(trace)
-        self._fields = declared_fields(trace)
-        self._progress = progress
-        self._read: dict[str, pl.DataFrame] = {}
-        self._decoding = Lock()  # the analysis asks for tables from two threads
-        self._sources: dict[str, list[str]] = {}
-        for full_name in trace.event_names:
-            name = table_name(full_name)
-            if name is not None:
-                self._sources.setdefault(name, []).append(full_name)
-        self.counts: dict[str, int] = {}
-        self.warnings: tuple[str, ...] = ()
-        self._names: dict[int, str] = {}
-        self._anonymous = 0
-        self._pids: set[int] = set()
-        self._moved: dict[str, int] = {}
-        # Where numbers may collide, everybody's have to be seen first.
-        everything = not overview or len(self._hosts) > 1
-        self._decode(CREATION | _ALSO | (_MESSAGES if everything else frozenset()))
-
-    def creation(self) -> events.EventTables:
-        """The tables of the objects' creation, and CARET's `caret_init`; empty ones included."""
-        return {name: self._read[name] for name in CREATION | _ALSO if name in self._read}
-
-    def commands(self) -> dict[int, str]:
-        """Process → its name, as far as the tracer recorded it with the objects' creation.
-
-        Where nothing was created during the recording, everything that ran is looked at.
-        """
-        tables = [self._read[name] for name in CREATION if name in self._read]
-        if not any(self._counted(name) for name in ("rcl_node_init", "rcl_init")):
-            tables += [self[name] for name in _WHO_RUNS if name in self]
-        return {
-            pid: self._names.get(pid, "")
-            for table in tables
-            for pid in table["pid"].unique().drop_nulls().to_list()
-        }
-
-    def thread_names(self) -> set[str]:
-        """Names of threads that the tracer recorded, the kernel's view included."""
-        names = set(self._names.values())
-        if "sched_switch" in self and "next_comm" in self["sched_switch"].columns:
-            names |= set(self["sched_switch"]["next_comm"].unique().drop_nulls())
-        return names
-
-    def __getitem__(self, name: str) -> pl.DataFrame:
-        if name not in self:
-            raise KeyError(name)
-        with self._decoding:
-            if name not in self._read:
-                self._decode(next(group for group in _GROUPS if name in group))
-        return self._read[name]
-
-    def __contains__(self, name: object) -> bool:
-        return name in events.FIELDS and self._counted(str(name)) > 0
-
-    def __iter__(self) -> Iterator[str]:
-        return (name for name in sorted(self._sources) if name in self)
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
-
-    def _counted(self, name: str) -> int:
-        return sum(self.counts.get(source, 0) for source in self._sources.get(name, ()))
-
-    def notes(self) -> tuple[str, ...]:
-        """What a reader of the tables must know: damage, absent fields, numbers that were moved."""
-        moved = [
-            f"processes and threads of host {host} have {by} added to their numbers, which another "
-            "host's processes have as well."
-            for host, by in self._moved.items()
-            if by
-        ]
-        anonymous = (
-            f"{self._anonymous} events say no process or thread and cannot be used: record with "
-            "`ros2 trace`, or `lttng add-context --userspace --type=vpid --type=vtid`."
-        )
-        return (
-            *self.warnings,
-            *missing_fields(self._fields, self.counts),
-            *moved,
-            *([anonymous] if self._anonymous else ()),
-        )
-
-    def _decode(self, group: frozenset[str]) -> None:
-        parts: dict[str, list[pl.DataFrame]] = {}
-        first, nameless = not self.counts, not self._names
-        for place, (host, trace) in enumerate(self._hosts.items()):
-            found = self._decoded(trace, group, place)
-            if first:
-                self._take_stock(trace, found)
-                self._settle_numbers(host, found)
-            if nameless:
-                self._note_names(host, trace, found)
-            for name in group:
-                for full in self._sources.get(name, ()):
-                    decoded = found.pop(full)  # let go of what is in no table
-                    table = event_table(decoded, name, trace.clock_offset_ns)
-                    self._anonymous += (decoded.height - table.height) * first
-                    parts.setdefault(name, []).append(self._with_moved_numbers(table, host))
-        for name, tables in parts.items():
-            self._read[name] = tables[0] if len(tables) == 1 else merged(tables)
-
-    def _decoded(self, trace: CtfTrace, group: frozenset[str], place: int) -> Events:
-        wanted = [full for name in group for full in self._sources.get(name, ())]
-        what, hosts = "decoding events", len(self._hosts)
-        self._progress(place / hosts, what)
-        with _as_our_errors():
-            return read_events(
-                trace,
-                wanted,
-                nameless=[full for full in wanted if table_name(full) not in CREATION],
-                progress=lambda share: self._progress((place + share) / hosts, what),
-            )
-
-    def _take_stock(self, trace: CtfTrace, found: Events) -> None:
-        """Counts of all events, those of streams included in which nothing was asked for."""
-        with _as_our_errors():
-            others = count_events(replace(trace, streams=found.unread))
-        for name, count in found.counts.items():
-            self.counts[name] = self.counts.get(name, 0) + count + others.get(name, 0)
-        self.warnings += found.warnings
-
-    def _settle_numbers(self, host: str, found: Events) -> None:
-        """Move the host's process numbers out of the way if another host has one of them."""
-        if len(self._hosts) == 1:
-            self._moved[host] = 0
-            return
-        known = [frame for frame in found.values() if frame.schema["pid"].is_integer()]
-        pids = {pid for frame in known for pid in frame["pid"].unique().drop_nulls().to_list()}
-        beyond = max(self._moved.values(), default=0) + NEXT_HOST
-        self._moved[host] = beyond if pids & self._pids else 0
-        self._pids |= pids
-
-    def _note_names(self, host: str, trace: CtfTrace, found: Events) -> None:
-        """What processes are called, from their objects' creation if it was traced."""
-        names = _process_names(found)
-        if not names and not any(name in self for name in CREATION):
-            ran = [full for name in _WHO_RUNS for full in self._sources.get(name, ())]
-            with _as_our_errors():
-                names = _process_names(read_events(trace, ran))
-        self._names |= {pid + self._moved[host]: name for pid, name in names.items()}
-
-    def _with_moved_numbers(self, table: pl.DataFrame, host: str) -> pl.DataFrame:
-        moved = self._moved[host]
-        return table.with_columns(pl.col("pid", "tid") + moved) if moved else table
+_DeclaredFields: TypeAlias = Mapping[str, Mapping[str, Type]]
+"""Table → the fields that the trace declares for its event."""
 
 
 def open_lttng_trace(
@@ -320,26 +75,28 @@ def open_lttng_trace(
     """Open the LTTng trace in ``paths``: folders of one recording, searched recursively.
 
     Kernel and user space, users (per-uid) and processes (per-pid) have a folder each; all are
-    merged by time. ``overview`` leaves callbacks and messages undecoded until they are asked for;
-    ``progress`` is told about this, and about decoding later on.
+    merged by time. ``overview`` leaves callbacks and messages undecoded until their first use;
+    ``progress`` hears about this, and about decoding later on.
 
     Raises:
         InputError: no trace there, metadata that cannot be understood, or traces taken by
             different clocks (other machines, other boots), whose times cannot be compared.
     """
-    progress = progress or _untold
+    progress = progress or (lambda _, __: None)
     progress(0.0, "opening the trace (the first time on a machine, its decoder is compiled)")
     with _as_our_errors():
         trace = open_trace(*paths)
     _refuse_different_clocks(trace)
     tables = TraceTables(trace, progress, overview)
     creation = tables.creation()
-    hosts = sorted({str(folder.declared.env.get("hostname", "")) for folder in trace.folders})
+    of_folders = [folder.declared.env for folder in trace.folders]
+    hosts = sorted({str(env.get("hostname", "")) for env in of_folders})
+    kernels = (env.get("kernel_release") for env in of_folders)
     info = RecordingInfo(
         source="lttng",
         host=", ".join(host for host in hosts if host),
-        kernel=_kernel(trace),
-        distribution=distribution_of(creation, _field_lengths(trace)),
+        kernel=next((str(release) for release in kernels if release), "unknown"),
+        distribution=distribution_of(creation, tables.field_lengths()),
         rmw=rmw_of_gids(creation) or rmw_of_threads(tables.thread_names()),
         clock_offset_ns=trace.clock_offset_ns,
         processes=processes_of(creation, tables.commands()),
@@ -365,8 +122,174 @@ def _as_our_errors() -> Iterator[None]:
         raise OperationError(f"the trace cannot be read: {error}") from error
 
 
-def _untold(*_: object) -> None:
-    """Progress that nobody watches."""
+def _refuse_different_clocks(trace: CtfTrace) -> None:
+    first = trace.folders[0]
+    for folder in trace.folders[1:]:
+        clocks = {first.clock.uuid, folder.clock.uuid}
+        if None not in clocks and len(clocks) == 2:
+            raise InputError(
+                f"{folder.path} was taken by another clock than {first.path} (another machine, or "
+                "another boot of this one): their times cannot be compared; give the folders of "
+                "one recording"
+            )
+
+
+class TraceTables(Mapping[str, pl.DataFrame]):
+    """The event tables of an open trace, decoded at first use.
+
+    ``counts`` are the events per full name, provider included. Only events that happened are in
+    the mapping.
+    """
+
+    def __init__(self, trace: CtfTrace, progress: Progress, overview: bool) -> None:
+        self._trace = trace
+        self._hosts = _by_host(trace)
+        self._fields = _declared_fields(trace)
+        self._progress = progress
+        self._read: dict[str, pl.DataFrame] = {}
+        self._decoding = Lock()  # the analysis asks for tables from two threads
+        self._sources: dict[str, list[str]] = {}
+        for full_name in trace.event_names:
+            name = table_name(full_name)
+            if name is not None:
+                self._sources.setdefault(name, []).append(full_name)
+        self.counts: dict[str, int] = {}
+        self.warnings: tuple[str, ...] = ()
+        self._names: dict[int, str] = {}
+        self._anonymous = 0
+        self._pids: set[int] = set()
+        self._moved: dict[str, int] = {}
+        # Where numbers may collide, those of all hosts have to be seen first.
+        everything = not overview or len(self._hosts) > 1
+        self._decode(CREATION | {_CARET_INIT} | (_MESSAGES if everything else frozenset()))
+
+    def creation(self) -> events.EventTables:
+        """The tables of the objects' creation, and CARET's `caret_init`; empty ones included."""
+        return {n: t for n, t in self._read.items() if n in CREATION or n == _CARET_INIT}
+
+    def commands(self) -> dict[int, str]:
+        """Process → what its main thread is called, for all that created objects.
+
+        Where no object was created during the recording, everything that ran is looked at.
+        """
+        tables = [self._read[name] for name in CREATION if name in self._read]
+        if not any(self._counted(name) for name in ("rcl_node_init", "rcl_init")):
+            tables += [self[name] for name in _WHO_RUNS if name in self]
+        return {
+            pid: self._names.get(pid, "")
+            for table in tables
+            for pid in table["pid"].unique().drop_nulls().to_list()
+        }
+
+    def thread_names(self) -> set[str]:
+        """Names of threads that the tracer recorded, the kernel's view included."""
+        names = set(self._names.values())
+        if "sched_switch" in self and "next_comm" in self["sched_switch"].columns:
+            names |= set(self["sched_switch"]["next_comm"].unique().drop_nulls())
+        return names
+
+    def field_lengths(self) -> dict[str, dict[str, int]]:
+        """Event → its declared fields, with the length of those that are arrays (0: no array)."""
+        return {
+            name: {f: t.length if isinstance(t, ArrayType) else 0 for f, t in fields.items()}
+            for name, fields in self._fields.items()
+        }
+
+    def __getitem__(self, name: str) -> pl.DataFrame:
+        if name not in self:
+            raise KeyError(name)
+        with self._decoding:
+            if name not in self._read:
+                self._decode(next(group for group in _GROUPS if name in group))
+        return self._read[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in events.FIELDS and self._counted(str(name)) > 0
+
+    def __iter__(self) -> Iterator[str]:
+        return (name for name in sorted(self._sources) if name in self)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+    def _counted(self, name: str) -> int:
+        return sum(self.counts.get(source, 0) for source in self._sources.get(name, ()))
+
+    def notes(self) -> tuple[str, ...]:
+        """What a reader of the tables must know: damage, absent fields, numbers that were moved."""
+        notes = [*self.warnings, *_missing_fields(self._fields, set(self))]
+        notes += [
+            f"processes and threads of host {host} have {by} added to their numbers, which another "
+            "host's processes have as well."
+            for host, by in self._moved.items()
+            if by
+        ]
+        if self._anonymous:
+            notes.append(
+                f"{self._anonymous} events say no process or thread and cannot be used: record "
+                "with `ros2 trace`, or `lttng add-context --userspace --type=vpid --type=vtid`."
+            )
+        return tuple(notes)
+
+    def _decode(self, group: frozenset[str]) -> None:
+        parts: dict[str, list[pl.DataFrame]] = {}
+        first, nameless = not self.counts, not self._names
+        for place, (host, trace) in enumerate(self._hosts.items()):
+            found = self._decoded(trace, group, place)
+            if first:
+                self._take_stock(trace, found)
+                self._settle_numbers(host, found)
+            if nameless:
+                self._note_names(host, trace, found)
+            for name in group:
+                for full in self._sources.get(name, ()):
+                    decoded = found.pop(full)  # let go of what is in no table
+                    table = _event_table(decoded, name, trace.clock_offset_ns)
+                    self._anonymous += (decoded.height - table.height) * first
+                    if moved := self._moved[host]:
+                        table = table.with_columns(pl.col("pid", "tid") + moved)
+                    parts.setdefault(name, []).append(table)
+        for name, tables in parts.items():
+            self._read[name] = tables[0] if len(tables) == 1 else _merged(tables)
+
+    def _decoded(self, trace: CtfTrace, group: frozenset[str], place: int) -> Events:
+        wanted = [full for name in group for full in self._sources.get(name, ())]
+        what, hosts = "decoding events", len(self._hosts)
+        self._progress(place / hosts, what)
+        with _as_our_errors():
+            return read_events(
+                trace,
+                wanted,
+                nameless=[full for full in wanted if table_name(full) not in CREATION],
+                progress=lambda share: self._progress((place + share) / hosts, what),
+            )
+
+    def _take_stock(self, trace: CtfTrace, found: Events) -> None:
+        """Counts of all events, those of streams included of which no event is wanted."""
+        with _as_our_errors():
+            others = count_events(replace(trace, streams=found.unread))
+        for name, count in found.counts.items():
+            self.counts[name] = self.counts.get(name, 0) + count + others.get(name, 0)
+        self.warnings += found.warnings
+
+    def _settle_numbers(self, host: str, found: Events) -> None:
+        """Move the host's process numbers out of the way if another host has one of them."""
+        self._moved[host] = 0
+        if len(self._hosts) > 1:
+            known = [frame for frame in found.values() if frame.schema["pid"].is_integer()]
+            pids = {pid for frame in known for pid in frame["pid"].unique().drop_nulls().to_list()}
+            if pids & self._pids:
+                self._moved[host] = max(self._moved.values()) + NEXT_HOST
+            self._pids |= pids
+
+    def _note_names(self, host: str, trace: CtfTrace, found: Events) -> None:
+        """What processes are called, from their objects' creation if it was traced."""
+        names = _process_names(found)
+        if not names and not any(name in self for name in CREATION):
+            ran = [full for name in _WHO_RUNS for full in self._sources.get(name, ())]
+            with _as_our_errors():
+                names = _process_names(read_events(trace, ran))
+        self._names |= {pid + self._moved[host]: name for pid, name in names.items()}
 
 
 def _by_host(trace: CtfTrace) -> dict[str, CtfTrace]:
@@ -400,26 +323,95 @@ def _process_names(frames: Mapping[str, pl.DataFrame]) -> dict[int, str]:
     return names
 
 
-def _field_lengths(trace: CtfTrace) -> dict[str, dict[str, int]]:
-    """Event → its fields, with the length of those that are arrays."""
-    return {
-        name: {f: t.length if isinstance(t, ArrayType) else 0 for f, t in fields.items()}
-        for name, fields in declared_fields(trace).items()
-    }
+def table_name(event: str) -> str | None:
+    """The table that an event belongs to: ``ros2:callback_start`` → ``callback_start``.
+
+    None for events that no table is for, and for another provider's event of the same name. The
+    kernel's events have no provider.
+    """
+    provider, _, name = event.rpartition(":")
+    if name == "sched_switch":
+        return None if provider else name
+    known = provider in _PROVIDERS and (name in events.FIELDS or name == _CARET_INIT)
+    return name if known else None
 
 
-def _kernel(trace: CtfTrace) -> str:
-    releases = [folder.declared.env.get("kernel_release") for folder in trace.folders]
-    return next((str(release) for release in releases if release), "unknown")
+def _declared_fields(trace: CtfTrace) -> dict[str, dict[str, Type]]:
+    """The fields of every event of the trace that a table is for."""
+    declared: dict[str, dict[str, Type]] = {}
+    for folder in trace.folders:
+        for stream in folder.declared.streams.values():
+            for event in stream.events.values():
+                name = table_name(event.name)
+                if name is not None:
+                    kind = event.fields or StructType()
+                    fields = {field_name(f.name): f.type for f in kind.fields}
+                    declared.setdefault(name, {}).update(fields)
+    return declared
 
 
-def _refuse_different_clocks(trace: CtfTrace) -> None:
-    first = trace.folders[0]
-    for folder in trace.folders[1:]:
-        clocks = {first.clock.uuid, folder.clock.uuid}
-        if None not in clocks and len(clocks) == 2:
-            raise InputError(
-                f"{folder.path} was taken by another clock than {first.path} (another machine, or "
-                "another boot of this one): their times cannot be compared; give the folders of "
-                "one recording"
+def _missing_fields(declared: _DeclaredFields, happened: set[str]) -> list[str]:
+    """In words, which fields of events that happened are absent, or of a kind without use."""
+    notes = []
+    for name in sorted(happened & declared.keys()):
+        fields = declared[name]
+        missing = [
+            field
+            for field, wanted in events.FIELDS[name].items()
+            if field not in events.VERSION_FIELDS.get(name, ())
+            and not (field in fields and _castable(_decoded_type(fields[field]), wanted))
+        ]
+        if missing:
+            notes.append(
+                f"the trace's {name} has no usable field {', '.join(missing)}: what depends on "
+                "it cannot be known."
             )
+    return notes
+
+
+def _decoded_type(declared: Type) -> pl.DataType | None:
+    """What the values of a declared field become, of the kinds that a table has."""
+    match declared:
+        case IntegerType() | EnumType():
+            return pl.Int64()
+        case StringType():
+            return pl.String()
+        case ArrayType(element=IntegerType() as one) | SequenceType(element=IntegerType() as one):
+            text = one.encoding != "none" and one.size == one.align == 8
+            return pl.String() if text else pl.List(pl.Int64())
+    return None
+
+
+def _castable(found: pl.DataType | None, wanted: pl.DataType) -> bool:
+    if isinstance(found, pl.List | pl.Array):
+        return isinstance(wanted, pl.List) and found.inner.is_integer()
+    if isinstance(wanted, pl.String):
+        return isinstance(found, pl.String)
+    return found is not None and found.is_integer() and wanted.is_integer()
+
+
+def _event_table(frame: pl.DataFrame, name: str, clock_offset_ns: int) -> pl.DataFrame:
+    """A decoded event's frame as an event table, without events of no known thread."""
+    if "init_timestamp" in frame.columns and frame.schema["init_timestamp"].is_integer():
+        happened = pl.col("init_timestamp")
+        wall_clock = happened > clock_offset_ns
+        at = pl.when(wall_clock).then(happened - clock_offset_ns).otherwise(happened)
+        frame = frame.with_columns(time=at.cast(pl.Int64)).sort("time", maintain_order=True)
+    if name not in events.FIELDS:
+        return frame
+    columns = []
+    for column, kind in {**events.COMMON_COLUMNS, **events.FIELDS[name]}.items():
+        if _castable(frame.schema.get(column), kind):
+            columns.append(pl.col(column).cast(kind, strict=False))
+        elif column not in events.VERSION_FIELDS.get(name, ()):
+            columns.append(pl.lit(None, dtype=kind).alias(column))
+    table = frame.select(columns)
+    # `sched_switch` names its threads itself.
+    nameless = name != "sched_switch" and (table["pid"].null_count() or table["tid"].null_count())
+    return table.drop_nulls(["pid", "tid"]) if nameless else table
+
+
+def _merged(parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
+    """Several providers' events of one name, by time; CARET's copy of an event is not another."""
+    together = pl.concat(parts, how="diagonal_relaxed").sort("time", maintain_order=True)
+    return together.unique(maintain_order=True) if together.height else together

@@ -1,6 +1,6 @@
 """The ROS graph with types and QoS, printed as JSON by the Python of a ROS 2 installation.
 
-    python3 ros_graph.py [SECONDS]
+    python3 graph.py [SECONDS]
 
 This file is run, not imported: by the interpreter that has `rclpy`, in the environment of the
 application, where nothing of ours may be installed. So it needs nothing but `rclpy` (Humble or

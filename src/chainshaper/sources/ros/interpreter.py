@@ -1,7 +1,22 @@
-"""What a trace's metadata says: field types, event, stream and trace classes (CTF 1.8).
+"""Running a script with the `rclpy` of an application that runs: its Python, its environment.
 
-All of it is immutable plain data. Names stay as TSDL writes them, with LTTng's leading underscore;
-`field_name` gives the name that users see. Sizes and alignments are in bits.
+The Python that has `rclpy` is seldom ours, and domain and RMW are those of the application's nodes.
+So a small script of its own asks ROS 2 what has to be asked, in a process of its own:
+:mod:`.graph` (:func:`ask_graph`) and :mod:`.parameter`.
+
+An environment says which programs and libraries are loaded: who wrote it chooses what runs. So this
+is the one place where something is run that was found through another process, and it runs with
+that process's user's rights or not at all:
+
+* as that user, with the groups of the user database, without capabilities, and with no way to get
+  any (`no_new_privs`);
+* in that environment and no other, in a session of its own, with no files of ours but the script,
+  and what it may print into: 8 MiB;
+* for a limited time, and no longer than we run ourselves.
+
+Even the search for the interpreter is that process's. An environment is not taken from a process
+that is no single user's (`sudo` carries that of whoever called it), nor from one in a container or
+a namespace of its own, whose paths lead elsewhere here. What a script prints is a stranger's word.
 """
 
 import ctypes
@@ -43,6 +58,10 @@ _MOST_PRINTED = 8 << 20
 _LOOKS = 5
 _SAME_PLACES = ("ns/user", "ns/mnt", "root")
 _PR_SET_NO_NEW_PRIVS, _CAPABILITY_VERSION_3 = 38, 0x20080522
+_PATIENCE_S, _START_S = 10, 20
+"""How long discovery may take, and Python and RMW to load beside it."""
+_NAME = re.compile(r"[!-~]{0,255}/[!-~]{1,255}")
+_LARGEST = 1 << 63
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
@@ -223,15 +242,13 @@ def _content(descriptor: int) -> str:
     return content.rstrip(b"\0").decode(errors="replace")
 
 
-_PATIENCE_S = 10
-"""Discovery is waited for that long at most, and longer than that for Python and RMW to load."""
-_START_S = 20
-_NAME = re.compile(r"[!-~]{0,255}/[!-~]{1,255}")
-_LARGEST = 1 << 63
-
-
 def ask_graph(environment: Environment) -> tuple[tuple[EndpointInfo, ...], str | None]:
     """All endpoints of the ROS graph that a node with this environment belongs to.
+
+    Types and QoS travel in DDS discovery only. One participant for a few seconds learns those of
+    all topics; `ros2 topic info -v` would be one per topic, and leave a daemon behind. Whoever is
+    in the graph says what it likes, and DDS without its security plug-ins does not prove who is:
+    the answer is bounded and checked in its form, and believed in names, types and QoS only.
 
     Returns:
         The endpoints, and why there are none, if so.
