@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import chainshaper
-from chainshaper.values.compiled import loading
+from chainshaper.values import compiled as loading
 
 NOBODY = pwd.getpwnam("nobody").pw_uid
 

@@ -1,8 +1,7 @@
 """What an application is: nodes, callbacks, topics and chains (paper, sections 2.1 and 2.3).
 
-These are values found in a recording or read from a description; they hold no behaviour of the
-running system. A callback is a vertex of the paper's graph G; it is connected to another when
-it publishes a topic that the other subscribes to.
+A callback is a vertex of the paper's graph G; it is connected to another when it publishes a topic
+that the other subscribes to.
 """
 
 from dataclasses import dataclass, field
@@ -79,11 +78,10 @@ class ApplicationGraph:
 
 @dataclass(frozen=True)
 class Chain:
-    """A computation chain: callbacks connected by topics (paper, section 2.3).
+    """A computation chain: callbacks (ids in its graph) connected by topics (paper, section 2.3).
 
     ``callbacks[i]`` publishes ``topics[i]``, which ``callbacks[i + 1]`` subscribes to; the last
-    topic is the chain's output. Both tuples have the same length. ``callbacks`` are ids in the
-    graph the chain was found in; ``spec`` is how a person wrote it (``/t1../t5``).
+    topic is the chain's output. ``spec`` is how a person wrote it (``/t1../t5``).
     """
 
     spec: str

@@ -1,7 +1,7 @@
 """Durations as people write them (``59ms``, ``250us``) and as we compute them (integer ns).
 
-Inside chainshaper time is an integer number of nanoseconds. Files and the command line carry
-units, because a bare number in a timing file is how robots get hurt.
+Files and the command line carry units, because a bare number in a timing file is how robots get
+hurt.
 
     >>> parse_duration("1.5ms")
     1500000

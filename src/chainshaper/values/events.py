@@ -51,70 +51,56 @@ COMMON_COLUMNS: dict[str, pl.DataType] = {
     "cpu": pl.Int32(),
 }
 
-_HANDLE = pl.UInt64()
+_HANDLE = _COUNT = pl.UInt64()
+_NUMBER = pl.Int32()
 _NAME = pl.String()
 _NANOSECONDS = pl.Int64()
 
+# fmt: off
 FIELDS: dict[str, dict[str, pl.DataType]] = {
     # Who exists: emitted once per object, in this order of dependence.
     "rcl_init": {"context_handle": _HANDLE, "version": _NAME},
     "rcl_node_init": {
-        "node_handle": _HANDLE,
-        "rmw_handle": _HANDLE,
-        "node_name": _NAME,
-        "namespace": _NAME,
+        "node_handle": _HANDLE, "rmw_handle": _HANDLE, "node_name": _NAME, "namespace": _NAME,
     },
     "rmw_publisher_init": {"rmw_publisher_handle": _HANDLE, "gid": pl.List(pl.UInt8)},
     "rcl_publisher_init": {
-        "publisher_handle": _HANDLE,
-        "node_handle": _HANDLE,
-        "rmw_publisher_handle": _HANDLE,
-        "topic_name": _NAME,
-        "queue_depth": pl.UInt64(),
+        "publisher_handle": _HANDLE, "node_handle": _HANDLE, "rmw_publisher_handle": _HANDLE,
+        "topic_name": _NAME, "queue_depth": _COUNT,
     },
     "rmw_subscription_init": {"rmw_subscription_handle": _HANDLE, "gid": pl.List(pl.UInt8)},
     "rcl_subscription_init": {
-        "subscription_handle": _HANDLE,
-        "node_handle": _HANDLE,
-        "rmw_subscription_handle": _HANDLE,
-        "topic_name": _NAME,
-        "queue_depth": pl.UInt64(),
+        "subscription_handle": _HANDLE, "node_handle": _HANDLE, "rmw_subscription_handle": _HANDLE,
+        "topic_name": _NAME, "queue_depth": _COUNT,
     },
     "rclcpp_subscription_init": {"subscription_handle": _HANDLE, "subscription": _HANDLE},
     "rclcpp_subscription_callback_added": {"subscription": _HANDLE, "callback": _HANDLE},
     "rcl_service_init": {
-        "service_handle": _HANDLE,
-        "node_handle": _HANDLE,
-        "rmw_service_handle": _HANDLE,
+        "service_handle": _HANDLE, "node_handle": _HANDLE, "rmw_service_handle": _HANDLE,
         "service_name": _NAME,
     },
     "rclcpp_service_callback_added": {"service_handle": _HANDLE, "callback": _HANDLE},
     "rcl_client_init": {
-        "client_handle": _HANDLE,
-        "node_handle": _HANDLE,
-        "rmw_client_handle": _HANDLE,
+        "client_handle": _HANDLE, "node_handle": _HANDLE, "rmw_client_handle": _HANDLE,
         "service_name": _NAME,
     },
     "rcl_timer_init": {"timer_handle": _HANDLE, "period": _NANOSECONDS},
     "rclcpp_timer_callback_added": {"timer_handle": _HANDLE, "callback": _HANDLE},
     "rclcpp_timer_link_node": {"timer_handle": _HANDLE, "node_handle": _HANDLE},
     "rclcpp_callback_register": {"callback": _HANDLE, "symbol": _NAME},
-    # What happens, again and again.
-    "callback_start": {"callback": _HANDLE, "is_intra_process": pl.Int32()},
+    # What happens, again and again. Timestamps of messages are DDS source timestamps:
+    # CLOCK_REALTIME, as the publisher wrote them.
+    "callback_start": {"callback": _HANDLE, "is_intra_process": _NUMBER},
     "callback_end": {"callback": _HANDLE},
     "rclcpp_publish": {"message": _HANDLE},
     "rclcpp_intra_publish": {"publisher_handle": _HANDLE, "message": _HANDLE},
     "rcl_publish": {"publisher_handle": _HANDLE, "message": _HANDLE},
     "rmw_publish": {
-        "rmw_publisher_handle": _HANDLE,
-        "message": _HANDLE,
-        "timestamp": _NANOSECONDS,  # the DDS source timestamp: CLOCK_REALTIME
+        "rmw_publisher_handle": _HANDLE, "message": _HANDLE, "timestamp": _NANOSECONDS,
     },
     "rmw_take": {
-        "rmw_subscription_handle": _HANDLE,
-        "message": _HANDLE,
-        "source_timestamp": _NANOSECONDS,  # CLOCK_REALTIME, as the publisher wrote it
-        "taken": pl.Int32(),
+        "rmw_subscription_handle": _HANDLE, "message": _HANDLE, "source_timestamp": _NANOSECONDS,
+        "taken": _NUMBER,
     },
     "rcl_take": {"message": _HANDLE},
     "rclcpp_take": {"message": _HANDLE},
@@ -123,69 +109,52 @@ FIELDS: dict[str, dict[str, pl.DataType]] = {
     "dds_write": {"message": _HANDLE},
     "dds_bind_addr_to_stamp": {"addr": _HANDLE, "source_stamp": _NANOSECONDS},
     "dispatch_subscription_callback": {
-        "message": _HANDLE,
-        "callback": _HANDLE,
-        "source_stamp": _NANOSECONDS,
+        "message": _HANDLE, "callback": _HANDLE, "source_stamp": _NANOSECONDS,
     },
     "rmw_implementation": {"rmw_impl": _NAME},
     # Intra-process communication: messages travel through ring buffers, not through DDS.
-    "rclcpp_construct_ring_buffer": {"buffer": _HANDLE, "capacity": pl.UInt64()},
+    "rclcpp_construct_ring_buffer": {"buffer": _HANDLE, "capacity": _COUNT},
     "rclcpp_buffer_to_ipb": {"buffer": _HANDLE, "ipb": _HANDLE},
     "rclcpp_ipb_to_subscription": {"ipb": _HANDLE, "subscription": _HANDLE},
     "rclcpp_ring_buffer_enqueue": {
-        "buffer": _HANDLE,
-        "index": pl.UInt64(),
-        "size": pl.UInt64(),
-        "overwritten": pl.Int32(),
+        "buffer": _HANDLE, "index": _COUNT, "size": _COUNT, "overwritten": _NUMBER,
     },
-    "rclcpp_ring_buffer_dequeue": {
-        "buffer": _HANDLE,
-        "index": pl.UInt64(),
-        "size": pl.UInt64(),
-    },
+    "rclcpp_ring_buffer_dequeue": {"buffer": _HANDLE, "index": _COUNT, "size": _COUNT},
     "rclcpp_ring_buffer_clear": {"buffer": _HANDLE},
     "rclcpp_executor_get_next_ready": {},
     "rclcpp_executor_wait_for_work": {"timeout": _NANOSECONDS},
     "rclcpp_executor_execute": {"handle": _HANDLE},
     "sched_switch": {
-        "prev_comm": _NAME,
-        "prev_tid": pl.Int32(),
-        "prev_prio": pl.Int32(),
-        "prev_state": pl.Int64(),
-        "next_comm": _NAME,
-        "next_tid": pl.Int32(),
-        "next_prio": pl.Int32(),
+        "prev_comm": _NAME, "prev_tid": _NUMBER, "prev_prio": _NUMBER, "prev_state": pl.Int64(),
+        "next_comm": _NAME, "next_tid": _NUMBER, "next_prio": _NUMBER,
     },
     # Ours: what the shaping node decided, when a message of an asynchronous publisher really
     # left, and what the machine did to everybody.
     "gate_release": {  # `time` is the instant at which the gate let the message go
         "callback": _HANDLE,  # the shaping node's subscription callback
-        "source_timestamp": _NANOSECONDS,  # of the message that was held
+        "source_timestamp": _NANOSECONDS,  # of the message that the gate delayed
         "arrival": _NANOSECONDS,
         "origin": _NANOSECONDS,  # the anchor the slots were counted from
         # Planned; `time` minus this is the gate's own error. Null: it was never let go.
         "release": _NANOSECONDS,
-        "slot": pl.Int32(),  # null: in none
-        "cycles_waited": pl.Int32(),  # 0: in its own cycle
-        "anchor": pl.String(),  # "stamp", or "cycle" (also when a stamp was unusable)
+        "slot": _NUMBER,  # null: in none
+        "cycles_waited": _NUMBER,  # 0: in its own cycle
+        "anchor": _NAME,  # "stamp", or "cycle" (also when a stamp was unusable)
     },
     "asynchronous_send": {  # `time` is when the publisher thread had the message in its hands
         "rmw_publisher_handle": _HANDLE,
         "timestamp": _NANOSECONDS,  # the DDS source timestamp of its `rmw_publish`
         # "sent"; "expired": older than its topic's lifespan; "overwritten": newer messages
         # had filled the history. The last two were never sent.
-        "outcome": pl.String(),
+        "outcome": _NAME,
         "duration": _NANOSECONDS,  # of sending
     },
-    "machine_stall": {  # `time` is when the sleeper should have woken, `cpu` where it sleeps
-        "duration": _NANOSECONDS,  # how late it woke
-    },
-    "machine_pace": {  # `time` is when a stretch of the sleeper's wake-ups began, on `cpu`
-        "duration": _NANOSECONDS,  # of the stretch
-        # CPU time of one wake-up in it. The work is the same each time: where it takes longer,
-        # the core runs at a slower pace.
-        "cpu_time": _NANOSECONDS,
-    },
+    # `time` is when the sleeper should have woken, `cpu` where it sleeps; how late it woke.
+    "machine_stall": {"duration": _NANOSECONDS},
+    # `time` is when a stretch of the sleeper's wake-ups began, on `cpu`; its duration, and the CPU
+    # time of one wake-up in it. The work is the same each time: where it takes longer, the core
+    # runs at a slower pace.
+    "machine_pace": {"duration": _NANOSECONDS, "cpu_time": _NANOSECONDS},
 }
 
 OPTIONAL_FIELDS: dict[str, dict[str, pl.DataType]] = {
@@ -193,19 +162,19 @@ OPTIONAL_FIELDS: dict[str, dict[str, pl.DataType]] = {
     # sched_switch.
     "callback_start": {"thread_time": _NANOSECONDS},
     "callback_end": {"thread_time": _NANOSECONDS},
-    # Not 0: a thread of its own sends what this publisher is given (`asynchronous_send`).
-    "rcl_publisher_init": {"asynchronous": pl.Int32()},
+    # Not 0: a thread of its own sends what this publisher gets (`asynchronous_send`).
+    "rcl_publisher_init": {"asynchronous": _NUMBER},
     "gate_release": {
         # Null: the message came in time; otherwise what was done about the overrun, "wait",
         # "discard" or "publish", or about a message behind its mode's slot, also "next-slot".
         # "bypass" and "silence" are a standby's: it published the message at once, or did not,
         # because no shaping node was there. Recordings from before there was a choice lack it.
-        "overrun": pl.String(),
-        "mode": pl.String(),  # of the message's cycle; null: the gate knows no modes
+        "overrun": _NAME,
+        "mode": _NAME,  # of the message's cycle; null: the gate knows no modes
         # Null: it left, or the recording is from before messages could wait. "replaced" by a newer
         # one of its cycle, "surplus" behind the first one of it, "overflowed" where newer ones
         # needed the room, "discarded" as an overrun.
-        "dropped": pl.String(),
+        "dropped": _NAME,
         "published": _NANOSECONDS,  # when publishing returned, in the log of a ROS 2 node
         # For how long behind the release neither the gate nor any other thread ran on its core,
         # in the same log: what the machine itself took.
@@ -217,6 +186,7 @@ OPTIONAL_FIELDS: dict[str, dict[str, pl.DataType]] = {
         "row": pl.Int64(),
     },
 }
+# fmt: on
 
 VERSION_FIELDS = {
     "rmw_publish": {"rmw_publisher_handle", "timestamp"},  # since Jazzy
@@ -226,7 +196,6 @@ VERSION_FIELDS = {
     "dispatch_subscription_callback": {"source_stamp"},
 }
 """Fields that not every version has, and that the analysis asks for as such."""
-
 
 CREATION = frozenset(
     name

@@ -2,9 +2,8 @@
 
 The folder is written beside its final place and renamed when it is complete, so a recording
 that exists is whole. `recording.json` says under which conditions the events were taken, and
-what was lost on the way: figures computed from a recording are only as good as these facts. It
-also has a checksum of every other file, which is compared when the file is read; the columns of
-all tables are looked at when the recording is opened.
+what was lost on the way. It also has a checksum of every other file, which is compared when the
+file is read; the columns of all tables are looked at when the recording is opened.
 """
 
 import io
@@ -20,12 +19,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import polars as pl
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.events import EventTables, as_table, column_problems
 from chainshaper.values.whole_file import open_to_all
-from chainshaper.values.yaml_file import explanations, key_text
+from chainshaper.values.yaml_file import in_words
 
 __all__ = [
     "EndpointInfo",
@@ -49,10 +48,8 @@ UNREADABLE = (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError)
 Integer: TypeAlias = Annotated[int, Field(ge=-(1 << 63), lt=1 << 63)]
 
 
-class ThreadInfo(BaseModel):
+class ThreadInfo(BaseModel, frozen=True):
     """One thread as the kernel reported it while the application ran (not as it was asked for)."""
-
-    model_config = ConfigDict(frozen=True)
 
     tid: Integer
     pid: Integer
@@ -64,15 +61,12 @@ class ThreadInfo(BaseModel):
     cores: tuple[Integer, ...]
 
 
-class EndpointInfo(BaseModel):
+class EndpointInfo(BaseModel, frozen=True):
     """A publisher or subscription with its QoS, as DDS discovery and the trace show them.
 
-    What neither tells is None: without ROS 2 at hand only the trace does, and not every RMW tells
-    others about its history. Durations are ns, None also where there is no limit. QoS words are
-    those of `ros2 topic info -v` in lower case.
+    What neither shows is None: not every RMW publishes its history. Durations are ns, None also
+    where there is no limit. QoS words are those of `ros2 topic info -v` in lower case.
     """
-
-    model_config = ConfigDict(frozen=True)
 
     node: str
     topic: str
@@ -88,15 +82,12 @@ class EndpointInfo(BaseModel):
     liveliness_lease_ns: Integer | None = None
 
 
-class StallMeterInfo(BaseModel):
+class StallMeterInfo(BaseModel, frozen=True):
     """How the machine was watched: a sleeper on every core of ``cores`` (ns throughout).
 
-    Stalls shorter than ``threshold_ns`` are not recorded. ``median_lateness_ns`` is what an
-    ordinary wake-up took on each core; ``realtime`` is false when the sleeper itself could be
-    pre-empted, so that its stalls may be ordinary scheduling.
+    Stalls shorter than ``threshold_ns`` are not recorded. ``median_lateness_ns`` is an ordinary
+    wake-up's on each core. Where ``realtime`` is false, stalls may be ordinary scheduling.
     """
-
-    model_config = ConfigDict(frozen=True)
 
     cores: tuple[Integer, ...]
     period_ns: Integer
@@ -106,30 +97,24 @@ class StallMeterInfo(BaseModel):
     realtime: bool
 
 
-class InForceInfo(BaseModel):
-    """When the plan was in force, of the time that was recorded (ns of CLOCK_MONOTONIC).
+class InForceInfo(BaseModel, frozen=True):
+    """When the plan was in force (ns of CLOCK_MONOTONIC; ``until_ns`` None: to the end).
 
-    From the start of the first cycle that was governed as a whole; ``until_ns`` is None where it
-    was in force to the end.
+    From the start of the first cycle that was governed as a whole.
     """
-
-    model_config = ConfigDict(frozen=True)
 
     since_ns: int
     until_ns: int | None = None
 
 
-class RecordingInfo(BaseModel):
-    """The facts of a recording that are not events. Times are ns of CLOCK_MONOTONIC.
+class RecordingInfo(BaseModel, frozen=True):
+    """The facts of a recording that are not events.
 
     ``clock_offset_ns`` is what to add to event times for CLOCK_REALTIME. ``lost`` counts events
     that are known to be missing, by reason. ``realtime`` says whether SCHED_FIFO was in force
-    for every thread it was asked for, ``notes`` what a reader of the figures must know.
-    ``trace_events`` are the events, by their full names, of the trace that it was converted from,
-    those included that no table keeps.
+    for every thread that was to have it, ``notes`` what a reader of the figures must know.
+    ``trace_events`` counts all events of the trace that it was converted from, by full name.
     """
-
-    model_config = ConfigDict(frozen=True)
 
     format: Integer = FORMAT
     source: str  # live, simulated, lttng, ebpf
@@ -157,12 +142,7 @@ class RecordingInfo(BaseModel):
 
 @dataclass(frozen=True)
 class Recording:
-    """An open recording: ``info`` and the event tables, read from disk when first asked for.
-
-    ``events`` behaves like a dictionary of frames, so every analysis function takes it as it is.
-    A trace that another tracer wrote is opened as a recording too
-    (:func:`chainshaper.sources.open_source`): what follows does not care.
-    """
+    """An open recording, or trace: ``info`` and the event tables, read at their first use."""
 
     path: Path
     info: RecordingInfo
@@ -283,10 +263,8 @@ def _read_info(file: Path) -> RecordingInfo:
     try:
         return RecordingInfo.model_validate_json(json.dumps(values), strict=True)
     except ValidationError as error:
-        problems = [
-            f"{key_text(where)}: {reason}" for where, reason in explanations(error, RecordingInfo)
-        ]
-        raise InputError(f"{file}: not a recording's description: {'; '.join(problems)}") from error
+        problems = in_words(error, RecordingInfo)
+        raise InputError(f"{file}: not a recording's description: {problems}") from error
 
 
 def refuse_existing(path: str | Path) -> Path:

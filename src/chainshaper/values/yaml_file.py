@@ -1,8 +1,7 @@
 """YAML files that people write: read them, and say exactly where they are wrong.
 
-A message such as ``robot.yaml:14: nodes.node3.callbacks[0].execution: …`` saves its reader the
-search. PyYAML knows the line of every key, Pydantic knows the path of every wrong value; here
-the two are put together.
+PyYAML knows the line of every key, Pydantic knows the path of every wrong value; a message has
+both: ``robot.yaml:14: nodes.node3.callbacks[0].execution: …``.
 """
 
 import difflib
@@ -37,6 +36,7 @@ __all__ = [
     "PositiveDuration",
     "compose",
     "explanations",
+    "in_words",
     "key_text",
     "read_model",
     "read_text",
@@ -167,25 +167,20 @@ def read_text(path: Path, made_by: str) -> str:
     Raises:
         InputError: it cannot be read, is no text in UTF-8, or larger than any such file.
     """
+    such = f"such a file is {made_by}"
     try:
         with path.open("rb") as file:
             content = file.read(LARGEST_FILE + 1)
     except OSError as error:
-        raise InputError(
-            f"{path}: cannot be read ({error.strerror}); such a file is {made_by}"
-        ) from error
+        raise InputError(f"{path}: cannot be read ({error.strerror}); {such}") from error
     if len(content) > LARGEST_FILE:
-        raise InputError(
-            f"{path}: larger than {LARGEST_FILE >> 20} MiB, the most that is read of such a file;"
-            f" such a file is {made_by}"
-        )
+        most = f"{LARGEST_FILE >> 20} MiB, the most that is read of such a file"
+        raise InputError(f"{path}: larger than {most}; {such}")
     try:
         return content.decode()
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
-        raise InputError(
-            f"{path}:{line}: not a text in UTF-8 ({error.reason}); such a file is {made_by}"
-        ) from error
+        raise InputError(f"{path}:{line}: not a text in UTF-8 ({error.reason}); {such}") from error
 
 
 def compose(text: str, name: str | Path) -> yaml.Node | None:
@@ -291,9 +286,8 @@ class PlainData:
             if key in values:
                 raise self._wrong(key_node, place, "stands here a second time: remove one")
             if self.ours and key.endswith("_ns"):
-                reason = (
-                    f"unknown key: write {key.removesuffix('_ns')!r}, and its value with a unit"
-                )
+                own = key.removesuffix("_ns")
+                reason = f"unknown key: write {own!r}, and its value with a unit"
                 raise self._wrong(key_node, place, reason)
             values[key] = self.of(value_node, place)
             self.lines[place] = key_node.start_mark.line + 1
@@ -306,23 +300,27 @@ class PlainData:
     def problems(self, error: ValidationError, model: type[BaseModel]) -> InputError:
         """What a model refused, each with its line."""
         said = [
-            f"{self.name}:{_line(self.lines, where)}: {key_text(where)}: {reason}"
+            f"{self.name}:{self._line(where)}: {key_text(where)}: {reason}"
             for where, reason in explanations(error, model)
         ]
         return InputError("\n".join(said))
 
-
-def _line(lines: dict[_Path, int], where: _Path) -> int:
-    # A missing key has no line of its own: the mapping it is missing from has.
-    while where and where not in lines:
-        where = where[:-1]
-    return lines.get(where, 1)
+    def _line(self, where: _Path) -> int:
+        # A missing key has no line of its own: the mapping it is missing from has.
+        while where and where not in self.lines:
+            where = where[:-1]
+        return self.lines.get(where, 1)
 
 
 def key_text(where: _Path) -> str:
     """``servers[1].slots[0]``"""
     text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in where)
     return text.removeprefix(".") or "the file"
+
+
+def in_words(error: ValidationError, model: type[BaseModel]) -> str:
+    """What a model refused, in one line."""
+    return "; ".join(f"{key_text(at)}: {reason}" for at, reason in explanations(error, model))
 
 
 def explanations(error: ValidationError, model: type[BaseModel]) -> list[tuple[_Path, str]]:

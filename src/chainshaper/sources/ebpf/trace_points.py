@@ -52,9 +52,14 @@ class TracingLibrary:
     version: str | None
 
     @property
+    def major(self) -> int | None:
+        """The first number of the version."""
+        return None if self.version is None else int(self.version.partition(".")[0])
+
+    @property
     def handles_at_rmw(self) -> bool:
         """Whether `rmw_publish` of this version names its publisher."""
-        return self.version is None or int(self.version.partition(".")[0]) >= 8
+        return self.major is None or self.major >= 8
 
 
 @dataclass(frozen=True)

@@ -14,23 +14,6 @@ from llvmlite import ir  # type: ignore[import-untyped]
 from numba import njit, types
 from numba.extending import intrinsic as typed_intrinsic
 
-__all__ = [
-    "compiled",
-    "get",
-    "load_byte",
-    "load_half",
-    "load_word",
-    "put",
-    "store_byte",
-    "store_half",
-    "store_long",
-    "store_word",
-    "swap_bytes",
-    "table_at",
-    "trailing_zeros",
-]
-
-
 intrinsic: Any = typed_intrinsic  # which takes types, where kernels give numbers
 
 
@@ -38,8 +21,7 @@ def compiled(*, inline: bool = False) -> Callable[[Callable[..., Any]], Any]:
     """``njit`` for functions of numbers, as they are called by each other.
 
     ``inline`` has the compiler put the function into its callers, where a call would cost more
-    than what it does. Python calls them by way of
-    :func:`~chainshaper.values.compiled.loading.kernel`.
+    than what it does. Python calls them by way of :func:`~chainshaper.values.compiled.kernel`.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
