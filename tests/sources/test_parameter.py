@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper.sources.ros import parameter
+from chainshaper.sources.ros import script
 from chainshaper.sources.ros.interpreter import Environment, run_with_rclpy
 
 RCLPY = '''
@@ -72,5 +72,5 @@ def test_an_answer_is_believed_where_one_participant_can_have_given_it(
     (tmp_path / "ros2").chmod(0o755)
     variables = {"PATH": str(tmp_path), "PYTHONPATH": str(tmp_path)}
     environment = Environment({**variables, "SERVERS": servers, "COUNTS": counts}, os.geteuid())
-    arguments = ("phase_ns", "7", "/shaper")
-    assert run_with_rclpy(environment, parameter.__file__, *arguments, within_s=30)[1] == problem
+    arguments = ("parameter", "phase_ns", "7", "/shaper")
+    assert run_with_rclpy(environment, script.__file__, *arguments, within_s=30)[1] == problem

@@ -18,7 +18,7 @@ from ros2 import ros2_environment
 from chainshaper.planning import Modes, Plan
 from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log
-from chainshaper.sources.ros import parameter as ros_parameter
+from chainshaper.sources.ros import script as ros_script
 from chainshaper.sources.ros.interpreter import own_environment, run_with_rclpy
 from chainshaper.splicing.generated_package import build_package
 from chainshaper.splicing.shaping_process import (
@@ -196,7 +196,7 @@ def test_a_running_node_is_told_where_cycles_begin(
     phase = 12_345_678
     with started(process, workspace), ThreadPoolExecutor() as beside:
         coming = beside.submit(exchanged, "best_effort", 200)
-        arguments = (ros_parameter.__file__, "phase_ns", str(phase), "/nobody", node)
+        arguments = (ros_script.__file__, "parameter", "phase_ns", str(phase), "/nobody", node)
         said = run_with_rclpy(own_environment(), *arguments, within_s=30)
         coming.result()
     assert said == ("", "/nobody offers no parameters"), "and the other was told"

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from chainshaper.enforcement.threads.allocation import Allocation
 from chainshaper.planning import Plan
 from chainshaper.planning.plan import shaping_nodes
-from chainshaper.sources.ros import parameter as ros_parameter
+from chainshaper.sources.ros import script as ros_script
 from chainshaper.sources.ros.interpreter import (
     Environment,
     Script,
@@ -86,8 +86,8 @@ def tell_phase(plan: Plan, found: Allocation, phase_ns: int) -> Telling:
         nodes = tuple(node for node, one in environments.items() if _is_ros(one))
         if not nodes:  # they are the live workload's
             return NOBODY
-        arguments = ("phase_ns", str(phase_ns % plan.cycle_ns), *nodes)
-        script = start_with_rclpy(environments[nodes[0]], ros_parameter.__file__, *arguments)
+        arguments = ("parameter", "phase_ns", str(phase_ns % plan.cycle_ns), *nodes)
+        script = start_with_rclpy(environments[nodes[0]], ros_script.__file__, *arguments)
     except OperationError as error:
         return Telling(tuple(pids), None, 0.0, str(error))
     return Telling(nodes, script, time.monotonic())

@@ -7,10 +7,10 @@ reads the blocks around them (``trace``, ``stream``, ``event``, …) into a `Tra
 from __future__ import annotations
 
 import re
+from collections import ChainMap, Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from typing import Literal, NamedTuple, NoReturn, TypeVar
 
 from chainshaper.sources.ctf.types import (
@@ -58,6 +58,7 @@ _TOKEN = re.compile(
     """,
     re.VERBOSE | re.DOTALL,
 )
+_NANOSECONDS = 1_000_000_000
 _MOST = 4_000_000
 """Tokens that fit into memory; a kernel trace with all its events has some 100,000."""
 _ESCAPE = re.compile(r"\\(x[0-9a-fA-F]{1,2}|[0-7]{1,3}|.)", re.DOTALL)
@@ -214,30 +215,12 @@ _DEEPEST = 32
 
 
 @dataclass
-class _Scope:
-    """Type names visible at one place: ``struct x``, ``enum x``, ``variant x`` and aliases."""
-
-    parent: _Scope | None = None
-    names: dict[str, Type] = field(default_factory=dict)
-
-    def find(self, name: str) -> Type | None:
-        """The innermost declaration of ``name``."""
-        scope: _Scope | None = self
-        while scope is not None:
-            if name in scope.names:
-                return scope.names[name]
-            scope = scope.parent
-        return None
-
-
-@dataclass
 class _Parser:
     """A position in a list of tokens and the type names known there."""
 
     tokens: list[Token]
     position: int = 0
-    scope: _Scope = field(default_factory=_Scope)
-    depth: int = 0
+    scope: ChainMap[str, Type] = field(default_factory=ChainMap)
 
     @property
     def token(self) -> Token:
@@ -272,13 +255,11 @@ class _Parser:
     def block(self) -> Iterator[None]:
         """Braces with a type scope of their own; nesting is bounded against hostile files."""
         self.expect("{")
-        if self.depth >= _DEEPEST:
+        if len(self.scope.maps) > _DEEPEST:
             self.fail(f"more than {_DEEPEST} nested blocks")
-        self.depth += 1
-        outer, self.scope = self.scope, _Scope(self.scope)
+        self.scope = self.scope.new_child()
         yield
-        self.scope = outer
-        self.depth -= 1
+        self.scope = self.scope.parents
         self.expect("}")
 
     def path(self) -> str:
@@ -353,7 +334,7 @@ class _Parser:
             words.pop()
             self.position -= 1
         name = " ".join(word for word in words if word != "const")
-        found = self.scope.find(name)
+        found = self.scope.get(name)
         if found is None:
             self.position = start
             self.fail(f"unknown type {name!r}")
@@ -362,20 +343,17 @@ class _Parser:
     def _named(self, keyword: str) -> str:
         """The optional name behind ``struct``, ``variant`` or ``enum``."""
         self.expect(keyword)
-        return f"{keyword} {self.take('word')}" if self.token.kind == "word" else ""
+        named = self.token.kind == "word" and not (keyword == "struct" and self.at("align"))
+        return f"{keyword} {self.take('word')}" if named else ""
 
     def _lookup(self, name: str) -> Type:
-        found = self.scope.find(name) if name else None
+        found = self.scope.get(name) if name else None
         if found is None:
             self.fail(f"unknown type {name!r}" if name else "expected '{'")
         return found
 
     def _struct(self) -> Type:
-        if self.tokens[self.position + 1].text == "align":
-            name = ""
-            self.expect("struct")
-        else:
-            name = self._named("struct")
+        name = self._named("struct")
         if not self.at("{"):
             return self._lookup(name)
         fields = self._fields()
@@ -386,7 +364,7 @@ class _Parser:
             self.expect(")")
         kind = StructType(tuple(fields), max([align, *(alignment(f.type) for f in fields)]))
         if name:
-            self.scope.names[name] = kind
+            self.scope[name] = kind
         return kind
 
     def _variant(self) -> Type:
@@ -398,7 +376,7 @@ class _Parser:
         if self.at("{"):
             kind = VariantType(tag, tuple(self._fields()))
             if name:
-                self.scope.names[name] = replace(kind, tag=None)
+                self.scope[name] = replace(kind, tag=None)
             return kind
         found = self._lookup(name)
         if not isinstance(found, VariantType):
@@ -415,11 +393,9 @@ class _Parser:
                     self.expect(";")
                 if len(fields) > 10_000:
                     self.fail("more than 10000 fields")
-        names = [f.name for f in fields]
-        if len(set(names)) != len(names):
-            ordered = sorted(names)
-            twice = next(a for a, b in pairwise(ordered) if a == b)
-            self.fail(f"field {twice!r} declared twice")
+        for name, count in Counter(f.name for f in fields).most_common(1):
+            if count > 1:
+                self.fail(f"field {name!r} declared twice")
         return fields
 
     def _declarators(self, kind: Type) -> Iterator[Field]:
@@ -453,7 +429,7 @@ class _Parser:
         if not self.at("{"):
             return self._lookup(name)
         if container is None:
-            container = self.scope.find("int")
+            container = self.scope.get("int")
         if isinstance(container, EnumType):
             container = container.container
         if not isinstance(container, IntegerType):
@@ -477,7 +453,7 @@ class _Parser:
         self.expect("}")
         kind = EnumType(container, tuple(mappings))
         if name:
-            self.scope.names[name] = kind
+            self.scope[name] = kind
         return kind
 
     def declaration(self) -> bool:
@@ -493,11 +469,11 @@ class _Parser:
                 if self.token.kind == "end":
                     self.fail("expected ';'")
                 self.position += 1
-            self.scope.names[" ".join(words)] = kind
+            self.scope[" ".join(words)] = kind
         elif self.accept("typedef"):
             kind = self.type(declares=True)
             for declared in self._declarators(kind):
-                self.scope.names[declared.name] = declared.type
+                self.scope[declared.name] = declared.type
         elif self.token.text in ("struct", "variant", "enum") and self.token.kind == "word":
             start = self.position
             self.type(declares=False)
@@ -510,9 +486,6 @@ class _Parser:
         return True
 
 
-_NANOSECONDS = 1_000_000_000
-
-
 def parse_tsdl(text: str) -> TraceClass:
     """Parse a whole metadata text.
 
@@ -520,10 +493,10 @@ def parse_tsdl(text: str) -> TraceClass:
     something undeclared, or declares something twice.
     """
     parser = _Parser(_tokens(text))
-    reader = _Blocks(parser)
+    blocks = _Blocks(parser)
     while parser.token.kind != "end":
-        reader.block()
-    return reader.finish()
+        blocks.read()
+    return blocks.finish()
 
 
 class _Blocks:
@@ -537,7 +510,7 @@ class _Blocks:
         self.streams: dict[int, StreamClass] = {}
         self.events: dict[tuple[int | None, int | None], tuple[EventClass, int]] = {}
 
-    def block(self) -> None:
+    def read(self) -> None:
         parser = self.parser
         offset = parser.token.offset
         if parser.declaration():
@@ -583,24 +556,18 @@ class _Blocks:
                 parser.expect(";")
         return found
 
-    def _clock(self, values: dict[str, tuple[Value, int]], offset: int) -> None:
-        def integer(name: str, default: int) -> int:
-            value, at = values.get(name, (default, offset))
-            if not isinstance(value, int):
-                raise TsdlError(at, f"clock {name} must be an integer, not {value!r}")
-            return value
-
+    def _clock(self, values: Attributes, offset: int) -> None:
         name = values.get("name", (None, 0))[0]
-        frequency = integer("freq", _NANOSECONDS)
+        frequency = _number(values, "freq", _NANOSECONDS)
         if not isinstance(name, str):
             raise TsdlError(offset, "clock without a name")
         if not 0 < frequency <= 10**10:
             raise TsdlError(offset, f"clock frequency of {frequency} Hz; up to 10 GHz supported")
-        cycles = integer("offset", 0)
+        seconds, cycles = _number(values, "offset_s", 0), _number(values, "offset", 0)
         self.clocks[name] = Clock(
             name=name,
             frequency=frequency,
-            offset_ns=integer("offset_s", 0) * _NANOSECONDS + cycles * _NANOSECONDS // frequency,
+            offset_ns=seconds * _NANOSECONDS + cycles * _NANOSECONDS // frequency,
             uuid=str(values["uuid"][0]) if "uuid" in values else None,
         )
 
@@ -608,12 +575,9 @@ class _Blocks:
         identifier = _integer(values, "id", offset) or 0
         if identifier in self.streams:
             raise TsdlError(offset, f"stream {identifier} declared twice")
-        self.streams[identifier] = StreamClass(
-            id=identifier,
-            packet_context=_struct(values, "packet.context", offset),
-            event_header=_struct(values, "event.header", offset),
-            event_context=_struct(values, "event.context", offset),
-        )
+        scopes = ("packet.context", "event.header", "event.context")
+        packet, header, context = (_struct(values, scope, offset) for scope in scopes)
+        self.streams[identifier] = StreamClass(identifier, packet, header, context)
 
     def _event(self, values: dict[str, Value | Type], offset: int) -> None:
         stream_id = _integer(values, "stream_id", offset)
@@ -623,12 +587,8 @@ class _Blocks:
             raise TsdlError(offset, "event without a name")
         if (stream_id, identifier) in self.events:
             raise TsdlError(offset, f"event {name!r}: id {identifier} declared twice")
-        event = EventClass(
-            id=identifier or 0,
-            name=name,
-            context=_struct(values, "context", offset),
-            fields=_struct(values, "fields", offset),
-        )
+        context, fields = (_struct(values, scope, offset) for scope in ("context", "fields"))
+        event = EventClass(identifier or 0, name, context, fields)
         self.events[stream_id, identifier] = (event, offset)
 
     def finish(self) -> TraceClass:

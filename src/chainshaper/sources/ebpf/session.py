@@ -412,7 +412,7 @@ def _boot_time_ahead() -> int:
 def _commands(tables: EventTables) -> dict[int, str]:
     """Process → the name of its main thread as `sched_switch` has it, empty if unknown."""
     switches = events.table(tables, "sched_switch").select("next_tid", "next_comm")
-    names = dict(switches.iter_rows())
+    names = dict(switches.unique("next_tid", keep="last").iter_rows())
     pids = {
         pid for name, t in tables.items() if name != "sched_switch" for pid in t["pid"].unique()
     }

@@ -1,8 +1,8 @@
 """Running a script with the `rclpy` of an application that runs: its Python, its environment.
 
 The Python that has `rclpy` is seldom ours, and domain and RMW are those of the application's nodes.
-So a small script of its own asks ROS 2 what has to be asked, in a process of its own:
-:mod:`.graph` (:func:`ask_graph`) and :mod:`.parameter`.
+So a small script of its own asks ROS 2 what has to be asked (:mod:`.script`), in a process of its
+own.
 
 An environment says which programs and libraries are loaded: who wrote it chooses what runs. So this
 is the one place where something is run that was found through another process, and it runs with
@@ -38,7 +38,7 @@ from typing import Any
 from chainshaper.linux.scheduling import signalled_with_parent
 from chainshaper.linux.threads import read_proc
 from chainshaper.linux.users import process_folder, user_in, user_name
-from chainshaper.sources.ros import graph as ros_graph
+from chainshaper.sources.ros import script as ros_script
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import EndpointInfo
 
@@ -253,9 +253,8 @@ def ask_graph(environment: Environment) -> tuple[tuple[EndpointInfo, ...], str |
     Returns:
         The endpoints, and why there are none, if so.
     """
-    said, problem = run_with_rclpy(
-        environment, ros_graph.__file__, str(_PATIENCE_S), within_s=_PATIENCE_S + _START_S
-    )
+    asked = (ros_script.__file__, "graph", str(_PATIENCE_S))
+    said, problem = run_with_rclpy(environment, *asked, within_s=_PATIENCE_S + _START_S)
     if problem is not None:
         return (), problem
     try:

@@ -1,0 +1,149 @@
+"""What is asked of a ROS 2 that runs, by the Python of its installation.
+
+    python3 script.py graph [SECONDS]
+    python3 script.py parameter NAME VALUE NODE...
+
+This file is run, not imported: by the interpreter that has `rclpy`, in the environment of the
+application, where nothing of ours may be installed. So it needs nothing but `rclpy` (Humble or
+later).
+
+`graph` prints one JSON object: ``endpoints``, one per publisher and subscription of each topic with
+type and QoS, two of a kind included. Discovery is over when nothing new has appeared for two
+seconds, or after SECONDS (10). Durations are ns; null where the application set none, or the RMW
+does not tell.
+
+`parameter` sets an integer parameter. It ends with an error that names each node which has no such
+parameter, refuses the value, or does not answer in time; all of them together have five seconds.
+Who answers is whoever offers the service under the node's name: DDS does not prove who that is
+without its security plug-ins (SROS 2). All that offer it are asked, the node among them; where
+there are several (rclpy counts them since Jazzy), an answer says nothing, and that is an error.
+"""
+
+import importlib
+import json
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+SNAPSHOT = "_chainshaper_snapshot"  # nodes' names; hidden: `ros2 node list` does not show them
+SETTER = "_chainshaper_parameter"
+QUIET_S, LOOK_S = 2.0, 0.2
+ANSWER_S, SPIN_S = 5.0, 0.05
+INFINITE_NS = 1 << 62
+"""Durations beyond are no durations: RMW_DURATION_INFINITE, and what RMWs make of it."""
+
+
+def main() -> None:
+    """Join the graph, do what is asked, leave."""
+    what, *arguments = sys.argv[1:]
+    if what == "graph":
+        print_graph(*(float(seconds) for seconds in arguments))
+    else:
+        set_parameter(*arguments)
+
+
+@contextmanager
+def node_named(name: str) -> "Iterator[tuple[Any, Any]]":
+    """`rclpy` and a node, for as long as it is used."""
+    rclpy: Any = importlib.import_module("rclpy")
+    rclpy.init(args=[])
+    node = rclpy.create_node(name, enable_rosout=False, start_parameter_services=False)
+    try:
+        yield rclpy, node
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
+
+
+def print_graph(patience: float = 10.0) -> None:
+    """Print the graph once it is known."""
+    with node_named(SNAPSHOT) as (_, node):
+        begun = quiet_since = time.monotonic()
+        known = -1
+        found: list[dict[str, Any]] = []
+        while time.monotonic() - quiet_since < QUIET_S and time.monotonic() - begun < patience:
+            found = endpoints(node)
+            if len(found) != known:
+                known, quiet_since = len(found), time.monotonic()
+            time.sleep(LOOK_S)
+        json.dump({"endpoints": found}, sys.stdout)
+
+
+def endpoints(node: Any) -> list[dict[str, Any]]:
+    """All publishers and subscriptions that ``node`` knows of, its own left out."""
+    found = []
+    for topic, _ in node.get_topic_names_and_types():
+        for kind, infos in (
+            ("publisher", node.get_publishers_info_by_topic(topic)),
+            ("subscription", node.get_subscriptions_info_by_topic(topic)),
+        ):
+            found += [_as_json(topic, kind, info) for info in infos if info.node_name != SNAPSHOT]
+    return found
+
+
+def _as_json(topic: str, kind: str, info: Any) -> dict[str, Any]:
+    qos = info.qos_profile
+    words = ("reliability", "durability", "history", "liveliness")
+    durations = {
+        "deadline_ns": qos.deadline,
+        "lifespan_ns": qos.lifespan,
+        "liveliness_lease_ns": qos.liveliness_lease_duration,
+    }
+    return {
+        "node": info.node_namespace.rstrip("/") + "/" + info.node_name,
+        "topic": topic,
+        "kind": kind,
+        "type": info.topic_type,
+        "depth": qos.depth,
+        **{word: getattr(qos, word).name.lower() for word in words},
+        **{name: _nanoseconds(duration) for name, duration in durations.items()},
+    }
+
+
+def _nanoseconds(duration: Any) -> "int | None":
+    nanoseconds = int(duration.nanoseconds)
+    return nanoseconds if 0 < nanoseconds < INFINITE_NS else None
+
+
+def set_parameter(name: str, value: str, *nodes: str) -> None:
+    """Call the service ``set_parameters`` of all nodes at once."""
+    with node_named(SETTER) as (rclpy, node):
+        service: Any = importlib.import_module("rcl_interfaces.srv").SetParameters
+        parameter: Any = importlib.import_module("rclpy.parameter").Parameter
+        wanted = parameter(name, parameter.Type.INTEGER, int(value)).to_parameter_msg()
+        request = service.Request(parameters=[wanted])
+        clients = {one: node.create_client(service, f"{one}/set_parameters") for one in nodes}
+        answers: dict[str, Any] = {}
+        until = time.monotonic() + ANSWER_S
+        while time.monotonic() < until:
+            for one, client in clients.items():
+                if one not in answers and client.service_is_ready():
+                    answers[one] = client.call_async(request)
+            rclpy.spin_once(node, timeout_sec=SPIN_S)
+            if len(answers) == len(nodes) and all(answer.done() for answer in answers.values()):
+                break
+        count = getattr(node, "count_services", lambda _: 1)
+        offered = {one: count(f"{one}/set_parameters") for one in nodes}
+    asked = [_problem(one, name, answers.get(one), offered[one]) for one in nodes]
+    problems = [problem for problem in asked if problem is not None]
+    if problems:
+        sys.exit("; ".join(problems))
+
+
+def _problem(node: str, name: str, answer: Any, offered: int) -> "str | None":
+    if offered > 1:
+        return f"{offered} participants answer for {node}, so none of them is believed"
+    if answer is None:
+        return f"{node} offers no parameters"
+    if not answer.done():
+        return f"{node} did not answer"
+    (result,) = answer.result().results
+    if result.successful:
+        return None
+    return f"{node} refused {name}: {result.reason or 'no reason given'}"
+
+
+if __name__ == "__main__":
+    main()
