@@ -130,7 +130,7 @@ def scaled(folder: Path, base: tuple[str, dict[int, list[EventRecord]]], events:
             encode_packet(
                 declared,
                 found[start : start + 2000],
-                {"cpu_id": cpu, "packet_seq_num": first + place, "events_discarded": 0},
+                {"cpu_id": cpu, "packet_seq_num": first + place},
                 instance=cpu,
                 stamps=STAMPS,
             )

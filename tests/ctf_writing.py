@@ -47,6 +47,7 @@ __all__ = [
     "metadata_packets",
     "repeat_packets",
     "write_lttng_trace",
+    "write_packet",
     "write_trace",
 ]
 
@@ -177,7 +178,7 @@ def _encode_array(bits: _Bits, kind: ArrayType | SequenceType, value: Any, depth
 def encode_packet(
     declared: TraceClass,
     records: Sequence[EventRecord],
-    context: Mapping[str, Any],
+    context: Mapping[str, Any] | None = None,
     *,
     stream_id: int = 0,
     instance: int = 0,
@@ -187,7 +188,8 @@ def encode_packet(
     """One packet of ``records``, which are in order of time.
 
     ``context`` gives the packet context's fields that cannot be told from the events
-    (``cpu_id``, ``packet_seq_num``, ``events_discarded``); ``padding`` bytes follow the content.
+    (``cpu_id``, ``packet_seq_num``, ``events_discarded``, by default 0); ``padding`` bytes follow
+    the content.
     ``stamps`` names 64-bit fields of payloads that hold times: `repeat_packets` moves them too.
     """
     stream = declared.streams[stream_id]
@@ -201,7 +203,8 @@ def encode_packet(
         "timestamp_end": records[-1].time if records else begin,
         "content_size": 0,
         "packet_size": 0,
-        **context,
+        **dict.fromkeys(("cpu_id", "packet_seq_num", "events_discarded"), 0),
+        **(context or {}),
     }
 
     def head(bits: _Bits) -> _Bits:
@@ -300,6 +303,11 @@ def repeat_packets(
                 value = int.from_bytes(data[place : place + 8], order) + by
                 data[place : place + 8] = value.to_bytes(8, order)
             yield bytes(data)
+
+
+def write_packet(folder: Path, metadata: str, records: Sequence[EventRecord]) -> None:
+    """Write a trace of one packet."""
+    write_trace(folder, metadata, {"channel_0": [encode_packet(parse_tsdl(metadata), records)]})
 
 
 def write_trace(

@@ -5,20 +5,17 @@ from typing import Any
 
 import pytest
 from command_line import called, json_of
-from ctf_writing import EventRecord, encode_packet, lttng_metadata, write_trace
+from ctf_writing import EventRecord, lttng_metadata, write_packet
 from test_lttng_trace import START, chain_story, written
 
 from chainshaper.sources import open_source
-from chainshaper.sources.ctf.tsdl import parse_tsdl
 
 
 def one_event(folder: Path, name: str, kinds: dict[str, str], payload: dict[str, Any]) -> None:
     """A trace of a single event, of process 10."""
     text = lttng_metadata({name: kinds}, {"vpid": "s32", "vtid": "s32"})
     event = EventRecord(name, START, payload, {"vpid": 10, "vtid": 10})
-    about = {"cpu_id": 0, "packet_seq_num": 0, "events_discarded": 0}
-    packet = encode_packet(parse_tsdl(text), [event], about)
-    write_trace(folder, text, {"channel_0": [packet]})
+    write_packet(folder, text, [event])
 
 
 def test_another_providers_events_of_the_same_name_are_not_ours(tmp_path: Path) -> None:
@@ -50,9 +47,7 @@ def test_events_of_nobody_knows_which_thread_are_counted_and_left_out(tmp_path: 
     """LTTng without contexts; `ros2 trace` always asks for them."""
     text = lttng_metadata({"ros2:callback_start": {"callback": "x64"}}, {"procname": "char[17]"})
     event = EventRecord("ros2:callback_start", START, {"callback": 1}, {"procname": "node"})
-    about = {"cpu_id": 0, "packet_seq_num": 0, "events_discarded": 0}
-    packet = encode_packet(parse_tsdl(text), [event, event], about)
-    write_trace(tmp_path / "trace", text, {"channel_0": [packet]})
+    write_packet(tmp_path / "trace", text, [event, event])
     for verb in ("callbacks", "graph", "chains"):
         said = called(verb, tmp_path / "trace")
         assert said.code == 0

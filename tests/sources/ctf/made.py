@@ -95,7 +95,7 @@ def make_trace(
         for number in range(packets):
             part = records(100 * seed + 10 * cpu + number, events, kinds, context, start=start)
             start = part[-1].time
-            about = {"cpu_id": cpu, "packet_seq_num": number, "events_discarded": 0}
+            about = {"cpu_id": cpu, "packet_seq_num": number}
             encoded.append(encode_packet(declared, part, about, instance=cpu, padding=cpu * 8))
             made += part
         files[f"channel_{cpu}"] = encoded

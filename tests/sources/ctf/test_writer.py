@@ -9,6 +9,7 @@ from ctf_writing import (
     encode_packet,
     lttng_metadata,
     repeat_packets,
+    write_packet,
     write_trace,
 )
 from made import START, USER_CONTEXT, USER_EVENTS, make_trace, records
@@ -72,9 +73,7 @@ def test_kernel_beside_user_space_and_per_process_folders(tmp_path: Path) -> Non
 def test_metadata_as_plain_text(tmp_path: Path) -> None:
     made = records(5, 30)
     text = lttng_metadata(USER_EVENTS, USER_CONTEXT)
-    packet = encode_packet(
-        parse_tsdl(text), made, {"cpu_id": 0, "packet_seq_num": 0, "events_discarded": 0}
-    )
+    packet = encode_packet(parse_tsdl(text), made)
     write_trace(tmp_path, text, {"a": [packet]}, packetized=False)
     assert_equal_to_babeltrace(tmp_path)
     with pytest.raises(FileExistsError):
@@ -89,7 +88,7 @@ def test_losses_are_counted(tmp_path: Path, files: Any) -> None:
     for number, (sequence, discarded) in enumerate([(3, 2), (4, 2), (9, 12), (10, 13)]):
         part = records(number, 10, start=start)
         start = part[-1].time + 1
-        about = {"cpu_id": 0, "packet_seq_num": sequence, "events_discarded": discarded}
+        about = {"packet_seq_num": sequence, "events_discarded": discarded}
         packets.append(encode_packet(declared, part, about))
     if files == 1:
         write_trace(tmp_path, text, {"a": packets})
@@ -109,7 +108,7 @@ def test_losses_before_the_first_packet_of_a_stream_count(tmp_path: Path) -> Non
         encode_packet(
             declared,
             [EventRecord("e", START + number)],
-            {"cpu_id": 0, "packet_seq_num": number, "events_discarded": discarded},
+            {"packet_seq_num": number, "events_discarded": discarded},
         )
         for number, discarded in enumerate([(1 << 32) - 2, 3])
     ]
@@ -119,9 +118,7 @@ def test_losses_before_the_first_packet_of_a_stream_count(tmp_path: Path) -> Non
 
 def test_repeated_packets_go_on_in_time(tmp_path: Path) -> None:
     text = lttng_metadata(USER_EVENTS, USER_CONTEXT)
-    packet = encode_packet(
-        parse_tsdl(text), records(1, 50), {"cpu_id": 0, "packet_seq_num": 0, "events_discarded": 0}
-    )
+    packet = encode_packet(parse_tsdl(text), records(1, 50))
     period = 1 << 42
     write_trace(tmp_path, text, {"a": repeat_packets([packet], 5, period)})
     trace, frames = assert_equal_to_babeltrace(tmp_path)
@@ -137,7 +134,7 @@ def test_equal_times_stand_in_order_of_the_files(tmp_path: Path) -> None:
     files = {}
     for cpu in (2, 0, 1):
         same = [EventRecord("e", START, {"n": 10 * cpu + i}) for i in range(2)]
-        about = {"cpu_id": cpu, "packet_seq_num": 0, "events_discarded": 0}
+        about = {"cpu_id": cpu}
         files[f"channel_{cpu}"] = [encode_packet(declared, same, about, instance=cpu)]
     write_trace(tmp_path, text, files)
     assert read_events(open_trace(tmp_path))["e"]["n"].to_list() == [0, 1, 10, 11, 20, 21]
@@ -162,14 +159,12 @@ def test_many_spans_and_threads_give_the_same_frames(
 def test_many_different_strings(tmp_path: Path) -> None:
     """The dictionary grows while columns are being filled."""
     text = lttng_metadata({"e": {"s": "string", "t": "char[24]", "n": "u8[]"}})
-    declared = parse_tsdl(text)
     made = [
         EventRecord("e", START + i, {"s": f"{i:x}" * (i % 4), "t": f"text {i}", "_n_length": i % 3,
                                      "n": [i & 255] * (i % 3)})
         for i in range(4000)
     ]  # fmt: skip
-    about = {"cpu_id": 0, "packet_seq_num": 0, "events_discarded": 0}
-    write_trace(tmp_path, text, {"a": [encode_packet(declared, made, about)]})
+    write_packet(tmp_path, text, made)
     frame = read_events(open_trace(tmp_path))["e"]
     assert frame["s"].to_list() == [event.payload["s"] for event in made]
     assert frame["t"].to_list() == [event.payload["t"] for event in made]
