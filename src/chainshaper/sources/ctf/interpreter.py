@@ -27,7 +27,6 @@ from chainshaper.values.compiled.memory import (
 )
 
 # Numba mixes int64 and uint64 into float64: every value below keeps to one of the two.
-# Kernels take many numbers rather than objects, whose references Numba would have to count.
 
 
 @compiled(inline=True)
@@ -143,7 +142,6 @@ def rehash(machine, count):
 
 
 # Numba mixes int64 and uint64 into float64: every value below keeps to one of the two.
-# Kernels take many numbers rather than objects, whose references Numba would have to count.
 
 
 @compiled()

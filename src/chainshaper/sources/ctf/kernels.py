@@ -5,8 +5,7 @@ mean.
 """
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
-# ruff: noqa: PLR0911, PLR0917
-# ruff: noqa: PLR0917
+# ruff: noqa: PLR0911, PLR0917 - numbers rather than objects, whose references Numba would count
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from chainshaper.sources.ctf import tables as tb
 from chainshaper.sources.ctf.interpreter import advance_clock, afforded, execute, move_batch
 from chainshaper.values.compiled.memory import compiled, get, load_word, put, store_long, store_word
 
-# Kernels take many numbers rather than objects, which Numba would have to count references to.
+A_ALL = tb.A_ROW * tb.AHEAD
 
 
 @compiled(inline=True)
@@ -262,12 +261,6 @@ def walk_events(
                 put(rows, counter, get(rows, counter) + 1)
             position = after
     return border
-
-
-# Kernels take many numbers rather than objects, which Numba would have to count references to.
-
-
-A_ALL = tb.A_ROW * tb.AHEAD
 
 
 @compiled()

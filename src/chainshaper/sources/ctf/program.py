@@ -135,18 +135,10 @@ class Number:
 
 
 @dataclass(slots=True, eq=False)
-class Text:
-    """A string that ends with NUL."""
-
-    slot: int
-    level: int
-
-
-@dataclass(slots=True, eq=False)
 class Characters:
-    """An array or sequence of bytes that is text, up to its first NUL."""
+    """Text up to its first NUL: an array or sequence of bytes, or a string (``count`` None)."""
 
-    count: int
+    count: int | None
     length: Number | None
     slot: int
     level: int
@@ -175,7 +167,7 @@ class Choice:
     level: int
 
 
-Step = Align | Number | Text | Characters | Repeat | Choice
+Step = Align | Number | Characters | Repeat | Choice
 Frame = dict[str, "Number | Frame | None"]
 
 
@@ -261,7 +253,8 @@ class Reader:
                 return self._number(name, kind, at)
             case StringType():
                 slot = self._slot(at, "u4")
-                return [Text(slot, at.level)], TextShape(slot) if at.keep else None
+                text = Characters(None, None, slot, at.level)
+                return [text], TextShape(slot) if at.keep else None
             case StructType():
                 return self._record(name, kind, at)
             case ArrayType() | SequenceType():
@@ -481,8 +474,6 @@ class Program:
                     self._skip(align, 0)
                 case Number():
                     self._number(step, storage)
-                case Text():
-                    self._row(tb.TEXT, {tb.O_ALIGN: 8, **_place(step, storage)})
                 case Characters():
                     self._characters(step, storage)
                 case Repeat():
@@ -509,7 +500,9 @@ class Program:
     def _characters(self, step: Characters, storage: Storage | None) -> None:
         place = _place(step, storage)
         own = {tb.O_ALIGN: 8, tb.O_REGISTER: _register(step.length)}
-        if place:
+        if step.count is None:
+            self._row(tb.TEXT, own | place)
+        elif place:
             self._row(tb.CHARACTERS, {**own, tb.O_COUNT: step.count, **place})
         elif step.length is None:
             self._skip(8, 8 * step.count)
@@ -573,9 +566,7 @@ class Program:
         self.joint = len(self.rows)
 
 
-def _place(
-    step: Number | Text | Characters | Repeat | Choice, storage: Storage | None
-) -> dict[int, int]:
+def _place(step: Number | Characters | Repeat | Choice, storage: Storage | None) -> dict[int, int]:
     """The columns of an operation that say where its value goes; none where it is not wanted."""
     if step.slot < 0 or storage is None or not storage.addresses:
         return {}
@@ -620,7 +611,7 @@ def _fixed(steps: list[Step]) -> tuple[int, int] | None:
                 part = (align, 0)
             case Number(size=size, align=align, register=-1, clock=False):
                 part = (align, size)
-            case Characters(count=count, length=None):
+            case Characters(count=int(count), length=None):
                 part = (8, 8 * count)
             case Repeat(align=align, count=count, length=None, body=body):
                 element = _fixed(body)
@@ -640,10 +631,8 @@ def _least(steps: list[Step]) -> int:
         match step:
             case Number(size=size):
                 total += size
-            case Text():
-                total += 8
             case Characters(count=count):
-                total += 8 * count
+                total += 8 if count is None else 8 * count
             case Repeat(count=count, body=body):
                 total += count * _least(body)
             case Choice(options=options):
