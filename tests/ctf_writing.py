@@ -361,10 +361,7 @@ trace {{
 	uuid = "{uuid}";
 	byte_order = {order};
 	packet.header := struct {{
-		uint32_t magic;
-		uint8_t  uuid[16];
-		uint32_t stream_id;
-		uint64_t stream_instance_id;
+		uint32_t magic; uint8_t  uuid[16]; uint32_t stream_id; uint64_t stream_instance_id;
 	}};
 }};
 
@@ -385,20 +382,12 @@ clock {{
 	offset = {offset};
 }};
 
-typealias integer {{
-	size = 27; align = 1; signed = false;
-	map = clock.monotonic.value;
-}} := uint27_clock_monotonic_t;
-
-typealias integer {{
-	size = 32; align = {a32}; signed = false;
-	map = clock.monotonic.value;
-}} := uint32_clock_monotonic_t;
-
-typealias integer {{
-	size = 64; align = {a64}; signed = false;
-	map = clock.monotonic.value;
-}} := uint64_clock_monotonic_t;
+typealias integer {{ size = 27; align = 1; signed = false; map = clock.monotonic.value; }}
+	:= uint27_clock_monotonic_t;
+typealias integer {{ size = 32; align = {a32}; signed = false; map = clock.monotonic.value; }}
+	:= uint32_clock_monotonic_t;
+typealias integer {{ size = 64; align = {a64}; signed = false; map = clock.monotonic.value; }}
+	:= uint64_clock_monotonic_t;
 
 struct packet_context {{
 	uint64_clock_monotonic_t timestamp_begin;
@@ -413,26 +402,16 @@ struct packet_context {{
 struct event_header_compact {{
 	enum : uint5_t {{ compact = 0 ... 30, extended = 31 }} id;
 	variant <id> {{
-		struct {{
-			uint27_clock_monotonic_t timestamp;
-		}} compact;
-		struct {{
-			uint32_t id;
-			uint64_clock_monotonic_t timestamp;
-		}} extended;
+		struct {{ uint27_clock_monotonic_t timestamp; }} compact;
+		struct {{ uint32_t id; uint64_clock_monotonic_t timestamp; }} extended;
 	}} v;
 }} align({a32});
 
 struct event_header_large {{
 	enum : uint16_t {{ compact = 0 ... 65534, extended = 65535 }} id;
 	variant <id> {{
-		struct {{
-			uint32_clock_monotonic_t timestamp;
-		}} compact;
-		struct {{
-			uint32_t id;
-			uint64_clock_monotonic_t timestamp;
-		}} extended;
+		struct {{ uint32_clock_monotonic_t timestamp; }} compact;
+		struct {{ uint32_t id; uint64_clock_monotonic_t timestamp; }} extended;
 	}} v;
 }} align({a16});
 
@@ -539,7 +518,7 @@ def write_lttng_trace(
         if not chosen:
             continue
         in_kernel = part == "kernel"
-        declared = {
+        kinds = {
             _full_name(name): {
                 column: _kind(kind, gid_length)
                 for column, kind in frame.schema.items()
@@ -550,11 +529,21 @@ def write_lttng_trace(
         context = {"vpid": "s32", "vtid": "s32", "procname": f"char[{_CHARACTERS + 1}]"}
         if in_kernel:
             context = {"pid": "s32", "tid": "s32"}
-        text = lttng_metadata(
-            declared, context, kernel=in_kernel, offset=clock_offset_ns, host=host
-        )
+        text = lttng_metadata(kinds, context, kernel=in_kernel, offset=clock_offset_ns, host=host)
         records = _records(chosen, names, in_kernel)
-        _write(folder / part, text, records, 0 if in_kernel else discarded_events)
+        declared, streams = parse_tsdl(text), {}
+        for cpu, found in sorted(records.items()):
+            dropped = discarded_events if not in_kernel and cpu == min(records) else 0
+            streams[f"channel_{cpu}"] = [
+                encode_packet(
+                    declared,
+                    found[start : start + _PACKET_EVENTS],
+                    {"cpu_id": cpu, "packet_seq_num": number, "events_discarded": dropped},
+                    instance=cpu,
+                )
+                for number, start in enumerate(range(0, len(found), _PACKET_EVENTS))
+            ]
+        write_trace(folder / part, text, streams)
     return folder
 
 
@@ -588,22 +577,3 @@ def _records(
     for found in records.values():
         found.sort(key=lambda record: record.time)
     return records
-
-
-def _write(
-    folder: Path, text: str, records: dict[int, list[EventRecord]], discarded_events: int
-) -> None:
-    declared = parse_tsdl(text)
-    streams = {}
-    for cpu, found in sorted(records.items()):
-        packets = []
-        for number, start in enumerate(range(0, len(found), _PACKET_EVENTS)):
-            about = {
-                "cpu_id": cpu,
-                "packet_seq_num": number,
-                "events_discarded": discarded_events if cpu == min(records) else 0,
-            }
-            part = found[start : start + _PACKET_EVENTS]
-            packets.append(encode_packet(declared, part, about, instance=cpu))
-        streams[f"channel_{cpu}"] = packets
-    write_trace(folder, text, streams)

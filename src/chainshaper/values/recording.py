@@ -23,7 +23,7 @@ from pydantic import BaseModel, Field, ValidationError
 
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.events import EventTables, as_table, column_problems
-from chainshaper.values.whole_file import open_to_all
+from chainshaper.values.whole_file import free_place, open_to_all
 from chainshaper.values.yaml_file import in_words
 
 __all__ = [
@@ -268,20 +268,12 @@ def _read_info(file: Path) -> RecordingInfo:
 
 
 def refuse_existing(path: str | Path) -> Path:
-    """The path, once it is sure that nothing of the user's is there to be overwritten.
-
-    Asked before a run begins, so that nobody loses a minute to learn it at the end.
-    """
+    """The path, once it is sure that a folder can be written there and nothing overwritten."""
     path = Path(path)
-    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
-        raise InputError(
-            f"{path} exists already and is not overwritten: name another, or remove it"
-        )
+    free_place(path, path.exists() and not (path.is_dir() and not any(path.iterdir())))
     if os.path.ismount(path) or (path.exists() and path.samefile(".")):
         raise InputError(f"{path} cannot be replaced by a new folder: name one inside it")
     parent = path.absolute().parent
-    if not parent.is_dir():
-        raise InputError(f"{parent}: no such folder to write {path.name} into")
     if not os.access(parent, os.W_OK | os.X_OK):
         raise InputError(f"{parent}: no permission to write {path.name} into it: name another")
     return path

@@ -1,4 +1,4 @@
-"""A new file, written whole or not at all, and never over another."""
+"""A new file, written whole or not at all, and never over another; a place for a new folder."""
 
 import os
 import tempfile
@@ -7,28 +7,36 @@ from pathlib import Path
 
 from chainshaper.values.errors import InputError, OperationError
 
-__all__ = ["new_file", "open_to_all", "write_whole"]
+__all__ = ["free_place", "new_file", "open_to_all", "write_whole"]
 
 
-def new_file(path: str | Path, endings: tuple[str, ...] = ()) -> Path:
-    """The path, once it is sure that a file of this kind can be made there.
+def free_place(path: Path, taken: bool) -> Path:
+    """The path, if it is not ``taken`` by what is the user's, and its folder is there.
 
-    Asked before long work begins, so that nobody waits to learn it at the end.
+    Asked before long work begins, so that its user need not wait to learn it at the end.
 
     Raises:
-        InputError: it exists, its folder does not, or it ends in none of ``endings``, if
-            there are any.
+        InputError: it is taken, or its folder does not exist.
     """
-    path = Path(path)
-    if endings and path.suffix not in endings:
-        raise InputError(f"{path}: write to a file that ends in {' or '.join(endings)}")
-    if path.exists():
+    if taken:
         raise InputError(
             f"{path} exists already and is not overwritten: name another, or remove it"
         )
     if not path.absolute().parent.is_dir():
         raise InputError(f"{path.absolute().parent}: no such folder to write {path.name} into")
     return path
+
+
+def new_file(path: str | Path, endings: tuple[str, ...] = ()) -> Path:
+    """The path, once it is sure that a file of this kind can be made there.
+
+    Raises:
+        InputError: as :func:`free_place`, or it ends in none of ``endings``, if there are any.
+    """
+    path = Path(path)
+    if endings and path.suffix not in endings:
+        raise InputError(f"{path}: write to a file that ends in {' or '.join(endings)}")
+    return free_place(path, path.exists())
 
 
 def write_whole(path: Path, parts: Iterable[bytes]) -> Path:
