@@ -277,7 +277,8 @@ def test_without_the_privileges_nothing_is_changed_and_the_missing_one_is_named(
 def test_steps_of_the_wall_clock_are_not_seen() -> None:
     """Setting the clock would disturb all else on the machine, so this is read from the source.
 
-    `gate/decision.py` alone reads the wall clock, since messages are stamped with it; its tests step it.
+    `gate/decision.py` alone reads the wall clock, since messages are stamped with it; its tests
+    step it.
     """
     package = Path(enforcement.__file__).parents[1]
     rooms = [*(package / room for room in ("enforcement", "gate", "linux"))]
