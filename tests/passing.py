@@ -2,7 +2,7 @@
 
 import time
 
-from chainshaper.gate.decision import Held, Release, Shaper
+from chainshaper.gate.decision import Outcome, Release, Shaper
 
 __all__ = ["decided", "held"]
 
@@ -15,7 +15,7 @@ def decided(shaper: Shaper, payload: bytes, arrival_ns: int) -> Release:
     return release
 
 
-def held(shaper: Shaper, payload: bytes = b"no header") -> Held:
+def held(shaper: Shaper, payload: bytes = b"no header") -> Outcome:
     """What becomes of a message that comes now."""
     shaper.arrive(payload, time.monotonic_ns())
     result = shaper.hold()

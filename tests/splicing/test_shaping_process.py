@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 import yaml
@@ -251,19 +252,20 @@ def test_messages_leave_unchanged_inside_their_slot(
 def test_every_release_is_rehearsed_twice_where_there_is_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    ros = SimpleNamespace(Node=object, Empty=object)
-    for module in ("rclpy", "rclpy.node", "std_msgs", "std_msgs.msg"):
-        monkeypatch.setitem(sys.modules, module, ros)
-    readiness = importlib.import_module("chainshaper.splicing.nodes.python.readiness")
+    parts = ("clock", "executors", "node", "parameter", "qos", "subscription")
+    messages = ("rcl_interfaces", "rcl_interfaces.msg", "std_msgs", "std_msgs.msg")
+    for module in ("rclpy", *(f"rclpy.{part}" for part in parts), *messages):
+        monkeypatch.setitem(sys.modules, module, MagicMock())
+    shaping_node = importlib.import_module("chainshaper.splicing.nodes.python.shaping_node")
     published: list[bytes] = []
     node = SimpleNamespace(
         create_publisher=lambda *_: SimpleNamespace(publish=published.append),
         get_logger=lambda: SimpleNamespace(warning=lambda _: None),
     )
-    ready = readiness.Readiness(node, None, 0)
+    ready = shaping_node.Readiness(node, None, 0)
     for releases in (1, 2, 3):
         ready.get_ready(time.monotonic_ns() + 60_000 * MS)
-        assert published == [readiness.EMPTY] * 2 * releases
+        assert published == [shaping_node.EMPTY] * 2 * releases
     ready.get_ready(time.monotonic_ns())
     assert len(published) == 6, "there was no time left"
     ready.relax()

@@ -34,8 +34,6 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 
-__all__ = ["FIELDS", "Page", "Standby", "Turn", "open_page", "page_folders"]
-
 FIELDS = (
     "holder",  # the shaping node in force, a process id; 0 while the standby has the lock
     "taken",  # how many messages shaping nodes have begun with
@@ -66,6 +64,12 @@ _TOPIC_BYTES = 256
 _SIZE = 8 * _TOPIC + _TOPIC_BYTES
 _PUBLISHING, _STANDING_BY, _PASSING = 0, 1, 2  # the bytes of the file that are locked
 _FLOCK = "hhqqi4x"  # struct flock: type, whence, start, length, process
+
+GIVE_UP_NS = 50_000_000
+"""A node waits so long for a standby, which needs the lock for a fraction of a millisecond."""
+
+AT_ONCE_NS = 30_000_000_000
+"""A node that deals with no message for so long has not failed at once."""
 
 BACK_OFF_AFTER = 3
 """So many starts may fail at once; then each waits twice as long as the one before."""
@@ -240,14 +244,11 @@ class Turn:
     Messages are named by their source timestamps; where that is not known (None), none is left out.
     """
 
-    GIVE_UP_NS = 50_000_000  # the standby needs the lock for a fraction of a millisecond
-    AT_ONCE_NS = 30_000_000_000
-
     def __init__(self, name: str, topic: str) -> None:
         self._name, self._topic, self._gave_up = name, topic, False
         self._open()
         now = time.monotonic_ns()
-        if now - self.page["started_ns"] > self.AT_ONCE_NS:
+        if now - self.page["started_ns"] > AT_ONCE_NS:
             self.page["failed_starts"] = 0
         self.page["started_ns"] = now
         self.page["starts"] += 1
@@ -293,7 +294,7 @@ class Turn:
         count = self.page["bypassed"]
         if count != self._seen:
             # What the standby is about to publish comes first.
-            give_up = time.monotonic_ns() + self.GIVE_UP_NS
+            give_up = time.monotonic_ns() + GIVE_UP_NS
             while self.page.is_passing and time.monotonic_ns() < give_up:
                 time.sleep(0.0001)
             self._bypassed = frozenset(self.page.noted(bypassed=True))
@@ -322,7 +323,7 @@ class Turn:
         self.page.note(key, bypassed=False)
 
     def _come_into_force(self, key: int | None) -> bool:
-        give_up = time.monotonic_ns() + self.GIVE_UP_NS
+        give_up = time.monotonic_ns() + GIVE_UP_NS
         while not self.page.lock():
             if _is_alive(self.page["holder"]):  # another shaping node
                 return False

@@ -17,8 +17,6 @@ from chainshaper.gate.decision import STALL_NS
 from chainshaper.values import events
 from chainshaper.values.errors import InputError
 
-__all__ = ["read_gate_log", "releases_so_far", "rows_missing", "with_gate_logs"]
-
 _LATER = ("dropped", "lost", "row")
 """Columns that logs have since messages may wait at a gate."""
 

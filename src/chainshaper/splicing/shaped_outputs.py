@@ -18,8 +18,6 @@ from chainshaper.gate.handover import Page, page_folders
 from chainshaper.values.durations import format_duration
 from chainshaper.values.yaml_file import FullName
 
-__all__ = ["ShapedOutput", "find_outputs", "output_text"]
-
 OutputState: TypeAlias = Literal["shaped", "bypassed", "silent", "no standby"]
 _TOPIC: TypeAdapter[str] = TypeAdapter(FullName)
 

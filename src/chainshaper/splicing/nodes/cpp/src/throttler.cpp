@@ -1,14 +1,12 @@
 // The throttler: a strictly periodic start for chains whose input is not quite periodic (Managing
 // End-to-End Timing Jitters in ROS2 Computation Chains, section 5.1).
 //
-// Each topic of `inputs` is republished on the topic of `outputs` in the same place, once every
-// `period_ns`, at `phase_ns` after multiples of it on CLOCK_MONOTONIC: the newest message that
-// came since the last time. Where none came nothing is published, and where several came the
-// older ones are dropped; both are counted, and said at the end. chainshaper's Python throttler does
-// the same, and says why that is not the paper's rule to the letter.
+// chainshaper's Python throttler does the same; its source says what that is, and why it is not the
+// paper's rule to the letter.
 
 #include <memory>
 #include <string>
+#include <tuple>
 #include <vector>
 
 #include "chainshaper_shaping/node.hpp"
@@ -56,18 +54,14 @@ int main(int argc, char ** argv)
   std::vector<std::unique_ptr<Channel>> channels;
   const int code = chainshaper::run(
     argc, argv, "chainshaper_throttler", [&](rclcpp::Node & node) -> std::function<bool()> {
-      using Names = std::vector<std::string>;
-      const auto inputs = chainshaper::parameter<Names>(node, "inputs", {});
-      const auto outputs = chainshaper::parameter<Names>(node, "outputs", {});
-      const auto period = chainshaper::parameter<std::int64_t>(node, "period_ns", 0);
-      const auto phase = chainshaper::parameter<std::int64_t>(node, "phase_ns", 0);
-      const auto depth = chainshaper::parameter<std::int64_t>(node, "output_depth", 10);
+      const auto parameters = chainshaper::parameters_of(node);
+      const auto & [inputs, outputs] = std::tie(parameters.inputs, parameters.outputs);
+      const auto period = parameters.period_ns;
       if (inputs.empty() || inputs.size() != outputs.size() || period <= 0) {
         throw std::invalid_argument("inputs, as many outputs, and a period are needed");
       }
       for (std::size_t i = 0; i < inputs.size(); ++i) {
-        const auto offer =
-        chainshaper::wait_for_publisher(node, inputs[i], static_cast<std::size_t>(depth));
+        const auto offer = chainshaper::wait_for_publisher(node, inputs[i]);
         if (!offer) {
           return {};
         }
@@ -75,7 +69,7 @@ int main(int argc, char ** argv)
         Channel & channel = *channels.back();
         channel.output = outputs[i];
         channel.publisher =
-        node.create_generic_publisher(outputs[i], offer->type, offer->publisher);
+          node.create_generic_publisher(outputs[i], offer->type, offer->publisher);
         channel.subscription = chainshaper::subscribe_serialized(
           node, inputs[i], offer->type, offer->subscription,
           [&channel](std::shared_ptr<rclcpp::SerializedMessage> message, const rclcpp::MessageInfo &) {
@@ -83,8 +77,8 @@ int main(int argc, char ** argv)
           });
       }
       // A timer keeps the phase at which it was made, on the same clock.
-      const std::int64_t since = chainshaper::monotonic_ns() - phase;
-      chainshaper::sleep_until(phase + (since / period + 1) * period);
+      const std::int64_t since = chainshaper::monotonic_ns() - parameters.phase_ns;
+      chainshaper::sleep_until(parameters.phase_ns + (since / period + 1) * period);
       for (auto & channel : channels) {
         channel->timer = node.create_wall_timer(
           std::chrono::nanoseconds(period), [&node, &channel] {publish(node, *channel);});

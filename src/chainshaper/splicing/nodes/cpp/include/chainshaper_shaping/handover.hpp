@@ -2,8 +2,7 @@
 // shaping node's side; what the two agree on, and why, is said in `handover.py` (`Turn`), which has
 // the same page: numbers of 8 bytes, two rings of messages, and the output's name. No ROS 2 here.
 
-#ifndef CHAINSHAPER_SHAPING__HANDOVER_HPP_
-#define CHAINSHAPER_SHAPING__HANDOVER_HPP_
+#pragma once
 
 #include <fcntl.h>
 #include <signal.h>
@@ -26,13 +25,6 @@
 
 namespace chainshaper
 {
-
-// The numbers at the beginning of a page, in their order.
-enum class Field
-{
-  holder, taken, first, acknowledged, until_ns, released, phase_ns, phase_known, mode, started_ns,
-  failed_starts, starts, standby, listening, silent, bypassing_since_ns, bypassed, bypassed_before
-};
 
 class Page
 {
@@ -98,7 +90,7 @@ public:
   void note_released(std::int64_t key)
   {
     const auto number = get(Field::released);
-    write(released_at + static_cast<std::size_t>(number) % ring, key);
+    write(released_at + static_cast<std::size_t>(number) % page_ring, key);
     set(Field::released, number + 1);
   }
 
@@ -106,26 +98,16 @@ public:
   std::vector<std::int64_t> bypassed() const
   {
     std::vector<std::int64_t> found;
-    found.reserve(ring);
-    for (std::size_t place = bypassed_at; place < bypassed_at + ring; ++place) {
+    found.reserve(page_ring);
+    for (std::size_t place = bypassed_at; place < bypassed_at + page_ring; ++place) {
       found.push_back(read(place));
     }
     std::sort(found.begin(), found.end());
     return found;
   }
 
-  static constexpr std::size_t ring = 1024;
-  static constexpr int version = 1;  // of the layout: part of a page's name
-
 private:
-  static constexpr std::size_t released_at = 32;
-  static constexpr std::size_t bypassed_at = released_at + ring;
-  static constexpr std::size_t topic_at = bypassed_at + ring;
-  static constexpr std::size_t topic_bytes = 256;
   static constexpr off_t size = 8 * topic_at + topic_bytes;
-  static constexpr off_t publishing = 0;  // the bytes of the file that are locked
-  static constexpr off_t standing_by = 1;
-  static constexpr off_t passing = 2;
 
   static struct flock region(off_t byte)
   {
@@ -207,7 +189,7 @@ inline std::unique_ptr<Page> open_page(
   const std::vector<std::string> & folders = page_folders())
 {
   const auto domain = std::to_string(std::atoi(text_in_environment("ROS_DOMAIN_ID").c_str()));
-  const auto file = name + "." + domain + ".v" + std::to_string(Page::version);
+  const auto file = name + "." + domain + ".v" + std::to_string(page_version);
   std::string problem = "no folder";
   for (const bool make : {false, true}) {
     for (const auto & folder : folders) {
@@ -303,7 +285,7 @@ public:
         sleep_until(monotonic_ns() + 100'000);
       }
       bypassed_ = page_->bypassed();
-      if (seen_ >= 0 && count - seen_ > static_cast<std::int64_t>(Page::ring)) {
+      if (seen_ >= 0 && count - seen_ > static_cast<std::int64_t>(page_ring)) {
         oldest_ = bypassed_.front();  // older ones were, too
       }
       seen_ = count;
@@ -338,10 +320,6 @@ public:
   void drop(std::int64_t key) {page_->note_released(key);}
 
 private:
-  static constexpr std::int64_t at_once_ns = 30'000'000'000;
-  static constexpr std::int64_t give_up_ns = 50'000'000;
-  static constexpr std::int64_t back_off_after = 3;
-
   static bool is_alive(std::int64_t pid)
   {
     return pid > 0 && kill(static_cast<pid_t>(pid), 0) == 0;
@@ -398,5 +376,3 @@ private:
 };
 
 }  // namespace chainshaper
-
-#endif  // CHAINSHAPER_SHAPING__HANDOVER_HPP_

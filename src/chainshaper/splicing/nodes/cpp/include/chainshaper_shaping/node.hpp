@@ -2,8 +2,7 @@
 // quality of service of a topic's publisher, real-time scheduling of the calling thread, and the
 // shaping of one message. Written for Humble to Rolling; where they differ, it is said.
 
-#ifndef CHAINSHAPER_SHAPING__NODE_HPP_
-#define CHAINSHAPER_SHAPING__NODE_HPP_
+#pragma once
 
 #include <dlfcn.h>
 #include <sched.h>
@@ -17,7 +16,6 @@
 #include <memory>
 #include <optional>
 #include <string>
-#include <thread>
 #include <utility>
 #include <vector>
 
@@ -34,19 +32,22 @@
 namespace chainshaper
 {
 
-template<typename T>
-T parameter(rclcpp::Node & node, const std::string & name, const T & otherwise)
-{
-  T value{};
-  node.get_parameter_or(name, value, otherwise);
-  return value;
-}
-
 // Parameters come from the file only: what is in it, is declared.
 inline std::shared_ptr<rclcpp::Node> make_node(const std::string & name)
 {
   return std::make_shared<rclcpp::Node>(
     name, rclcpp::NodeOptions().automatically_declare_parameters_from_overrides(true));
+}
+
+inline Parameters parameters_of(rclcpp::Node & node)
+{
+  Parameters found;
+  found.each(
+    [&](const char * name, auto & value) {
+      const auto otherwise = value;
+      node.get_parameter_or(name, value, otherwise);
+    });
+  return found;
 }
 
 // A publisher as others know it, and the QoS with which to subscribe to it and to stand in for it.
@@ -93,10 +94,10 @@ inline bool wait(double seconds)
   return rclcpp::ok();
 }
 
-// Wait until somebody publishes a topic; none when the process is to stop.
-inline std::optional<Offer> wait_for_publisher(
-  rclcpp::Node & node, const std::string & topic, std::size_t depth)
+// Wait until a topic has a publisher; none when the process is to stop.
+inline std::optional<Offer> wait_for_publisher(rclcpp::Node & node, const std::string & topic)
 {
+  const auto depth = static_cast<std::size_t>(parameters_of(node).output_depth);
   const std::string name = node.get_node_topics_interface()->resolve_topic_name(topic);
   bool said = false;
   while (rclcpp::ok()) {
@@ -118,7 +119,7 @@ inline std::optional<Offer> wait_for_publisher(
       RCLCPP_INFO(node.get_logger(), "waiting for a publisher of %s", name.c_str());
       said = true;
     }
-    std::this_thread::sleep_for(std::chrono::milliseconds(10));
+    wait(0.01);
   }
   return std::nullopt;
 }
@@ -128,8 +129,8 @@ inline std::optional<Offer> wait_for_publisher(
 // of DDS must not; later ones do not get the class. What is not permitted is warned of.
 inline void become_realtime(rclcpp::Node & node)
 {
-  const auto core = parameter<std::int64_t>(node, "core", -1);
-  const auto priority = parameter<std::int64_t>(node, "fifo_priority", 0);
+  const auto parameters = parameters_of(node);
+  const auto core = parameters.core;
   const auto warn = [&](const char * what, const char * remedy) {
       RCLCPP_WARN(
         node.get_logger(), "%s: %s; it works on without: %s", what, std::strerror(errno), remedy);
@@ -137,9 +138,9 @@ inline void become_realtime(rclcpp::Node & node)
   if (mlockall(MCL_CURRENT | MCL_FUTURE) != 0) {
     warn("memory cannot be locked", "give the user a memlock limit of unlimited");
   }
-  if (priority > 0) {
+  if (parameters.fifo_priority > 0) {
     sched_param wanted{};
-    wanted.sched_priority = static_cast<int>(priority);
+    wanted.sched_priority = static_cast<int>(parameters.fifo_priority);
     if (sched_setscheduler(0, SCHED_FIFO | SCHED_RESET_ON_FORK, &wanted) != 0) {
       warn("SCHED_FIFO is refused", "give the user an rtprio limit of 98");
     }
@@ -154,62 +155,10 @@ inline void become_realtime(rclcpp::Node & node)
   }
 }
 
-inline Policy policy_named(const std::string & name)
-{
-  for (std::size_t i = 0; i < policy_names.size(); ++i) {
-    if (name == policy_names[i]) {
-      return static_cast<Policy>(i);
-    }
-  }
-  throw std::invalid_argument("there is no policy '" + name + "' for late messages");
-}
-
-inline Messages messages_named(const std::string & name)
-{
-  for (std::size_t i = 0; i < messages_names.size(); ++i) {
-    if (name == messages_names[i]) {
-      return static_cast<Messages>(i);
-    }
-  }
-  throw std::invalid_argument("there is no choice '" + name + "' of messages");
-}
-
-inline Gate gate_from(rclcpp::Node & node, const rclcpp::QoS & offered)
-{
-  using Numbers = std::vector<std::int64_t>;
-  Gate gate;
-  const auto bounds = parameter<Numbers>(node, "slots_ns", {});
-  for (std::size_t i = 0; i + 1 < bounds.size(); i += 2) {
-    gate.slots.push_back({bounds[i], bounds[i + 1]});
-  }
-  gate.cycle_ns = parameter<std::int64_t>(node, "cycle_ns", 0);
-  gate.phase_ns = parameter<std::int64_t>(node, "phase_ns", 0);
-  gate.due_cycles = parameter<std::int64_t>(node, "due_cycles", 0);
-  gate.overrun = policy_named(parameter<std::string>(node, "overrun", "wait"));
-  gate.messages = messages_named(parameter<std::string>(node, "messages", "all-in-order"));
-  const auto depth = parameter<std::int64_t>(node, "depth", 0);
-  gate.depth = depth > 0 ? static_cast<std::size_t>(depth) : std::max(gate.depth, offered.depth());
-  const bool by_stamp = parameter<std::string>(node, "anchor", "stamp") == "stamp";
-  gate.anchor = by_stamp ? Anchor::stamp : Anchor::cycle;
-  if (!parameter<std::string>(node, "mode_topic", "").empty()) {
-    Modes modes;
-    modes.names = parameter<std::vector<std::string>>(node, "mode_names", {});
-    for (const auto slot : parameter<Numbers>(node, "mode_slots", {})) {
-      modes.bands.push_back(static_cast<std::size_t>(slot));
-    }
-    const auto initial = modes.find(parameter<std::string>(node, "mode_default", ""));
-    modes.initial = initial.value_or(modes.names.size());
-    modes.late = policy_named(parameter<std::string>(node, "mode_late", "wait"));
-    gate.modes = modes;
-  }
-  return gate;
-}
-
 // Where DDS threads deliver the output: the first core that is ours to use and has no server. None
 // where the plan does not name its servers' cores, because it leaves receivers alone.
-inline std::optional<std::size_t> delivery_core(rclcpp::Node & node)
+inline std::optional<std::size_t> delivery_core(const std::vector<std::int64_t> & taken)
 {
-  const auto taken = parameter<std::vector<std::int64_t>>(node, "server_cores", {});
   cpu_set_t ours;
   if (taken.empty() || sched_getaffinity(0, sizeof(ours), &ours) != 0) {
     return std::nullopt;
@@ -228,7 +177,7 @@ inline std::optional<std::size_t> delivery_core(rclcpp::Node & node)
 // core; so this comes before anything that may fail.
 inline std::optional<Turn> turn_of(rclcpp::Node & node)
 {
-  const auto page = parameter<std::string>(node, "handover", "");
+  const auto page = parameters_of(node).handover;
   if (page.empty()) {
     return std::nullopt;
   }
@@ -292,10 +241,10 @@ public:
   using Pointer = std::shared_ptr<Message>;
 
   Shaping(rclcpp::Node & node, const Offer & offer, std::optional<Turn> turn)
-  : node_(node), pause_ns_(parameter<std::int64_t>(node, "pause_ns", 0)), turn_(std::move(turn)),
-    readiness_(node, delivery_core(node), pause_ns_),
+  : node_(node), parameters_(parameters_of(node)), turn_(std::move(turn)),
+    readiness_(node, delivery_core(parameters_.server_cores), parameters_.pause_ns),
     shaper_(
-      gate_from(node, offer.publisher), parameter<std::int64_t>(node, "spin_ns", 0),
+      gate_of(parameters_, depth_for(parameters_, offer.publisher)), parameters_.spin_ns,
       [this](std::int64_t release_ns) {readiness_.get_ready(release_ns);}, [] {},
       [this](const Release & release, std::int64_t phase_ns) {
         if (turn_) {
@@ -306,9 +255,8 @@ public:
     if (turn_) {
       go_on();
     }
-    const auto log = parameter<std::string>(node, "log", "");
-    const auto most_bytes = parameter<std::int64_t>(node, "log_bytes", 100'000'000);
-    if (!log.empty() && !log_.open_file(log, most_bytes)) {
+    const auto & log = parameters_.log;
+    if (!log.empty() && !log_.open_file(log, parameters_.log_bytes)) {
       RCLCPP_WARN(
         node.get_logger(), "no log is written to %s: %s", log.c_str(), std::strerror(errno));
     }
@@ -338,7 +286,7 @@ public:
   // delivered when it is asked for, and only if its publisher keeps it.
   void listen_to_modes()
   {
-    const auto topic = parameter<std::string>(node_, "mode_topic", "");
+    const auto & topic = parameters_.mode_topic;
     if (topic.empty()) {
       return;
     }
@@ -413,8 +361,8 @@ public:
       shaper_.queue.leave({}, monotonic_ns());
       return;
     }
-    const auto held = shaper_.hold();
-    if (!held) {
+    const auto outcome = shaper_.hold();
+    if (!outcome) {
       return;
     }
     if (turn_ && turn_->was_bypassed(key)) {
@@ -423,9 +371,9 @@ public:
     }
     std::optional<std::int64_t> published_ns;
     std::optional<std::int64_t> stalled_ns;
-    if (held->release.at_ns) {
+    if (outcome->release.at_ns) {
       try {
-        topics_.publish(*held->waiting.message);
+        topics_.publish(*outcome->waiting.message);
       } catch (const rclcpp::exceptions::RCLError &) {
         if (rclcpp::ok()) {
           throw;
@@ -436,13 +384,13 @@ public:
       if (turn_) {
         turn_->done(key);
       }
-      stalled_ns = shaper_.time_lost(*held);
-      shaper_.rest(*published_ns, pause_ns_);
+      stalled_ns = shaper_.time_lost(*outcome);
+      shaper_.rest(*published_ns, parameters_.pause_ns);
     } else if (turn_) {
       turn_->done(key);
     }
     readiness_.relax();
-    note(*held, published_ns, stalled_ns);
+    note(*outcome, published_ns, stalled_ns);
   }
 
   // Deal with what waits at the gate, each by the subscription's callback, until there is time for
@@ -467,9 +415,14 @@ public:
   }
 
 private:
-  static constexpr std::size_t reader_depth = 1000;
-
   std::size_t depth() const {return shaper_.queue.gate.depth;}
+
+  // How many messages may wait: what the publisher's history has, where it is not said.
+  static std::size_t depth_for(const Parameters & parameters, const rclcpp::QoS & offered)
+  {
+    return parameters.depth > 0 ? static_cast<std::size_t>(parameters.depth) :
+           std::max(default_depth, offered.depth());
+  }
 
   static rclcpp::QoS deeper(rclcpp::QoS qos, std::size_t depth)
   {
@@ -497,10 +450,10 @@ private:
 
   // Losses are said when they happen, at most every ten seconds.
   void note(
-    const Held<Pointer> & held, std::optional<std::int64_t> published_ns = {},
+    const Outcome<Pointer> & outcome, std::optional<std::int64_t> published_ns = {},
     std::optional<std::int64_t> stalled_ns = {})
   {
-    log_.write(shaper_.queue.gate, held, published_ns, stalled_ns);
+    log_.write(shaper_.queue.gate, outcome, published_ns, stalled_ns);
     const std::int64_t now = monotonic_ns();
     if (said_ns_ != 0 && now - said_ns_ < 10'000'000'000) {
       return;
@@ -528,7 +481,7 @@ private:
   }
 
   rclcpp::Node & node_;
-  std::int64_t pause_ns_;
+  Parameters parameters_;
   std::optional<Turn> turn_;
   Readiness readiness_;
   Shaper<Pointer> shaper_;
@@ -573,5 +526,3 @@ int run(int argc, char ** argv, const std::string & name, SetUp && set_up)
 }
 
 }  // namespace chainshaper
-
-#endif  // CHAINSHAPER_SHAPING__NODE_HPP_

@@ -1,37 +1,91 @@
-// Making what follows a release take the same time in every cycle.
-//
-// Publishing is fast when its code and data are in the processor's caches, and slow, never equally
-// slow, when the chain has run there since the last time. So it is rehearsed shortly before each
-// release: a message that nobody receives goes the way of the real one, through the same layers of
-// ROS 2 and DDS, and a datagram to ourselves the way through the network stack.
-//
-// A core that sleeps takes tens of microseconds to wake up, on virtual machines more, and never the
-// same: most of what a subscriber sees of an output's jitter. While /dev/cpu_dma_latency is held
-// open, cores wake up within the microseconds written there, 0 at best
-// (Documentation/power/pm_qos_interface.rst). What is written ends with the process.
+// Making what follows a release take the same time in every cycle, as Readiness of chainshaper's
+// Python node, which says why: the publication is rehearsed, and idle cores do not sleep.
 
-#ifndef CHAINSHAPER_SHAPING__READINESS_HPP_
-#define CHAINSHAPER_SHAPING__READINESS_HPP_
+#pragma once
 
 #include <arpa/inet.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <netinet/in.h>
+#include <pthread.h>
+#include <sched.h>
+#include <semaphore.h>
 #include <sys/socket.h>
 #include <unistd.h>
 
 #include <array>
+#include <atomic>
 #include <cstdint>
 #include <cstring>
 #include <optional>
+#include <thread>
 
 #include "rclcpp/rclcpp.hpp"
 
-#include "kept_core.hpp"
 #include "shaper.hpp"
 
 namespace chainshaper
 {
+
+// A core that is clear of other work while an output is delivered there: as
+// chainshaper/gate/clear_core.py, which says why. Where SCHED_FIFO or the core is refused, it is not.
+class ClearCore
+{
+public:
+  explicit ClearCore(std::size_t core)
+  {
+    sem_init(&more_, 0, 0);
+    thread_ = std::thread([this, core] {clear(core);});
+  }
+
+  ClearCore(const ClearCore &) = delete;
+  ClearCore & operator=(const ClearCore &) = delete;
+
+  ~ClearCore()
+  {
+    clear_until(over);
+    thread_.join();
+    sem_destroy(&more_);
+  }
+
+  // Clear the core from now until that time of CLOCK_MONOTONIC.
+  void clear_until(std::int64_t time_ns)
+  {
+    until_ns_ = time_ns;
+    sem_post(&more_);
+  }
+
+private:
+  static constexpr std::int64_t over = -1;
+
+  void clear(std::size_t core)
+  {
+    pthread_setname_np(pthread_self(), "clear_core");
+    sched_param lowest{};
+    lowest.sched_priority = 1;
+    cpu_set_t cores;
+    CPU_ZERO(&cores);
+    CPU_SET(core, &cores);
+    if (sched_setscheduler(0, SCHED_FIFO | SCHED_RESET_ON_FORK, &lowest) != 0 ||
+      sched_setaffinity(0, sizeof(cores), &cores) != 0)
+    {
+      return;
+    }
+    for (;;) {
+      while (sem_wait(&more_) != 0) {
+        // A signal ended the wait early.
+      }
+      if (until_ns_ == over) {
+        return;
+      }
+      watch_until(until_ns_);
+    }
+  }
+
+  sem_t more_;
+  std::atomic<std::int64_t> until_ns_{0};
+  std::thread thread_;
+};
 
 class Readiness
 {
@@ -82,7 +136,7 @@ public:
   {
     ask_for(0);
     if (delivery_core_) {
-      delivery_core_->keep_until(release_ns + pause_ns_);
+      delivery_core_->clear_until(release_ns + pause_ns_);
     }
     for (int time = 0; time < 2; ++time) {  // the second finds in order what the first has loaded
       if (monotonic_ns() > release_ns - rehearsal_ns) {
@@ -114,7 +168,7 @@ private:
   }
 
   std::int64_t pause_ns_;
-  std::optional<KeptCore> delivery_core_;
+  std::optional<ClearCore> delivery_core_;
   rclcpp::GenericPublisher::SharedPtr rehearsal_;
   rclcpp::SerializedMessage empty_;
   int to_itself_;
@@ -123,5 +177,3 @@ private:
 };
 
 }  // namespace chainshaper
-
-#endif  // CHAINSHAPER_SHAPING__READINESS_HPP_

@@ -6,8 +6,7 @@
 // on the way of serialized messages: here they are passed what rclcpp knows, and emit the events
 // that Jazzy has. Upstream: ros2_tracing, `tracetools/include/tracetools/tracetools.h`, 4.1.1.
 
-#ifndef CHAINSHAPER_SHAPING__SERIALIZED_HPP_
-#define CHAINSHAPER_SHAPING__SERIALIZED_HPP_
+#pragma once
 
 #include <functional>
 #include <memory>
@@ -103,5 +102,3 @@ inline void publish_serialized(
 #endif
 
 }  // namespace chainshaper
-
-#endif  // CHAINSHAPER_SHAPING__SERIALIZED_HPP_

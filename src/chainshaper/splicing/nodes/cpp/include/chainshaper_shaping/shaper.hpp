@@ -1,11 +1,7 @@
-// A gate at work: holds each message until its release, and minds the clocks.
-//
-// Stamps are CLOCK_REALTIME, sleeping is CLOCK_MONOTONIC; the offset between the two is taken anew
-// for every message, since the wall clock may be stepped. A message under way during a step is
-// anchored to the cycle instead, at the phase that the last good stamp had. No ROS 2 here.
+// A gate at work: holds each message until its release, and minds the clocks. The same as Shaper in
+// chainshaper/gate/decision.py, which explains it. No ROS 2 here.
 
-#ifndef CHAINSHAPER_SHAPING__SHAPER_HPP_
-#define CHAINSHAPER_SHAPING__SHAPER_HPP_
+#pragma once
 
 #include <errno.h>
 #include <fcntl.h>
@@ -24,7 +20,6 @@
 #include <vector>
 
 #include "gate.hpp"
-#include "queue.hpp"
 
 namespace chainshaper
 {
@@ -122,7 +117,7 @@ private:
 };
 
 // `Message` is what the queue holds. `look` takes what has come and has it arrive: it is called
-// while others are held, before each release and behind it.
+// while others wait, before each release and behind it.
 template<typename Message>
 class Shaper
 {
@@ -143,24 +138,21 @@ public:
   // Cycles begin elsewhere, from the first such beginning after `now_ns` on.
   void set_phase(std::int64_t phase_ns, std::int64_t now_ns)
   {
-    const std::int64_t cycle_ns = queue.gate.cycle_ns;
-    const std::int64_t rest = (phase_ns - now_ns) % cycle_ns;
-    const std::int64_t from_ns = now_ns + (rest < 0 ? rest + cycle_ns : rest);
-    next_phase_ = {from_ns, phase_ns};
+    next_phase_ = {now_ns + modulo(phase_ns - now_ns, queue.gate.cycle_ns), phase_ns};
   }
 
   // A mode is announced, in force from the next cycle on; false: there is none like it.
   bool announce(const std::string & name, std::int64_t now_ns)
   {
     const auto & modes = queue.gate.modes;
-    const auto mode = modes ? modes->find(name) : std::nullopt;
+    const auto mode = modes ? place_of(modes->names, name) : std::nullopt;
     if (!mode) {
       return false;
     }
     auto & changes = queue.changes;
     if (*mode != (changes.empty() ? modes->initial : changes.back().second)) {
       changes.emplace_back(now_ns, *mode);
-      if (changes.size() > 64) {  // reaches back further than the oldest stamp that is of use
+      if (changes.size() > max_changes) {
         changes.pop_front();
       }
     }
@@ -174,7 +166,6 @@ public:
     std::optional<std::int64_t> source_timestamp = {}, bool waited = false,
     std::optional<std::int64_t> lost = {})
   {
-    constexpr std::int64_t step_ns = 500'000;  // slewing moves the clock by far less in a cycle
     const std::int64_t offset = clock_offset();
     const bool stepped = std::abs(offset - offset_) > step_ns;
     offset_ = offset;
@@ -199,7 +190,7 @@ public:
   // Wait until the oldest message leaves, or is dropped; none: it was overflowed meanwhile. One
   // that is to be discarded is not waited for; where overruns are discarded, so is a message whose
   // slot is over when this thread wakes.
-  std::optional<Held<Message>> hold()
+  std::optional<Outcome<Message>> hold()
   {
     const std::uint64_t number = queue.waiting.front().number;
     std::int64_t now = monotonic_ns();
@@ -226,7 +217,7 @@ public:
       }
     }
     if (!release.at_ns) {
-      return Held<Message>{queue.leave(release, now), release, now, dropped};
+      return Outcome<Message>{queue.leave(release, now), release, now, dropped};
     }
     if (slept) {
       on_waking_(*release.at_ns);
@@ -241,7 +232,7 @@ public:
       release.overrun = Policy::discard;
       dropped = Dropped::discarded;
     }
-    return Held<Message>{queue.leave(release, awake), release, awake, dropped};
+    return Outcome<Message>{queue.leave(release, awake), release, awake, dropped};
   }
 
   // Whether there is time for something else before the next release.
@@ -273,24 +264,20 @@ public:
   // How much of the delay between a release and the time when the thread was awake the machine
   // itself took: what the kernel does not say that other threads ran. To be called right after
   // publishing.
-  std::int64_t time_lost(const Held<Message> & held)
+  std::int64_t time_lost(const Outcome<Message> & outcome)
   {
-    if (!held.release.at_ns) {
+    if (!outcome.release.at_ns) {
       return 0;
     }
     const std::int64_t others = waiting_.so_far() - waited_ns_;
-    return std::max<std::int64_t>(0, held.awake_ns - *held.release.at_ns - others);
+    return std::max<std::int64_t>(0, outcome.awake_ns - *outcome.release.at_ns - others);
   }
 
   Queue<Message> queue;
-  std::vector<Held<Message>> overflowed;  // since the owner has emptied it
+  std::vector<Outcome<Message>> overflowed;  // since the owner has emptied it
   std::function<void()> look;
 
 private:
-  // Often enough for the reader's history, seldom enough for the core.
-  static constexpr std::int64_t look_ns = 50'000'000;
-  static constexpr std::int64_t others_ns = 2'000'000;  // an executor's other callbacks take less
-
   void look_again()
   {
     const std::int64_t now = monotonic_ns();
@@ -309,5 +296,3 @@ private:
 };
 
 }  // namespace chainshaper
-
-#endif  // CHAINSHAPER_SHAPING__SHAPER_HPP_
