@@ -12,11 +12,9 @@
 #include "chainshaper_shaping/node.hpp"
 #include "chainshaper_shaping/serialized.hpp"
 
-namespace
-{
+namespace {
 
-struct Channel
-{
+struct Channel {
   std::string output;
   rclcpp::GenericPublisher::SharedPtr publisher;
   rclcpp::GenericSubscription::SharedPtr subscription;
@@ -27,14 +25,12 @@ struct Channel
   std::uint64_t missing{0};
 };
 
-void take(Channel & channel, std::shared_ptr<const rclcpp::SerializedMessage> message)
-{
+void take(Channel & channel, std::shared_ptr<const rclcpp::SerializedMessage> message) {
   channel.dropped += channel.newest ? 1 : 0;
   channel.newest = std::move(message);
 }
 
-void publish(rclcpp::Node & node, Channel & channel)
-{
+void publish(rclcpp::Node & node, Channel & channel) {
   if (channel.newest) {
     chainshaper::publish_serialized(*channel.publisher, *channel.newest);
     channel.newest.reset();
@@ -42,54 +38,49 @@ void publish(rclcpp::Node & node, Channel & channel)
     return;
   }
   ++channel.missing;
-  RCLCPP_WARN_THROTTLE(
-    node.get_logger(), *node.get_clock(), 10'000, "nothing new for %s; this is no. %zu",
-    channel.output.c_str(), static_cast<std::size_t>(channel.missing));
+  RCLCPP_WARN_THROTTLE(node.get_logger(), *node.get_clock(), 10'000,
+                       "nothing new for %s; this is no. %zu", channel.output.c_str(),
+                       static_cast<std::size_t>(channel.missing));
 }
 
 }  // namespace
 
-int main(int argc, char ** argv)
-{
+int main(int argc, char ** argv) {
   std::vector<std::unique_ptr<Channel>> channels;
   const int code = chainshaper::run(
-    argc, argv, "chainshaper_throttler", [&](rclcpp::Node & node) -> std::function<bool()> {
-      const auto parameters = chainshaper::parameters_of(node);
-      const auto & [inputs, outputs] = std::tie(parameters.inputs, parameters.outputs);
-      const auto period = parameters.period_ns;
-      if (inputs.empty() || inputs.size() != outputs.size() || period <= 0) {
-        throw std::invalid_argument("inputs, as many outputs, and a period are needed");
-      }
-      for (std::size_t i = 0; i < inputs.size(); ++i) {
-        const auto offer = chainshaper::wait_for_publisher(node, inputs[i]);
-        if (!offer) {
-          return {};
+      argc, argv, "chainshaper_throttler", [&](rclcpp::Node & node) -> std::function<bool()> {
+        const auto parameters = chainshaper::parameters_of(node);
+        const auto & [inputs, outputs] = std::tie(parameters.inputs, parameters.outputs);
+        const auto period = parameters.period_ns;
+        if (inputs.empty() || inputs.size() != outputs.size() || period <= 0)
+          throw std::invalid_argument("inputs, as many outputs, and a period are needed");
+        for (std::size_t i = 0; i < inputs.size(); ++i) {
+          const auto offer = chainshaper::wait_for_publisher(node, inputs[i]);
+          if (!offer) return {};
+          channels.push_back(std::make_unique<Channel>());
+          Channel & channel = *channels.back();
+          channel.output = outputs[i];
+          channel.publisher =
+              node.create_generic_publisher(outputs[i], offer->type, offer->publisher);
+          channel.subscription = chainshaper::subscribe_serialized(
+              node, inputs[i], offer->type, offer->subscription,
+              [&channel](std::shared_ptr<rclcpp::SerializedMessage> message,
+                         const rclcpp::MessageInfo &) { take(channel, std::move(message)); });
         }
-        channels.push_back(std::make_unique<Channel>());
-        Channel & channel = *channels.back();
-        channel.output = outputs[i];
-        channel.publisher =
-          node.create_generic_publisher(outputs[i], offer->type, offer->publisher);
-        channel.subscription = chainshaper::subscribe_serialized(
-          node, inputs[i], offer->type, offer->subscription,
-          [&channel](std::shared_ptr<rclcpp::SerializedMessage> message, const rclcpp::MessageInfo &) {
-            take(channel, std::move(message));
-          });
-      }
-      // A timer keeps the phase at which it was made, on the same clock.
-      const std::int64_t since = chainshaper::monotonic_ns() - parameters.phase_ns;
-      chainshaper::sleep_until(parameters.phase_ns + (since / period + 1) * period);
-      for (auto & channel : channels) {
-        channel->timer = node.create_wall_timer(
-          std::chrono::nanoseconds(period), [&node, &channel] {publish(node, *channel);});
-      }
-      return [] {return false;};
-    });
+        // A timer keeps the phase at which it was made, on the same clock.
+        const std::int64_t since = chainshaper::monotonic_ns() - parameters.phase_ns;
+        chainshaper::sleep_until(parameters.phase_ns + (since / period + 1) * period);
+        for (auto & channel : channels) {
+          channel->timer = node.create_wall_timer(std::chrono::nanoseconds(period),
+                                                  [&node, &channel] { publish(node, *channel); });
+        }
+        return [] { return false; };
+      });
   for (const auto & channel : channels) {
-    std::printf(
-      "%s: %zu published, %zu times nothing new, %zu dropped for newer ones\n",
-      channel->output.c_str(), static_cast<std::size_t>(channel->published),
-      static_cast<std::size_t>(channel->missing), static_cast<std::size_t>(channel->dropped));
+    std::printf("%s: %zu published, %zu times nothing new, %zu dropped for newer ones\n",
+                channel->output.c_str(), static_cast<std::size_t>(channel->published),
+                static_cast<std::size_t>(channel->missing),
+                static_cast<std::size_t>(channel->dropped));
   }
   return code;
 }

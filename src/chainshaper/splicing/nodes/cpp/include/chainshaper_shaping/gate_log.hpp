@@ -12,59 +12,42 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
-#include <algorithm>
-#include <array>
 #include <cerrno>
-#include <cstdint>
 #include <cstdio>
 #include <cstring>
-#include <optional>
-#include <string>
 #include <thread>
-#include <utility>
 
 #include "gate.hpp"
 
-namespace chainshaper
-{
+namespace chainshaper {
 
 // Adds lines to a file, whole ones only. A file that would have more than half of `most_bytes`
 // becomes `….1`, in place of the one before it; one that has been removed is made anew. What cannot
 // be written is missing.
-class RowWriter
-{
+class RowWriter {
 public:
   RowWriter(std::string path, std::int64_t most_bytes)
-  : path_(std::move(path)), most_bytes_(most_bytes)
-  {
+      : path_(std::move(path)), most_bytes_(most_bytes) {
     if (pipe2(ends_, O_CLOEXEC) == 0) {
       fcntl(ends_[1], F_SETFL, O_NONBLOCK);
       fcntl(ends_[1], F_SETPIPE_SZ, 1 << 20);  // more than a user may have is refused
-      writer_ = std::thread([this] {write();});
+      writer_ = std::thread([this] { write(); });
     }
   }
 
-  RowWriter(const RowWriter &) = delete;
-  RowWriter & operator=(const RowWriter &) = delete;
-
-  ~RowWriter()
-  {
+  ~RowWriter() {
     close(ends_[1]);
-    if (writer_.joinable()) {
-      writer_.join();
-    }
+    if (writer_.joinable()) writer_.join();
     close(ends_[0]);
   }
 
   // False: there is no room. Never waits.
-  bool put(const char * line, std::size_t size)
-  {
+  bool put(const char * line, std::size_t size) {
     return ::write(ends_[1], line, size) == static_cast<ssize_t>(size);
   }
 
 private:
-  void write()
-  {
+  void write() {
     pthread_setname_np(pthread_self(), "gate_log");
     std::string lines;
     std::array<char, 4096> received;
@@ -81,28 +64,24 @@ private:
     }
   }
 
-  void append(const std::string & lines)
-  {
+  void append(const std::string & lines) {
     const auto opened = [this] {
-        return open(path_.c_str(), O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC, 0644);
-      };
+      return open(path_.c_str(), O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC, 0644);
+    };
     int file = opened();
     std::int64_t before = file < 0 ? 0 : lseek(file, 0, SEEK_END);
     const auto header = static_cast<std::int64_t>(std::strlen(log_header));
     if (before > header && before + static_cast<std::int64_t>(lines.size()) > most_bytes_ / 2 &&
-      std::rename(path_.c_str(), (path_ + ".1").c_str()) == 0)
-    {
+        std::rename(path_.c_str(), (path_ + ".1").c_str()) == 0) {
       close(file);
       file = opened();
       before = 0;
     }
-    if (file < 0) {
-      return;
-    }
+    if (file < 0) return;
     const std::string whole = (before == 0 ? log_header : "") + lines;
-    if (::write(file, whole.data(), whole.size()) != static_cast<ssize_t>(whole.size())) {
-      [[maybe_unused]] const int cut = ftruncate(file, before);
-    }
+    if (::write(file, whole.data(), whole.size()) != static_cast<ssize_t>(whole.size()))
+        [[maybe_unused]]
+      const int cut = ftruncate(file, before);
     close(file);
   }
 
@@ -112,19 +91,16 @@ private:
   std::thread writer_;
 };
 
-class GateLog
-{
+class GateLog {
 public:
   // Lines are added to a file that is there; false (and errno): it cannot be written now.
-  bool open_file(const std::string & path, std::int64_t most_bytes)
-  {
+  bool open_file(const std::string & path, std::int64_t most_bytes) {
     const int flags = O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC | O_NONBLOCK;
     const int file = open(path.c_str(), flags, 0644);
     const int because = errno;
     if (file >= 0) {
-      if (lseek(file, 0, SEEK_END) == 0) {
-        [[maybe_unused]] const auto size = ::write(file, log_header, std::strlen(log_header));
-      }
+      if (lseek(file, 0, SEEK_END) == 0) [[maybe_unused]]
+        const auto size = ::write(file, log_header, std::strlen(log_header));
       close(file);
     }
     writer_.emplace(path, most_bytes);
@@ -134,47 +110,33 @@ public:
 
   // `published_ns` is when publishing returned, `stalled_ns` for how long the machine stood still
   // behind the release; none for a message that was dropped.
-  template<typename Message>
-  void write(
-    const Gate & gate, const Outcome<Message> & outcome,
-    std::optional<std::int64_t> published_ns = {}, std::optional<std::int64_t> stalled_ns = {})
-  {
+  template <typename Message>
+  void write(const Gate & gate, const Outcome<Message> & outcome, Maybe published_ns = {},
+             Maybe stalled_ns = {}) {
     const auto & [waiting, release, awake_ns, why] = outcome;
     ++rows;
-    if (why) {
-      ++dropped[static_cast<std::size_t>(*why)];
-    }
+    if (why) ++dropped[static_cast<std::size_t>(*why)];
     lost_by_dds += static_cast<std::uint64_t>(waiting.lost.value_or(0));
-    if (!writer_) {
-      return;
-    }
+    if (!writer_) return;
     size_ = 0;
     const auto mode = release.mode ? gate.modes->names[*release.mode].c_str() : "";
-    row(
-      awake_ns, getpid(), syscall(SYS_gettid), sched_getcpu(), waiting.source_timestamp,
-      waiting.arrival_ns, release.origin_ns, release.at_ns, release.slot, release.cycles_waited,
-      anchor_names[static_cast<std::size_t>(release.anchor)],
-      release.overrun ? policy_names[static_cast<std::size_t>(*release.overrun)] : "", mode,
-      published_ns, stalled_ns, why ? dropped_names[static_cast<std::size_t>(*why)] : "",
-      waiting.lost, rows);
+    row(awake_ns, getpid(), syscall(SYS_gettid), sched_getcpu(), waiting.source_timestamp,
+        waiting.arrival_ns, release.origin_ns, release.at_ns, release.slot, release.cycles_waited,
+        anchor_names[static_cast<std::size_t>(release.anchor)],
+        release.overrun ? policy_names[static_cast<std::size_t>(*release.overrun)] : "", mode,
+        published_ns, stalled_ns, why ? dropped_names[static_cast<std::size_t>(*why)] : "",
+        waiting.lost, rows);
     line_[size_ - 1] = '\n';  // in place of the last comma
-    if (!writer_->put(line_.data(), size_)) {
-      ++unlogged;
-    }
+    if (!writer_->put(line_.data(), size_)) ++unlogged;
   }
 
   // What is lost so far, in words; empty: nothing.
-  std::string losses() const
-  {
+  std::string losses() const {
     std::string said;
     const auto add = [&](std::uint64_t count, const char * why) {
-        if (count > 0) {
-          said += (said.empty() ? "" : ", ") + std::to_string(count) + " " + why;
-        }
-      };
-    for (std::size_t i = 0; i < dropped.size(); ++i) {
-      add(dropped[i], dropped_names[i]);
-    }
+      if (count > 0) said += (said.empty() ? "" : ", ") + std::to_string(count) + " " + why;
+    };
+    for (std::size_t i = 0; i < dropped.size(); ++i) add(dropped[i], dropped_names[i]);
     add(lost_by_dds, "lost by DDS");
     add(unlogged, "not in the log");
     return said;
@@ -187,30 +149,26 @@ public:
 
 private:
   // The values of the columns, in the order of `log_header`.
-  template<typename ... Values>
-  void row(const Values & ... values)
-  {
+  template <typename... Values>
+  void row(const Values &... values) {
     static_assert(sizeof...(values) == log_columns);
     (add(values), ...);
   }
 
-  template<typename Value>
-  void add(const std::optional<Value> & value)
-  {
+  template <typename Value>
+  void add(const std::optional<Value> & value) {
     value ? add(*value) : add("");
   }
 
-  template<typename Number>
-  void add(const Number & number)
-  {
+  template <typename Number>
+  void add(const Number & number) {
     print("%lld,", static_cast<long long>(number));  // NOLINT(runtime/int)
   }
 
-  void add(const char * text) {print("%s,", text);}
+  void add(const char * text) { print("%s,", text); }
 
-  template<typename Value>
-  void print(const char * how, Value value)
-  {
+  template <typename Value>
+  void print(const char * how, Value value) {
     const int written = std::snprintf(line_.data() + size_, line_.size() - size_, how, value);
     size_ = std::min(line_.size() - 1, size_ + static_cast<std::size_t>(written));
   }

@@ -13,44 +13,33 @@
 #include <sys/socket.h>
 #include <unistd.h>
 
-#include <array>
 #include <atomic>
-#include <cstdint>
 #include <cstring>
-#include <optional>
 #include <thread>
 
 #include "rclcpp/rclcpp.hpp"
-
 #include "shaper.hpp"
 
-namespace chainshaper
-{
+namespace chainshaper {
 
 // A core that is clear of other work while an output is delivered there: as
-// chainshaper/gate/clear_core.py, which says why. Where SCHED_FIFO or the core is refused, it is not.
-class ClearCore
-{
+// chainshaper/gate/clear_core.py, which says why. Where SCHED_FIFO or the core is refused, it is
+// not.
+class ClearCore {
 public:
-  explicit ClearCore(std::size_t core)
-  {
+  explicit ClearCore(std::size_t core) {
     sem_init(&more_, 0, 0);
-    thread_ = std::thread([this, core] {clear(core);});
+    thread_ = std::thread([this, core] { clear(core); });
   }
 
-  ClearCore(const ClearCore &) = delete;
-  ClearCore & operator=(const ClearCore &) = delete;
-
-  ~ClearCore()
-  {
+  ~ClearCore() {
     clear_until(over);
     thread_.join();
     sem_destroy(&more_);
   }
 
   // Clear the core from now until that time of CLOCK_MONOTONIC.
-  void clear_until(std::int64_t time_ns)
-  {
+  void clear_until(std::int64_t time_ns) {
     until_ns_ = time_ns;
     sem_post(&more_);
   }
@@ -58,8 +47,7 @@ public:
 private:
   static constexpr std::int64_t over = -1;
 
-  void clear(std::size_t core)
-  {
+  void clear(std::size_t core) {
     pthread_setname_np(pthread_self(), "clear_core");
     sched_param lowest{};
     lowest.sched_priority = 1;
@@ -67,17 +55,14 @@ private:
     CPU_ZERO(&cores);
     CPU_SET(core, &cores);
     if (sched_setscheduler(0, SCHED_FIFO | SCHED_RESET_ON_FORK, &lowest) != 0 ||
-      sched_setaffinity(0, sizeof(cores), &cores) != 0)
-    {
+        sched_setaffinity(0, sizeof(cores), &cores) != 0) {
       return;
     }
     for (;;) {
       while (sem_wait(&more_) != 0) {
         // A signal ended the wait early.
       }
-      if (until_ns_ == over) {
-        return;
-      }
+      if (until_ns_ == over) return;
       watch_until(until_ns_);
     }
   }
@@ -87,26 +72,23 @@ private:
   std::thread thread_;
 };
 
-class Readiness
-{
+class Readiness {
 public:
   // The core is where the output is delivered, for `pause_ns` after it was published.
   Readiness(rclcpp::Node & node, std::optional<std::size_t> delivery_core, std::int64_t pause_ns)
-  : pause_ns_(pause_ns),
-    rehearsal_(node.create_generic_publisher(  // of all shaping nodes; an underscore hides it
-        "/_chainshaper_rehearsal", "std_msgs/msg/Empty", rclcpp::QoS(1))),
-    empty_(serialized_empty.size()),
-    to_itself_(socket(AF_INET, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0)),
-    latency_(open("/dev/cpu_dma_latency", O_WRONLY | O_CLOEXEC))
-  {
+      : pause_ns_(pause_ns),
+        rehearsal_(node.create_generic_publisher(  // of all shaping nodes; an underscore hides it
+            "/_chainshaper_rehearsal", "std_msgs/msg/Empty", rclcpp::QoS(1))),
+        empty_(serialized_empty.size()),
+        to_itself_(socket(AF_INET, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0)),
+        latency_(open("/dev/cpu_dma_latency", O_WRONLY | O_CLOEXEC)) {
     if (latency_ < 0) {
-      RCLCPP_WARN(
-        node.get_logger(), "/dev/cpu_dma_latency: %s: idle cores sleep, and deliver less "
-        "regularly; run as root, or give the user the right to write it", std::strerror(errno));
+      RCLCPP_WARN(node.get_logger(),
+                  "/dev/cpu_dma_latency: %s: idle cores sleep, and deliver less "
+                  "regularly; run as root, or give the user the right to write it",
+                  std::strerror(errno));
     }
-    if (delivery_core) {
-      delivery_core_.emplace(*delivery_core);
-    }
+    if (delivery_core) delivery_core_.emplace(*delivery_core);
     auto & message = empty_.get_rcl_serialized_message();
     std::memcpy(message.buffer, serialized_empty.data(), serialized_empty.size());
     message.buffer_length = serialized_empty.size();
@@ -116,55 +98,42 @@ public:
     socklen_t length = sizeof(address);
     auto * const general = reinterpret_cast<sockaddr *>(&address);
     connected_ = bind(to_itself_, general, length) == 0 &&
-      getsockname(to_itself_, general, &length) == 0 && connect(to_itself_, general, length) == 0;
+                 getsockname(to_itself_, general, &length) == 0 &&
+                 connect(to_itself_, general, length) == 0;
   }
 
-  Readiness(const Readiness &) = delete;
-  Readiness & operator=(const Readiness &) = delete;
-
-  ~Readiness()
-  {
-    for (const int file : {to_itself_, latency_}) {
-      if (file >= 0) {
-        close(file);
-      }
-    }
+  ~Readiness() {
+    for (const int file : {to_itself_, latency_})
+      if (file >= 0) close(file);
   }
 
   // For a release at that time of CLOCK_MONOTONIC, as far as there is time left for it.
-  void get_ready(std::int64_t release_ns)
-  {
+  void get_ready(std::int64_t release_ns) {
     ask_for(0);
-    if (delivery_core_) {
-      delivery_core_->clear_until(release_ns + pause_ns_);
-    }
+    if (delivery_core_) delivery_core_->clear_until(release_ns + pause_ns_);
     for (int time = 0; time < 2; ++time) {  // the second finds in order what the first has loaded
-      if (monotonic_ns() > release_ns - rehearsal_ns) {
-        return;
-      }
+      if (monotonic_ns() > release_ns - rehearsal_ns) return;
       rehearsal_->publish(empty_);
       if (connected_) {
         std::array<std::uint8_t, serialized_empty.size()> back;
         [[maybe_unused]] auto bytes =
-          send(to_itself_, serialized_empty.data(), serialized_empty.size(), 0);
+            send(to_itself_, serialized_empty.data(), serialized_empty.size(), 0);
         bytes = recv(to_itself_, back.data(), back.size(), 0);
       }
     }
   }
 
   // The message is delivered: cores may sleep, as if nothing had been asked for.
-  void relax() const {ask_for(-1);}
+  void relax() const { ask_for(-1); }
 
 private:
   static constexpr std::array<std::uint8_t, 5> serialized_empty{0, 1, 0, 0, 0};
   // A rehearsal is not begun later before a release than this: the first may take most of it.
   static constexpr std::int64_t rehearsal_ns = 400'000;
 
-  void ask_for(std::int32_t latency_us) const
-  {
-    if (latency_ >= 0) {
-      [[maybe_unused]] const auto written = write(latency_, &latency_us, sizeof(latency_us));
-    }
+  void ask_for(std::int32_t latency_us) const {
+    if (latency_ >= 0) [[maybe_unused]]
+      const auto written = write(latency_, &latency_us, sizeof(latency_us));
   }
 
   std::int64_t pause_ns_;
