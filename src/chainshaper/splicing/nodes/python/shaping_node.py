@@ -21,8 +21,8 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from std_msgs.msg import Empty, String
 
 from chainshaper.gate.clear_core import ClearCore
-from chainshaper.gate.decision import Release, Shaper
-from chainshaper.gate.handover import Turn
+from chainshaper.gate.decision import Outcome, Release, Shaper
+from chainshaper.gate.handover import STANDING_BY, Turn
 from chainshaper.splicing.nodes.python.endpoints import (
     message_class,
     parameters_of,
@@ -210,7 +210,7 @@ def await_receivers(node: Node, turn: Turn, publisher: Any) -> None:
     be seen: it is given a little longer.
     """
     topic, give_up = node.resolve_topic_name("output"), time.monotonic() + DISCOVERY_S
-    while turn.page.has_standby and time.monotonic() < give_up:
+    while turn.page.is_locked(STANDING_BY) and time.monotonic() < give_up:
         if publisher.get_subscription_count() >= node.count_subscribers(topic):
             wait(SETTLING_S)
             return
@@ -261,7 +261,7 @@ class Shaping:
         served = False
         while rclpy.ok():
             for gone in overflowed:
-                self._log.write(gone)
+                self._note(gone)
             overflowed.clear()
             if not waiting or (served and self._shaper.nothing_due()):
                 break
@@ -303,9 +303,18 @@ class Shaping:
         elif turn is not None:
             turn.done(key)
         self._readiness.relax()
-        self._log.write(outcome, published, stalled)
+        self._note(outcome, published, stalled)
         if not self._shaper.queue.waiting:
             gc.collect()  # here is time for it; all that is older is frozen
+
+    def _note(
+        self, outcome: Outcome, published: int | None = None, stalled: int | None = None
+    ) -> None:
+        """Note what became of a message: in the log, and for the standby and `status`."""
+        self._log.write(outcome, published, stalled)
+        if self._turn is not None:
+            late = outcome.release.overrun is not None
+            self._turn.count(outcome.dropped, outcome.message.lost, late=late)
 
     def _shape_uninformed(self, payload: bytes) -> None:
         self._shape(payload, {})
