@@ -14,6 +14,8 @@ from pathlib import Path
 from queue import Empty, Queue
 from typing import Any
 
+from passing import serialized
+
 from chainshaper.splicing.shaping_process import ShapingProcess
 
 __all__ = ["RELIABLE", "NodeRun", "running_node", "stamped"]
@@ -133,6 +135,4 @@ def running_node(
 
 def stamped(rest: bytes = b"rest", age_ns: int = 0) -> bytes:
     """A serialized message whose chain began when this is called, or so long before."""
-    seconds, nanoseconds = divmod(time.time_ns() - age_ns, 1_000_000_000)
-    stamp = seconds.to_bytes(4, "little", signed=True) + nanoseconds.to_bytes(4, "little")
-    return b"\0\1\0\0" + stamp + rest
+    return serialized(time.time_ns() - age_ns, rest)
