@@ -103,9 +103,9 @@ def test_the_shaping_node_still_gets_message_and_source_timestamp(
     assert plan.shaping_node is not None
     log = tmp_path / "gate.csv"
     process = write_shaping_process(plan, plan.shaping_node, "python", tmp_path, log=log)
-    with running_node(process, tmp_path, {"/t3_tmp": IMAGES}, **preloaded(tmp_path)) as run:
-        run.tell(topic="/t3_tmp", payload=stamped().hex(), source=77)
-        run.hear(lambda words: words.get("published") == "/t3")
+    with running_node(process, tmp_path, **preloaded(tmp_path)) as run:
+        run.send(stamped(), 77)
+        run.hear_published()
         assert run.end() == 0
     assert log.read_text().splitlines()[1].split(",")[4] == "77"
     assert [event for event, *_ in heard(tmp_path)][-2:] == ["callback_start", "callback_end"]
@@ -129,9 +129,9 @@ def test_on_humble_serialized_messages_are_seen_as_on_later_distributions(
     assert plan.shaping_node is not None
     process = write_shaping_process(plan, plan.shaping_node, "python", tmp_path)
     humble = {**preloaded(tmp_path), "STAND_IN_HUMBLE": "1"}
-    with running_node(process, tmp_path, {"/t3_tmp": IMAGES}, **humble) as run:
-        run.tell(topic="/t3_tmp", payload=stamped().hex(), source=77)
-        run.hear(lambda words: words.get("published") == "/t3")
+    with running_node(process, tmp_path, **humble) as run:
+        run.send(stamped(), 77)
+        run.hear_published()
         assert run.end() == 0
     taken, _, published, written, _ = heard(tmp_path)[-5:]
     message = taken[2]
