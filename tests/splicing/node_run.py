@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from queue import Empty, Queue
@@ -122,7 +122,7 @@ def running_node(
     publishers: dict[str, list[dict[str, Any]]] | None = None,
     *,
     spinning: bool = True,
-    **environment: str,
+    environment: Mapping[str, str] | None = None,
 ) -> Iterator[NodeRun]:
     """A Python node that runs where only the stand-in and PyYAML can be imported.
 
@@ -153,7 +153,7 @@ def running_node(
             "PYTHONPATH": str(modules),
             "XDG_RUNTIME_DIR": str(folder),
             "STAND_IN_PUBLISHERS": json.dumps(PUBLISHERS if publishers is None else publishers),
-            **environment,
+            **(environment or {}),
         },
     )
     try:

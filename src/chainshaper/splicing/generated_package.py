@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from chainshaper.analysis.close_names import close_names
+from chainshaper.analysis.chains import close_names
 from chainshaper.gate import decision, handover
 from chainshaper.gate.parameters import NodeParameters
 from chainshaper.values.errors import InputError, OperationError, PlatformError
