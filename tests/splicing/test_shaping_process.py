@@ -22,11 +22,13 @@ from small_chain import EXECUTOR_CORE
 
 from chainshaper.gate import decision as gate
 from chainshaper.gate.decision import READER_DEPTH
+from chainshaper.gate.parameters import NodeParameters, gate_parameters
 from chainshaper.planning import Modes, Plan, ShapingNode, let_per_callback
 from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log
 from chainshaper.splicing.shaping_process import (
     ShapingProcess,
+    gate_of,
     write_shaping_process,
     write_throttler,
 )
@@ -128,6 +130,17 @@ def test_the_parameters_say_what_the_plan_says(
     }
     elsewhere = write_shaping_process(plan, node, "python", tmp_path / "elsewhere")
     assert parameters_of(elsewhere)["handover"] != parameters_of(process)["handover"]
+
+
+def test_every_parameter_is_documented() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "shaping_node.md").read_text()
+    throttled = {"inputs", "outputs", "period_ns"}
+    assert [name for name in vars(NodeParameters()) if f"`{name}`" not in text] == sorted(throttled)
+
+
+def test_a_gate_is_the_same_behind_its_parameters(plan: Plan, node: ShapingNode) -> None:
+    gate = gate_of(banded(plan), node)
+    assert NodeParameters(**gate_parameters(gate, "/mode")).gate() == gate
 
 
 def test_under_let_each_topic_is_due_a_cycle_after_the_one_before_it(

@@ -32,7 +32,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from chainshaper.gate.decision import DROPPED
 
@@ -334,12 +334,10 @@ class Turn:
         """Whether a standby still deals with what came before this node's first message."""
         if not self.page["listening"] or not self.page.is_locked(STANDING_BY):
             return False
-        known = key in (None, self.page["acknowledged"]) or key in self.page.noted(bypassed=True)
-        return not known
+        return key not in (None, self.page["acknowledged"], *self.page.noted(bypassed=True))
 
 
-@dataclass(frozen=True)
-class _Waiting:
+class _Waiting(NamedTuple):
     """A message that is the shaping node's, unless that fails."""
 
     key: int
@@ -387,12 +385,7 @@ class Standby:
         """A message has come, for the shaping node and for the standby alike."""
         now = time.monotonic_ns()
         with self._mutex:
-            if not self.page.is_current and not self.page.is_locked():
-                with suppress(OSError):
-                    left = self.page
-                    self._forget()  # a new page knows of nothing
-                    self._open()
-                    left.close()
+            self._follow()
             self.page["listening"] = 1
             if key is not None:
                 self._pending.append(_Waiting(key, payload, now))
@@ -406,7 +399,17 @@ class Standby:
     def look(self) -> None:
         """See whether the shaping node still does what it has to."""
         with self._mutex:
+            self._follow()
             self._look(time.monotonic_ns())
+
+    def _follow(self) -> None:
+        """Go to the new page, where this one was removed and the shaping node has left it."""
+        if not self.page.is_current and not self.page.is_locked():
+            with suppress(OSError):
+                left = self.page
+                self._forget()  # a new page knows of nothing
+                self._open()
+                left.close()
 
     def watch(self) -> None:
         """Look when the shaping node dies, and when it should have released a message; for ever."""
@@ -414,7 +417,8 @@ class Standby:
         poll = select.poll()
         poll.register(self._woken, select.POLLIN)
         while True:
-            holder = self.page["holder"]
+            with self._mutex:  # the page may be left meanwhile
+                holder = self.page["holder"]
             if holder != watched:
                 if died >= 0:
                     poll.unregister(died)

@@ -1,8 +1,7 @@
 """The log of a shaping node as a table: what it did with each message.
 
 A node in ROS 2 is not recorded like one of the live workload, so it notes its decisions itself:
-lines of comma-separated values with the columns of the event ``gate_release``
-(:mod:`chainshaper.values.events`), to which this turns them.
+in lines of comma-separated values. This turns them to the event table ``gate_release``.
 """
 
 import contextlib
@@ -13,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper.gate.decision import STALL_NS
+from chainshaper.gate.decision import LOG_COLUMNS, STALL_NS
 from chainshaper.values import events
 from chainshaper.values.errors import InputError
 
@@ -50,7 +49,7 @@ def _read_part(path: Path) -> pl.DataFrame:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     whole = text[: text.rfind(b"\n") + 1]
     names = whole.split(b"\n", 1)[0].decode(errors="replace").split(",")
-    if types.keys() - {"callback", *_LATER} - set(names) or set(names) - types.keys():
+    if set(LOG_COLUMNS) - {*_LATER, *names} or set(names) - set(LOG_COLUMNS):
         raise InputError(
             f"{path}:1: this is not the log of a shaping node, which begins with the names of its "
             "columns: name the file that the parameter `log` of the node names"
