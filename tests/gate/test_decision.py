@@ -132,7 +132,7 @@ def test_without_a_stamp_of_use_a_message_is_anchored_to_the_cycle() -> None:
     real = Gate(((60 * MS, 61 * MS),), 100 * MS, phase_ns=3 * MS)
     hours_old = release_of(real, 7200 * SECOND, stamp_ns=50 * MS)
     assert hours_old.at_ns == 7200 * SECOND + 63 * MS
-    assert release_of(real, 0, stamp_ns=7200 * SECOND).at_ns == 63 * MS, "not held for two hours"
+    assert release_of(real, 0, stamp_ns=7200 * SECOND).at_ns == 63 * MS, "and not in two hours"
 
 
 def test_a_stamp_slightly_from_the_future_still_starts_cycle_0() -> None:

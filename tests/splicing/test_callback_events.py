@@ -57,7 +57,7 @@ const void * rcl_subscription_get_rmw_handle(const char * subscription) {return 
 
 
 def preloaded(folder: Path, *flags: str) -> dict[str, str]:
-    """An environment in which the libraries are loaded; what they are told is written down."""
+    """An environment in which the libraries are loaded; the events are written down."""
     if shutil.which("gcc") is None:
         pytest.skip("no gcc to build the tracing library with")
     libraries = []

@@ -5,7 +5,7 @@ workload: the publisher's output topic is remapped to ``…_tmp``, and a node th
 that topic and republishes on the original one is added. Subscribers notice nothing.
 
 Where the plan gates the publisher's own thread instead (section 3.2.1, Design 1), no node is
-added: the application is held against what the plan takes it for, and its output gets the
+added: the application is compared with what the plan takes it for, and its output gets the
 lifespan by which DDS discards what overran.
 """
 

@@ -37,11 +37,8 @@ RESPAWN = {"respawn": True, "respawn_delay": 0.1}
 The delay (s) is for a program that ends at once, such as one that lacks a library.
 """
 
-STANDBY = "_standby"
-"""What a standby's name has behind that of its shaping node."""
-
-SHORTEST_PATIENCE_NS = 10_000_000
-"""By how much a shaping node may be late before it is taken to hang; else half a cycle."""
+STANDBY = "_standby"  # what a standby's name has behind that of its shaping node
+SHORTEST_PATIENCE_NS = 10_000_000  # a node later than that hangs, or than half a cycle
 
 
 @dataclass(frozen=True)
