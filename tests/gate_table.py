@@ -1,7 +1,6 @@
 """What gates do with messages: the table, and the Python gate walking through one of its cases."""
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -105,8 +104,3 @@ def walk(case: Case, publishing_ns: int = PUBLISHING_NS) -> list[Outcome]:
         queue.free_ns = now
         come_until(now)
     return [found[number] for number in range(len(case.arrivals))]
-
-
-def leaves(outcomes: Sequence[Outcome]) -> tuple[int | str, ...]:
-    """As the table has it."""
-    return tuple(outcome.leave for outcome in outcomes)

@@ -1,10 +1,11 @@
 """Messages passing a gate one by one."""
 
+import struct
 import time
 
-from chainshaper.gate.decision import Held, Release, Shaper
+from chainshaper.gate.decision import Outcome, Release, Shaper
 
-__all__ = ["decided", "held"]
+__all__ = ["decided", "held", "serialized"]
 
 
 def decided(shaper: Shaper, payload: bytes, arrival_ns: int) -> Release:
@@ -15,9 +16,16 @@ def decided(shaper: Shaper, payload: bytes, arrival_ns: int) -> Release:
     return release
 
 
-def held(shaper: Shaper, payload: bytes = b"no header") -> Held:
+def held(shaper: Shaper, payload: bytes = b"no header") -> Outcome:
     """What becomes of a message that comes now."""
     shaper.arrive(payload, time.monotonic_ns())
     result = shaper.hold()
     assert result is not None
     return result
+
+
+def serialized(stamp_ns: int, rest: bytes = b"the rest", *, big_endian: bool = False) -> bytes:
+    """A serialized message whose first field is a header with this stamp."""
+    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    stamp = struct.pack(">iI" if big_endian else "<iI", seconds, nanoseconds)
+    return bytes([0, 0 if big_endian else 1, 0, 0]) + stamp + rest

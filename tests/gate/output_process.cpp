@@ -12,28 +12,22 @@
 
 #include "chainshaper_shaping/handover.hpp"
 
-void publish(char word, std::int64_t number)
-{
+void publish(char word, std::int64_t number) {
   char record[9];
   record[0] = word;
   std::memcpy(record + 1, &number, 8);
-  if (write(1, record, sizeof(record)) != sizeof(record)) {
-    std::_Exit(1);
-  }
+  if (write(1, record, sizeof(record)) != sizeof(record)) std::_Exit(1);
 }
 
-// The folder of pages, "shaping" (or "counting"), the page's name, the port to listen at, how long to hold (ns).
-int main(int, char ** argv)
-{
+// The folder of pages, "shaping" or "counting", the page's name, the port to listen at, how long to
+// hold (ns).
+int main(int, char ** argv) {
   chainshaper::Turn turn(argv[3], "/t5", {argv[1]});
   if (std::string(argv[2]) == "counting") {
-    for (std::size_t number = 0; number < chainshaper::dropped_names.size(); ++number) {
-      for (std::size_t i = 0; i <= number; ++i) {
-        turn.count(
-          static_cast<chainshaper::Dropped>(number), static_cast<std::int64_t>(number),
-          number % 2 == 1);
-      }
-    }
+    for (std::size_t number = 0; number < chainshaper::dropped_names.size(); ++number)
+      for (std::size_t i = 0; i <= number; ++i)
+        turn.count(static_cast<chainshaper::Dropped>(number), static_cast<std::int64_t>(number),
+                   number % 2 == 1);
     turn.count({}, {}, false);
     return 0;
   }
@@ -42,18 +36,14 @@ int main(int, char ** argv)
   address.sin_family = AF_INET;
   address.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
   address.sin_port = htons(static_cast<std::uint16_t>(std::stoi(argv[4])));
-  if (bind(inbox, reinterpret_cast<sockaddr *>(&address), sizeof(address)) != 0) {
-    return 1;
-  }
+  if (bind(inbox, reinterpret_cast<sockaddr *>(&address), sizeof(address)) != 0) return 1;
   sched_param lowest{};  // else who receives may run before it has noted what it did
   lowest.sched_priority = 1;
   sched_setscheduler(0, SCHED_FIFO, &lowest);
   publish('R', getpid());
   std::int64_t number = 0;
   while (recv(inbox, &number, 8, 0) == 8) {
-    if (!turn.take(number)) {
-      continue;
-    }
+    if (!turn.take(number)) continue;
     const std::int64_t until = chainshaper::monotonic_ns() + std::stoll(argv[5]);
     turn.hold(until, 0);
     chainshaper::sleep_until(until);

@@ -16,8 +16,7 @@ import threading
 import time
 from contextlib import suppress
 
-from chainshaper.gate import decision as gate
-from chainshaper.gate import handover
+from chainshaper.gate import decision, handover
 
 
 def publish(word: bytes, number: int) -> None:
@@ -29,7 +28,7 @@ def main() -> None:
     handover.page_folders = lambda: iter([folder])
     if what == "counting":
         turn = handover.Turn(name, "/t5")
-        for number, reason in enumerate(gate.DROPPED):
+        for number, reason in enumerate(decision.DROPPED):
             for _ in range(number + 1):
                 turn.count(reason, number, late=number % 2 == 1)
         turn.count(None, None, late=False)

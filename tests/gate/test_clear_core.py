@@ -1,4 +1,4 @@
-"""A core that is kept: by a real process, at the lowest real-time priority, until it is told."""
+"""A core that is cleared: by a real process, at the lowest real-time priority, until a time."""
 
 import os
 import signal
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper.gate.clear_core import KeptCore
+from chainshaper.gate.clear_core import ClearCore
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import list_threads
 
@@ -27,30 +27,30 @@ def _worked_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) * TICK_S
 
 
-def test_it_watches_the_clock_until_the_time_it_is_told_and_ends_with_its_owner() -> None:
+def test_it_watches_the_clock_until_the_time_it_is_given_and_ends_with_its_owner() -> None:
     if not may_use_fifo():
         pytest.skip("SCHED_FIFO is not permitted")
     core = available_cores()[0]
-    kept = KeptCore(core)
-    _wait_for(lambda: list_threads(kept.pid)[0].policy == "SCHED_FIFO")
-    _wait_for(lambda: list_threads(kept.pid)[0].cores == (core,))
-    assert list_threads(kept.pid)[0].priority == 1
-    before = _worked_s(kept.pid)
+    clearing = ClearCore(core)
+    _wait_for(lambda: list_threads(clearing.pid)[0].policy == "SCHED_FIFO")
+    _wait_for(lambda: list_threads(clearing.pid)[0].cores == (core,))
+    assert list_threads(clearing.pid)[0].priority == 1
+    before = _worked_s(clearing.pid)
     begun = time.monotonic()
-    kept.keep_until(time.monotonic_ns() + 300_000_000)
+    clearing.clear_until(time.monotonic_ns() + 300_000_000)
     time.sleep(0.4)
     # Others of higher priority may take some of it, on a machine that has a core to spare.
-    assert 0.1 < _worked_s(kept.pid) - before < time.monotonic() - begun
-    worked = _worked_s(kept.pid)
+    assert 0.1 < _worked_s(clearing.pid) - before < time.monotonic() - begun
+    worked = _worked_s(clearing.pid)
     time.sleep(0.1)
-    assert _worked_s(kept.pid) == worked, "it rests again"
-    os.kill(kept.pid, signal.SIGKILL)
-    kept.keep_until(time.monotonic_ns())  # its death does no harm
-    kept.end()
-    assert not list_threads(kept.pid)
+    assert _worked_s(clearing.pid) == worked, "it rests again"
+    os.kill(clearing.pid, signal.SIGKILL)
+    clearing.clear_until(time.monotonic_ns())  # its death does no harm
+    clearing.end()
+    assert not list_threads(clearing.pid)
 
 
-def test_what_cannot_be_kept_is_not() -> None:
-    kept = KeptCore(100_000)
-    kept.keep_until(time.monotonic_ns() + 3_600_000_000_000)
-    kept.end()
+def test_what_cannot_be_cleared_is_not() -> None:
+    clearing = ClearCore(100_000)
+    clearing.clear_until(time.monotonic_ns() + 3_600_000_000_000)
+    clearing.end()

@@ -14,14 +14,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
+from cpp_program import compiled
 
-from chainshaper import splicing
 from chainshaper.gate.decision import DROPPED
 from chainshaper.gate.handover import RING, Page, Standby, Turn, open_page
 
 MS = 1_000_000
 PROCESS = Path(__file__).parent / "output_process.py"
-HEADERS = Path(splicing.__file__).parent / "nodes" / "cpp" / "include"
 KILLS = int(os.environ.get("CHAINSHAPER_KILLS", "20"))
 PERIOD_S, HOLD_NS = 0.004, 2 * MS
 
@@ -104,15 +103,7 @@ class Output:
 @pytest.fixture(scope="module")
 def in_cpp(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The shaping node in C++."""
-    compiler = shutil.which("g++")
-    if compiler is None:
-        pytest.skip("g++ is not installed, so the shaping node in C++ cannot be compiled")
-    program = tmp_path_factory.mktemp("cpp") / "output_process"
-    source = PROCESS.with_suffix(".cpp")
-    warnings = ["-Wall", "-Wextra", "-Wconversion", "-Werror"]
-    options = ["-std=c++17", "-O1", *warnings, f"-I{HEADERS}"]
-    subprocess.run([compiler, *options, source, "-o", program], check=True, timeout=150)
-    return program
+    return compiled(PROCESS.with_suffix(".cpp"), tmp_path_factory.mktemp("cpp"))
 
 
 @pytest.fixture(params=["python", "cpp"])

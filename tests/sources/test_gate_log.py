@@ -5,6 +5,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
+from chainshaper.gate.decision import LOG_COLUMNS
 from chainshaper.sources.gate_log import read_gate_log, with_gate_logs
 from chainshaper.values import events
 from chainshaper.values.errors import InputError
@@ -26,6 +27,7 @@ def test_each_line_is_a_row_of_gate_release(tmp_path: Path) -> None:
         **events.FIELDS["gate_release"],
         **events.OPTIONAL_FIELDS["gate_release"],
     }
+    assert set(table.columns) == {*LOG_COLUMNS, "callback"}
     early, late = table.rows(named=True)
     assert (early["time"], early["release"], early["slot"], early["published"]) == (
         *(1060, 1060, 2),

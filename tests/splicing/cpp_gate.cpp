@@ -1,5 +1,5 @@
-// Drives the C++ gate without ROS 2: what becomes of the messages of the cases on standard input, one
-// case a line; with `--origins` the origins of payloads in hexadecimal; with a path a log.
+// Drives the C++ gate without ROS 2: what becomes of the messages of the cases on standard input,
+// one case a line; with `--origins` the origins of payloads in hexadecimal; with a path a log.
 
 #include <iostream>
 #include <string>
@@ -10,39 +10,31 @@
 
 using namespace chainshaper;  // NOLINT
 
-namespace
-{
+namespace {
 
-std::int64_t number()
-{
+std::int64_t number() {
   std::int64_t value{};
   std::cin >> value;
   return value;
 }
 
 // "-" stands for none.
-std::optional<std::int64_t> maybe()
-{
+Maybe maybe() {
   std::string word;
   std::cin >> word;
-  if (word == "-") {
-    return std::nullopt;
-  }
+  if (word == "-") return std::nullopt;
   return std::stoll(word);
 }
 
-template<typename T>
-void show(const std::optional<T> & value)
-{
-  if (value) {
+template <typename T>
+void show(const std::optional<T> & value) {
+  if (value)
     std::cout << ' ' << static_cast<std::int64_t>(*value);
-  } else {
+  else
     std::cout << " -";
-  }
 }
 
-Gate read_gate()
-{
+Gate read_gate() {
   Gate gate;
   gate.anchor = static_cast<Anchor>(number());
   gate.phase_ns = number();
@@ -69,16 +61,14 @@ Gate read_gate()
   return gate;
 }
 
-struct Outcome
-{
-  std::optional<std::int64_t> left_ns;
+struct Outcome {
+  Maybe left_ns;
   Release release;
   std::optional<Dropped> dropped;
 };
 
 // What the gate does without a clock; messages are their places in the order of coming.
-void walk()
-{
+void walk() {
   Queue<std::size_t> queue(read_gate());
   for (auto count = number(); count > 0; --count) {
     const auto time = number();
@@ -86,7 +76,7 @@ void walk()
   }
   const auto publishing_ns = number();
   const auto late_ns = number();
-  std::vector<std::pair<std::int64_t, std::optional<std::int64_t>>> arrivals;
+  std::vector<std::pair<std::int64_t, Maybe>> arrivals;
   for (auto count = number(); count > 0; --count) {
     const auto arrival = number();
     arrivals.emplace_back(arrival, maybe());
@@ -95,13 +85,11 @@ void walk()
   std::size_t next = 0;
   std::int64_t now = 0;
   const auto come_until = [&](std::int64_t time) {
-      for (; next < arrivals.size() && arrivals[next].first <= time; ++next) {
-        const auto full = queue.arrive(next, arrivals[next].first, arrivals[next].second);
-        if (full) {
-          found[full->waiting.message] = {std::nullopt, full->release, full->dropped};
-        }
-      }
-    };
+    for (; next < arrivals.size() && arrivals[next].first <= time; ++next) {
+      const auto full = queue.arrive(next, arrivals[next].first, arrivals[next].second);
+      if (full) found[full->waiting.message] = {std::nullopt, full->release, full->dropped};
+    }
+  };
   while (next < arrivals.size() || !queue.waiting.empty()) {
     if (queue.waiting.empty()) {
       now = std::max(now, arrivals[next].first);
@@ -113,9 +101,7 @@ void walk()
       const bool slept = *release.at_ns > now;
       now = std::max(now, *release.at_ns);
       come_until(now);
-      if (queue.waiting.front().message != oldest) {
-        continue;
-      }
+      if (queue.waiting.front().message != oldest) continue;
       now += slept ? late_ns : 0;
       if (queue.replaced(release, now)) {
         dropped = Dropped::replaced;
@@ -148,20 +134,17 @@ void walk()
   }
 }
 
-void show_origins()
-{
-  for (std::string line; std::getline(std::cin, line); ) {
+void show_origins() {
+  for (std::string line; std::getline(std::cin, line);) {
     std::vector<std::uint8_t> payload;
-    for (std::size_t i = 0; i + 1 < line.size(); i += 2) {
+    for (std::size_t i = 0; i + 1 < line.size(); i += 2)
       payload.push_back(static_cast<std::uint8_t>(std::stoi(line.substr(i, 2), nullptr, 16)));
-    }
     show(origin_of(payload.data(), payload.size()));
     std::cout << '\n';
   }
 }
 
-void write_log(const std::string & path, std::int64_t most_bytes, int rows)
-{
+void write_log(const std::string & path, std::int64_t most_bytes, int rows) {
   Gate gate;
   gate.slots = {{300'000'000, 400'000'000}};
   gate.cycle_ns = 1'000'000'000;
@@ -170,13 +153,11 @@ void write_log(const std::string & path, std::int64_t most_bytes, int rows)
   Shaper<int> shaper(gate, 0);
   {
     GateLog log;
-    if (!log.open_file(path, most_bytes)) {
-      throw std::runtime_error("no log");
-    }
-    const auto hold = [&](std::int64_t age_ns, std::optional<std::int64_t> source) {
-        shaper.arrive(0, clock_ns(CLOCK_REALTIME) - age_ns, source, false, source ? 2 : 0);
-        return *shaper.hold();
-      };
+    if (!log.open_file(path, most_bytes)) throw std::runtime_error("no log");
+    const auto hold = [&](std::int64_t age_ns, Maybe source) {
+      shaper.arrive(0, clock_ns(CLOCK_REALTIME) - age_ns, source, false, source ? 2 : 0);
+      return *shaper.hold();
+    };
     const auto first = hold(0, 5);
     log.write(shaper.queue.gate, first, monotonic_ns(), shaper.time_lost(first));
     shaper.announce("city", monotonic_ns());
@@ -185,9 +166,8 @@ void write_log(const std::string & path, std::int64_t most_bytes, int rows)
     const auto late = hold(500'000'000, std::numeric_limits<std::int64_t>::max());
     for (auto row = 0; row < rows; ++row) {
       log.write(shaper.queue.gate, late);
-      if (row % 1000 == 999) {  // the writer is an ordinary thread
+      if (row % 1000 == 999)  // the writer is an ordinary thread
         sleep_until(monotonic_ns() + 50'000'000);
-      }
     }
     std::cout << log.losses() << '\n';
   }
@@ -195,8 +175,7 @@ void write_log(const std::string & path, std::int64_t most_bytes, int rows)
 
 // Cycles of 4 s are to begin 2 s from now instead: when one begins before that is in force (counted
 // from where one did), and behind it (counted from where the first was to). In ms.
-void moved_phase()
-{
+void moved_phase() {
   Gate gate;
   gate.cycle_ns = 4'000'000'000;
   gate.slots = {{0, gate.cycle_ns}};
@@ -206,9 +185,9 @@ void moved_phase()
   const std::int64_t moved = now + 2'000'000'000;
   shaper.set_phase(moved % gate.cycle_ns, now);
   const auto origin = [&] {
-      shaper.arrive(0, std::nullopt);
-      return shaper.hold()->release.origin_ns;
-    };
+    shaper.arrive(0, std::nullopt);
+    return shaper.hold()->release.origin_ns;
+  };
   std::cout << origin() % gate.cycle_ns / 1'000'000 << "\n";
   sleep_until(moved);
   std::cout << (origin() - moved) / 1'000'000 << "\n";
@@ -216,8 +195,7 @@ void moved_phase()
 
 }  // namespace
 
-int main(int argc, char ** argv)
-{
+int main(int argc, char ** argv) {
   const std::string what = argc > 1 ? argv[1] : "";
   if (what == "--phase") {
     moved_phase();
@@ -231,7 +209,5 @@ int main(int argc, char ** argv)
     write_log(what, std::stoll(argv[2]), std::stoi(argv[3]));
     return 0;
   }
-  for (auto cases = number(); cases > 0; --cases) {
-    walk();
-  }
+  for (auto cases = number(); cases > 0; --cases) walk();
 }

@@ -8,15 +8,17 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from queue import Empty, Queue
 from typing import Any
 
+from passing import serialized
+
 from chainshaper.splicing.shaping_process import ShapingProcess
 
-__all__ = ["RELIABLE", "NodeRun", "running_node", "stamped"]
+__all__ = ["PUBLISHERS", "RELIABLE", "NodeRun", "running_node", "stamped"]
 
 STAND_IN = Path(__file__).parent / "rclpy_stand_in.py"
 
@@ -31,6 +33,9 @@ RELIABLE = {
     "liveliness": 1,
     "liveliness_lease_duration": "infinite",
 }
+
+
+PUBLISHERS = {"/t3_tmp": [{"type": "sensor_msgs/msg/Image", "qos": RELIABLE}]}
 
 
 class NodeRun:
@@ -53,6 +58,30 @@ class NodeRun:
         assert self.process.stdin is not None
         self.process.stdin.write(json.dumps(what) + "\n")
         self.process.stdin.flush()
+
+    def send(self, payload: bytes, source: int = 1, **more: Any) -> None:
+        """Give it a message of its input."""
+        self.tell(topic="/t3_tmp", payload=payload.hex(), source=source, **more)
+
+    def hear_published(self, payload: bytes | None = None) -> None:
+        """Wait until it publishes the output: anything, or that."""
+        self.hear(
+            lambda words: (
+                words.get("published") == "/t3"
+                and payload in (None, bytes.fromhex(words["payload"]))
+            )
+        )
+
+    @property
+    def published(self) -> list[bytes]:
+        """What it has published on the output."""
+        found = [words["payload"] for words in self.said if words.get("published") == "/t3"]
+        return [bytes.fromhex(payload) for payload in found]
+
+    @property
+    def logged(self) -> list[str]:
+        """The texts of its log output."""
+        return [words["log"] for words in self.said if "log" in words]
 
     def hear(self, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
         """The next thing it says that is wanted."""
@@ -90,12 +119,15 @@ class NodeRun:
 def running_node(
     process: ShapingProcess,
     folder: Path,
-    publishers: dict[str, list[dict[str, Any]]],
-    **environment: str,
+    publishers: dict[str, list[dict[str, Any]]] | None = None,
+    *,
+    spinning: bool = True,
+    environment: Mapping[str, str] | None = None,
 ) -> Iterator[NodeRun]:
     """A Python node that runs where only the stand-in and PyYAML can be imported.
 
-    What it agrees on with its standby is in a folder of the test.
+    What it agrees on with its standby is in a folder of the test. ``spinning``: once it has begun
+    to work.
     """
     modules = folder / "modules"
     modules.mkdir(exist_ok=True)
@@ -120,12 +152,15 @@ def running_node(
             **os.environ,
             "PYTHONPATH": str(modules),
             "XDG_RUNTIME_DIR": str(folder),
-            "STAND_IN_PUBLISHERS": json.dumps(publishers),
-            **environment,
+            "STAND_IN_PUBLISHERS": json.dumps(PUBLISHERS if publishers is None else publishers),
+            **(environment or {}),
         },
     )
     try:
-        yield NodeRun(child)
+        run = NodeRun(child)
+        if spinning:
+            run.hear(lambda words: words.get("event") == "spinning")
+        yield run
     finally:
         child.kill()
         child.wait()
@@ -133,6 +168,4 @@ def running_node(
 
 def stamped(rest: bytes = b"rest", age_ns: int = 0) -> bytes:
     """A serialized message whose chain began when this is called, or so long before."""
-    seconds, nanoseconds = divmod(time.time_ns() - age_ns, 1_000_000_000)
-    stamp = seconds.to_bytes(4, "little", signed=True) + nanoseconds.to_bytes(4, "little")
-    return b"\0\1\0\0" + stamp + rest
+    return serialized(time.time_ns() - age_ns, rest)

@@ -50,12 +50,14 @@ class ClockType(IntEnum):
     STEADY_TIME = 3
 
 
-class QoSProfile(SimpleNamespace):
-    """Upstream checks its fields; the test does here, from the line that is written."""
+class _Record(SimpleNamespace):
+    """Fields as they are given. Upstream checks those of a QoSProfile; the test does here."""
 
 
-class Clock(SimpleNamespace):
-    """Nothing asks it for the time."""
+class QoSProfile(_Record): ...
+
+
+class Clock(_Record): ...
 
 
 class Parameter(SimpleNamespace):
@@ -65,8 +67,7 @@ class Parameter(SimpleNamespace):
         super().__init__(name=name, value=value)
 
 
-class SetParametersResult(SimpleNamespace):
-    """Of rcl_interfaces.msg."""
+SetParametersResult = DiagnosticStatus = KeyValue = String = _Record  # messages, of their packages
 
 
 class Subscription:
@@ -79,31 +80,17 @@ class Subscription:
             WITH_MESSAGE_INFO = 1
 
 
-class DiagnosticStatus(SimpleNamespace):
-    """Of diagnostic_msgs.msg."""
-
-
-class KeyValue(SimpleNamespace):
-    """Of diagnostic_msgs.msg."""
-
-
 class DiagnosticArray(SimpleNamespace):
     """Of diagnostic_msgs.msg."""
 
-    def __init__(self, status: list[DiagnosticStatus]) -> None:
+    def __init__(self, status: list[_Record]) -> None:
         super().__init__(status=status, header=SimpleNamespace(stamp=None))
 
 
-class Image:
-    """Of sensor_msgs.msg."""
+class Image: ...
 
 
-class Empty:
-    """Of std_msgs.msg."""
-
-
-class String(SimpleNamespace):
-    """Of std_msgs.msg."""
+class Empty: ...
 
 
 def _say(**what: Any) -> None:

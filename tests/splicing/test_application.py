@@ -128,8 +128,8 @@ def test_a_gated_publisher_discards_by_a_lifespan(application: Application) -> N
     assert Application.model_validate(spliced.model_dump()) == spliced
     shorter = spliced.topic("/t3").model_copy(update={"lifespan_ns": 9_000_000})
     own = application.model_copy(update={"topics": {"/t3": shorter}})
-    kept = splice_application(own, discarding).topic("/t3")
-    assert kept.lifespan_ns == 9_000_000, "the application's own is stricter"
+    shortest = splice_application(own, discarding).topic("/t3")
+    assert shortest.lifespan_ns == 9_000_000, "the application's own is stricter"
 
 
 def test_a_gated_publisher_has_to_publish_asynchronously(tmp_path: Path) -> None:

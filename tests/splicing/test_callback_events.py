@@ -57,7 +57,7 @@ const void * rcl_subscription_get_rmw_handle(const char * subscription) {return 
 
 
 def preloaded(folder: Path, *flags: str) -> dict[str, str]:
-    """An environment in which the libraries are loaded; what they are told is written down."""
+    """An environment in which the libraries are loaded; the events are written down."""
     if shutil.which("gcc") is None:
         pytest.skip("no gcc to build the tracing library with")
     libraries = []
@@ -77,7 +77,7 @@ def heard(folder: Path) -> list[tuple[str, int, int, str]]:
 
 def test_the_throttlers_callbacks_are_seen_like_those_of_rclcpp(tmp_path: Path) -> None:
     process = write_throttler({"/raw": "/scan"}, 100_000_000, "python", tmp_path)
-    with running_node(process, tmp_path, {"/raw": IMAGES}, **preloaded(tmp_path)) as run:
+    with running_node(process, tmp_path, {"/raw": IMAGES}, environment=preloaded(tmp_path)) as run:
         run.tell(topic="/raw", payload="aa", source=1)
         run.tell(tick=1)
         run.hear(lambda words: "published" in words)
@@ -103,9 +103,9 @@ def test_the_shaping_node_still_gets_message_and_source_timestamp(
     assert plan.shaping_node is not None
     log = tmp_path / "gate.csv"
     process = write_shaping_process(plan, plan.shaping_node, "python", tmp_path, log=log)
-    with running_node(process, tmp_path, {"/t3_tmp": IMAGES}, **preloaded(tmp_path)) as run:
-        run.tell(topic="/t3_tmp", payload=stamped().hex(), source=77)
-        run.hear(lambda words: words.get("published") == "/t3")
+    with running_node(process, tmp_path, environment=preloaded(tmp_path)) as run:
+        run.send(stamped(), 77)
+        run.hear_published()
         assert run.end() == 0
     assert log.read_text().splitlines()[1].split(",")[4] == "77"
     assert [event for event, *_ in heard(tmp_path)][-2:] == ["callback_start", "callback_end"]
@@ -114,7 +114,7 @@ def test_the_shaping_node_still_gets_message_and_source_timestamp(
 def test_a_library_without_all_trace_points_is_left_alone(tmp_path: Path) -> None:
     process = write_throttler({"/raw": "/scan"}, 100_000_000, "python", tmp_path)
     library = preloaded(tmp_path, "-DINCOMPLETE")
-    with running_node(process, tmp_path, {"/raw": IMAGES}, **library) as run:
+    with running_node(process, tmp_path, {"/raw": IMAGES}, environment=library) as run:
         run.tell(topic="/raw", payload="aa", source=1)
         run.tell(tick=1)
         run.hear(lambda words: "published" in words)
@@ -129,9 +129,9 @@ def test_on_humble_serialized_messages_are_seen_as_on_later_distributions(
     assert plan.shaping_node is not None
     process = write_shaping_process(plan, plan.shaping_node, "python", tmp_path)
     humble = {**preloaded(tmp_path), "STAND_IN_HUMBLE": "1"}
-    with running_node(process, tmp_path, {"/t3_tmp": IMAGES}, **humble) as run:
-        run.tell(topic="/t3_tmp", payload=stamped().hex(), source=77)
-        run.hear(lambda words: words.get("published") == "/t3")
+    with running_node(process, tmp_path, environment=humble) as run:
+        run.send(stamped(), 77)
+        run.hear_published()
         assert run.end() == 0
     taken, _, published, written, _ = heard(tmp_path)[-5:]
     message = taken[2]

@@ -199,7 +199,7 @@ def test_a_running_node_is_told_where_cycles_begin(
         arguments = (ros_script.__file__, "parameter", "phase_ns", str(phase), "/nobody", node)
         said = run_with_rclpy(own_environment(), *arguments, within_s=30)
         coming.result()
-    assert said == ("", "/nobody offers no parameters"), "and the other was told"
+    assert said == ("", "/nobody offers no parameters"), "and the other has it"
     origins = read_gate_log(log)["origin"]
     assert origins[-1] % plan.cycle_ns == phase
     assert set(origins % plan.cycle_ns) <= {0, phase}

@@ -5,14 +5,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from node_run import RELIABLE, NodeRun, running_node, stamped
+from node_run import NodeRun, running_node, stamped
 from processes import wait_for
 
 from chainshaper.gate.handover import Page, open_page
@@ -23,7 +21,6 @@ from chainshaper.splicing.shaped_outputs import find_outputs, output_text
 from chainshaper.splicing.shaping_process import ShapingProcess, write_shaping_process
 
 MS = 1_000_000
-PUBLISHERS = {"/t3_tmp": [{"type": "sensor_msgs/msg/Image", "qos": RELIABLE}]}
 
 
 def written(
@@ -43,22 +40,15 @@ def written(
     return process, process.standby
 
 
-@contextmanager
-def running(process: ShapingProcess, folder: Path, **more: str) -> Iterator[NodeRun]:
-    with running_node(process, folder, PUBLISHERS, **more) as run:
-        run.hear(lambda words: words.get("event") == "spinning")
-        yield run
-
-
 def came(run: NodeRun) -> list[int]:
     """The numbers of the messages that a node has published."""
-    return [int(words["payload"][-2:], 16) for words in run.said if words.get("published") == "/t3"]
+    return [payload[-1] for payload in run.published]
 
 
 def say(number: int, *runs: NodeRun) -> None:
-    payload = stamped(bytes([number])).hex()
+    payload = stamped(bytes([number]))
     for run in runs:
-        run.tell(topic="/t3_tmp", payload=payload, source=1000 + number)
+        run.send(payload, 1000 + number)
 
 
 def take_over(number: int, folder: Path, shaping: NodeRun) -> None:
@@ -75,11 +65,11 @@ def test_what_a_killed_node_had_in_hand_goes_around_it_until_it_is_back(
     tmp_path: Path, plan: Plan
 ) -> None:
     process, beside = written(plan, tmp_path)
-    with running(beside, tmp_path) as standby:
-        with running(process, tmp_path) as shaping:
+    with running_node(beside, tmp_path) as standby:
+        with running_node(process, tmp_path) as shaping:
             take_over(1, tmp_path, shaping)
             say(1, standby)
-            shaping.hear(lambda words: words.get("published") == "/t3")
+            shaping.hear_published()
             (output,) = outputs(tmp_path)
             assert (output.topic, output.state) == ("/t3", "shaped")
             assert (output.shaping_node, output.standby) == (
@@ -89,9 +79,9 @@ def test_what_a_killed_node_had_in_hand_goes_around_it_until_it_is_back(
             say(2, shaping, standby)
             time.sleep(0.005)  # the node holds it for 21 ms
             shaping.process.kill()
-            standby.hear(lambda words: words.get("published") == "/t3")
+            standby.hear_published()
         say(3, standby)
-        standby.hear(lambda words: words.get("published") == "/t3")
+        standby.hear_published()
         wait_for(lambda: outputs(tmp_path)[0].messages == 2, "both to be counted")
         (output,) = outputs(tmp_path)
         assert (output.state, output.shaping_node) == ("bypassed", None)
@@ -100,21 +90,20 @@ def test_what_a_killed_node_had_in_hand_goes_around_it_until_it_is_back(
         report = standby.hear(lambda words: "diagnostics" in words)
         assert (report["diagnostics"], report["level"]) == ("chainshaper: /t3", 1)
         assert report["message"].endswith("2 messages")
-        with running(process, tmp_path) as again:
+        with running_node(process, tmp_path) as again:
             take_over(3, tmp_path, again)
             say(4, again, standby)
-            again.hear(lambda words: words.get("published") == "/t3")
+            again.hear_published()
             say(5, again, standby)
-            again.hear(lambda words: words.get("published") == "/t3")
+            again.hear_published()
             standby.tell(tick=2)
             report = standby.hear(lambda words: "diagnostics" in words)
             assert (report["level"], report["message"]) == (0, "shaped")
             again.end()
         standby.end()
     assert (came(shaping), came(standby), came(again)) == ([1], [2, 3], [4, 5])
-    logged = [words["log"] for words in standby.said if "log" in words]
-    assert "chainshaper_t3 is not there: /t3: messages go around it" in logged
-    assert any("is back after " in text and "2 messages came" in text for text in logged)
+    assert "chainshaper_t3 is not there: /t3: messages go around it" in standby.logged
+    assert any("is back after " in text and "2 messages came" in text for text in standby.logged)
     gate = read_gate_log(tmp_path / "gate.csv")
     assert gate["source_timestamp"].to_list() == [1001, 1004, 1005]
     bypass = read_gate_log(tmp_path / "chainshaper_t3_standby.csv")
@@ -151,7 +140,7 @@ def test_what_waits_in_a_killed_node_goes_around_it_but_not_what_it_has_dropped(
     timing = {"cycle_ns": 60_000 * MS, "slots_ns": slot, "anchor": "cycle"}
     phase = (time.monotonic_ns() - 1000 * MS) % (60_000 * MS)
     change(process, **{**timing, "phase_ns": phase, "overrun": "wait", **changes})
-    with running(beside, tmp_path) as standby, running(process, tmp_path) as shaping:
+    with running_node(beside, tmp_path) as standby, running_node(process, tmp_path) as shaping:
         take_over(1, tmp_path, shaping)
         say(1, standby)
         for number in range(2, 9):
@@ -161,7 +150,7 @@ def test_what_waits_in_a_killed_node_goes_around_it_but_not_what_it_has_dropped(
         shaping.process.kill()
         say(9, standby)
         for _ in range(dropped + 1, 10):
-            standby.hear(lambda words: words.get("published") == "/t3")
+            standby.hear_published()
         standby.end()
     assert (came(shaping), came(standby)) == ([], list(range(dropped + 1, 10)))
 
@@ -171,14 +160,14 @@ def test_what_a_stopped_node_finds_when_it_goes_on_is_neither_doubled_nor_counte
 ) -> None:
     process, beside = written(plan, tmp_path, patience_ns=300 * MS)
     change(process, depth=3, cycle_ns=1000 * MS, slots_ns=[500 * MS, 700 * MS])
-    with running(beside, tmp_path) as standby, running(process, tmp_path) as shaping:
+    with running_node(beside, tmp_path) as standby, running_node(process, tmp_path) as shaping:
         take_over(1, tmp_path, shaping)
         shaping.process.send_signal(signal.SIGSTOP)  # while it waits for the slot
         say(1, standby)
         for number in range(2, 9):
             say(number, shaping, standby)
         for _ in range(1, 9):
-            standby.hear(lambda words: words.get("published") == "/t3")
+            standby.hear_published()
         shaping.process.send_signal(signal.SIGCONT)
         number = 8
         while not shaping.heard(lambda words: words.get("published") == "/t3", within_s=0.9):
@@ -195,7 +184,7 @@ def test_with_the_fallback_silence_nothing_is_published_and_all_is_counted(
     tmp_path: Path, plan: Plan
 ) -> None:
     _, beside = written(revised(plan, fallback="silence"), tmp_path)
-    with running(beside, tmp_path) as standby:
+    with running_node(beside, tmp_path) as standby:
         for number in range(3):
             say(number, standby)
         wait_for(lambda: outputs(tmp_path)[0].messages == 3, "all to be counted")
@@ -215,14 +204,14 @@ def test_with_the_fallback_silence_nothing_is_published_and_all_is_counted(
 
 def test_a_node_that_is_stopped_is_gone_around(tmp_path: Path, plan: Plan) -> None:
     process, beside = written(plan, tmp_path, patience_ns=500 * MS)
-    with running(beside, tmp_path) as standby, running(process, tmp_path) as shaping:
+    with running_node(beside, tmp_path) as standby, running_node(process, tmp_path) as shaping:
         take_over(1, tmp_path, shaping)
         say(1, standby)
-        shaping.hear(lambda words: words.get("published") == "/t3")
+        shaping.hear_published()
         shaping.process.send_signal(signal.SIGSTOP)
         for number in (2, 3):
             say(number, shaping, standby)
-            standby.hear(lambda words: words.get("published") == "/t3")
+            standby.hear_published()
         shaping.process.send_signal(signal.SIGCONT)
         number = 3
         while not shaping.heard(lambda words: words.get("published") == "/t3", within_s=0.6):
@@ -232,7 +221,7 @@ def test_a_node_that_is_stopped_is_gone_around(tmp_path: Path, plan: Plan) -> No
         standby.end()
     assert came(standby)[:2] == [2, 3]
     assert sorted(came(shaping) + came(standby)) == list(range(1, number + 1))
-    assert any("it hangs, or was stopped" in words.get("log", "") for words in standby.said)
+    assert any("it hangs, or was stopped" in text for text in standby.logged)
 
 
 def test_a_node_that_starts_again_goes_on_in_its_cycle_and_mode(tmp_path: Path, plan: Plan) -> None:
@@ -245,13 +234,13 @@ def test_a_node_that_starts_again_goes_on_in_its_cycle_and_mode(tmp_path: Path, 
     plan = revised(plan, servers=servers, modes=modes, anchor="cycle")
     process, _ = written(plan, tmp_path)
     for announced in (True, False):
-        with running(process, tmp_path) as run:
+        with running_node(process, tmp_path) as run:
             if announced:
                 run.tell(set=["phase_ns", 13 * MS])
                 run.tell(topic="/mode", data="highway")
                 time.sleep(0.15)  # it is in force from the next cycle on
             say(int(announced), run)
-            run.hear(lambda words: "published" in words)
+            run.hear_published()
             seen = 2 - int(announced)
             wait_for(lambda: read_gate_log(tmp_path / "gate.csv").height == seen, "its log")  # noqa: B023
             run.process.kill()
@@ -268,13 +257,11 @@ def test_a_node_that_fails_at_once_waits_longer_each_time_and_says_so(
     for failed in range(4):
         if failed == 2:  # for another reason
             process.parameters_file.write_text(text.replace("cycle_ns: 50000000", "cycle_ns: 5"))
-        with running_node(process, tmp_path, {"/t3_tmp": [{"type": "no/msg/T", "qos": {}}]}) as run:
+        unknown = {"/t3_tmp": [{"type": "no/msg/T", "qos": {}}]}
+        with running_node(process, tmp_path, unknown, spinning=False) as run:
             assert run.end() == 1
-        said = any(
-            f"has failed {failed} times: starting in 0.5 s" in words.get("log", "")
-            for words in run.said
-        )
-        assert said == (failed == 3)
+        said = f"has failed {failed} times: starting in 0.5 s"
+        assert any(said in text for text in run.logged) == (failed == 3)
 
 
 def test_without_a_folder_the_node_works_alone_and_the_standby_says_that_it_cannot(
@@ -289,12 +276,12 @@ def test_without_a_folder_the_node_works_alone_and_the_standby_says_that_it_cann
     (tmp_path / "outputs").touch()
     (tmp_path / "chainshaper").touch()
     (tmp_path / "no").touch()
-    with running_node(beside, tmp_path, PUBLISHERS) as standby:
+    with running_node(beside, tmp_path, spinning=False) as standby:
         standby.hear(lambda words: "/t3 falls silent when" in words.get("log", ""))
-        with running(process, tmp_path) as shaping:
+        with running_node(process, tmp_path) as shaping:
             say(1, shaping)
-            shaping.hear(lambda words: words.get("published") == "/t3")
-            assert any("nothing can be agreed" in words.get("log", "") for words in shaping.said)
+            shaping.hear_published()
+            assert any("nothing can be agreed" in text for text in shaping.logged)
         wait_for(lambda: standby.process.poll() is None, "the standby to be there")
         standby.process.kill()
 
@@ -304,9 +291,9 @@ def test_the_standby_leaves_the_cores_of_servers_alone(tmp_path: Path, plan: Pla
     servers = {server.core for server in plan.servers}
     parameters = yaml.safe_load(beside.parameters_file.read_text())["/**"]["ros__parameters"]
     assert set(parameters["server_cores"]) == servers
-    with running(beside, tmp_path) as standby:
+    with running_node(beside, tmp_path) as standby:
         say(1, standby)
-        standby.hear(lambda words: words.get("published") == "/t3")
+        standby.hear_published()
         ours = os.sched_getaffinity(0)
         assert os.sched_getaffinity(standby.process.pid) == (ours - servers or ours)
         assert os.sched_getscheduler(standby.process.pid) == os.SCHED_OTHER

@@ -6,7 +6,6 @@ from typing import Any
 import polars as pl
 import pytest
 
-from chainshaper.gate.decision import ANCHORS, DROPPED, LATE, MESSAGES
 from chainshaper.values import events
 from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS, EventLog, number_of
 from chainshaper.workload.event_reading import ProcessLog, event_tables, meter_tables
@@ -47,12 +46,6 @@ def test_the_layout_says_what_the_event_tables_say() -> None:
         known = {**events.FIELDS[name], **events.OPTIONAL_FIELDS.get(name, {})}
         assert set(events.FIELDS[name]) <= set(fields) <= {*known, *events.COMMON_COLUMNS}, name
         assert 2 + len(fields) <= WIDTH, name
-
-
-def test_words_are_those_that_the_gate_uses() -> None:
-    assert (WORDS["anchor"], WORDS["overrun"]) == (ANCHORS, LATE)
-    assert (WORDS["messages"], WORDS["dropped"]) == (MESSAGES, DROPPED)
-    assert number_of("outcome", "overwritten") == 2
 
 
 def test_a_discarded_message_has_no_release_and_no_slot() -> None:

@@ -1,4 +1,4 @@
-"""A core that is kept clear of other work while an output is delivered there.
+"""A core that is clear of other work while an output is delivered there.
 
 DDS threads that receive outrank everything else on their core, but that does not help them at once:
 unless the kernel is fully preemptible, an ordinary thread that is inside a system call goes on
@@ -15,50 +15,48 @@ import subprocess
 import sys
 from contextlib import suppress
 
-__all__ = ["KeptCore"]
 
-
-def _keep(core: int) -> None:
-    """Keep a core until the times (ns of CLOCK_MONOTONIC) that come on standard input."""
+def _clear(core: int) -> None:
+    """Clear a core until the times (ns of CLOCK_MONOTONIC) that come on standard input."""
     import os  # this function is all that its process has
     import time
 
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     os.sched_setaffinity(0, {core})
-    while told := os.read(0, 8):
-        until_ns = int.from_bytes(told, "little")
+    while received := os.read(0, 8):
+        until_ns = int.from_bytes(received, "little")
         while time.monotonic_ns() < until_ns:
             pass
 
 
-class KeptCore:
-    """A process that keeps a core. It ends with the one that made it, and hears no Ctrl-C.
+class ClearCore:
+    """A process that clears a core. It ends with the one that made it, and hears no Ctrl-C.
 
-    Where SCHED_FIFO or the core is refused, nothing is kept.
+    Where SCHED_FIFO or the core is refused, it clears none.
     """
 
     def __init__(self, core: int) -> None:
-        program = f"{inspect.getsource(_keep)}\n_keep({core})"
-        told, self._tell = os.pipe()
+        program = f"{inspect.getsource(_clear)}\n_clear({core})"
+        times, self._times = os.pipe()
         self._process = subprocess.Popen(
             [sys.executable, "-I", "-S", "-c", program],
-            stdin=told,
+            stdin=times,
             stderr=subprocess.DEVNULL,
             start_new_session=True,
         )
-        os.close(told)
+        os.close(times)
 
     @property
     def pid(self) -> int:
         """The id of its process."""
         return self._process.pid
 
-    def keep_until(self, time_ns: int) -> None:
-        """Keep the core from now until then."""
+    def clear_until(self, time_ns: int) -> None:
+        """Clear the core from now until then."""
         with suppress(BrokenPipeError):
-            os.write(self._tell, time_ns.to_bytes(8, "little"))
+            os.write(self._times, time_ns.to_bytes(8, "little"))
 
     def end(self) -> None:
         """Give the core back."""
-        os.close(self._tell)
+        os.close(self._times)
         self._process.wait()

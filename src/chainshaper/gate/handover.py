@@ -17,8 +17,8 @@ when it goes on, leaves it out. What is left is the time from a publication unti
 the page, some microseconds: a process that is killed just there has published a message that the
 other publishes again.
 
-Like the gate, this imports nothing outside the standard library, since it runs inside ROS 2 nodes;
-`handover.hpp` is the node's side in C++, with the same page.
+Standard library only, as the gate; `handover.hpp` is the node's side in C++, with the same page,
+whose layout is filled in from here.
 """
 
 import fcntl
@@ -32,9 +32,9 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from typing import NamedTuple
 
-__all__ = ["FIELDS", "Page", "Standby", "Turn", "open_page", "page_folders"]
+from chainshaper.gate.decision import DROPPED
 
 FIELDS = (
     "holder",  # the shaping node in force, a process id; 0 while the standby has the lock
@@ -56,10 +56,7 @@ FIELDS = (
     "bypassed",  # how many messages the standby has dealt with: so many are in its ring
     "bypassed_before",  # how many of these before the present time without a shaping node
     "published",  # how many messages shaping nodes have published
-    "replaced",  # how many they have dropped, for each of the gate's reasons
-    "surplus",
-    "overflowed",
-    "discarded",
+    *DROPPED,  # how many they have dropped, for each of the gate's reasons
     "lost_by_dds",  # how many are missing in what they have received
     "late",  # how many came behind the last slot that they were due in
 )
@@ -67,12 +64,18 @@ FIELDS = (
 
 VERSION = 1  # of the page's layout: part of its name
 RING = 1024
+RELEASED, BYPASSED, TOPIC = 32, 32 + RING, 32 + 2 * RING  # places of two rings and the name
+TOPIC_BYTES = 256
+PUBLISHING, STANDING_BY, PASSING = 0, 1, 2  # the bytes of the file that are locked
 _AT = {name: place for place, name in enumerate(FIELDS)}
-_RELEASED, _BYPASSED, _TOPIC = 32, 32 + RING, 32 + 2 * RING
-_TOPIC_BYTES = 256
-_SIZE = 8 * _TOPIC + _TOPIC_BYTES
-_PUBLISHING, _STANDING_BY, _PASSING = 0, 1, 2  # the bytes of the file that are locked
+_SIZE = 8 * TOPIC + TOPIC_BYTES
 _FLOCK = "hhqqi4x"  # struct flock: type, whence, start, length, process
+
+GIVE_UP_NS = 50_000_000
+"""A node waits so long for a standby, which needs the lock for a fraction of a millisecond."""
+
+AT_ONCE_NS = 30_000_000_000
+"""A node that deals with no message for so long has not failed at once."""
 
 BACK_OFF_AFTER = 3
 """So many starts may fail at once; then each waits twice as long as the one before."""
@@ -152,7 +155,7 @@ class Page:
         self._inode = found.st_ino
         self._numbers = memoryview(self._memory).cast("q")
         if topic is not None:
-            self._memory[8 * _TOPIC :] = topic.encode()[:_TOPIC_BYTES].ljust(_TOPIC_BYTES, b"\0")
+            self._memory[8 * TOPIC :] = topic.encode()[:TOPIC_BYTES].ljust(TOPIC_BYTES, b"\0")
 
     def __getitem__(self, field: str) -> int:
         return self._numbers[_AT[field]]
@@ -163,7 +166,7 @@ class Page:
     @property
     def topic(self) -> str:
         """The output."""
-        return self._memory[8 * _TOPIC :].rstrip(b"\0").decode(errors="replace")
+        return self._memory[8 * TOPIC :].rstrip(b"\0").decode(errors="replace")
 
     @property
     def is_current(self) -> bool:
@@ -173,60 +176,23 @@ class Page:
         except OSError:
             return False
 
-    def lock(self) -> bool:
-        """Take the right to publish, if no process has it; it ends with the process."""
-        return self._lock(_PUBLISHING, fcntl.F_WRLCK)
-
-    def unlock(self) -> None:
-        """Give the right back."""
-        self._lock(_PUBLISHING, fcntl.F_UNLCK)
-
-    def stand_by(self) -> bool:
-        """Be the standby of this output, if there is no other."""
-        return self._lock(_STANDING_BY, fcntl.F_WRLCK)
-
-    @property
-    def has_standby(self) -> bool:
-        """Whether another process is the standby."""
-        return self._locked(_STANDING_BY)
-
-    def begin_passing(self) -> None:
-        """The standby publishes although the shaping node has the lock."""
-        self._lock(_PASSING, fcntl.F_WRLCK)
-
-    def end_passing(self) -> None:
-        """The standby has published."""
-        self._lock(_PASSING, fcntl.F_UNLCK)
-
-    @property
-    def is_passing(self) -> bool:
-        """Whether the standby publishes although the shaping node has the lock."""
-        return self._locked(_PASSING)
-
-    @property
-    def is_locked(self) -> bool:
-        """Whether another process has the right to publish."""
-        return self._locked(_PUBLISHING)
-
-    def note(self, key: int | None, *, bypassed: bool) -> None:
-        """A message has been dealt with, by the standby or by the shaping node."""
-        count, ring = ("bypassed", _BYPASSED) if bypassed else ("released", _RELEASED)
-        number = self[count]
-        self._numbers[ring + number % RING] = key or 0
-        self[count] = number + 1
-
-    def noted(self, *, bypassed: bool) -> list[int]:
-        """The latest messages that one of the two has dealt with, in no order."""
-        ring = _BYPASSED if bypassed else _RELEASED
-        return self._numbers[ring : ring + RING].tolist()
-
-    def close(self) -> None:
-        """Give up the page, and with it whatever it has locked."""
-        self._numbers.release()
-        self._memory.close()
-        os.close(self._file)
-
     # Locks of open files (F_OFD_…): several in one file, each visible without taking it.
+
+    def lock(self, byte: int = PUBLISHING) -> bool:
+        """Take a right, if no process has it: to publish, to be the standby, or to publish as the
+        standby although the shaping node has the first. It ends with the process.
+        """
+        return self._lock(byte, fcntl.F_WRLCK)
+
+    def unlock(self, byte: int = PUBLISHING) -> None:
+        """Give the right back."""
+        self._lock(byte, fcntl.F_UNLCK)
+
+    def is_locked(self, byte: int = PUBLISHING) -> bool:
+        """Whether another process has the right."""
+        asked = struct.pack(_FLOCK, fcntl.F_WRLCK, 0, byte, 1, 0)
+        answer = fcntl.fcntl(self._file, fcntl.F_OFD_GETLK, asked)
+        return bool(struct.unpack(_FLOCK, answer)[0] != fcntl.F_UNLCK)
 
     def _lock(self, byte: int, kind: int) -> bool:
         try:
@@ -235,10 +201,23 @@ class Page:
             return False
         return True
 
-    def _locked(self, byte: int) -> bool:
-        asked = struct.pack(_FLOCK, fcntl.F_WRLCK, 0, byte, 1, 0)
-        answer = fcntl.fcntl(self._file, fcntl.F_OFD_GETLK, asked)
-        return bool(struct.unpack(_FLOCK, answer)[0] != fcntl.F_UNLCK)
+    def note(self, key: int | None, *, bypassed: bool) -> None:
+        """A message has been dealt with, by the standby or by the shaping node."""
+        count, ring = ("bypassed", BYPASSED) if bypassed else ("released", RELEASED)
+        number = self[count]
+        self._numbers[ring + number % RING] = key or 0
+        self[count] = number + 1
+
+    def noted(self, *, bypassed: bool) -> list[int]:
+        """The latest messages that one of the two has dealt with, in no order."""
+        ring = BYPASSED if bypassed else RELEASED
+        return self._numbers[ring : ring + RING].tolist()
+
+    def close(self) -> None:
+        """Give up the page, and with it whatever it has locked."""
+        self._numbers.release()
+        self._memory.close()
+        os.close(self._file)
 
 
 class Turn:
@@ -247,14 +226,11 @@ class Turn:
     Messages are named by their source timestamps; where that is not known (None), none is left out.
     """
 
-    GIVE_UP_NS = 50_000_000  # the standby needs the lock for a fraction of a millisecond
-    AT_ONCE_NS = 30_000_000_000
-
     def __init__(self, name: str, topic: str) -> None:
         self._name, self._topic, self._gave_up = name, topic, False
         self._open()
         now = time.monotonic_ns()
-        if now - self.page["started_ns"] > self.AT_ONCE_NS:
+        if now - self.page["started_ns"] > AT_ONCE_NS:
             self.page["failed_starts"] = 0
         self.page["started_ns"] = now
         self.page["starts"] += 1
@@ -300,8 +276,8 @@ class Turn:
         count = self.page["bypassed"]
         if count != self._seen:
             # What the standby is about to publish comes first.
-            give_up = time.monotonic_ns() + self.GIVE_UP_NS
-            while self.page.is_passing and time.monotonic_ns() < give_up:
+            give_up = time.monotonic_ns() + GIVE_UP_NS
+            while self.page.is_locked(PASSING) and time.monotonic_ns() < give_up:
                 time.sleep(0.0001)
             self._bypassed = frozenset(self.page.noted(bypassed=True))
             if self._seen >= 0 and count - self._seen > RING:
@@ -338,7 +314,7 @@ class Turn:
         self.page["late"] += late
 
     def _come_into_force(self, key: int | None) -> bool:
-        give_up = time.monotonic_ns() + self.GIVE_UP_NS
+        give_up = time.monotonic_ns() + GIVE_UP_NS
         while not self.page.lock():
             if _is_alive(self.page["holder"]):  # another shaping node
                 return False
@@ -350,23 +326,18 @@ class Turn:
             self._in_force, self._gave_up = True, False
         self.page["until_ns"] = time.monotonic_ns()
         self.page["first"], self.page["holder"] = key or 0, os.getpid()
-        while self._may_be_acknowledged and not self._is_acknowledged(key):
-            if time.monotonic_ns() > give_up:
-                break
+        while self._to_be_acknowledged(key) and time.monotonic_ns() < give_up:
             time.sleep(0.0002)
         return True
 
-    @property
-    def _may_be_acknowledged(self) -> bool:
-        return self.page.has_standby and self.page["listening"] > 0
-
-    def _is_acknowledged(self, key: int | None) -> bool:
-        """Whether the standby has dealt with all that came before this node's first message."""
-        return key in (None, self.page["acknowledged"]) or key in self.page.noted(bypassed=True)
+    def _to_be_acknowledged(self, key: int | None) -> bool:
+        """Whether a standby still deals with what came before this node's first message."""
+        if not self.page["listening"] or not self.page.is_locked(STANDING_BY):
+            return False
+        return key not in (None, self.page["acknowledged"], *self.page.noted(bypassed=True))
 
 
-@dataclass(frozen=True)
-class _Waiting:
+class _Waiting(NamedTuple):
     """A message that is the shaping node's, unless that fails."""
 
     key: int
@@ -403,7 +374,7 @@ class Standby:
     def _open(self) -> None:
         self.page = open_page(self._name, self._topic)
         give_up = time.monotonic() + 1.0
-        while not self.page.stand_by():
+        while not self.page.lock(STANDING_BY):
             if time.monotonic() > give_up:
                 raise OSError(f"{self.page.path}: another process is the standby of this output")
             time.sleep(0.01)
@@ -414,17 +385,12 @@ class Standby:
         """A message has come, for the shaping node and for the standby alike."""
         now = time.monotonic_ns()
         with self._mutex:
-            if not self.page.is_current and not self.page.is_locked:
-                with suppress(OSError):
-                    left = self.page
-                    self._forget()  # a new page knows of nothing
-                    self._open()
-                    left.close()
+            self._follow()
             self.page["listening"] = 1
             if key is not None:
                 self._pending.append(_Waiting(key, payload, now))
                 self._look(now)
-            elif self._nobody_in_force():
+            elif self._none_in_force():
                 self._pass_on([_Waiting(0, payload, now)])
                 self.page.unlock()
         with suppress(BlockingIOError):
@@ -433,7 +399,17 @@ class Standby:
     def look(self) -> None:
         """See whether the shaping node still does what it has to."""
         with self._mutex:
+            self._follow()
             self._look(time.monotonic_ns())
+
+    def _follow(self) -> None:
+        """Go to the new page, where this one was removed and the shaping node has left it."""
+        if not self.page.is_current and not self.page.is_locked():
+            with suppress(OSError):
+                left = self.page
+                self._forget()  # a new page knows of nothing
+                self._open()
+                left.close()
 
     def watch(self) -> None:
         """Look when the shaping node dies, and when it should have released a message; for ever."""
@@ -441,7 +417,8 @@ class Standby:
         poll = select.poll()
         poll.register(self._woken, select.POLLIN)
         while True:
-            holder = self.page["holder"]
+            with self._mutex:  # the page may be left meanwhile
+                holder = self.page["holder"]
             if holder != watched:
                 if died >= 0:
                     poll.unregister(died)
@@ -471,7 +448,7 @@ class Standby:
         return max(self.page["until_ns"], oldest) + self._patience_ns
 
     def _look(self, now: int) -> None:
-        if self._nobody_in_force():
+        if self._none_in_force():
             self._forget()
             self._gone("is not there")
             self._pass_on(list(self._pending))
@@ -482,16 +459,16 @@ class Standby:
         if self._pending and (now > self._due_ns() or taken == self._stuck_at):
             self._stuck_at = taken
             self._gone("is late for its own release: it hangs, or was stopped")
-            self.page.begin_passing()
+            self.page.lock(PASSING)
             for waiting in self._pending:  # the node is there, and could go on at any time
                 self.page.note(waiting.key, bypassed=True)
             self._pass_on(list(self._pending), noted=True)
-            self.page.end_passing()
+            self.page.unlock(PASSING)
         elif taken != self._stuck_at:
             self._back()
             self._pass_on_before_its_first()
 
-    def _nobody_in_force(self) -> bool:
+    def _none_in_force(self) -> bool:
         """Take the lock, if no shaping node has it."""
         if not self.page.lock():
             return False

@@ -6,13 +6,9 @@ against each other, on random gates and messages and on `tests/gate_conformance.
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
 
+from chainshaper.gate.decision import MAX_AGE_CYCLES, MAX_FUTURE_NS
 from chainshaper.simulation import layout as at
 from chainshaper.values.compiled.memory import compiled
-
-__all__ = ["decide", "drop", "left", "missed_slot", "replaces", "switch_mode"]
-
-MAX_FUTURE_NS = 1_000_000
-MAX_AGE_CYCLES = 10
 
 
 @compiled()

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from chainshaper.gate.decision import CHANGES
+
 __all__ = ["Int64s", "Machine"]
 
 Int64s = npt.NDArray[np.int64]
@@ -154,7 +156,7 @@ ALL_IN_ORDER, NEWEST, FIRST = range(3)
 REPLACED, SURPLUS, OVERFLOWED, DISCARDED = range(4)
 """Policies and reasons, as :data:`chainshaper.workload.event_log.WORDS` numbers them."""
 
-CHANGES_KEPT = 64
+CHANGES_KEPT = CHANGES
 
 S_FIRST, S_END, SYNCHRONISER_COLUMNS = range(3)
 # Inputs of synchronisers.

@@ -1,8 +1,7 @@
 """The log of a shaping node as a table: what it did with each message.
 
 A node in ROS 2 is not recorded like one of the live workload, so it notes its decisions itself:
-lines of comma-separated values with the columns of the event ``gate_release``
-(:mod:`chainshaper.values.events`).
+in lines of comma-separated values. This turns them to the event table ``gate_release``.
 """
 
 import contextlib
@@ -13,19 +12,12 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper.gate.decision import STALL_NS
+from chainshaper.gate.decision import LOG_COLUMNS, STALL_NS
 from chainshaper.values import events
 from chainshaper.values.errors import InputError
 
-__all__ = ["read_gate_log", "releases_so_far", "rows_missing", "with_gate_logs"]
-
-_TYPES = {
-    **events.COMMON_COLUMNS,
-    **events.FIELDS["gate_release"],
-    **events.OPTIONAL_FIELDS["gate_release"],
-}
-_OPTIONAL = {"callback", "dropped", "lost", "row"}
-"""The last three are in logs since messages may wait at a gate."""
+_LATER = ("dropped", "lost", "row")
+"""Columns that logs have since messages may wait at a gate."""
 
 
 def read_gate_log(path: str | Path) -> pl.DataFrame:
@@ -40,31 +32,34 @@ def read_gate_log(path: str | Path) -> pl.DataFrame:
     """
     path = Path(path)
     before = path.with_name(f"{path.name}.1")
-    parts = [before] if before.exists() else []
-    if path.exists() or not parts:
-        parts.append(path)
-    tables = [_read_part(part) for part in parts]
+    parts = [before, path] if path.exists() or not before.exists() else [before]
+    tables = [_read_part(part) for part in parts if part is path or part.exists()]
     return pl.concat(tables).sort("time", maintain_order=True)
 
 
 def _read_part(path: Path) -> pl.DataFrame:
+    types = {
+        **events.COMMON_COLUMNS,
+        **events.FIELDS["gate_release"],
+        **events.OPTIONAL_FIELDS["gate_release"],
+    }
     try:
         text = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     whole = text[: text.rfind(b"\n") + 1]
     names = whole.split(b"\n", 1)[0].decode(errors="replace").split(",")
-    if _TYPES.keys() - _OPTIONAL - set(names) or set(names) - _TYPES.keys():
+    if set(LOG_COLUMNS) - {*_LATER, *names} or set(names) - set(LOG_COLUMNS):
         raise InputError(
             f"{path}:1: this is not the log of a shaping node, which begins with the names of its "
             "columns: name the file that the parameter `log` of the node names"
         )
     try:
-        table = pl.read_csv(whole, schema={name: _TYPES[name] for name in names})
+        table = pl.read_csv(whole, schema={name: types[name] for name in names})
     except pl.exceptions.PolarsError as error:
         raise InputError(f"{path}: a line is not as a shaping node writes it: {error}") from error
-    unknown = [pl.lit(None, dtype=_TYPES[n]).alias(n) for n in _TYPES.keys() - set(names)]
-    return table.with_columns(unknown).select(*_TYPES)
+    unknown = [pl.lit(None, dtype=types[n]).alias(n) for n in types.keys() - set(names)]
+    return table.with_columns(unknown).select(*types)
 
 
 def rows_missing(releases: pl.DataFrame) -> tuple[int, int]:
@@ -94,7 +89,7 @@ def releases_so_far(logs: Iterable[Path]) -> npt.NDArray[np.int64]:
 def with_gate_logs(
     tables: events.EventTables, logs: Sequence[Path], since_ns: int, until_ns: int
 ) -> tuple[events.EventTables, tuple[str, ...]]:
-    """Event tables with `gate_release` from the logs of shaping nodes, and what is not there.
+    """Event tables with `gate_release` from the logs of shaping nodes, and which are not there.
 
     A node writes its log for as long as it runs. Of that, the cycles count that began at
     ``since_ns`` or later, and whose message was let go before ``until_ns``: those are in the other
@@ -104,30 +99,31 @@ def with_gate_logs(
         InputError: a file is no shaping node's log.
     """
     there = [log for log in logs if log.is_file()]
-    missing = [
+    missing = tuple(
         f"the shaping node's log {log} is not there: it has let nothing through, or did not start."
         for log in logs
         if log not in there
-    ]
+    )
     if not there:
-        return tables, tuple(missing)
+        return tables, missing
     releases = pl.concat([read_gate_log(log) for log in there]).sort("time", maintain_order=True)
     removed, unwritten = rows_missing(releases)
     if removed:
-        missing.append(
-            f"{removed} rows of shaping nodes' logs were removed to make room for newer ones."
+        missing += (
+            f"{removed} rows of shaping nodes' logs were removed to make room for newer ones.",
         )
     if unwritten:
-        missing.append(
+        missing += (
             f"{unwritten} rows of shaping nodes' logs could not be written: what became of those "
-            "messages is not known. See to room on the disk."
+            "messages is not known. See to room on the disk.",
         )
     releases = releases.filter(pl.col("origin") >= since_ns, pl.col("time") < until_ns)
-    # Gates saw stalls of the machine: each watches the clock at its releases.
+    stalls = pl.concat([events.table(tables, "machine_stall"), _stalls(releases)], how="diagonal")
+    stalls = stalls.sort("time", maintain_order=True)
+    return {**tables, "gate_release": releases, "machine_stall": stalls}, missing
+
+
+def _stalls(releases: pl.DataFrame) -> pl.DataFrame:
+    """The rows of `machine_stall` that gates saw: each watches the clock at its releases."""
     seen = releases.filter(pl.col("stalled") >= STALL_NS)
-    stalls = [
-        events.table(tables, "machine_stall"),
-        seen.select("pid", "tid", "cpu", time="release", duration="stalled"),
-    ]
-    all_stalls = pl.concat(stalls, how="diagonal").sort("time", maintain_order=True)
-    return {**tables, "gate_release": releases, "machine_stall": all_stalls}, tuple(missing)
+    return seen.select("pid", "tid", "cpu", time="release", duration="stalled")

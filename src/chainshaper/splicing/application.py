@@ -5,27 +5,27 @@ workload: the publisher's output topic is remapped to ``…_tmp``, and a node th
 that topic and republishes on the original one is added. Subscribers notice nothing.
 
 Where the plan gates the publisher's own thread instead (section 3.2.1, Design 1), no node is
-added: the application is held against what the plan takes it for, and its output gets the
+added: the application is compared with what the plan takes it for, and its output gets the
 lifespan by which DDS discards what overran.
 """
 
+from typing import Any
+
 from pydantic import ValidationError
 
-from chainshaper.planning.overruns import cycles_until_output, output_lifespan
-from chainshaper.planning.plan import Modes, Plan, ShapingNode, server_of
+from chainshaper.planning.overruns import output_lifespan
+from chainshaper.planning.plan import Plan, ShapingNode
 from chainshaper.planning.publication import Writer, check_publication
 from chainshaper.planning.publisher_threads import publisher_servers
+from chainshaper.splicing.shaping_process import gate_of
 from chainshaper.values.errors import InputError
 from chainshaper.values.yaml_file import explanations, key_text
 from chainshaper.workload.description import (
     Application,
     CallbackDescription,
     GateDescription,
-    ModesDescription,
     NodeDescription,
 )
-
-__all__ = ["splice_application", "writers_of"]
 
 
 def splice_application(application: Application, plan: Plan) -> Application:
@@ -122,7 +122,12 @@ def _with_lifespan(
 
 
 def _described(plan: Plan, shaping: ShapingNode, depth: int) -> NodeDescription:
-    server = server_of(plan, shaping.thread)  # a plan without one for a shaping node is refused
+    gate = gate_of(plan, shaping, depth)
+    same = ("slots", "cycle_ns", "anchor", "overrun", "due_cycles", "messages", "depth")
+    described: dict[str, Any] = {name: getattr(gate, name) for name in same}
+    described |= {"spin_ns": shaping.spin_ns, "pause_ns": shaping.pause_ns}
+    if gate.modes is not None and plan.modes is not None:
+        described["modes"] = {"topic": plan.modes.topic, **vars(gate.modes)}
     try:
         return NodeDescription(
             core=shaping.core,
@@ -131,20 +136,7 @@ def _described(plan: Plan, shaping: ShapingNode, depth: int) -> NodeDescription:
                 CallbackDescription(
                     subscription=shaping.input,
                     publishes=(shaping.output,),
-                    gate=GateDescription(
-                        slots=server.slots if server else (),
-                        cycle_ns=plan.cycle_ns,
-                        anchor=plan.anchor,
-                        overrun=plan.overrun,
-                        due_cycles=cycles_until_output(plan, shaping),
-                        messages=plan.messages,
-                        depth=depth,
-                        modes=_described_modes(plan.modes)
-                        if shaping == plan.shaping_node
-                        else None,
-                        spin_ns=shaping.spin_ns,
-                        pause_ns=shaping.pause_ns,
-                    ),
+                    gate=GateDescription.model_validate(described),
                 ),
             ),
         )
@@ -153,13 +145,6 @@ def _described(plan: Plan, shaping: ShapingNode, depth: int) -> NodeDescription:
             f"{key_text(where)}: {reason}" for where, reason in explanations(error, NodeDescription)
         ]
         raise InputError(f"the plan's shaping node cannot be run: {'; '.join(problems)}") from error
-
-
-def _described_modes(modes: Modes | None) -> ModesDescription | None:
-    if modes is None:
-        return None
-    bands = {mode: band - 1 for mode, band in modes.bands.items()}
-    return ModesDescription(topic=modes.topic, bands=bands, default=modes.default, late=modes.late)
 
 
 def _remapped(node: NodeDescription, old: str, new: str) -> NodeDescription:

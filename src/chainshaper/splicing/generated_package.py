@@ -1,9 +1,9 @@
 """ROS 2 packages with a shaping node: one for all types, and one generated for a single type.
 
-The generic package is shipped as it is. The typed one is the paper's (section 4.2): from the type
-of the chain's output, ``pkg/msg/Type``, follow the package to link to, the header to include and
-the class to declare, and with them `CMakeLists.txt`, `package.xml` and a header are filled in. Both
-contain the same gate.
+Both are of one source. The typed one is the paper's (section 4.2): from the type of the chain's
+output, ``pkg/msg/Type``, follow the package to link to, the header to include and the class to
+declare, and with them `CMakeLists.txt`, `package.xml` and `message.hpp` are filled in. `schema.hpp`
+is filled in with what the gate in C++ shares with the one in Python.
 """
 
 import os
@@ -12,22 +12,21 @@ import shutil
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from chainshaper.analysis.chains import close_names
+from chainshaper.gate import decision, handover
+from chainshaper.gate.parameters import NodeParameters
 from chainshaper.values.errors import InputError, OperationError, PlatformError
-
-__all__ = [
-    "GENERIC_PACKAGE",
-    "MessageType",
-    "build_package",
-    "check_build_tools",
-    "generic_package",
-    "message_type_named",
-    "typed_package",
-]
 
 GENERIC_PACKAGE = "chainshaper_shaping"
 _NODES = Path(__file__).parent / "nodes"
+_CPP_TYPES = {
+    int: "std::int64_t",
+    str: "std::string",
+    list[int]: "std::vector<std::int64_t>",
+    list[str]: "std::vector<std::string>",
+}
 _TYPE = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
 
 
@@ -96,34 +95,85 @@ def message_type_named(text: str) -> MessageType:
 
 def generic_package() -> dict[str, str]:
     """The files of the package for all types: paths inside it, and their text."""
-    respawning = (_NODES / "python" / "respawning.py").read_text(encoding="utf-8")
-    return {**_files_of(_NODES / "cpp"), "scripts/respawning": respawning}
+    files = _filled(GENERIC_PACKAGE, "topics of any type", ["std_msgs"], "shaping_node throttler")
+    del files["include/message.hpp"]
+    return files
 
 
 def typed_package(message_type: MessageType) -> dict[str, str]:
     """The files of the package generated for one type: paths inside it, and their text."""
-    parts = ("include/", "scripts/")
-    shared = {path: text for path, text in generic_package().items() if path.startswith(parts)}
     # The modes of the system are named by a std_msgs/String.
     messages = sorted({"std_msgs", message_type.package})
-    values = {
-        "PROJECT": message_type.node_package,
-        "TYPE": message_type.full_name,
-        "HEADER": f"{message_type.package}/msg/{message_type.snake_name}.hpp",
-        "CLASS": f"{message_type.package}::msg::{message_type.name}",
-        "GUARD": f"{message_type.node_package.upper()}__MESSAGE_HPP_",
+    name = message_type.full_name
+    files = _filled(
+        message_type.node_package,
+        name,
+        messages,
+        "shaping_node",
+        TYPE=name,
+        HEADER=f"{message_type.package}/msg/{message_type.snake_name}.hpp",
+        CLASS=f"{message_type.package}::msg::{message_type.name}",
+    )
+    del files["src/throttler.cpp"]
+    return files
+
+
+def _filled(
+    project: str, shaped: str, messages: list[str], nodes: str, **values: str
+) -> dict[str, str]:
+    """The files of a package, with the templates among them, ``….in``, filled in."""
+    values |= _schema() | {
+        "PROJECT": project,
+        "FOR": shaped,
+        "NODES": nodes,
         "FIND_MESSAGES": "\n".join(f"find_package({name} REQUIRED)" for name in messages),
         "MESSAGE_TARGETS": " ".join(f"${{{name}_TARGETS}}" for name in messages),
         "DEPENDS": "\n".join(f"  <depend>{name}</depend>" for name in messages),
     }
-    templates = _files_of(_NODES / "typed")
-    return {
-        **shared,
-        "CMakeLists.txt": _filled(templates["CMakeLists.txt.in"], values),
-        "package.xml": _filled(templates["package.xml.in"], values),
-        "include/message.hpp": _filled(templates["message.hpp.in"], values),
-        "src/shaping_node.cpp": templates["shaping_node.cpp"],
+    respawning = (_NODES / "python" / "respawning.py").read_text(encoding="utf-8")
+    files = {"scripts/respawning": respawning}
+    for path in sorted((_NODES / "cpp").rglob("*.*")):
+        text = path.read_text(encoding="utf-8")
+        if path.suffix == ".in":
+            for name, value in values.items():
+                text = text.replace(f"@{name}@", value)
+        files[str(path.relative_to(_NODES / "cpp")).removesuffix(".in")] = text
+    return files
+
+
+def _schema() -> dict[str, str]:
+    """What the gate in C++ shares with the one in Python, as `schema.hpp.in` has it."""
+    words = {
+        "Anchor": decision.ANCHORS,
+        "Policy": decision.LATE,
+        "Messages": decision.MESSAGES,
+        "Dropped": decision.DROPPED,
     }
+    constants = {
+        name.lstrip("_"): str(value)
+        for room in (decision, handover)
+        for name, value in vars(room).items()
+        if name.isupper() and isinstance(value, int)
+    }
+    usual = vars(NodeParameters())
+    types = {name: _CPP_TYPES[kind] for name, kind in NodeParameters.__annotations__.items()}
+    return constants | {
+        "WORDS": "\n".join(
+            f"enum class {kind} {{{', '.join(name.replace('-', '_') for name in names)}}};\n"
+            f"inline constexpr std::array<const char *, {len(names)}> {kind.lower()}_names{{\n"
+            f"  {', '.join(map(_in_cpp, names))}}};"
+            for kind, names in words.items()
+        ),
+        "COLUMNS": str(len(decision.LOG_COLUMNS)),
+        "LOG_HEADER": '"\n  "'.join(f"{name}," for name in decision.LOG_COLUMNS).removesuffix(","),
+        "FIELDS": ",\n  ".join(handover.FIELDS),
+        "PARAMETERS": "\n  ".join(f"{types[n]} {n}{{{_in_cpp(usual[n])}}};" for n in types),
+        "READS": "\n    ".join(f'read("{name}", {name});' for name in types),
+    }
+
+
+def _in_cpp(value: str | int | list[Any]) -> str:
+    return f'"{value}"' if isinstance(value, str) else str(value).strip("[]")
 
 
 def check_build_tools() -> None:
@@ -175,17 +225,3 @@ def build_package(folder: Path) -> Path:
             f"{folder / 'log' / 'latest_build'}. It ended with:\n{end}"
         )
     return folder / "install" / "setup.bash"
-
-
-def _files_of(folder: Path) -> dict[str, str]:
-    return {
-        str(path.relative_to(folder)): path.read_text(encoding="utf-8")
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
-
-
-def _filled(template: str, values: dict[str, str]) -> str:
-    for name, value in values.items():
-        template = template.replace(f"@{name}@", value)
-    return template

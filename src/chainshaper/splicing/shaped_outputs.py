@@ -15,11 +15,9 @@ from typing import Literal, TypeAlias
 from pydantic import TypeAdapter, ValidationError
 
 from chainshaper.gate.decision import DROPPED
-from chainshaper.gate.handover import Page, page_folders
+from chainshaper.gate.handover import STANDING_BY, Page, page_folders
 from chainshaper.values.durations import format_duration
 from chainshaper.values.yaml_file import FullName
-
-__all__ = ["ShapedOutput", "find_outputs", "output_text"]
 
 OutputState: TypeAlias = Literal["shaped", "bypassed", "silent", "no standby"]
 _TOPIC: TypeAdapter[str] = TypeAdapter(FullName)
@@ -103,8 +101,8 @@ def _folders() -> Iterator[str]:
 
 def _looked_at(page: Page) -> ShapedOutput | None:
     try:
-        holder = page["holder"] if page.is_locked else 0
-        standby = page["standby"] if page.has_standby else 0
+        holder = page["holder"] if page.is_locked() else 0
+        standby = page["standby"] if page.is_locked(STANDING_BY) else 0
         if not holder and not standby:
             return None
         since = page["bypassing_since_ns"] if standby else 0

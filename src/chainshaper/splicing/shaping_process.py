@@ -14,6 +14,8 @@ from typing import Any, Literal, TypeAlias
 
 import yaml
 
+from chainshaper.gate.decision import DEPTH, Gate, Modes
+from chainshaper.gate.parameters import gate_parameters
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.plan import Plan, ShapingNode, server_of
 from chainshaper.splicing.generated_package import (
@@ -25,17 +27,6 @@ from chainshaper.splicing.generated_package import (
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.whole_file import write_whole
 
-__all__ = [
-    "RESPAWN",
-    "STANDBY",
-    "NodeKind",
-    "ShapingProcess",
-    "python_node",
-    "shaping_parameters",
-    "write_shaping_process",
-    "write_throttler",
-]
-
 NodeKind: TypeAlias = Literal["python", "cpp", "typed"]
 _PACKAGE = Path(__file__).parents[1]
 _PYTHON_NODES = _PACKAGE / "splicing" / "nodes" / "python"
@@ -43,15 +34,11 @@ _PYTHON_NODES = _PACKAGE / "splicing" / "nodes" / "python"
 RESPAWN = {"respawn": True, "respawn_delay": 0.1}
 """What a launch file says of every process that is added, in the words of all its languages.
 
-The delay (s) is for a process that ends before it can wait by itself, such as a program that lacks
-a library: starting it over and over takes a tenth of a core.
+The delay (s) is for a program that ends at once, such as one that lacks a library.
 """
 
-STANDBY = "_standby"
-"""What a standby's name has behind that of its shaping node."""
-
-SHORTEST_PATIENCE_NS = 10_000_000
-"""By how much a shaping node may be late before it is taken to hang; else half a cycle."""
+STANDBY = "_standby"  # what a standby's name has behind that of its shaping node
+SHORTEST_PATIENCE_NS = 10_000_000  # a node later than that hangs, or than half a cycle
 
 
 @dataclass(frozen=True)
@@ -60,8 +47,8 @@ class ShapingProcess:
 
     It is either a ``command`` (without ``--ros-args``; name, namespace, parameters and remappings
     are for the launch file to add) or an ``executable`` of a ``package``. ``parameters_file`` is
-    a ROS 2 parameters file; ``remappings`` are pairs such as ``("input", "/t5_tmp")``. Whoever
-    starts it starts it again when it ends, and its ``standby`` as well, which passes its output on
+    a ROS 2 parameters file; ``remappings`` are pairs such as ``("input", "/t5_tmp")``. The
+    launch starts it again when it ends, and its ``standby`` as well, which passes its output on
     meanwhile.
     """
 
@@ -122,7 +109,7 @@ def write_shaping_process(
         "patience_ns": max(plan.cycle_ns // 2, SHORTEST_PATIENCE_NS),
         "output_depth": parameters["output_depth"],
         "depth": parameters["depth"],
-        "server_cores": sorted({server.core for server in plan.servers}),
+        "server_cores": _server_cores(plan),
         "log": "" if log is None else str(log.with_stem(standby).absolute()),
     }
     files |= {
@@ -146,7 +133,7 @@ def write_throttler(
     phase_ns: int = 0,
     core: int | None = None,
     fifo_priority: int | None = None,
-    depth: int = 10,
+    depth: int = DEPTH,
 ) -> ShapingProcess:
     """Write a throttler into ``folder`` (paper, section 5.1); what a launch file has to start.
 
@@ -174,37 +161,46 @@ def write_throttler(
     return _process(folder, name, package, "throttler", ())
 
 
+def gate_of(plan: Plan, node: ShapingNode, depth: int = DEPTH) -> Gate:
+    """The gate of a plan's shaping node, with room for so many messages.
+
+    Plans number bands from 1, as people do; a gate numbers its slots from 0.
+    """
+    server = server_of(plan, node.thread)  # a plan without one for a shaping node is refused
+    modes = plan.modes if node == plan.shaping_node else None
+    bands = {} if modes is None else {mode: band - 1 for mode, band in modes.bands.items()}
+    return Gate(
+        slots=() if server is None else server.slots,
+        cycle_ns=plan.cycle_ns,
+        anchor=plan.anchor,
+        phase_ns=plan.offset_ns,
+        overrun=plan.overrun,
+        due_cycles=cycles_until_output(plan, node),
+        modes=None if modes is None else Modes(bands, modes.default, modes.late),
+        messages=plan.messages,
+        depth=depth,
+    )
+
+
 def shaping_parameters(plan: Plan, node: ShapingNode, log: Path | None) -> dict[str, Any]:
-    """The ROS 2 parameters of a shaping node; times are ns, slots pairs laid end to end."""
-    server = server_of(plan, node.thread)
-    slots = () if server is None else server.slots
-    parameters: dict[str, Any] = {
-        "slots_ns": [bound for slot in slots for bound in slot],
-        "cycle_ns": plan.cycle_ns,
-        "anchor": plan.anchor,
-        "phase_ns": plan.offset_ns,
-        "overrun": plan.overrun,
-        "due_cycles": cycles_until_output(plan, node),
-        "messages": plan.messages,
+    """The ROS parameters of a shaping node, by the names of :class:`NodeParameters`."""
+    mode_topic = "" if plan.modes is None else plan.modes.topic
+    parameters = gate_parameters(gate_of(plan, node), mode_topic) | {
         "depth": node.depth or 0,
         "spin_ns": node.spin_ns,
         "pause_ns": node.pause_ns,
         "core": node.core,
         "fifo_priority": node.fifo_priority,
-        "output_depth": plan.chain.output_depth or 10,
+        "output_depth": plan.chain.output_depth or DEPTH,
         "log": "" if log is None else str(log.absolute()),
     }
     if node.receivers:
-        parameters["server_cores"] = sorted({server.core for server in plan.servers})
-    if plan.modes is not None and node == plan.shaping_node:
-        parameters |= {
-            "mode_topic": plan.modes.topic,
-            "mode_names": list(plan.modes.bands),
-            "mode_slots": [band - 1 for band in plan.modes.bands.values()],
-            "mode_default": plan.modes.default,
-            "mode_late": plan.modes.late,
-        }
+        parameters["server_cores"] = _server_cores(plan)
     return parameters
+
+
+def _server_cores(plan: Plan) -> list[int]:
+    return sorted({server.core for server in plan.servers})
 
 
 def python_node(executable: str) -> str:

@@ -12,6 +12,8 @@ from collections.abc import Callable
 from time import monotonic_ns
 from typing import Any
 
+from chainshaper.gate.decision import ANCHORS, DROPPED, LATE, MESSAGES
+
 __all__ = ["ABSENT", "LAYOUT", "WIDTH", "WORDS", "EventLog", "number_of"]
 
 LAYOUT: tuple[tuple[str, tuple[str, ...]], ...] = (
@@ -53,10 +55,10 @@ ABSENT = -1
 """Stands for null in fields that may be."""
 
 WORDS: dict[str, tuple[str, ...]] = {
-    "anchor": ("stamp", "cycle"),
-    "overrun": ("wait", "discard", "publish", "next-slot"),
-    "messages": ("all-in-order", "newest", "first"),
-    "dropped": ("replaced", "surplus", "overflowed", "discarded"),
+    "anchor": ANCHORS,
+    "overrun": LATE,
+    "messages": MESSAGES,
+    "dropped": DROPPED,
     "outcome": ("sent", "expired", "overwritten"),
 }
 """Fields that hold words are recorded as places in these lists.

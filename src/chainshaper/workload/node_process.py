@@ -14,8 +14,8 @@ from functools import partial
 from itertools import count
 from typing import Any
 
-from chainshaper.gate.clear_core import KeptCore
-from chainshaper.gate.decision import READER_DEPTH, STALL_NS, Gate, Held, Modes, Shaper, text_of
+from chainshaper.gate.clear_core import ClearCore
+from chainshaper.gate.decision import READER_DEPTH, STALL_NS, Gate, Modes, Outcome, Shaper, text_of
 from chainshaper.linux.scheduling import (
     lock_memory,
     set_thread_name,
@@ -304,11 +304,11 @@ class NodeProcess:
 
     def _shaper(self, gate: dict[str, Any]) -> Shaper:
         modes, core = gate["modes"], self.spec["delivery_core"]
-        delivery_core = None if core is None else KeptCore(core)
+        delivery_core = None if core is None else ClearCore(core)
 
         def get_ready(release_ns: int) -> None:
             if delivery_core is not None:
-                delivery_core.keep_until(release_ns + gate["pause_ns"])
+                delivery_core.clear_until(release_ns + gate["pause_ns"])
 
         shaper = Shaper(
             Gate(
@@ -398,7 +398,7 @@ class NodeProcess:
         self.executor.backlogs.append(work_off)
         return body
 
-    def _note_release(self, handle: int, gate: dict[str, Any], held: Held) -> None:
+    def _note_release(self, handle: int, gate: dict[str, Any], held: Outcome) -> None:
         """Record what became of a message at a gate."""
         modes = [] if gate["modes"] is None else list(gate["modes"]["bands"])
         release = held.release

@@ -1,7 +1,6 @@
 """What the nodes have in common on the side of ROS 2: parameters, topics, real-time scheduling.
 
-Written for rclpy of Humble to Rolling; where they differ, it is said. Like the gate, this imports
-nothing of chainshaper, since it becomes a part of the nodes' own files.
+Written for rclpy of Humble to Rolling; where they differ, it is said.
 """
 
 import ctypes
@@ -26,21 +25,17 @@ from rclpy.qos import (
     QoSReliabilityPolicy,
 )
 
-__all__ = [
-    "asked_of",
-    "become_realtime",
-    "message_class",
-    "offered_by",
-    "parameter",
-    "run",
-    "wait",
-    "wait_for_publisher",
-]
+from chainshaper.gate.decision import DEPTH, READER_DEPTH
+from chainshaper.gate.parameters import NodeParameters
 
 
-def parameter(node: Node, name: str, otherwise: Any) -> Any:
-    """A parameter's value; the types of parameters are those of the file they come from."""
-    return node.get_parameter_or(name, Parameter(name, value=otherwise)).value
+def parameters_of(node: Node) -> NodeParameters:
+    """What the parameter file says, and the rest as usual."""
+    known = {
+        name: node.get_parameter_or(name, Parameter(name, value=usual)).value
+        for name, usual in vars(NodeParameters()).items()
+    }
+    return NodeParameters(**known)
 
 
 def wait(seconds: float) -> None:
@@ -91,12 +86,12 @@ def message_class(type_name: str) -> Any:
     return getattr(importlib.import_module(f"{package}.{kind}"), name)
 
 
-def offered_by(info: Any, depth: int) -> QoSProfile:
+def offered_by(info: Any, node: Node) -> QoSProfile:
     """The quality of service of a publisher, for the one that stands in for it.
 
     Discovery does not always tell everything: unknown reliability is taken to be reliable, unknown
     durability volatile, unknown liveliness automatic, and an unknown history keeps the last
-    ``depth``.
+    ``output_depth``.
     """
     offered = info.qos_profile
     best_effort = offered.reliability == QoSReliabilityPolicy.BEST_EFFORT
@@ -105,7 +100,7 @@ def offered_by(info: Any, depth: int) -> QoSProfile:
     keep_all = offered.history == QoSHistoryPolicy.KEEP_ALL
     return QoSProfile(
         history=QoSHistoryPolicy.KEEP_ALL if keep_all else QoSHistoryPolicy.KEEP_LAST,
-        depth=offered.depth or depth,
+        depth=offered.depth or parameters_of(node).output_depth,
         reliability=(
             QoSReliabilityPolicy.BEST_EFFORT if best_effort else QoSReliabilityPolicy.RELIABLE
         ),
@@ -131,6 +126,18 @@ def asked_of(offered: QoSProfile) -> QoSProfile:
     )
 
 
+def room_of(node: Node, info: Any) -> tuple[int, QoSProfile, QoSProfile]:
+    """How many messages may wait at the gate of a topic, and the QoS of its output and input."""
+    offered = offered_by(info, node)
+    depth = parameters_of(node).depth or max(DEPTH, offered.depth)
+    if offered.durability != QoSDurabilityPolicy.TRANSIENT_LOCAL:
+        # What leaves in one slot must find room in the writer, too.
+        offered.depth = max(offered.depth, depth)
+    asked = asked_of(offered)
+    asked.depth = max(READER_DEPTH, depth)
+    return depth, offered, asked
+
+
 def become_realtime(node: Node) -> None:
     """Lock the memory, and give the calling thread its core and SCHED_FIFO priority.
 
@@ -138,8 +145,8 @@ def become_realtime(node: Node) -> None:
     threads inherit, and those of DDS must not; later ones do not get the class. What is not
     permitted is warned of.
     """
-    logger = node.get_logger()
-    core, priority = parameter(node, "core", -1), parameter(node, "fifo_priority", 0)
+    logger, parameters = node.get_logger(), parameters_of(node)
+    core, priority = parameters.core, parameters.fifo_priority
     if ctypes.CDLL(None).mlockall(1 | 2):  # MCL_CURRENT | MCL_FUTURE
         logger.warning(
             "memory cannot be locked; it works on without: give the user a memlock limit of "

@@ -1,9 +1,9 @@
 """What a gate did, a line of comma-separated values per message, and how many it lost.
 
-A process of its own writes the file, so that neither a slow disk nor a full one can hold up the
+A process of its own writes the file, so that neither a slow disk nor a full one can delay the
 gate: that only puts a line into a pipe, and goes on without it where the pipe is full. What is in
-the pipe is written although the gate is killed. Rows are numbered, so that those that are missing
-can be counted.
+the pipe is written although the gate is killed. Rows are numbered, so that missing ones can be
+counted.
 """
 
 import atexit
@@ -19,15 +19,10 @@ from contextlib import suppress
 
 from rclpy.node import Node
 
-from chainshaper.gate.decision import Held
-from chainshaper.splicing.nodes.python.endpoints import parameter
+from chainshaper.gate.decision import LOG_COLUMNS, Outcome
+from chainshaper.splicing.nodes.python.endpoints import parameters_of
 
-LOG_HEADER = (
-    "time,pid,tid,cpu,source_timestamp,arrival,origin,release,slot,cycles_waited,anchor,overrun,"
-    "mode,published,stalled,dropped,lost,row\n"
-)
-LOG_BYTES = 100_000_000
-"""The log and the one before it have no more."""
+LOG_HEADER = f"{','.join(LOG_COLUMNS)}\n".encode()
 PIPE_BYTES = 1 << 20
 SAID_EVERY_NS = 10_000_000_000
 
@@ -80,7 +75,7 @@ def _begin(path: str) -> None:
     file = os.open(path, flags, 0o644)
     try:
         if os.fstat(file).st_size == 0:
-            os.write(file, LOG_HEADER.encode())
+            os.write(file, LOG_HEADER)
     finally:
         os.close(file)
 
@@ -103,7 +98,7 @@ class GateLog:
             self._start_writer(path, most_bytes)
 
     def _start_writer(self, path: str, most_bytes: int) -> None:
-        call = f"_write_rows({path!r}, {LOG_HEADER.encode()!r}, {most_bytes})"
+        call = f"_write_rows({path!r}, {LOG_HEADER!r}, {most_bytes})"
         rows, self._pipe = os.pipe()
         os.set_blocking(self._pipe, False)
         with suppress(OSError):  # more than a user may have
@@ -124,25 +119,29 @@ class GateLog:
         with suppress(subprocess.TimeoutExpired):
             writer.wait(2)
 
-    def write(self, held: Held, published: int | None = None, stalled: int | None = None) -> None:
+    def write(
+        self, outcome: Outcome, published: int | None = None, stalled: int | None = None
+    ) -> None:
         """Note what became of a message.
 
         ``published`` is when publishing returned, ``stalled`` for how long the machine stood still
         behind the release (ns, None: not known).
         """
-        release, message = held.release, held.message
+        release, message = outcome.release, outcome.message
         self._rows += 1
-        if held.dropped is not None:
-            self._lost[held.dropped] += 1
+        if outcome.dropped is not None:
+            self._lost[outcome.dropped] += 1
         if message.lost:
             self._lost["lost by DDS"] += message.lost
         if self._pipe is not None:
             core = next(iter(os.sched_getaffinity(0)))
-            before = (message.about, message.arrival_ns, release.origin_ns, release.at_ns)
-            how = (release.slot, release.cycles_waited, release.anchor, release.overrun)
-            after = (release.mode, published, stalled, held.dropped, message.lost, self._rows)
-            texts = ["" if field is None else str(field) for field in (*before, *how, *after)]
-            line = f"{held.awake_ns},{self._process},{core},{','.join(texts)}\n"
+            values = (  # of LOG_COLUMNS, in their order
+                *(outcome.awake_ns, self._process, core, message.about, message.arrival_ns),
+                *(release.origin_ns, release.at_ns, release.slot, release.cycles_waited),
+                *(release.anchor, release.overrun, release.mode, published, stalled),
+                *(outcome.dropped, message.lost, self._rows),
+            )
+            line = ",".join("" if value is None else str(value) for value in values) + "\n"
             try:
                 os.write(self._pipe, line.encode())
             except OSError:
@@ -151,7 +150,7 @@ class GateLog:
             self._say()
 
     def _say(self) -> None:
-        """Tell people what is lost so far, at most every ten seconds."""
+        """Warn of what is lost so far, at most every ten seconds."""
         now = time.monotonic_ns()
         if self._said_ns and now - self._said_ns < SAID_EVERY_NS:
             return
@@ -162,4 +161,5 @@ class GateLog:
 
 def log_of(node: Node) -> GateLog:
     """The log that a node's parameters name."""
-    return GateLog(node, parameter(node, "log", ""), parameter(node, "log_bytes", LOG_BYTES))
+    parameters = parameters_of(node)
+    return GateLog(node, parameters.log, parameters.log_bytes)

@@ -21,19 +21,19 @@ from typing import Any
 
 import rclpy
 from rclpy.node import Node
-from rclpy.subscription import Subscription
 
-from chainshaper.gate.decision import Held, Release, Waiting
+from chainshaper.gate.decision import Outcome, Release, Waiting
 from chainshaper.gate.handover import Standby
 from chainshaper.splicing.nodes.python.endpoints import (
     message_class,
-    parameter,
+    parameters_of,
+    room_of,
     run,
     wait,
     wait_for_publisher,
 )
 from chainshaper.splicing.nodes.python.gate_log import log_of
-from chainshaper.splicing.nodes.python.room import room_of
+from chainshaper.splicing.nodes.python.tracing import HUMBLE
 
 
 def leave_cores(taken: set[int]) -> None:
@@ -100,9 +100,9 @@ def state_of(page: Any) -> tuple[int, str]:
 
 def set_up(node: Node) -> Callable[[], bool]:
     """Make the node's endpoints, and begin to watch."""
-    leave_cores({core for core in parameter(node, "server_cores", [-1]) if core >= 0})
-    silent = parameter(node, "fallback", "bypass") == "silence"
-    shaping_node = parameter(node, "shaping_node", "the shaping node")
+    parameters = parameters_of(node)
+    leave_cores(set(parameters.server_cores))
+    silent, shaping_node = parameters.fallback == "silence", parameters.shaping_node
     log, logger = log_of(node), node.get_logger()
     info = wait_for_publisher(node, "input")
     _, offered, asked = room_of(node, info)
@@ -122,7 +122,7 @@ def set_up(node: Node) -> Callable[[], bool]:
         treated = "silence" if silent else "bypass"
         release = Release(None if silent else arrival, arrival, None, 0, "cycle", treated)
         message = Waiting(payload, arrival, None, 0, about=source_timestamp)
-        log.write(Held(message, release, time.monotonic_ns()), published)
+        log.write(Outcome(message, release, time.monotonic_ns()), published)
 
     def changed(what: str) -> None:
         until = "nothing is published" if silent else "messages go around it"
@@ -133,8 +133,8 @@ def set_up(node: Node) -> Callable[[], bool]:
     while standby is None:
         try:
             standby = Standby(
-                *(parameter(node, "handover", ""), topic, publish, changed),
-                patience_ns=parameter(node, "patience_ns", 0),
+                *(parameters.handover, topic, publish, changed),
+                patience_ns=parameters.patience_ns,
                 depth=asked.depth,
             )
         except OSError as error:
@@ -148,8 +148,8 @@ def set_up(node: Node) -> Callable[[], bool]:
     def without_info(payload: bytes) -> None:
         standby.arrived(payload, None)
 
-    # Humble gives a callback the message only: what the shaping node holds is lost with it there.
-    callback = with_info if hasattr(Subscription, "CallbackType") else without_info
+    # On Humble what the shaping node holds is lost with it.
+    callback = without_info if HUMBLE else with_info
     node.create_subscription(message_type, "input", callback, asked, raw=True)
     threading.Thread(target=watch, args=(node, standby), name="watch", daemon=True).start()
     diagnostics_of(node, standby, shaping_node)

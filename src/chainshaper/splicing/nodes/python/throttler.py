@@ -23,16 +23,19 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from chainshaper.gate.decision import sleep_until
-from chainshaper.splicing.nodes.python.callback_events import create_subscription, create_timer
 from chainshaper.splicing.nodes.python.endpoints import (
     asked_of,
     message_class,
     offered_by,
-    parameter,
+    parameters_of,
     run,
     wait_for_publisher,
 )
-from chainshaper.splicing.nodes.python.message_events import publish_function
+from chainshaper.splicing.nodes.python.tracing import (
+    create_subscription,
+    create_timer,
+    publish_function,
+)
 
 
 @dataclass
@@ -74,15 +77,16 @@ class Channel:
 
 def set_up(node: Node) -> Callable[[], bool]:
     """Make the node's endpoints and timers; behind their callbacks nothing is left to do."""
-    inputs, outputs = parameter(node, "inputs", [""]), parameter(node, "outputs", [""])
-    period, phase = parameter(node, "period_ns", 0), parameter(node, "phase_ns", 0)
-    if not all(inputs) or len(inputs) != len(outputs) or period <= 0:
+    parameters = parameters_of(node)
+    inputs, outputs, phase = parameters.inputs, parameters.outputs, parameters.phase_ns
+    period = parameters.period_ns
+    if not inputs or len(inputs) != len(outputs) or period <= 0:
         raise ValueError("inputs, as many outputs, and a period are needed")
     channels: list[Channel] = []
     atexit.register(lambda: print(*channels, sep="\n", flush=True))  # noqa: T201
     for source, target in zip(inputs, outputs, strict=True):
         info = wait_for_publisher(node, source)
-        offered = offered_by(info, parameter(node, "output_depth", 10))
+        offered = offered_by(info, node)
         message_type = message_class(info.topic_type)
         publisher = node.create_publisher(message_type, target, offered)
         channel = Channel(target, publish_function(publisher), node.get_logger())

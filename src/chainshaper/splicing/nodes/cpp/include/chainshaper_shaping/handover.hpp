@@ -2,8 +2,7 @@
 // shaping node's side; what the two agree on, and why, is said in `handover.py` (`Turn`), which has
 // the same page: numbers of 8 bytes, two rings of messages, and the output's name. No ROS 2 here.
 
-#ifndef CHAINSHAPER_SHAPING__HANDOVER_HPP_
-#define CHAINSHAPER_SHAPING__HANDOVER_HPP_
+#pragma once
 
 #include <fcntl.h>
 #include <signal.h>
@@ -11,57 +10,33 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
-#include <algorithm>
-#include <array>
 #include <cerrno>
-#include <cstdint>
-#include <cstdlib>
 #include <cstring>
 #include <memory>
-#include <optional>
-#include <stdexcept>
-#include <string>
-#include <vector>
 
-#include "gate.hpp"
 #include "shaper.hpp"
 
-namespace chainshaper
-{
+namespace chainshaper {
 
-// The numbers at the beginning of a page, in their order.
-enum class Field
-{
-  holder, taken, first, acknowledged, until_ns, released, phase_ns, phase_known, mode, started_ns,
-  failed_starts, starts, standby, listening, silent, bypassing_since_ns, bypassed, bypassed_before,
-  published, replaced, surplus, overflowed, discarded, lost_by_dds, late
-};
-
-class Page
-{
+class Page {
 public:
   // Throws where there is none and it is not to be made, or where it is not ours.
-  Page(
-    const std::string & folder, const std::string & name, const std::string & topic, bool make)
-  : path_(folder + "/" + name)
-  {
+  Page(const std::string & folder, const std::string & name, const std::string & topic, bool make)
+      : path_(folder + "/" + name) {
     const int flags = O_RDWR | O_CLOEXEC | O_NOFOLLOW | O_NONBLOCK | (make ? O_CREAT : 0);
     file_ = open(path_.c_str(), flags, 0600);
     struct stat found{};
     const bool ours = file_ >= 0 && fstat(file_, &found) == 0 && S_ISREG(found.st_mode) &&
-      found.st_uid == geteuid();
+                      found.st_uid == geteuid();
     // Memory that a full file system does not have later would be a SIGBUS.
     const int lacking = ours ? posix_fallocate(file_, 0, size) : 0;
-    if (ours && lacking == 0) {
+    if (ours && lacking == 0)
       memory_ = mmap(nullptr, size, PROT_READ | PROT_WRITE, MAP_SHARED, file_, 0);
-    }
     if (memory_ == MAP_FAILED) {
       const bool by_system = ours || file_ < 0;
       const std::string reason =
-        by_system ? std::strerror(lacking != 0 ? lacking : errno) : "not a file of this user";
-      if (file_ >= 0) {
-        close(file_);
-      }
+          by_system ? std::strerror(lacking != 0 ? lacking : errno) : "not a file of this user";
+      if (file_ >= 0) close(file_);
       throw std::runtime_error(path_ + ": " + reason);
     }
     inode_ = found.st_ino;
@@ -74,64 +49,48 @@ public:
   Page & operator=(const Page &) = delete;
 
   // Gives up what is locked, too.
-  ~Page()
-  {
+  ~Page() {
     munmap(memory_, size);
     close(file_);
   }
 
-  std::int64_t get(Field field) const {return read(static_cast<std::size_t>(field));}
-  void set(Field field, std::int64_t value) {write(static_cast<std::size_t>(field), value);}
-  void add(Field field, std::int64_t more = 1) {set(field, get(field) + more);}
+  std::int64_t get(Field field) const { return read(static_cast<std::size_t>(field)); }
+  void set(Field field, std::int64_t value) { write(static_cast<std::size_t>(field), value); }
+  void add(Field field, std::int64_t more = 1) { set(field, get(field) + more); }
 
-  bool lock() {return locks(publishing);}
+  bool lock() { return locks(publishing); }
 
-  bool has_standby() const {return is_locked(standing_by);}
+  bool has_standby() const { return is_locked(standing_by); }
 
   // Whether the standby publishes although this node has the lock.
-  bool is_passing() const {return is_locked(passing);}
+  bool is_passing() const { return is_locked(passing); }
 
-  bool is_current() const
-  {
+  bool is_current() const {
     struct stat found{};
     return stat(path_.c_str(), &found) == 0 && found.st_ino == inode_;
   }
 
   // This node has dealt with a message.
-  void note_released(std::int64_t key)
-  {
+  void note_released(std::int64_t key) {
     const auto number = get(Field::released);
-    write(released_at + static_cast<std::size_t>(number) % ring, key);
+    write(released_at + static_cast<std::size_t>(number) % page_ring, key);
     set(Field::released, number + 1);
   }
 
   // The latest messages that the standby has dealt with, ascending.
-  std::vector<std::int64_t> bypassed() const
-  {
+  std::vector<std::int64_t> bypassed() const {
     std::vector<std::int64_t> found;
-    found.reserve(ring);
-    for (std::size_t place = bypassed_at; place < bypassed_at + ring; ++place) {
+    found.reserve(page_ring);
+    for (std::size_t place = bypassed_at; place < bypassed_at + page_ring; ++place)
       found.push_back(read(place));
-    }
     std::sort(found.begin(), found.end());
     return found;
   }
 
-  static constexpr std::size_t ring = 1024;
-  static constexpr int version = 1;  // of the layout: part of a page's name
-
 private:
-  static constexpr std::size_t released_at = 32;
-  static constexpr std::size_t bypassed_at = released_at + ring;
-  static constexpr std::size_t topic_at = bypassed_at + ring;
-  static constexpr std::size_t topic_bytes = 256;
   static constexpr off_t size = 8 * topic_at + topic_bytes;
-  static constexpr off_t publishing = 0;  // the bytes of the file that are locked
-  static constexpr off_t standing_by = 1;
-  static constexpr off_t passing = 2;
 
-  static struct flock region(off_t byte)
-  {
+  static struct flock region(off_t byte) {
     struct flock wanted{};
     wanted.l_type = F_WRLCK;
     wanted.l_whence = SEEK_SET;
@@ -140,26 +99,22 @@ private:
     return wanted;
   }
 
-  bool locks(off_t byte)
-  {
+  bool locks(off_t byte) {
     struct flock wanted = region(byte);
     return fcntl(file_, F_OFD_SETLK, &wanted) == 0;
   }
 
-  bool is_locked(off_t byte) const
-  {
+  bool is_locked(off_t byte) const {
     struct flock asked = region(byte);
     return fcntl(file_, F_OFD_GETLK, &asked) == 0 && asked.l_type != F_UNLCK;
   }
 
   // Another process writes there as well.
-  std::int64_t read(std::size_t place) const
-  {
+  std::int64_t read(std::size_t place) const {
     return __atomic_load_n(static_cast<const std::int64_t *>(memory_) + place, __ATOMIC_SEQ_CST);
   }
 
-  void write(std::size_t place, std::int64_t value)
-  {
+  void write(std::size_t place, std::int64_t value) {
     __atomic_store_n(static_cast<std::int64_t *>(memory_) + place, value, __ATOMIC_SEQ_CST);
   }
 
@@ -169,48 +124,40 @@ private:
   ino_t inode_{};
 };
 
-inline std::string text_in_environment(const char * name)
-{
+inline std::string text_in_environment(const char * name) {
   const char * const text = std::getenv(name);
   return text == nullptr ? "" : text;
 }
 
 // Where pages are, the best place first: of root, of a login session, of any user.
-inline std::vector<std::string> page_folders()
-{
+inline std::vector<std::string> page_folders() {
   std::vector<std::string> folders;
   const auto session = text_in_environment("XDG_RUNTIME_DIR");
-  if (geteuid() == 0) {
+  if (geteuid() == 0)
     folders.push_back("/run/chainshaper/outputs");
-  } else if (!session.empty()) {
+  else if (!session.empty())
     folders.push_back(session + "/chainshaper/outputs");
-  }
   folders.push_back("/dev/shm/chainshaper-" + std::to_string(geteuid()));
   return folders;
 }
 
 // A folder that is ours alone, made where there is none.
-inline void check_private(const std::string & folder)
-{
+inline void check_private(const std::string & folder) {
   mkdir(folder.substr(0, folder.rfind('/')).c_str(), 0755);
   mkdir(folder.c_str(), 0700);
   struct stat found{};
-  if (lstat(folder.c_str(), &found) != 0) {
+  if (lstat(folder.c_str(), &found) != 0)
     throw std::runtime_error(folder + ": " + std::strerror(errno));
-  }
-  if (!S_ISDIR(found.st_mode) || found.st_uid != geteuid() || (found.st_mode & 077) != 0) {
+  if (!S_ISDIR(found.st_mode) || found.st_uid != geteuid() || (found.st_mode & 077) != 0)
     throw std::runtime_error(folder + ": it is not a folder of this user alone (mode 0700)");
-  }
 }
 
 // The page of an output: the one that is there, or else a new one. Throws where no folder is ours
 // alone.
-inline std::unique_ptr<Page> open_page(
-  const std::string & name, const std::string & topic,
-  const std::vector<std::string> & folders = page_folders())
-{
+inline std::unique_ptr<Page> open_page(const std::string & name, const std::string & topic,
+                                       const std::vector<std::string> & folders = page_folders()) {
   const auto domain = std::to_string(std::atoi(text_in_environment("ROS_DOMAIN_ID").c_str()));
-  const auto file = name + "." + domain + ".v" + std::to_string(Page::version);
+  const auto file = name + "." + domain + ".v" + std::to_string(page_version);
   std::string problem = "no folder";
   for (const bool make : {false, true}) {
     for (const auto & folder : folders) {
@@ -226,89 +173,69 @@ inline std::unique_ptr<Page> open_page(
 }
 
 // Whose turn it is to publish a message; messages are named by their source timestamps.
-class Turn
-{
+class Turn {
 public:
-  Turn(
-    std::string name, std::string topic, std::vector<std::string> folders = page_folders())
-  : name_(std::move(name)), topic_(std::move(topic)), folders_(std::move(folders))
-  {
+  Turn(std::string name, std::string topic, std::vector<std::string> folders = page_folders())
+      : name_(std::move(name)), topic_(std::move(topic)), folders_(std::move(folders)) {
     page_ = open_page(name_, topic_, folders_);
     const auto now = monotonic_ns();
-    if (now - page_->get(Field::started_ns) > at_once_ns) {
-      page_->set(Field::failed_starts, 0);
-    }
+    if (now - page_->get(Field::started_ns) > at_once_ns) page_->set(Field::failed_starts, 0);
     page_->set(Field::started_ns, now);
     page_->add(Field::starts);
     page_->add(Field::failed_starts);
   }
 
-  bool has_standby() const {return page_->has_standby();}
+  bool has_standby() const { return page_->has_standby(); }
 
   // How many nodes before this one have failed, shortly one after the other.
-  std::int64_t failed_before() const {return page_->get(Field::failed_starts) - 1;}
+  std::int64_t failed_before() const { return page_->get(Field::failed_starts) - 1; }
 
   // For how long to wait before starting, because of that.
-  double wait_s() const
-  {
+  double wait_s() const {
     const auto failed = failed_before() - back_off_after;
-    return failed < 0 ? 0.0 : std::min(10.0, 0.5 * static_cast<double>(1 << std::min<std::int64_t>(failed, 5)));
+    return failed < 0
+               ? 0.0
+               : std::min(10.0, 0.5 * static_cast<double>(1 << std::min<std::int64_t>(failed, 5)));
   }
 
   // Where cycles began for the shaping node before this one.
-  std::optional<std::int64_t> phase_ns() const
-  {
-    if (page_->get(Field::phase_known) == 0) {
-      return std::nullopt;
-    }
+  Maybe phase_ns() const {
+    if (page_->get(Field::phase_known) == 0) return std::nullopt;
     return page_->get(Field::phase_ns);
   }
 
   // The mode in force for that node, by its number.
-  std::optional<std::size_t> mode() const
-  {
+  std::optional<std::size_t> mode() const {
     const auto number = page_->get(Field::mode);
     return number > 0 ? std::optional<std::size_t>(number - 1) : std::nullopt;
   }
 
   // Whether a message that was received is this node's to deal with.
-  bool take(std::int64_t key)
-  {
-    if (!in_force_ && !come_into_force(key)) {
-      return false;
-    }
+  bool take(std::int64_t key) {
+    if (!in_force_ && !come_into_force(key)) return false;
     page_->set(Field::until_ns, monotonic_ns());
     page_->add(Field::taken);
     return !was_bypassed(key);
   }
 
   // The message is released then, if ever; cycles begin at `phase_ns`, and its cycle has this mode.
-  void hold(
-    std::optional<std::int64_t> until_ns, std::int64_t phase_ns,
-    std::optional<std::size_t> mode = std::nullopt)
-  {
+  void hold(Maybe until_ns, std::int64_t phase_ns, std::optional<std::size_t> mode = std::nullopt) {
     page_->set(Field::mode, mode ? static_cast<std::int64_t>(*mode) + 1 : 0);
-    if (until_ns) {
-      page_->set(Field::until_ns, *until_ns);
-    }
+    if (until_ns) page_->set(Field::until_ns, *until_ns);
     page_->set(Field::phase_ns, phase_ns);
     page_->set(Field::phase_known, 1);
   }
 
   // Whether the standby has dealt with a message.
-  bool was_bypassed(std::int64_t key)
-  {
+  bool was_bypassed(std::int64_t key) {
     const auto count = page_->get(Field::bypassed);
     if (count != seen_) {
       // What the standby is about to publish comes first.
       const auto give_up = monotonic_ns() + give_up_ns;
-      while (page_->is_passing() && monotonic_ns() < give_up) {
-        sleep_until(monotonic_ns() + 100'000);
-      }
+      while (page_->is_passing() && monotonic_ns() < give_up) sleep_until(monotonic_ns() + 100'000);
       bypassed_ = page_->bypassed();
-      if (seen_ >= 0 && count - seen_ > static_cast<std::int64_t>(Page::ring)) {
+      if (seen_ >= 0 && count - seen_ > static_cast<std::int64_t>(page_ring))
         oldest_ = bypassed_.front();  // older ones were, too
-      }
       seen_ = count;
     }
     if (key >= oldest_ && !std::binary_search(bypassed_.begin(), bypassed_.end(), key)) {
@@ -320,8 +247,7 @@ public:
   }
 
   // A message has been published or discarded.
-  void done(std::int64_t key)
-  {
+  void done(std::int64_t key) {
     page_->note_released(key);
     page_->set(Field::until_ns, monotonic_ns());
     page_->set(Field::failed_starts, 0);
@@ -338,36 +264,29 @@ public:
   }
 
   // A message that was received has no room any more, and is never published.
-  void drop(std::int64_t key) {page_->note_released(key);}
+  void drop(std::int64_t key) { page_->note_released(key); }
 
   // A message has been published, or was dropped; so many were missing before it.
-  void count(std::optional<Dropped> dropped, std::optional<std::int64_t> lost, bool late)
-  {
-    constexpr std::array<Field, dropped_names.size()> reasons{
-      Field::replaced, Field::surplus, Field::overflowed, Field::discarded};
-    page_->add(dropped ? reasons[static_cast<std::size_t>(*dropped)] : Field::published);
+  void count(std::optional<Dropped> dropped, Maybe lost, bool late) {
+    const auto reason = [](Dropped why) {  // they stand in the page in their order
+      return static_cast<Field>(static_cast<int>(Field::replaced) + static_cast<int>(why));
+    };
+    page_->add(dropped ? reason(*dropped) : Field::published);
     page_->add(Field::lost_by_dds, lost.value_or(0));
     page_->add(Field::late, late ? 1 : 0);
   }
 
 private:
-  static constexpr std::int64_t at_once_ns = 30'000'000'000;
-  static constexpr std::int64_t give_up_ns = 50'000'000;
-  static constexpr std::int64_t back_off_after = 3;
-
-  static bool is_alive(std::int64_t pid)
-  {
+  static bool is_alive(std::int64_t pid) {
     return pid > 0 && kill(static_cast<pid_t>(pid), 0) == 0;
   }
 
-  bool come_into_force(std::int64_t key)
-  {
+  bool come_into_force(std::int64_t key) {
     const auto give_up = monotonic_ns() + give_up_ns;
     in_force_ = page_->lock();
     while (!in_force_) {
-      if (is_alive(page_->get(Field::holder))) {  // another shaping node
+      if (is_alive(page_->get(Field::holder)))  // another shaping node
         return false;
-      }
       if (gave_up_ || monotonic_ns() > give_up) {  // the standby was stopped while it published
         gave_up_ = true;
         break;
@@ -379,22 +298,19 @@ private:
     page_->set(Field::until_ns, monotonic_ns());
     page_->set(Field::first, key);
     page_->set(Field::holder, getpid());
-    while (may_be_acknowledged() && !is_acknowledged(key) && monotonic_ns() < give_up) {
+    while (may_be_acknowledged() && !is_acknowledged(key) && monotonic_ns() < give_up)
       sleep_until(monotonic_ns() + 200'000);
-    }
     return true;
   }
 
   // Whether the standby has dealt with all that came before this node's first message.
-  bool is_acknowledged(std::int64_t key) const
-  {
+  bool is_acknowledged(std::int64_t key) const {
     const auto bypassed = page_->bypassed();
     return page_->get(Field::acknowledged) == key ||
            std::binary_search(bypassed.begin(), bypassed.end(), key);
   }
 
-  bool may_be_acknowledged() const
-  {
+  bool may_be_acknowledged() const {
     return page_->has_standby() && page_->get(Field::listening) > 0;
   }
 
@@ -411,5 +327,3 @@ private:
 };
 
 }  // namespace chainshaper
-
-#endif  // CHAINSHAPER_SHAPING__HANDOVER_HPP_

@@ -1,58 +1,94 @@
-// Making what follows a release take the same time in every cycle.
-//
-// Publishing is fast when its code and data are in the processor's caches, and slow, never equally
-// slow, when the chain has run there since the last time. So it is rehearsed shortly before each
-// release: a message that nobody receives goes the way of the real one, through the same layers of
-// ROS 2 and DDS, and a datagram to ourselves the way through the network stack.
-//
-// A core that sleeps takes tens of microseconds to wake up, on virtual machines more, and never the
-// same: most of what a subscriber sees of an output's jitter. While /dev/cpu_dma_latency is held
-// open, cores wake up within the microseconds written there, 0 at best
-// (Documentation/power/pm_qos_interface.rst). What is written ends with the process.
+// Making what follows a release take the same time in every cycle, as Readiness of chainshaper's
+// Python node, which says why: the publication is rehearsed, and idle cores do not sleep.
 
-#ifndef CHAINSHAPER_SHAPING__READINESS_HPP_
-#define CHAINSHAPER_SHAPING__READINESS_HPP_
+#pragma once
 
 #include <arpa/inet.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <netinet/in.h>
+#include <pthread.h>
+#include <sched.h>
+#include <semaphore.h>
 #include <sys/socket.h>
 #include <unistd.h>
 
-#include <array>
-#include <cstdint>
+#include <atomic>
 #include <cstring>
-#include <optional>
+#include <thread>
 
 #include "rclcpp/rclcpp.hpp"
-
-#include "kept_core.hpp"
 #include "shaper.hpp"
 
-namespace chainshaper
-{
+namespace chainshaper {
 
-class Readiness
-{
+// A core that is clear of other work while an output is delivered there: as
+// chainshaper/gate/clear_core.py, which says why. Where SCHED_FIFO or the core is refused, it is
+// not.
+class ClearCore {
+public:
+  explicit ClearCore(std::size_t core) {
+    sem_init(&more_, 0, 0);
+    thread_ = std::thread([this, core] { clear(core); });
+  }
+
+  ~ClearCore() {
+    clear_until(over);
+    thread_.join();
+    sem_destroy(&more_);
+  }
+
+  // Clear the core from now until that time of CLOCK_MONOTONIC.
+  void clear_until(std::int64_t time_ns) {
+    until_ns_ = time_ns;
+    sem_post(&more_);
+  }
+
+private:
+  static constexpr std::int64_t over = -1;
+
+  void clear(std::size_t core) {
+    pthread_setname_np(pthread_self(), "clear_core");
+    sched_param lowest{};
+    lowest.sched_priority = 1;
+    cpu_set_t cores;
+    CPU_ZERO(&cores);
+    CPU_SET(core, &cores);
+    if (sched_setscheduler(0, SCHED_FIFO | SCHED_RESET_ON_FORK, &lowest) != 0 ||
+        sched_setaffinity(0, sizeof(cores), &cores) != 0) {
+      return;
+    }
+    for (;;) {
+      while (sem_wait(&more_) != 0) {
+        // A signal ended the wait early.
+      }
+      if (until_ns_ == over) return;
+      watch_until(until_ns_);
+    }
+  }
+
+  sem_t more_;
+  std::atomic<std::int64_t> until_ns_{0};
+  std::thread thread_;
+};
+
+class Readiness {
 public:
   // The core is where the output is delivered, for `pause_ns` after it was published.
   Readiness(rclcpp::Node & node, std::optional<std::size_t> delivery_core, std::int64_t pause_ns)
-  : pause_ns_(pause_ns),
-    rehearsal_(node.create_generic_publisher(  // of all shaping nodes; an underscore hides it
-        "/_chainshaper_rehearsal", "std_msgs/msg/Empty", rclcpp::QoS(1))),
-    empty_(serialized_empty.size()),
-    to_itself_(socket(AF_INET, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0)),
-    latency_(open("/dev/cpu_dma_latency", O_WRONLY | O_CLOEXEC))
-  {
+      : pause_ns_(pause_ns),
+        rehearsal_(node.create_generic_publisher(  // of all shaping nodes; an underscore hides it
+            "/_chainshaper_rehearsal", "std_msgs/msg/Empty", rclcpp::QoS(1))),
+        empty_(serialized_empty.size()),
+        to_itself_(socket(AF_INET, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0)),
+        latency_(open("/dev/cpu_dma_latency", O_WRONLY | O_CLOEXEC)) {
     if (latency_ < 0) {
-      RCLCPP_WARN(
-        node.get_logger(), "/dev/cpu_dma_latency: %s: idle cores sleep, and deliver less "
-        "regularly; run as root, or give the user the right to write it", std::strerror(errno));
+      RCLCPP_WARN(node.get_logger(),
+                  "/dev/cpu_dma_latency: %s: idle cores sleep, and deliver less "
+                  "regularly; run as root, or give the user the right to write it",
+                  std::strerror(errno));
     }
-    if (delivery_core) {
-      delivery_core_.emplace(*delivery_core);
-    }
+    if (delivery_core) delivery_core_.emplace(*delivery_core);
     auto & message = empty_.get_rcl_serialized_message();
     std::memcpy(message.buffer, serialized_empty.data(), serialized_empty.size());
     message.buffer_length = serialized_empty.size();
@@ -62,59 +98,46 @@ public:
     socklen_t length = sizeof(address);
     auto * const general = reinterpret_cast<sockaddr *>(&address);
     connected_ = bind(to_itself_, general, length) == 0 &&
-      getsockname(to_itself_, general, &length) == 0 && connect(to_itself_, general, length) == 0;
+                 getsockname(to_itself_, general, &length) == 0 &&
+                 connect(to_itself_, general, length) == 0;
   }
 
-  Readiness(const Readiness &) = delete;
-  Readiness & operator=(const Readiness &) = delete;
-
-  ~Readiness()
-  {
-    for (const int file : {to_itself_, latency_}) {
-      if (file >= 0) {
-        close(file);
-      }
-    }
+  ~Readiness() {
+    for (const int file : {to_itself_, latency_})
+      if (file >= 0) close(file);
   }
 
   // For a release at that time of CLOCK_MONOTONIC, as far as there is time left for it.
-  void get_ready(std::int64_t release_ns)
-  {
+  void get_ready(std::int64_t release_ns) {
     ask_for(0);
-    if (delivery_core_) {
-      delivery_core_->keep_until(release_ns + pause_ns_);
-    }
+    if (delivery_core_) delivery_core_->clear_until(release_ns + pause_ns_);
     for (int time = 0; time < 2; ++time) {  // the second finds in order what the first has loaded
-      if (monotonic_ns() > release_ns - rehearsal_ns) {
-        return;
-      }
+      if (monotonic_ns() > release_ns - rehearsal_ns) return;
       rehearsal_->publish(empty_);
       if (connected_) {
         std::array<std::uint8_t, serialized_empty.size()> back;
         [[maybe_unused]] auto bytes =
-          send(to_itself_, serialized_empty.data(), serialized_empty.size(), 0);
+            send(to_itself_, serialized_empty.data(), serialized_empty.size(), 0);
         bytes = recv(to_itself_, back.data(), back.size(), 0);
       }
     }
   }
 
   // The message is delivered: cores may sleep, as if nothing had been asked for.
-  void relax() const {ask_for(-1);}
+  void relax() const { ask_for(-1); }
 
 private:
   static constexpr std::array<std::uint8_t, 5> serialized_empty{0, 1, 0, 0, 0};
   // A rehearsal is not begun later before a release than this: the first may take most of it.
   static constexpr std::int64_t rehearsal_ns = 400'000;
 
-  void ask_for(std::int32_t latency_us) const
-  {
-    if (latency_ >= 0) {
-      [[maybe_unused]] const auto written = write(latency_, &latency_us, sizeof(latency_us));
-    }
+  void ask_for(std::int32_t latency_us) const {
+    if (latency_ >= 0) [[maybe_unused]]
+      const auto written = write(latency_, &latency_us, sizeof(latency_us));
   }
 
   std::int64_t pause_ns_;
-  std::optional<KeptCore> delivery_core_;
+  std::optional<ClearCore> delivery_core_;
   rclcpp::GenericPublisher::SharedPtr rehearsal_;
   rclcpp::SerializedMessage empty_;
   int to_itself_;
@@ -123,5 +146,3 @@ private:
 };
 
 }  // namespace chainshaper
-
-#endif  // CHAINSHAPER_SHAPING__READINESS_HPP_

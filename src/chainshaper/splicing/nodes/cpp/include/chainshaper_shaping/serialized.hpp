@@ -6,8 +6,7 @@
 // on the way of serialized messages: here they are passed what rclcpp knows, and emit the events
 // that Jazzy has. Upstream: ros2_tracing, `tracetools/include/tracetools/tracetools.h`, 4.1.1.
 
-#ifndef CHAINSHAPER_SHAPING__SERIALIZED_HPP_
-#define CHAINSHAPER_SHAPING__SERIALIZED_HPP_
+#pragma once
 
 #include <functional>
 #include <memory>
@@ -21,57 +20,49 @@
 #include "tracetools/tracetools.h"
 #endif
 
-namespace chainshaper
-{
+namespace chainshaper {
 
 using Taken =
-  std::function<void(std::shared_ptr<rclcpp::SerializedMessage>, const rclcpp::MessageInfo &)>;
+    std::function<void(std::shared_ptr<rclcpp::SerializedMessage>, const rclcpp::MessageInfo &)>;
 
 #if RCLCPP_VERSION_GTE(25, 0, 0)
 
-inline rclcpp::GenericSubscription::SharedPtr subscribe_serialized(
-  rclcpp::Node & node, const std::string & topic, const std::string & type,
-  const rclcpp::QoS & qos, Taken taken)
-{
+inline rclcpp::GenericSubscription::SharedPtr subscribe_serialized(rclcpp::Node & node,
+                                                                   const std::string & topic,
+                                                                   const std::string & type,
+                                                                   const rclcpp::QoS & qos,
+                                                                   Taken taken) {
   return node.create_generic_subscription(topic, type, qos, taken);
 }
 
-inline void publish_serialized(
-  rclcpp::GenericPublisher & publisher, const rclcpp::SerializedMessage & message)
-{
+inline void publish_serialized(rclcpp::GenericPublisher & publisher,
+                               const rclcpp::SerializedMessage & message) {
   publisher.publish(message);
 }
 
 #else
 
-class SerializedSubscription : public rclcpp::GenericSubscription
-{
+class SerializedSubscription : public rclcpp::GenericSubscription {
 public:
-  SerializedSubscription(
-    rclcpp::Node & node, const std::string & topic, const std::string & type,
-    const rclcpp::QoS & qos, Taken taken)
-  : GenericSubscription(
-      node.get_node_base_interface().get(),
-      rclcpp::get_typesupport_library(type, "rosidl_typesupport_cpp"), topic, type, qos,
-      [](std::shared_ptr<rclcpp::SerializedMessage>) {}, rclcpp::SubscriptionOptions()),
-    taken_(taken)
-  {
+  SerializedSubscription(rclcpp::Node & node, const std::string & topic, const std::string & type,
+                         const rclcpp::QoS & qos, Taken taken)
+      : GenericSubscription(
+            node.get_node_base_interface().get(),
+            rclcpp::get_typesupport_library(type, "rosidl_typesupport_cpp"), topic, type, qos,
+            [](std::shared_ptr<rclcpp::SerializedMessage>) {}, rclcpp::SubscriptionOptions()),
+        taken_(taken) {
     const void * handle = get_subscription_handle().get();
     TRACEPOINT(rclcpp_subscription_init, handle, static_cast<const void *>(this));
-    TRACEPOINT(
-      rclcpp_subscription_callback_added, static_cast<const void *>(this),
-      static_cast<const void *>(&taken_));
+    TRACEPOINT(rclcpp_subscription_callback_added, static_cast<const void *>(this),
+               static_cast<const void *>(&taken_));
   }
 
-  void handle_serialized_message(
-    const std::shared_ptr<rclcpp::SerializedMessage> & message,
-    const rclcpp::MessageInfo & info) override
-  {
+  void handle_serialized_message(const std::shared_ptr<rclcpp::SerializedMessage> & message,
+                                 const rclcpp::MessageInfo & info) override {
     const auto source_timestamp = info.get_rmw_message_info().source_timestamp;
     const void * handle = rcl_subscription_get_rmw_handle(get_subscription_handle().get());
     const void * callback = &taken_;
-    TRACEPOINT(
-      rmw_take, handle, static_cast<const void *>(message.get()), source_timestamp, true);
+    TRACEPOINT(rmw_take, handle, static_cast<const void *>(message.get()), source_timestamp, true);
     TRACEPOINT(callback_start, callback, false);
     taken_(message, info);
     TRACEPOINT(callback_end, callback);
@@ -81,18 +72,18 @@ private:
   Taken taken_;
 };
 
-inline rclcpp::GenericSubscription::SharedPtr subscribe_serialized(
-  rclcpp::Node & node, const std::string & topic, const std::string & type,
-  const rclcpp::QoS & qos, Taken taken)
-{
+inline rclcpp::GenericSubscription::SharedPtr subscribe_serialized(rclcpp::Node & node,
+                                                                   const std::string & topic,
+                                                                   const std::string & type,
+                                                                   const rclcpp::QoS & qos,
+                                                                   Taken taken) {
   auto subscription = std::make_shared<SerializedSubscription>(node, topic, type, qos, taken);
   node.get_node_topics_interface()->add_subscription(subscription, nullptr);
   return subscription;
 }
 
-inline void publish_serialized(
-  rclcpp::GenericPublisher & publisher, const rclcpp::SerializedMessage & message)
-{
+inline void publish_serialized(rclcpp::GenericPublisher & publisher,
+                               const rclcpp::SerializedMessage & message) {
   const void * content = &message;
   const void * handle = publisher.get_publisher_handle().get();
   TRACEPOINT(rcl_publish, handle, content);
@@ -103,5 +94,3 @@ inline void publish_serialized(
 #endif
 
 }  // namespace chainshaper
-
-#endif  // CHAINSHAPER_SHAPING__SERIALIZED_HPP_

@@ -1,0 +1,27 @@
+"""Programs of tests that contain the gate in C++, from the headers of the package for all types."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from chainshaper.splicing.generated_package import generic_package
+
+__all__ = ["compiled"]
+
+
+def compiled(source: Path, folder: Path) -> Path:
+    """The program of a source file, compiled into a folder; no warning is let pass."""
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("g++ is not installed, so the gate in C++ cannot be compiled")
+    for path, text in generic_package().items():
+        if path.endswith(".hpp"):
+            (folder / path).parent.mkdir(parents=True, exist_ok=True)
+            (folder / path).write_text(text)
+    program = folder / source.stem
+    warnings = ["-Wall", "-Wextra", "-Wconversion", "-Werror"]
+    options = ["-std=c++17", "-O1", *warnings, f"-I{folder / 'include'}"]
+    subprocess.run([compiler, *options, source, "-o", program], check=True, timeout=150)
+    return program

@@ -1,0 +1,509 @@
+"""The gate's decision: worked by hand, against a walk through time, and what may never be.
+
+What several messages do to each other, and logical execution time, is in `gate_conformance.yaml`.
+"""
+
+import time
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from passing import decided, held, serialized
+
+from chainshaper.gate import decision
+from chainshaper.gate.decision import (
+    LATE,
+    OVERRUNS,
+    Gate,
+    Modes,
+    Release,
+    Shaper,
+    missed,
+    origin_of,
+    release_of,
+    text_of,
+)
+
+MS, SECOND = 1_000_000, 1_000_000_000
+
+ONE = Gate(slots=((60, 61),), cycle_ns=100)
+BANDS = Gate(slots=((20, 25), (25, 30), (80, 100)), cycle_ns=100)
+# What comes from 61 on has overrun.
+TWO = Gate(slots=((20, 30), (60, 61)), cycle_ns=100)
+DISCARD, PUBLISH = replace(TWO, overrun="discard"), replace(TWO, overrun="publish")
+# The last slot is the city's.
+MODES = Modes(bands={"city": 2, "village": 1, "highway": 0}, default="city")
+MODAL = Gate(slots=((20, 21), (40, 42), (60, 61)), cycle_ns=100, modes=MODES)
+
+
+def with_late(late: str, overrun: str = "wait") -> Gate:
+    return replace(MODAL, overrun=overrun, modes=replace(MODES, late=late))
+
+
+@st.composite
+def gates(draw: st.DrawFn) -> Gate:
+    """Small enough that a test can walk through every instant of a few cycles."""
+    cycle = draw(st.integers(2, 40))
+    cuts = sorted(draw(st.sets(st.integers(0, cycle), min_size=2, max_size=8)))
+    return Gate(
+        slots=tuple(zip(cuts[::2], cuts[1::2], strict=False)),
+        cycle_ns=cycle,
+        anchor=draw(st.sampled_from(["stamp", "cycle"])),
+        phase_ns=draw(st.integers(-100, 100)),
+        max_future_ns=draw(st.integers(0, 50)),
+        due_cycles=draw(st.integers(0, 2)),
+    )
+
+
+ARRIVALS, STAMPS = st.integers(0, 1000), st.none() | st.integers(0, 1000)
+
+
+# Slots and anchors ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arrival", "leaves_at", "slot", "cycles_waited"),
+    [
+        (1000, 1020, 0, 0),  # as early as can be
+        (1019, 1020, 0, 0),  # just before the slot
+        (1020, 1020, 0, 0),  # at its start: inside
+        (1024, 1024, 0, 0),  # inside: at once
+        (1025, 1025, 1, 0),  # at its end: outside, but the next slot begins here
+        (1029, 1029, 1, 0),
+        (1030, 1080, 2, 0),  # between two slots
+        (1099, 1099, 2, 0),  # the last instant of a slot that ends with the cycle
+        (1100, 1120, 0, 1),  # after the last slot: the next cycle, and counted
+        (1130, 1180, 2, 1),
+        (1740, 1780, 2, 7),  # seven cycles late
+    ],
+)
+def test_stamped_messages_leave_in_the_first_slot_they_can_reach(
+    arrival: int, leaves_at: int, slot: int, cycles_waited: int
+) -> None:
+    release = release_of(BANDS, arrival, stamp_ns=1000)
+    overrun = "wait" if cycles_waited else None
+    assert release == Release(leaves_at, 1000, slot, cycles_waited, "stamp", overrun)
+
+
+@pytest.mark.parametrize(
+    ("arrival", "leaves_at", "origin", "cycles_waited"),
+    [
+        (7, 67, 7, 0),  # cycles start at 7, 107, 207, …, whatever the stamp says
+        (66, 67, 7, 0),
+        (67, 67, 7, 0),
+        (68, 167, 7, 1),  # missed
+        (106, 167, 7, 1),
+        (107, 167, 107, 0),  # a new cycle begins
+        (5, 67, -93, 1),  # before the phase: the cycle that began at -93, its slot [-33, -32)
+    ],
+)
+def test_the_cycle_anchor_counts_from_its_phase(
+    arrival: int, leaves_at: int, origin: int, cycles_waited: int
+) -> None:
+    gate = replace(ONE, anchor="cycle", phase_ns=7)
+    assert release_of(gate, arrival, stamp_ns=1) == Release(
+        leaves_at, origin, 0, cycles_waited, "cycle", "wait" if cycles_waited else None
+    )
+    late = release_of(replace(gate, overrun="discard"), arrival, None)
+    assert (late.at_ns is None) == bool(cycles_waited), "it belongs to the cycle it comes in"
+
+
+@pytest.mark.parametrize(
+    ("changes", "arrival", "stamp", "anchor"),
+    [
+        ({}, 1000, None, "cycle"),
+        ({}, 2000, 1000, "stamp"),  # ten cycles is the oldest, unless said otherwise
+        ({}, 2001, 1000, "cycle"),
+        ({"max_age_ns": 2000}, 2001, 1000, "stamp"),
+        ({"max_future_ns": 150}, 1000, 1150, "stamp"),
+        ({"max_future_ns": 150}, 1000, 1151, "cycle"),
+    ],
+)
+def test_a_stamp_is_of_use_that_is_neither_old_nor_far_from_the_future(
+    changes: dict[str, int], arrival: int, stamp: int | None, anchor: str
+) -> None:
+    assert release_of(replace(ONE, **changes), arrival, stamp).anchor == anchor  # type: ignore[arg-type]
+
+
+def test_without_a_stamp_of_use_a_message_is_anchored_to_the_cycle() -> None:
+    release = release_of(replace(ONE, phase_ns=30), 1000, stamp_ns=None)
+    assert release == Release(1090, 930, 0, 1, "cycle", "wait")
+    real = Gate(((60 * MS, 61 * MS),), 100 * MS, phase_ns=3 * MS)
+    hours_old = release_of(real, 7200 * SECOND, stamp_ns=50 * MS)
+    assert hours_old.at_ns == 7200 * SECOND + 63 * MS
+    assert release_of(real, 0, stamp_ns=7200 * SECOND).at_ns == 63 * MS, "and not in two hours"
+
+
+def test_a_stamp_slightly_from_the_future_still_starts_cycle_0() -> None:
+    gate = replace(ONE, max_future_ns=150)
+    # The other host's clock is 150 ns ahead: more than a whole cycle, and no slot is skipped.
+    assert release_of(gate, 1000, stamp_ns=1150) == Release(1210, 1150, 0, 0, "stamp")
+    assert release_of(DISCARD, 990, stamp_ns=1000).at_ns == 1020, "no overrun"
+
+
+@given(gates(), ARRIVALS, STAMPS)
+def test_a_message_leaves_at_the_first_instant_inside_a_slot(
+    gate: Gate, arrival: int, stamp: int | None
+) -> None:
+    gate = replace(gate, due_cycles=0)
+    release = release_of(gate, arrival, stamp)
+
+    assert release.at_ns is not None
+    assert release.slot is not None
+    instant = max(arrival, release.origin_ns)  # no cycle exists before the first one
+    while not _inside_a_slot(gate, instant - release.origin_ns):
+        instant += 1
+    assert release.at_ns == instant
+
+    after_start = release.at_ns - release.origin_ns - release.cycles_waited * gate.cycle_ns
+    start, end = gate.slots[release.slot]
+    assert start <= after_start < end
+    assert release_of(gate, arrival, stamp) == release, "the same question, another answer"
+
+
+def _inside_a_slot(gate: Gate, since_origin: int) -> bool:
+    return any(start <= since_origin % gate.cycle_ns < end for start, end in gate.slots)
+
+
+@given(gates(), ARRIVALS, st.integers(0, 1000))
+def test_the_origin_is_the_stamp_or_a_start_of_the_cycle(
+    gate: Gate, arrival: int, stamp: int
+) -> None:
+    release = release_of(gate, arrival, stamp)
+    if release.anchor == "stamp":
+        assert (gate.anchor, release.origin_ns) == ("stamp", stamp)
+    else:
+        assert (release.origin_ns - gate.phase_ns) % gate.cycle_ns == 0
+        assert 0 <= arrival - release.origin_ns < gate.cycle_ns
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"slots": ()}, "without slots"),
+        ({"cycle_ns": 0}, "longer than nothing"),
+        ({"cycle_ns": -100}, "longer than nothing"),
+        ({"cycle_ns": 60}, "within the cycle"),  # the slot ends after it
+        ({"slots": ((60, 60),)}, "must ascend"),  # empty
+        ({"slots": ((61, 60),)}, "must ascend"),
+        ({"slots": ((-1, 60),)}, "within the cycle"),
+        ({"slots": ((30, 40), (10, 20))}, "must ascend"),
+        ({"slots": ((10, 20), (19, 30))}, "not overlap"),
+        ({"anchor": "clock"}, "choose one of stamp, cycle"),
+        ({"overrun": "drop"}, "choose one of wait, discard, publish"),
+        ({"due_cycles": -1}, "due beforehand"),
+        ({"modes": Modes({"city": 3}, "city")}, "numbered 0 to 0"),
+        ({"modes": Modes({"city": -1}, "city")}, "numbered 0 to 0"),
+    ],
+)
+def test_gates_that_make_no_sense_are_refused(changes: dict[str, object], reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        replace(ONE, **changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("default", "late", "reason"),
+    [
+        ("sea", "wait", "'sea' has no band: choose one of city"),
+        ("city", "never", "choose one of wait, .*next-slot"),
+    ],
+)
+def test_modes_that_make_no_sense_are_refused(default: str, late: str, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        Modes({"city": 2}, default, late)
+
+
+# Overruns ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arrival", "waits", "discards", "publishes"),
+    [
+        (1000, 1020, 1020, 1020),  # in time, all policies agree
+        (1025, 1025, 1025, 1025),
+        (1030, 1060, 1060, 1060),  # it missed a slot, but not the last
+        (1060, 1060, 1060, 1060),  # the last instant
+        (1061, 1120, None, 1061),  # the first one that is too late
+        (1099, 1120, None, 1099),
+        (1130, 1160, None, 1130),  # in the next cycle: still an overrun of its own
+    ],
+)
+def test_an_overrun_is_treated_as_the_policy_says(
+    arrival: int, waits: int, discards: int | None, publishes: int
+) -> None:
+    for gate, leaves_at in ((TWO, waits), (DISCARD, discards), (PUBLISH, publishes)):
+        release = release_of(gate, arrival, stamp_ns=1000)
+        assert release.at_ns == leaves_at
+        assert release.overrun == (gate.overrun if arrival >= 1061 else None)
+
+
+def test_what_leaves_in_no_slot_names_none_and_misses_none() -> None:
+    late = Release(None, 1000, None, 1, "stamp", "discard")
+    assert release_of(DISCARD, 1130, stamp_ns=1000) == late
+    at_once = release_of(PUBLISH, 1130, stamp_ns=1000)
+    assert at_once == replace(late, at_ns=1130, overrun="publish")
+    assert not missed(PUBLISH, at_once, 5000)
+    release = release_of(DISCARD, 1000, stamp_ns=1000)
+    assert [missed(DISCARD, release, now) for now in (1020, 1029, 1030)] == [False, False, True]
+
+
+@given(gates(), ARRIVALS, STAMPS)
+def test_overruns_are_treated_behind_the_slots_of_the_due_cycle_and_nowhere_else(
+    gate: Gate, arrival: int, stamp: int | None
+) -> None:
+    wait, discard, publish = (
+        release_of(replace(gate, overrun=policy), arrival, stamp) for policy in OVERRUNS
+    )
+    due = gate.due_cycles if wait.anchor == "stamp" else min(gate.due_cycles, 1)
+    last_end = wait.origin_ns + due * gate.cycle_ns + gate.slots[-1][1]
+    if wait.overrun is None:
+        assert wait == discard == publish
+        assert wait.at_ns is not None
+        assert arrival <= wait.at_ns < max(last_end, arrival + 1)
+        cycle, within = divmod(wait.at_ns - wait.origin_ns, gate.cycle_ns)
+        assert cycle == due
+        assert any(start <= within < end for start, end in gate.slots)
+    else:
+        assert arrival >= last_end, "it came in time"
+        assert (discard.at_ns, publish.at_ns) == (None, arrival)
+        assert (discard.overrun, publish.overrun) == ("discard", "publish")
+
+
+@given(gates(), st.sampled_from(OVERRUNS), st.lists(st.integers(0, 60), min_size=1))
+def test_one_after_another_messages_leave_in_the_order_they_came(
+    gate: Gate, policy: str, latencies: list[int]
+) -> None:
+    """The shaping node handles a message when the one before it has left."""
+    gate = replace(gate, overrun=policy)
+    now = 0
+    for number, latency in enumerate(latencies):
+        stamp = number * gate.cycle_ns
+        handled_at = max(now, stamp + latency)
+        release = release_of(gate, handled_at, stamp)
+        if release.at_ns is not None:
+            assert release.at_ns >= handled_at, "it left before the one before it"
+            now = release.at_ns
+
+
+def test_a_message_to_be_discarded_is_not_waited_for() -> None:
+    gate = Gate(slots=((0, 1),), cycle_ns=3_600_000 * MS, overrun="discard")
+    one = held(Shaper(gate), serialized(time.time_ns()))
+    assert (one.release.at_ns, one.release.overrun) == (None, "discard")
+    assert one.dropped == "discarded"
+
+
+def test_who_wakes_behind_the_slot_discards_what_came_in_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The machine stands still over the slot: the sleep ends late."""
+    slot = (20 * MS, 21 * MS)
+
+    def oversleep(deadline_ns: int) -> None:
+        while time.monotonic_ns() < deadline_ns + 3 * MS:
+            pass
+
+    monkeypatch.setattr(decision, "sleep_until", oversleep)
+    for policy, leaves in (("discard", False), ("wait", True), ("publish", True)):
+        shaper = Shaper(Gate(slots=(slot,), cycle_ns=100 * MS, overrun=policy))
+        release = held(shaper, serialized(time.time_ns())).release
+        assert (release.at_ns is not None) == leaves, policy
+        assert (release.overrun, release.slot) == ((None, 0) if leaves else ("discard", None))
+
+
+# Modes ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mode", "arrival", "leaves_at", "slot"),
+    [
+        ("city", 1000, 1060, 2),  # early: past both slots before its own
+        ("city", 1020, 1060, 2),  # inside another mode's slot: that one is not open to it
+        ("city", 1060, 1060, 2),  # inside its own
+        ("village", 1000, 1040, 1),
+        ("village", 1041, 1041, 1),  # the last instant
+        ("highway", 1000, 1020, 0),
+    ],
+)
+def test_an_early_message_waits_for_the_slot_of_its_mode(
+    mode: str, arrival: int, leaves_at: int, slot: int
+) -> None:
+    release = release_of(MODAL, arrival, 1000, changes=[(500, mode)])
+    assert release == Release(leaves_at, 1000, slot, 0, "stamp", None, mode)
+    without = release_of(replace(MODAL, modes=None), 1000, 1000, [(0, mode)])
+    assert (without.at_ns, without.mode) == (1020, None), "nothing is asked of them"
+
+
+@pytest.mark.parametrize(
+    ("late", "overrun", "arrival", "leaves_at", "slot", "treated"),
+    [
+        # Behind the village's slot, before the city's.
+        ("wait", "discard", 1042, 1140, 1, "wait"),
+        ("discard", "wait", 1042, None, None, "discard"),
+        ("publish", "wait", 1042, 1042, None, "publish"),
+        ("next-slot", "discard", 1042, 1060, 2, "next-slot"),
+        ("next-slot", "discard", 1060, 1060, 2, "next-slot"),
+        # Behind the last slot of all: an overrun like any other where the next slot is taken.
+        ("wait", "discard", 1070, 1140, 1, "wait"),
+        ("next-slot", "wait", 1070, 1140, 1, "wait"),
+        ("next-slot", "discard", 1061, None, None, "discard"),
+        ("next-slot", "publish", 1061, 1061, None, "publish"),
+        # In the next cycle already.
+        ("wait", "wait", 1141, 1141, 1, "wait"),
+        ("next-slot", "wait", 1142, 1160, 2, "wait"),
+    ],
+)
+def test_a_late_message_is_treated_as_said(  # noqa: PLR0917 - a row of the table
+    late: str, overrun: str, arrival: int, leaves_at: int | None, slot: int | None, treated: str
+) -> None:
+    release = release_of(with_late(late, overrun), arrival, 1000, changes=[(0, "village")])
+    assert (release.at_ns, release.slot, release.overrun) == (leaves_at, slot, treated)
+
+
+@pytest.mark.parametrize(
+    ("announced_at", "cycle_of", "mode"),
+    [
+        (1000, 1000, "highway"),  # at the very start: in force
+        (1001, 1000, "city"),  # within the cycle: not in this one
+        (1001, 1100, "highway"),  # but in the next
+        (1099, 1000, "city"),
+    ],
+)
+def test_a_change_is_in_force_from_the_next_cycle_on(
+    announced_at: int, cycle_of: int, mode: str
+) -> None:
+    changes = [(announced_at, "highway")]
+    for gate, stamp in ((MODAL, cycle_of), (replace(MODAL, anchor="cycle"), None)):
+        assert release_of(gate, cycle_of + 10, stamp, changes).mode == mode
+
+
+def test_a_late_message_has_the_mode_of_the_cycle_that_it_belongs_to() -> None:
+    changes = [(1050, "highway"), (1150, "village")]
+    release = release_of(with_late("publish"), 1175, 1000, changes)
+    assert (release.mode, release.at_ns) == ("city", 1175)
+    assert release_of(MODAL, 1175, 1100, changes).mode == "highway"
+    assert release_of(MODAL, 1275, 1200, changes).mode == "village"
+
+
+LATER = st.integers(0, 400)
+CHANGES = st.lists(st.tuples(LATER, st.sampled_from(sorted(MODES.bands)))).map(sorted)
+
+
+@given(st.sampled_from(LATE), st.sampled_from(OVERRUNS), LATER, CHANGES)
+def test_a_message_leaves_in_its_modes_slot_unless_it_is_late_and_takes_the_next(
+    late: str, overrun: str, arrival: int, changes: list[tuple[int, str]]
+) -> None:
+    release = release_of(with_late(late, overrun), arrival, 0, changes)
+    assert release.mode is not None
+    band = MODES.bands[release.mode]
+    start, end = MODAL.slots[band]
+    assert (release.overrun is None) == (arrival < end)
+    if release.overrun is None:
+        assert (release.slot, release.at_ns) == (band, max(arrival, start))
+    elif release.slot is not None and late != "next-slot":
+        assert release.slot == band
+
+
+@given(st.sampled_from(LATE), LATER, LATER, CHANGES)
+def test_one_cycle_has_one_mode(
+    late: str, first: int, second: int, changes: list[tuple[int, str]]
+) -> None:
+    gate = replace(with_late(late), anchor="cycle")
+    one, two = (release_of(gate, arrival, None, changes) for arrival in (first, second))
+    if one.origin_ns == two.origin_ns:
+        assert one.mode == two.mode
+
+
+# Messages, and a gate at work -------------------------------------------------------------------
+
+
+@given(st.integers(1, 2**31 * SECOND - 1), st.booleans())
+def test_the_stamp_is_read_in_either_byte_order(stamp: int, big_endian: bool) -> None:
+    assert origin_of(serialized(stamp, big_endian=big_endian)) == stamp
+
+
+def test_payloads_without_a_stamp_have_no_origin() -> None:
+    assert origin_of(serialized(0)) is None
+    assert origin_of(b"") is None
+    assert origin_of(serialized(5)[:11]) is None
+    assert origin_of(serialized(5)[:12]) == 5
+    not_a_header = bytes([0, 1, 0, 0]) + b"\xff" * 8  # 4.3 billion ns in a second
+    assert origin_of(not_a_header) is None
+
+
+@pytest.mark.parametrize(
+    ("payload", "text"),
+    [
+        (b"\0\1\0\0\5\0\0\0city\0", "city"),
+        (b"\0\0\0\0\0\0\0\5city\0", "city"),  # big-endian
+        (b"\0\1\0\0\1\0\0\0\0", ""),
+        (b"\0\1\0\0\6\0\0\0city\0", None),  # longer than the message
+        (b"\0\1\0\0\0\0\0\0", None),
+        (b"\0\1\0\0", None),
+        (b"", None),
+    ],
+)
+def test_the_text_of_a_message_is_read_in_either_byte_order(
+    payload: bytes, text: str | None
+) -> None:
+    assert text_of(payload) == text
+
+
+@pytest.mark.parametrize(
+    ("phase", "first_ms"),
+    [(13, 113), (93, 193), (0, 200)],  # later than before; earlier, but that has passed; the same
+)
+def test_a_new_phase_is_in_force_from_the_next_cycle_that_begins_there(
+    phase: int, first_ms: int
+) -> None:
+    shaper = Shaper(Gate(((60 * MS, 61 * MS),), 100 * MS, anchor="cycle"))
+    shaper.set_phase(phase * MS, 100 * MS if phase == 13 else 100 * MS + 1)
+    before = decided(shaper, b"", first_ms * MS - 1)
+    assert before.origin_ns == 100 * MS, "what comes until then belongs to a cycle as it was"
+    assert decided(shaper, b"", first_ms * MS).origin_ns == first_ms * MS
+    assert decided(shaper, b"", (first_ms + 100) * MS).origin_ns == (first_ms + 100) * MS
+
+
+def test_a_step_of_the_wall_clock_disturbs_no_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    """NTP corrects the clock by an hour while a message is under way.
+
+    The wall clock cannot be stepped for a test, so the offset that the shaper reads stands in.
+    """
+    offset = 1_700_000_000 * SECOND
+    monkeypatch.setattr(decision, "clock_offset", lambda: offset)
+    shaper = Shaper(Gate(((60 * MS, 61 * MS),), 100 * MS))
+
+    started = 5 * SECOND + 42 * MS
+    before = decided(shaper, serialized(started + offset), started + 30 * MS)
+    assert (before.anchor, before.at_ns) == ("stamp", started + 60 * MS)
+
+    under_way = serialized(started + 100 * MS + offset)
+    offset += 3600 * SECOND
+    during = decided(shaper, under_way, started + 130 * MS)
+    assert (during.anchor, during.at_ns) == ("cycle", started + 160 * MS)
+
+    after = decided(shaper, serialized(started + 200 * MS + offset), started + 230 * MS)
+    assert (after.anchor, after.at_ns) == ("stamp", started + 260 * MS)
+    stampless = decided(shaper, serialized(0), started + 330 * MS)
+    assert (stampless.anchor, stampless.at_ns) == ("cycle", started + 360 * MS)
+
+
+def test_a_shaper_follows_the_modes_that_are_announced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The offset between the two clocks, zero here, cannot be set for a test."""
+    monkeypatch.setattr(decision, "clock_offset", lambda: 0)
+    slots = tuple((start * MS, end * MS) for start, end in MODAL.slots)
+    shaper = Shaper(Gate(slots=slots, cycle_ns=100 * MS, modes=MODES))
+    assert shaper.mode == "city"
+    assert decided(shaper, serialized(1000 * MS), 1010 * MS).at_ns == 1060 * MS
+
+    assert shaper.switch("highway", 1050 * MS)
+    assert shaper.mode == "highway"
+    assert decided(shaper, serialized(1000 * MS), 1055 * MS).at_ns == 1060 * MS, "it was begun"
+    assert decided(shaper, serialized(1100 * MS), 1110 * MS).at_ns == 1120 * MS
+
+    assert shaper.switch("highway", 1150 * MS), "no change, but a mode that exists"
+    assert not shaper.switch("sea", 1150 * MS)
+    assert not shaper.switch(None, 1150 * MS)
+    assert decided(shaper, serialized(1200 * MS), 1210 * MS).mode == "highway"
+    without = Shaper(ONE)
+    assert (without.mode, without.switch("city", 5)) == (None, False)
