@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain
+from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain, plan_shaping, plan_warnings
 from chainshaper.planning.margins import (
     covered_latency,
     cycles_needed,
@@ -14,7 +14,6 @@ from chainshaper.planning.margins import (
     late_share,
 )
 from chainshaper.planning.plan_file import dump_plan
-from chainshaper.planning.shaping import plan_shaping, plan_warnings
 from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000

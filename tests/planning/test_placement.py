@@ -5,8 +5,8 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
+from chainshaper.planning.bands import choose_bands, with_bands, with_long_slot
 from chainshaper.planning.baselines import server_per_chain
-from chainshaper.planning.placement import choose_bands, with_bands, with_long_slot
 from chainshaper.planning.plan import Plan, publish_slots
 from chainshaper.planning.shaping import plan_shaping
 from chainshaper.values.errors import InputError, OperationError

@@ -17,9 +17,14 @@ from chainshaper.planning import (
     plan_warnings,
     with_bands,
 )
-from chainshaper.planning.overruns import cycles_until_output, output_lifespan
+from chainshaper.planning.overruns import (
+    Writer,
+    check_publication,
+    cycles_until_output,
+    output_lifespan,
+    publication_warnings,
+)
 from chainshaper.planning.plan import publish_slots, revised
-from chainshaper.planning.publication import Writer, check_publication, publication_warnings
 from chainshaper.values.errors import InputError
 
 OUTPUT = Writer("/n5", "/t5", depth=10, asynchronous=True)

@@ -18,8 +18,7 @@ from chainshaper.planning import (
     with_bands,
     with_long_slot,
 )
-from chainshaper.planning.plan import output_server, revised
-from chainshaper.planning.publisher_threads import messages_held, publisher_servers
+from chainshaper.planning.plan import messages_held, output_server, publisher_servers, revised
 from chainshaper.values.errors import InputError
 
 MS = 1_000_000

@@ -14,8 +14,9 @@ from chainshaper.planning.bands import (
     band_problem,
     broken_constraint,
     place_bands,
+    place_by_swarm,
+    place_randomly,
 )
-from chainshaper.planning.swarm import place_by_swarm, place_randomly
 from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000

@@ -59,9 +59,8 @@ from chainshaper.linux.command_process import end_command, start_command
 from chainshaper.linux.scheduling import available_cores, check_cores
 from chainshaper.linux.users import run_users
 from chainshaper.planning import Plan
-from chainshaper.planning.overruns import open_until_done
+from chainshaper.planning.overruns import open_until_done, publication_warnings
 from chainshaper.planning.plan import shaping_nodes
-from chainshaper.planning.publication import publication_warnings
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 

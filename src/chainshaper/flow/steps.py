@@ -13,7 +13,7 @@ from pathlib import Path
 from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
 from chainshaper.flow.profiles import profile_of
 from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain
-from chainshaper.planning.publisher_threads import publisher_servers
+from chainshaper.planning.plan import publisher_servers
 from chainshaper.sources import open_source
 from chainshaper.splicing.application import splice_application
 from chainshaper.values import events

@@ -24,15 +24,6 @@ from chainshaper.planning.shaping import OUTPUT_PRIORITY, shaping_node_like
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError
 
-__all__ = [
-    "CallbackTimes",
-    "let_per_callback",
-    "let_per_callback_asynchronous",
-    "let_per_chain",
-    "server_per_callback",
-    "server_per_chain",
-]
-
 
 @dataclass(frozen=True)
 class CallbackTimes:

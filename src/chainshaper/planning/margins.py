@@ -1,4 +1,7 @@
-"""How far beyond the longest undisturbed latency a slot must reach.
+"""Measured latencies, and how far beyond the longest undisturbed one a slot must reach.
+
+Planning needs nothing else of a chain than its end-to-end latencies, so a sample from any tool can
+be planned with (:func:`read_latencies`).
 
 **By default** (:func:`covered_latency`) so far that a stated share of *all* cycles is in time, also
 of those that the machine disturbed: an actuator does not care who caused a delay. How many of n
@@ -34,25 +37,16 @@ density does not vanish at the end of the distribution, it errs on the high side
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.planning.latency_file import check_latencies
 from chainshaper.planning.plan import Margin
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import InputError, OperationError
 
-__all__ = [
-    "EPSILON_NS",
-    "OVERRUN_PROBABILITY",
-    "TailFit",
-    "covered_latency",
-    "cycles_needed",
-    "derive_margin",
-    "fit_tail",
-    "late_share",
-]
+LONGEST_NS = 24 * 3_600 * 1_000_000_000  # beyond a day it is a wrong unit, not a latency
 
 EPSILON_NS = 1_000_000
 """What a margin adds to latencies seen: the way to the shaping node is not in them."""
@@ -75,6 +69,98 @@ WIDEST_INTERVAL = 0.5  # of the latency itself; wider, the sample does not tell
 LEAST_LOG = np.log(1e-12)  # of a probability: a fitted end may stand at the longest excess itself
 
 _Floats = NDArray[np.float64]
+
+
+def read_latencies(path: str | Path) -> NDArray[np.int64]:
+    """End-to-end latencies of a file, in nanoseconds, in the file's order.
+
+    Raises:
+        InputError: no such file, a line that is no duration (named with its number), an array
+            that does not hold whole nanoseconds, fewer than two latencies, or none above zero.
+    """
+    path = Path(path)
+    try:
+        found = _read_array(path) if path.suffix == ".npy" else _read_lines(path)
+        latencies = check_latencies(found)
+        if not latencies.any():
+            raise InputError("every latency is 0ms: check the unit, and what was measured")
+        return latencies
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except InputError as error:
+        # Lines are named already; what concerns the whole sample gets the file's name here.
+        raise InputError(
+            str(error) if str(error).startswith(str(path)) else f"{path}: {error}"
+        ) from error
+
+
+def check_latencies(latencies: object) -> NDArray[np.int64]:
+    """A sample that can be planned with: at least two latencies, whole nanoseconds, none negative.
+
+    Floating-point numbers are taken when each is a whole number of nanoseconds.
+
+    Raises:
+        InputError: anything else, with the first wrong element named by its place from 0.
+    """
+    array = np.asarray(latencies)
+    if array.ndim != 1 or array.dtype.kind not in "iuf":
+        raise InputError(
+            f"latencies must be one row of numbers in nanoseconds, not {array.ndim}-dimensional"
+            f" {array.dtype}"
+        )
+    if array.size < 2:
+        raise InputError(
+            f"{array.size} latencies are too few to plan with: measure more cycles (100 at least)"
+        )
+    if array.dtype.kind == "f":
+        _refuse_first(array, ~np.isfinite(array), "is not a number: remove it")
+        _refuse_first(
+            array, array != np.floor(array), "is not a whole number of nanoseconds: convert it"
+        )
+    _refuse_first(array, array < 0, "is negative: a latency is not; check the clocks")
+    _refuse_first(
+        array, array > LONGEST_NS, f"is longer than {format_duration(LONGEST_NS)}: check the unit"
+    )
+    return array.astype(np.int64)
+
+
+def _refuse_first(array: NDArray[np.generic], wrong: NDArray[np.bool_], reason: str) -> None:
+    if wrong.any():
+        place = int(np.argmax(wrong))
+        raise InputError(f"latency number {place} ({array[place]}) {reason}")
+
+
+def _read_array(path: Path) -> object:
+    try:
+        return np.load(path, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise InputError(
+            f"{path}: not a NumPy file of numbers: write it with numpy.save, whole nanoseconds in"
+            " one row"
+        ) from error
+
+
+def _read_lines(path: Path) -> NDArray[np.int64]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")  # spreadsheets begin with a byte-order mark
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path}: not a text of one duration a line ({error}); arrays end in .npy"
+        ) from error
+    found = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        content = line.partition("#")[0].strip()
+        if not content:
+            continue
+        try:
+            found.append(parse_duration(content))
+        except InputError as error:
+            raise InputError(f"{path}:{number}: {error}") from error
+        if not 0 <= found[-1] <= LONGEST_NS:
+            raise InputError(
+                f"{path}:{number}: {content} is no latency: write 0ms or more, up to a day"
+            )
+    return np.array(found, dtype=np.int64)
 
 
 @dataclass(frozen=True)

@@ -23,21 +23,17 @@ as well but may run out of time.
 import math
 import random
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.planning.entangled import refuse_shared_parts
-from chainshaper.planning.extras import extra_library
 from chainshaper.planning.plan import Plan, publishing_servers, revised
 from chainshaper.planning.shaping import OUTPUT_PRIORITY
 from chainshaper.values.durations import format_duration
-from chainshaper.values.errors import InputError, OperationError
-
-__all__ = ["place_chains", "with_offsets"]
+from chainshaper.values.errors import InputError, OperationError, extra_library
 
 MOST_SEARCHED = 4  # chains; beyond, CP-SAT is faster
 TIME_LIMIT_SECONDS = 60.0
@@ -110,7 +106,7 @@ def with_offsets(
     """
     if not plans:
         raise InputError("no plans to find offsets for: give one per chain")
-    refuse_shared_parts(plans)
+    _refuse_shared_parts(plans)
     allowed: _Allowed = {}
     for j, k in combinations(range(len(plans)), 2):
         found = _allowed_differences(plans[j], plans[k])
@@ -381,3 +377,30 @@ def _pair_too_long(one: Plan, two: Plan, common: int) -> str:
 
 def _name(plan: Plan) -> str:
     return plan.chain.spec or plan.chain.output or "a chain without a name"
+
+
+def _refuse_shared_parts(plans: Sequence[Plan]) -> None:
+    """Plans that were made one by one may not govern the same threads, or the same output."""
+    for one, two in combinations(plans, 2):
+        if one.chain.output is not None and one.chain.output == two.chain.output:
+            raise InputError(same_output(_name(one), _name(two), one.chain.output))
+        nodes = [{t.node for server in plan.servers for t in server.threads} for plan in (one, two)]
+        if shared := nodes[0] & nodes[1]:
+            raise InputError(same_nodes(_name(one), _name(two), shared))
+
+
+def same_output(one: str, two: str, topic: str) -> str:
+    """Why two chains with one output have no plan together."""
+    return (
+        f"{one} and {two} both publish {topic}, and one shaping node can hold it at one place"
+        " only: name each output once, with the chain that takes longest"
+    )
+
+
+def same_nodes(one: str, two: str, nodes: Iterable[str]) -> str:
+    """Why two chains with common nodes have no plan together."""
+    return (
+        f"{one} and {two} share {', '.join(sorted(nodes))}: a thread runs in the servers of one"
+        " plan. Plan one of the two alone or, where both begin at the same callback, the other as"
+        " its --sink"
+    )

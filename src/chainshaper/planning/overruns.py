@@ -1,27 +1,42 @@
-"""Overruns: outputs that come behind the last slot they were due in (section 6).
+"""What a plan asks of the application and the machine: overruns, publishers, warnings.
 
-A shaping node sees them and treats them as the plan says (:mod:`chainshaper.gate.decision`).
-The thread of an asynchronous publisher cannot tell an overrun from an output that came early, but
-DDS can, by its age: with a **lifespan** on the topic, what waited for the slot of a later cycle
-has expired when the thread may run again.
+An **overrun** is an output that comes behind the last slot it was due in (section 6). A shaping
+node sees them and treats them as the plan says (:mod:`chainshaper.gate.decision`). The thread of an
+asynchronous publisher cannot tell an overrun from an output that came early, but DDS can, by its
+age: with a **lifespan** on the topic, what waited for the slot of a later cycle has expired when
+the thread may run again.
+
+A plan for asynchronous publication (section 3.2.1) gates the thread that publishes the chain's
+output. Its own values are checked wherever a plan is made or read
+(:mod:`chainshaper.planning.plan`); who publishes what, and how, only the application can tell.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
+from chainshaper.planning.margins import OVERRUN_PROBABILITY, cycles_needed
 from chainshaper.planning.plan import (
     PER_CALLBACK,
     Plan,
+    ShapingNode,
+    Thread,
+    below_executors,
+    messages_held,
     output_server,
     publish_slots,
+    publisher_servers,
     publishing_servers,
     revised,
     server_of,
 )
-from chainshaper.planning.plan_parts import ShapingNode, Thread
-from chainshaper.planning.publisher_threads import below_executors, publisher_servers
+from chainshaper.values.durations import format_duration, milliseconds
 from chainshaper.values.errors import InputError
 
-__all__ = ["cycles_until_output", "open_until_done", "output_lifespan"]
+NEARLY_FULL = 0.95  # of the cycle; also the kernel's default share for real-time threads
+
+ROOMY_SLOT_NS = 10_000_000
+"""What is left of such a slot suffices for many sends where the machine stalls for 1 to 8 ms."""
 
 
 def cycles_until_output(plan: Plan, node: ShapingNode | None = None) -> int:
@@ -90,3 +105,184 @@ def open_until_done(plan: Plan) -> Plan:
         return revised(plan, servers=below_executors(servers))
     except InputError:  # another server has a slot there
         return plan
+
+
+@dataclass(frozen=True)
+class Writer:
+    """A writer of an application: node, topic, history (keep last), and who sends.
+
+    ``asynchronous``: a publisher thread does. None is: not known.
+    """
+
+    node: str
+    topic: str
+    depth: int | None = None
+    asynchronous: bool | None = None
+
+
+def check_publication(plan: Plan, writers: Sequence[Writer]) -> list[str]:
+    """Hold a plan that gates publishers' threads against the writers of the application.
+
+    Returns what a person must know, one sentence each. Plans that gate no publisher's thread, or
+    do not say which output they are for, have nothing to be checked.
+
+    Raises:
+        InputError: the output is published by another node, or synchronously, or its history is
+            too shallow for what is handed over while the thread may not run.
+    """
+    warnings: list[str] = []
+    for _, server, nodes in publisher_servers(plan):
+        for node in nodes:
+            own = [writer for writer in writers if writer.node == node]
+            if node == plan.chain.publisher and plan.chain.output is not None:
+                _check_output(plan.chain.output, node, own, messages_held(plan, server))
+            delayed = sorted(
+                writer.topic
+                for writer in own
+                if writer.asynchronous and writer.topic != plan.chain.output
+            )
+            if delayed:
+                warnings.append(
+                    f"{', '.join(delayed)} of {node} will be delayed as well, until the slots of"
+                    f" server {server.name!r}: one thread sends for all asynchronous writers of a"
+                    " process. Publish them synchronously, or from another process."
+                )
+    return warnings
+
+
+def _check_output(topic: str, node: str, own: Sequence[Writer], held: int) -> None:
+    writer = next((writer for writer in own if writer.topic == topic), None)
+    if writer is None:
+        raise InputError(
+            f"the plan gates the thread by which {node} publishes {topic}, but {node} does not"
+            " publish it: plan again from a recording of this application"
+        )
+    if writer.asynchronous is False:
+        raise InputError(
+            f"{node} publishes {topic} synchronously, so gating its publisher thread would hold"
+            " nothing: publish it asynchronously, or plan with --publication synchronous"
+        )
+    if writer.depth is not None and writer.depth < held:
+        raise InputError(
+            f"{topic} has a history of {writer.depth}, but {held} messages are handed over while"
+            f" the publisher thread of {node} may not run: give it a depth of {held + 1}"
+        )
+
+
+def publication_warnings(plan: Plan) -> list[str]:
+    """What a plan for asynchronous publication asks of the application; one sentence each."""
+    warnings = []
+    for _, server, nodes in publisher_servers(open_until_done(plan)):
+        names = ", ".join(nodes)
+        warnings.append(
+            f"only asynchronous publication can be shaped like this, and all of it is: whatever"
+            f" else {names} publishes asynchronously, such as /rosout, waits for the slots of"
+            f" server {server.name!r} too."
+        )
+        shortest = min(end - start for start, end in server.slots)
+        if shortest < ROOMY_SLOT_NS:
+            warnings.append(
+                f"a slot of {format_duration(shortest)} that opens late may end while {names}"
+                " sends, which blocks the whole process until the next one; it costs nothing to"
+                f" give it {format_duration(ROOMY_SLOT_NS)} (--publish-slot), since outputs leave"
+                " when it opens."
+            )
+        depth = plan.chain.output_depth
+        held = messages_held(plan, server)
+        if depth == held and plan.overrun == "wait" and plan.chain.publisher in nodes:
+            warnings.append(
+                f"a history of {depth} has no room for an output that overran: it will be"
+                " overwritten by the next. A depth of one more would keep it."
+            )
+    if plan.overrun == "discard" and warnings:
+        lifespan, topic = output_lifespan(plan), plan.chain.output or "their topic"
+        warnings.append(
+            "outputs that are due in a later cycle than their own cannot be told from overruns by"
+            " their age: none will be discarded."
+            if lifespan is None
+            else f"outputs that overran are discarded by DDS if {topic} has a lifespan of"
+            f" {format_duration(lifespan)}: give it one."
+        )
+    return warnings
+
+
+def plan_warnings(plan: Plan) -> list[str]:
+    """What a person must know before relying on a plan; one sentence each, none if all is well."""
+    evidence, cycle = plan.evidence, plan.cycle_ns
+    warnings = _about_late_outputs(plan)
+    if evidence.realtime is False:
+        warnings.append(
+            "the latencies were taken without real-time scheduling: other programs are in them,"
+            " and the chain's slot is longer than it needs to be. Record again with the privilege"
+            " to use SCHED_FIFO."
+        )
+    if evidence.lost_events:
+        warnings.append(
+            f"{evidence.lost_events} events were lost while recording: cycles are missing, and the"
+            " longest latency may be among them. Record again, see the recording's notes."
+        )
+    if evidence.incomplete:
+        warnings.append(
+            f"{evidence.incomplete} executions of the chain have no end in the recording; their"
+            " latencies, which may be the longest, are not in the plan."
+        )
+    if plan.margin.confidence_interval_ns is not None:
+        low, high = map(format_duration, plan.margin.confidence_interval_ns)
+        warnings.append(
+            f"the margin {format_duration(plan.margin.epsilon_ns)} is an estimate; with 95 %"
+            f" confidence it lies between {low} and {high}."
+        )
+    last = max((end for _, end in publish_slots(plan)), default=evidence.max_latency_ns)
+    if NEARLY_FULL * cycle < last <= cycle:
+        warnings.append(
+            f"the plan fills {last / cycle:.1%} of the cycle {format_duration(cycle)}: an"
+            " execution a little longer than any measured delays the next one."
+        )
+    if evidence.max_latency_ns >= cycle:
+        warnings.append(
+            f"the longest latency {format_duration(evidence.max_latency_ns)} is not shorter than"
+            f" the cycle {format_duration(cycle)}: executions of the chain overlapped while they"
+            " were measured, and response times have each other's interference in them."
+        )
+    elif evidence.max_latency_ns > NEARLY_FULL * cycle:
+        warnings.append(
+            "a cycle as long as the longest measured keeps its core busy for more than"
+            f" {NEARLY_FULL:.0%}, where the kernel throttles real-time threads"
+            " (/proc/sys/kernel/sched_rt_runtime_us)."
+        )
+    if evidence.utilisation is not None and evidence.utilisation > NEARLY_FULL:
+        warnings.append(
+            f"the chain's execution takes {evidence.utilisation:.1%} of its core: latencies"
+            " will pile up from cycle to cycle, whatever the slots."
+        )
+    return [*warnings, *publication_warnings(plan)]
+
+
+def _about_late_outputs(plan: Plan) -> list[str]:
+    """How many outputs will be late, if the sample tells, and what the machine's stalls cost."""
+    evidence, margin = plan.evidence, plan.margin
+    cycles, needed = evidence.samples + evidence.disturbed, cycles_needed(OVERRUN_PROBABILITY)
+    found = []
+    if cycles < needed:
+        found.append(
+            f"the sample is small: {cycles} cycles are too few to say how late one output in a"
+            f" hundred will be. Record {needed} cycles or more."
+        )
+    if evidence.disturbed:
+        stall = evidence.longest_stall_ns
+        what = "" if stall is None else f", longest stall {milliseconds(stall)} ms"
+        found.append(f"the machine disturbed {evidence.disturbed} of {cycles} cycles{what}.")
+    if margin.stalls_ns:
+        end = evidence.max_latency_ns + margin.epsilon_ns
+        found.append(
+            f"covering the disturbed cycles costs {milliseconds(margin.stalls_ns)} ms: outputs"
+            f" leave at {milliseconds(end)} ms; on a machine that does not stall it would be"
+            f" {milliseconds(end - margin.stalls_ns)} ms (--ideal-machine)."
+        )
+    late = margin.overrun_probability or 0.0
+    if cycles >= needed and late > OVERRUN_PROBABILITY and margin.source != "derived":
+        found.append(
+            f"by the latencies of all cycles, up to {late:.1%} of the outputs will miss their slot"
+            f" ({plan.overrun}): a larger margin (--epsilon) or a calmer machine helps."
+        )
+    return found

@@ -16,8 +16,6 @@ from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.whole_file import new_file, write_whole
 from chainshaper.values.yaml_file import AS_YAML, read_model
 
-__all__ = ["Plan", "dump_plan", "load_plan", "plan_json", "save_plan", "save_plans"]
-
 _HEADER = """\
 # A chainshaper plan: the reservation servers that give a ROS 2 chain a constant latency.
 # Edit it as you like; it is checked when it is used. Durations carry units (59ms, 250us);

@@ -11,10 +11,13 @@ lifespan by which DDS discards what overran.
 
 from pydantic import ValidationError
 
-from chainshaper.planning.overruns import cycles_until_output, output_lifespan
-from chainshaper.planning.plan import Modes, Plan, ShapingNode, server_of
-from chainshaper.planning.publication import Writer, check_publication
-from chainshaper.planning.publisher_threads import publisher_servers
+from chainshaper.planning.overruns import (
+    Writer,
+    check_publication,
+    cycles_until_output,
+    output_lifespan,
+)
+from chainshaper.planning.plan import Modes, Plan, ShapingNode, publisher_servers, server_of
 from chainshaper.values.errors import InputError
 from chainshaper.values.yaml_file import explanations, key_text
 from chainshaper.workload.description import (
