@@ -231,11 +231,7 @@ class BandChoice:
 
 
 def choose_bands(
-    plan: Plan,
-    latencies_ns: NDArray[np.int64],
-    *,
-    least_gain: float = 0.02,
-    **limits: Any,
+    plan: Plan, latencies_ns: NDArray[np.int64], *, least_gain: float = 0.02, **limits: Any
 ) -> BandChoice:
     """What :func:`with_bands` takes for ``auto``, with its grounds.
 
@@ -315,11 +311,7 @@ def _with_publish_slots(plan: Plan, slots: tuple[Slot, ...], predicted: Predicti
 
 
 def place_bands(
-    problem: BandProblem,
-    bands: int,
-    *,
-    minimise: Goal = "mean",
-    mean_at_most_ns: int | None = None,
+    problem: BandProblem, bands: int, *, minimise: Goal = "mean", mean_at_most_ns: int | None = None
 ) -> Placement:
     """The best placement of ``bands`` slots that exists on the grid.
 

@@ -136,10 +136,7 @@ def let_per_chain(plan: Plan) -> Plan:
         for server in plan.servers
     )
     return revised(
-        plan,
-        policy="let-per-chain",
-        servers=servers,
-        predicted=_after_periods(plan, 1, length),
+        plan, policy="let-per-chain", servers=servers, predicted=_after_periods(plan, 1, length)
     )
 
 

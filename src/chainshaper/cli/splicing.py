@@ -1,25 +1,18 @@
 """`chainshaper splice`: put shaping nodes, or throttlers, into copies of launch files."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
-from chainshaper.cli.options import JsonOption
-from chainshaper.cli.plan_options import FallbackOption
+from chainshaper.cli.options import JsonOption, NodeKind, NodeOption, option, wish
+from chainshaper.cli.output import notes, print_json, show_line
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Fallback
 
 if TYPE_CHECKING:
     from chainshaper.flow.launch_splicing import Splicing, ThrottledInput
-    from chainshaper.planning import Plan
     from chainshaper.values.recording import Recording
-
-__all__ = ["splice"]
-
-
-NodeKind: TypeAlias = Literal["python", "cpp", "typed"]
-"""How the shaping node is made."""
 
 
 class _Launched(NamedTuple):
@@ -36,10 +29,7 @@ class _Launched(NamedTuple):
 
 def splice(
     plan: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="plan.yaml", help="The plan; none with --throttle.", show_default=False
-        ),
+        Path | None, typer.Argument(metavar="plan.yaml", help="The plan; none with --throttle.")
     ] = None,
     launch: Annotated[
         list[str] | None,
@@ -47,55 +37,43 @@ def splice(
             metavar="LAUNCH... [NAME:=VALUE...]",
             help="The launch files (.py, .xml, .yaml), and launch arguments that are not at their "
             "defaults, as for `ros2 launch`.",
-            show_default=False,
         ),
     ] = None,
     *,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output", "-o", metavar="DIR", help="Folder for the copies.", show_default=False
-        ),
-    ],
+    output: Annotated[Path, option("--output -o", "Folder for the copies.", "DIR")],
     throttle: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
             "--throttle",
-            metavar="[NODE:]TOPIC=PERIOD",
-            help="Instead of a plan: a throttler before an input that is not quite periodic, for "
+            "Instead of a plan: a throttler before an input that is not quite periodic, for "
             "NODE or whoever subscribes in the recording (may be repeated).",
-            show_default=False,
+            "[NODE:]TOPIC=PERIOD",
         ),
     ] = None,
-    node: Annotated[
-        NodeKind,
-        typer.Option(help="A script; a package for all types; or one generated for the type."),
-    ] = "python",
+    node: NodeOption = "python",
     message_type: Annotated[
         str | None,
-        typer.Option(
+        option(
             "--type",
-            metavar="PKG/msg/TYPE",
-            help="Of the output, for --node typed. Default: what the recording says.",
-            show_default=False,
+            "Of the output, for --node typed. Default: what the recording says.",
+            "PKG/msg/TYPE",
         ),
     ] = None,
     recording: Annotated[
         Path | None,
-        typer.Option(
+        option(
             "--recording",
-            metavar="REC",
-            help="A recording of the application: it tells publishers, subscribers and types. "
+            "A recording of the application: it tells publishers, subscribers and types. "
             "Default: the plan's own, where it exists.",
-            show_default=False,
+            "REC",
         ),
     ] = None,
-    fallback: FallbackOption = None,
+    fallback: Annotated[Fallback | None, wish("fallback", " Default: what the plan says.")] = None,
     build: Annotated[
-        bool, typer.Option("--build", help="Build the shaping node's package with colcon.")
+        bool, option("--build", "Build the shaping node's package with colcon.")
     ] = False,
     undo: Annotated[
-        bool, typer.Option("--undo", help="Remove DIR again, unless it was changed since.")
+        bool, option("--undo", "Remove DIR again, unless it was changed since.")
     ] = False,
     json: JsonOption = False,
 ) -> None:
@@ -105,9 +83,9 @@ def splice(
     record and plan, and splice the plan into the copy. Shows a diff. Launch the copy that it names;
     the originals stay as they are.
     """
-    from chainshaper.cli.output import print_json, show_line
     from chainshaper.flow.launch_splicing import undo_splice
-    from chainshaper.splicing.generated_package import check_build_tools
+    from chainshaper.splicing.generated_package import build_package, check_build_tools
+    from chainshaper.splicing.launch.folder import NODES
 
     if undo:
         undo_splice(output)
@@ -132,23 +110,24 @@ def splice(
         raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
     else:
         splicing = _shaped(plan, launched)
-    setup = _built(splicing) if build else None
+    setup = build_package(splicing.folder / NODES) if build else None
     _print(splicing, setup, json)
 
 
 def _shaped(plan: Path, launched: _Launched) -> "Splicing":
-    from chainshaper.cli.output import notes
     from chainshaper.flow.launch_splicing import splice_launch_files
     from chainshaper.planning import load_plan, plan_warnings
 
     planned = load_plan(plan)
     notes(plan_warnings(planned))
+    own = planned.evidence.recording
+    known = Path(own) if own and Path(own).is_dir() else None
     return splice_launch_files(
         *(planned, launched.files, launched.folder),
         node=launched.node,
         arguments=launched.arguments,
         message_type=launched.message_type,
-        recording=_opened(launched.recording or _own_recording(planned)),
+        recording=_opened(launched.recording or known),
         fallback=launched.fallback,
     )
 
@@ -186,11 +165,6 @@ def _input(text: str) -> "ThrottledInput":
         )
 
 
-def _own_recording(plan: "Plan") -> Path | None:
-    own = Path(plan.evidence.recording or "")
-    return own if plan.evidence.recording and own.is_dir() else None
-
-
 def _opened(recording: Path | None) -> "Recording | None":
     if recording is None:
         return None
@@ -199,18 +173,21 @@ def _opened(recording: Path | None) -> "Recording | None":
     return open_source(recording)
 
 
-def _built(splicing: "Splicing") -> Path:
-    from chainshaper.splicing.generated_package import build_package
-    from chainshaper.splicing.launch.folder import NODES
-
-    return build_package(splicing.folder / NODES)
-
-
 def _print(splicing: "Splicing", setup: Path | None, json: bool) -> None:
-    from chainshaper.cli.output import notes, print_json, show_line
-
     if json:
-        print_json(_values(splicing, setup))
+        print_json(
+            {
+                "folder": str(splicing.folder),
+                "launch": {str(file): str(copy) for file, copy in splicing.launch.items()},
+                "originals": {str(copy): str(file) for copy, file in splicing.originals.items()},
+                "nodes": [one.name for one in splicing.processes],
+                "standbys": [one.standby.name for one in splicing.processes if one.standby],
+                "logs": [str(log) for log in splicing.logs],
+                "setup": None if setup is None else str(setup),
+                "diff": splicing.diff,
+                "notes": list(splicing.notes),
+            }
+        )
         return
     show_line(splicing.diff.rstrip("\n").expandtabs())
     notes(splicing.notes)
@@ -218,17 +195,3 @@ def _print(splicing: "Splicing", setup: Path | None, json: bool) -> None:
         show_line(f"source {setup}")
     for copy in splicing.launch.values():
         show_line(f"ros2 launch {copy}")
-
-
-def _values(splicing: "Splicing", setup: Path | None) -> dict[str, Any]:
-    return {
-        "folder": str(splicing.folder),
-        "launch": {str(file): str(copy) for file, copy in splicing.launch.items()},
-        "originals": {str(copy): str(file) for copy, file in splicing.originals.items()},
-        "nodes": [process.name for process in splicing.processes],
-        "standbys": [one.standby.name for one in splicing.processes if one.standby is not None],
-        "logs": [str(log) for log in splicing.logs],
-        "setup": None if setup is None else str(setup),
-        "diff": splicing.diff,
-        "notes": list(splicing.notes),
-    }
