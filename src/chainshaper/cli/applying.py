@@ -2,15 +2,13 @@
 
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Any
 
-import typer
-
-from chainshaper.cli.options import JsonOption, UsersOption, option
+from chainshaper.cli.options import JSON, USERS, argument, option
 from chainshaper.cli.output import (
     notes,
     print_json,
@@ -25,31 +23,25 @@ from chainshaper.values.errors import InputError, OperationError
 if TYPE_CHECKING:
     from chainshaper.enforcement.runs.state import RunState
     from chainshaper.planning import Plan
-    from chainshaper.values.recording import Recording
 
 LINE_EVERY = 10
 
 
 def threads(
-    where: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="[PID|PLAN]",
-            help="A process, which stands for its descendants too, or a plan.yaml for the nodes "
-            "of its servers. Default: all that looks like ROS 2 or DDS.",
-        ),
-    ] = None,
-    recording: Annotated[
-        Path | None,
-        option(
-            "--recording",
-            "A recording or trace of the processes while they ran: it tells nodes and "
-            "executors for sure. Default: the plan's own, where it exists.",
-            "REC",
-        ),
-    ] = None,
-    user: UsersOption = None,
-    json: JsonOption = False,
+    where: str | None = argument(
+        None,
+        "[PID|PLAN]",
+        "A process, which stands for its descendants too, or a plan.yaml for the nodes "
+        "of its servers. Default: all that looks like ROS 2 or DDS.",
+    ),
+    recording: Path | None = option(
+        None,
+        "--recording REC",
+        "A recording or trace of the processes while they ran: it tells nodes and "
+        "executors for sure. Default: the plan's own, where it exists.",
+    ),
+    user: list[str] | None = USERS,
+    json: bool = JSON,
 ) -> None:
     """Show the threads of running nodes: executors, DDS threads, publishers; class and cores."""
     from chainshaper.flow.thread_search import find_threads
@@ -75,52 +67,35 @@ def threads(
 
 
 def apply(
-    plan: Annotated[Path, typer.Argument(metavar="plan.yaml", help="The plan.")],
-    command: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="[-- COMMAND…]",
-            help="Start this, such as `ros2 launch …`, and end when it ends. Default: attach to "
-            "what runs.",
-        ),
-    ] = None,
-    backend: Annotated[
-        str,
-        option(
-            "--backend",
-            "auto (the strongest that works here), scx, litmus, freezer or fifo.",
-            "NAME",
-        ),
-    ] = "auto",
-    phase: Annotated[
-        int | None,
-        option(
-            "--phase",
-            "Where in a cycle the chain's timer expires, on CLOCK_MONOTONIC. Default: measured.",
-            "DURATION",
-        ),
-    ] = None,
-    recording: Annotated[
-        Path | None,
-        option(
-            "--recording",
-            "A recording of these very processes: it tells executors for sure.",
-            "REC",
-        ),
-    ] = None,
-    wait: Annotated[
-        int | None,
-        option(
-            "--wait",
-            "How long the plan's nodes have to appear. Default: 30s with a COMMAND, else no time.",
-            "DURATION",
-        ),
-    ] = None,
-    user: UsersOption = None,
-    dry_run: Annotated[
-        bool, option("--dry-run", "Show what would be done to which thread, and change nothing.")
-    ] = False,
-    json: JsonOption = False,
+    plan: Path = argument(..., "plan.yaml", "The plan."),
+    command: list[str] | None = argument(
+        None,
+        "[-- COMMAND…]",
+        "Start this, such as `ros2 launch …`, and end when it ends. Default: attach to what runs.",
+    ),
+    backend: str = option(
+        "auto",
+        "--backend NAME",
+        "auto (the strongest that works here), scx, litmus, freezer or fifo.",
+    ),
+    phase: int | None = option(
+        None,
+        "--phase DURATION",
+        "Where in a cycle the chain's timer expires, on CLOCK_MONOTONIC. Default: measured.",
+    ),
+    recording: Path | None = option(
+        None, "--recording REC", "A recording of these very processes: it tells executors for sure."
+    ),
+    wait: int | None = option(
+        None,
+        "--wait DURATION",
+        "How long the plan's nodes have to appear. Default: 30s with a COMMAND, else no time.",
+    ),
+    user: list[str] | None = USERS,
+    dry_run: bool = option(
+        False, "--dry-run", "Show what would be done to which thread, and change nothing."
+    ),
+    json: bool = JSON,
 ) -> None:
     """Keep the threads of an application inside a plan's slots, until Ctrl-C.
 
@@ -136,7 +111,8 @@ def apply(
 
         recorded = open_source(recording)
     if dry_run:
-        _show_changes(planned, backend, recorded, phase, user or (), json=json)
+        where = {"recording": recorded, "phase_ns": phase, "users": user or ()}
+        _show_changes(planned, backend, json, **where)
         return
     notes(plan_warnings(planned))
     stop = threading.Event()
@@ -164,21 +140,13 @@ def apply(
         raise OperationError(f"the command ended with code {done.exit_code}")
 
 
-def _show_changes(
-    plan: "Plan",
-    backend: str,
-    recording: "Recording | None",
-    phase_ns: int | None,
-    users: Sequence[str],
-    *,
-    json: bool,
-) -> None:
+def _show_changes(plan: "Plan", backend: str, json: bool, **where: Any) -> None:
     import shlex
 
     from chainshaper.flow.dry_run import planned_changes
     from chainshaper.reporting.servers import changes_table
 
-    changes = planned_changes(plan, backend, recording=recording, phase_ns=phase_ns, users=users)
+    changes = planned_changes(plan, backend, **where)
     if json:
         print_json(asdict(changes))
         return
@@ -232,10 +200,10 @@ def _lines(text: "Callable[[RunState], str]") -> "Callable[[RunState], None]":
 
 
 def status(
-    outputs: Annotated[
-        bool, option("--outputs", "Only the outputs that are shaped, bypassed or silent.")
-    ] = False,
-    json: JsonOption = False,
+    outputs: bool = option(
+        False, "--outputs", "Only the outputs that are shaped, bypassed or silent."
+    ),
+    json: bool = JSON,
 ) -> None:
     """Show the plans in force: back end, servers, counters, and what crashed runs have left.
 
@@ -279,12 +247,9 @@ def status(
 
 
 def release(
-    run: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="[RUN]", help="The run, as `chainshaper status` names it. Default: all of them."
-        ),
-    ] = None,
+    run: str | None = argument(
+        None, "[RUN]", "The run, as `chainshaper status` names it. Default: all of them."
+    ),
 ) -> None:
     """End plans in force, and put back what crashed runs have left changed."""
     from chainshaper.enforcement.runs.journal import find_journals
@@ -319,10 +284,10 @@ def release(
 
 
 def doctor(
-    watch: Annotated[
-        int, option("--watch", "How long to watch for stalls of the machine.", "DURATION")
-    ] = "5s",  # type: ignore[assignment]
-    json: JsonOption = False,
+    watch: int = option(
+        5_000_000_000, "--watch DURATION", "How long to watch for stalls of the machine."
+    ),
+    json: bool = JSON,
 ) -> None:
     """Examine this machine: scheduling, privileges, tracing, DDS, and its own stalls."""
     from chainshaper.flow.doctor import examine_machine

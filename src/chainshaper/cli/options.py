@@ -9,14 +9,14 @@ from dataclasses import fields
 from functools import wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 import typer
 
 from chainshaper.gate.decision import Late
 from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import InputError
-from chainshaper.values.plan_choices import Wishes
+from chainshaper.values.plan_choices import BANDS, Wishes
 
 if TYPE_CHECKING:
     from chainshaper.planning import Modes, Plan
@@ -55,75 +55,66 @@ def _share(text: str) -> float:
     return value
 
 
-PARSERS: dict[str, Callable[[str], Any]] = {
-    "DURATION": _duration,
-    "N|auto": _bands,
-    "SHARE": _share,
+PARSERS: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
+    "DURATION": (_duration, format_duration),
+    "N|auto": (_bands, str),
+    "SHARE": (_share, "{:.0%}".format),
 }
-"""What is behind a metavar."""
-
-WRITTEN: dict[str, Callable[[Any], str]] = {
-    "DURATION": format_duration,
-    "N|auto": str,
-    "SHARE": "{:.0%}".format,
-}
-"""How a default is written for these."""
+"""What reads and writes the values behind a metavar."""
 
 
-def option(name: str, help_text: str, metavar: str | None = None, **more: Any) -> Any:
-    """An option; of a duration (with its unit; in ns), of bands and of a share it is parsed."""
-    parser = PARSERS.get(metavar or "")
-    return typer.Option(*name.split(" "), help=help_text, metavar=metavar, parser=parser, **more)
+def option(default: Any, names: str, help_text: str, **more: Any) -> Any:
+    """An option as a parameter's default: ``--epsilon DURATION``, ``--output -o FILE``.
+
+    Of a duration (with its unit; in ns), of bands and of a share the value is parsed, and its
+    default written.
+    """
+    words = names.split()
+    metavar = None if words[-1].startswith("-") else words.pop()
+    parse, write = PARSERS.get(metavar or "", (None, None))
+    if write is not None and default is not None:
+        default = write(default)
+    return typer.Option(default, *words, help=help_text, metavar=metavar, parser=parse, **more)
 
 
-JsonOption = Annotated[bool, option("--json", "Print the figures as JSON (integer ns).")]
-ChainOption = Annotated[
-    str | None,
-    option(
-        "--chain",
-        "The chain, by topics or nodes: /t1../t5. Default: the one the recording names.",
-        "FIRST..LAST",
-    ),
-]
-PlanInForceOption = Annotated[
-    Path | None,
-    option(
-        "--plan",
-        "The plan that the last recording was made with, where it does not say so.",
-        "plan.yaml",
-    ),
-]
-TraceArgument = Annotated[
-    list[Path],
-    typer.Argument(
-        metavar="TRACE...",
-        help="An LTTng trace's folder (several of one trace: kernel and user space), or a "
-        "recording's.",
-    ),
-]
-ApplicationArgument = Annotated[
-    Path, typer.Argument(metavar="APP.yaml", help="The application's description.")
-]
-RecordingOutput = Annotated[Path, option("--output -o", "Folder to write; must not exist.", "REC")]
-CyclesOption = Annotated[int, option("--cycles", "Cycles to record.", min=1)]
-SeedOption = Annotated[int | None, option("--seed", "Instead of the description's.", min=0)]
-RealtimeOption = Annotated[
-    bool | None,
-    option("--realtime/--no-realtime", "Use SCHED_FIFO. Default: where it is permitted."),
-]
-UsersOption = Annotated[
-    list[str] | None,
-    option(
-        "--user",
-        "Whose processes are taken for nodes (may be repeated). Default: yours, also behind "
-        "sudo, and root's.",
-        "NAME",
-    ),
-]
-SourceOption = Annotated[Source, option("--source", "Who records the events.")]
-NodeOption = Annotated[
-    NodeKind, option("--node", "A script; a package for all types; or one generated for the type.")
-]
+def argument(default: Any, metavar: str, help_text: str) -> Any:
+    """An argument as a parameter's default; ``...`` where it must be given."""
+    return typer.Argument(default, metavar=metavar, help=help_text, show_default=False)
+
+
+JSON: bool = option(False, "--json", "Print the figures as JSON (integer ns).")
+CHAIN: str | None = option(
+    None,
+    "--chain FIRST..LAST",
+    "The chain, by topics or nodes: /t1../t5. Default: the one the recording names.",
+)
+PLAN_IN_FORCE: Path | None = option(
+    None,
+    "--plan plan.yaml",
+    "The plan that the last recording was made with, where it does not say so.",
+)
+TRACE: list[Path] = argument(
+    ...,
+    "TRACE...",
+    "An LTTng trace's folder (several of one trace: kernel and user space), or a recording's.",
+)
+APPLICATION: Path = argument(..., "APP.yaml", "The application's description.")
+RECORDING_OUTPUT: Path = option(..., "--output -o REC", "Folder to write; must not exist.")
+CYCLES: int = option(320, "--cycles", "Cycles to record.", min=1)
+SEED: int | None = option(None, "--seed", "Instead of the description's.", min=0)
+REALTIME: bool | None = option(
+    None, "--realtime/--no-realtime", "Use SCHED_FIFO. Default: where it is permitted."
+)
+USERS: list[str] | None = option(
+    None,
+    "--user NAME",
+    "Whose processes are taken for nodes (may be repeated). Default: yours, also behind sudo, and"
+    " root's.",
+)
+SOURCE: Source = option("lttng", "--source", "Who records the events.")
+NODE: NodeKind = option(
+    "python", "--node", "A script; a package for all types; or one generated for the type."
+)
 
 
 def plan_in_force(path: Path | None) -> "Plan | None":
@@ -138,57 +129,45 @@ PLAN_WISHES = (*_WISHES, "modes", "late")
 """All that :func:`takes_wishes` knows."""
 
 
-def wish(name: str, default_text: str = "") -> Any:
-    """The option of a wish."""
+def wish(name: str, **more: Any) -> Any:
+    """The option of a wish; ``more`` may give it another ``default``."""
     described = next(one for one in get_args(_WISHES[name].type) if hasattr(one, "panel"))
-    flag = described.flag or "--" + name.removesuffix("_ns").replace("_", "-")
-    more = {} if described.least is None else {"min": described.least}
+    names = described.flag or "--" + name.removesuffix("_ns").replace("_", "-")
+    metavar = "DURATION" if name.endswith("_ns") else described.metavar or ""
+    if described.least is not None:
+        more["min"] = described.least
+    default = more.pop("default", _WISHES[name].default)
     return option(
-        flag,
-        described.help + default_text,
-        "DURATION" if name.endswith("_ns") else described.metavar,
-        rich_help_panel=described.panel,
-        **more,
+        default, f"{names} {metavar}", described.help, rich_help_panel=described.panel, **more
     )
+
+
+MODES: str | None = option(
+    None,
+    "--modes TOPIC:MODE=BAND,…",
+    "Each mode's band, 1 is the first; the first mode named is in force until the topic"
+    " (std_msgs/String) names another. Such as /driving_mode:city=2,highway=1.",
+    rich_help_panel=BANDS,
+)
+LATE: Late | None = option(
+    None,
+    "--late",
+    "With --modes, an output behind its mode's slot: at once, wait for the next cycle's, discard,"
+    " or in the cycle's next slot. Default: publish.",
+    rich_help_panel=BANDS,
+)
 
 
 def _parameter(name: str) -> Parameter:
-    """A wish as a parameter of a verb; a default that is parsed is written out."""
-    field, information = _WISHES[name], wish(name)
-    default = field.default
-    if default is not None and information.metavar in WRITTEN:
-        default = WRITTEN[information.metavar](default)
-    kind = str if name == "bands" else get_args(field.type)[0]  # Typer knows no unions
-    return Parameter(
-        name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, information]
-    )
+    if name in _MODES:
+        kind, default = _MODES[name]
+    else:  # Typer knows no unions
+        kind = str if name == "bands" else get_args(_WISHES[name].type)[0]
+        default = wish(name)
+    return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=kind)
 
 
-ModesOption = Annotated[
-    str | None,
-    option(
-        "--modes",
-        "Each mode's band, 1 is the first; the first mode named is in force until the topic"
-        " (std_msgs/String) names another. Such as /driving_mode:city=2,highway=1.",
-        "TOPIC:MODE=BAND,…",
-        rich_help_panel="Latency bands",
-    ),
-]
-LateOption = Annotated[
-    Late | None,
-    option(
-        "--late",
-        "With --modes, an output behind its mode's slot: at once, wait for the next cycle's,"
-        " discard, or in the cycle's next slot. Default: publish.",
-        rich_help_panel="Latency bands",
-    ),
-]
-
-
-_MODES = {
-    name: Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=kind)
-    for name, kind in (("modes", ModesOption), ("late", LateOption))
-}
+_MODES: dict[str, tuple[Any, Any]] = {"modes": (str | None, MODES), "late": (Late | None, LATE)}
 
 
 def takes_wishes(*names: str) -> Callable[[Callable[..., None]], Any]:
@@ -207,7 +186,7 @@ def takes_wishes(*names: str) -> Callable[[Callable[..., None]], Any]:
             modes = modes_of(wished.pop("modes", None), wished.pop("late", None))
             verb(**values, request=PlanRequest(**wished, modes=modes))
 
-        options = [_MODES.get(name) or _parameter(name) for name in names]
+        options = [_parameter(name) for name in names]
         parameters: list[Parameter] = []
         for one in signature(verb).parameters.values():
             own = [one.replace(kind=Parameter.KEYWORD_ONLY)]

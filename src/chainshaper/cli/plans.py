@@ -2,15 +2,14 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from chainshaper.cli.options import (
+    APPLICATION,
+    JSON,
     PLAN_WISHES,
-    ApplicationArgument,
-    JsonOption,
-    SeedOption,
+    SEED,
+    argument,
     option,
     plan_in_force,
     takes_wishes,
@@ -24,55 +23,39 @@ if TYPE_CHECKING:
 
 @takes_wishes(*PLAN_WISHES)
 def plan(
-    recording: Annotated[
-        Path | None, typer.Argument(metavar="[REC]", help="A recording's or a trace's folder.")
-    ] = None,
-    chain: Annotated[
-        list[str] | None,
-        option(
-            "--chain",
-            "The chain, by topics or nodes: /t1../t5. Default: the one the recording names."
-            " Give several to plan chains that share cores: their offsets are found.",
-            "FIRST..LAST",
-        ),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        option(
-            "--output -o",
-            "File to write; for several chains a folder, which must not exist.",
-            "plan.yaml",
-        ),
-    ] = None,
-    latencies: Annotated[
-        Path | None,
-        option("--latencies", "Instead of a recording: a duration a line, or .npy in ns.", "FILE"),
-    ] = None,
-    period: Annotated[
-        int | None,
-        option("--period", "Period, with --latencies or a chain that no timer starts.", "DURATION"),
-    ] = None,
+    recording: Path | None = argument(None, "[REC]", "A recording's or a trace's folder."),
+    chain: list[str] | None = option(
+        None,
+        "--chain FIRST..LAST",
+        "The chain, by topics or nodes: /t1../t5. Default: the one the recording names."
+        " Give several to plan chains that share cores: their offsets are found.",
+    ),
+    output: Path | None = option(
+        None,
+        "--output -o plan.yaml",
+        "File to write; for several chains a folder, which must not exist.",
+    ),
+    latencies: Path | None = option(
+        None, "--latencies FILE", "Instead of a recording: a duration a line, or .npy in ns."
+    ),
+    period: int | None = option(
+        None, "--period DURATION", "Period, with --latencies or a chain that no timer starts."
+    ),
     *,
     request: "PlanRequest",
-    curve: Annotated[
-        Path | None,
-        option(
-            "--curve",
-            "With --bands auto: draw the average over the number of bands.",
-            "FILE.png",
-            rich_help_panel="Latency bands",
-        ),
-    ] = None,
-    sink: Annotated[
-        list[str] | None,
-        option(
-            "--sink",
-            "A chain to a further output of the same graph, to be shaped too.",
-            "FIRST..LAST",
-            rich_help_panel="More of the graph",
-        ),
-    ] = None,
-    json: JsonOption = False,
+    curve: Path | None = option(
+        None,
+        "--curve FILE.png",
+        "With --bands auto: draw the average over the number of bands.",
+        rich_help_panel="Latency bands",
+    ),
+    sink: list[str] | None = option(
+        None,
+        "--sink FIRST..LAST",
+        "A chain to a further output of the same graph, to be shaped too.",
+        rich_help_panel="More of the graph",
+    ),
+    json: bool = JSON,
 ) -> None:
     """Plan the reservation servers of a chain: by default one publish slot behind its longest
     latency, or several latency bands, or one of the schedules that shaping is compared with.
@@ -144,16 +127,14 @@ def _print_one(
 
 
 def offsets(
-    plans: Annotated[
-        list[Path], typer.Argument(metavar="PLAN PLAN...", help="Plans, one a chain.")
-    ],
-    output: Annotated[
-        Path | None, option("--output -o", "Folder to write the plans into; must not exist.", "DIR")
-    ] = None,
-    time_limit: Annotated[
-        float, option("--time-limit", "How long to search, per group.", "SECONDS", min=0.1)
-    ] = 60.0,
-    json: JsonOption = False,
+    plans: list[Path] = argument(..., "PLAN PLAN...", "Plans, one a chain."),
+    output: Path | None = option(
+        None, "--output -o DIR", "Folder to write the plans into; must not exist."
+    ),
+    time_limit: float = option(
+        60.0, "--time-limit SECONDS", "How long to search, per group.", min=0.1
+    ),
+    json: bool = JSON,
 ) -> None:
     """Find when each chain's cycles start, so that no slots of one core collide.
 
@@ -190,46 +171,32 @@ def _place_and_print(
 
 
 def sweep(
-    application: ApplicationArgument,
-    vary: Annotated[
-        list[str],
-        option(
-            "--vary",
-            "An axis (repeat it for more): a wish for the plan, such as epsilon=0ms,1ms or"
-            " bands=1..5; interference=0ms,20ms; or a value of the description by its path, such"
-            " as nodes.node3.core=0,1.",
-            "NAME=VALUES",
-        ),
-    ],
-    output: Annotated[
-        Path, option("--output -o", "File to write, a row for each point.", "FILE.parquet")
-    ],
-    plan: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="plan.yaml",
-            help="A plan that is in force at all points. Default: each is planned.",
-        ),
-    ] = None,
-    cycles: Annotated[
-        int, option("--cycles", "Cycles to plan from, and to judge by.", min=1)
-    ] = 100_000,
-    seed: SeedOption = None,
-    workers: Annotated[
-        int | None, option("--workers", "Processes that compute. Default: one per core.", min=1)
-    ] = None,
-    scheduler: Annotated[
-        str | None,
-        option(
-            "--scheduler",
-            "Compute on the Dask cluster whose scheduler is there, such as tcp://host:8786.",
-            "ADDRESS",
-        ),
-    ] = None,
-    draw: Annotated[
-        Path | None, option("--draw", "Draw average and jitter over the first axis.", "FILE.png")
-    ] = None,
-    json: JsonOption = False,
+    application: Path = APPLICATION,
+    vary: list[str] = option(
+        ...,
+        "--vary NAME=VALUES",
+        "An axis (repeat it for more): a wish for the plan, such as epsilon=0ms,1ms or"
+        " bands=1..5; interference=0ms,20ms; or a value of the description by its path, such"
+        " as nodes.node3.core=0,1.",
+    ),
+    output: Path = option(..., "--output -o FILE.parquet", "File to write, a row for each point."),
+    plan: Path | None = argument(
+        None, "plan.yaml", "A plan that is in force at all points. Default: each is planned."
+    ),
+    cycles: int = option(100_000, "--cycles", "Cycles to plan from, and to judge by.", min=1),
+    seed: int | None = SEED,
+    workers: int | None = option(
+        None, "--workers", "Processes that compute. Default: one per core.", min=1
+    ),
+    scheduler: str | None = option(
+        None,
+        "--scheduler ADDRESS",
+        "Compute on the Dask cluster whose scheduler is there, such as tcp://host:8786.",
+    ),
+    draw: Path | None = option(
+        None, "--draw FILE.png", "Draw average and jitter over the first axis."
+    ),
+    json: bool = JSON,
 ) -> None:
     """Simulate an application at every combination of some values: planned, shaped, judged.
 

@@ -2,26 +2,26 @@
 
 import sys
 import threading
-from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from chainshaper.cli.options import (
-    ApplicationArgument,
-    ChainOption,
-    CyclesOption,
-    JsonOption,
+    APPLICATION,
+    CHAIN,
+    CYCLES,
+    JSON,
+    NODE,
+    REALTIME,
+    RECORDING_OUTPUT,
+    SEED,
+    SOURCE,
+    USERS,
     NodeKind,
-    NodeOption,
-    RealtimeOption,
-    RecordingOutput,
-    SeedOption,
     Source,
-    SourceOption,
-    UsersOption,
+    argument,
     option,
     plan_in_force,
     takes_wishes,
@@ -40,7 +40,6 @@ from chainshaper.values.errors import InputError, OperationError
 
 if TYPE_CHECKING:
     from chainshaper.analysis import ChainEnumeration
-    from chainshaper.flow.record import Scheduling
     from chainshaper.planning import PlanRequest
     from chainshaper.values.application import ApplicationGraph
 
@@ -49,51 +48,37 @@ STDERR = 2
 DESCRIPTIONS = (".yaml", ".yml")
 SHAPING_DURATION_NS = 60_000_000_000
 
-CommandArgument = Annotated[
-    list[str] | None,
-    typer.Argument(
-        metavar="[-- COMMAND…]",
-        help="Starts the application, such as `ros2 launch …`; ended with the recording.",
-    ),
-]
-DurationOption = Annotated[
-    int | None,
-    option(
-        "--duration",
-        "How long to record. Default: until the application ends, or Ctrl-C.",
-        "DURATION",
-    ),
-]
-BufferOption = Annotated[
-    int | None,
-    option(
-        "--buffer",
-        "LTTng's buffer of each core, in MiB, for when events were lost. Default: 4.",
-        "MIB",
-        min=1,
-    ),
-]
+COMMAND: list[str] | None = argument(
+    None,
+    "[-- COMMAND…]",
+    "Starts the application, such as `ros2 launch …`; ended with the recording.",
+)
+DURATION: int | None = option(
+    None,
+    "--duration DURATION",
+    "How long to record. Default: until the application ends, or Ctrl-C.",
+)
+BUFFER: int | None = option(
+    None,
+    "--buffer MIB",
+    "LTTng's buffer of each core, in MiB, for when events were lost. Default: 4.",
+    min=1,
+)
 
 
 @takes_wishes("ideal_machine")
 def demo(
-    output: Annotated[
-        Path | None,
-        option(
-            "--output -o", "Folder for everything. Default: chainshaper-demo-DATE-TIME here.", "DIR"
-        ),
-    ] = None,
-    application: Annotated[
-        Path | None,
-        option(
-            "--application", "Another application than the paper's synthetic chain.", "APP.yaml"
-        ),
-    ] = None,
-    cycles: CyclesOption = 320,
-    realtime: RealtimeOption = None,
+    output: Path | None = option(
+        None, "--output -o DIR", "Folder for everything. Default: chainshaper-demo-DATE-TIME here."
+    ),
+    application: Path | None = option(
+        None, "--application APP.yaml", "Another application than the paper's synthetic chain."
+    ),
+    cycles: int = CYCLES,
+    realtime: bool | None = REALTIME,
     *,
     request: "PlanRequest",
-    json: JsonOption = False,
+    json: bool = JSON,
 ) -> None:
     """Measure a live chain, plan, splice the shaping node, measure again, show the gain.
 
@@ -134,10 +119,10 @@ def demo(
 
 
 def run(
-    application: ApplicationArgument,
-    output: RecordingOutput,
-    cycles: CyclesOption = 320,
-    realtime: RealtimeOption = None,
+    application: Path = APPLICATION,
+    output: Path = RECORDING_OUTPUT,
+    cycles: int = CYCLES,
+    realtime: bool | None = REALTIME,
 ) -> None:
     """Run an application live over DDS and record its events.
 
@@ -157,21 +142,16 @@ def run(
 
 
 def simulate(
-    application: ApplicationArgument,
-    output: RecordingOutput,
-    plan: Annotated[
-        Path | None, typer.Argument(metavar="plan.yaml", help="The plan in force.")
-    ] = None,
-    cycles: CyclesOption = 320,
-    seed: SeedOption = None,
-    switches: Annotated[bool, option("--switches", "Record what ran on which core, too.")] = False,
-    execution_times: Annotated[
-        Path | None,
-        option("--execution-times", "Draw execution times from those recorded there.", "REC"),
-    ] = None,
-    block: Annotated[
-        int, option("--block", "So many consecutive ones at a time.", min=1, max=1024)
-    ] = 1,
+    application: Path = APPLICATION,
+    output: Path = RECORDING_OUTPUT,
+    plan: Path | None = argument(None, "plan.yaml", "The plan in force."),
+    cycles: int = CYCLES,
+    seed: int | None = SEED,
+    switches: bool = option(False, "--switches", "Record what ran on which core, too."),
+    execution_times: Path | None = option(
+        None, "--execution-times REC", "Draw execution times from those recorded there."
+    ),
+    block: int = option(1, "--block", "So many consecutive ones at a time.", min=1, max=1024),
 ) -> None:
     """Simulate an application, with a plan in force or without, and record its events.
 
@@ -199,28 +179,24 @@ def simulate(
 
 
 def record(
-    output: RecordingOutput,
-    command: CommandArgument = None,
-    source: SourceOption = "lttng",
-    duration: DurationOption = None,
-    pid: Annotated[
-        list[int] | None,
-        option(
-            "--pid",
-            "Attach to this process and what it has started (ebpf; may be repeated). "
-            "Default, without a COMMAND: everything of the users that looks like ROS 2.",
-        ),
-    ] = None,
-    user: UsersOption = None,
-    buffer: BufferOption = None,
-    watch_stalls: Annotated[
-        bool,
-        option(
-            "--watch-stalls",
-            "Have a sleeper on every core notice when the machine itself stands still.",
-        ),
-    ] = False,
-    json: JsonOption = False,
+    output: Path = RECORDING_OUTPUT,
+    command: list[str] | None = COMMAND,
+    source: Source = SOURCE,
+    duration: int | None = DURATION,
+    pid: list[int] | None = option(
+        None,
+        "--pid",
+        "Attach to this process and what it has started (ebpf; may be repeated). "
+        "Default, without a COMMAND: everything of the users that looks like ROS 2.",
+    ),
+    user: list[str] | None = USERS,
+    buffer: int | None = BUFFER,
+    watch_stalls: bool = option(
+        False,
+        "--watch-stalls",
+        "Have a sleeper on every core notice when the machine itself stands still.",
+    ),
+    json: bool = JSON,
 ) -> None:
     """Record a ROS 2 application: its events, nodes, threads and QoS.
 
@@ -235,33 +211,18 @@ def record(
             "runs already, add `--source ebpf`"
         )
     _record_and_show(
-        *(output, command or [], source, duration, buffer),
-        json=json,
+        *(output, command or [], json),
+        source=source,
+        duration_ns=duration,
+        buffer=buffer and buffer * MIB,
         pids=pid or [],
         users=user or [],
         watch_stalls=watch_stalls,
     )
 
 
-def _record_and_show(
-    output: Path,
-    command: list[str],
-    source: Source,
-    duration_ns: int | None,
-    buffer_mib: int | None,
-    *,
-    json: bool,
-    pids: Sequence[int] = (),
-    users: Sequence[str] = (),
-    chain: str | None = None,
-    scheduling: "Scheduling | None" = None,
-    watch_stalls: bool,
-) -> None:
-    """Record and say what came of it.
-
-    Raises:
-        OperationError: the application failed; what was recorded until then is there.
-    """
+def _record_and_show(output: Path, command: list[str], json: bool, **how: Any) -> None:
+    """Record, and say what came of it; ``how`` goes to :func:`chainshaper.record_command`."""
     from chainshaper.flow.exploration import event_counts, lost_events
     from chainshaper.flow.record import record_command
     from chainshaper.linux.own_processes import end_in_words
@@ -271,17 +232,10 @@ def _record_and_show(
         recorded = record_command(
             output,
             command,
-            source=source,
-            duration_ns=duration_ns,
-            pids=pids,
-            users=users,
-            buffer=buffer_mib and buffer_mib * MIB,
-            chain=chain,
-            scheduling=scheduling,
-            watch_stalls=watch_stalls,
             command_stdout=STDERR if json else None,  # standard output is ours
             stop=stop,
             progress=stage_lines("record"),
+            **how,
         )
     recording = recorded.recording
     count = int(event_counts(recording)["count"].sum())
@@ -306,45 +260,34 @@ def _record_and_show(
 
 
 def profile(
-    output: RecordingOutput,
-    command: CommandArgument = None,
-    chain: Annotated[
-        str | None,
-        option(
-            "--chain",
-            "The chain whose nodes get the priority; --like tells which those are.",
-            "FIRST..LAST",
-        ),
-    ] = None,
-    like: Annotated[
-        Path | None,
-        option(
-            "--like",
-            "An earlier recording of the application: it knows the chain's nodes, components "
-            "of containers, and executors with several threads.",
-            "REC",
-        ),
-    ] = None,
-    node: Annotated[
-        list[str] | None,
-        option(
-            "--node",
-            "A node that gets the priority (may be repeated). Default: the chain's, or all.",
-            "NAME",
-        ),
-    ] = None,
-    core: Annotated[
-        int | None,
-        option(
-            "--core",
-            "Where executors run. Default: the last core. DDS threads run on the others.",
-            min=0,
-        ),
-    ] = None,
-    source: SourceOption = "lttng",
-    duration: DurationOption = None,
-    buffer: BufferOption = None,
-    json: JsonOption = False,
+    output: Path = RECORDING_OUTPUT,
+    command: list[str] | None = COMMAND,
+    chain: str | None = option(
+        None,
+        "--chain FIRST..LAST",
+        "The chain whose nodes get the priority; --like tells which those are.",
+    ),
+    like: Path | None = option(
+        None,
+        "--like REC",
+        "An earlier recording of the application: it knows the chain's nodes, components "
+        "of containers, and executors with several threads.",
+    ),
+    node: list[str] | None = option(
+        None,
+        "--node NAME",
+        "A node that gets the priority (may be repeated). Default: the chain's, or all.",
+    ),
+    core: int | None = option(
+        None,
+        "--core",
+        "Where executors run. Default: the last core. DDS threads run on the others.",
+        min=0,
+    ),
+    source: Source = SOURCE,
+    duration: int | None = DURATION,
+    buffer: int | None = BUFFER,
+    json: bool = JSON,
 ) -> None:
     """Record with the chain's threads under SCHED_FIFO, DDS threads on another core.
 
@@ -371,8 +314,10 @@ def profile(
     if earlier is not None and chain is not None:
         names += chain_nodes(earlier, chain)
     _record_and_show(
-        *(output, command, source, duration, buffer),
-        json=json,
+        *(output, command, json),
+        source=source,
+        duration_ns=duration,
+        buffer=buffer and buffer * MIB,
         chain=chain,
         scheduling=profiling_condition(names, core, like=earlier),
         watch_stalls=True,
@@ -384,36 +329,30 @@ def profile(
     *("with_receivers", "fallback"),
 )
 def shape(
-    words: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="APP.yaml plan.yaml | -- ros2 launch ...",
-            help="A described application and the plan in force; or what launches a real one, "
-            "which is then measured and planned first.",
-        ),
-    ],
-    output: Annotated[
-        Path,
-        option(
-            "--output -o",
-            "Folder for the recording; of a launched application, for everything.",
-            "REC",
-        ),
-    ],
-    cycles: CyclesOption = 320,
-    realtime: RealtimeOption = None,
-    chain: ChainOption = None,
-    duration: Annotated[
-        int | None,
-        option("--duration", "How long to measure, before and after. Default: 60s.", "DURATION"),
-    ] = None,
-    source: SourceOption = "lttng",
-    node: NodeOption = "python",
-    backend: Annotated[str, option("--backend", "As for `chainshaper apply`.", "NAME")] = "auto",
+    words: list[str] = argument(
+        ...,
+        "APP.yaml plan.yaml | -- ros2 launch ...",
+        "A described application and the plan in force; or what launches a real one, "
+        "which is then measured and planned first.",
+    ),
+    output: Path = option(
+        ...,
+        "--output -o REC",
+        "Folder for the recording; of a launched application, for everything.",
+    ),
+    cycles: int = CYCLES,
+    realtime: bool | None = REALTIME,
+    chain: str | None = CHAIN,
+    duration: int | None = option(
+        None, "--duration DURATION", "How long to measure, before and after. Default: 60s."
+    ),
+    source: Source = SOURCE,
+    node: NodeKind = NODE,
+    backend: str = option("auto", "--backend NAME", "As for `chainshaper apply`."),
     *,
     request: "PlanRequest",
-    user: UsersOption = None,
-    json: JsonOption = False,
+    user: list[str] | None = USERS,
+    json: bool = JSON,
 ) -> None:
     """Run an application with its output shaped as planned, and record it.
 
@@ -433,8 +372,7 @@ def shape(
             "APP.yaml plan.yaml -o REC`"
         )
     _shape_launched(
-        words,
-        output,
+        *(words, output, json),
         chain=chain,
         duration_ns=duration or SHAPING_DURATION_NS,
         source=source,
@@ -442,7 +380,6 @@ def shape(
         back_end=backend,
         request=request,
         users=user or (),
-        json=json,
     )
 
 
@@ -474,19 +411,8 @@ def _shape_described(
     show_line(str(recording.path))
 
 
-def _shape_launched(
-    command: list[str],
-    folder: Path,
-    *,
-    chain: str | None,
-    duration_ns: int,
-    source: Source,
-    node: NodeKind,
-    back_end: str,
-    request: "PlanRequest",
-    users: Sequence[str],
-    json: bool,
-) -> None:
+def _shape_launched(command: list[str], folder: Path, json: bool, **how: Any) -> None:
+    """The whole flow; ``how`` goes to :func:`chainshaper.shape_launch`."""
     from chainshaper.flow.launch_shaping import shape_launch
     from chainshaper.planning import plan_warnings
     from chainshaper.reporting.predictions import prediction_table
@@ -497,17 +423,11 @@ def _shape_launched(
         shaped = shape_launch(
             command,
             folder,
-            chain=chain,
             choose=_ask if sys.stdin.isatty() and not json else None,
-            request=request,
-            duration_ns=duration_ns,
-            source=source,
-            node=node,
-            back_end=back_end,
-            users=users,
             stop=stop,
             planned=lambda plan: notes(plan_warnings(plan)),
             progress=stage_lines("shape"),
+            **how,
         )
     if json:
         print_json(comparison_json(shaped.comparison) | {"folder": str(shaped.folder)})

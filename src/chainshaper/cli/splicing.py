@@ -1,11 +1,9 @@
 """`chainshaper splice`: put shaping nodes, or throttlers, into copies of launch files."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import typer
-
-from chainshaper.cli.options import JsonOption, NodeKind, NodeOption, option, wish
+from chainshaper.cli.options import JSON, NODE, NodeKind, argument, option, wish
 from chainshaper.cli.output import notes, print_json, show_line
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Fallback
@@ -28,54 +26,37 @@ class _Launched(NamedTuple):
 
 
 def splice(
-    plan: Annotated[
-        Path | None, typer.Argument(metavar="plan.yaml", help="The plan; none with --throttle.")
-    ] = None,
-    launch: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="LAUNCH... [NAME:=VALUE...]",
-            help="The launch files (.py, .xml, .yaml), and launch arguments that are not at their "
-            "defaults, as for `ros2 launch`.",
-        ),
-    ] = None,
+    plan: Path | None = argument(None, "plan.yaml", "The plan; none with --throttle."),
+    launch: list[str] | None = argument(
+        None,
+        "LAUNCH... [NAME:=VALUE...]",
+        "The launch files (.py, .xml, .yaml), and launch arguments that are not at their "
+        "defaults, as for `ros2 launch`.",
+    ),
     *,
-    output: Annotated[Path, option("--output -o", "Folder for the copies.", "DIR")],
-    throttle: Annotated[
-        list[str] | None,
-        option(
-            "--throttle",
-            "Instead of a plan: a throttler before an input that is not quite periodic, for "
-            "NODE or whoever subscribes in the recording (may be repeated).",
-            "[NODE:]TOPIC=PERIOD",
-        ),
-    ] = None,
-    node: NodeOption = "python",
-    message_type: Annotated[
-        str | None,
-        option(
-            "--type",
-            "Of the output, for --node typed. Default: what the recording says.",
-            "PKG/msg/TYPE",
-        ),
-    ] = None,
-    recording: Annotated[
-        Path | None,
-        option(
-            "--recording",
-            "A recording of the application: it tells publishers, subscribers and types. "
-            "Default: the plan's own, where it exists.",
-            "REC",
-        ),
-    ] = None,
-    fallback: Annotated[Fallback | None, wish("fallback", " Default: what the plan says.")] = None,
-    build: Annotated[
-        bool, option("--build", "Build the shaping node's package with colcon.")
-    ] = False,
-    undo: Annotated[
-        bool, option("--undo", "Remove DIR again, unless it was changed since.")
-    ] = False,
-    json: JsonOption = False,
+    output: Path = option(..., "--output -o DIR", "Folder for the copies."),
+    throttle: list[str] | None = option(
+        None,
+        "--throttle [NODE:]TOPIC=PERIOD",
+        "Instead of a plan: a throttler before an input that is not quite periodic, for "
+        "NODE or whoever subscribes in the recording (may be repeated).",
+    ),
+    node: NodeKind = NODE,
+    message_type: str | None = option(
+        None,
+        "--type PKG/msg/TYPE",
+        "Of the output, for --node typed. Default: what the recording says.",
+    ),
+    recording: Path | None = option(
+        None,
+        "--recording REC",
+        "A recording of the application: it tells publishers, subscribers and types. "
+        "Default: the plan's own, where it exists.",
+    ),
+    fallback: Fallback | None = wish("fallback", default=None),
+    build: bool = option(False, "--build", "Build the shaping node's package with colcon."),
+    undo: bool = option(False, "--undo", "Remove DIR again, unless it was changed since."),
+    json: bool = JSON,
 ) -> None:
     """Edit copies of launch files: the output is remapped, and a shaping node republishes it.
 

@@ -1,16 +1,14 @@
 """Verbs that look at recordings and traces, one or several, and write what they find elsewhere."""
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from chainshaper.cli.options import (
-    ChainOption,
-    JsonOption,
-    PlanInForceOption,
-    RecordingOutput,
-    TraceArgument,
+    CHAIN,
+    JSON,
+    PLAN_IN_FORCE,
+    RECORDING_OUTPUT,
+    TRACE,
+    argument,
     option,
     plan_in_force,
 )
@@ -18,7 +16,7 @@ from chainshaper.cli.output import late_progress, notes, print_json, show, show_
 from chainshaper.values.errors import InputError
 
 
-def info(trace: TraceArgument, json: JsonOption = False) -> None:
+def info(trace: list[Path] = TRACE, json: bool = JSON) -> None:
     """Show what is in a trace: events, losses, clock, distribution, RMW, hosts, processes."""
     from chainshaper.flow.exploration import lost_events
     from chainshaper.reporting.contents import contents_json, contents_table
@@ -36,20 +34,17 @@ def info(trace: TraceArgument, json: JsonOption = False) -> None:
 
 
 def graph(
-    trace: TraceArgument,
-    output: Annotated[
-        Path | None,
-        option("--output -o", "File to write: .svg, .dot or .json; must not exist.", "FILE"),
-    ] = None,
-    everything: Annotated[
-        bool,
-        option(
-            "--all",
-            "Also what every node has for itself: parameter services, /rosout, "
-            "/parameter_events. In JSON they are always there, marked as internal.",
-        ),
-    ] = False,
-    json: JsonOption = False,
+    trace: list[Path] = TRACE,
+    output: Path | None = option(
+        None, "--output -o FILE", "File to write: .svg, .dot or .json; must not exist."
+    ),
+    everything: bool = option(
+        False,
+        "--all",
+        "Also what every node has for itself: parameter services, /rosout, "
+        "/parameter_events. In JSON they are always there, marked as internal.",
+    ),
+    json: bool = JSON,
 ) -> None:
     """Show the application: nodes, callbacks with kind, period and function, topics, services."""
     from chainshaper.flow.exploration import describe_application, lost_events
@@ -82,7 +77,7 @@ def graph(
         notes((*application.notes, lost_events(opened.info)))
 
 
-def callbacks(trace: TraceArgument, json: JsonOption = False) -> None:
+def callbacks(trace: list[Path] = TRACE, json: bool = JSON) -> None:
     """Show every callback of a recording or trace: kind, count, execution and response time."""
     from chainshaper.analysis import callback_statistics, data_flow
     from chainshaper.flow.exploration import lost_events
@@ -104,23 +99,17 @@ def callbacks(trace: TraceArgument, json: JsonOption = False) -> None:
 
 
 def chains(
-    trace: TraceArgument,
-    start: Annotated[
-        str | None,
-        option(
-            "--from",
-            "Topic or node where they begin. Default: callbacks that nothing triggers.",
-            "X",
-        ),
-    ] = None,
-    end: Annotated[
-        str | None,
-        option(
-            "--to", "Topic or node where they end. Default: topics from which nothing goes on.", "Y"
-        ),
-    ] = None,
-    limit: Annotated[int, option("--limit", "How many to list.", min=1)] = 100,
-    json: JsonOption = False,
+    trace: list[Path] = TRACE,
+    start: str | None = option(
+        None,
+        "--from X",
+        "Topic or node where they begin. Default: callbacks that nothing triggers.",
+    ),
+    end: str | None = option(
+        None, "--to Y", "Topic or node where they end. Default: topics from which nothing goes on."
+    ),
+    limit: int = option(100, "--limit", "How many to list.", min=1),
+    json: bool = JSON,
 ) -> None:
     """List the computation chains, count them, and show the heaviest.
 
@@ -147,20 +136,15 @@ def chains(
 
 
 def latency(
-    trace: TraceArgument,
-    chain: ChainOption = None,
-    chains: Annotated[
-        Path | None,
-        option(
-            "--chains",
-            "A CARET architecture file: --chain then names one of its named_paths.",
-            "FILE",
-        ),
-    ] = None,
-    json: JsonOption = False,
-    instances: Annotated[
-        bool, option("--instances", "With --json: every traversal, one by one.")
-    ] = False,
+    trace: list[Path] = TRACE,
+    chain: str | None = CHAIN,
+    chains: Path | None = option(
+        None,
+        "--chains FILE",
+        "A CARET architecture file: --chain then names one of its named_paths.",
+    ),
+    json: bool = JSON,
+    instances: bool = option(False, "--instances", "With --json: every traversal, one by one."),
 ) -> None:
     """Show the end-to-end latency of a chain: average, maximum, jitter, percentiles.
 
@@ -201,7 +185,7 @@ def latency(
     notes(analysis.notes)
 
 
-def convert(trace: TraceArgument, output: RecordingOutput) -> None:
+def convert(trace: list[Path] = TRACE, output: Path = RECORDING_OUTPUT) -> None:
     """Write a trace as a recording: one Parquet file per event table."""
     from chainshaper.flow.exploration import convert_recording, lost_events
     from chainshaper.sources import open_source
@@ -216,16 +200,13 @@ def convert(trace: TraceArgument, output: RecordingOutput) -> None:
 
 
 def compare(
-    recordings: Annotated[
-        list[Path], typer.Argument(metavar="REC REC...", help="Recordings' folders.")
-    ],
-    chain: ChainOption = None,
-    figures: Annotated[
-        Path | None,
-        option("--figures", "Draw latency.png and distribution.png into this folder.", "DIR"),
-    ] = None,
-    plan: PlanInForceOption = None,
-    json: JsonOption = False,
+    recordings: list[Path] = argument(..., "REC REC...", "Recordings' folders."),
+    chain: str | None = CHAIN,
+    figures: Path | None = option(
+        None, "--figures DIR", "Draw latency.png and distribution.png into this folder."
+    ),
+    plan: Path | None = PLAN_IN_FORCE,
+    json: bool = JSON,
 ) -> None:
     """Show the same chain in several recordings side by side, usually before and after shaping.
 
@@ -248,23 +229,18 @@ def compare(
 
 
 def report(
-    recordings: Annotated[
-        list[Path], typer.Argument(metavar="REC...", help="Recordings' or LTTng traces' folders.")
-    ],
-    output: Annotated[Path, option("--output -o", "File to write; must not exist.", "FILE.html")],
-    chain: ChainOption = None,
-    plan: PlanInForceOption = None,
-    cycles: Annotated[
-        list[int] | None,
-        option(
-            "--cycle",
-            "A cycle that the timeline has to show, where there are too many to show all. "
-            "May be given several times.",
-            "N",
-            min=0,
-        ),
-    ] = None,
-    json: JsonOption = False,
+    recordings: list[Path] = argument(..., "REC...", "Recordings' or LTTng traces' folders."),
+    output: Path = option(..., "--output -o FILE.html", "File to write; must not exist."),
+    chain: str | None = CHAIN,
+    plan: Path | None = PLAN_IN_FORCE,
+    cycles: list[int] | None = option(
+        None,
+        "--cycle N",
+        "A cycle that the timeline has to show, where there are too many to show all. "
+        "May be given several times.",
+        min=0,
+    ),
+    json: bool = JSON,
 ) -> None:
     """Write one self-contained HTML page about a chain, usually before and after shaping.
 
@@ -296,13 +272,13 @@ def report(
 
 
 def export(
-    trace: TraceArgument,
-    output: Annotated[
-        Path, option("--output -o", "File to write, such as trace.pftrace; must not exist.", "FILE")
-    ],
-    perfetto: Annotated[bool, option("--perfetto", "A trace that ui.perfetto.dev opens.")] = False,
-    chain: ChainOption = None,
-    plan: PlanInForceOption = None,
+    trace: list[Path] = TRACE,
+    output: Path = option(
+        ..., "--output -o FILE", "File to write, such as trace.pftrace; must not exist."
+    ),
+    perfetto: bool = option(False, "--perfetto", "A trace that ui.perfetto.dev opens."),
+    chain: str | None = CHAIN,
+    plan: Path | None = PLAN_IN_FORCE,
 ) -> None:
     """Write a recording for another tool: threads, callbacks, messages, slots, stalls.
 

@@ -42,7 +42,8 @@ class Option(NamedTuple):
     flag: str | None = None
 
 
-_BANDS, _MARGIN = "Latency bands", "Margin"
+BANDS, MARGIN = "Latency bands", "Margin"
+"""Panels of the help."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,7 @@ class Wishes:
         Option(
             "A given margin behind the longest undisturbed latency. Default: 1ms behind the latency"
             " that all cycles but 1 % stay below.",
-            _MARGIN,
+            MARGIN,
         ),
     ] = None
     overrun_probability: Annotated[
@@ -76,35 +77,33 @@ class Wishes:
         Option(
             "Share of all cycles that may be late, such as 0.01; below 0.001 it is derived from"
             " the tail of the latencies.",
-            _MARGIN,
+            MARGIN,
             "P",
         ),
     ] = None
     ideal_machine: Annotated[
         bool,
-        Option(
-            "Leave out cycles that the machine disturbed: for one that does not stall.", _MARGIN
-        ),
+        Option("Leave out cycles that the machine disturbed: for one that does not stall.", MARGIN),
     ] = False
     bands: Annotated[
         int | Literal["auto"],
-        Option("Number of bands; auto: as many as are worth it.", _BANDS, "N|auto"),
+        Option("Number of bands; auto: as many as are worth it.", BANDS, "N|auto"),
     ] = 1
-    solver: Annotated[Solver, Option("What places bands.", _BANDS)] = "exact"
-    grid_ns: Annotated[int, Option("Slots end at multiples of this.", _BANDS)] = 1_000
+    solver: Annotated[Solver, Option("What places bands.", BANDS)] = "exact"
+    grid_ns: Annotated[int, Option("Slots end at multiples of this.", BANDS)] = 1_000
     max_gap_ns: Annotated[
-        int | None, Option("Longest distance of neighbouring bands (LV).", _BANDS)
+        int | None, Option("Longest distance of neighbouring bands (LV).", BANDS)
     ] = None
     max_share: Annotated[
-        float | None, Option("Most cycles in one band: 0.4 or 40%.", _BANDS, "SHARE")
+        float | None, Option("Most cycles in one band: 0.4 or 40%.", BANDS, "SHARE")
     ] = None
-    minimise: Annotated[Goal, Option("What to make small.", _BANDS)] = "mean"
+    minimise: Annotated[Goal, Option("What to make small.", BANDS)] = "mean"
     mean_at_most_ns: Annotated[
-        int | None, Option("The average that --minimise may cost.", _BANDS)
+        int | None, Option("The average that --minimise may cost.", BANDS)
     ] = None
     least_gain: Annotated[
         float,
-        Option("With --bands auto: what another band must take off the average.", _BANDS, "SHARE"),
+        Option("With --bands auto: what another band must take off the average.", BANDS, "SHARE"),
     ] = 0.02
     seed: Annotated[int, Option("For pso, random and the derived margin.", least=0)] = 0
     first_slot_ns: Annotated[
@@ -134,7 +133,10 @@ class Wishes:
     ] = None
     fallback: Annotated[
         Fallback,
-        Option("While the shaping node is not there: outputs go around it, or none is published."),
+        Option(
+            "While the shaping node is not there: outputs go around it, or none is published."
+            " Default: bypass, or what the plan says."
+        ),
     ] = "bypass"
     spin_ns: Annotated[int, Option("How long the gate watches the clock before its slot.")] = (
         1_000_000
