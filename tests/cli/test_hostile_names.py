@@ -109,13 +109,7 @@ def harmless(finished: Finished, *, code: int = 0) -> Finished:
     return finished
 
 
-VERBS_THAT_READ = (
-    ("info",),
-    ("graph", "--all"),
-    ("callbacks",),
-    ("chains",),
-    ("latency",),
-)
+VERBS_THAT_READ = (("info",), ("graph", "--all"), ("callbacks",), ("chains",), ("latency",))
 
 
 @pytest.mark.parametrize("verb", VERBS_THAT_READ, ids=lambda verb: verb[0])

@@ -13,13 +13,7 @@ from chainshaper.planning.baselines import (
     server_per_callback,
     server_per_chain,
 )
-from chainshaper.planning.plan import (
-    Plan,
-    Thread,
-    publish_slots,
-    publishing_servers,
-    server_of,
-)
+from chainshaper.planning.plan import Plan, Thread, publish_slots, publishing_servers, server_of
 from chainshaper.planning.plan_file import dump_plan
 from chainshaper.planning.shaping import over_cores, plan_shaping, with_first_node_apart, with_sink
 from chainshaper.values.errors import InputError, OperationError

@@ -1,7 +1,7 @@
 """The command line: each verb a thin coat over a library call.
 
-Results go to stdout, errors and progress to stderr. Exit codes: 0 done, 1 the operation failed,
-2 wrong use or bad input, 3 the platform cannot do it.
+Results go to stdout, errors and progress to stderr. Exit codes: 0 done, 1 the operation failed, 2
+wrong use or bad input, 3 the platform cannot do it.
 """
 
 import io

@@ -138,8 +138,8 @@ def offsets(
 ) -> None:
     """Find when each chain's cycles start, so that no slots of one core collide.
 
-    Where chains cannot take turns on a core, they run at the same time at different priorities,
-    and only their publish slots are kept apart.
+    Where chains cannot take turns on a core, they run at the same time at different priorities, and
+    only their publish slots are kept apart.
     """
     from chainshaper.planning import load_plan
 

@@ -82,8 +82,8 @@ def demo(
 ) -> None:
     """Measure a live chain, plan, splice the shaping node, measure again, show the gain.
 
-    Runs the paper's synthetic chain as real processes over real DDS topics, for about a minute
-    and a half. Needs no ROS 2.
+    Runs the paper's synthetic chain as real processes over real DDS topics, for about a minute and
+    a half. Needs no ROS 2.
     """
     from chainshaper.flow.demo import run_demo
     from chainshaper.planning import plan_warnings
@@ -360,8 +360,8 @@ def shape(
     Behind `--`, `ros2 launch` does the whole flow: record, choose a chain, profile, plan, splice,
     apply, record again, compare. Every file in between stays; --chain, --duration, --source,
     --node, --backend, --bands, --modes, --epsilon, --ideal-machine, --overrun, --messages, --depth,
-    --no-receivers, --fallback and --user are for this, and mean what they mean for
-    `chainshaper plan` and `apply`.
+    --no-receivers, --fallback and --user are for this, and mean what they mean for `chainshaper
+    plan` and `apply`.
     """
     if len(words) == 2 and words[0].endswith(DESCRIPTIONS):
         _shape_described(Path(words[0]), Path(words[1]), output, cycles, realtime)

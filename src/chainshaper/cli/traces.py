@@ -148,8 +148,8 @@ def latency(
 ) -> None:
     """Show the end-to-end latency of a chain: average, maximum, jitter, percentiles.
 
-    Each traversal is followed from the start of the first callback to the publication of the
-    last topic, message by message. A second table shows in which hop the time went.
+    Each traversal is followed from the start of the first callback to the publication of the last
+    topic, message by message. A second table shows in which hop the time went.
     """
     from chainshaper.flow.exploration import lost_events, named_chain
     from chainshaper.flow.steps import measure_latency

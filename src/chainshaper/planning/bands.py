@@ -1,27 +1,27 @@
 """Where to put the publish slots of several latency bands, exactly (sections 3.3 and 4.1).
 
-With ν bands an execution publishes in the first slot that ends after it is done, so most of
-them come earlier than the longest latency. The average is eq. 5,
+With ν bands an execution publishes in the first slot that ends after it is done, so most of them
+come earlier than the longest latency. The average is eq. 5,
 
     Σ_α (φ(x_α) − φ(x_{α−1}))·x_α,
 
-x_α the end of slot α and φ the measured distribution; the last slot stays where single-band
-shaping has it. The optimum is found on a grid of instants by dynamic programming from the last
-slot backwards: B_m(i), the least cost of the m bands behind a band that ends at x_i, is
+x_α the end of slot α and φ the measured distribution; the last slot stays where single-band shaping
+has it. The optimum is found on a grid of instants by dynamic programming from the last slot
+backwards: B_m(i), the least cost of the m bands behind a band that ends at x_i, is
 
     B_m(i) = min over j of (c_j − c_i)·x_j + B_{m−1}(j),    B_1(i) = (n − c_i)·x_ν,
 
 c_i being the number of latencies ≤ x_i among n.
 
-**Why this is exact, also under tight constraints.** For row i, column j costs the value of the
-line with intercept c_j·x_j + B_{m−1}(j) and slope −x_j at c_i. Every constraint on neighbouring
-bands says that j lies in a window whose both ends ascend with i: Δ and LV bound x_j − x_i, the cap
-on a band's share bounds c_j − c_i, and x and c ascend. So B_m(i) is the least of the lines of a
-moving window at c_i, and all the c_i ascend too. The kernel keeps the lower envelope of the
-lines, in an order of rows in which windows only grow, so that no line is lost that a later row
-may need, and positions from which no placement leads on are left out. Each layer is linear in
-the number of grid points. (The cost is Monge as well, w(i, j) + w(i', j') ≤ w(i, j') + w(i', j) for
-i < i', j < j', which is why the average gains less with every further band.)
+**Why this is exact, also under tight constraints.** For row i, column j costs the value of the line
+with intercept c_j·x_j + B_{m−1}(j) and slope −x_j at c_i. Every constraint on neighbouring bands
+says that j lies in a window whose both ends ascend with i: Δ and LV bound x_j − x_i, the cap on a
+band's share bounds c_j − c_i, and x and c ascend. So B_m(i) is the least of the lines of a moving
+window at c_i, and all the c_i ascend too. The kernel keeps the lower envelope of the lines, in an
+order of rows in which windows only grow, so that no line is lost that a later row may need, and
+positions from which no placement leads on are left out. Each layer is linear in the number of grid
+points. (The cost is Monge as well, w(i, j) + w(i', j') ≤ w(i, j') + w(i', j) for i < i', j < j',
+which is why the average gains less with every further band.)
 
 Placement by particle swarm, as the paper does it, and at random (section 5.1.5, the rows "PSO" and
 "Random" of tables 3 and 4) are for comparison: neither better nor faster.
@@ -83,13 +83,12 @@ def predict_bands(
 ) -> Prediction:
     """What publication in given slots makes of measured latencies.
 
-    Each band is represented by the end of its slot, x_α. The latest output is at x_ν, the earliest
-    at the start of the first slot, x_1 − Δ, so the jitter is x_ν − (x_1 − Δ): 25 ms for the paper's
-    slots [62, 63], [77, 78], [86, 87] ms. ``slot_ends_ns`` ascend and the last is not before the
-    longest latency; Δ is ``publish_slot_ns``.
+    A band is represented by the end of its slot, x_α. The latest output is at x_ν, the earliest at
+    the start of the first slot, so the jitter is x_ν − (x_1 − Δ): 25 ms for the paper's slots [62,
+    63], [77, 78], [86, 87] ms. ``slot_ends_ns`` ascend; Δ is ``publish_slot_ns``.
 
     Raises:
-        InputError: slot ends that break these rules.
+        InputError: slot ends that do not ascend, or the last is before the longest latency.
     """
     ends = [int(end) for end in slot_ends_ns]
     if not ends or any(after <= before for before, after in pairwise(ends)):
@@ -114,12 +113,11 @@ def _refuse_before_longest(last_end_ns: int, longest_ns: int) -> None:
 
 @dataclass(frozen=True)
 class BandProblem:
-    """What a placement must respect; all times in nanoseconds. Made by :func:`band_problem`.
+    """What a placement must respect; made by :func:`band_problem`.
 
     ``latencies_ns`` ascend. Slots are ``publish_slot_ns`` long (Δ), the last ends at
     ``last_end_ns``, the others at multiples of ``grid_ns``. Neighbouring slot ends are at most
-    ``max_gap_ns`` apart (LV), a band holds at most ``max_share`` of the executions; None: no
-    such limit.
+    ``max_gap_ns`` apart (LV), a band has at most ``max_share`` of the executions.
     """
 
     latencies_ns: NDArray[np.int64]
@@ -190,11 +188,10 @@ def with_bands(
     """A shaped plan with ``bands`` publish slots; the last stays where the plan has it.
 
     The slots are as long as the plan's own (Δ). ``exact`` finds the best placement on the grid;
-    ``pso`` and ``random`` are for comparison and take a ``seed``. ``auto`` takes as many bands
-    as each lower the average by ``least_gain`` of it at least. With ``mean_at_most_ns`` the exact
-    solver can ``minimise`` the ``jitter`` or the largest ``gap`` instead of the average.
-    ``limits`` are those of :func:`~chainshaper.planning.bands.band_problem`: ``grid_ns``,
-    ``max_gap_ns`` (LV) and ``max_share``.
+    ``pso`` and ``random`` take a ``seed``. ``auto`` takes as many bands as each lower the average
+    by ``least_gain`` of it at least. With ``mean_at_most_ns`` the exact solver can ``minimise`` the
+    ``jitter`` or the largest ``gap`` instead of the average. ``limits`` are ``grid_ns``,
+    ``max_gap_ns`` (LV) and ``max_share``, as in :func:`band_problem`.
 
     Raises:
         InputError: a plan without a publish slot, or values that make no sense together.
@@ -235,8 +232,6 @@ def choose_bands(
 ) -> BandChoice:
     """What :func:`with_bands` takes for ``auto``, with its grounds.
 
-    ``plan`` may have any publish slots, of which the last counts.
-
     Raises:
         InputError: a plan without a publish slot, or a least gain that is no share.
         OperationError: no number of bands can be placed.
@@ -264,9 +259,8 @@ def choose_bands(
 def with_long_slot(plan: Plan, latencies_ns: NDArray[np.int64], slot_start_ns: int) -> Plan:
     """A shaped plan with one long publish slot, from ``slot_start_ns`` to where it ended before.
 
-    An execution that is done earlier waits for the slot, any other publishes at once: the
-    average falls and the jitter grows as the start moves towards the shortest latency (end of
-    section 4.1; the paper's example is [62, 87] ms).
+    An execution that is done earlier waits for the slot, any other publishes at once: the average
+    falls and the jitter grows as the start moves towards the shortest latency (end of section 4.1).
 
     Raises:
         InputError: a start that is not before the plan's own publish slot, or negative.
@@ -315,9 +309,9 @@ def place_bands(
 ) -> Placement:
     """The best placement of ``bands`` slots that exists on the grid.
 
-    ``minimise`` the average (eq. 5; among equals the one with the smallest jitter), or, under
-    the condition that the average stays at or below ``mean_at_most_ns``, the overall jitter
-    x_ν − (x_1 − Δ), or the largest gap between neighbouring bands.
+    ``minimise`` the average (eq. 5; among equals the one with the smallest jitter), or, while the
+    average stays at or below ``mean_at_most_ns``, the overall jitter x_ν − (x_1 − Δ), or the
+    largest gap between neighbouring bands.
 
     Raises:
         InputError: a goal that makes no sense, or as :func:`refuse_more_than_fit`.
@@ -340,9 +334,7 @@ def place_bands(
 
 
 def placement_curve(problem: BandProblem, most_bands: int) -> list[Placement]:
-    """The best placement for each number of bands from one upwards (figure 7).
-
-    Ends early where more bands do not fit.
+    """The best placement for each number of bands from one upwards, as far as they fit (figure 7).
 
     Raises:
         OperationError: no number of bands up to ``most_bands`` can be placed.
@@ -362,11 +354,7 @@ def placement_curve(problem: BandProblem, most_bands: int) -> list[Placement]:
 
 
 def refuse_more_than_fit(problem: BandProblem, bands: int) -> None:
-    """Refuse a number of bands for which there is no room, whatever the grid and other limits.
-
-    Raises:
-        InputError: no bands, or more than publish slots fit behind the shortest latency.
-    """
+    """Refuse no bands, or more than publish slots fit behind the shortest latency."""
     if bands < 1:
         raise InputError(f"{bands} bands: plan with one band at least")
     most = _room(problem)
@@ -380,11 +368,7 @@ def refuse_more_than_fit(problem: BandProblem, bands: int) -> None:
 
 
 def enough_bands(curve: list[Placement], least_gain: float = 0.02) -> Placement:
-    """The first placement of a curve behind which another band gains less than ``least_gain``.
-
-    The gain is the share of the average that one more band takes away: beyond the point that
-    this picks, figure 7 is flat.
-    """
+    """The first placement of a curve behind which another band gains less than ``least_gain``."""
     for placement, following in pairwise(curve):
         if placement.mean_ns - following.mean_ns < least_gain * placement.mean_ns:
             return placement
@@ -392,10 +376,7 @@ def enough_bands(curve: list[Placement], least_gain: float = 0.02) -> Placement:
 
 
 def broken_constraint(problem: BandProblem, slot_ends_ns: tuple[int, ...]) -> str | None:
-    """The first constraint that given slot ends break, in words; None when they keep all.
-
-    The grid is not among them: a solver may place slots anywhere.
-    """
+    """The first constraint that given slot ends break, in words; the grid is not among them."""
     ends = np.array(slot_ends_ns)
     slot, shortest = problem.publish_slot_ns, int(problem.latencies_ns[0])
     if ends.size > 1 and ends[0] - slot <= shortest:
@@ -552,11 +533,11 @@ def _why_none(problem: BandProblem, bands: int) -> str:
 def place_by_swarm(problem: BandProblem, bands: int, seed: int | None = None) -> Placement:
     """Place bands with PySwarms and the paper's parameters; the same ``seed``, the same result.
 
-    Particles are the ends of all slots but the last, on the problem's grid. A particle that
-    breaks a constraint costs more than any that does not, in proportion to how far it is off.
+    Particles are the ends of all slots but the last, on the grid. A particle that breaks a
+    constraint costs more than any that does not, in proportion to how far it is off.
 
     Raises:
-        InputError: as :func:`~chainshaper.planning.bands.refuse_more_than_fit`.
+        InputError: as :func:`refuse_more_than_fit`.
         OperationError: the swarm ended at a placement that breaks a constraint.
         PlatformError: PySwarms is not installed.
     """
@@ -581,9 +562,8 @@ def place_randomly(problem: BandProblem, bands: int, seed: int | None = None) ->
     """Place bands at random, every allowed placement on the grid being equally likely.
 
     Raises:
-        InputError: as :func:`~chainshaper.planning.bands.refuse_more_than_fit`.
-        OperationError: the grid is too coarse for so many, or no draw out of ten thousand keeps
-            all constraints.
+        InputError: as :func:`refuse_more_than_fit`.
+        OperationError: the grid is too coarse for so many, or no draw of many respects the limits.
     """
     refuse_more_than_fit(problem, bands)
     if bands == 1:
@@ -644,8 +624,8 @@ def _costs(problem: BandProblem, particles: NDArray[np.float64]) -> NDArray[np.f
 def _quiet_and_seeded(seed: int | None) -> Iterator[None]:
     """PySwarms draws from NumPy's global generator and sets up logging into the current folder.
 
-    Both are put right here: the generator's state comes back, and a logging configuration that
-    changes nothing (named by PySwarms' own environment variable) keeps it from writing files.
+    The generator's state comes back; a logging configuration that changes nothing (named by
+    PySwarms' own environment variable) makes it write no files.
     """
     state = np.random.get_state()
     configured = os.environ.get("LOG_CFG")

@@ -23,16 +23,15 @@ unchanging system and a tail that does look generalised Pareto. Each of the thre
 where one fails there is no number.
 
 The parameters are estimated by L-moments (Hosking and Wallis, *Parameter and quantile estimation
-for the generalized Pareto distribution*, Technometrics 29, 1987), which for a few hundred
-excesses err less than maximum likelihood does. They may put the end of a bounded tail before the
-longest latency measured, which is then made the end (Dupuis and Tsao, *A hybrid estimator for
-generalized Pareto and extreme-value distributions*, Communications in Statistics 27, 1998). The
-goodness of fit (Anderson–Darling) and the
-confidence interval come from one parametric bootstrap, because tables for known parameters do
-not hold for estimated ones. In simulations with normal, exponential, triangular and uniform-sum
-latencies the 95 % interval for a probability of 1e-5 held the true value in 97 to 100 of 100
-samples of 5,000 and in 93 to 98 of 100 samples of 1,500; where it missed it was too low. Where the
-density does not vanish at the end of the distribution, it errs on the high side.
+for the generalized Pareto distribution*, Technometrics 29, 1987), which for a few hundred excesses
+err less than maximum likelihood does. They may put the end of a bounded tail before the longest
+latency measured, which is then made the end (Dupuis and Tsao, *A hybrid estimator for generalized
+Pareto and extreme-value distributions*, Communications in Statistics 27, 1998). The goodness of fit
+(Anderson–Darling) and the confidence interval come from one parametric bootstrap, because tables
+for known parameters do not hold for estimated ones. In simulations with normal, exponential,
+triangular and uniform-sum latencies the 95 % interval for a probability of 1e-5 held the true value
+in 97 to 100 of 100 samples of 5,000 and in 93 to 98 of 100 samples of 1,500; where it missed it was
+too low. Where the density does not vanish at the end of the distribution, it errs on the high side.
 """
 
 import math
@@ -74,6 +73,9 @@ _Floats = NDArray[np.float64]
 def read_latencies(path: str | Path) -> NDArray[np.int64]:
     """End-to-end latencies of a file, in nanoseconds, in the file's order.
 
+    One duration a line with its unit (``59.3ms``; blank lines and lines that begin with ``#`` are
+    skipped), or a ``.npy`` file of nanoseconds.
+
     Raises:
         InputError: no such file, a line that is no duration (named with its number), an array
             that does not hold whole nanoseconds, fewer than two latencies, or none above zero.
@@ -96,8 +98,6 @@ def read_latencies(path: str | Path) -> NDArray[np.int64]:
 
 def check_latencies(latencies: object) -> NDArray[np.int64]:
     """A sample that can be planned with: at least two latencies, whole nanoseconds, none negative.
-
-    Floating-point numbers are taken when each is a whole number of nanoseconds.
 
     Raises:
         InputError: anything else, with the first wrong element named by its place from 0.
@@ -167,8 +167,8 @@ def _read_lines(path: Path) -> NDArray[np.int64]:
 class TailFit:
     """A generalised Pareto tail and the latency that it says is exceeded with ``probability``.
 
-    ``interval_ns`` is the 95 % confidence interval of ``latency_ns``; ``goodness`` the p-value
-    of the Anderson–Darling test of the fit.
+    ``interval_ns`` is the 95 % confidence interval of ``latency_ns``; ``goodness`` the p-value of
+    the Anderson–Darling test of the fit.
     """
 
     probability: float
@@ -235,10 +235,8 @@ def derive_margin(
 ) -> Margin:
     """The margin ε with which an execution overruns its slot with the given probability.
 
-    ``latencies_ns`` are in the order in which they were measured; the margin counts from
-    ``longest_ns``, their longest unless given. The result says that it was
-    derived, and keeps the probability and the confidence interval of ε; hand it to
-    :func:`chainshaper.planning.shaping.plan_shaping`.
+    ``latencies_ns`` are in the order in which they were measured; ε counts from ``longest_ns``,
+    their longest unless given. The result has its confidence interval.
 
     Raises: as :func:`fit_tail`.
     """
@@ -256,8 +254,7 @@ def derive_margin(
 def fit_tail(latencies_ns: NDArray[np.int64], probability: float, seed: int = 0) -> TailFit:
     """Fit the tail of a sample and read the latency that is exceeded with a small probability.
 
-    The threshold is the lowest of a few that leaves a tail of good fit. ``seed`` is the
-    bootstrap's.
+    The threshold is the lowest of a few that leaves a tail of good fit.
 
     Raises:
         InputError: latencies that cannot be planned with, or a probability outside the tail.
@@ -343,8 +340,8 @@ def _fit_above(
 def _l_moment_fit(ordered: _Floats) -> tuple[_Floats, _Floats]:
     """Shape and scale for each row of ascending excesses.
 
-    With λ₁ the mean and λ₂ half the mean difference of two, ξ = 2 − λ₁/λ₂ and σ = λ₁(1 − ξ).
-    Where that distribution would end, at −σ/ξ, before the longest excess, it is made to end there.
+    With λ₁ the mean and λ₂ half the mean difference of two, ξ = 2 − λ₁/λ₂ and σ = λ₁(1 − ξ). Where
+    that distribution would end, at −σ/ξ, before the longest excess, it is made to end there.
     """
     size = ordered.shape[1]
     first = ordered.mean(axis=1)

@@ -1,23 +1,23 @@
 """Several chains on shared cores: when each one's cycles start, so that no slots collide.
 
-Plans made one by one may want the same instants of the same core. Within the hyper-period of
-their cycles, chains are moved against each other until every two slots of one core and one
-priority are disjoint in all cycles (the rule that holds inside a plan, across plans; servers of
-different priority may overlap, as there). The paper leaves this open (section 3.1).
+Plans made one by one may want the same instants of the same core. Within the hyper-period of their
+cycles, chains are moved against each other until every two slots of one core and one priority are
+disjoint in all cycles (the rule that holds inside a plan, across plans; servers of different
+priority may overlap, as there). The paper leaves this open (section 3.1).
 
 Two slots [a, a + d) and [b, b + e) that repeat every T and U collide in some cycle unless the
-distance of their starts, modulo g = gcd(T, U), is in [d, g − e]: the distances that occur are
-all numbers congruent to it. So each pair of chains allows a set of differences of offsets
-modulo g, and nothing else matters.
+distance of their starts, modulo g = gcd(T, U), is in [d, g − e]: the distances that occur are all
+numbers congruent to it. So each pair of chains allows a set of differences of offsets modulo g, and
+nothing else matters.
 
-**Few chains are searched exhaustively.** From any solution, take the chains that are not linked
-to the first by a chain of tight pairs (pairs whose difference is at an end of an allowed
-interval), and start all of them earlier until some pair becomes tight. Repeated, that links
-every chain to the first without breaking a constraint: if there is a solution, there is one in
-which the tight pairs form a tree, and it is enough to try the ends of allowed intervals. Many
-chains are first fitted in one after the other, pushing each other out where there is no room, which
-is quick and mostly enough; where it is not, the CP-SAT solver of OR-tools decides, which is exact
-as well but may run out of time.
+**Few chains are searched exhaustively.** From any solution, take the chains that are not linked to
+the first by a chain of tight pairs (pairs whose difference is at an end of an allowed interval),
+and start all of them earlier until some pair becomes tight. Repeated, that links every chain to the
+first without breaking a constraint: if there is a solution, there is one in which the tight pairs
+form a tree, and it is enough to try the ends of allowed intervals. Many chains are first fitted in
+one after the other, pushing each other out where there is no room, which is quick and mostly
+enough; where it is not, the CP-SAT solver of OR-tools decides, which is exact as well but may run
+out of time.
 """
 
 import math
@@ -50,9 +50,9 @@ def place_chains(
 ) -> tuple[tuple[Plan, ...], list[str]]:
     """Offsets for chains that share cores, and what is to be known about them.
 
-    The chains take turns where they can (:func:`with_offsets`). Where they cannot, they run at
-    the same time, the chain with the shorter period at the better priority, and only their
-    publish slots, which make the latency constant, are kept apart.
+    The chains take turns where they can (:func:`with_offsets`). Where they cannot, they run at the
+    same time, the chain with the shorter period at the better priority, and only their publish
+    slots, which make the latency constant, are kept apart.
 
     Raises: as :func:`with_offsets`.
     """
@@ -92,16 +92,13 @@ def with_offsets(
 ) -> tuple[Plan, ...]:
     """The plans of several chains with offsets that keep their slots apart.
 
-    The first chain, and any that shares no core with another, keeps the offset 0. To let two
-    chains run on one core at the same time, give their servers different priorities first.
-
-    ``time_limit_s`` bounds the search among chains that can collide with each other.
+    The first chain, and any that shares no core with another, has the offset 0. ``time_limit_s``
+    bounds the search among chains that can collide with each other.
 
     Raises:
         InputError: no plans, or plans that govern the same threads or the same output.
-        OperationError: there are no such offsets, with the reason where a single pair of chains
-            or the load of a core already excludes them; or it is not known whether there are,
-            because the time was up.
+        OperationError: there are no such offsets, with the reason where a single pair of chains or
+            the load of a core already excludes them; or the time was up before an answer.
         PlatformError: more than a few chains collide and OR-tools is not installed.
     """
     if not plans:
@@ -231,9 +228,9 @@ def _fitted(
     """Chains fitted in one after the other; None says nothing.
 
     A chain that fits nowhere is put where it pushes out what was hardest to place the least, and
-    those chains wait their turn again. Every time a chain does not fit it weighs more, so that
-    the hard ones come to stay and the others move around them (guided ejection: Nagata and
-    Bräysy, Operations Research Letters 37, 2009).
+    those chains wait their turn again. Every time a chain does not fit it weighs more, so that the
+    hard ones come to stay and the others move around them (guided ejection: Nagata and Bräysy,
+    Operations Research Letters 37, 2009).
     """
     waiting = sorted(group, key=lambda k: (-plans[k].cycle_ns, _busy(plans[k])))
     weight = dict.fromkeys(group, 1)
@@ -320,11 +317,10 @@ def _solve(
 
 
 def _played_out(plans: Sequence[Plan], group: list[int]) -> Iterator[list[tuple[int, int, int]]]:
-    """Per core and priority, every slot of a hyper-period and of the cycle before it.
+    """Per core and priority, every slot (chain, start, end) of a hyper-period and the cycle before.
 
-    As (chain, start, end), from the chain's offset on. Pairs of chains say all that there is to
-    say, but only from slots side by side does a solver see that a core is too full for all of
-    them. Nothing, where a hyper-period is too long to be of use.
+    Pairs of chains say all that there is to say, but only from slots side by side does a solver see
+    that a core is too full for all of them. Nothing, where a hyper-period is too long to be of use.
     """
     hyper_period = math.lcm(*(plans[k].cycle_ns for k in group))
     if sum(hyper_period // plans[k].cycle_ns for k in group) > MOST_CYCLES:

@@ -40,12 +40,11 @@ ROOMY_SLOT_NS = 10_000_000
 
 
 def cycles_until_output(plan: Plan, node: ShapingNode | None = None) -> int:
-    """How many cycles after its own an output is due, and leaves at the earliest: more than 0
-    under LET only.
+    """How many cycles after its own an output is due, and leaves at the earliest: 0 but under LET.
 
     It is the chain's output, or what ``node`` republishes: under LET per callback, each topic
-    inside the chain is due a cycle after the one before it. (Without slots for outputs, as many as
-    the prediction takes.)
+    inside the chain is due a cycle after the one before it. Without slots for outputs: as
+    predicted.
     """
     if plan.policy == "let-per-chain":
         return 1
@@ -59,12 +58,12 @@ def cycles_until_output(plan: Plan, node: ShapingNode | None = None) -> int:
 def output_lifespan(plan: Plan) -> int | None:
     """The lifespan (ns) by which DDS discards what overruns; None where it is not needed.
 
-    It is as short as it may be: an output that comes in time waits no longer than until the end
-    of the first slot when it was handed over at the very start of the cycle, or of the next slot
-    when it just missed one. An overrun waits from when it is handed over, at latency l, to the
-    first slot of the next cycle, CT + (x_1 − Δ) − l. So overruns are discarded up to a latency of
-    CT − Δ with one slot; one that took longer still is taken for an early output of the next
-    cycle. Under LET, where every output waits for the next cycle, age tells nothing.
+    It is as short as it may be: an output that comes in time waits no longer than until the end of
+    the first slot when it was handed over at the very start of the cycle, or of the next slot when
+    it just missed one. An overrun waits from when it is handed over, at latency l, to the first
+    slot of the next cycle, CT + (x_1 − Δ) − l. So overruns are discarded up to a latency of CT − Δ
+    with one slot; one that took longer still is taken for an early output of the next cycle. Under
+    LET, where every output waits for the next cycle, age tells nothing.
     """
     publisher = plan.chain.publisher
     if plan.overrun != "discard" or publisher is None or cycles_until_output(plan):
@@ -76,17 +75,28 @@ def output_lifespan(plan: Plan) -> int | None:
     return max([slots[0][1], *waits])
 
 
+def refuse_offset(plan: Plan) -> None:
+    """Refuse an offset where the phase of the chain's own timer says when its cycles start.
+
+    Raises:
+        InputError: the plan has one; the message says how to carry it out.
+    """
+    if plan.offset_ns:
+        raise InputError(
+            f"offset: {format_duration(plan.offset_ns)} cannot be carried out here, where the"
+            " chain's first timer starts its cycles: let this timer start so much later, and"
+            " remove `offset` from the plan"
+        )
+
+
 def open_until_done(plan: Plan) -> Plan:
     """The plan as back ends and the simulator carry it out: what overruns may finish.
 
     Where an output that missed its slot is to leave at once, the servers that run the chain to its
     end stay open until the cycle's end (section 6), and so does the last publish slot of an
     asynchronous publisher's thread: a server that stopped either of them would delay the output by
-    a whole cycle. The plan itself states what is reserved (eq. 1); it is also what is shared out
-    among several chains of a core, and where another server of the same priority has a slot there,
-    the servers stay as planned.
-
-    In the next cycle the thread of an asynchronous publisher waits for its slot again.
+    a whole cycle. The plan itself states what is reserved (eq. 1) and shared out among chains;
+    where another server of the same priority has a slot there, the servers stay as planned.
     """
     shaped = plan.policy in ("shaped", "one-long-slot") and output_server(plan) is not None
     if plan.overrun != "publish" or not shaped:
@@ -109,9 +119,8 @@ def open_until_done(plan: Plan) -> Plan:
 
 @dataclass(frozen=True)
 class Writer:
-    """A writer of an application: node, topic, history (keep last), and who sends.
-
-    ``asynchronous``: a publisher thread does. None is: not known.
+    """A writer of an application: node, topic, history (keep last), and whether a publisher thread
+    sends for it. None is: not known.
     """
 
     node: str
@@ -121,10 +130,9 @@ class Writer:
 
 
 def check_publication(plan: Plan, writers: Sequence[Writer]) -> list[str]:
-    """Hold a plan that gates publishers' threads against the writers of the application.
+    """Check a plan that gates publishers' threads against the writers of the application.
 
-    Returns what a person must know, one sentence each. Plans that gate no publisher's thread, or
-    do not say which output they are for, have nothing to be checked.
+    Returns what a person must know, one sentence each.
 
     Raises:
         InputError: the output is published by another node, or synchronously, or its history is

@@ -5,8 +5,8 @@ written as YAML that people edit (:mod:`chainshaper.planning.plan_file`), and ca
 back ends. Every :class:`Plan` obeys every rule checked here, whichever way it came about.
 
 Durations are integer nanoseconds, in fields that end in ``_ns``; in YAML the same keys stand
-without the suffix and their values carry a unit (``period: 100ms``). Slots are half-open
-intervals ``(start, end)`` in nanoseconds after the start of a cycle.
+without the suffix and their values carry a unit (``period: 100ms``). Slots are half-open intervals
+``(start, end)`` in nanoseconds after the start of a cycle.
 
 A server may stop the thread of an asynchronous publisher (design 1, section 3.2.1), which shares
 locks with the rest of its process. With Fast DDS 2.14, three things turned out to be destructive:
@@ -72,9 +72,8 @@ Slot: TypeAlias = tuple[Duration, Duration]
 class ChainOfPlan(Part):
     """The chain that is planned for, as far as it is known.
 
-    ``publisher`` is the node that publishes ``output``, the chain's last topic. A plan computed
-    from bare latencies knows only the period; it can be studied but not carried out.
-    ``output_depth`` is the history (keep last) of the output's writer, where it is known.
+    A plan from bare latencies knows only the period; it can be studied but not carried out.
+    ``publisher`` is the node that publishes ``output``, ``output_depth`` its writer's history.
     """
 
     spec: str | None = None
@@ -87,12 +86,10 @@ class ChainOfPlan(Part):
 class Evidence(Part):
     """The measurements that the plan rests on: end-to-end latencies under high SCHED_FIFO.
 
-    ``incomplete`` counts traversals without an end, ``disturbed`` those that a stall of the
-    machine hit, ``utilisation`` is the share of its core that the chain's execution takes,
-    ``longest_send_ns`` how long the output's asynchronous publisher took to send one message.
-    The latencies are those of undisturbed cycles; ``max_of_all_ns`` is the longest of all cycles.
-    ``lost_events`` counts what the tracer lost, if it lost anything.
-    ``None`` is: not known.
+    The latencies are those of undisturbed cycles; ``max_of_all_ns`` is the longest of all.
+    ``incomplete`` counts traversals without an end, ``disturbed`` those that a stall of the machine
+    hit; ``utilisation`` is the share of its core that the chain's execution takes,
+    ``longest_send_ns`` is of the output's asynchronous publisher. ``None`` is: not known.
     """
 
     recording: str | None = None
@@ -119,11 +116,10 @@ class Evidence(Part):
 class Margin(Part):
     """How far the chain's slot reaches beyond the longest undisturbed latency (ε of eq. 1).
 
-    ``given`` by a person, ``measured``: it covers all cycles that were measured but a share, also
-    those that the machine disturbed, for which ``stalls_ns`` of it are needed; either way
-    ``overrun_probability`` is the share of outputs that will be late, at most, with 95 %
-    confidence. Or ``derived`` from the tail of the latencies, for a probability smaller than the
-    sample shows, with the confidence interval of the margin.
+    ``given`` by a person; ``measured``: it covers all cycles but a share, also those that the
+    machine disturbed, for which ``stalls_ns`` of it are needed; ``derived`` from the tail of the
+    latencies, with its confidence interval. ``overrun_probability`` is the share of late outputs,
+    at most, with 95 % confidence.
     """
 
     epsilon_ns: Duration
@@ -136,7 +132,7 @@ class Margin(Part):
 class Thread(Part):
     """A thread of a node that runs inside a server: its executor, or its asynchronous publisher.
 
-    DDS threads other than the publisher's are never gated (section 3.1), so they have no role.
+    Other DDS threads are never gated (section 3.1), so they have no role.
     """
 
     node: FullName
@@ -179,15 +175,13 @@ class Server(Part):
 class ShapingNode(Part):
     """The node that takes the chain's output from ``input`` and republishes it on ``output``.
 
-    It publishes in the slots of the server that holds its thread. ``core`` and ``fifo_priority``
-    are those of its executor; it sleeps until ``spin_ns`` before the slot and spins from there,
-    and pauses for ``pause_ns`` after a publication so that delivery is not delayed by it.
-    ``publisher`` is the node whose output it takes, of a node that stands elsewhere than behind
-    the chain's own output (`chain.publisher`), where it is known. ``receivers`` are nodes that
-    subscribe to the output: while the plan is in force their executors run under SCHED_FIFO below
-    all servers, so that what comes in time is taken in time. ``depth`` is how many messages may
-    wait in it; None: as many as the histories of the output's publisher and subscribers have room
-    for, as far as they are known, and 10 at least.
+    It publishes in the slots of the server that has its thread. It sleeps until ``spin_ns`` before
+    the slot and spins from there, and pauses for ``pause_ns`` after a publication so that delivery
+    is not delayed by it. ``publisher`` is the node whose output it takes, where that is not
+    `chain.publisher`. While the plan is in force the executors of ``receivers``, which subscribe to
+    the output, run under SCHED_FIFO below all servers. ``depth`` is how many messages may wait in
+    it; None: as many as the histories of the output's publisher and subscribers have room for, 10
+    at least.
     """
 
     name: Annotated[str, _plain_name("node")]
@@ -221,10 +215,9 @@ class Modes(Part):
     """Which latency band the chain's output has in each mode of the system (sections 3.3, 6).
 
     The active mode's name is read from ``topic``, a ``std_msgs/msg/String``; until one is read it
-    is ``default``. ``bands`` has the number of each mode's band, 1 for the slot that comes first of
-    those that the shaping node publishes in. An output that is early for its mode's slot waits for
-    it. ``late`` says what becomes of one that comes behind it: ``wait`` for the same slot of the
-    next cycle, ``discard``, ``publish`` at once, or take the ``next-slot`` of the cycle.
+    is ``default``. ``bands`` has the number of each mode's band, 1 for the first slot. An early
+    output waits for its mode's slot. A late one waits for the same slot of the next cycle
+    (``wait``), is discarded, leaves at once (``publish``), or takes the ``next-slot`` of the cycle.
     """
 
     topic: FullName
@@ -246,8 +239,8 @@ class Modes(Part):
 class Prediction(Part):
     """What the plan promises: end-to-end latency, and the share of cycles per latency band.
 
-    A band is represented by the end of its slot (section 4.1). The jitter is the widest
-    distance of two outputs, from the start of the first slot to the end of the last.
+    A band is represented by the end of its slot (section 4.1). The jitter is the widest distance of
+    two outputs, from the start of the first slot to the end of the last.
     """
 
     mean_ns: Duration
@@ -257,10 +250,7 @@ class Prediction(Part):
 
 
 class BandPrediction(NamedTuple):
-    """One latency band: its slot, its share of the cycles, and the jitter within it at most.
-
-    An output of the band leaves somewhere in its slot, so the jitter is the slot's length.
-    """
+    """One latency band: its slot, its share of the cycles, its jitter at most."""
 
     start_ns: int
     end_ns: int
@@ -276,17 +266,15 @@ def slot_text(slot: Slot) -> str:
 class Plan(Part):
     """Servers and shaping nodes for one chain, with the evidence and the prediction.
 
-    ``cycle_ns`` is the servers' cycle time: the chain's period, or a whole multiple of it. Where
-    several chains share cores, this chain's cycles start ``offset_ns`` after the instant from
-    which all of them count; slots count from the start of the chain's own cycle nevertheless.
+    ``cycle_ns`` is the servers' cycle time: the chain's period, or a whole multiple of it. This
+    chain's cycles start ``offset_ns`` after the instant from which those of all chains count.
     ``anchor`` says what starts a cycle for the shaping node: the stamp that each message carries
-    from the chain's first callback, or the servers' own cycle. ``overrun`` says what becomes of
-    an output that missed its last slot, ``messages`` which of several outputs of one cycle leave,
-    and ``fallback`` what becomes of outputs while their shaping node is not there.
-    ``shaping_node`` serves the chain's output; it is absent
-    when the publisher's own thread is gated (asynchronous publication) or nothing is.
-    ``further_shaping_nodes`` serve other sinks, or the topics inside a chain whose callbacks
-    follow LET one by one. With ``modes`` the slot of an output depends on the mode of the system.
+    from the chain's first callback, or the servers' own cycle. ``overrun`` says what becomes of an
+    output that missed its last slot, ``messages`` which of several outputs of one cycle leave,
+    ``fallback`` what becomes of outputs while their shaping node is not there. ``shaping_node``
+    serves the chain's output; it is absent when the publisher's own thread is gated or nothing is.
+    ``further_shaping_nodes`` serve other sinks, or the topics inside a chain whose callbacks follow
+    LET one by one.
     """
 
     format: Literal[1] = 1
@@ -331,9 +319,8 @@ def shaping_nodes(plan: Plan) -> list[ShapingNode]:
 def output_server(plan: Plan) -> Server | None:
     """The server in whose slots the chain's output is published; None without shaping.
 
-    It is the one of the shaping node or, where the publisher is asynchronous, of the
-    publisher's thread. A plan from bare latencies names no threads; its server ``output`` is
-    the one meant.
+    It has the thread of the shaping node or of the asynchronous publisher. A plan from bare
+    latencies names no threads; its server ``output`` is the one meant.
     """
     server = None
     if plan.shaping_node is not None:
@@ -363,10 +350,7 @@ def band_predictions(plan: Plan) -> tuple[BandPrediction, ...]:
 
 
 def publishing_servers(plan: Plan) -> tuple[Server, ...]:
-    """All servers in whose slots something is published: the output, other sinks, inner topics.
-
-    They hold shaping nodes' threads or publishers' threads; the others run the chain.
-    """
+    """All servers in whose slots something is published: the output, other sinks, inner topics."""
     nodes = {node.thread for node in shaping_nodes(plan)}
     output = output_server(plan)
     return tuple(
@@ -390,10 +374,7 @@ def revised(plan: Plan, **changes: object) -> Plan:
 
 @contextmanager
 def wrong_values_refused(model: type[Part] | None = None) -> Iterator[None]:
-    """Inside, a value that no plan may have ends in an InputError that names it.
-
-    For code that builds plans, or a ``model`` that is a part of one, from what a caller gave.
-    """
+    """Inside, a value that no plan, or part of one (``model``), may have ends in an InputError."""
     try:
         yield
     except ValidationError as error:
@@ -578,7 +559,7 @@ def publisher_servers(plan: Plan) -> Iterator[tuple[int, Server, list[str]]]:
 
 
 def messages_held(plan: Plan, server: Server) -> int:
-    """How many messages of the chain may be handed over while a server is closed, in one stretch.
+    """How many messages may be handed over while a server is closed, in one stretch.
 
     One per period of the chain, and one more for where the stretch begins.
     """

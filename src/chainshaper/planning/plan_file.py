@@ -1,8 +1,8 @@
 """A plan on disk: YAML that a person reads, edits and compares, checked again when it is read.
 
-:func:`load_plan` tolerates whatever a person does to the layout (comments, order of keys, flow
-or block style) and refuses whatever would not run: each wrong value is named with its file,
-line, key, the reason and what to write instead.
+:func:`load_plan` tolerates whatever a person does to the layout (comments, order of keys, flow or
+block style) and refuses whatever would not run: each wrong value is named with its file, line, key,
+the reason and what to write instead.
 """
 
 from collections.abc import Sequence

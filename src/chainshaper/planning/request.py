@@ -1,13 +1,13 @@
 """From what was measured of a chain, and what is wished, to its plan of any policy.
 
-:class:`Profile` has the measurements, :class:`PlanRequest` the wishes, and :func:`plan_chain`
-turns one of each into a plan. A profile may come from a recording or consist of bare latencies
-and a period; a policy that needs more says so.
+:class:`Profile` has the measurements, :class:`PlanRequest` the wishes, and :func:`plan_chain` turns
+one of each into a plan. A profile may come from a recording or consist of bare latencies and a
+period; a policy that needs more says so.
 
 Several chains cannot be planned together where one's plan would move another's outputs. A plan is
 made from latencies that were measured while nothing was shaped: shaping a topic that another
-chain's output waits for makes that one later than was measured, and its slot too early. Nor can
-two plans have one thread. Chains that share no more than cores, and sinks that fork off behind the
+chain's output waits for makes that one later than was measured, and its slot too early. Nor can two
+plans have one thread. Chains that share no more than cores, and sinks that fork off behind the
 first callback, are planned right; the others are refused with what they have in common.
 """
 
@@ -65,14 +65,14 @@ class Profile:
 
     ``latencies_ns`` are those of undisturbed cycles, ``every_latency_ns`` those of all (None: all
     were undisturbed), both in the order of time. ``nodes`` are those of the chain's callbacks, one
-    per callback, ``topics`` what each of these publishes for the chain. ``core_of`` names the
-    core of every node whose executor takes part, also on branches that the chain waits for.
-    ``begins`` is the first callback's number in the graph, and its name, ``upstream`` the topics
-    that the output waits for: on the chain, on those branches, and before the chain begins.
-    ``receivers`` are the nodes that subscribe to the chain's output and are none of these.
-    ``callbacks`` are those of the chain and its branches, see
-    :func:`~chainshaper.planning.baselines.server_per_callback`. ``output_depth`` is the history
-    of the output's writer. The rest is :class:`~chainshaper.planning.plan.Evidence`.
+    per callback, ``topics`` what each of these publishes for the chain. ``core_of`` names the core
+    of every node whose executor takes part, also on branches that the chain waits for. ``begins``
+    is the first callback's number in the graph, and its name, ``upstream`` the topics that the
+    output waits for: on the chain, on those branches, and before the chain begins. ``receivers``
+    are the nodes that subscribe to the chain's output and are none of these. ``callbacks`` are
+    those of the chain and its branches, see
+    :func:`~chainshaper.planning.baselines.server_per_callback`. ``output_depth`` is the history of
+    the output's writer. The rest is :class:`~chainshaper.planning.plan.Evidence`.
     """
 
     latencies_ns: NDArray[np.int64]

@@ -1,12 +1,12 @@
 """Latency shaping: from measured latencies to the chain's server and its publish slots.
 
-The chain runs in a server that is open from the start of a cycle until every execution seen so
-far was complete, and its output is published in a server whose slot comes then: late for most
-cycles, but at the same time in all of them (paper, sections 3.1 and 3.2).
+The chain runs in a server that is open from the start of a cycle until every execution seen so far
+was complete, and its output is published in a server whose slot comes then: late for most cycles,
+but at the same time in all of them (paper, sections 3.1 and 3.2).
 
-:func:`plan_shaping` plans one chain; further steps take its plan and return one that covers more
-of a graph (sections 5.1 and 5.4). Within the graph's given assignment of callbacks to cores,
-shaping needs no new idea: one server per core while the graph runs, one publish slot per sink.
+:func:`plan_shaping` plans one chain; further steps take its plan and return one that covers more of
+a graph (sections 5.1 and 5.4). Within the graph's given assignment of callbacks to cores, shaping
+needs no new idea: one server per core while the graph runs, one publish slot per sink.
 """
 
 from collections.abc import Mapping, Sequence
@@ -59,11 +59,11 @@ def plan_shaping(
 ) -> Plan:
     """Plan single-band shaping: one publish slot right behind the longest latency measured.
 
-    With L̄ the longest latency, ε the margin, Δ the length of the publish slot and CT the
-    period, the chain's server R_m gets the slot [0, L̄ + ε) (eq. 1) and the output's server R_m°
-    gets [L̄ + ε, L̄ + ε + Δ) (eq. 4 with a shaping node, eq. 2 with an asynchronous publisher
-    thread), in the same cycle (eq. 3). R_m° gets the better priority and, unless ``output_core``
-    says otherwise, the same core.
+    With L̄ the longest latency, ε the margin, Δ the length of the publish slot and CT the period,
+    the chain's server R_m gets the slot [0, L̄ + ε) (eq. 1) and the output's server R_m° gets [L̄ +
+    ε, L̄ + ε + Δ) (eq. 4 with a shaping node, eq. 2 with an asynchronous publisher thread), in the
+    same cycle (eq. 3). R_m° gets the better priority and, unless ``output_core`` says otherwise,
+    the same core.
 
     Args:
         latencies_ns: every end-to-end latency to be covered; leave out beforehand what the chain
@@ -205,8 +205,8 @@ def _refuse_too_long(longest: int, epsilon: int, publish_slot: int, period: int)
 def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
     """One server per core for the chain's threads, each with the chain's slot (section 5.4).
 
-    ``core_of`` names the core of every node whose executor takes part, also of nodes that the
-    plan does not know yet: branches that the chain waits for.
+    ``core_of`` names the core of every node whose executor takes part, also of nodes that the plan
+    does not know yet: branches that the chain waits for.
 
     Raises:
         InputError: a node of the plan is missing.
@@ -234,9 +234,9 @@ def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
 def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int) -> Plan:
     """The chain's first node in a server of its own, [0, ``slot_end_ns``), the rest behind it.
 
-    For a chain whose first callback is not a timer: held back until its slot, it starts every
-    execution at the beginning of a cycle as if it were one (table 4, rows 2 to 5: [0, 2] and
-    [2, 86] ms).
+    For a chain whose first callback is not a timer: stopped until its slot, it starts every
+    execution at the beginning of a cycle as if it were one (table 4, rows 2 to 5: [0, 2] and [2,
+    86] ms).
 
     Raises:
         InputError: the chain's server has no thread of that node, or is shorter than the slot.
@@ -270,18 +270,16 @@ def with_sink(
 ) -> Plan:
     """A shaped plan with one more shaped output: another sink of the same graph (end of 5.4).
 
-    The sink gets a shaping node of its own, behind its ``publisher`` and before its ``receivers``;
-    where the plan's output is published asynchronously, that node's publisher thread is gated
-    instead.
-
-    ``latencies_ns`` are those from the start of the graph to this sink. Its publish slot starts
-    the plan's margin after the longest of them, or where a publish slot that is in the way on
-    the same core ends; the chain's servers stay open as long as the slowest sink needs. The
-    plan's prediction goes on to describe its first output.
+    The sink gets a shaping node behind its ``publisher`` and before its ``receivers``; where the
+    plan's output is published asynchronously, that node's publisher thread is gated instead.
+    ``latencies_ns`` are those from the start of the graph to this sink. Its slot starts the plan's
+    margin after the longest, or where a publish slot that is in the way on the same core ends; the
+    chain's servers stay open as long as the slowest sink needs. The prediction stays that of the
+    first output.
 
     Raises:
-        InputError: a plan that shapes nothing or publishes in the other way, a sink that it
-            shapes already, latencies or a topic that no plan may have.
+        InputError: a plan that shapes nothing or publishes in the other way, a sink that it shapes
+            already, latencies or a topic that no plan may have.
         OperationError: the slot does not fit into the cycle.
     """
     node, publishing = plan.shaping_node, output_server(plan)
