@@ -180,8 +180,8 @@ class ShapingNode(Part):
     is not delayed by it. ``publisher`` is the node whose output it takes, where that is not
     `chain.publisher`. While the plan is in force the executors of ``receivers``, which subscribe to
     the output, run under SCHED_FIFO below all servers. ``depth`` is how many messages may wait in
-    it; None: as many as the histories of the output's publisher and subscribers have room for, 10
-    at least.
+    it; None: as many as the history of the output's publisher has room for, as far as that is
+    known, and 10 at least. The histories of its subscribers do not count.
     """
 
     name: Annotated[str, _plain_name("node")]
