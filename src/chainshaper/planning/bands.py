@@ -48,6 +48,7 @@ from chainshaper.planning.plan import (
     output_server,
     publish_slots,
     revised,
+    with_slots,
 )
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError, extra_library
@@ -297,10 +298,7 @@ def _last_publish_slot(plan: Plan) -> Slot:
 
 def _with_publish_slots(plan: Plan, slots: tuple[Slot, ...], predicted: Prediction) -> Plan:
     publishing = output_server(plan)
-    servers = [
-        server.model_copy(update={"slots": slots}) if server is publishing else server
-        for server in plan.servers
-    ]
+    servers = with_slots(plan.servers, {} if publishing is None else {publishing.name: slots})
     return revised(plan, servers=below_executors(servers), predicted=predicted)
 
 

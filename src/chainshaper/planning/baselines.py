@@ -18,6 +18,7 @@ from chainshaper.planning.plan import (
     output_server,
     publish_slots,
     revised,
+    with_slots,
     wrong_values_refused,
 )
 from chainshaper.planning.shaping import OUTPUT_PRIORITY, shaping_node_like
@@ -126,14 +127,12 @@ def let_per_chain(plan: Plan) -> Plan:
             " own cycle: use a shorter slot"
         )
     publishing = output_server(plan)
-    servers = tuple(
-        server.model_copy(
-            update={"slots": ((0, length),) if server is publishing else ((0, plan.cycle_ns),)}
-        )
-        for server in plan.servers
-    )
+    ends = {s.name: length if s is publishing else plan.cycle_ns for s in plan.servers}
     return revised(
-        plan, policy="let-per-chain", servers=servers, predicted=_after_periods(plan, 1, length)
+        plan,
+        policy="let-per-chain",
+        servers=with_slots(plan.servers, {name: ((0, end),) for name, end in ends.items()}),
+        predicted=_after_periods(plan, 1, length),
     )
 
 
@@ -207,11 +206,8 @@ def _let_per_thread(plan: Plan, threads: list[Thread]) -> Plan:
         )
         for number, thread in enumerate(reversed(threads))
     ]
-    chain = [
-        server.model_copy(update={"slots": ((0, plan.cycle_ns),)})
-        for server in plan.servers
-        if server is not publishing
-    ]
+    others = [server for server in plan.servers if server is not publishing]
+    chain = with_slots(others, {server.name: ((0, plan.cycle_ns),) for server in others})
     return revised(
         plan,
         policy="let-per-callback",

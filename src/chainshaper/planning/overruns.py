@@ -29,6 +29,8 @@ from chainshaper.planning.plan import (
     publishing_servers,
     revised,
     server_of,
+    until,
+    with_slots,
 )
 from chainshaper.values.durations import format_duration, milliseconds
 from chainshaper.values.errors import InputError
@@ -103,16 +105,13 @@ def open_until_done(plan: Plan) -> Plan:
         return plan
     publishers = [server for _, server, _ in publisher_servers(plan)]
     publishing, (last_start, _) = publishing_servers(plan), publish_slots(plan)[-1]
-    servers = [
-        server.model_copy(
-            update={"slots": (*server.slots[:-1], (server.slots[-1][0], plan.cycle_ns))}
-        )
-        if server in publishers or (server not in publishing and server.slots[-1][1] >= last_start)
-        else server
+    longer = {
+        server.name: until(server, plan.cycle_ns)
         for server in plan.servers
-    ]
+        if server in publishers or (server not in publishing and server.slots[-1][1] >= last_start)
+    }
     try:
-        return revised(plan, servers=below_executors(servers))
+        return revised(plan, servers=below_executors(with_slots(plan.servers, longer)))
     except InputError:  # another server has a slot there
         return plan
 
@@ -216,54 +215,57 @@ def publication_warnings(plan: Plan) -> list[str]:
 
 def plan_warnings(plan: Plan) -> list[str]:
     """What a person must know before relying on a plan; one sentence each, none if all is well."""
-    evidence, cycle = plan.evidence, plan.cycle_ns
-    warnings = _about_late_outputs(plan)
-    if evidence.realtime is False:
-        warnings.append(
+    evidence, cycle, margin = plan.evidence, plan.cycle_ns, plan.margin
+    longest, used = evidence.max_latency_ns, evidence.utilisation or 0.0
+    last = max((end for _, end in publish_slots(plan)), default=longest)
+    low, high = map(format_duration, margin.confidence_interval_ns or (0, 0))
+    doubts = [
+        (
+            evidence.realtime is False,
             "the latencies were taken without real-time scheduling: other programs are in them,"
             " and the chain's slot is longer than it needs to be. Record again with the privilege"
-            " to use SCHED_FIFO."
-        )
-    if evidence.lost_events:
-        warnings.append(
+            " to use SCHED_FIFO.",
+        ),
+        (
+            evidence.lost_events,
             f"{evidence.lost_events} events were lost while recording: cycles are missing, and the"
-            " longest latency may be among them. Record again, see the recording's notes."
-        )
-    if evidence.incomplete:
-        warnings.append(
+            " longest latency may be among them. Record again, see the recording's notes.",
+        ),
+        (
+            evidence.incomplete,
             f"{evidence.incomplete} executions of the chain have no end in the recording; their"
-            " latencies, which may be the longest, are not in the plan."
-        )
-    if plan.margin.confidence_interval_ns is not None:
-        low, high = map(format_duration, plan.margin.confidence_interval_ns)
-        warnings.append(
-            f"the margin {format_duration(plan.margin.epsilon_ns)} is an estimate; with 95 %"
-            f" confidence it lies between {low} and {high}."
-        )
-    last = max((end for _, end in publish_slots(plan)), default=evidence.max_latency_ns)
-    if NEARLY_FULL * cycle < last <= cycle:
-        warnings.append(
+            " latencies, which may be the longest, are not in the plan.",
+        ),
+        (
+            margin.confidence_interval_ns,
+            f"the margin {format_duration(margin.epsilon_ns)} is an estimate; with 95 % confidence"
+            f" it lies between {low} and {high}.",
+        ),
+        (
+            NEARLY_FULL * cycle < last <= cycle,
             f"the plan fills {last / cycle:.1%} of the cycle {format_duration(cycle)}: an"
-            " execution a little longer than any measured delays the next one."
-        )
-    if evidence.max_latency_ns >= cycle:
-        warnings.append(
-            f"the longest latency {format_duration(evidence.max_latency_ns)} is not shorter than"
-            f" the cycle {format_duration(cycle)}: executions of the chain overlapped while they"
-            " were measured, and response times have each other's interference in them."
-        )
-    elif evidence.max_latency_ns > NEARLY_FULL * cycle:
-        warnings.append(
+            " execution a little longer than any measured delays the next one.",
+        ),
+        (
+            longest >= cycle,
+            f"the longest latency {format_duration(longest)} is not shorter than the cycle"
+            f" {format_duration(cycle)}: executions of the chain overlapped while they were"
+            " measured, and response times have each other's interference in them.",
+        ),
+        (
+            NEARLY_FULL * cycle < longest < cycle,
             "a cycle as long as the longest measured keeps its core busy for more than"
             f" {NEARLY_FULL:.0%}, where the kernel throttles real-time threads"
-            " (/proc/sys/kernel/sched_rt_runtime_us)."
-        )
-    if evidence.utilisation is not None and evidence.utilisation > NEARLY_FULL:
-        warnings.append(
-            f"the chain's execution takes {evidence.utilisation:.1%} of its core: latencies"
-            " will pile up from cycle to cycle, whatever the slots."
-        )
-    return [*warnings, *publication_warnings(plan)]
+            " (/proc/sys/kernel/sched_rt_runtime_us).",
+        ),
+        (
+            used > NEARLY_FULL,
+            f"the chain's execution takes {used:.1%} of its core: latencies will pile up from"
+            " cycle to cycle, whatever the slots.",
+        ),
+    ]
+    found = [sentence for doubtful, sentence in doubts if doubtful]
+    return [*_about_late_outputs(plan), *found, *publication_warnings(plan)]
 
 
 def _about_late_outputs(plan: Plan) -> list[str]:

@@ -22,9 +22,9 @@ locks with the rest of its process. With Fast DDS 2.14, three things turned out 
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import combinations, pairwise
+from itertools import combinations, pairwise, product
 from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
@@ -153,22 +153,15 @@ class Server(Part):
 
     @model_validator(mode="after")
     def _slots_ascend(self) -> "Server":
-        for number, (start, end) in enumerate(self.slots):
-            if end <= start:
-                raise wrong_value(
-                    f"the slot {slot_text((start, end))} is empty: its end must come after its"
-                    " start",
-                    "slots",
-                    number,
+        for number, slot in enumerate(self.slots):
+            reason = "" if slot[0] < slot[1] else "is empty: its end must come after its start"
+            if number and slot[0] < (before := self.slots[number - 1])[1]:
+                reason = reason or (
+                    f"begins before {slot_text(before)} ends: write a server's slots in ascending"
+                    " order, without overlap"
                 )
-        for number, (before, after) in enumerate(pairwise(self.slots), start=1):
-            if after[0] < before[1]:
-                raise wrong_value(
-                    f"the slot {slot_text(after)} begins before {slot_text(before)} ends: write"
-                    " a server's slots in ascending order, without overlap",
-                    "slots",
-                    number,
-                )
+            if reason:
+                raise wrong_value(f"the slot {slot_text(slot)} {reason}", "slots", number)
         return self
 
 
@@ -361,6 +354,21 @@ def publishing_servers(plan: Plan) -> tuple[Server, ...]:
     )
 
 
+def with_slots(
+    servers: Iterable[Server], slots: Mapping[str, Sequence[Slot]]
+) -> tuple[Server, ...]:
+    """The servers, of which those of these names have other slots."""
+    return tuple(
+        server.model_copy(update={"slots": tuple(slots.get(server.name, server.slots))})
+        for server in servers
+    )
+
+
+def until(server: Server, end_ns: int) -> tuple[Slot, ...]:
+    """A server's slots, of which the last ends at another instant."""
+    return (*server.slots[:-1], (server.slots[-1][0], end_ns))
+
+
 def revised(plan: Plan, **changes: object) -> Plan:
     """A copy of a plan with some fields replaced, checked like any other plan.
 
@@ -411,24 +419,23 @@ def _check_servers(plan: Plan) -> None:
     names: set[str] = set()
     homes: dict[Thread, str] = {}
     for number, server in enumerate(plan.servers):
+        where = ("servers", number)
         if server.name in names:
-            raise wrong_value(
-                f"two servers are named {server.name!r}: rename one", "servers", number, "name"
-            )
+            raise wrong_value(f"two servers are named {server.name!r}: rename one", *where, "name")
         names.add(server.name)
         for slot_number, slot in enumerate(server.slots):
             if slot[1] > plan.cycle_ns:
                 raise wrong_value(
                     f"the slot {slot_text(slot)} ends after the cycle"
                     f" {format_duration(plan.cycle_ns)}: move it, or split it in two slots",
-                    *("servers", number, "slots", slot_number),
+                    *(*where, "slots", slot_number),
                 )
         for thread_number, thread in enumerate(server.threads):
             if thread in homes:
                 raise wrong_value(
                     f"the {thread.role} of {thread.node} is already in server {homes[thread]!r}:"
                     " a thread belongs to one server, remove it from the other",
-                    *("servers", number, "threads", thread_number),
+                    *(*where, "threads", thread_number),
                 )
             homes[thread] = server.name
 
@@ -438,19 +445,19 @@ def _check_overlaps(plan: Plan) -> None:
     for (_, one), (number, two) in combinations(enumerate(plan.servers), 2):
         if (one.core, one.priority) != (two.core, two.priority):
             continue
-        for slot_number, slot in enumerate(two.slots):
-            for other in one.slots:
-                if slot[0] < other[1] and other[0] < slot[1]:
-                    raise wrong_value(
-                        f"the slot {slot_text(slot)} overlaps {slot_text(other)} of server"
-                        f" {one.name!r} on core {one.core} at the same priority {one.priority}:"
-                        " move one of them, or give one server another priority",
-                        *("servers", number, "slots", slot_number),
-                    )
+        for (slot_number, slot), other in product(enumerate(two.slots), one.slots):
+            if slot[0] < other[1] and other[0] < slot[1]:
+                raise wrong_value(
+                    f"the slot {slot_text(slot)} overlaps {slot_text(other)} of server"
+                    f" {one.name!r} on core {one.core} at the same priority {one.priority}:"
+                    " move one of them, or give one server another priority",
+                    *("servers", number, "slots", slot_number),
+                )
 
 
 def _check_shaping_node(plan: Plan, node: ShapingNode, where: tuple[Any, ...]) -> None:
     others = [other for place, other in _placed_nodes(plan) if place != where]
+    server = server_of(plan, node.thread)
     if any(node.name == other.name or node.output == other.output for other in others):
         raise wrong_value(
             f"another shaping node has the name {node.name} or the output {node.output} too:"
@@ -461,23 +468,19 @@ def _check_shaping_node(plan: Plan, node: ShapingNode, where: tuple[Any, ...]) -
         raise wrong_value(
             f"publishes {node.output}, but the chain's output is {plan.chain.output}: make them"
             " the same",
-            *where,
-            "output",
+            *(*where, "output"),
         )
-    server = server_of(plan, node.thread)
     if server is None:
         raise wrong_value(
             f"no server holds the shaping node's thread: add {{node: {node.thread.node}}} to the"
             " threads of the server whose slots it publishes in",
-            *where,
-            "name",
+            *(*where, "name"),
         )
     if server.core != node.core:
         raise wrong_value(
             f"core {node.core}, but its server {server.name!r} is on core {server.core}: make them"
             " the same",
-            *where,
-            "core",
+            *(*where, "core"),
         )
 
 

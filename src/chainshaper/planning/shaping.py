@@ -31,6 +31,8 @@ from chainshaper.planning.plan import (
     publish_slots,
     publishing_servers,
     revised,
+    until,
+    with_slots,
     wrong_values_refused,
 )
 from chainshaper.values.durations import format_duration
@@ -348,9 +350,5 @@ def _open_until(plan: Plan, end: int) -> tuple[Server, ...]:
     publishing = publishing_servers(plan)
     running = [server for server in plan.servers if server not in publishing]
     latest = max((server.slots[-1][1] for server in running), default=end)
-    return tuple(
-        server.model_copy(update={"slots": (*server.slots[:-1], (server.slots[-1][0], end))})
-        if server in running and server.slots[-1][1] == latest < end
-        else server
-        for server in plan.servers
-    )
+    longer = [server for server in running if server.slots[-1][1] == latest < end]
+    return with_slots(plan.servers, {server.name: until(server, end) for server in longer})
