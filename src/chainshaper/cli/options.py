@@ -211,7 +211,7 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
             raise InputError(f"--late {late} goes with modes: add --modes, or leave it out")
         return None
     from chainshaper.planning import Modes
-    from chainshaper.planning.plan import wrong_values_refused
+    from chainshaper.values.yaml_file import wrong_values_refused
 
     topic, _, listed = text.partition(":")
     pairs = [pair.partition("=") for pair in listed.split(",")]

@@ -133,8 +133,8 @@ def _throttled(inputs: list[str], launched: _Launched) -> "Splicing":
 def _input(text: str) -> "ThrottledInput":
     """One input to be throttled, as it is written: ``/fusion:/points_raw=100ms``."""
     from chainshaper.flow.launch_splicing import ThrottledInput
-    from chainshaper.planning.plan import wrong_values_refused
     from chainshaper.values.durations import parse_duration
+    from chainshaper.values.yaml_file import wrong_values_refused
 
     where, equals, period = text.rpartition("=")
     if not equals:

@@ -19,11 +19,11 @@ from chainshaper.planning.plan import (
     publish_slots,
     revised,
     with_slots,
-    wrong_values_refused,
 )
 from chainshaper.planning.shaping import OUTPUT_PRIORITY, shaping_node_like
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.yaml_file import wrong_values_refused
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def server_per_callback(
             " margin (--epsilon), or move callbacks to another core"
         )
     last, (start, _) = callbacks[-1], slots[-1]
-    with wrong_values_refused():
+    with wrong_values_refused(Plan):
         return revised(
             plan,
             policy="server-per-callback",
@@ -154,7 +154,7 @@ def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str
             "LET per callback needs a plan with a shaping node and all topics of the chain, its"
             " output last"
         )
-    with wrong_values_refused():
+    with wrong_values_refused(Plan):
         inside = tuple(
             shaping_node_like(last, topic, publisher)
             for topic, publisher in zip_longest(topics[:-1], publishers[: len(topics) - 1])
@@ -179,7 +179,7 @@ def let_per_callback_asynchronous(plan: Plan, publishers: Sequence[str]) -> Plan
             "asynchronous LET per callback needs a plan for asynchronous publication and the"
             " nodes of the chain, the one that publishes its output last"
         )
-    with wrong_values_refused():
+    with wrong_values_refused(Plan):
         threads = [Thread(node=name, role="publisher") for name in publishers]
         return _let_per_thread(plan, threads)
 

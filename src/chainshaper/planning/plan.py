@@ -23,24 +23,21 @@ locks with the rest of its process. With Fast DDS 2.14, three things turned out 
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from itertools import combinations, pairwise, product
 from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 
-from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from chainshaper.gate.decision import Anchor, Late, Messages, Overrun
 from chainshaper.values.durations import format_duration
-from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Fallback, Policy
 from chainshaper.values.yaml_file import (
     Duration,
     FullName,
     Part,
     PositiveDuration,
-    explanations,
-    key_text,
     wrong_value,
+    wrong_values_refused,
 )
 
 SHORTEST_SLOT_NS = 1_000_000
@@ -376,19 +373,8 @@ def revised(plan: Plan, **changes: object) -> Plan:
         InputError: the fields make no plan together.
     """
     values = {name: getattr(plan, name) for name in Plan.model_fields}
-    with wrong_values_refused():
+    with wrong_values_refused(Plan):
         return Plan.model_validate({**values, **changes})
-
-
-@contextmanager
-def wrong_values_refused(model: type[Part] | None = None) -> Iterator[None]:
-    """Inside, a value that no plan, or part of one (``model``), may have ends in an InputError."""
-    try:
-        yield
-    except ValidationError as error:
-        found = explanations(error, model or Plan)
-        problems = [f"{key_text(where)}: {reason}" for where, reason in found]
-        raise InputError("; ".join(problems)) from error
 
 
 def _placed_nodes(plan: Plan) -> Iterator[tuple[tuple[str | int, ...], ShapingNode]]:

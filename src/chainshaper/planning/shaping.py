@@ -33,11 +33,11 @@ from chainshaper.planning.plan import (
     revised,
     until,
     with_slots,
-    wrong_values_refused,
 )
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import Wishes
+from chainshaper.values.yaml_file import wrong_values_refused
 
 OUTPUT_PRIORITY = 1  # better than the chain's: a publish slot inside its slot has to pre-empt it
 CHAIN_PRIORITY = 2
@@ -99,7 +99,7 @@ def plan_shaping(
     slot_end = chain_end + wishes.publish_slot_ns
     _refuse_too_long(int(latencies.max()), epsilon, wishes.publish_slot_ns, period_ns)
     output_core = core if output_core is None else output_core
-    with wrong_values_refused():
+    with wrong_values_refused(Plan):
         chain = ChainOfPlan(period_ns=period_ns, **of_chain)
         node, gated = _gate(chain, wishes, output_core, fifo_priority, receivers)
         return Plan(
@@ -218,7 +218,7 @@ def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
     if missing:
         raise InputError(f"no core is named for {', '.join(missing)}: name one for each node")
     cores = sorted(set(core_of.values()))
-    with wrong_values_refused():
+    with wrong_values_refused(Plan):
         split = [
             Server(
                 name=f"{chain.name}_core{core}" if len(cores) > 1 else chain.name,
@@ -308,7 +308,7 @@ def with_sink(
             f" the cycle of {format_duration(plan.cycle_ns)}: plan with a longer period, a"
             " shorter slot, or another core for one of the outputs"
         )
-    with wrong_values_refused():
+    with wrong_values_refused(Plan):
         added, thread = _gate_like(node, output, publisher, receivers)
         server = Server(
             name=f"output_{thread.node.strip('/')}",

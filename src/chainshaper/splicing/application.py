@@ -9,8 +9,6 @@ added: the application is held against what the plan takes it for, and its outpu
 lifespan by which DDS discards what overran.
 """
 
-from pydantic import ValidationError
-
 from chainshaper.planning.overruns import (
     Writer,
     check_publication,
@@ -19,7 +17,7 @@ from chainshaper.planning.overruns import (
 )
 from chainshaper.planning.plan import Modes, Plan, ShapingNode, publisher_servers, server_of
 from chainshaper.values.errors import InputError
-from chainshaper.values.yaml_file import explanations, key_text
+from chainshaper.values.yaml_file import wrong_values_refused
 from chainshaper.workload.description import (
     Application,
     CallbackDescription,
@@ -126,7 +124,7 @@ def _with_lifespan(
 
 def _described(plan: Plan, shaping: ShapingNode, depth: int) -> NodeDescription:
     server = server_of(plan, shaping.thread)  # a plan without one for a shaping node is refused
-    try:
+    with wrong_values_refused(NodeDescription, "the plan's shaping node cannot be run: "):
         return NodeDescription(
             core=shaping.core,
             priority=shaping.fifo_priority,
@@ -151,11 +149,6 @@ def _described(plan: Plan, shaping: ShapingNode, depth: int) -> NodeDescription:
                 ),
             ),
         )
-    except ValidationError as error:
-        problems = [
-            f"{key_text(where)}: {reason}" for where, reason in explanations(error, NodeDescription)
-        ]
-        raise InputError(f"the plan's shaping node cannot be run: {'; '.join(problems)}") from error
 
 
 def _described_modes(modes: Modes | None) -> ModesDescription | None:

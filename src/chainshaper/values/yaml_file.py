@@ -7,6 +7,8 @@ the two are put together.
 
 import difflib
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -42,6 +44,7 @@ __all__ = [
     "read_text",
     "scalar",
     "wrong_value",
+    "wrong_values_refused",
 ]
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -323,6 +326,19 @@ def key_text(where: _Path) -> str:
     """``servers[1].slots[0]``"""
     text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in where)
     return text.removeprefix(".") or "the file"
+
+
+@contextmanager
+def wrong_values_refused(model: type[BaseModel], what: str = "") -> Iterator[None]:
+    """Inside, values that a model may not have end in one InputError that names each of them.
+
+    ``what`` stands before them, and says what they are of.
+    """
+    try:
+        yield
+    except ValidationError as error:
+        found = [f"{key_text(where)}: {reason}" for where, reason in explanations(error, model)]
+        raise InputError(what + "; ".join(found)) from error
 
 
 def explanations(error: ValidationError, model: type[BaseModel]) -> list[tuple[_Path, str]]:
