@@ -35,7 +35,7 @@ from chainshaper.planning.overruns import (
     publication_warnings,
     refuse_offset,
 )
-from chainshaper.planning.plan import messages_held, output_server, publisher_servers, revised
+from chainshaper.planning.plan import messages_waiting, output_server, publisher_servers, revised
 from chainshaper.values.errors import InputError
 
 MS = 1_000_000
@@ -125,18 +125,18 @@ def test_logical_execution_time_goes_with_asynchronous_publication() -> None:
         (((0, 100),), 1),  # never closed, but the model knows no less than one
     ],
 )
-def test_messages_held_in_one_stretch(slots: tuple[tuple[int, int], ...], held: int) -> None:
+def test_messages_waiting_in_one_stretch(slots: tuple[tuple[int, int], ...], held: int) -> None:
     plan = asynchronous()
     (_, server, _), *_ = publisher_servers(plan)
     in_ns = tuple((start * MS, end * MS) for start, end in slots)
-    assert messages_held(plan, server.model_copy(update={"slots": in_ns})) == held
+    assert messages_waiting(plan, server.model_copy(update={"slots": in_ns})) == held
 
 
 def test_a_history_that_is_too_shallow_is_refused() -> None:
     plan = asynchronous(output_depth=3)
     # One slot in three cycles: closed for 299 ms, so three messages may come in one stretch.
     (_, server, _), *_ = publisher_servers(revised(plan, cycle_ns=300 * MS))
-    assert messages_held(revised(plan, cycle_ns=300 * MS), server) == 3
+    assert messages_waiting(revised(plan, cycle_ns=300 * MS), server) == 3
     shallow = plan.chain.model_copy(update={"output_depth": 2})
     with pytest.raises(InputError, match=r"history of 2 is too shallow.*3 messages.*depth of 4"):
         revised(plan, cycle_ns=300 * MS, chain=shallow)

@@ -432,9 +432,8 @@ def _shape_launched(command: list[str], folder: Path, json: bool, **how: Any) ->
     if json:
         print_json(comparison_json(shaped.comparison) | {"folder": str(shaped.folder)})
         return
-    held = [one.held for one in shaped.comparison.measurements]
-    tables = [prediction_table(one) for one in held if one is not None]
-    show(comparison_table(shaped.comparison), *tables)
+    predictions = [one.held for one in shaped.comparison.measurements if one.held is not None]
+    show(comparison_table(shaped.comparison), *map(prediction_table, predictions))
     notes(shaped.notes)
     show_line(str(shaped.folder))
 

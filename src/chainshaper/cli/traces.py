@@ -210,7 +210,7 @@ def compare(
 ) -> None:
     """Show the same chain in several recordings side by side, usually before and after shaping.
 
-    Where a plan was in force, its prediction is held against the measurement, band by band.
+    Where a plan was in force, its prediction stands beside the measurement, band by band.
     """
     from chainshaper.flow.steps import compare_recordings
     from chainshaper.reporting.predictions import prediction_table
@@ -224,8 +224,8 @@ def compare(
     if json:
         print_json(comparison_json(comparison))
         return
-    held = [measurement.held for measurement in comparison.measurements]
-    show(comparison_table(comparison), *(prediction_table(one) for one in held if one is not None))
+    predictions = [one.held for one in comparison.measurements if one.held is not None]
+    show(comparison_table(comparison), *map(prediction_table, predictions))
 
 
 def report(

@@ -22,7 +22,7 @@ from chainshaper.planning.plan import (
     ShapingNode,
     Thread,
     below_executors,
-    messages_held,
+    messages_waiting,
     output_server,
     publish_slots,
     publisher_servers,
@@ -142,7 +142,7 @@ def check_publication(plan: Plan, writers: Sequence[Writer]) -> list[str]:
         for node in nodes:
             own = [writer for writer in writers if writer.node == node]
             if node == plan.chain.publisher and plan.chain.output is not None:
-                _check_output(plan.chain.output, node, own, messages_held(plan, server))
+                _check_output(plan.chain.output, node, own, messages_waiting(plan, server))
             delayed = sorted(
                 writer.topic
                 for writer in own
@@ -157,7 +157,7 @@ def check_publication(plan: Plan, writers: Sequence[Writer]) -> list[str]:
     return warnings
 
 
-def _check_output(topic: str, node: str, own: Sequence[Writer], held: int) -> None:
+def _check_output(topic: str, node: str, own: Sequence[Writer], waiting: int) -> None:
     writer = next((writer for writer in own if writer.topic == topic), None)
     if writer is None:
         raise InputError(
@@ -169,10 +169,10 @@ def _check_output(topic: str, node: str, own: Sequence[Writer], held: int) -> No
             f"{node} publishes {topic} synchronously, so gating its publisher thread would hold"
             " nothing: publish it asynchronously, or plan with --publication synchronous"
         )
-    if writer.depth is not None and writer.depth < held:
+    if writer.depth is not None and writer.depth < waiting:
         raise InputError(
-            f"{topic} has a history of {writer.depth}, but {held} messages are handed over while"
-            f" the publisher thread of {node} may not run: give it a depth of {held + 1}"
+            f"{topic} has a history of {writer.depth}, but {waiting} messages are handed over while"
+            f" the publisher thread of {node} may not run: give it a depth of {waiting + 1}"
         )
 
 
@@ -195,8 +195,8 @@ def publication_warnings(plan: Plan) -> list[str]:
                 " when it opens."
             )
         depth = plan.chain.output_depth
-        held = messages_held(plan, server)
-        if depth == held and plan.overrun == "wait" and plan.chain.publisher in nodes:
+        waiting = messages_waiting(plan, server)
+        if depth == waiting and plan.overrun == "wait" and plan.chain.publisher in nodes:
             warnings.append(
                 f"a history of {depth} has no room for an output that overran: it will be"
                 " overwritten by the next. A depth of one more would keep it."

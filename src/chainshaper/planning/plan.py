@@ -510,12 +510,12 @@ def _check_publisher_threads(plan: Plan) -> None:
             )
         depth = plan.chain.output_depth
         if depth is not None and plan.chain.publisher in nodes:
-            held = messages_held(plan, server)
-            if depth < held:
+            waiting = messages_waiting(plan, server)
+            if depth < waiting:
                 raise wrong_value(
                     f"a history of {depth} is too shallow: while the publisher's thread may not"
-                    f" run, {held} messages are handed over, and the oldest would be lost; give"
-                    f" {plan.chain.output or 'the output'} a depth of {held + 1}, or the server"
+                    f" run, {waiting} messages are handed over, and the oldest would be lost; give"
+                    f" {plan.chain.output or 'the output'} a depth of {waiting + 1}, or the server"
                     f" {server.name!r} more slots",
                     *("chain", "output_depth"),
                 )
@@ -547,7 +547,7 @@ def publisher_servers(plan: Plan) -> Iterator[tuple[int, Server, list[str]]]:
             yield number, server, nodes
 
 
-def messages_held(plan: Plan, server: Server) -> int:
+def messages_waiting(plan: Plan, server: Server) -> int:
     """How many messages may be handed over while a server is closed, in one stretch.
 
     One per period of the chain, and one more for where the stretch begins.
