@@ -16,8 +16,13 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.planning.bands import BandProblem, Placement, band_problem, place_bands
-from chainshaper.planning.swarm import place_by_swarm
+from chainshaper.planning.bands import (
+    BandProblem,
+    Placement,
+    band_problem,
+    place_bands,
+    place_by_swarm,
+)
 from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000

@@ -24,7 +24,9 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from chainshaper import load_application, simulate, simulate_latencies
+from chainshaper import simulate
+from chainshaper.simulation.simulating import simulate_latencies
+from chainshaper.workload.description import load_application
 
 os.environ.setdefault("POLARS_MAX_THREADS", "1")
 

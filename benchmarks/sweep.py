@@ -13,7 +13,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from chainshaper import load_application, sweep
+from chainshaper import sweep
+from chainshaper.workload.description import load_application
 
 EXAMPLE = Path(__file__).parents[1] / "examples/synthetic_chain.yaml"
 GRIDS: Mapping[str, Mapping[str, Sequence[Any]]] = {

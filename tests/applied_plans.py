@@ -18,7 +18,7 @@ from chainshaper.linux.processes import descendants
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import list_threads, parents, start_of
 from chainshaper.planning import Plan, save_plan
-from chainshaper.planning.plan_parts import (
+from chainshaper.planning.plan import (
     ChainOfPlan,
     Evidence,
     Margin,

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from small_chain import PERIOD_NS
 
-from chainshaper import measure_latency
+from chainshaper.flow.steps import measure_latency
 from chainshaper.values.recording import Recording
 
 __all__ = ["calm_run"]

@@ -293,10 +293,7 @@ def test_memory_that_runs_out_is_one_message(fails: Callable[[], object], said: 
 
 
 def test_other_mistakes_of_ours_stay_tracebacks() -> None:
-    with (
-        mock.patch("chainshaper.cli.app.app", side_effect=KeyError("x")),
-        pytest.raises(KeyError),
-    ):
+    with mock.patch("chainshaper.cli.app.app", side_effect=KeyError("x")), pytest.raises(KeyError):
         called("info")
 
 

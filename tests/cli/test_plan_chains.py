@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from command_line import called, json_of, refused
 
-from chainshaper import load_plan, plan_shaping, save_plan
-from chainshaper.planning import Modes
+from chainshaper.planning import Modes, Plan
+from chainshaper.planning.plan import revised
+from chainshaper.planning.plan_file import load_plan, save_plan
+from chainshaper.planning.shaping import plan_shaping
 from chainshaper.values.recording import Recording
 
 MS = 1_000_000
@@ -58,6 +60,21 @@ def test_chains_take_turns_where_they_can(tmp_path: Path) -> None:
     assert load_plan(tmp_path / "placed" / "2_b.yaml").offset_ns == 41 * MS
     again = refused(2, "offsets", *files, "-o", tmp_path / "placed")
     assert "exists already and is not overwritten" in again
+
+
+def test_an_offset_is_refused_where_the_chains_timer_starts_its_cycles(
+    application_file: Path, plan: Plan
+) -> None:
+    file, output = application_file.with_name("plan.yaml"), application_file.with_name("rec")
+    save_plan(revised(plan, offset_ns=7 * MS), file)
+    for words in (
+        ("apply", file, "--dry-run"),
+        ("apply", file),
+        ("shape", application_file, file, "-o", output),
+    ):
+        assert "offset: 7ms cannot be carried out here" in refused(2, *words)
+    assert not output.exists()
+    assert called("simulate", application_file, file, "-o", output, "--cycles", "3").code == 0
 
 
 def test_chains_that_overlap_keep_their_publish_slots_apart(tmp_path: Path) -> None:

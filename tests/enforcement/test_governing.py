@@ -13,7 +13,6 @@ from applied_plans import needs_fifo
 from gated import needs_cgroups
 from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain_text
 
-from chainshaper import measure_latency, open_recording, save_plan
 from chainshaper.enforcement.runs.governing import Governed, governing, in_force_throughout
 from chainshaper.enforcement.runs.journal import Journal, open_journal
 from chainshaper.enforcement.runs.state import (
@@ -24,7 +23,10 @@ from chainshaper.enforcement.runs.state import (
 )
 from chainshaper.enforcement.runs.undoing import remove_run
 from chainshaper.enforcement.servers import ServerCounters
+from chainshaper.flow.steps import measure_latency
 from chainshaper.planning import Plan, plan_shaping
+from chainshaper.planning.plan_file import save_plan
+from chainshaper.values.recording import open_recording
 
 MS = 1_000_000
 

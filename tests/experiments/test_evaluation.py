@@ -11,8 +11,12 @@ import table_5
 from configurations import Options, simulated
 from results import MS, Run
 
-from chainshaper import load_application
-from chainshaper.workload.description import Application, ExecutionTime, SimulationDescription
+from chainshaper.workload.description import (
+    Application,
+    ExecutionTime,
+    SimulationDescription,
+    load_application,
+)
 
 NOTHING = ExecutionTime(constant_ns=0)
 

@@ -1,9 +1,11 @@
-"""Exact band placement, proven against trying out every placement."""
+"""Band placement: exact, proven against trying out every placement; by swarm; on a whole plan."""
 
 import itertools
 import math
 import random
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,17 +13,27 @@ import pytest
 
 from chainshaper.planning.bands import (
     BandProblem,
+    Placement,
     band_problem,
     broken_constraint,
+    choose_bands,
+    counts_and_mean,
     enough_bands,
-    mean_of,
     place_bands,
+    place_by_swarm,
+    place_randomly,
     placement_curve,
+    with_bands,
+    with_long_slot,
 )
+from chainshaper.planning.baselines import server_per_chain
+from chainshaper.planning.plan import Plan, publish_slots
+from chainshaper.planning.shaping import plan_shaping
 from chainshaper.values.errors import InputError, OperationError
-from chainshaper.values.plan_choices import Goal
+from chainshaper.values.plan_choices import Goal, Solver
 
 MS = 1_000_000
+LATENCIES = (np.random.default_rng(3).triangular(33, 68, 85, 2000) * MS).astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -104,7 +116,7 @@ def test_the_optimum_is_that_of_trying_everything(seed: int) -> None:
         assert placement.mean_ns == least / size
         assert placement.slot_ends_ns in {one.ends for one in tried}
         assert broken_constraint(problem, placement.slot_ends_ns) is None
-        assert mean_of(problem, placement.slot_ends_ns) == placement.mean_ns
+        assert counts_and_mean(problem.latencies_ns, placement.slot_ends_ns)[1] == placement.mean_ns
         best_jitter = min(one.jitter for one in tried if one.total == least)
         found = next(one for one in tried if one.ends == placement.slot_ends_ns)
         assert found.jitter == best_jitter
@@ -247,3 +259,154 @@ def test_bands_are_enough_when_another_gains_little() -> None:
     assert all(gain >= 0.02 for gain in gains[: bands - 1])
     assert gains[bands - 1] < 0.02
     assert enough_bands(curve, least_gain=0) == curve[-1]
+
+
+def _plan() -> Plan:
+    return plan_shaping(LATENCIES, 100 * MS, output="/t5", publisher="/n5", nodes=["/n5"])
+
+
+def test_bands_replace_the_publish_slot_and_nothing_else() -> None:
+    plan = _plan()
+    banded = with_bands(plan, LATENCIES, 3)
+    assert len(publish_slots(banded)) == 3
+    assert publish_slots(banded)[-1] == publish_slots(plan)[-1]
+    assert banded.servers[0] == plan.servers[0]
+    assert banded.predicted.max_ns == plan.predicted.max_ns
+    assert banded.predicted.mean_ns < plan.predicted.mean_ns
+    assert sum(banded.predicted.shares) == pytest.approx(1)
+    first, last = publish_slots(banded)[0], publish_slots(banded)[-1]
+    assert banded.predicted.jitter_ns == last[1] - first[0]
+    unchanged = {"servers", "predicted"}
+    assert banded.model_dump(exclude=unchanged) == plan.model_dump(exclude=unchanged)
+
+
+def test_solvers_agree_in_order() -> None:
+    if find_spec("pyswarms") is None:
+        pytest.skip("pyswarms is not installed")
+    solvers: list[Solver] = ["exact", "pso", "random"]
+    exact, swarm, drawn = (
+        with_bands(_plan(), LATENCIES, 4, solver=solver, seed=1).predicted.mean_ns
+        for solver in solvers
+    )
+    assert exact <= swarm <= drawn
+
+
+def test_auto_takes_a_number_of_bands_from_the_curve() -> None:
+    curve = choose_bands(_plan(), LATENCIES).curve
+    auto = with_bands(_plan(), LATENCIES, "auto")
+    bands = len(publish_slots(auto))
+    assert 2 <= bands <= 6
+    assert auto.predicted.mean_ns == round(curve[bands - 1].mean_ns)
+
+
+def test_goals_and_limits_reach_the_placement() -> None:
+    ends = [end for _, end in publish_slots(with_bands(_plan(), LATENCIES, 4, max_gap_ns=5 * MS))]
+    assert max(np.diff(ends)) <= 5 * MS
+    shared = with_bands(_plan(), LATENCIES, 4, max_share=0.3)
+    assert max(shared.predicted.shares) <= 0.3
+    least = with_bands(_plan(), LATENCIES, 3).predicted
+    calm = with_bands(
+        _plan(), LATENCIES, 3, minimise="jitter", mean_at_most_ns=least.mean_ns + 2 * MS
+    ).predicted
+    assert calm.jitter_ns < least.jitter_ns
+    assert calm.mean_ns <= least.mean_ns + 2 * MS
+    with pytest.raises(OperationError, match=r"30\.0% of the executions"):
+        with_bands(_plan(), LATENCIES, 3, max_share=0.3)
+    with pytest.raises(InputError, match="needs the exact solver"):
+        with_bands(_plan(), LATENCIES, 3, solver="pso", mean_at_most_ns=80 * MS)
+    with pytest.raises(InputError, match="only the exact solver"):
+        with_bands(_plan(), LATENCIES, "auto", solver="random")
+
+
+def test_one_long_slot_trades_jitter_for_the_average() -> None:
+    latencies = np.array([40, 61, 70, 85]) * MS
+    plan = plan_shaping(latencies, 100 * MS, output="/t5")
+    long = with_long_slot(plan, latencies, 62 * MS)
+    assert long.policy == "one-long-slot"
+    assert publish_slots(long) == ((62 * MS, 87 * MS),)
+    assert long.predicted.mean_ns == (62 + 62 + 70 + 85) * MS // 4
+    assert long.predicted.jitter_ns == 25 * MS  # as the paper's three bands, earlier on average
+    for start in (-1, 86 * MS + 1):
+        with pytest.raises(InputError, match="may start from 0ms to 86ms"):
+            with_long_slot(plan, latencies, start)
+
+
+def test_a_plan_without_publish_slot_has_no_bands() -> None:
+    bare = server_per_chain(_plan())
+    with pytest.raises(InputError, match="server-per-chain has no publish slot"):
+        with_bands(bare, LATENCIES, 2)
+    with pytest.raises(InputError, match="no publish slot"):
+        with_long_slot(bare, LATENCIES, 0)
+
+
+def _problem(seed: int, **limits: float) -> BandProblem:
+    latencies = np.random.default_rng(seed).normal(67 * MS, 9 * MS, 400)
+    latencies = latencies.clip(33 * MS, 85 * MS).astype(np.int64)
+    return band_problem(latencies, 87 * MS, **limits)  # type: ignore[arg-type]
+
+
+def _swarm(problem: BandProblem, bands: int, seed: int = 1) -> Placement:
+    if find_spec("pyswarms") is None:
+        pytest.skip("pyswarms is not installed")
+    return place_by_swarm(problem, bands, seed)
+
+
+def test_the_swarm_is_repeatable_and_leaves_no_traces(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.random.seed(5)
+    expected = np.random.random()
+    np.random.seed(5)
+    assert _swarm(_problem(1), 3) == _swarm(_problem(1), 3)
+    assert np.random.random() == expected
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_exact_placement_is_never_worse_than_the_swarm() -> None:
+    generator = random.Random(11)
+    infeasible = 0
+    for seed in range(25):
+        bands = generator.randint(2, 8)
+        max_gap = generator.choice([None, 20 * MS, 2 * MS])
+        problem = _problem(seed, max_gap_ns=max_gap)  # type: ignore[arg-type]
+        exact = place_bands(problem, bands)
+        try:
+            swarm = _swarm(problem, bands, seed)
+        except OperationError:
+            infeasible += 1
+            continue
+        assert broken_constraint(problem, swarm.slot_ends_ns) is None
+        assert exact.mean_ns <= swarm.mean_ns
+    assert infeasible < 25
+
+
+def test_random_placements_keep_the_constraints_and_reach_everywhere() -> None:
+    problem = band_problem(np.array([0, 10]), 12, publish_slot_ns=1, grid_ns=1)
+    seen = {place_randomly(problem, 3, seed).slot_ends_ns for seed in range(500)}
+    allowed = {
+        (first, second, 12)
+        for first in range(2, 11)
+        for second in range(first + 2, 11)
+        if first - 1 > 0
+    }
+    assert seen == allowed
+    assert place_randomly(_problem(1), 3, 8) == place_randomly(_problem(1), 3, 8)
+    tight = _problem(1, max_gap_ns=25 * MS)
+    assert broken_constraint(tight, place_randomly(tight, 3, 2).slot_ends_ns) is None
+
+
+def test_what_cannot_be_placed_is_said() -> None:
+    with pytest.raises(OperationError, match="last random draw ended"):
+        place_randomly(_problem(1, max_gap_ns=1_001_000), 3)
+    with pytest.raises(OperationError, match="grid of 20ms is too coarse"):
+        place_randomly(replace(_problem(1), grid_ns=20 * MS), 10)
+    with pytest.raises(OperationError, match="use the exact solver"):
+        _swarm(_problem(1), 40)
+    equal = band_problem(np.array([50, 50]) * MS, 51 * MS)
+    for place in (place_by_swarm, place_randomly):
+        with pytest.raises(InputError, match="room for 1 publish slots"):
+            place(equal, 2)
+        assert place(equal, 1).slot_ends_ns == (51 * MS,)
+        with pytest.raises(InputError, match="one band at least"):
+            place(equal, 0)

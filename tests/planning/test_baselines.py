@@ -13,16 +13,9 @@ from chainshaper.planning.baselines import (
     server_per_callback,
     server_per_chain,
 )
-from chainshaper.planning.graphs import over_cores, with_first_node_apart, with_sink
-from chainshaper.planning.plan import (
-    Plan,
-    Thread,
-    publish_slots,
-    publishing_servers,
-    server_of,
-)
+from chainshaper.planning.plan import Plan, Thread, publish_slots, publishing_servers, server_of
 from chainshaper.planning.plan_file import dump_plan
-from chainshaper.planning.shaping import plan_shaping
+from chainshaper.planning.shaping import over_cores, plan_shaping, with_first_node_apart, with_sink
 from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000

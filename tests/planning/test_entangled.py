@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper import measure_latency, simulate
-from chainshaper.flow.steps import plan_recording, profile_chains
+from chainshaper import simulate
+from chainshaper.flow.steps import measure_latency, plan_recording, profile_chains
 from chainshaper.planning import Plan, PlanRequest, place_chains, plan_chains, publish_slots
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording

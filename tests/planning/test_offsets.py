@@ -98,12 +98,7 @@ def test_offsets_are_found_exactly_when_there_are_any(
 
 def _chain(name: str, cycle_ms: int, latency_ms: int, core: int = 1, priority: int = 2) -> Plan:
     busy = latency_ms * MS
-    return _plan(
-        name,
-        cycle_ms * MS,
-        (core, priority, [(0, busy)]),
-        (0, 1, [(busy, busy + MS)]),
-    )
+    return _plan(name, cycle_ms * MS, (core, priority, [(0, busy)]), (0, 1, [(busy, busy + MS)]))
 
 
 def test_two_chains_take_turns_on_a_core() -> None:
@@ -223,10 +218,7 @@ def _shaped(name: str, cycle_ms: int, latency_ms: int) -> Plan:
 def _absolute(plan: Plan) -> list[tuple[str, tuple[int, int, int]]]:
     """Every slot of two hyper-periods of 200 ms: (place, start, end)."""
     return [
-        (
-            server.name,
-            (server.core, plan.offset_ns + cycle + start, plan.offset_ns + cycle + end),
-        )
+        (server.name, (server.core, plan.offset_ns + cycle + start, plan.offset_ns + cycle + end))
         for server in plan.servers
         for start, end in server.slots
         for cycle in range(-200 * MS, 400 * MS, plan.cycle_ns)

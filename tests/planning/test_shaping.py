@@ -78,10 +78,7 @@ def test_the_last_nanosecond_fits_and_the_next_does_not() -> None:
         _plan(period_ns=50 * MS)
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [{"epsilon_ns": -1}, {"publish_slot_ns": 0}, {"period_ns": 0}],
-)
+@pytest.mark.parametrize("wrong", [{"epsilon_ns": -1}, {"publish_slot_ns": 0}, {"period_ns": 0}])
 def test_impossible_durations_are_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(InputError, match="longer than 0ms"):
         _plan(**wrong)

@@ -14,7 +14,8 @@ from chromium import Page, opened
 from matplotlib import image
 from told_run import LATENCY_NS, told_run
 
-from chainshaper import measure_latency, write_report
+from chainshaper.flow.steps import measure_latency
+from chainshaper.reporting.html.page import write_report
 from chainshaper.values.durations import milliseconds
 
 CHARTS = ("over-time", "histogram", "cdf", "breakdown", "timeline", "slots-0")

@@ -12,18 +12,12 @@ from command_line import called, json_of, refused
 from small_chain import small_chain
 from told_run import LATENCY_NS, MS, PERIOD_NS, told_plan, told_run
 
-from chainshaper import (
-    compare_recordings,
-    hop_breakdown,
-    measure_latency,
-    plan_recording,
-    save_plan,
-    simulate,
-    write_report,
-)
-from chainshaper.flow.steps import Measurement
+from chainshaper import simulate
+from chainshaper.flow.steps import Measurement, compare_recordings, measure_latency, plan_recording
 from chainshaper.planning import publish_slots
-from chainshaper.reporting.html.page import distinct_names, report_page
+from chainshaper.planning.plan_file import save_plan
+from chainshaper.reporting.breakdown import hop_breakdown
+from chainshaper.reporting.html.page import distinct_names, report_page, write_report
 from chainshaper.values.durations import milliseconds
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording

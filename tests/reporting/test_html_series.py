@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from told_run import LATENCY_NS, MS, PERIOD_NS, told_run
 
-from chainshaper import data_flow, measure_latency
+from chainshaper.analysis.flow import data_flow
+from chainshaper.flow.steps import measure_latency
 from chainshaper.reporting.html import cycles as cycles_of_page
 from chainshaper.reporting.html.cycles import timeline_data
 from chainshaper.reporting.html.series import latency_histogram, latency_points

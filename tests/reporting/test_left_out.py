@@ -6,8 +6,8 @@ import pytest
 from command_line import called, json_of
 from told_run import LATENCY_NS, MS, PERIOD_NS, told_run
 
-from chainshaper import measure_latency, open_recording
-from chainshaper.values.recording import InForceInfo
+from chainshaper.flow.steps import measure_latency
+from chainshaper.values.recording import InForceInfo, open_recording
 
 
 @pytest.mark.parametrize(

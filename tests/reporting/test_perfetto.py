@@ -18,9 +18,11 @@ from hypothesis import strategies as st
 from reference_traces import reference_folder
 from told_run import LATENCY_NS, MS, PERIOD_NS, told_run
 
-from chainshaper import data_flow, export_perfetto, measure_latency, open_source
-from chainshaper.flow.steps import Measurement
+from chainshaper.analysis.flow import data_flow
+from chainshaper.flow.steps import Measurement, measure_latency
+from chainshaper.reporting.perfetto import export_perfetto
 from chainshaper.reporting.perfetto_format import Slice, Track, Value, encode_trace
+from chainshaper.sources import open_source
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording
 

@@ -5,7 +5,8 @@ from pathlib import Path
 import polars as pl
 from told_run import MS, PERIOD_NS, told_plan, told_run
 
-from chainshaper import data_flow, measure_latency
+from chainshaper.analysis.flow import data_flow
+from chainshaper.flow.steps import measure_latency
 from chainshaper.planning import Plan, publish_slots
 from chainshaper.planning.plan import revised
 from chainshaper.reporting.timeline import Timeline, timeline_of

@@ -12,8 +12,13 @@ from hypothesis import strategies as st
 from rich.console import Console
 from small_chain import small_chain
 
-from chainshaper import compare_recordings, measure_latency, plan_recording, shape_application
 from chainshaper.analysis import LatencyAnalysis, latency_statistics
+from chainshaper.flow.steps import (
+    compare_recordings,
+    measure_latency,
+    plan_recording,
+    shape_application,
+)
 from chainshaper.planning import (
     Modes,
     Plan,

@@ -7,7 +7,7 @@ import pytest
 from calm_runs import calm_run
 from small_chain import EXECUTOR_CORE, small_chain_text
 
-from chainshaper import measure_latency, shape_application
+from chainshaper.flow.steps import measure_latency, shape_application
 from chainshaper.planning import Modes, Plan
 from chainshaper.planning.plan import revised
 from chainshaper.splicing.application import splice_application

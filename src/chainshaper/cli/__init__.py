@@ -1,7 +1,7 @@
-"""The command line: one small module per verb, each a thin coat over a library call.
+"""The command line: each verb a thin coat over a library call.
 
-Results go to stdout, errors and progress to stderr. Exit codes: 0 done, 1 the operation failed,
-2 wrong use or bad input, 3 the platform cannot do it.
+Results go to stdout, errors and progress to stderr. Exit codes: 0 done, 1 the operation failed, 2
+wrong use or bad input, 3 the platform cannot do it.
 """
 
 import io
@@ -58,12 +58,10 @@ def _run(arguments: list[str] | None, name: str) -> Any:
 
 def _show_usage(error: Any) -> None:
     """As Typer does it, but with what the user, or a file's name, has written made safe."""
-    from typer.rich_utils import rich_format_error
-
     from chainshaper.values.safe_text import shown
 
     error.message = shown(error.message, but="\n")
-    rich_format_error(error)
+    error.show()
 
 
 def _end_in_order(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - a signal handler

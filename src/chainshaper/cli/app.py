@@ -1,32 +1,75 @@
-"""All verbs of the command line."""
+"""All verbs of the command line, and their help as plain text.
+
+A verb's module is imported when the verb is called: `chainshaper --help` has to be there at once.
+Help is written without Rich, which takes longer to import than most verbs take to run.
+"""
 
 from importlib import import_module
 from typing import Any
 
 import typer
 from typer import Abort
+from typer.core import TyperArgument, TyperCommand, TyperGroup
+from typer.main import get_command
 
-__all__ = ["USAGE_ERROR", "Abort", "app"]
+__all__ = ["USAGE_ERROR", "VERBS", "Abort", "app"]
 
 USAGE_ERROR: Any = typer.BadParameter.__base__
 """What Typer raises where a command line is wrong; the name of its module changes."""
 
-app = typer.Typer(
+_MODULES = (
+    ("runs", "demo run simulate"),
+    ("plans", "sweep"),
+    ("runs", "record profile"),
+    ("traces", "info graph callbacks chains latency convert"),
+    ("plans", "plan offsets"),
+    ("splicing", "splice"),
+    ("runs", "shape"),
+    ("traces", "compare report export"),
+    ("applying", "threads apply status release doctor"),
+)
+VERBS = {verb: module for module, verbs in _MODULES for verb in verbs.split()}
+"""As `--help` lists them; each is a function in the module that stands with it."""
+
+_SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
+
+
+class _PlainCommand(TyperCommand):
+    """A command whose help has a section for each panel."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        panels: dict[str, list[tuple[str, str]]] = {}
+        for parameter in self.get_params(ctx):
+            usual = "Arguments" if isinstance(parameter, TyperArgument) else "Options"
+            record = parameter.get_help_record(ctx)
+            if record is not None:
+                panel = getattr(parameter, "rich_help_panel", None) or usual
+                panels.setdefault(panel, []).append(record)
+        for title, records in panels.items():
+            with formatter.section(title):
+                formatter.write_dl(records)
+
+
+class _Verb(TyperCommand):
+    """A verb that is not imported yet."""
+
+    def _function(self) -> Any:
+        return getattr(import_module(f"chainshaper.cli.{VERBS[self.name or '']}"), self.name or "")
+
+    def get_short_help_str(self, limit: int = 45) -> str:  # noqa: ARG002 - it is not cut off
+        return " ".join(str(self._function().__doc__).partition("\n\n")[0].split())
+
+    def make_context(self, *values: Any, **more: Any) -> Any:
+        alone = typer.Typer(add_completion=False, rich_markup_mode=None, context_settings=_SETTINGS)
+        alone.command(self.name, cls=_PlainCommand)(self._function())
+        return get_command(alone).make_context(*values, **more)
+
+
+app = TyperGroup(
+    name="chainshaper",
     help="Constant end-to-end latency for ROS 2 computation chains, without touching their code.",
+    commands={verb: _Verb(verb) for verb in VERBS},
     no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
-    context_settings={"help_option_names": ["-h", "--help"]},
+    rich_markup_mode=None,
+    context_settings=_SETTINGS,
 )
-
-VERBS = (
-    *("demo", "run", "simulate", "sweep"),
-    *("record", "profile", "info", "graph", "callbacks", "chains", "latency", "convert"),
-    *("plan", "offsets", "splice", "shape", "compare", "report", "export"),
-    *("threads", "apply", "status", "release", "doctor"),
-)
-"""As `--help` lists them; each is a function in the module of its name."""
-
-for verb in VERBS:
-    app.command()(getattr(import_module(f"chainshaper.cli.{verb}"), verb))

@@ -29,7 +29,7 @@ _FRUGAL = {
     "OPENBLAS_NUM_THREADS": "1",
     "_RJEM_MALLOC_CONF": "background_thread:false",  # of the allocator in Polars
 }
-_kept: list[Any] = []  # ctypes forgets a callback that nothing refers to
+_handlers: list[Any] = []  # ctypes forgets a callback that nothing refers to
 
 
 def exhausted(error: BaseException) -> str | None:
@@ -83,5 +83,5 @@ def catch_aborts() -> None:
         os._exit(1)
 
     handler = ctypes.CFUNCTYPE(None, ctypes.c_int)(ended)
-    _kept.append(handler)
+    _handlers.append(handler)
     ctypes.CDLL(None).signal(int(signal.SIGABRT), handler)

@@ -1,77 +1,33 @@
-"""Options that several verbs share."""
+"""Options that several verbs share, and those that are wishes for a plan.
 
+A wish is declared once, in :class:`chainshaper.values.plan_choices.Wishes`; :func:`takes_wishes`
+makes options of them.
+"""
+
+from collections.abc import Callable
+from dataclasses import fields
+from functools import wraps
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 import typer
 
+from chainshaper.gate.decision import Late
+from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import InputError
+from chainshaper.values.plan_choices import BANDS, Wishes
 
-__all__ = [
-    "ApplicationArgument",
-    "ChainOption",
-    "CyclesOption",
-    "JsonOption",
-    "PlanInForceOption",
-    "RealtimeOption",
-    "RecordingOutput",
-    "TraceArgument",
-    "UsersOption",
-    "duration_option",
-]
+if TYPE_CHECKING:
+    from chainshaper.planning import Modes, Plan
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the figures as JSON (integer ns).")]
-ChainOption = Annotated[
-    str | None,
-    typer.Option(
-        "--chain",
-        metavar="FIRST..LAST",
-        help="The chain, by topics or nodes: /t1../t5. Default: the one the recording names.",
-    ),
-]
-PlanInForceOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--plan",
-        metavar="plan.yaml",
-        help="The plan that the last recording was made with, where it does not say so.",
-    ),
-]
-TraceArgument = Annotated[
-    list[Path],
-    typer.Argument(
-        metavar="TRACE...",
-        help="An LTTng trace's folder (several of one trace: kernel and user space), or a "
-        "recording's.",
-    ),
-]
-ApplicationArgument = Annotated[
-    Path, typer.Argument(metavar="APP.yaml", help="The application's description.")
-]
-RecordingOutput = Annotated[
-    Path, typer.Option("--output", "-o", metavar="REC", help="Folder to write; must not exist.")
-]
-CyclesOption = Annotated[int, typer.Option("--cycles", min=1, help="Cycles to record.")]
-RealtimeOption = Annotated[
-    bool | None,
-    typer.Option(
-        "--realtime/--no-realtime", help="Use SCHED_FIFO. Default: where it is permitted."
-    ),
-]
-UsersOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--user",
-        metavar="NAME",
-        help="Whose processes are taken for nodes (may be repeated). Default: yours, also behind "
-        "sudo, and root's.",
-    ),
-]
+Source: TypeAlias = Literal["lttng", "ebpf"]
+
+NodeKind: TypeAlias = Literal["python", "cpp", "typed"]
+"""How a shaping node is made."""
 
 
-def _parse(text: str) -> int:
-    from chainshaper.values.durations import parse_duration
-
+def _duration(text: str) -> int:
     try:
         value = parse_duration(text)
     except InputError as error:
@@ -81,8 +37,189 @@ def _parse(text: str) -> int:
     return value
 
 
-def duration_option(name: str, help_text: str, panel: str | None = None) -> Any:
-    """An option that takes a duration with a unit and gives nanoseconds."""
-    return typer.Option(
-        name, help=help_text, metavar="DURATION", parser=_parse, rich_help_panel=panel
+def _bands(text: str) -> int | Literal["auto"]:
+    if text == "auto":
+        return "auto"
+    if not (text.isdecimal() and int(text) > 0):
+        raise typer.BadParameter(f"{text!r} is neither a number of bands from 1 on nor auto")
+    return int(text)
+
+
+def _share(text: str) -> float:
+    try:
+        value = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
+    except ValueError as error:
+        raise typer.BadParameter(f"{text!r} is no share: write 0.4 or 40%") from error
+    if not 0 < value <= 1:
+        raise typer.BadParameter(f"{text} is no share: write more than 0, at most 1 or 100%")
+    return value
+
+
+PARSERS: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
+    "DURATION": (_duration, format_duration),
+    "N|auto": (_bands, str),
+    "SHARE": (_share, "{:.0%}".format),
+}
+"""What reads and writes the values behind a metavar."""
+
+
+def option(default: Any, names: str, help_text: str, **more: Any) -> Any:
+    """An option as a parameter's default: ``--epsilon DURATION``, ``--output -o FILE``.
+
+    Of a duration (with its unit; in ns), of bands and of a share the value is parsed, and its
+    default written.
+    """
+    words = names.split()
+    metavar = None if words[-1].startswith("-") else words.pop()
+    parse, write = PARSERS.get(metavar or "", (None, None))
+    if write is not None and default is not None:
+        default = write(default)
+    return typer.Option(default, *words, help=help_text, metavar=metavar, parser=parse, **more)
+
+
+def argument(default: Any, metavar: str, help_text: str) -> Any:
+    """An argument as a parameter's default; ``...`` where it must be given."""
+    return typer.Argument(default, metavar=metavar, help=help_text, show_default=False)
+
+
+JSON: bool = option(False, "--json", "Print the figures as JSON (integer ns).")
+CHAIN: str | None = option(
+    None,
+    "--chain FIRST..LAST",
+    "The chain, by topics or nodes: /t1../t5. Default: the one the recording names.",
+)
+PLAN_IN_FORCE: Path | None = option(
+    None,
+    "--plan plan.yaml",
+    "The plan that the last recording was made with, where it does not say so.",
+)
+TRACE: list[Path] = argument(
+    ...,
+    "TRACE...",
+    "An LTTng trace's folder (several of one trace: kernel and user space), or a recording's.",
+)
+APPLICATION: Path = argument(..., "APP.yaml", "The application's description.")
+RECORDING_OUTPUT: Path = option(..., "--output -o REC", "Folder to write; must not exist.")
+CYCLES: int = option(320, "--cycles", "Cycles to record.", min=1)
+SEED: int | None = option(None, "--seed", "Instead of the description's.", min=0)
+REALTIME: bool | None = option(
+    None, "--realtime/--no-realtime", "Use SCHED_FIFO. Default: where it is permitted."
+)
+USERS: list[str] | None = option(
+    None,
+    "--user NAME",
+    "Whose processes are taken for nodes (may be repeated). Default: yours, also behind sudo, and"
+    " root's.",
+)
+SOURCE: Source = option("lttng", "--source", "Who records the events.")
+NODE: NodeKind = option(
+    "python", "--node", "A script; a package for all types; or one generated for the type."
+)
+
+
+def plan_in_force(path: Path | None) -> "Plan | None":
+    """The plan of a file, if one is named."""
+    from chainshaper.planning import load_plan
+
+    return None if path is None else load_plan(path)
+
+
+_WISHES = {field.name: field for field in fields(Wishes)}
+PLAN_WISHES = (*_WISHES, "modes", "late")
+"""All that :func:`takes_wishes` knows."""
+
+
+def wish(name: str, **more: Any) -> Any:
+    """The option of a wish; ``more`` may give it another ``default``."""
+    described = next(one for one in get_args(_WISHES[name].type) if hasattr(one, "panel"))
+    names = described.flag or "--" + name.removesuffix("_ns").replace("_", "-")
+    metavar = "DURATION" if name.endswith("_ns") else described.metavar or ""
+    if described.least is not None:
+        more["min"] = described.least
+    default = more.pop("default", _WISHES[name].default)
+    return option(
+        default, f"{names} {metavar}", described.help, rich_help_panel=described.panel, **more
     )
+
+
+MODES: str | None = option(
+    None,
+    "--modes TOPIC:MODE=BAND,…",
+    "Each mode's band, 1 is the first; the first mode named is in force until the topic"
+    " (std_msgs/String) names another. Such as /driving_mode:city=2,highway=1.",
+    rich_help_panel=BANDS,
+)
+LATE: Late | None = option(
+    None,
+    "--late",
+    "With --modes, an output behind its mode's slot: at once, wait for the next cycle's, discard,"
+    " or in the cycle's next slot. Default: publish.",
+    rich_help_panel=BANDS,
+)
+
+
+def _parameter(name: str) -> Parameter:
+    if name in _MODES:
+        kind, default = _MODES[name]
+    else:  # Typer knows no unions
+        kind = str if name == "bands" else get_args(_WISHES[name].type)[0]
+        default = wish(name)
+    return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+
+
+_MODES: dict[str, tuple[Any, Any]] = {"modes": (str | None, MODES), "late": (Late | None, LATE)}
+
+
+def takes_wishes(*names: str) -> Callable[[Callable[..., None]], Any]:
+    """Give a verb, in place of its parameter ``request``, an option for each of these wishes.
+
+    ``request`` is the :class:`~chainshaper.planning.PlanRequest` that the options make. Wishes here
+    are also ``modes`` and ``late``, which give it the modes of the system.
+    """
+
+    def decorate(verb: Callable[..., None]) -> Any:
+        @wraps(verb)
+        def called(**values: Any) -> None:
+            from chainshaper.planning import PlanRequest
+
+            wished = {name: values.pop(name) for name in names}
+            modes = modes_of(wished.pop("modes", None), wished.pop("late", None))
+            verb(**values, request=PlanRequest(**wished, modes=modes))
+
+        options = [_parameter(name) for name in names]
+        parameters: list[Parameter] = []
+        for one in signature(verb).parameters.values():
+            own = [one.replace(kind=Parameter.KEYWORD_ONLY)]
+            parameters += options if one.name == "request" else own
+        called.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
+        called.__annotations__ = {one.name: one.annotation for one in parameters}
+        return called
+
+    return decorate
+
+
+def modes_of(text: str | None, late: Late | None) -> "Modes | None":
+    """The modes that `--modes` names, such as ``/mode:city=2,highway=1``; the first is the default.
+
+    An output behind its mode's slot leaves at once unless ``late`` says otherwise.
+
+    Raises:
+        InputError: it is not of this form, or names what no mode or topic may be called.
+    """
+    if text is None:
+        if late is not None:
+            raise InputError(f"--late {late} goes with modes: add --modes, or leave it out")
+        return None
+    from chainshaper.planning import Modes
+    from chainshaper.values.yaml_file import wrong_values_refused
+
+    topic, _, listed = text.partition(":")
+    pairs = [pair.partition("=") for pair in listed.split(",")]
+    bands = {mode: int(band) for mode, _, band in pairs if band.isdecimal()}
+    if len(bands) != len(pairs):
+        raise InputError(
+            f"--modes {text}: write the topic, and a band for each mode once, such as"
+            " /driving_mode:city=2,highway=1"
+        )
+    with wrong_values_refused(Modes):
+        return Modes(topic=topic, default=pairs[0][0], bands=bands, late=late or "publish")

@@ -1,11 +1,13 @@
-"""What verbs print: tables for people, JSON for machines, progress on stderr."""
+"""What verbs print: tables for people, JSON for machines, progress on stderr; how they end."""
 
 import json
 import os
+import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from chainshaper.values.errors import OperationError
@@ -13,17 +15,6 @@ from chainshaper.values.safe_text import shown
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
-
-__all__ = [
-    "late_progress",
-    "notes",
-    "print_json",
-    "progress",
-    "say",
-    "show",
-    "show_line",
-    "stage_lines",
-]
 
 PATIENCE_S = 2.0
 """What takes longer than this shows its progress."""
@@ -151,3 +142,21 @@ def stage_lines(title: str) -> Callable[[float, str], None]:
             last = what
 
     return report
+
+
+@contextmanager
+def stop_on_signals(stop: threading.Event) -> Iterator[None]:
+    """Inside, Ctrl-C, a closed terminal and `kill` are an order to finish: each sets ``stop``."""
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    before = {
+        number: signal.signal(number, end)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

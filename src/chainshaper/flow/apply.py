@@ -59,9 +59,12 @@ from chainshaper.linux.command_process import end_command, start_command
 from chainshaper.linux.scheduling import available_cores, check_cores
 from chainshaper.linux.users import run_users
 from chainshaper.planning import Plan
-from chainshaper.planning.overruns import open_until_done
+from chainshaper.planning.overruns import (
+    open_until_done,
+    publication_warnings,
+    refuse_offset,
+)
 from chainshaper.planning.plan import shaping_nodes
-from chainshaper.planning.publication import publication_warnings
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 
@@ -154,13 +157,15 @@ def apply_plan(
     (default: `/run/chainshaper`).
 
     Raises:
-        InputError: the plan names no threads, or its table is not one; or there is no such user.
+        InputError: the plan names no threads, its table is not one, or it has an offset; or there
+            is no such user.
         PlatformError: the machine lacks a core or the back end, or we a privilege.
         OperationError: another run governs one of the cores or nodes, a node does not appear or
             is ambiguous, the chain has no regular beginning, the kernel refuses something, the
             servers failed while in force, or the application, not being our command, has ended;
             or ``stop`` was set before the plan was in force.
     """
+    refuse_offset(plan)
     given, plan = plan, open_until_done(plan)
     table, taken = server_table(plan), run_users(users)
     check_cores({server.core: f"server {server.name}" for server in plan.servers})

@@ -23,7 +23,7 @@ from chainshaper.flow.thread_search import find_threads
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.linux.threads import Thread
 from chainshaper.planning import Plan
-from chainshaper.planning.overruns import open_until_done
+from chainshaper.planning.overruns import open_until_done, refuse_offset
 from chainshaper.planning.plan import shaping_nodes
 from chainshaper.values.errors import OperationError
 
@@ -67,6 +67,7 @@ def planned_changes(
 
     Raises: as :func:`.applying.apply_plan`.
     """
+    refuse_offset(plan)
     plan = open_until_done(plan)
     table = server_table(plan)
     found = find_threads(plan, recording, users=users)

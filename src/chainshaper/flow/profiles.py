@@ -16,6 +16,7 @@ from chainshaper.analysis import DataFlow, LatencyAnalysis
 from chainshaper.analysis.disturbance import overlapping
 from chainshaper.analysis.graph import goes_on_elsewhere
 from chainshaper.planning import CallbackTimes, Profile
+from chainshaper.planning.request import DEFAULT_CORE
 from chainshaper.values import events
 from chainshaper.values.application import ApplicationGraph, Callback, Chain
 from chainshaper.values.durations import format_duration
@@ -24,7 +25,6 @@ from chainshaper.values.recording import Recording
 
 __all__ = ["profile_of"]
 
-DEFAULT_CORE = 1
 DEFAULT_PRIORITY = 80
 
 

@@ -14,7 +14,7 @@ from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.linux.threads import list_threads
 from chainshaper.planning import Plan
 from chainshaper.planning.overruns import open_until_done
-from chainshaper.planning.publisher_threads import publisher_servers
+from chainshaper.planning.plan import publisher_servers
 from chainshaper.values.errors import OperationError
 from chainshaper.workload.live import StartedNodes
 

@@ -13,7 +13,8 @@ from pathlib import Path
 from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
 from chainshaper.flow.profiles import profile_of
 from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain
-from chainshaper.planning.publisher_threads import publisher_servers
+from chainshaper.planning.overruns import refuse_offset
+from chainshaper.planning.plan import publisher_servers
 from chainshaper.sources import open_source
 from chainshaper.splicing.application import splice_application
 from chainshaper.values import events
@@ -229,10 +230,11 @@ def shape_application(
     (:mod:`chainshaper.flow.publisher_gating`).
 
     Raises:
-        InputError: the plan does not fit the application; and what
+        InputError: the plan does not fit the application, or has an offset; and what
             :func:`~chainshaper.workload.live.run_application` raises.
         PlatformError: the plan gates a publisher's thread, and threads cannot be frozen here.
     """
+    refuse_offset(plan)
     if any(publisher_servers(plan)) and enforcement is None:
         from chainshaper.flow.publisher_gating import publishers_gated
 

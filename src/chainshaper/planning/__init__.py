@@ -4,6 +4,13 @@ Everything starts with :func:`plan_shaping`; each further step takes a plan and 
 :func:`plan_chain` takes all of them that a :class:`PlanRequest` asks for.
 """
 
+from chainshaper.planning.bands import (
+    BandChoice,
+    choose_bands,
+    predict_bands,
+    with_bands,
+    with_long_slot,
+)
 from chainshaper.planning.baselines import (
     CallbackTimes,
     let_per_callback,
@@ -12,15 +19,9 @@ from chainshaper.planning.baselines import (
     server_per_callback,
     server_per_chain,
 )
-from chainshaper.planning.graphs import over_cores, with_first_node_apart, with_sink
-from chainshaper.planning.latency_file import check_latencies, read_latencies
+from chainshaper.planning.margins import check_latencies, read_latencies
 from chainshaper.planning.offsets import place_chains
-from chainshaper.planning.placement import (
-    BandChoice,
-    choose_bands,
-    with_bands,
-    with_long_slot,
-)
+from chainshaper.planning.overruns import plan_warnings
 from chainshaper.planning.plan import (
     ChainOfPlan,
     Evidence,
@@ -38,7 +39,7 @@ from chainshaper.planning.plan import (
 )
 from chainshaper.planning.plan_file import dump_plan, load_plan, plan_json, save_plan, save_plans
 from chainshaper.planning.request import PlanRequest, Profile, band_choice, plan_chain, plan_chains
-from chainshaper.planning.shaping import plan_shaping, plan_warnings, predict_bands
+from chainshaper.planning.shaping import over_cores, plan_shaping, with_first_node_apart, with_sink
 
 __all__ = [
     "BandChoice",

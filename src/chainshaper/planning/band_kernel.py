@@ -14,8 +14,6 @@ import numpy as np
 from chainshaper.planning.bands import UNREACHABLE
 from chainshaper.values.compiled.memory import compiled, store_word, table_at
 
-__all__ = ["fill_costs"]
-
 
 @compiled()
 def fill_costs(grid, windows, costs, successors, work, positions, layers):

@@ -1,8 +1,8 @@
 """The schedules that latency shaping is compared with (sections 2.5, 5.1 and 5.3).
 
-Each takes a shaped plan, for the chain, the evidence and the cores it names, and returns the
-plan of another policy for the same chain. Predictions follow the shaped plan's convention: an
-output in a slot is represented by the slot's end.
+Each takes a shaped plan, for the chain, the evidence and the cores it names, and returns the plan
+of another policy for the same chain. Predictions follow the shaped plan's convention: an output in
+a slot is represented by the slot's end.
 """
 
 from collections.abc import Sequence
@@ -18,20 +18,12 @@ from chainshaper.planning.plan import (
     output_server,
     publish_slots,
     revised,
-    wrong_values_refused,
+    with_slots,
 )
 from chainshaper.planning.shaping import OUTPUT_PRIORITY, shaping_node_like
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError
-
-__all__ = [
-    "CallbackTimes",
-    "let_per_callback",
-    "let_per_callback_asynchronous",
-    "let_per_chain",
-    "server_per_callback",
-    "server_per_chain",
-]
+from chainshaper.values.yaml_file import wrong_values_refused
 
 
 @dataclass(frozen=True)
@@ -79,14 +71,11 @@ def server_per_callback(
 ) -> Plan:
     """Time-triggered scheduling: each callback runs in a slot of its own, as long as its longest.
 
-    A slot starts when the slots of all callbacks that this one waits for have ended, which are
-    the synchronisation points of a graph (table 4 row 1: fusion waits for the slower filter),
-    and when the slot before it on its core has. It is the longest response time plus
-    ``margin_ns`` long, rounded up to a multiple of ``boundary_ns``. Callbacks of one node share
-    its thread, hence a server with several slots.
-
-    ``callbacks`` are in an order in which each comes after those it waits for; the chain's last
-    callback stands last, and the first starts the cycle.
+    A slot starts when the slots of all callbacks that this one waits for have ended, the
+    synchronisation points of a graph (table 4 row 1), and the slot before it on its core. It is the
+    longest response time plus ``margin_ns`` long, rounded up to a multiple of ``boundary_ns``.
+    Callbacks of one node share its thread, hence a server with several slots. Each of ``callbacks``
+    comes after those it waits for; the chain's last stands last, the first starts the cycle.
 
     Raises:
         InputError: no callbacks, or one that waits for itself or a later one.
@@ -101,7 +90,7 @@ def server_per_callback(
             " margin (--epsilon), or move callbacks to another core"
         )
     last, (start, _) = callbacks[-1], slots[-1]
-    with wrong_values_refused():
+    with wrong_values_refused(Plan):
         return revised(
             plan,
             policy="server-per-callback",
@@ -122,12 +111,12 @@ def server_per_callback(
 def let_per_chain(plan: Plan) -> Plan:
     """Logical execution time for the chain as one task: output at the next cycle's start.
 
-    The chain may run whenever it is ready; its output is published in a slot at the beginning
-    of the following cycle, so the latency is one period (section 5.3, table 5).
+    The output is published in a slot at the beginning of the following cycle, so the latency is one
+    period (section 5.3, table 5).
 
     Raises:
-        InputError: a plan without a publish slot, or a chain so fast that it could publish in
-            the cycle it began in.
+        InputError: a plan without a publish slot, or a chain so fast that it could publish in the
+            cycle it began in.
     """
     start, end = _one_slot(plan)
     length = end - start
@@ -138,16 +127,11 @@ def let_per_chain(plan: Plan) -> Plan:
             " own cycle: use a shorter slot"
         )
     publishing = output_server(plan)
-    servers = tuple(
-        server.model_copy(
-            update={"slots": ((0, length),) if server is publishing else ((0, plan.cycle_ns),)}
-        )
-        for server in plan.servers
-    )
+    ends = {s.name: length if s is publishing else plan.cycle_ns for s in plan.servers}
     return revised(
         plan,
         policy="let-per-chain",
-        servers=servers,
+        servers=with_slots(plan.servers, {name: ((0, end),) for name, end in ends.items()}),
         predicted=_after_periods(plan, 1, length),
     )
 
@@ -156,13 +140,12 @@ def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str
     """Logical execution time for every callback: each one's output waits for the next cycle.
 
     ``topics`` are the outputs of the chain's callbacks in order, the chain's own last;
-    ``publishers`` are the nodes that publish them, where they are known. Behind each topic
-    a shaping node republishes at the beginning of the next cycle, so the latency is as many
-    periods as there are callbacks (section 5.3, table 5).
+    ``publishers`` their nodes, where known. Behind each topic a shaping node republishes at the
+    beginning of the next cycle: as many periods as there are callbacks (section 5.3, table 5).
 
     Raises:
-        InputError: a plan without a shaping node, topics that do not end with the chain's
-            output, or repeat one.
+        InputError: a plan without a shaping node, topics that do not end with the chain's output,
+            or repeat one.
         OperationError: the slots do not fit into the cycle.
     """
     last = plan.shaping_node
@@ -171,7 +154,7 @@ def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str
             "LET per callback needs a plan with a shaping node and all topics of the chain, its"
             " output last"
         )
-    with wrong_values_refused():
+    with wrong_values_refused(Plan):
         inside = tuple(
             shaping_node_like(last, topic, publisher)
             for topic, publisher in zip_longest(topics[:-1], publishers[: len(topics) - 1])
@@ -183,12 +166,12 @@ def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str
 def let_per_callback_asynchronous(plan: Plan, publishers: Sequence[str]) -> Plan:
     """:func:`let_per_callback` for callbacks that publish asynchronously: no nodes are added.
 
-    ``publishers`` are the nodes of the chain's callbacks in order; their own publisher threads
-    run in the slots.
+    The publisher threads of ``publishers``, the nodes of the chain's callbacks in order, run in the
+    slots.
 
     Raises:
-        InputError: a plan that does not gate the publisher's thread, or nodes that do not end
-            with it, or repeat one.
+        InputError: a plan that does not gate the publisher's thread, or nodes that do not end with
+            it, or repeat one.
         OperationError: the slots do not fit into the cycle.
     """
     if plan.shaping_node is not None or not publishers or publishers[-1] != plan.chain.publisher:
@@ -196,7 +179,7 @@ def let_per_callback_asynchronous(plan: Plan, publishers: Sequence[str]) -> Plan
             "asynchronous LET per callback needs a plan for asynchronous publication and the"
             " nodes of the chain, the one that publishes its output last"
         )
-    with wrong_values_refused():
+    with wrong_values_refused(Plan):
         threads = [Thread(node=name, role="publisher") for name in publishers]
         return _let_per_thread(plan, threads)
 
@@ -223,11 +206,8 @@ def _let_per_thread(plan: Plan, threads: list[Thread]) -> Plan:
         )
         for number, thread in enumerate(reversed(threads))
     ]
-    chain = [
-        server.model_copy(update={"slots": ((0, plan.cycle_ns),)})
-        for server in plan.servers
-        if server is not publishing
-    ]
+    others = [server for server in plan.servers if server is not publishing]
+    chain = with_slots(others, {server.name: ((0, plan.cycle_ns),) for server in others})
     return revised(
         plan,
         policy="let-per-callback",

@@ -1,4 +1,7 @@
-"""How far beyond the longest undisturbed latency a slot must reach.
+"""Measured latencies, and how far beyond the longest undisturbed one a slot must reach.
+
+Planning needs nothing else of a chain than its end-to-end latencies, so a sample from any tool can
+be planned with (:func:`read_latencies`).
 
 **By default** (:func:`covered_latency`) so far that a stated share of *all* cycles is in time, also
 of those that the machine disturbed: an actuator does not care who caused a delay. How many of n
@@ -20,39 +23,29 @@ unchanging system and a tail that does look generalised Pareto. Each of the thre
 where one fails there is no number.
 
 The parameters are estimated by L-moments (Hosking and Wallis, *Parameter and quantile estimation
-for the generalized Pareto distribution*, Technometrics 29, 1987), which for a few hundred
-excesses err less than maximum likelihood does. They may put the end of a bounded tail before the
-longest latency measured, which is then made the end (Dupuis and Tsao, *A hybrid estimator for
-generalized Pareto and extreme-value distributions*, Communications in Statistics 27, 1998). The
-goodness of fit (Anderson–Darling) and the
-confidence interval come from one parametric bootstrap, because tables for known parameters do
-not hold for estimated ones. In simulations with normal, exponential, triangular and uniform-sum
-latencies the 95 % interval for a probability of 1e-5 held the true value in 97 to 100 of 100
-samples of 5,000 and in 93 to 98 of 100 samples of 1,500; where it missed it was too low. Where the
-density does not vanish at the end of the distribution, it errs on the high side.
+for the generalized Pareto distribution*, Technometrics 29, 1987), which for a few hundred excesses
+err less than maximum likelihood does. They may put the end of a bounded tail before the longest
+latency measured, which is then made the end (Dupuis and Tsao, *A hybrid estimator for generalized
+Pareto and extreme-value distributions*, Communications in Statistics 27, 1998). The goodness of fit
+(Anderson–Darling) and the confidence interval come from one parametric bootstrap, because tables
+for known parameters do not hold for estimated ones. In simulations with normal, exponential,
+triangular and uniform-sum latencies the 95 % interval for a probability of 1e-5 had the true value
+in 97 to 100 of 100 samples of 5,000 and in 93 to 98 of 100 samples of 1,500; where it missed it was
+too low. Where the density does not vanish at the end of the distribution, it errs on the high side.
 """
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.planning.latency_file import check_latencies
 from chainshaper.planning.plan import Margin
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import InputError, OperationError
 
-__all__ = [
-    "EPSILON_NS",
-    "OVERRUN_PROBABILITY",
-    "TailFit",
-    "covered_latency",
-    "cycles_needed",
-    "derive_margin",
-    "fit_tail",
-    "late_share",
-]
+LONGEST_NS = 24 * 3_600 * 1_000_000_000  # beyond a day it is a wrong unit, not a latency
 
 EPSILON_NS = 1_000_000
 """What a margin adds to latencies seen: the way to the shaping node is not in them."""
@@ -77,12 +70,105 @@ LEAST_LOG = np.log(1e-12)  # of a probability: a fitted end may stand at the lon
 _Floats = NDArray[np.float64]
 
 
+def read_latencies(path: str | Path) -> NDArray[np.int64]:
+    """End-to-end latencies of a file, in nanoseconds, in the file's order.
+
+    One duration a line with its unit (``59.3ms``; blank lines and lines that begin with ``#`` are
+    skipped), or a ``.npy`` file of nanoseconds.
+
+    Raises:
+        InputError: no such file, a line that is no duration (named with its number), an array
+            that does not hold whole nanoseconds, fewer than two latencies, or none above zero.
+    """
+    path = Path(path)
+    try:
+        found = _read_array(path) if path.suffix == ".npy" else _read_lines(path)
+        latencies = check_latencies(found)
+        if not latencies.any():
+            raise InputError("every latency is 0ms: check the unit, and what was measured")
+        return latencies
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except InputError as error:
+        # Lines are named already; what concerns the whole sample gets the file's name here.
+        raise InputError(
+            str(error) if str(error).startswith(str(path)) else f"{path}: {error}"
+        ) from error
+
+
+def check_latencies(latencies: object) -> NDArray[np.int64]:
+    """A sample that can be planned with: at least two latencies, whole nanoseconds, none negative.
+
+    Raises:
+        InputError: anything else, with the first wrong element named by its place from 0.
+    """
+    array = np.asarray(latencies)
+    if array.ndim != 1 or array.dtype.kind not in "iuf":
+        raise InputError(
+            f"latencies must be one row of numbers in nanoseconds, not {array.ndim}-dimensional"
+            f" {array.dtype}"
+        )
+    if array.size < 2:
+        raise InputError(
+            f"{array.size} latencies are too few to plan with: measure more cycles (100 at least)"
+        )
+    if array.dtype.kind == "f":
+        _refuse_first(array, ~np.isfinite(array), "is not a number: remove it")
+        _refuse_first(
+            array, array != np.floor(array), "is not a whole number of nanoseconds: convert it"
+        )
+    _refuse_first(array, array < 0, "is negative: a latency is not; check the clocks")
+    _refuse_first(
+        array, array > LONGEST_NS, f"is longer than {format_duration(LONGEST_NS)}: check the unit"
+    )
+    return array.astype(np.int64)
+
+
+def _refuse_first(array: NDArray[np.generic], wrong: NDArray[np.bool_], reason: str) -> None:
+    if wrong.any():
+        place = int(np.argmax(wrong))
+        raise InputError(f"latency number {place} ({array[place]}) {reason}")
+
+
+def _read_array(path: Path) -> object:
+    try:
+        return np.load(path, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise InputError(
+            f"{path}: not a NumPy file of numbers: write it with numpy.save, whole nanoseconds in"
+            " one row"
+        ) from error
+
+
+def _read_lines(path: Path) -> NDArray[np.int64]:
+    try:
+        text = path.read_text(encoding="utf-8-sig")  # spreadsheets begin with a byte-order mark
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path}: not a text of one duration a line ({error}); arrays end in .npy"
+        ) from error
+    found = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        content = line.partition("#")[0].strip()
+        if not content:
+            continue
+        try:
+            found.append(parse_duration(content))
+        except InputError as error:
+            raise InputError(f"{path}:{number}: {error}") from error
+        if not 0 <= found[-1] <= LONGEST_NS:
+            raise InputError(
+                f"{path}:{number}: {content} is no latency: write 0ms or more, up to a day"
+            )
+    return np.array(found, dtype=np.int64)
+
+
 @dataclass(frozen=True)
 class TailFit:
     """A generalised Pareto tail and the latency that it says is exceeded with ``probability``.
 
-    ``interval_ns`` is the 95 % confidence interval of ``latency_ns``; ``goodness`` the p-value
-    of the Anderson–Darling test of the fit.
+    ``interval_ns`` is the 95 % confidence interval of ``latency_ns``; ``goodness`` the p-value of
+    the Anderson–Darling test of the fit.
     """
 
     probability: float
@@ -149,10 +235,8 @@ def derive_margin(
 ) -> Margin:
     """The margin ε with which an execution overruns its slot with the given probability.
 
-    ``latencies_ns`` are in the order in which they were measured; the margin counts from
-    ``longest_ns``, their longest unless given. The result says that it was
-    derived, and keeps the probability and the confidence interval of ε; hand it to
-    :func:`chainshaper.planning.shaping.plan_shaping`.
+    ``latencies_ns`` are in the order in which they were measured; ε counts from ``longest_ns``,
+    their longest unless given. The result has its confidence interval.
 
     Raises: as :func:`fit_tail`.
     """
@@ -170,8 +254,7 @@ def derive_margin(
 def fit_tail(latencies_ns: NDArray[np.int64], probability: float, seed: int = 0) -> TailFit:
     """Fit the tail of a sample and read the latency that is exceeded with a small probability.
 
-    The threshold is the lowest of a few that leaves a tail of good fit. ``seed`` is the
-    bootstrap's.
+    The threshold is the lowest of a few that leaves a tail of good fit.
 
     Raises:
         InputError: latencies that cannot be planned with, or a probability outside the tail.
@@ -257,8 +340,8 @@ def _fit_above(
 def _l_moment_fit(ordered: _Floats) -> tuple[_Floats, _Floats]:
     """Shape and scale for each row of ascending excesses.
 
-    With λ₁ the mean and λ₂ half the mean difference of two, ξ = 2 − λ₁/λ₂ and σ = λ₁(1 − ξ).
-    Where that distribution would end, at −σ/ξ, before the longest excess, it is made to end there.
+    With λ₁ the mean and λ₂ half the mean difference of two, ξ = 2 − λ₁/λ₂ and σ = λ₁(1 − ξ). Where
+    that distribution would end, at −σ/ξ, before the longest excess, it is made to end there.
     """
     size = ordered.shape[1]
     first = ordered.mean(axis=1)

@@ -1,43 +1,39 @@
 """Several chains on shared cores: when each one's cycles start, so that no slots collide.
 
-Plans made one by one may want the same instants of the same core. Within the hyper-period of
-their cycles, chains are moved against each other until every two slots of one core and one
-priority are disjoint in all cycles (the rule that holds inside a plan, across plans; servers of
-different priority may overlap, as there). The paper leaves this open (section 3.1).
+Plans made one by one may want the same instants of the same core. Within the hyper-period of their
+cycles, chains are moved against each other until every two slots of one core and one priority are
+disjoint in all cycles (the rule that holds inside a plan, across plans; servers of different
+priority may overlap, as there). The paper leaves this open (section 3.1).
 
 Two slots [a, a + d) and [b, b + e) that repeat every T and U collide in some cycle unless the
-distance of their starts, modulo g = gcd(T, U), is in [d, g − e]: the distances that occur are
-all numbers congruent to it. So each pair of chains allows a set of differences of offsets
-modulo g, and nothing else matters.
+distance of their starts, modulo g = gcd(T, U), is in [d, g − e]: the distances that occur are all
+numbers congruent to it. So each pair of chains allows a set of differences of offsets modulo g, and
+nothing else matters.
 
-**Few chains are searched exhaustively.** From any solution, take the chains that are not linked
-to the first by a chain of tight pairs (pairs whose difference is at an end of an allowed
-interval), and start all of them earlier until some pair becomes tight. Repeated, that links
-every chain to the first without breaking a constraint: if there is a solution, there is one in
-which the tight pairs form a tree, and it is enough to try the ends of allowed intervals. Many
-chains are first fitted in one after the other, pushing each other out where there is no room, which
-is quick and mostly enough; where it is not, the CP-SAT solver of OR-tools decides, which is exact
-as well but may run out of time.
+**Few chains are searched exhaustively.** From any solution, take the chains that are not linked to
+the first by a chain of tight pairs (pairs whose difference is at an end of an allowed interval),
+and start all of them earlier until some pair becomes tight. Repeated, that links every chain to the
+first without breaking a constraint: if there is a solution, there is one in which the tight pairs
+form a tree, and it is enough to try the ends of allowed intervals. Many chains are first fitted in
+one after the other, pushing each other out where there is no room, which is quick and mostly
+enough; where it is not, the CP-SAT solver of OR-tools decides, which is exact as well but may run
+out of time.
 """
 
 import math
 import random
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import combinations
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.planning.entangled import refuse_shared_parts
-from chainshaper.planning.extras import extra_library
 from chainshaper.planning.plan import Plan, publishing_servers, revised
 from chainshaper.planning.shaping import OUTPUT_PRIORITY
 from chainshaper.values.durations import format_duration
-from chainshaper.values.errors import InputError, OperationError
-
-__all__ = ["place_chains", "with_offsets"]
+from chainshaper.values.errors import InputError, OperationError, extra_library
 
 MOST_SEARCHED = 4  # chains; beyond, CP-SAT is faster
 TIME_LIMIT_SECONDS = 60.0
@@ -54,9 +50,9 @@ def place_chains(
 ) -> tuple[tuple[Plan, ...], list[str]]:
     """Offsets for chains that share cores, and what is to be known about them.
 
-    The chains take turns where they can (:func:`with_offsets`). Where they cannot, they run at
-    the same time, the chain with the shorter period at the better priority, and only their
-    publish slots, which make the latency constant, are kept apart.
+    The chains take turns where they can (:func:`with_offsets`). Where they cannot, they run at the
+    same time, the chain with the shorter period at the better priority, and only their publish
+    slots, which make the latency constant, stay apart.
 
     Raises: as :func:`with_offsets`.
     """
@@ -96,21 +92,18 @@ def with_offsets(
 ) -> tuple[Plan, ...]:
     """The plans of several chains with offsets that keep their slots apart.
 
-    The first chain, and any that shares no core with another, keeps the offset 0. To let two
-    chains run on one core at the same time, give their servers different priorities first.
-
-    ``time_limit_s`` bounds the search among chains that can collide with each other.
+    The first chain, and any that shares no core with another, has the offset 0. ``time_limit_s``
+    bounds the search among chains that can collide with each other.
 
     Raises:
         InputError: no plans, or plans that govern the same threads or the same output.
-        OperationError: there are no such offsets, with the reason where a single pair of chains
-            or the load of a core already excludes them; or it is not known whether there are,
-            because the time was up.
+        OperationError: there are no such offsets, with the reason where a single pair of chains or
+            the load of a core already excludes them; or the time was up before an answer.
         PlatformError: more than a few chains collide and OR-tools is not installed.
     """
     if not plans:
         raise InputError("no plans to find offsets for: give one per chain")
-    refuse_shared_parts(plans)
+    _refuse_shared_parts(plans)
     allowed: _Allowed = {}
     for j, k in combinations(range(len(plans)), 2):
         found = _allowed_differences(plans[j], plans[k])
@@ -235,9 +228,9 @@ def _fitted(
     """Chains fitted in one after the other; None says nothing.
 
     A chain that fits nowhere is put where it pushes out what was hardest to place the least, and
-    those chains wait their turn again. Every time a chain does not fit it weighs more, so that
-    the hard ones come to stay and the others move around them (guided ejection: Nagata and
-    Bräysy, Operations Research Letters 37, 2009).
+    those chains wait their turn again. Every time a chain does not fit it weighs more, so that the
+    hard ones come to stay and the others move around them (guided ejection: Nagata and Bräysy,
+    Operations Research Letters 37, 2009).
     """
     waiting = sorted(group, key=lambda k: (-plans[k].cycle_ns, _busy(plans[k])))
     weight = dict.fromkeys(group, 1)
@@ -324,11 +317,10 @@ def _solve(
 
 
 def _played_out(plans: Sequence[Plan], group: list[int]) -> Iterator[list[tuple[int, int, int]]]:
-    """Per core and priority, every slot of a hyper-period and of the cycle before it.
+    """Per core and priority, every slot (chain, start, end) of a hyper-period and the cycle before.
 
-    As (chain, start, end), from the chain's offset on. Pairs of chains say all that there is to
-    say, but only from slots side by side does a solver see that a core is too full for all of
-    them. Nothing, where a hyper-period is too long to be of use.
+    Pairs of chains say all that there is to say, but only from slots side by side does a solver see
+    that a core is too full for all of them. Nothing, where a hyper-period is too long to be of use.
     """
     hyper_period = math.lcm(*(plans[k].cycle_ns for k in group))
     if sum(hyper_period // plans[k].cycle_ns for k in group) > MOST_CYCLES:
@@ -381,3 +373,30 @@ def _pair_too_long(one: Plan, two: Plan, common: int) -> str:
 
 def _name(plan: Plan) -> str:
     return plan.chain.spec or plan.chain.output or "a chain without a name"
+
+
+def _refuse_shared_parts(plans: Sequence[Plan]) -> None:
+    """Plans that were made one by one may not govern the same threads, or the same output."""
+    for one, two in combinations(plans, 2):
+        if one.chain.output is not None and one.chain.output == two.chain.output:
+            raise InputError(same_output(_name(one), _name(two), one.chain.output))
+        nodes = [{t.node for server in plan.servers for t in server.threads} for plan in (one, two)]
+        if shared := nodes[0] & nodes[1]:
+            raise InputError(same_nodes(_name(one), _name(two), shared))
+
+
+def same_output(one: str, two: str, topic: str) -> str:
+    """Why two chains with one output have no plan together."""
+    return (
+        f"{one} and {two} both publish {topic}, and one shaping node can hold it at one place"
+        " only: name each output once, with the chain that takes longest"
+    )
+
+
+def same_nodes(one: str, two: str, nodes: Iterable[str]) -> str:
+    """Why two chains with common nodes have no plan together."""
+    return (
+        f"{one} and {two} share {', '.join(sorted(nodes))}: a thread runs in the servers of one"
+        " plan. Plan one of the two alone or, where both begin at the same callback, the other as"
+        " its --sink"
+    )

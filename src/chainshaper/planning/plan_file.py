@@ -1,8 +1,8 @@
 """A plan on disk: YAML that a person reads, edits and compares, checked again when it is read.
 
-:func:`load_plan` tolerates whatever a person does to the layout (comments, order of keys, flow
-or block style) and refuses whatever would not run: each wrong value is named with its file,
-line, key, the reason and what to write instead.
+:func:`load_plan` tolerates whatever a person does to the layout (comments, order of keys, flow or
+block style) and refuses whatever would not run: each wrong value is named with its file, line, key,
+the reason and what to write instead.
 """
 
 from collections.abc import Sequence
@@ -15,8 +15,6 @@ from chainshaper.planning.plan import Plan, band_predictions, publish_slots
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.whole_file import new_file, write_whole
 from chainshaper.values.yaml_file import AS_YAML, read_model
-
-__all__ = ["Plan", "dump_plan", "load_plan", "plan_json", "save_plan", "save_plans"]
 
 _HEADER = """\
 # A chainshaper plan: the reservation servers that give a ROS 2 chain a constant latency.

@@ -1,19 +1,27 @@
-"""What is asked of a plan, and what was measured of a chain: together they make the plan.
+"""From what was measured of a chain, and what is wished, to its plan of any policy.
 
-:class:`Profile` holds the measurements, :class:`PlanRequest` the wishes, and :func:`plan_chain`
-turns one of each into a plan of any policy. A profile may come from a recording or consist of
-bare latencies and a period; a policy that needs more says so.
+:class:`Profile` has the measurements, :class:`PlanRequest` the wishes, and :func:`plan_chain` turns
+one of each into a plan. A profile may come from a recording or consist of bare latencies and a
+period; a policy that needs more says so.
+
+Several chains cannot be planned together where one's plan would move another's outputs. A plan is
+made from latencies that were measured while nothing was shaped: shaping a topic that another
+chain's output waits for makes that one later than was measured, and its slot too early. Nor can two
+plans have one thread. Chains that share no more than cores, and sinks that fork off behind the
+first callback, are planned right; the others are refused with what they have in common.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain as joined
-from typing import Any, Literal
+from itertools import combinations, permutations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.gate.decision import Anchor, Messages, Overrun
+from chainshaper.gate.decision import Overrun
+from chainshaper.planning.bands import BandChoice, choose_bands, with_bands, with_long_slot
 from chainshaper.planning.baselines import (
     CallbackTimes,
     let_per_callback,
@@ -22,42 +30,33 @@ from chainshaper.planning.baselines import (
     server_per_callback,
     server_per_chain,
 )
-from chainshaper.planning.entangled import refuse_entangled
-from chainshaper.planning.graphs import over_cores, with_first_node_apart, with_sink
-from chainshaper.planning.latency_file import check_latencies
 from chainshaper.planning.margins import (
     EPSILON_NS,
     MOST_PROBABLE,
     OVERRUN_PROBABILITY,
+    check_latencies,
     covered_latency,
     cycles_needed,
     derive_margin,
     late_share,
 )
-from chainshaper.planning.placement import (
-    BandChoice,
-    choose_bands,
-    with_bands,
-    with_long_slot,
+from chainshaper.planning.offsets import same_nodes, same_output
+from chainshaper.planning.plan import PER_CALLBACK, Evidence, Margin, Modes, Plan, revised
+from chainshaper.planning.shaping import (
+    evidence_of,
+    over_cores,
+    plan_shaping,
+    with_first_node_apart,
+    with_sink,
 )
-from chainshaper.planning.plan import (
-    PER_CALLBACK,
-    Evidence,
-    Margin,
-    Modes,
-    Plan,
-    revised,
-)
-from chainshaper.planning.shaping import evidence_of, plan_shaping
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError
-from chainshaper.values.plan_choices import Fallback, Goal, Policy, Publication, Solver
-
-__all__ = ["PlanRequest", "Profile", "band_choice", "plan_chain", "plan_chains"]
+from chainshaper.values.plan_choices import Policy, Wishes
 
 DEFAULT_CORE = 1
 OWN_SLOTS = (*PER_CALLBACK, "let-per-chain")
 """Policies whose plan has no slot behind the chain's, in the same cycle."""
+UNSHAPED = ("server-per-chain", "server-per-callback")
 
 
 @dataclass(frozen=True)
@@ -66,15 +65,14 @@ class Profile:
 
     ``latencies_ns`` are those of undisturbed cycles, ``every_latency_ns`` those of all (None: all
     were undisturbed), both in the order of time. ``nodes`` are those of the chain's callbacks, one
-    per callback, ``topics`` what each of these publishes for the chain. ``core_of`` names the
-    core of every node whose executor takes part, also on branches that the chain waits for.
-    ``begins`` is the first callback's number in the graph, and its name, ``upstream`` the topics
-    that the output waits for: on the chain, on those branches, and before the chain begins.
-    ``receivers`` are the nodes that subscribe to the chain's output and are none of these.
-    ``callbacks`` are those of the chain and its branches, see
-    :func:`~chainshaper.planning.baselines.server_per_callback`. ``output_depth`` is the history
-    of the output's writer, ``longest_send_ns`` how long its asynchronous publisher took to send.
-    The rest is evidence.
+    per callback, ``topics`` what each of these publishes for the chain. ``core_of`` names the core
+    of every node whose executor takes part, also on branches that the chain waits for. ``begins``
+    is the first callback's number in the graph, and its name, ``upstream`` the topics that the
+    output waits for: on the chain, on those branches, and before the chain begins. ``receivers``
+    are the nodes that subscribe to the chain's output and are none of these. ``callbacks`` are
+    those of the chain and its branches, see
+    :func:`~chainshaper.planning.baselines.server_per_callback`. ``output_depth`` is the history of
+    the output's writer. The rest is :class:`~chainshaper.planning.plan.Evidence`.
     """
 
     latencies_ns: NDArray[np.int64]
@@ -89,6 +87,7 @@ class Profile:
     receivers: tuple[str, ...] = ()
     callbacks: tuple[CallbackTimes, ...] = ()
     fifo_priority: int = 84
+    output_depth: int | None = None
     recording: str | None = None
     incomplete: int = 0
     disturbed: int = 0
@@ -97,51 +96,16 @@ class Profile:
     utilisation: float | None = None
     longest_send_ns: int | None = None
     lost_events: int | None = None
-    output_depth: int | None = None
 
 
 @dataclass(frozen=True)
-class PlanRequest:
+class PlanRequest(Wishes):
     """The wishes for a plan; every field has the default that the command line has.
 
-    The margin is ``epsilon_ns`` behind the longest undisturbed latency where that is given.
-    Otherwise it covers all cycles, also disturbed ones, but a share of ``overrun_probability``
-    (None: 1 %, or as few as the sample shows); with ``ideal_machine`` undisturbed cycles only.
-    ``overrun`` says what becomes of an output that missed its slot (None: it leaves at once, where
-    the policy and the publisher allow it). ``bands`` to
-    ``seed`` are those of :func:`~chainshaper.planning.placement.with_bands` and go with the
-    policy ``shaped``, ``slot_start_ns`` goes with ``one-long-slot``. ``first_slot_ns`` puts the
-    chain's first node into a server of its own that ends there. ``modes`` give each mode of the
-    system one of the bands. ``depth`` is the shaping nodes'. Without ``with_receivers`` those of
-    the output are left alone.
+    ``modes`` give each mode of the system one of the bands.
     """
 
-    policy: Policy = "shaped"
-    publication: Publication = "synchronous"
-    epsilon_ns: int | None = None
-    overrun_probability: float | None = None
-    ideal_machine: bool = False
-    publish_slot_ns: int = 1_000_000
-    bands: int | Literal["auto"] = 1
-    solver: Solver = "exact"
-    grid_ns: int = 1_000
-    max_gap_ns: int | None = None
-    max_share: float | None = None
-    minimise: Goal = "mean"
-    mean_at_most_ns: int | None = None
-    least_gain: float = 0.02
-    seed: int = 0
-    slot_start_ns: int | None = None
-    first_slot_ns: int | None = None
     modes: Modes | None = None
-    anchor: Anchor = "stamp"
-    overrun: Overrun | None = None
-    messages: Messages = "all-in-order"
-    depth: int | None = None
-    fallback: Fallback = "bypass"
-    spin_ns: int = 1_000_000
-    pause_ns: int | None = None
-    with_receivers: bool = True
 
 
 _STANDARD = PlanRequest()
@@ -161,24 +125,26 @@ def plan_chain(
         PlatformError: a library that only this request needs is not installed.
     """
     _refuse_contradictions(request, bool(sinks))
-    refuse_entangled((profile, *sinks), request.policy, sinks=True)
+    _refuse_entangled((profile, *sinks), request.policy, sinks=True)
     margin = _margin(profile, request)
     if request.policy == "let-per-chain":
         _refuse_longer_than_period(profile)
-    if request.policy in OWN_SLOTS:
-        plan = _with_policy(
-            _shaped(_shortened(profile, request, margin), request, margin, sinks), profile, request
-        )
-        plan = revised(plan, evidence=_measured(plan.evidence, profile.latencies_ns))
-    else:
-        plan = _with_policy(_shaped(profile, request, margin, sinks), profile, request)
+    own_slots = request.policy in OWN_SLOTS
+    measured = _shortened(profile, request, margin) if own_slots else profile
+    plan = _with_policy(_shaped(measured, request, margin, sinks), profile, request)
+    if own_slots:
+        figures = evidence_of(profile.latencies_ns)
+        names = ("min_latency_ns", "mean_latency_ns", "max_latency_ns")
+        update = {name: getattr(figures, name) for name in names}
+        plan = revised(plan, evidence=plan.evidence.model_copy(update=update))
     for sink in sinks:
-        publisher = sink.nodes[-1] if sink.nodes else None
+        if not sink.topics:
+            raise InputError("a sink needs the topic it is published on: plan from a recording")
         plan = with_sink(
             plan,
             sink.latencies_ns,
-            _output(sink),
-            publisher=publisher,
+            sink.topics[-1],
+            publisher=sink.nodes[-1] if sink.nodes else None,
             receivers=sink.receivers if request.with_receivers else (),
         )
     if request.fallback != _STANDARD.fallback and plan.shaping_node is None:
@@ -186,7 +152,7 @@ def plan_chain(
             f"--fallback {request.fallback} is for an output with a shaping node, and the plan has"
             " none: leave it out, or plan with synchronous publication"
         )
-    return revised(plan, modes=request.modes, fallback=request.fallback)
+    return revised(plan, modes=request.modes)
 
 
 def plan_chains(profiles: Sequence[Profile], request: PlanRequest = _STANDARD) -> tuple[Plan, ...]:
@@ -195,18 +161,17 @@ def plan_chains(profiles: Sequence[Profile], request: PlanRequest = _STANDARD) -
     Raises: as :func:`plan_chain`; InputError also where one chain's plan would move another's
         outputs.
     """
-    refuse_entangled(profiles, request.policy)
+    _refuse_entangled(profiles, request.policy)
     return tuple(plan_chain(profile, request) for profile in profiles)
 
 
 def band_choice(plan: Plan, profile: Profile, request: PlanRequest) -> BandChoice:
     """The curve of figure 7 for a plan, and the number of bands that ``auto`` takes from it."""
-    values = _placement(request, "least_gain")
-    return choose_bands(plan, profile.latencies_ns, **values)
+    return choose_bands(plan, profile.latencies_ns, **_placement(request, "least_gain"))
 
 
 def _shortened(profile: Profile, request: PlanRequest, margin: Margin) -> Profile:
-    """The profile with no latency beyond what shaping could hold in a cycle.
+    """The profile with no latency beyond what shaping could fit into a cycle.
 
     Where the policy has slots of its own, shaping is only the start of the plan.
     """
@@ -225,42 +190,30 @@ def _refuse_longer_than_period(profile: Profile) -> None:
         )
 
 
-def _measured(evidence: Evidence, latencies_ns: NDArray[np.int64]) -> Evidence:
-    figures = evidence_of(latencies_ns)
-    names = ("min_latency_ns", "mean_latency_ns", "max_latency_ns")
-    return evidence.model_copy(update={name: getattr(figures, name) for name in names})
-
-
 def _shaped(
     profile: Profile, request: PlanRequest, margin: Margin, sinks: Sequence[Profile]
 ) -> Plan:
     last = profile.nodes[-1] if profile.nodes else None
-    asynchronous = request.publication == "asynchronous"
-    conditions = {n: getattr(profile, n) for n in Evidence.model_fields if hasattr(profile, n)}
-    conditions["max_of_all_ns"] = int(_every_latency(profile).max())
-    if not asynchronous:  # how long sends take is no evidence for it
-        del conditions["longest_send_ns"]
+    values = {n: getattr(profile, n) for n in Evidence.model_fields if hasattr(profile, n)}
+    if request.publication == "asynchronous":
+        values["output_depth"] = profile.output_depth
+    else:  # how long sends take is no evidence for it
+        del values["longest_send_ns"]
     plan = plan_shaping(
         profile.latencies_ns,
         profile.period_ns,
+        wishes=request,
+        margin=margin,
         spec=profile.spec,
         output=profile.topics[-1] if profile.topics else None,
         publisher=last,
         nodes=tuple(dict.fromkeys(profile.nodes)),
-        margin=margin,
-        publish_slot_ns=request.publish_slot_ns,
-        publication=request.publication,
-        output_depth=profile.output_depth if asynchronous else None,
         core=profile.core_of.get(last or "", DEFAULT_CORE),
-        anchor=request.anchor,
         overrun=_overrun(request),
-        messages=request.messages,
-        depth=request.depth,
         fifo_priority=profile.fifo_priority,
-        spin_ns=request.spin_ns,
-        pause_ns=request.pause_ns,
         receivers=profile.receivers if request.with_receivers else (),
-        **conditions,
+        max_of_all_ns=int(_every_latency(profile).max()),
+        **values,
     )
     core_of = dict(joined.from_iterable(one.core_of.items() for one in (profile, *sinks)))
     if request.first_slot_ns is not None:
@@ -276,10 +229,8 @@ def _overrun(request: PlanRequest) -> Overrun:
 
     The thread of an asynchronous publisher cannot do that where outputs are due a cycle later.
     """
-    if request.overrun is not None:
-        return request.overrun
     bound = request.publication == "asynchronous" and request.policy in OWN_SLOTS
-    return "wait" if bound else "publish"
+    return request.overrun or ("wait" if bound else "publish")
 
 
 def _margin(profile: Profile, request: PlanRequest) -> Margin:
@@ -320,6 +271,11 @@ def _every_latency(profile: Profile) -> NDArray[np.int64]:
     return profile.latencies_ns if every is None else check_latencies(every)
 
 
+def _placement(request: PlanRequest, *names: str) -> dict[str, Any]:
+    """What a request says about placing bands: the limits, and what else is named."""
+    return {n: getattr(request, n) for n in ("grid_ns", "max_gap_ns", "max_share", *names)}
+
+
 def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
     if request.policy == "shaped":
         values = _placement(request, "solver", "minimise", "mean_at_most_ns", "least_gain", "seed")
@@ -333,11 +289,6 @@ def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
     if request.policy == "let-per-chain":
         return let_per_chain(plan)
     return _per_callback(plan, profile, request)
-
-
-def _placement(request: PlanRequest, *names: str) -> dict[str, Any]:
-    """What a request says about placing bands: the limits, and what else is named."""
-    return {n: getattr(request, n) for n in ("grid_ns", "max_gap_ns", "max_share", *names)}
 
 
 def _per_callback(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
@@ -374,7 +325,43 @@ def _refuse_contradictions(request: PlanRequest, sinks: bool) -> None:
         raise InputError(f"further sinks are shaped, not planned as {request.policy}")
 
 
-def _output(profile: Profile) -> str:
-    if not profile.topics:
-        raise InputError("a sink needs the topic it is published on: plan from a recording")
-    return profile.topics[-1]
+def _refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: bool = False) -> None:
+    """With ``sinks`` all are planned as one: the first chain, and further outputs of its graph."""
+    for one, two in combinations(profiles, 2):
+        if one.topics and one.topics[-1:] == two.topics[-1:]:
+            raise InputError(same_output(_name(one), _name(two), one.topics[-1]))
+    for shaped, waiting in permutations(profiles, 2):
+        # The topics that come later under the plan than they were measured:
+        delayed = shaped.topics if policy == "let-per-callback" else shaped.topics[-1:]
+        if on_the_way := sorted(waiting.upstream.intersection(delayed)):
+            if policy in UNSHAPED:
+                continue
+            raise InputError(
+                f"{_name(waiting)} waits for {', '.join(on_the_way)}, which the plan for"
+                f" {_name(shaped)} publishes later than it was measured: {_name(waiting)} would"
+                f" miss its own slot. Plan {_name(waiting)} alone, whose output is constant then,"
+                f" or {_name(shaped)} alone"
+            )
+    for one, two in combinations(profiles, 2):
+        if sinks:
+            _refuse_another_beginning(one, two)
+        elif shared := set(one.core_of) & set(two.core_of):
+            raise InputError(same_nodes(_name(one), _name(two), shared))
+
+
+def _refuse_another_beginning(one: Profile, two: Profile) -> None:
+    if one.begins is not None and two.begins is not None and one.begins != two.begins:
+        raise InputError(
+            f"{_name(two)} begins at {two.begins[1]}, {_name(one)} at another callback,"
+            f" {one.begins[1]}: the slots of a sink count from the beginning of the chain. Name a"
+            " sink behind the same first callback, or plan one of the two alone"
+        )
+    if one.period_ns != two.period_ns:
+        raise InputError(
+            f"{_name(two)} has the period {format_duration(two.period_ns)}, {_name(one)}"
+            f" {format_duration(one.period_ns)}: a plan has one cycle. Plan one of the two alone"
+        )
+
+
+def _name(profile: Profile) -> str:
+    return profile.spec or "..".join(profile.topics)

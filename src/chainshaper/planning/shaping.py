@@ -1,151 +1,117 @@
 """Latency shaping: from measured latencies to the chain's server and its publish slots.
 
-The chain runs in a server that is open from the start of a cycle until every execution seen so
-far was complete, and its output is published in a server whose slot comes then: late for most
-cycles, but at the same time in all of them (paper, sections 3.1 and 3.2).
+The chain runs in a server that is open from the start of a cycle until every execution seen so far
+was complete, and its output is published in a server whose slot comes then: late for most cycles,
+but at the same time in all of them (paper, sections 3.1 and 3.2).
+
+:func:`plan_shaping` plans one chain; further steps take its plan and return one that covers more of
+a graph (sections 5.1 and 5.4). Within the graph's given assignment of callbacks to cores, shaping
+needs no new idea: one server per core while the graph runs, one publish slot per sink.
 """
 
-from collections.abc import Sequence
-from itertools import pairwise
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.gate.decision import Anchor, Messages, Overrun
-from chainshaper.planning.latency_file import check_latencies
-from chainshaper.planning.margins import EPSILON_NS, OVERRUN_PROBABILITY, cycles_needed
+from chainshaper.planning.bands import predict_bands
+from chainshaper.planning.margins import EPSILON_NS, check_latencies
 from chainshaper.planning.plan import (
     ChainOfPlan,
     Evidence,
     Margin,
     Plan,
-    Prediction,
     Server,
     ShapingNode,
     Thread,
+    below_executors,
+    output_server,
     publish_slots,
-    wrong_values_refused,
+    publishing_servers,
+    revised,
+    until,
+    with_slots,
 )
-from chainshaper.planning.publication import publication_warnings
-from chainshaper.values.durations import format_duration, milliseconds
+from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError
-from chainshaper.values.plan_choices import Publication
-
-__all__ = ["evidence_of", "plan_shaping", "plan_warnings", "predict_bands", "shaping_node_like"]
+from chainshaper.values.plan_choices import Wishes
+from chainshaper.values.yaml_file import wrong_values_refused
 
 OUTPUT_PRIORITY = 1  # better than the chain's: a publish slot inside its slot has to pre-empt it
 CHAIN_PRIORITY = 2
 PAUSE_NS = 2_000_000  # a receiver on a slow machine takes a millisecond to get to its callback
 
-NEARLY_FULL = 0.95  # of the cycle; also the kernel's default share for real-time threads
+_WISHES = {field.name for field in fields(Wishes)}
 
 
 def plan_shaping(
     latencies_ns: NDArray[np.int64],
     period_ns: int,
     *,
-    spec: str | None = None,
-    output: str | None = None,
-    publisher: str | None = None,
-    nodes: Sequence[str] = (),
-    epsilon_ns: int = EPSILON_NS,
+    wishes: Wishes | None = None,
     margin: Margin | None = None,
-    publish_slot_ns: int = 1_000_000,
-    publication: Publication = "synchronous",
-    output_depth: int | None = None,
+    nodes: Sequence[str] = (),
     core: int = 1,
     output_core: int | None = None,
-    anchor: Anchor = "stamp",
-    overrun: Overrun = "publish",
-    messages: Messages = "all-in-order",
-    depth: int | None = None,
     fifo_priority: int = 84,
-    spin_ns: int = 1_000_000,
-    pause_ns: int | None = None,
     receivers: Sequence[str] = (),
-    **conditions: Any,
+    **values: Any,
 ) -> Plan:
     """Plan single-band shaping: one publish slot right behind the longest latency measured.
 
-    With L̄ the longest latency, ε the margin, Δ the length of the publish slot and CT the
-    period, the chain's server R_m gets the slot [0, L̄ + ε) (eq. 1) and the output's server R_m°
-    gets [L̄ + ε, L̄ + ε + Δ) (eq. 4 with a shaping node, eq. 2 with an asynchronous publisher
-    thread), in the same cycle (eq. 3). R_m° gets the better priority and, unless ``output_core``
-    says otherwise, the same core.
+    With L̄ the longest latency, ε the margin, Δ the length of the publish slot and CT the period,
+    the chain's server R_m gets the slot [0, L̄ + ε) (eq. 1) and the output's server R_m° gets [L̄ +
+    ε, L̄ + ε + Δ) (eq. 4 with a shaping node, eq. 2 with an asynchronous publisher thread), in the
+    same cycle (eq. 3). R_m° gets the better priority and, unless ``output_core`` says otherwise,
+    the same core.
 
     Args:
-        latencies_ns: every end-to-end latency to be covered; L̄ is the longest of them, so leave
-            out beforehand what the chain is not to be planned for.
+        latencies_ns: every end-to-end latency to be covered; leave out beforehand what the chain
+            is not to be planned for.
         period_ns: the chain's period.
-        spec, output, publisher, nodes: the chain as written, its last topic, the node that
-            publishes it, and the nodes whose executors run the chain's callbacks. Without
-            ``output`` the plan names no publishing thread: it can be studied, not carried out.
-        epsilon_ns, publish_slot_ns: ε and Δ.
-        margin: a margin that was derived from the latencies, in place of ``epsilon_ns``.
-        publication: ``synchronous`` splices a shaping node behind the output; ``asynchronous``
-            puts the publisher's own thread into R_m°.
-        output_depth: history of the output's writer (keep last).
+        wishes, margin: ε is the margin's or, without one, 1 ms unless the wishes say otherwise.
+        nodes: those whose executors run the chain's callbacks.
         core, output_core: cores of the two servers.
-        anchor, fifo_priority, spin_ns, pause_ns, receivers: for the shaping node; it pauses for
-            2 ms, a twentieth of the period at most, if nothing else is asked for.
-        overrun: what becomes of an output that missed its slot.
-        messages, depth: which of several outputs in one cycle leave, and how many may wait.
-        conditions: how the latencies were taken: the other fields of
-            :class:`~chainshaper.planning.plan_parts.Evidence`.
+        fifo_priority, receivers: for the shaping node.
+        values: fields of :class:`~chainshaper.planning.plan.ChainOfPlan` (without ``output`` the
+            plan names no publishing thread: it can be studied, not carried out), single
+            :class:`~chainshaper.values.plan_choices.Wishes`, and how the latencies were taken:
+            fields of :class:`~chainshaper.planning.plan.Evidence`.
 
     Raises:
         InputError: latencies or values that no plan may have.
         OperationError: L̄ + ε + Δ does not fit into the period.
     """
     latencies = check_latencies(latencies_ns)
-    if margin is not None:
-        epsilon_ns = margin.epsilon_ns
-    if epsilon_ns < 0 or publish_slot_ns <= 0 or period_ns <= 0:
+    of_chain = {n: values.pop(n) for n in ChainOfPlan.model_fields.keys() & values.keys()}
+    wishes = replace(wishes or Wishes(), **{n: values.pop(n) for n in _WISHES & values.keys()})
+    given = EPSILON_NS if wishes.epsilon_ns is None else wishes.epsilon_ns
+    epsilon = given if margin is None else margin.epsilon_ns
+    if epsilon < 0 or wishes.publish_slot_ns <= 0 or period_ns <= 0:
         raise InputError(
             "epsilon must be 0ms or more, the publish slot and the period longer than 0ms;"
-            f" found {format_duration(epsilon_ns)}, {format_duration(publish_slot_ns)} and"
+            f" found {format_duration(epsilon)}, {format_duration(wishes.publish_slot_ns)} and"
             f" {format_duration(period_ns)}"
         )
-    if publication == "asynchronous" and output is not None and publisher is None:
-        raise InputError(
-            "asynchronous publication gates the publisher's own thread: name the node that"
-            " publishes the chain's output"
-        )
-    chain_end = int(latencies.max()) + epsilon_ns
-    slot_end = chain_end + publish_slot_ns
-    _refuse_too_long(int(latencies.max()), epsilon_ns, publish_slot_ns, period_ns)
+    chain_end = int(latencies.max()) + epsilon
+    slot_end = chain_end + wishes.publish_slot_ns
+    _refuse_too_long(int(latencies.max()), epsilon, wishes.publish_slot_ns, period_ns)
     output_core = core if output_core is None else output_core
-    with wrong_values_refused():
-        node = None
-        if publication == "synchronous" and output is not None:
-            node = ShapingNode(
-                **_names(output),
-                depth=depth,
-                core=output_core,
-                fifo_priority=fifo_priority,
-                spin_ns=spin_ns,
-                pause_ns=min(PAUSE_NS, period_ns // 20) if pause_ns is None else pause_ns,
-                receivers=tuple(receivers),
-            )
-        publishing = [node.thread] if node is not None else []
-        if publication == "asynchronous" and publisher is not None:
-            publishing = [Thread(node=publisher, role="publisher")]
+    with wrong_values_refused(Plan):
+        chain = ChainOfPlan(period_ns=period_ns, **of_chain)
+        node, gated = _gate(chain, wishes, output_core, fifo_priority, receivers)
         return Plan(
-            chain=ChainOfPlan(
-                spec=spec,
-                output=output,
-                publisher=publisher,
-                output_depth=output_depth,
-                period_ns=period_ns,
-            ),
-            evidence=evidence_of(latencies, **conditions),
-            margin=margin or Margin(epsilon_ns=epsilon_ns),
+            chain=chain,
+            evidence=evidence_of(latencies, **values),
+            margin=margin or Margin(epsilon_ns=epsilon),
             policy="shaped",
             cycle_ns=period_ns,
-            anchor=anchor,
-            overrun=overrun,
-            messages=messages,
+            anchor=wishes.anchor,
+            overrun=wishes.overrun or "publish",
+            messages=wishes.messages,
+            fallback=wishes.fallback,
             servers=(
                 Server(
                     name="chain",
@@ -159,12 +125,45 @@ def plan_shaping(
                     core=output_core,
                     priority=OUTPUT_PRIORITY,
                     slots=((chain_end, slot_end),),
-                    threads=tuple(publishing),
+                    threads=gated,
                 ),
             ),
             shaping_node=node,
-            predicted=predict_bands(latencies, [slot_end], publish_slot_ns),
+            predicted=predict_bands(latencies, [slot_end], wishes.publish_slot_ns),
         )
+
+
+def _gate(
+    chain: ChainOfPlan, wishes: Wishes, core: int, fifo_priority: int, receivers: Sequence[str]
+) -> tuple[ShapingNode | None, tuple[Thread, ...]]:
+    """The shaping node of a chain's output, if any, and the threads that publish it."""
+    if wishes.publication == "asynchronous":
+        if chain.publisher is not None:
+            return None, (Thread(node=chain.publisher, role="publisher"),)
+        if chain.output is not None:
+            raise InputError(
+                "asynchronous publication gates the publisher's own thread: name the node that"
+                " publishes the chain's output"
+            )
+    if chain.output is None:
+        return None, ()
+    pause = min(PAUSE_NS, chain.period_ns // 20) if wishes.pause_ns is None else wishes.pause_ns
+    node = ShapingNode(
+        **_names(chain.output),
+        depth=wishes.depth,
+        core=core,
+        fifo_priority=fifo_priority,
+        spin_ns=wishes.spin_ns,
+        pause_ns=pause,
+        receivers=tuple(receivers),
+    )
+    return node, (node.thread,)
+
+
+def _names(output: str) -> dict[str, str]:
+    # The chain publishes on a topic of its own, and the shaping node takes over the output's.
+    name = "chainshaper" + output.replace("/", "_")
+    return {"name": name, "input": f"{output}_tmp", "output": output}
 
 
 def shaping_node_like(
@@ -186,134 +185,6 @@ def evidence_of(latencies_ns: NDArray[np.int64], **conditions: Any) -> Evidence:
     )
 
 
-def predict_bands(
-    latencies_ns: NDArray[np.int64], slot_ends_ns: Sequence[int], publish_slot_ns: int
-) -> Prediction:
-    """What publication in given slots makes of measured latencies.
-
-    Each band is represented by the end of its slot, x_α. An execution whose own latency is in
-    (x_{α−1}, x_α] publishes in slot α, so with φ the measured distribution the average is
-    Σ (φ(x_α) − φ(x_{α−1}))·x_α (eq. 5). The latest output is at x_ν, the earliest at the start
-    of the first slot, x_1 − Δ, so the jitter is x_ν − (x_1 − Δ): 25 ms for the paper's slots
-    [62, 63], [77, 78], [86, 87] ms.
-
-    ``slot_ends_ns`` ascend and the last is not before the longest latency; Δ is
-    ``publish_slot_ns``. All in nanoseconds.
-
-    Raises:
-        InputError: slot ends that break these rules.
-    """
-    ends = [int(end) for end in slot_ends_ns]
-    if not ends or any(after <= before for before, after in pairwise(ends)):
-        raise InputError(f"slot ends must ascend, at least one: found {ends}")
-    longest = int(latencies_ns.max())
-    if ends[-1] < longest:
-        raise InputError(
-            f"the last slot ends at {format_duration(ends[-1])}, before the longest latency,"
-            f" {format_duration(longest)}: move it behind"
-        )
-    reached = np.searchsorted(np.sort(latencies_ns), ends, side="right")
-    counts = [int(count) for count in np.diff(reached, prepend=0)]
-    total = sum(counts)
-    return Prediction(
-        mean_ns=round(sum(count * end for count, end in zip(counts, ends, strict=True)) / total),
-        max_ns=ends[-1],
-        jitter_ns=ends[-1] - (ends[0] - publish_slot_ns),
-        shares=tuple(count / total for count in counts),
-    )
-
-
-def plan_warnings(plan: Plan) -> list[str]:
-    """What a person must know before relying on a plan; one sentence each, none if all is well."""
-    evidence, cycle = plan.evidence, plan.cycle_ns
-    warnings = _about_late_outputs(plan)
-    if evidence.realtime is False:
-        warnings.append(
-            "the latencies were taken without real-time scheduling: other programs are in them,"
-            " and the chain's slot is longer than it needs to be. Record again with the privilege"
-            " to use SCHED_FIFO."
-        )
-    if evidence.lost_events:
-        warnings.append(
-            f"{evidence.lost_events} events were lost while recording: cycles are missing, and the"
-            " longest latency may be among them. Record again, see the recording's notes."
-        )
-    if evidence.incomplete:
-        warnings.append(
-            f"{evidence.incomplete} executions of the chain have no end in the recording; their"
-            " latencies, which may be the longest, are not in the plan."
-        )
-    if plan.margin.confidence_interval_ns is not None:
-        low, high = map(format_duration, plan.margin.confidence_interval_ns)
-        warnings.append(
-            f"the margin {format_duration(plan.margin.epsilon_ns)} is an estimate; with 95 %"
-            f" confidence it lies between {low} and {high}."
-        )
-    last = max((end for _, end in publish_slots(plan)), default=evidence.max_latency_ns)
-    if NEARLY_FULL * cycle < last <= cycle:
-        warnings.append(
-            f"the plan fills {last / cycle:.1%} of the cycle {format_duration(cycle)}: an"
-            " execution a little longer than any measured delays the next one."
-        )
-    if evidence.max_latency_ns >= cycle:
-        warnings.append(
-            f"the longest latency {format_duration(evidence.max_latency_ns)} is not shorter than"
-            f" the cycle {format_duration(cycle)}: executions of the chain overlapped while they"
-            " were measured, and response times have each other's interference in them."
-        )
-    elif evidence.max_latency_ns > NEARLY_FULL * cycle:
-        warnings.append(
-            "a cycle as long as the longest measured keeps its core busy for more than"
-            f" {NEARLY_FULL:.0%}, where the kernel throttles real-time threads"
-            " (/proc/sys/kernel/sched_rt_runtime_us)."
-        )
-    if evidence.utilisation is not None and evidence.utilisation > NEARLY_FULL:
-        warnings.append(
-            f"the chain's execution takes {evidence.utilisation:.1%} of its core: latencies"
-            " will pile up from cycle to cycle, whatever the slots."
-        )
-    return [*warnings, *publication_warnings(plan)]
-
-
-def _about_late_outputs(plan: Plan) -> list[str]:
-    """How many outputs will be late, if the sample tells, and what the machine's stalls cost."""
-    evidence, margin = plan.evidence, plan.margin
-    cycles, needed = evidence.samples + evidence.disturbed, cycles_needed(OVERRUN_PROBABILITY)
-    found = []
-    if cycles < needed:
-        found.append(
-            f"the sample is small: {cycles} cycles are too few to say how late one output in a"
-            f" hundred will be. Record {needed} cycles or more."
-        )
-    if evidence.disturbed:
-        stall = evidence.longest_stall_ns
-        what = "" if stall is None else f", longest stall {milliseconds(stall)} ms"
-        found.append(f"the machine disturbed {evidence.disturbed} of {cycles} cycles{what}.")
-    if margin.stalls_ns:
-        end = evidence.max_latency_ns + margin.epsilon_ns
-        found.append(
-            f"covering the disturbed cycles costs {milliseconds(margin.stalls_ns)} ms: outputs"
-            f" leave at {milliseconds(end)} ms; on a machine that does not stall it would be"
-            f" {milliseconds(end - margin.stalls_ns)} ms (--ideal-machine)."
-        )
-    late = margin.overrun_probability or 0.0
-    if cycles >= needed and late > OVERRUN_PROBABILITY and margin.source != "derived":
-        found.append(
-            f"by the latencies of all cycles, up to {late:.1%} of the outputs will miss their slot"
-            f" ({plan.overrun}): a larger margin (--epsilon) or a calmer machine helps."
-        )
-    return found
-
-
-def _names(output: str) -> dict[str, str]:
-    # The chain publishes on a topic of its own, and the shaping node takes over the output's.
-    return {
-        "name": "chainshaper" + output.replace("/", "_"),
-        "input": f"{output}_tmp",
-        "output": output,
-    }
-
-
 def _refuse_too_long(longest: int, epsilon: int, publish_slot: int, period: int) -> None:
     missing = longest + epsilon + publish_slot - period
     if missing <= 0:
@@ -331,3 +202,153 @@ def _refuse_too_long(longest: int, epsilon: int, publish_slot: int, period: int)
         f" {format_duration(period)}: {format_duration(missing)} too long. What helps:"
         f" {', or '.join(remedies)}."
     )
+
+
+def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
+    """One server per core for the chain's threads, each with the chain's slot (section 5.4).
+
+    ``core_of`` names the core of every node whose executor takes part, also of nodes that the plan
+    does not know yet: branches that the chain waits for.
+
+    Raises:
+        InputError: a node of the plan is missing.
+    """
+    chain = _chain_server(plan)
+    missing = [thread.node for thread in chain.threads if thread.node not in core_of]
+    if missing:
+        raise InputError(f"no core is named for {', '.join(missing)}: name one for each node")
+    cores = sorted(set(core_of.values()))
+    with wrong_values_refused(Plan):
+        split = [
+            Server(
+                name=f"{chain.name}_core{core}" if len(cores) > 1 else chain.name,
+                core=core,
+                priority=chain.priority,
+                slots=chain.slots,
+                threads=tuple(Thread(node=node) for node, its in core_of.items() if its == core),
+            )
+            for core in cores
+        ]
+        others = tuple(server for server in plan.servers if server is not chain)
+        return revised(plan, servers=(*split, *others))
+
+
+def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int) -> Plan:
+    """The chain's first node in a server of its own, [0, ``slot_end_ns``), the rest behind it.
+
+    For a chain whose first callback is not a timer: stopped until its slot, it starts every
+    execution at the beginning of a cycle as if it were one (table 4, rows 2 to 5: [0, 2] and [2,
+    86] ms).
+
+    Raises:
+        InputError: the chain's server has no thread of that node, or is shorter than the slot.
+    """
+    chain = _chain_server(plan)
+    (start, end), thread = chain.slots[0], Thread(node=node)
+    if thread not in chain.threads:
+        raise InputError(f"{node} is no node of the chain's server: name its first node")
+    if not start < slot_end_ns < end:
+        raise InputError(
+            f"the first node's slot must end after {format_duration(start)} and before"
+            f" {format_duration(end)}, where the chain's does: not at"
+            f" {format_duration(slot_end_ns)}"
+        )
+    rest = tuple(other for other in chain.threads if other != thread)
+    first = chain.model_copy(
+        update={"name": "first", "slots": ((start, slot_end_ns),), "threads": (thread,)}
+    )
+    behind = chain.model_copy(update={"slots": ((slot_end_ns, end),), "threads": rest})
+    others = tuple(server for server in plan.servers if server is not chain)
+    return revised(plan, servers=(first, behind, *others))
+
+
+def with_sink(
+    plan: Plan,
+    latencies_ns: NDArray[np.int64],
+    output: str,
+    *,
+    publisher: str | None = None,
+    receivers: Sequence[str] = (),
+) -> Plan:
+    """A shaped plan with one more shaped output: another sink of the same graph (end of 5.4).
+
+    The sink gets a shaping node behind its ``publisher`` and before its ``receivers``; where the
+    plan's output is published asynchronously, that node's publisher thread is gated instead.
+    ``latencies_ns`` are those from the start of the graph to this sink. Its slot starts the plan's
+    margin after the longest, or where a publish slot that is in the way on the same core ends; the
+    chain's servers stay open as long as the slowest sink needs. The prediction stays that of the
+    first output.
+
+    Raises:
+        InputError: a plan that shapes nothing or publishes in the other way, a sink that it shapes
+            already, latencies or a topic that no plan may have.
+        OperationError: the slot does not fit into the cycle.
+    """
+    node, publishing = plan.shaping_node, output_server(plan)
+    if publishing is None or not publishing.threads:
+        raise InputError("a further sink needs a plan that shapes one output already")
+    if output in {plan.chain.output, *(other.output for other in plan.further_shaping_nodes)}:
+        raise InputError(f"the plan shapes {output} already: name each sink once")
+    slot_start, slot_end = publish_slots(plan)[-1]
+    length = slot_end - slot_start
+    done = int(check_latencies(latencies_ns).max()) + plan.margin.epsilon_ns
+    start = done
+    taken = [
+        slot
+        for server in publishing_servers(plan)
+        if server.core == publishing.core
+        for slot in server.slots
+    ]
+    for other_start, other_end in sorted(taken):
+        if start < other_end and other_start < start + length:
+            start = other_end
+    if start + length > plan.cycle_ns:
+        raise OperationError(
+            f"the sink {output} would be published until {format_duration(start + length)}, after"
+            f" the cycle of {format_duration(plan.cycle_ns)}: plan with a longer period, a"
+            " shorter slot, or another core for one of the outputs"
+        )
+    with wrong_values_refused(Plan):
+        added, thread = _gate_like(node, output, publisher, receivers)
+        server = Server(
+            name=f"output_{thread.node.strip('/')}",
+            core=publishing.core,
+            priority=OUTPUT_PRIORITY,
+            slots=((start, start + length),),
+            threads=(thread,),
+        )
+        return revised(
+            plan,
+            servers=below_executors([*_open_until(plan, done), server]),
+            further_shaping_nodes=(*plan.further_shaping_nodes, *added),
+        )
+
+
+def _gate_like(
+    node: ShapingNode | None, output: str, publisher: str | None, receivers: Sequence[str]
+) -> tuple[tuple[ShapingNode, ...], Thread]:
+    """The shaping node that a further sink needs, if any, and the thread that publishes it."""
+    if node is not None:
+        added = shaping_node_like(node, output, publisher, receivers)
+        return (added,), added.thread
+    if publisher is not None:
+        return (), Thread(node=publisher, role="publisher")
+    raise InputError(
+        f"the plan gates publishers' threads, and who publishes {output} is not known: name it"
+    )
+
+
+def _chain_server(plan: Plan) -> Server:
+    found = next((server for server in plan.servers if server.name == "chain"), None)
+    if found is None:
+        raise InputError("the plan has no server named 'chain': begin with a shaped plan")
+    return found
+
+
+def _open_until(plan: Plan, end: int) -> tuple[Server, ...]:
+    """The servers, of which those that run the graph to its end stay open until ``end``."""
+    publishing = publishing_servers(plan)
+    running = [server for server in plan.servers if server not in publishing]
+    latest = max((server.slots[-1][1] for server in running), default=end)
+    longer = [server for server in running if server.slots[-1][1] == latest < end]
+    return with_slots(plan.servers, {server.name: until(server, end) for server in longer})

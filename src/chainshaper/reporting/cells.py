@@ -5,7 +5,7 @@ from typing import Any
 
 from rich.table import Table
 
-from chainshaper.planning.plan_parts import Server
+from chainshaper.planning.plan import Server
 from chainshaper.reporting.terminal import PlainTable
 from chainshaper.values.durations import format_duration, milliseconds
 

@@ -9,7 +9,7 @@ from chainshaper.enforcement.runs.journal import Journal
 from chainshaper.enforcement.runs.state import RunState, ServerState
 from chainshaper.enforcement.threads.server_threads import WantedScheduling
 from chainshaper.linux.threads import POLICIES, Scheduling
-from chainshaper.planning.plan_parts import slot_text
+from chainshaper.planning.plan import slot_text
 from chainshaper.reporting.cells import terminal_table
 from chainshaper.values.durations import format_duration
 

@@ -7,8 +7,7 @@ from pathlib import Path
 import polars as pl
 
 from chainshaper.planning.overruns import open_until_done
-from chainshaper.planning.plan import Plan
-from chainshaper.planning.publisher_threads import publisher_servers
+from chainshaper.planning.plan import Plan, publisher_servers
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.arrays import Timing, build_machine
 from chainshaper.simulation.layout import Int64s, Machine

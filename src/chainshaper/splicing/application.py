@@ -11,15 +11,15 @@ lifespan by which DDS discards what overran.
 
 from typing import Any
 
-from pydantic import ValidationError
-
-from chainshaper.planning.overruns import output_lifespan
-from chainshaper.planning.plan import Plan, ShapingNode
-from chainshaper.planning.publication import Writer, check_publication
-from chainshaper.planning.publisher_threads import publisher_servers
+from chainshaper.planning.overruns import (
+    Writer,
+    check_publication,
+    output_lifespan,
+)
+from chainshaper.planning.plan import Plan, ShapingNode, publisher_servers
 from chainshaper.splicing.shaping_process import gate_of
 from chainshaper.values.errors import InputError
-from chainshaper.values.yaml_file import explanations, key_text
+from chainshaper.values.yaml_file import wrong_values_refused
 from chainshaper.workload.description import (
     Application,
     CallbackDescription,
@@ -128,7 +128,7 @@ def _described(plan: Plan, shaping: ShapingNode, depth: int) -> NodeDescription:
     described |= {"spin_ns": shaping.spin_ns, "pause_ns": shaping.pause_ns}
     if gate.modes is not None and plan.modes is not None:
         described["modes"] = {"topic": plan.modes.topic, **vars(gate.modes)}
-    try:
+    with wrong_values_refused(NodeDescription, "the plan's shaping node cannot be run: "):
         return NodeDescription(
             core=shaping.core,
             priority=shaping.fifo_priority,
@@ -140,11 +140,6 @@ def _described(plan: Plan, shaping: ShapingNode, depth: int) -> NodeDescription:
                 ),
             ),
         )
-    except ValidationError as error:
-        problems = [
-            f"{key_text(where)}: {reason}" for where, reason in explanations(error, NodeDescription)
-        ]
-        raise InputError(f"the plan's shaping node cannot be run: {'; '.join(problems)}") from error
 
 
 def _remapped(node: NodeDescription, old: str, new: str) -> NodeDescription:

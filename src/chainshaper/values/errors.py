@@ -5,7 +5,10 @@ message; the command line prints that message and nothing else. Three kinds are 
 a caller has three ways to react: correct the input, look at what failed, or change the machine.
 """
 
-__all__ = ["ChainshaperError", "InputError", "OperationError", "PlatformError"]
+import importlib
+from typing import Any
+
+__all__ = ["ChainshaperError", "InputError", "OperationError", "PlatformError", "extra_library"]
 
 
 class ChainshaperError(Exception):
@@ -30,3 +33,20 @@ class PlatformError(ChainshaperError):
     """This machine cannot do it: a missing core, a missing privilege, no CycloneDDS wheel."""
 
     exit_code = 3
+
+
+def extra_library(name: str, purpose: str) -> Any:
+    """Import a library that only some uses need, or one module of it.
+
+    Raises:
+        PlatformError: it is not installed; the message says what it is needed for and how to
+            get it.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        package = name.partition(".")[0]
+        raise PlatformError(
+            f"{purpose} needs the Python package {package} ({error}): install it with"
+            f" `pip install {package}`"
+        ) from error

@@ -19,12 +19,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import polars as pl
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field
 
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.events import EventTables, as_table, column_problems
 from chainshaper.values.whole_file import free_place, open_to_all
-from chainshaper.values.yaml_file import in_words
+from chainshaper.values.yaml_file import wrong_values_refused
 
 __all__ = [
     "EndpointInfo",
@@ -260,11 +260,8 @@ def _read_info(file: Path) -> RecordingInfo:
         raise InputError(
             f"{file}: format {format_}, this chainshaper reads format {FORMAT}; update it"
         )
-    try:
+    with wrong_values_refused(RecordingInfo, f"{file}: not a recording's description: "):
         return RecordingInfo.model_validate_json(json.dumps(values), strict=True)
-    except ValidationError as error:
-        problems = in_words(error, RecordingInfo)
-        raise InputError(f"{file}: not a recording's description: {problems}") from error
 
 
 def refuse_existing(path: str | Path) -> Path:

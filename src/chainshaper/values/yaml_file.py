@@ -6,6 +6,8 @@ both: ``robot.yaml:14: nodes.node3.callbacks[0].execution: …``.
 
 import difflib
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -42,6 +44,7 @@ __all__ = [
     "read_text",
     "scalar",
     "wrong_value",
+    "wrong_values_refused",
 ]
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -321,6 +324,18 @@ def key_text(where: _Path) -> str:
 def in_words(error: ValidationError, model: type[BaseModel]) -> str:
     """What a model refused, in one line."""
     return "; ".join(f"{key_text(at)}: {reason}" for at, reason in explanations(error, model))
+
+
+@contextmanager
+def wrong_values_refused(model: type[BaseModel], what: str = "") -> Iterator[None]:
+    """Inside, values that a model may not have end in one InputError that names each of them.
+
+    ``what`` stands before them, and says what they are of.
+    """
+    try:
+        yield
+    except ValidationError as error:
+        raise InputError(what + in_words(error, model)) from error
 
 
 def explanations(error: ValidationError, model: type[BaseModel]) -> list[tuple[_Path, str]]:

@@ -15,7 +15,7 @@ from chainshaper.analysis.departures import with_overrun
 from chainshaper.gate.decision import DROPPED
 from chainshaper.planning import Plan
 from chainshaper.planning.overruns import cycles_until_output
-from chainshaper.planning.publisher_threads import publisher_servers
+from chainshaper.planning.plan import publisher_servers
 from chainshaper.values import events
 from chainshaper.values.recording import Recording
 

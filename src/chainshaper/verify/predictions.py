@@ -28,8 +28,7 @@ from chainshaper.analysis import LatencyAnalysis, LatencyStatistics, latency_sta
 from chainshaper.analysis.punctuality import Due
 from chainshaper.planning import Plan, publish_slots
 from chainshaper.planning.overruns import cycles_until_output
-from chainshaper.planning.plan import server_of
-from chainshaper.planning.publisher_threads import publisher_servers
+from chainshaper.planning.plan import publisher_servers, server_of
 from chainshaper.values.durations import milliseconds
 
 __all__ = ["BandHeld", "FigureHeld", "PredictionHeld", "due_of", "hold_prediction"]

@@ -12,7 +12,8 @@ from collections.abc import Callable
 from time import monotonic_ns
 from typing import Any
 
-from chainshaper.gate.decision import ANCHORS, DROPPED, LATE, MESSAGES
+from chainshaper.cli.options import LATE
+from chainshaper.gate.decision import ANCHORS, DROPPED, MESSAGES
 
 __all__ = ["ABSENT", "LAYOUT", "WIDTH", "WORDS", "EventLog", "number_of"]
 

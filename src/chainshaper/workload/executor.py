@@ -21,7 +21,7 @@ So what it waits for, it waits for in the kernel: without the interpreter's lock
 lock of DDS. Woken while it is kept from running, it stops before it returns to user space, and
 the executor, which only appends and wakes, never waits for it. Stopped in the midst of sending,
 however, it holds both, and the process stands still: a publish slot has to be far longer than a
-send (:mod:`chainshaper.planning.publication`).
+send (:mod:`chainshaper.planning.overruns`).
 """
 
 import queue

@@ -26,7 +26,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from chainshaper.planning import Plan, PlanRequest
 from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import InputError
-from chainshaper.values.yaml_file import AS_YAML, PlainData, compose, explanations, key_text
+from chainshaper.values.yaml_file import AS_YAML, PlainData, compose, wrong_values_refused
 from chainshaper.workload.description import Application, application_as_written
 from chainshaper.workload.live import origin_timer
 
@@ -279,12 +279,9 @@ def _interfered(described: dict[str, Any], period_ns: int, longest_ns: int) -> d
 
 
 def _validated(model: type[_Model], data: Any, changes: Values) -> _Model:
-    try:
+    said = ", ".join(f"{name}={value}" for name, value in changes.items())
+    with wrong_values_refused(model, f"{said}: "):
         return model.model_validate_json(json.dumps(data), context=AS_YAML)
-    except ValidationError as error:
-        said = ", ".join(f"{name}={value}" for name, value in changes.items())
-        problems = [f"{key_text(where)}: {why}" for where, why in explanations(error, model)]
-        raise InputError(f"{said}: {'; '.join(problems)}") from error
 
 
 def _nanoseconds(name: str, value: Any) -> Any:

@@ -25,10 +25,9 @@ from typing import Any, TypeAlias
 
 from chainshaper.linux.own_processes import LIBRARIES, module_command
 from chainshaper.planning import Profile
-from chainshaper.planning.extras import extra_library
 from chainshaper.simulation.sweeping.grid import Grid, Values, changes_application, request_at
 from chainshaper.simulation.sweeping.points import profile_at, row_at
-from chainshaper.values.errors import ChainshaperError, InputError, OperationError
+from chainshaper.values.errors import ChainshaperError, InputError, OperationError, extra_library
 
 __all__ = ["Group", "groups_of", "rows_from_cluster", "rows_from_here"]
 

@@ -1,25 +1,16 @@
 """`chainshaper splice`: put shaping nodes, or throttlers, into copies of launch files."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple
 
-import typer
-
-from chainshaper.cli.options import JsonOption
-from chainshaper.cli.plan_options import FallbackOption
+from chainshaper.cli.options import JSON, NODE, NodeKind, argument, option, wish
+from chainshaper.cli.output import notes, print_json, show_line
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Fallback
 
 if TYPE_CHECKING:
     from chainshaper.flow.launch_splicing import Splicing, ThrottledInput
-    from chainshaper.planning import Plan
     from chainshaper.values.recording import Recording
-
-__all__ = ["splice"]
-
-
-NodeKind: TypeAlias = Literal["python", "cpp", "typed"]
-"""How the shaping node is made."""
 
 
 class _Launched(NamedTuple):
@@ -35,69 +26,37 @@ class _Launched(NamedTuple):
 
 
 def splice(
-    plan: Annotated[
-        Path | None,
-        typer.Argument(
-            metavar="plan.yaml", help="The plan; none with --throttle.", show_default=False
-        ),
-    ] = None,
-    launch: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="LAUNCH... [NAME:=VALUE...]",
-            help="The launch files (.py, .xml, .yaml), and launch arguments that are not at their "
-            "defaults, as for `ros2 launch`.",
-            show_default=False,
-        ),
-    ] = None,
+    plan: Path | None = argument(None, "plan.yaml", "The plan; none with --throttle."),
+    launch: list[str] | None = argument(
+        None,
+        "LAUNCH... [NAME:=VALUE...]",
+        "The launch files (.py, .xml, .yaml), and launch arguments that are not at their "
+        "defaults, as for `ros2 launch`.",
+    ),
     *,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output", "-o", metavar="DIR", help="Folder for the copies.", show_default=False
-        ),
-    ],
-    throttle: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--throttle",
-            metavar="[NODE:]TOPIC=PERIOD",
-            help="Instead of a plan: a throttler before an input that is not quite periodic, for "
-            "NODE or whoever subscribes in the recording (may be repeated).",
-            show_default=False,
-        ),
-    ] = None,
-    node: Annotated[
-        NodeKind,
-        typer.Option(help="A script; a package for all types; or one generated for the type."),
-    ] = "python",
-    message_type: Annotated[
-        str | None,
-        typer.Option(
-            "--type",
-            metavar="PKG/msg/TYPE",
-            help="Of the output, for --node typed. Default: what the recording says.",
-            show_default=False,
-        ),
-    ] = None,
-    recording: Annotated[
-        Path | None,
-        typer.Option(
-            "--recording",
-            metavar="REC",
-            help="A recording of the application: it tells publishers, subscribers and types. "
-            "Default: the plan's own, where it exists.",
-            show_default=False,
-        ),
-    ] = None,
-    fallback: FallbackOption = None,
-    build: Annotated[
-        bool, typer.Option("--build", help="Build the shaping node's package with colcon.")
-    ] = False,
-    undo: Annotated[
-        bool, typer.Option("--undo", help="Remove DIR again, unless it was changed since.")
-    ] = False,
-    json: JsonOption = False,
+    output: Path = option(..., "--output -o DIR", "Folder for the copies."),
+    throttle: list[str] | None = option(
+        None,
+        "--throttle [NODE:]TOPIC=PERIOD",
+        "Instead of a plan: a throttler before an input that is not quite periodic, for "
+        "NODE or whoever subscribes in the recording (may be repeated).",
+    ),
+    node: NodeKind = NODE,
+    message_type: str | None = option(
+        None,
+        "--type PKG/msg/TYPE",
+        "Of the output, for --node typed. Default: what the recording says.",
+    ),
+    recording: Path | None = option(
+        None,
+        "--recording REC",
+        "A recording of the application: it tells publishers, subscribers and types. "
+        "Default: the plan's own, where it exists.",
+    ),
+    fallback: Fallback | None = wish("fallback", default=None),
+    build: bool = option(False, "--build", "Build the shaping node's package with colcon."),
+    undo: bool = option(False, "--undo", "Remove DIR again, unless it was changed since."),
+    json: bool = JSON,
 ) -> None:
     """Edit copies of launch files: the output is remapped, and a shaping node republishes it.
 
@@ -105,9 +64,9 @@ def splice(
     record and plan, and splice the plan into the copy. Shows a diff. Launch the copy that it names;
     the originals stay as they are.
     """
-    from chainshaper.cli.output import print_json, show_line
     from chainshaper.flow.launch_splicing import undo_splice
-    from chainshaper.splicing.generated_package import check_build_tools
+    from chainshaper.splicing.generated_package import build_package, check_build_tools
+    from chainshaper.splicing.launch.folder import NODES
 
     if undo:
         undo_splice(output)
@@ -132,23 +91,24 @@ def splice(
         raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
     else:
         splicing = _shaped(plan, launched)
-    setup = _built(splicing) if build else None
+    setup = build_package(splicing.folder / NODES) if build else None
     _print(splicing, setup, json)
 
 
 def _shaped(plan: Path, launched: _Launched) -> "Splicing":
-    from chainshaper.cli.output import notes
     from chainshaper.flow.launch_splicing import splice_launch_files
     from chainshaper.planning import load_plan, plan_warnings
 
     planned = load_plan(plan)
     notes(plan_warnings(planned))
+    own = planned.evidence.recording
+    known = Path(own) if own and Path(own).is_dir() else None
     return splice_launch_files(
         *(planned, launched.files, launched.folder),
         node=launched.node,
         arguments=launched.arguments,
         message_type=launched.message_type,
-        recording=_opened(launched.recording or _own_recording(planned)),
+        recording=_opened(launched.recording or known),
         fallback=launched.fallback,
     )
 
@@ -173,8 +133,8 @@ def _throttled(inputs: list[str], launched: _Launched) -> "Splicing":
 def _input(text: str) -> "ThrottledInput":
     """One input to be throttled, as it is written: ``/fusion:/points_raw=100ms``."""
     from chainshaper.flow.launch_splicing import ThrottledInput
-    from chainshaper.planning.plan import wrong_values_refused
     from chainshaper.values.durations import parse_duration
+    from chainshaper.values.yaml_file import wrong_values_refused
 
     where, equals, period = text.rpartition("=")
     if not equals:
@@ -186,11 +146,6 @@ def _input(text: str) -> "ThrottledInput":
         )
 
 
-def _own_recording(plan: "Plan") -> Path | None:
-    own = Path(plan.evidence.recording or "")
-    return own if plan.evidence.recording and own.is_dir() else None
-
-
 def _opened(recording: Path | None) -> "Recording | None":
     if recording is None:
         return None
@@ -199,18 +154,21 @@ def _opened(recording: Path | None) -> "Recording | None":
     return open_source(recording)
 
 
-def _built(splicing: "Splicing") -> Path:
-    from chainshaper.splicing.generated_package import build_package
-    from chainshaper.splicing.launch.folder import NODES
-
-    return build_package(splicing.folder / NODES)
-
-
 def _print(splicing: "Splicing", setup: Path | None, json: bool) -> None:
-    from chainshaper.cli.output import notes, print_json, show_line
-
     if json:
-        print_json(_values(splicing, setup))
+        print_json(
+            {
+                "folder": str(splicing.folder),
+                "launch": {str(file): str(copy) for file, copy in splicing.launch.items()},
+                "originals": {str(copy): str(file) for copy, file in splicing.originals.items()},
+                "nodes": [one.name for one in splicing.processes],
+                "standbys": [one.standby.name for one in splicing.processes if one.standby],
+                "logs": [str(log) for log in splicing.logs],
+                "setup": None if setup is None else str(setup),
+                "diff": splicing.diff,
+                "notes": list(splicing.notes),
+            }
+        )
         return
     show_line(splicing.diff.rstrip("\n").expandtabs())
     notes(splicing.notes)
@@ -218,17 +176,3 @@ def _print(splicing: "Splicing", setup: Path | None, json: bool) -> None:
         show_line(f"source {setup}")
     for copy in splicing.launch.values():
         show_line(f"ros2 launch {copy}")
-
-
-def _values(splicing: "Splicing", setup: Path | None) -> dict[str, Any]:
-    return {
-        "folder": str(splicing.folder),
-        "launch": {str(file): str(copy) for file, copy in splicing.launch.items()},
-        "originals": {str(copy): str(file) for copy, file in splicing.originals.items()},
-        "nodes": [process.name for process in splicing.processes],
-        "standbys": [one.standby.name for one in splicing.processes if one.standby is not None],
-        "logs": [str(log) for log in splicing.logs],
-        "setup": None if setup is None else str(setup),
-        "diff": splicing.diff,
-        "notes": list(splicing.notes),
-    }

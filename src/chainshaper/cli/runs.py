@@ -1,0 +1,448 @@
+"""Verbs that run an application: live, simulated, recorded, profiled, shaped; and the demo."""
+
+import sys
+import threading
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from chainshaper.cli.options import (
+    APPLICATION,
+    CHAIN,
+    CYCLES,
+    JSON,
+    NODE,
+    REALTIME,
+    RECORDING_OUTPUT,
+    SEED,
+    SOURCE,
+    USERS,
+    NodeKind,
+    Source,
+    argument,
+    option,
+    plan_in_force,
+    takes_wishes,
+)
+from chainshaper.cli.output import (
+    late_progress,
+    notes,
+    print_json,
+    progress,
+    show,
+    show_line,
+    stage_lines,
+    stop_on_signals,
+)
+from chainshaper.values.errors import InputError, OperationError
+
+if TYPE_CHECKING:
+    from chainshaper.analysis import ChainEnumeration
+    from chainshaper.planning import PlanRequest
+    from chainshaper.values.application import ApplicationGraph
+
+MIB = 1 << 20
+STDERR = 2
+DESCRIPTIONS = (".yaml", ".yml")
+SHAPING_DURATION_NS = 60_000_000_000
+
+COMMAND: list[str] | None = argument(
+    None,
+    "[-- COMMAND…]",
+    "Starts the application, such as `ros2 launch …`; ended with the recording.",
+)
+DURATION: int | None = option(
+    None,
+    "--duration DURATION",
+    "How long to record. Default: until the application ends, or Ctrl-C.",
+)
+BUFFER: int | None = option(
+    None,
+    "--buffer MIB",
+    "LTTng's buffer of each core, in MiB, for when events were lost. Default: 4.",
+    min=1,
+)
+
+
+@takes_wishes("ideal_machine")
+def demo(
+    output: Path | None = option(
+        None, "--output -o DIR", "Folder for everything. Default: chainshaper-demo-DATE-TIME here."
+    ),
+    application: Path | None = option(
+        None, "--application APP.yaml", "Another application than the paper's synthetic chain."
+    ),
+    cycles: int = CYCLES,
+    realtime: bool | None = REALTIME,
+    *,
+    request: "PlanRequest",
+    json: bool = JSON,
+) -> None:
+    """Measure a live chain, plan, splice the shaping node, measure again, show the gain.
+
+    Runs the paper's synthetic chain as real processes over real DDS topics, for about a minute and
+    a half. Needs no ROS 2.
+    """
+    from chainshaper.flow.demo import run_demo
+    from chainshaper.planning import plan_warnings
+    from chainshaper.reporting.tables import (
+        callback_table,
+        comparison_json,
+        comparison_table,
+        plan_table,
+    )
+
+    folder = output or Path(f"chainshaper-demo-{datetime.now():%Y%m%d-%H%M%S}")
+    with progress("demo") as report:
+        result = run_demo(
+            folder,
+            application=application,
+            cycles=cycles,
+            request=request,
+            realtime=realtime,
+            command=sys.argv,
+            planned=lambda plan: notes(plan_warnings(plan)),
+            progress=report,
+        )
+    if json:
+        print_json({**comparison_json(result.comparison), "folder": str(folder)})
+        return
+    show(
+        callback_table(result.callbacks),
+        plan_table(result.plan),
+        comparison_table(result.comparison),
+    )
+    notes(result.notes)
+    show_line(str(folder.absolute()))
+
+
+def run(
+    application: Path = APPLICATION,
+    output: Path = RECORDING_OUTPUT,
+    cycles: int = CYCLES,
+    realtime: bool | None = REALTIME,
+) -> None:
+    """Run an application live over DDS and record its events.
+
+    Every node is a process of its own, scheduled as the description says (SCHED_FIFO where it is
+    permitted). The recording is a folder of Parquet tables.
+    """
+    from chainshaper.workload.description import load_application
+    from chainshaper.workload.live import run_application
+
+    description = load_application(application)
+    with progress(f"running {description.name}") as report:
+        recording = run_application(
+            description, output, cycles=cycles, realtime=realtime, command=sys.argv, progress=report
+        )
+    notes(recording.info.notes)
+    show_line(str(recording.path))
+
+
+def simulate(
+    application: Path = APPLICATION,
+    output: Path = RECORDING_OUTPUT,
+    plan: Path | None = argument(None, "plan.yaml", "The plan in force."),
+    cycles: int = CYCLES,
+    seed: int | None = SEED,
+    switches: bool = option(False, "--switches", "Record what ran on which core, too."),
+    execution_times: Path | None = option(
+        None, "--execution-times REC", "Draw execution times from those recorded there."
+    ),
+    block: int = option(1, "--block", "So many consecutive ones at a time.", min=1, max=1024),
+) -> None:
+    """Simulate an application, with a plan in force or without, and record its events.
+
+    The recording is like that of a live run: every other verb takes it.
+    """
+    from chainshaper.simulation import simulate as run_simulation
+    from chainshaper.simulation.samples import with_recorded_times
+    from chainshaper.workload.description import load_application
+
+    description = load_application(application)
+    if execution_times is not None:
+        description = with_recorded_times(description, execution_times, block=block)
+    with late_progress(f"simulating {description.name}") as report:
+        recording = run_simulation(
+            description,
+            output,
+            plan_in_force(plan),
+            cycles=cycles,
+            seed=seed,
+            switches=switches,
+            command=sys.argv,
+            progress=report,
+        )
+    show_line(str(recording.path))
+
+
+def record(
+    output: Path = RECORDING_OUTPUT,
+    command: list[str] | None = COMMAND,
+    source: Source = SOURCE,
+    duration: int | None = DURATION,
+    pid: list[int] | None = option(
+        None,
+        "--pid",
+        "Attach to this process and what it has started (ebpf; may be repeated). "
+        "Default, without a COMMAND: everything of the users that looks like ROS 2.",
+    ),
+    user: list[str] | None = USERS,
+    buffer: int | None = BUFFER,
+    watch_stalls: bool = option(
+        False,
+        "--watch-stalls",
+        "Have a sleeper on every core notice when the machine itself stands still.",
+    ),
+    json: bool = JSON,
+) -> None:
+    """Record a ROS 2 application: its events, nodes, threads and QoS.
+
+    Starts tracing, then the COMMAND, and ends both with Ctrl-C, after --duration, or when the
+    application ends by itself. The application is neither changed nor recompiled.
+    """
+    if command and pid:
+        raise InputError("a COMMAND is started, --pid attaches to what runs: give one of them")
+    if not command and source == "lttng":
+        raise InputError(
+            "no command given: `chainshaper record -o REC -- ros2 launch …`; to attach to what "
+            "runs already, add `--source ebpf`"
+        )
+    _record_and_show(
+        *(output, command or [], json),
+        source=source,
+        duration_ns=duration,
+        buffer=buffer and buffer * MIB,
+        pids=pid or [],
+        users=user or [],
+        watch_stalls=watch_stalls,
+    )
+
+
+def _record_and_show(output: Path, command: list[str], json: bool, **how: Any) -> None:
+    """Record, and say what came of it; ``how`` goes to :func:`chainshaper.record_command`."""
+    from chainshaper.flow.exploration import event_counts, lost_events
+    from chainshaper.flow.record import record_command
+    from chainshaper.linux.own_processes import end_in_words
+
+    stop = threading.Event()
+    with stop_on_signals(stop):
+        recorded = record_command(
+            output,
+            command,
+            command_stdout=STDERR if json else None,  # standard output is ours
+            stop=stop,
+            progress=stage_lines("record"),
+            **how,
+        )
+    recording = recorded.recording
+    count = int(event_counts(recording)["count"].sum())
+    if json:
+        print_json(
+            {
+                "recording": str(recording.path),
+                "events": count,
+                "lost": recording.info.lost,
+                "exit_code": recorded.exit_code,
+                "notes": list(recording.info.notes),
+            }
+        )
+    else:
+        show_line(str(recording.path))
+    notes((*recording.info.notes, f"{count} events; {lost_events(recording.info)}"))
+    if recorded.exit_code:
+        raise OperationError(
+            f"the command {end_in_words(recorded.exit_code)}; what was recorded until then is in "
+            f"{recording.path}"
+        )
+
+
+def profile(
+    output: Path = RECORDING_OUTPUT,
+    command: list[str] | None = COMMAND,
+    chain: str | None = option(
+        None,
+        "--chain FIRST..LAST",
+        "The chain whose nodes get the priority; --like tells which those are.",
+    ),
+    like: Path | None = option(
+        None,
+        "--like REC",
+        "An earlier recording of the application: it knows the chain's nodes, components "
+        "of containers, and executors with several threads.",
+    ),
+    node: list[str] | None = option(
+        None,
+        "--node NAME",
+        "A node that gets the priority (may be repeated). Default: the chain's, or all.",
+    ),
+    core: int | None = option(
+        None,
+        "--core",
+        "Where executors run. Default: the last core. DDS threads run on the others.",
+        min=0,
+    ),
+    source: Source = SOURCE,
+    duration: int | None = DURATION,
+    buffer: int | None = BUFFER,
+    json: bool = JSON,
+) -> None:
+    """Record with the chain's threads under SCHED_FIFO, DDS threads on another core.
+
+    This is how the latencies are measured that a plan is computed from. Whatever ends it, all
+    threads are as before. What happened before the priorities were in force is left out.
+    """
+    from chainshaper.flow.profiling import chain_nodes, check_profiling, profiling_condition
+    from chainshaper.linux.command_process import check_command
+    from chainshaper.sources import open_source
+    from chainshaper.values.recording import refuse_existing
+
+    if not command:
+        raise InputError("no command given: `chainshaper profile -o REC -- ros2 launch …`")
+    if chain is not None and like is None and not node:
+        raise InputError(
+            f"which nodes {chain} has, an earlier recording knows: name it with --like REC "
+            "(`chainshaper record`), or name the nodes with --node"
+        )
+    refuse_existing(output)
+    check_command(command)
+    core = check_profiling(core)
+    names = [f"/{name.strip('/')}" for name in node or ()]
+    earlier = None if like is None else open_source(like)
+    if earlier is not None and chain is not None:
+        names += chain_nodes(earlier, chain)
+    _record_and_show(
+        *(output, command, json),
+        source=source,
+        duration_ns=duration,
+        buffer=buffer and buffer * MIB,
+        chain=chain,
+        scheduling=profiling_condition(names, core, like=earlier),
+        watch_stalls=True,
+    )
+
+
+@takes_wishes(
+    *("bands", "modes", "epsilon_ns", "ideal_machine", "overrun", "messages", "depth"),
+    *("with_receivers", "fallback"),
+)
+def shape(
+    words: list[str] = argument(
+        ...,
+        "APP.yaml plan.yaml | -- ros2 launch ...",
+        "A described application and the plan in force; or what launches a real one, "
+        "which is then measured and planned first.",
+    ),
+    output: Path = option(
+        ...,
+        "--output -o REC",
+        "Folder for the recording; of a launched application, for everything.",
+    ),
+    cycles: int = CYCLES,
+    realtime: bool | None = REALTIME,
+    chain: str | None = CHAIN,
+    duration: int | None = option(
+        None, "--duration DURATION", "How long to measure, before and after. Default: 60s."
+    ),
+    source: Source = SOURCE,
+    node: NodeKind = NODE,
+    backend: str = option("auto", "--backend NAME", "As for `chainshaper apply`."),
+    *,
+    request: "PlanRequest",
+    user: list[str] | None = USERS,
+    json: bool = JSON,
+) -> None:
+    """Run an application with its output shaped as planned, and record it.
+
+    The publisher's output topic is remapped, and the shaping node republishes it in its slots.
+    Behind `--`, `ros2 launch` does the whole flow: record, choose a chain, profile, plan, splice,
+    apply, record again, compare. Every file in between stays; --chain, --duration, --source,
+    --node, --backend, --bands, --modes, --epsilon, --ideal-machine, --overrun, --messages, --depth,
+    --no-receivers, --fallback and --user are for this, and mean what they mean for `chainshaper
+    plan` and `apply`.
+    """
+    if len(words) == 2 and words[0].endswith(DESCRIPTIONS):
+        _shape_described(Path(words[0]), Path(words[1]), output, cycles, realtime)
+        return
+    if Path(words[0]).suffix in DESCRIPTIONS:
+        raise InputError(
+            "a described application is shaped with its plan, and nothing else: `chainshaper shape "
+            "APP.yaml plan.yaml -o REC`"
+        )
+    _shape_launched(
+        *(words, output, json),
+        chain=chain,
+        duration_ns=duration or SHAPING_DURATION_NS,
+        source=source,
+        node=node,
+        back_end=backend,
+        request=request,
+        users=user or (),
+    )
+
+
+def _shape_described(
+    application: Path, plan: Path, output: Path, cycles: int, realtime: bool | None
+) -> None:
+    from chainshaper.flow.steps import shape_application
+    from chainshaper.planning import load_plan, plan_warnings
+    from chainshaper.verify.overruns import dropped_in, dropped_text, overruns_in, overruns_text
+    from chainshaper.workload.description import load_application
+
+    description, planned = load_application(application), load_plan(plan)
+    notes(plan_warnings(planned))
+    with progress(f"shaping {description.name}") as report:
+        recording = shape_application(
+            description,
+            planned,
+            output,
+            cycles=cycles,
+            realtime=realtime,
+            command=sys.argv,
+            progress=report,
+        )
+    if overruns := overruns_in(recording, planned):
+        notes([overruns_text(overruns)])
+    if dropped := dropped_in(recording):
+        notes([dropped_text(dropped)])
+    notes(recording.info.notes)
+    show_line(str(recording.path))
+
+
+def _shape_launched(command: list[str], folder: Path, json: bool, **how: Any) -> None:
+    """The whole flow; ``how`` goes to :func:`chainshaper.shape_launch`."""
+    from chainshaper.flow.launch_shaping import shape_launch
+    from chainshaper.planning import plan_warnings
+    from chainshaper.reporting.predictions import prediction_table
+    from chainshaper.reporting.tables import comparison_json, comparison_table
+
+    stop = threading.Event()
+    with stop_on_signals(stop):
+        shaped = shape_launch(
+            command,
+            folder,
+            choose=_ask if sys.stdin.isatty() and not json else None,
+            stop=stop,
+            planned=lambda plan: notes(plan_warnings(plan)),
+            progress=stage_lines("shape"),
+            **how,
+        )
+    if json:
+        print_json(comparison_json(shaped.comparison) | {"folder": str(shaped.folder)})
+        return
+    predictions = [one.held for one in shaped.comparison.measurements if one.held is not None]
+    show(comparison_table(shaped.comparison), *map(prediction_table, predictions))
+    notes(shaped.notes)
+    show_line(str(shaped.folder))
+
+
+def _ask(graph: "ApplicationGraph", found: "ChainEnumeration") -> str:
+    from chainshaper.reporting.chain_list import chain_table
+    from chainshaper.values.safe_text import shown
+
+    show(chain_table(graph, found))
+    default = (found.heaviest or found.chains[0]).spec
+    question = f"Which chain, FIRST..LAST? [{shown(default)}]"
+    return str(typer.prompt(question, default=default, show_default=False, err=True))
