@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from passing import decided, held, serialized
 
-from chainshaper.cli.options import LATE
 from chainshaper.gate import decision
 from chainshaper.gate.decision import (
+    LATE,
     OVERRUNS,
     Gate,
     Modes,

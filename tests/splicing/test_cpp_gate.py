@@ -9,8 +9,16 @@ import pytest
 from cpp_program import compiled
 from gate_table import PUBLISHING_NS, Case, Outcome, cases, walk
 
-from chainshaper.cli.options import LATE
-from chainshaper.gate.decision import ANCHORS, DROPPED, MESSAGES, OVERRUNS, Gate, Modes, origin_of
+from chainshaper.gate.decision import (
+    ANCHORS,
+    DROPPED,
+    LATE,
+    MESSAGES,
+    OVERRUNS,
+    Gate,
+    Modes,
+    origin_of,
+)
 from chainshaper.sources.gate_log import read_gate_log
 
 CASES = 5000

@@ -12,8 +12,7 @@ from collections.abc import Callable
 from time import monotonic_ns
 from typing import Any
 
-from chainshaper.cli.options import LATE
-from chainshaper.gate.decision import ANCHORS, DROPPED, MESSAGES
+from chainshaper.gate.decision import ANCHORS, DROPPED, LATE, MESSAGES
 
 __all__ = ["ABSENT", "LAYOUT", "WIDTH", "WORDS", "EventLog", "number_of"]
 
