@@ -37,7 +37,7 @@ from chainshaper import (
     shape_application,
     simulate,
 )
-from chainshaper.enforcement.runs.state import RunState
+from chainshaper.enforcement.undoing import RunState
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.planning import Plan, Slot
 from chainshaper.planning.publisher_threads import publisher_servers

@@ -12,9 +12,9 @@ import pytest
 from gated import cpu_ns, groups_left, own_cgroup
 from processes import children_of, wait_for
 
-from chainshaper.enforcement.runs.journal import find_journals
 from chainshaper.linux import cgroups
 from chainshaper.linux.processes import descendants
+from chainshaper.linux.runs import find_journals
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import list_threads, parents, start_of
 from chainshaper.planning import Plan, save_plan
@@ -35,8 +35,8 @@ needs_fifo = pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not pe
 
 
 MODULES = {
-    "guardian": "chainshaper.enforcement.runs.guardian",
-    "dispatcher": "chainshaper.enforcement.freezer.slot_dispatcher",
+    "guardian": "chainshaper.enforcement.guardian",
+    "dispatcher": "chainshaper.enforcement.slot_dispatcher",
 }
 FREEZER = ("--backend", "freezer", "--phase", "0ms")
 

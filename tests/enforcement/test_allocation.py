@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from actors import acting
 
-from chainshaper.enforcement.threads.allocation import (
+from chainshaper.enforcement.threads import (
     Allocation,
     NodeThread,
     RecordedProcess,
@@ -14,9 +14,8 @@ from chainshaper.enforcement.threads.allocation import (
     allocate,
     new_and_ended,
 )
-from chainshaper.linux.dds_threads import dds_kind, role_of
 from chainshaper.linux.processes import Process, read_process
-from chainshaper.linux.threads import Thread
+from chainshaper.linux.threads import Thread, dds_kind, role_of
 
 CYCLONE = ("gc", "dq.builtins", "dq.user", "tev", "recv")
 

@@ -39,7 +39,7 @@ from applied_plans import (
 from gated import cpu_ns, kill, needs_cgroups
 from processes import wait_for
 
-from chainshaper import enforcement
+import chainshaper
 from chainshaper.linux import cgroups
 from chainshaper.planning import save_plan
 
@@ -277,15 +277,24 @@ def test_without_the_privileges_nothing_is_changed_and_the_missing_one_is_named(
 def test_steps_of_the_wall_clock_are_not_seen() -> None:
     """Setting the clock would disturb all else on the machine, so this is read from the source.
 
-    `gate.py` alone reads the wall clock, since messages are stamped with it; its tests step it.
+    The gate's decision alone reads the wall clock, since messages are stamped with it; its tests
+    step it.
     """
-    package = Path(enforcement.__file__).parent
+    package = Path(chainshaper.__file__).parent
     sources = [
-        *package.rglob("*.py"),
-        *(package.parent / name for name in ("applying.py", "publisher_gating.py")),
+        *(
+            path
+            for room in ("enforcement", "linux", "gate")
+            for path in (package / room).rglob("*")
+        ),
+        *(package / "flow" / name for name in ("apply.py", "phase.py", "threads.py")),
     ]
     wall_clock = re.compile(
         r"CLOCK_REALTIME|\btime\.time(_ns)?\(|\bdatetime\b|\blocaltime|\bgmtime"
     )
-    readers = {path.name for path in sources if wall_clock.search(path.read_text())}
-    assert readers == {"gate.py"}
+    readers = {
+        path.name
+        for path in sources
+        if path.suffix == ".py" and wall_clock.search(path.read_text())
+    }
+    assert readers == {"decision.py"}

@@ -22,7 +22,7 @@ from applied_plans import (
 )
 from processes import wait_for
 
-from chainshaper.enforcement.runs.journal import journals_folder
+from chainshaper.linux.runs import journals_folder
 from chainshaper.linux.threads import list_threads
 from chainshaper.planning import Plan
 

@@ -24,11 +24,11 @@ from gated import (
 )
 from processes import wait_for
 
-from chainshaper.enforcement.freezer.back_end import Freezer, create
-from chainshaper.enforcement.freezer.slot_dispatcher import PRIORITY, overrun
-from chainshaper.enforcement.runs.journal import discard_journal, open_journal
+from chainshaper.enforcement.freezer import Freezer, create
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
+from chainshaper.enforcement.slot_dispatcher import PRIORITY, overrun
 from chainshaper.linux import cgroups
+from chainshaper.linux.runs import discard_journal, open_journal
 from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.linux.threads import list_threads
 

@@ -14,16 +14,15 @@ from gated import needs_cgroups
 from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain_text
 
 from chainshaper import measure_latency, open_recording, save_plan
-from chainshaper.enforcement.runs.governing import Governed, governing, in_force_throughout
-from chainshaper.enforcement.runs.journal import Journal, open_journal
-from chainshaper.enforcement.runs.state import (
+from chainshaper.enforcement.servers import ServerCounters
+from chainshaper.enforcement.undoing import (
     RunState,
     ServerState,
     find_runs,
+    remove_run,
     save_run_state,
 )
-from chainshaper.enforcement.runs.undoing import remove_run
-from chainshaper.enforcement.servers import ServerCounters
+from chainshaper.linux.runs import Governed, Journal, governing, in_force_throughout, open_journal
 from chainshaper.planning import Plan, plan_shaping
 
 MS = 1_000_000

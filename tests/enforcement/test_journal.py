@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper.enforcement.runs import journal as module
-from chainshaper.enforcement.runs.journal import (
+from chainshaper.linux import runs as module
+from chainshaper.linux.runs import (
     Journal,
     discard_journal,
     find_journals,
@@ -131,7 +131,7 @@ def test_a_journal_from_before_the_machine_booted_has_nothing_to_undo(
 def test_a_journal_whose_owner_was_killed_is_nobodys(tmp_path: Path) -> None:
     program = (
         "import os, signal, sys\n"
-        "from chainshaper.enforcement.runs.journal import open_journal\n"
+        "from chainshaper.linux.runs import open_journal\n"
         "open_journal(sys.argv[1], 'killed').note('cgroup', path='a')\n"
         "os.kill(os.getpid(), signal.SIGKILL)\n"
     )

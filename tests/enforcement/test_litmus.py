@@ -10,13 +10,12 @@ import pytest
 from actors import Actor, acting
 from litmus_stand_in import StandIn, install
 
-from chainshaper.enforcement.litmus import back_end as litmus
-from chainshaper.enforcement.litmus.back_end import create, restore_plugin
-from chainshaper.enforcement.runs.journal import Journal, find_journals, open_journal
-from chainshaper.enforcement.runs.scheduling_memory import restore_scheduling
+from chainshaper.enforcement import litmus
+from chainshaper.enforcement.litmus import create, restore_plugin
+from chainshaper.enforcement.scheduling_memory import restore_scheduling
 from chainshaper.enforcement.servers import BackEnd, ReservationServer, ServerTable
-from chainshaper.linux.scheduling import available_cores
-from chainshaper.linux.scheduling_state import state_of
+from chainshaper.linux.runs import Journal, find_journals, open_journal
+from chainshaper.linux.scheduling import available_cores, state_of
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
 MS = 1_000_000
@@ -171,8 +170,8 @@ def test_a_plugin_that_somebody_changed_is_a_failure(stand_in: StandIn, journal:
 _ARMED_AND_KILLED = """
 import os, signal, sys
 from pathlib import Path
-from chainshaper.enforcement.litmus import back_end as litmus
-from chainshaper.enforcement.runs.journal import open_journal
+from chainshaper.enforcement import litmus
+from chainshaper.linux.runs import open_journal
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 
 litmus.SCHED_LITMUS = os.SCHED_BATCH

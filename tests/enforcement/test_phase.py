@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chainshaper.enforcement.phase import find_drift, find_phase, measure_phase, watch_wake_ups
+from chainshaper.flow.phase import find_drift, find_phase, measure_phase, watch_wake_ups
 from chainshaper.values.errors import OperationError
 
 MS = 1_000_000

@@ -26,12 +26,12 @@ from applied_plans import (
 from gated import CORE, cpu_ns, groups_left, kill, needs_cgroups, own_cgroup
 from processes import wait_for
 
-from chainshaper.enforcement.runs.guardian import GROUP
-from chainshaper.enforcement.runs.journal import find_journals
-from chainshaper.enforcement.runs.state import RunState
+from chainshaper.enforcement.guardian import GROUP
+from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow.apply import apply_plan
 from chainshaper.linux.cgroups import cgroup_of, mount_point
-from chainshaper.linux.scheduling_state import state_of
+from chainshaper.linux.runs import find_journals
+from chainshaper.linux.scheduling import state_of
 from chainshaper.linux.threads import list_threads
 
 pytestmark = [needs_fifo, needs_cgroups]

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from litmus_stand_in import StandIn, install
 
-from chainshaper.enforcement.litmus.resctl import (
+from chainshaper.enforcement.litmus import (
     create_command,
     interval_text,
     litmus_commands,

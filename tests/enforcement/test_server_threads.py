@@ -8,17 +8,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chainshaper.enforcement.threads.allocation import Allocation, NodeThread
-from chainshaper.enforcement.threads.server_threads import (
+from chainshaper.enforcement.threads import (
     DDS_PRIORITY,
+    Allocation,
+    NodeThread,
     WantedScheduling,
     left_by_back_end,
     plan_scheduling,
     server_members,
     server_priorities,
 )
-from chainshaper.linux.dds_threads import ThreadRole
-from chainshaper.linux.threads import Scheduling, Thread
+from chainshaper.linux.scheduling import Scheduling
+from chainshaper.linux.threads import Thread, ThreadRole
 from chainshaper.planning import Plan, plan_shaping
 from chainshaper.planning.plan import Server, ShapingNode, revised
 from chainshaper.planning.plan import Thread as PlannedThread

@@ -5,7 +5,7 @@ from itertools import chain, takewhile
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chainshaper.enforcement.freezer.slot_boundaries import (
+from chainshaper.enforcement.slot_dispatcher import (
     Anchoring,
     Boundary,
     boundaries_of,

@@ -17,7 +17,7 @@ from processes import wait_for
 from strangers import NOBODY, named, needs_root, open_folder, strange
 
 from chainshaper import find_threads
-from chainshaper.enforcement.runs.state import RunState
+from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow import apply as applying
 from chainshaper.linux.processes import read_process
 from chainshaper.linux.threads import has_ended, list_threads, start_of

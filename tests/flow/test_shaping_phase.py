@@ -17,11 +17,10 @@ import pytest
 from applied_plans import CYCLE, MS, needs_fifo, plan_for, running_node, server
 from processes import wait_for
 
-from chainshaper.enforcement.phase import DriftWatch
-from chainshaper.enforcement.runs.state import RunState
+from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow import apply as applying
-from chainshaper.flow import shaping_phase
-from chainshaper.flow.shaping_phase import NOBODY, Telling
+from chainshaper.flow import phase
+from chainshaper.flow.phase import NOBODY, DriftWatch, Telling
 from chainshaper.planning import Plan
 from chainshaper.sources.ros.interpreter import Script
 
@@ -111,7 +110,7 @@ def test_it_can_be_stopped_before_the_nodes_were_told(
 def test_a_node_that_never_answers_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     waiting = telling("sleep", "600")
     assert not waiting.is_over()
-    monkeypatch.setattr(shaping_phase, "_PATIENCE_S", 0)
+    monkeypatch.setattr(phase, "_PATIENCE_S", 0)
     assert waiting.is_over()
     (note,) = waiting.end()
     assert "ROS 2 did not answer within 0 s" in note

@@ -9,12 +9,7 @@ from pathlib import Path
 import pytest
 from processes import wait_for
 
-from chainshaper.linux.command_process import (
-    check_command,
-    end_command,
-    start_command,
-)
-from chainshaper.linux.own_processes import end_in_words
+from chainshaper.linux.own_processes import check_command, end_command, end_in_words, start_command
 from chainshaper.values.errors import InputError
 
 IGNORING = "trap '' INT; echo ready; exec sleep 60"
@@ -70,7 +65,7 @@ def test_a_command_gets_a_sigint_when_we_are_killed(tmp_path: Path) -> None:
     script = f"trap 'echo interrupted > {said}; exit' INT; echo ready; while :; do sleep 0.05; done"
     program = (
         "import time\n"
-        "from chainshaper.linux.command_process import start_command\n"
+        "from chainshaper.linux.own_processes import start_command\n"
         f"start_command(['sh', '-c', {script!r}])\n"
         "time.sleep(60)"
     )

@@ -2,7 +2,7 @@
 
 import pytest
 
-from chainshaper.linux.dds_threads import DdsKind, dds_kind, role_of
+from chainshaper.linux.threads import DdsKind, dds_kind, role_of
 
 KINDS: dict[DdsKind, tuple[str, ...]] = {
     "receive": ("recv", "recvUC", "recvMC", "dds.udp.7410", "dds.shm.7413", "dds.tcp.5100"),

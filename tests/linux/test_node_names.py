@@ -6,11 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chainshaper.linux.node_names import (
-    guessed_name,
-    named_nodes,
-    takes_ros_arguments,
-)
+from chainshaper.linux.processes import guessed_name, named_nodes, takes_ros_arguments
 
 CASES = {
     "talker": (),

@@ -19,8 +19,8 @@ from chainshaper.linux.own_processes import is_installed, module_command
 
 SOURCES = Path(chainshaper.__file__).parent
 MODULES = [
-    "chainshaper.enforcement.freezer.slot_dispatcher",
-    "chainshaper.enforcement.runs.guardian",
+    "chainshaper.enforcement.slot_dispatcher",
+    "chainshaper.enforcement.guardian",
     "chainshaper.enforcement.scx.kicker",
     "chainshaper.simulation.sweeping.worker",
     "chainshaper.workload.node_process",
@@ -56,9 +56,9 @@ def test_one_place_starts_python() -> None:
         for path in SOURCES.rglob("*.py")
         if re.search(r"sys\.executable|multiprocessing|ProcessPool", path.read_text())
     }
-    in_nodes = {"enforcement/kept_core.py", "splicing/nodes/python/gate_log.py"}
+    in_nodes = {"gate/clear_core.py", "splicing/nodes/python/gate_log.py"}
     again = "splicing/nodes/python/respawning.py"
-    assert starting.keys() == {"enforcement/own_processes.py", *in_nodes, again}
+    assert starting.keys() == {"linux/own_processes.py", *in_nodes, again}
     for name in in_nodes:
         assert '[sys.executable, "-I", "-S", "-c"' in starting[name]
 
@@ -113,11 +113,12 @@ def test_python_dash_m_imports_from_no_current_folder(tmp_path: Path) -> None:
 def copied(folder: Path) -> Path:
     """The package where nothing but PYTHONPATH leads to, as colcon installs it."""
     root = folder / "install"
-    names = ["__init__.py", "errors.py", "trusted_files.py", "enforcement/__init__.py"]
-    for name in (*names, "enforcement/own_processes.py"):
-        place = root / "chainshaper" / name
+    values = ("__init__", "errors", "trusted_files")
+    linux = ("__init__", "own_processes", "scheduling", "threads")
+    for name in ("__init__", *(f"values/{v}" for v in values), *(f"linux/{one}" for one in linux)):
+        place = root / "chainshaper" / f"{name}.py"
         place.parent.mkdir(parents=True, exist_ok=True)
-        place.write_bytes((SOURCES / name).read_bytes())
+        place.write_bytes((SOURCES / f"{name}.py").read_bytes())
     (root / "chainshaper" / "said.py").write_text("print(__file__); import library")
     (root / "library.py").write_text("print('library')")
     (root / "json.py").write_text("raise SystemExit('no module of Python is hidden')")

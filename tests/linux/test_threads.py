@@ -9,6 +9,8 @@ from actors import acting
 from processes import wait_for
 
 from chainshaper.linux.scheduling import (
+    Scheduling,
+    apply_scheduling,
     available_cores,
     check_cores,
     may_use_fifo,
@@ -16,9 +18,7 @@ from chainshaper.linux.scheduling import (
     throttle_fraction,
 )
 from chainshaper.linux.threads import (
-    Scheduling,
     Thread,
-    apply_scheduling,
     find_thread,
     foreign_realtime_processes,
     innermost_id,

@@ -13,7 +13,7 @@ from chainshaper.cli.options import JsonOption, UsersOption, duration_option
 from chainshaper.cli.signals import stop_on_signals
 
 if TYPE_CHECKING:
-    from chainshaper.enforcement.runs.state import RunState
+    from chainshaper.enforcement.undoing import RunState
     from chainshaper.planning import Plan
     from chainshaper.values.recording import Recording
 
@@ -127,7 +127,7 @@ def _show_changes(
     from dataclasses import asdict
 
     from chainshaper.cli.output import notes, print_json, show, show_line
-    from chainshaper.flow.dry_run import planned_changes
+    from chainshaper.flow.threads import planned_changes
     from chainshaper.reporting.servers import changes_table
 
     changes = planned_changes(plan, backend, recording=recording, phase_ns=phase_ns, users=users)

@@ -17,9 +17,9 @@ def release(
 ) -> None:
     """End plans in force, and put back what crashed runs have left changed."""
     from chainshaper.cli.output import notes, show_line
-    from chainshaper.enforcement.runs.journal import find_journals
-    from chainshaper.enforcement.runs.scheduling_memory import look_alikes
-    from chainshaper.enforcement.runs.undoing import end_run, release_strays
+    from chainshaper.enforcement.scheduling_memory import look_alikes
+    from chainshaper.enforcement.undoing import end_run, release_strays
+    from chainshaper.linux.runs import find_journals
     from chainshaper.values.errors import InputError, OperationError
 
     runs = find_journals()

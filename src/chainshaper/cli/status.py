@@ -22,9 +22,8 @@ def status(
     And the outputs that have a shaping node: which of them go around it, or are silent.
     """
     from chainshaper.cli.output import notes, print_json, show, show_line
-    from chainshaper.enforcement.freezer.state import stray_groups
-    from chainshaper.enforcement.runs.state import find_runs, runs_as_json
-    from chainshaper.enforcement.runs.undoing import strange_lines
+    from chainshaper.enforcement.freezer_state import stray_groups
+    from chainshaper.enforcement.undoing import find_runs, runs_as_json, strange_lines
     from chainshaper.reporting.servers import runs_table, servers_table
     from chainshaper.splicing.shaped_outputs import find_outputs, output_text
 

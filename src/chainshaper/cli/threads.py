@@ -35,7 +35,7 @@ def threads(
 ) -> None:
     """Show the threads of running nodes: executors, DDS threads, publishers; class and cores."""
     from chainshaper.cli.output import notes, print_json, show
-    from chainshaper.flow.thread_search import find_threads
+    from chainshaper.flow.threads import find_threads
     from chainshaper.planning import load_plan
     from chainshaper.reporting.threads import threads_json, threads_table
     from chainshaper.sources import open_source

@@ -3,7 +3,7 @@
     find the threads ─► priorities and cores ─► servers ─► anchor ─► arm ─► watch ─► all as before
 
 Nothing of the application is changed but where and when its threads run, and everything that is
-changed stands in a journal first (:mod:`chainshaper.enforcement.runs.journal`): whatever ends
+changed stands in a journal first (:mod:`chainshaper.linux.runs`): whatever ends
 the run, this function, a signal or a crash, puts it back. Servers are armed only when all nodes
 run, and released before a command of ours is told to end, since a stopped thread cannot.
 
@@ -21,61 +21,70 @@ import subprocess
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, make_back_end
-from chainshaper.enforcement.phase import DriftWatch, measure_phase
-from chainshaper.enforcement.runs.claims import claim_run
-from chainshaper.enforcement.runs.governing import PLAN_FILE
-from chainshaper.enforcement.runs.guardian import Guardians, start_guardians
-from chainshaper.enforcement.runs.journal import Journal
-from chainshaper.enforcement.runs.scheduling_memory import (
-    change_all,
-    look_alikes,
-    note_descendants,
+from chainshaper.enforcement.guardian import Guardians, run_claimed, start_guardians
+from chainshaper.enforcement.scheduling_memory import change_all, look_alikes, note_descendants
+from chainshaper.enforcement.servers import (
+    BackEnd,
+    ReservationServer,
+    ServerCounters,
+    ServerTable,
 )
-from chainshaper.enforcement.runs.state import RunState, ServerState, save_run_state
-from chainshaper.enforcement.runs.undoing import strange_lines, undo_run
-from chainshaper.enforcement.servers import BackEnd, ServerCounters, ServerTable
-from chainshaper.enforcement.threads.allocation import (
+from chainshaper.enforcement.threads import (
     LEFT_ALONE,
     Allocation,
     NodeThread,
     RecordedProcess,
-    new_and_ended,
-)
-from chainshaper.enforcement.threads.server_threads import (
     left_by_back_end,
+    new_and_ended,
     plan_scheduling,
     server_members,
 )
-from chainshaper.flow.dry_run import LEAD_NS, first_thread, server_table
-from chainshaper.flow.shaping_phase import NOBODY, Telling, moved_text, tell_phase
-from chainshaper.flow.thread_search import find_threads
-from chainshaper.linux.command_process import end_command, start_command
+from chainshaper.enforcement.undoing import (
+    RunState,
+    ServerState,
+    claim_run,
+    save_run_state,
+    strange_lines,
+    undo_run,
+)
+from chainshaper.flow.phase import (
+    NOBODY,
+    DriftWatch,
+    Telling,
+    measure_phase,
+    moved_text,
+    tell_phase,
+)
+from chainshaper.flow.threads import LEAD_NS, find_threads, first_thread, server_table
+from chainshaper.linux.own_processes import end_command, start_command
+from chainshaper.linux.runs import PLAN_FILE, Journal
 from chainshaper.linux.scheduling import available_cores, check_cores
+from chainshaper.linux.threads import list_threads
 from chainshaper.linux.users import run_users
-from chainshaper.planning import Plan
 from chainshaper.planning.overruns import open_until_done
-from chainshaper.planning.plan import shaping_nodes
+from chainshaper.planning.plan import Plan, shaping_nodes
 from chainshaper.planning.publication import publication_warnings
+from chainshaper.planning.publisher_threads import publisher_servers
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 
 if TYPE_CHECKING:
     from chainshaper.values.recording import Recording  # slow to import
+    from chainshaper.workload.live import StartedNodes
 
-__all__ = ["Applied", "apply_plan"]
 
 START_NS = 30_000_000_000
 """A command has this long to start all nodes of the plan."""
 
 PHASE_BOUND_NS = 250_000
 """Shaping nodes are told again where cycles begin when that has moved by more. Watching a thread
-from outside tells nothing finer (:data:`chainshaper.enforcement.phase.POLL_NS`)."""
+from outside tells nothing finer (:data:`.phase.POLL_NS`)."""
 
 _LOOK_S = 1.0
 _SETTLING_LOOKS = 3
@@ -114,11 +123,7 @@ class _Run:
         return self.journal.path.parent
 
     def go_on(self) -> None:
-        """See whether the run is to come into force still.
-
-        Raises:
-            OperationError: it is to end.
-        """
+        """See whether the run is to come into force still. Raises OperationError: it is to end."""
         _go_on(self.stop)
 
     @property
@@ -481,8 +486,7 @@ def _living(found: Allocation, state: RunState) -> dict[str, tuple[int, ...]]:
 def _taken_in(run: _Run, servers: BackEnd, found: Allocation, state: RunState) -> RunState:
     """Threads that appeared later get what the plan says.
 
-    Raises:
-        OperationError: not all nodes are there, or a thread has ended again.
+    Raises OperationError: not all nodes are there, or a thread has ended again.
     """
     already = {one.name: one.threads for one in state.servers}
     _schedule(run, found)
@@ -509,3 +513,50 @@ def _put_back(run: _Run) -> None:
             f"not everything could be put back: {'; '.join(problems)}; {run.journal.path} says "
             "what was there, `chainshaper release` tries again"
         )
+
+
+@contextlib.contextmanager
+def publishers_gated(plan: Plan, nodes: "StartedNodes") -> Iterator[None]:
+    """Inside, the publisher threads that a plan names run in the slots of their servers only.
+
+    For the live workload (paper, section 3.2.1, design 1): its nodes are ours, so which process
+    each is, and when cycles start, needs not be found or measured. Executors and DDS threads of
+    the same processes run on.
+
+    Raises:
+        PlatformError: threads cannot be frozen here.
+        OperationError: another run governs one of the cores or nodes, a node has no such thread,
+            or the servers failed meanwhile.
+    """
+    choice = choose_back_end("freezer")  # the others want threads of the fair class
+    planned = [(server, names) for _, server, names in publisher_servers(open_until_done(plan))]
+    table = ServerTable(
+        plan.cycle_ns,
+        tuple(ReservationServer(s.name, s.core, s.priority, s.slots) for s, _ in planned),
+    )
+    cores = {server.core for server, _ in planned}
+    with run_claimed(cores, {name for _, names in planned for name in names}) as journal:
+        servers = make_back_end(choice.name, table, journal)
+        try:
+            for server, names in planned:
+                for name in names:
+                    for tid in _publisher_threads(name, nodes):
+                        servers.assign(tid, server.name)
+            servers.arm(nodes.anchor_ns)
+            yield
+            failure = servers.failure()
+        finally:
+            servers.release()
+    if failure is not None:
+        raise OperationError(f"the servers failed while the application ran: {failure}")
+
+
+def _publisher_threads(node: str, nodes: "StartedNodes") -> list[int]:
+    pid = nodes.pids.get(node)
+    found = [t.tid for t in list_threads(pid) if t.role == "publisher"] if pid is not None else []
+    if not found:
+        raise OperationError(
+            f"{node} has no thread that publishes for it: let it publish asynchronously "
+            "(`publication: asynchronous` under `topics`), or plan with --publication synchronous"
+        )
+    return found

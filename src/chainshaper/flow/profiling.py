@@ -16,25 +16,23 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from chainshaper.analysis import data_flow, find_chain, graph_of
-from chainshaper.enforcement.runs.guardian import run_claimed
-from chainshaper.enforcement.runs.journal import Journal
-from chainshaper.enforcement.runs.scheduling_memory import change_all
+from chainshaper.enforcement.guardian import run_claimed
+from chainshaper.enforcement.scheduling_memory import change_all
 from chainshaper.enforcement.servers import ReservationServer
-from chainshaper.enforcement.threads.allocation import (
+from chainshaper.enforcement.threads import (
     Allocation,
     NodeThread,
     RecordedProcess,
     allocate,
+    scheduling_around,
 )
-from chainshaper.enforcement.threads.server_threads import scheduling_around
 from chainshaper.flow.recorded_threads import recorded_processes
 from chainshaper.linux.processes import Process
+from chainshaper.linux.runs import Journal
 from chainshaper.linux.scheduling import available_cores, check_cores, may_use_fifo
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError, PlatformError
 from chainshaper.values.recording import Recording
-
-__all__ = ["chain_nodes", "check_profiling", "executors_of", "profiling_condition"]
 
 START_NS = 30_000_000_000
 """The nodes have this long to appear."""
@@ -69,8 +67,7 @@ def profiling_condition(
 def check_profiling(core: int | None = None) -> int:
     """The core on which executors will run, once it is sure that they may.
 
-    Raises:
-        PlatformError: no such core, or SCHED_FIFO is not permitted.
+    Raises PlatformError: no such core, or SCHED_FIFO is not permitted.
     """
     if not may_use_fifo():
         raise PlatformError(
@@ -85,8 +82,7 @@ def check_profiling(core: int | None = None) -> int:
 def chain_nodes(recording: Recording, chain: str) -> tuple[str, ...]:
     """The nodes of a chain in an earlier recording of the application, in its order.
 
-    Raises:
-        InputError: no such chain.
+    Raises InputError: no such chain.
     """
     graph = graph_of(data_flow(recording.events, recording.info.clock_offset_ns))
     found = find_chain(graph, chain)

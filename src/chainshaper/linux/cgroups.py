@@ -20,23 +20,6 @@ from pathlib import Path
 
 from chainshaper.values.errors import OperationError, PlatformError
 
-__all__ = [
-    "QUICK_MOVES",
-    "cgroup_of",
-    "dissolve",
-    "enter_own_group",
-    "has_unseen_threads",
-    "leave_own_group",
-    "make_threaded_child",
-    "mount_options",
-    "mount_point",
-    "move_thread",
-    "moves_are_quick",
-    "remount",
-    "remove_own_group",
-    "threads_in",
-]
-
 MOUNTS = Path("/proc/mounts")
 QUICK_MOVES = "favordynmods"
 """A mount option since Linux 6.0 (Documentation/admin-guide/cgroup-v2.rst, "Mounting").
@@ -66,19 +49,14 @@ _REMEDY = (
 
 
 def mount_point() -> Path:
-    """Where the version 2 hierarchy is mounted.
-
-    Raises:
-        PlatformError: it is not.
-    """
+    """Where the version 2 hierarchy is mounted. Raises PlatformError: it is not."""
     return _mount()[0]
 
 
 def mount_options() -> str:
     """How the version 2 hierarchy is mounted: ``rw,nosuid,nodev,noexec,relatime,nsdelegate``.
 
-    Raises:
-        PlatformError: it is not.
+    Raises PlatformError: it is not.
     """
     return _mount()[1]
 
@@ -116,9 +94,8 @@ def _mount() -> tuple[Path, str]:
 def cgroup_of(tid: int) -> Path:
     """The folder of the group in which a thread is.
 
-    Raises:
-        OperationError: there is no such thread.
-        PlatformError: its group cannot be seen from here.
+    Raises OperationError: there is no such thread. PlatformError: its group cannot be seen from
+    here.
     """
     try:
         lines = Path(f"/proc/{tid}/cgroup").read_text().splitlines()
@@ -139,9 +116,8 @@ def cgroup_of(tid: int) -> Path:
 def make_threaded_child(parent: Path, name: str) -> Path:
     """Make an empty threaded group directly beneath the group of the threads it is for.
 
-    Raises:
-        OperationError: the name is taken.
-        PlatformError: the machine or the privileges do not allow it; nothing is left behind.
+    Raises OperationError: the name is taken. PlatformError: the machine or the privileges do not
+    allow it; nothing is left behind.
     """
     folder = parent / name
     try:
@@ -185,9 +161,8 @@ def _why_not_threaded(parent: Path, error: OSError) -> str:
 def move_thread(tid: int, folder: Path) -> bool:
     """Put one thread into a group; False when the thread has ended.
 
-    Raises:
-        PlatformError: the group is of another process, or the privilege is missing.
-        OperationError: the group is gone, or the kernel refuses for a reason of its own.
+    Raises PlatformError: the group is of another process, or the privilege is missing.
+    OperationError: the group is gone, or the kernel refuses for a reason of its own.
     """
     try:
         (folder / "cgroup.threads").write_text(str(tid))

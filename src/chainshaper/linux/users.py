@@ -24,8 +24,6 @@ from contextlib import contextmanager, suppress
 from chainshaper.linux.threads import read_proc
 from chainshaper.values.errors import InputError
 
-__all__ = ["process_folder", "run_users", "user_in", "user_name", "user_of"]
-
 _AT_UID = 11
 _AUXILIARY = struct.Struct("@NN")
 
@@ -33,10 +31,8 @@ _AUXILIARY = struct.Struct("@NN")
 def run_users(named: Collection[str | int] = ()) -> frozenset[int]:
     """The ids of users whose processes a run takes, by their names or numbers.
 
-    By default: who has launched us, also by way of `sudo`, and root.
-
-    Raises:
-        InputError: there is no such user.
+    By default: who has launched us, also by way of `sudo`, and root. Raises InputError: there is no
+    such user.
     """
     if named:
         return frozenset(_user_id(one) for one in named)
@@ -72,8 +68,7 @@ def user_name(user: int | None) -> str:
 def process_folder(pid: int) -> Iterator[int]:
     """A process's folder in /proc, open: what is read from it is never another process's.
 
-    Raises:
-        OSError: there is no such process.
+    Raises OSError: there is no such process.
     """
     folder = os.open(f"/proc/{pid}", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -90,11 +85,7 @@ def user_of(pid: int) -> int | None:
 
 
 def user_in(folder: int) -> int | None:
-    """The same from a process's open folder.
-
-    Raises:
-        OSError: the process has ended.
-    """
+    """The same from a process's open folder. Raises OSError: the process has ended."""
     status = read_proc("status", folder)
     line = next(line for line in status.splitlines() if line.startswith(b"Uid:"))
     user, *others = (int(number) for number in line.split()[1:])

@@ -22,8 +22,6 @@ from chainshaper.linux.own_processes import module_command
 from chainshaper.linux.scheduling import lock_memory, set_thread_name, stop_garbage_collection
 from chainshaper.values.errors import OperationError
 
-__all__ = ["start_kicker"]
-
 PRIORITY = 1
 _CLOCK_MONOTONIC, _TIMER_ABSTIME = 1, 1
 
@@ -31,10 +29,8 @@ _CLOCK_MONOTONIC, _TIMER_ABSTIME = 1, 1
 def start_kicker(core: int, program: int) -> subprocess.Popen[bytes]:
     """Start the kicker of a core; returns when it is at work.
 
-    ``program`` is the file descriptor of `table_boundary`.
-
-    Raises:
-        OperationError: it cannot be started.
+    ``program`` is the file descriptor of `table_boundary`. Raises OperationError: it cannot be
+    started.
     """
     process = subprocess.Popen(
         [*module_command(__name__), str(core), str(program)],

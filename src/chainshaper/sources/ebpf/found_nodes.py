@@ -16,8 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import polars as pl
 
 from chainshaper.analysis.objects import INTERNAL_TOPICS
-from chainshaper.linux.node_names import named_nodes
-from chainshaper.linux.processes import Process
+from chainshaper.linux.processes import Process, named_nodes
 from chainshaper.sources.ebpf.late_attachment import added_rows
 from chainshaper.sources.system import processes_of
 from chainshaper.values import events

@@ -1,6 +1,6 @@
 """A guardian: a process that outlives the owner of a run, and undoes what it leaves behind.
 
-    python -m chainshaper.enforcement.runs.guardian OWNER FOLDER READY_FD
+    python -m chainshaper.enforcement.guardian OWNER FOLDER READY_FD
 
 A dispatcher that is killed leaves its threads frozen, and an owner that is killed leaves an
 application under real-time priorities, or in slots, for ever. So every run has guardians, whatever
@@ -29,24 +29,22 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from chainshaper.enforcement.freezer.counters import CounterPage, open_page
-from chainshaper.enforcement.freezer.state import groups_of, run_of, thaw
-from chainshaper.enforcement.runs.claims import claim_run
-from chainshaper.enforcement.runs.journal import FILE, Journal, remembered_journal
-from chainshaper.enforcement.runs.processes import (
-    DISPATCHER,
-    GUARDIAN,
-    note_process,
-    open_process,
-    own_processes,
-)
-from chainshaper.enforcement.runs.undoing import undo_run
+from chainshaper.enforcement.freezer_state import CounterPage, groups_of, open_page, run_of, thaw
+from chainshaper.enforcement.undoing import claim_run, undo_run
 from chainshaper.linux import cgroups
 from chainshaper.linux.own_processes import module_command, what_happened
-from chainshaper.linux.scheduling import set_thread_name
+from chainshaper.linux.runs import (
+    DISPATCHER,
+    FILE,
+    GUARDIAN,
+    Journal,
+    note_process,
+    own_processes,
+    remembered_journal,
+)
+from chainshaper.linux.scheduling import become_fifo, set_thread_name
+from chainshaper.linux.threads import open_process
 from chainshaper.values.errors import OperationError
-
-__all__ = ["Guardians", "run_claimed", "start_guardians"]
 
 HOW_MANY = 2
 PRIORITY = 98
@@ -90,8 +88,7 @@ class Guardians:
     def await_ready(self, go_on: Callable[[], None] = lambda: None) -> None:
         """Until they watch. ``go_on`` is called again and again meanwhile, and may raise.
 
-        Raises:
-            OperationError: one does not start.
+        Raises OperationError: one does not start.
         """
         for process in self.processes:
             reading = self.ready.pop(process.pid, None)
@@ -138,9 +135,8 @@ def run_claimed(
 ) -> Iterator[Journal]:
     """A run that governs these, watched over: all in its journal is as before when it is over.
 
-    Raises:
-        OperationError, PlatformError: see :func:`.claim_run` and :meth:`Guardians.await_ready`; or
-            not all could be put back.
+    Raises OperationError, PlatformError: see :func:`.claim_run` and :meth:`Guardians.await_ready`;
+    or not all could be put back.
     """
     journal = claim_run(cores, nodes, folder)
     guardians = None
@@ -276,8 +272,7 @@ def main() -> None:
         owner = os.pidfd_open(owner_pid)
         if os.getppid() != owner_pid:
             raise ProcessLookupError(owner_pid)
-        with contextlib.suppress(PermissionError):
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        become_fifo(PRIORITY)
         with contextlib.suppress(BrokenPipeError):
             os.write(ready, b"!")
         os.close(ready)

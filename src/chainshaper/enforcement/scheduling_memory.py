@@ -1,9 +1,10 @@
 """Changing the class and cores of threads that are not ours, and putting them back.
 
 Before a change, the journal learns what was there and what is wanted. Putting back looks at each
-aspect of a thread (:mod:`.scheduling_state`) by itself. One that is as we set it goes back to what
-it was; one that somebody else has changed since is theirs, and is left and said so. A thread that
-has ended is done with, and one that has its id by now is recognised by its start.
+aspect of a thread (:mod:`chainshaper.linux.scheduling`) by itself. One that is as we set it goes
+back to what it was; one that another program has changed since is that program's, and is left and
+said so. A thread that has ended is done with, and one that has its id by now is recognised by its
+start.
 
 Threads inherit class and cores from those that create them. What an application starts while it is
 changed is put back as well (:func:`restore_inherited`), if it is the application's beyond doubt:
@@ -22,20 +23,21 @@ it are refused.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from time import CLOCK_BOOTTIME, clock_gettime_ns
 from typing import Any, Literal, TypeAlias
 
-from chainshaper.enforcement.freezer.state import groups_of, run_of
-from chainshaper.enforcement.runs.journal import Journal, process_of
+from chainshaper.enforcement.freezer_state import groups_of, run_of
 from chainshaper.linux.cgroups import threads_in
 from chainshaper.linux.processes import descendants
-from chainshaper.linux.scheduling_state import (
+from chainshaper.linux.runs import Journal, process_of
+from chainshaper.linux.scheduling import (
     ASPECTS,
+    Aspect,
+    Scheduling,
     SchedulingClass,
     SchedulingState,
     set_state,
-    state_as_json,
     state_from_json,
     state_of,
     state_text,
@@ -44,7 +46,6 @@ from chainshaper.linux.scheduling_state import (
 from chainshaper.linux.threads import (
     SCHED_DEADLINE,
     TICK_NS,
-    Scheduling,
     Thread,
     find_thread,
     list_threads,
@@ -53,29 +54,11 @@ from chainshaper.linux.threads import (
 )
 from chainshaper.values.errors import OperationError, PlatformError
 
-__all__ = [
-    "DESCENDANTS",
-    "KIND",
-    "Change",
-    "Outcome",
-    "change_all",
-    "change_scheduling",
-    "look_alikes",
-    "note_descendants",
-    "note_scheduling",
-    "read_change",
-    "release_threads",
-    "remembered_threads",
-    "restore_inherited",
-    "restore_scheduling",
-]
-
 KIND = "scheduling"
 DESCENDANTS = "descendant"
 
 Fate: TypeAlias = Literal["restored", "unchanged", "ended", "left", "failed"]
 """``unchanged``: it is as it was already; ``left``: somebody else has changed it since."""
-
 
 _GENERATIONS = 5
 
@@ -111,21 +94,13 @@ class Change:
         return (self.tid, self.started)
 
 
-def change_scheduling(journal: Journal, thread: Thread, wanted: Scheduling) -> None:
-    """:func:`change_all` for one thread."""
-    change_all(journal, ((thread, wanted),))
-
-
 def change_all(journal: Journal, changes: Iterable[tuple[Thread, Scheduling]]) -> None:
     """Give threads their class and cores, with what was there in the journal.
 
-    All is written down together before anything is changed. A thread that has ended meanwhile is
-    no error; one that we gave the same before, and has it, is not written down again.
-
-    Raises:
-        OperationError: one runs under SCHED_DEADLINE, the journal cannot be written (then nothing
-            is changed), or the kernel refuses.
-        PlatformError: the privilege to change one is missing.
+    All is written down together before anything is changed. A thread that has ended meanwhile is no
+    error; one that we gave the same before, and has it, is not written down again. Raises
+    OperationError: one runs under SCHED_DEADLINE, the journal cannot be written (then nothing is
+    changed), or the kernel refuses. PlatformError: the privilege to change one is missing.
     """
     targets = []
     for thread, wanted in changes:
@@ -135,8 +110,7 @@ def change_all(journal: Journal, changes: Iterable[tuple[Thread, Scheduling]]) -
             continue
     for thread, target in note_scheduling(journal, targets):
         try:
-            now = state_of(thread.tid)
-            set_state(thread.tid, target, [a for a in ASPECTS if _differ(now, target, a)])
+            set_state(thread.tid, target, _different(state_of(thread.tid), target))
         except ProcessLookupError:
             continue
         except PermissionError as error:
@@ -157,15 +131,11 @@ def note_scheduling(
 ) -> tuple[tuple[Thread, SchedulingState], ...]:
     """Write down what threads have before each gets its target; those that are to be changed.
 
-    For what is changed by other means than :func:`change_all`.
-
-    Raises:
-        OperationError: one runs under SCHED_DEADLINE, or the journal cannot be written.
+    For what is changed by other means than :func:`change_all`. Raises OperationError: one runs
+    under SCHED_DEADLINE, or the journal cannot be written.
     """
     known = {one.identity: one for one in remembered_threads(journal)}
-    families: dict[int, list[Change]] = {}
-    for one in known.values():
-        families.setdefault(one.pid, []).append(one)
+    families = _by_process(known.values())
     noted, entries = [], []
     for thread, target in changes:
         try:
@@ -197,11 +167,12 @@ def note_scheduling(
 def note_descendants(journal: Journal) -> None:
     """Write down processes that the journal's have started meanwhile, as long as that shows.
 
-    Raises:
-        OperationError: the journal cannot be written.
+    Raises OperationError: the journal cannot be written.
     """
     remembered = remembered_threads(journal)
-    known = {one.pid for one in remembered} | {pid for pid, _ in _descendants_noted(journal)}
+    known = {one.pid for one in remembered} | {
+        pid for pid, _ in journal.read(DESCENDANTS, process_of)
+    }
     new = [pid for pid in _families(journal, remembered) if pid not in known]
     started = ((pid, start_of(pid, pid)) for pid in new)
     entries = [{"pid": pid, "started": when} for pid, when in started if when is not None]
@@ -224,8 +195,7 @@ def restore_scheduling(journal: Journal) -> tuple[Outcome, ...]:
 def release_threads(journal: Journal) -> None:
     """:func:`restore_scheduling`, where all has to be put back.
 
-    Raises:
-        OperationError: the kernel refuses for some threads; the others are as before.
+    Raises OperationError: the kernel refuses for some threads; the others are as before.
     """
     left = [one for one in restore_scheduling(journal) if one.fate == "failed"]
     if left:
@@ -302,9 +272,7 @@ def _born_of(journal: Journal, remembered: list[Change]) -> list[tuple[Thread, l
 
 def _families(journal: Journal, remembered: list[Change]) -> dict[int, list[Change]]:
     """Processes that are the application's, each with the changes that it may have inherited."""
-    families: dict[int, list[Change]] = {}
-    for one in remembered:
-        families.setdefault(one.pid, []).append(one)
+    families = _by_process(remembered)
     # A process that had begun when its thread was changed is still the same.
     families = {
         pid: family
@@ -312,7 +280,7 @@ def _families(journal: Journal, remembered: list[Change]) -> dict[int, list[Chan
         if (begun := start_of(pid, pid)) is not None
         and begun <= min(one.changed_at for one in family)
     }
-    for pid, started in _descendants_noted(journal):
+    for pid, started in journal.read(DESCENDANTS, process_of):
         if start_of(pid, pid) == started:
             families.setdefault(pid, remembered)
     parent_of = parents() if families else {}
@@ -322,15 +290,18 @@ def _families(journal: Journal, remembered: list[Change]) -> dict[int, list[Chan
     return families
 
 
-def _descendants_noted(journal: Journal) -> tuple[tuple[int, int], ...]:
-    return journal.read(DESCENDANTS, process_of)
+def _by_process(changes: Iterable[Change]) -> dict[int, list[Change]]:
+    families: dict[int, list[Change]] = {}
+    for one in changes:
+        families.setdefault(one.pid, []).append(one)
+    return families
 
 
 def _target(now: SchedulingState, wanted: Scheduling) -> SchedulingState:
     """What a thread has after a wish is fulfilled: what the wish leaves open stays."""
     if wanted.priority is not None:
-        held = SchedulingClass(wanted.policy, wanted.priority, now.scheduling_class.reset_on_fork)
-        now = replace(now, scheduling_class=held)
+        own = SchedulingClass(wanted.policy, wanted.priority, now.scheduling_class.reset_on_fork)
+        now = replace(now, scheduling_class=own)
     return now if wanted.cores is None else replace(now, cores=tuple(sorted(wanted.cores)))
 
 
@@ -339,8 +310,8 @@ def _restore(one: Change) -> Outcome:
         return Outcome(one.tid, one.comm, "ended")
     try:
         now = state_of(one.tid)
-        different = [aspect for aspect in ASPECTS if _differ(now, one.original, aspect)]
-        ours = [a for a in different if any(not _differ(now, given, a) for given in one.given)]
+        different = _different(now, one.original)
+        ours = [a for a in different if _has_been_given(now, one, a)]
         set_state(one.tid, one.original, ours)
     except ProcessLookupError:
         return Outcome(one.tid, one.comm, "ended")
@@ -360,7 +331,7 @@ def _disinherit(thread: Thread, family: list[Change]) -> Outcome | None:
         target = _without_inheritance(now, thread.started, family)
         if target == now:
             return None
-        set_state(thread.tid, target, [a for a in ASPECTS if _differ(now, target, a)])
+        set_state(thread.tid, target, _different(now, target))
     except ProcessLookupError:
         return None
     except OSError as error:
@@ -379,12 +350,18 @@ def _without_inheritance(
     """
     for aspect in ASPECTS:
         for one in family:
-            if started < one.changed_at or not _differ(state, one.original, aspect):
-                continue
-            if any(not _differ(state, given, aspect) for given in one.given):
+            if (
+                started >= one.changed_at
+                and aspect in _different(state, one.original)
+                and _has_been_given(state, one, aspect)
+            ):
                 state = with_aspect(state, aspect, one.original)
                 break
     return state
+
+
+def _has_been_given(state: SchedulingState, one: Change, aspect: Aspect) -> bool:
+    return any(getattr(state, aspect) == getattr(given, aspect) for given in one.given)
 
 
 def read_change(entry: Mapping[str, Any]) -> Change:
@@ -402,8 +379,8 @@ def _as_entry(thread: Thread, before: SchedulingState, target: SchedulingState) 
         "pid": thread.pid,
         "comm": thread.comm,
         "at": clock_gettime_ns(CLOCK_BOOTTIME) // TICK_NS,
-        "before": state_as_json(before),
-        "given": state_as_json(target),
+        "before": asdict(before),
+        "given": asdict(target),
     }
 
 
@@ -421,12 +398,12 @@ def remembered_threads(journal: Journal) -> list[Change]:
         original = earlier.original
         for aspect in ASPECTS:
             known = (original, *earlier.given)
-            if all(_differ(change.original, one, aspect) for one in known):
+            if all(aspect in _different(change.original, one) for one in known):
                 original = with_aspect(original, aspect, change.original)
         given = (*earlier.given, *change.given)
         threads[change.identity] = replace(earlier, original=original, given=given)
     return list(threads.values())
 
 
-def _differ(one: SchedulingState, other: SchedulingState, aspect: str) -> bool:
-    return bool(getattr(one, aspect) != getattr(other, aspect))
+def _different(one: SchedulingState, other: SchedulingState) -> list[Aspect]:
+    return [aspect for aspect in ASPECTS if getattr(one, aspect) != getattr(other, aspect)]
