@@ -14,10 +14,11 @@ the owner's descriptors for as long as the owner lives. All numbers are 64-bit i
 machine's order, each written by one kind of process only:
 
     the owner    released: servers that need no dispatcher any more
-    per core     beats, acknowledged, real time, and (by guardians) silent
+    per core     beats, acknowledged, real time, and (by guardians) let go (ns), silent
     per server   slots, late entries, longest lateness (ns), overruns (-1: unknown), groups lost
 
 ``beats`` moves as long as its process does; one that did not for too long was ``silent``.
+A guardian that thaws the threads of one that is still for a moment says when it has: ``let go``.
 ``acknowledged`` is the number of the last command that a dispatcher has carried out.
 """
 
@@ -37,7 +38,8 @@ from chainshaper.linux.cgroups import (
     has_unseen_threads,
     mount_point,
     moves_are_quick,
-    remount,
+    options_before_ours,
+    restore_mount,
 )
 from chainshaper.linux.runs import Journal
 from chainshaper.linux.threads import has_ended, start_of
@@ -142,9 +144,18 @@ def restore(run: FreezerRun | None) -> tuple[str, ...]:
     thaw(groups)
     left = tuple(why for folder in groups if (why := dissolve(folder)) is not None)
     before = None if run is None else run.mount_options
-    if before is not None and moves_are_quick():
-        remount(before)
+    if before is not None:
+        restore_mount(before)
     return left
+
+
+def restore_stray_mount() -> None:
+    """Mount the hierarchy as it was before a run whose journal is gone, if no group is in use."""
+    with contextlib.suppress(PlatformError):
+        in_use = not moves_are_quick() or _groups(lambda _: True)
+        before = None if in_use else options_before_ours()
+        if before is not None:
+            restore_mount(before)
 
 
 def _groups(wanted: Callable[["re.Match[str]"], bool]) -> tuple[Path, ...]:
@@ -167,8 +178,9 @@ class _Core(ctypes.Structure):
     beats: int
     acknowledged: int
     real_time: int
+    let_go: int
     silent: int
-    _fields_ = _numbers("beats", "acknowledged", "real_time", "silent")
+    _fields_ = _numbers("beats", "acknowledged", "real_time", "let_go", "silent")
 
 
 class _Server(ctypes.Structure):
