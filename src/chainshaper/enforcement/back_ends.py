@@ -130,7 +130,6 @@ class Fifo:
         self._since_ns: int | None = None
 
     def assign(self, tid: int, server: str) -> None:
-        """See :meth:`BackEnd.assign`."""
         if server not in self._members:
             raise InputError(f"no server {server!r}: choose of {', '.join(self._members)}")
         thread = find_thread(tid)
@@ -142,24 +141,19 @@ class Fifo:
             self._schedule()
 
     def arm(self, anchor_ns: int) -> None:  # noqa: ARG002 - priorities know no cycle
-        """Give all threads the priority and core of their servers."""
         self._schedule()
         self._since_ns = time.monotonic_ns()
 
     def in_force_from(self) -> int | None:
-        """See :meth:`BackEnd.in_force_from`."""
         return self._since_ns
 
     def counters(self) -> dict[str, ServerCounters]:
-        """Nothing is counted: there are no slots."""
         return {server.name: ServerCounters() for server in self._table.servers}
 
     def failure(self) -> str | None:
-        """None: there is nothing that could stop."""
         return None
 
     def release(self) -> None:
-        """Every thread as it was before; see :meth:`BackEnd.release`."""
         self._since_ns = None
         release_threads(self._journal)
 

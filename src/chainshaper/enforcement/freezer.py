@@ -2,16 +2,12 @@
 
 Each server's threads are put into cgroups of its own, and a dispatcher on the server's core opens
 and closes these by freezing them (DESIGN section 6). What a slot does not cover does not run, not
-even on an idle core. A thread sees nothing of it but the time: futexes, condition variables, sleeps
-and polls go on as if it had been pre-empted. Only ``epoll_wait``, ``recvmsg`` with a timeout,
-``sigtimedwait`` and ``semtimedop`` return EINTR.
+even on an idle core. A thread sees nothing of it but the time, except that ``epoll_wait``,
+``recvmsg`` with a timeout, ``sigtimedwait`` and ``semtimedop`` return EINTR.
 
-The owner (this process) starts one dispatcher per core. The run's guardians
-(:mod:`chainshaper.enforcement.guardian`) watch over all of them: whichever is lost, no thread
-stays stopped. Should the owner and all guardians be lost at once, a dispatcher undoes the run.
-
-Threads that a gated thread creates, and processes that it forks, are born in its server and stay
-there: they count as its members and are put back with it.
+The owner (this process) starts one dispatcher per core, and the run's guardians watch over all of
+them: whichever is lost, no thread stays stopped. Threads that a gated thread creates, and processes
+that it forks, are born in its server, count as its members and are put back with it.
 """
 
 import contextlib
@@ -138,7 +134,6 @@ class Freezer:
         self._await_answers()
 
     def in_force_from(self) -> int | None:
-        """When (CLOCK_MONOTONIC, ns) the cycles of the latest :meth:`arm` begin."""
         return None if self._anchoring is None else self._anchoring.begin_ns
 
     def members(self) -> dict[str, tuple[int, ...]]:
@@ -170,7 +165,6 @@ class Freezer:
         return self._dispatcher_failure() or lost
 
     def release(self) -> None:
-        """See :meth:`BackEnd.release`."""
         if self._released:
             return
         self._released = True
@@ -234,7 +228,6 @@ class Freezer:
         return f"{ended}: {'; '.join(said.splitlines())}" if said else ended
 
     def _lost(self) -> str | None:
-        """What others have taken from us."""
         for server in self.table.servers:
             if self._page.servers[server.name].lost:
                 return (
@@ -259,7 +252,6 @@ class Freezer:
             raise OperationError(f"the servers are no longer in force: {reason}")
 
     def _parent_for(self, tid: int) -> Path:
-        """The group beneath which the thread's own is, or is to be, made."""
         folder = cgroups.cgroup_of(tid)
         if folder in self._groups:
             return folder.parent
@@ -271,7 +263,6 @@ class Freezer:
         return folder
 
     def _make(self, folder: Path, server: str) -> None:
-        """A new group, made and known to its dispatcher."""
         cgroups.make_threaded_child(folder.parent, folder.name)
         self._groups[folder] = server
         self._send(self._cores[server], server=server, folder=str(folder))
@@ -279,7 +270,6 @@ class Freezer:
             self._await_answers()
 
     def _send(self, core: int, **fields: str | int) -> None:
-        """Send a dispatcher a command."""
         self._command += 1
         self._sent[core] = self._command
         line = json.dumps({"number": self._command, **fields}) + "\n"
@@ -287,7 +277,6 @@ class Freezer:
             os.write(self._pipes[core], line.encode())
 
     def _await_answers(self) -> None:
-        """Until the dispatchers have carried out what they were sent."""
         deadline = time.monotonic() + _ANSWER_S
         for core, number in self._sent.items():
             while self._page.cores[core].acknowledged < number:

@@ -1,25 +1,21 @@
 """What the freezer's processes share: what it has changed on this machine, and its counters.
 
-Whoever survives must be able to put everything back, and so must a stranger after all of a run's
-processes have been killed at once. So the journal says, *before* anything is changed, which servers
-there will be and how the hierarchy was mounted. Cgroups of ours need no line each: their names say
-which process made them and for which server, so they are found even where the journal is gone. A
-group is made directly beneath the one from which its threads came: their way back is its parent,
-for them and for the children that they have had since.
+The journal says, *before* anything is changed, which servers there will be and how the hierarchy
+was mounted. Cgroups of ours need no line each: their names say which process made them and for
+which server, so a stranger finds them even where the journal is gone. A group is made directly
+beneath the one from which its threads came: their way back is its parent, for them and for the
+children that they have had since.
 
-A dispatcher must not wait, so it sends nothing: it writes its numbers to memory that others can
-read. Not to a file on a disk, though: a store to a mapped page that is being written back waits for
-the disk, for 0.1 s and more. The memory belongs to the owner and has no file; it is reached through
-the owner's descriptors for as long as the owner lives. All numbers are 64-bit integers in the
-machine's order, each written by one kind of process only:
+A dispatcher must not wait, so it writes its numbers to memory that others read. Not to a file on a
+disk: a store to a mapped page that is being written back waits for the disk, for 0.1 s and more.
+The memory belongs to the owner, and is reached through its descriptors. All numbers are 64-bit
+integers in the machine's order, each written by one kind of process only:
 
     the owner    released: servers that need no dispatcher any more
-    per core     beats, acknowledged, real time, and (by guardians) let go (ns), silent
+    per core     beats (moves as long as its process does), acknowledged (the last command carried
+                 out), real time, and by guardians: let go (when they thawed the threads of one that
+                 was still for a moment, ns), silent (it was still for too long)
     per server   slots, late entries, longest lateness (ns), overruns (-1: unknown), groups lost
-
-``beats`` moves as long as its process does; one that did not for too long was ``silent``.
-A guardian that thaws the threads of one that is still for a moment says when it has: ``let go``.
-``acknowledged`` is the number of the last command that a dispatcher has carried out.
 """
 
 import contextlib
@@ -71,7 +67,6 @@ def note_freezer(journal: Journal, run: FreezerRun) -> None:
 
 
 def read_run(entry: Mapping[str, Any]) -> FreezerRun:
-    """What :func:`note_freezer` wrote."""
     table, (pid, started) = entry["table"], entry["owner"]
     servers = tuple(
         ReservationServer(**{**one, "slots": tuple((start, end) for start, end in one["slots"])})
@@ -86,7 +81,6 @@ def read_run(entry: Mapping[str, Any]) -> FreezerRun:
 
 
 def run_of(journal: Journal) -> FreezerRun | None:
-    """The freezer's run, None where there is none."""
     return next(iter(journal.read(FREEZER, read_run)), None)
 
 
@@ -230,7 +224,6 @@ def open_page(path: Path, table: ServerTable) -> CounterPage:
 
 
 def read_counters(page: CounterPage) -> dict[str, ServerCounters]:
-    """The counters of every server, as :meth:`BackEnd.counters` gives them."""
     return {
         name: ServerCounters(
             its.slots, its.late, its.longest, its.overruns if its.overruns >= 0 else None

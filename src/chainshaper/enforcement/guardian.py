@@ -2,21 +2,18 @@
 
     python -m chainshaper.enforcement.guardian OWNER FOLDER READY_FD
 
-A dispatcher that is killed leaves its threads frozen, and an owner that is killed leaves an
-application under real-time priorities, or in slots, for ever. So every run has guardians, whatever
-its back end. They learn of a death from a pidfd, at once, and of a dispatcher that hangs from the
-sign of life that stands still. Whoever is lost, a guardian undoes all that the journal says.
-
-There are two of them, which do the same: each is there should the other be killed or stopped at
-the same instant as what they watch over. The owner starts anew the one that it has lost. They are
-out of reach of what befalls the application or the owner: each has a session of its own, a cgroup
-that is neither's, and a priority above the dispatchers'.
+Every run has two guardians, whatever its back end, which do the same: each is there should the
+other be killed or stopped at the same instant as what they watch over. They learn of a death from a
+pidfd, at once, and of a dispatcher that hangs from the sign of life that stands still; then they
+undo all that the journal says. The owner starts anew the one that it has lost. They are out of
+reach of what befalls the application or the owner: each has a session of its own, a cgroup that is
+neither's, and a priority above the dispatchers'.
 
 A dispatcher that gives no sign of life for a tenth of a second may hang, or its core may have been
-taken from the machine for a moment. So its threads are let go first, and questions asked later: one
-that comes back closes what has to be closed, at the price of a cycle or less in which a server's
-threads ran freely; one that stays away for half a second has failed. The sign of life must stand
-still over several looks, rather than for some time: that a machine stalls as a whole is no fault.
+taken from the machine for a moment. So its threads are let go first: one that comes back closes
+what has to be closed, at the price of a cycle or less in which a server's threads ran freely; one
+that stays away for half a second has failed. The sign of life must stand still over several looks,
+rather than for some time: that a machine stalls as a whole is no fault.
 """
 
 import contextlib
@@ -32,17 +29,9 @@ from pathlib import Path
 
 from chainshaper.enforcement.freezer_state import CounterPage, groups_of, open_page, run_of, thaw
 from chainshaper.enforcement.undoing import claim_run, undo_run
-from chainshaper.linux import cgroups
+from chainshaper.linux import cgroups, runs
 from chainshaper.linux.own_processes import module_command, what_happened
-from chainshaper.linux.runs import (
-    DISPATCHER,
-    FILE,
-    GUARDIAN,
-    Journal,
-    note_process,
-    own_processes,
-    remembered_journal,
-)
+from chainshaper.linux.runs import Journal
 from chainshaper.linux.scheduling import become_fifo, set_thread_name
 from chainshaper.linux.threads import open_process
 from chainshaper.values.errors import OperationError
@@ -69,7 +58,6 @@ class Guardians:
     """By process: the pipe by which it says that it watches."""
 
     def start_one(self) -> None:
-        """Start one, without waiting for it."""
         reading, writing = os.pipe()
         folder = str(self.journal.path.parent)
         try:
@@ -110,7 +98,6 @@ class Guardians:
                 )
 
     def renew(self) -> None:
-        """Replace those that were killed, or stopped."""
         for lost in [one for one in self.processes if what_happened(one) is not None]:
             lost.kill()
             lost.wait()
@@ -119,7 +106,6 @@ class Guardians:
             self.start_one()
 
     def end(self) -> None:
-        """End them, when nothing is left to undo."""
         for process in self.processes:
             process.kill()
         for process in self.processes:
@@ -195,7 +181,6 @@ class _Watch:
         return False
 
     def keep_journal(self) -> bool:
-        """Whether the run goes on."""
         try:
             return self.journal.keep()
         except OSError:  # its folder is gone, and there is no room for another: it is in memory
@@ -215,7 +200,7 @@ class _Watch:
                 self.page = open_page(run.page, run.table)
             except OSError:  # the owner is gone, which its pidfd will say
                 return False
-        for one in own_processes(self.journal, DISPATCHER):
+        for one in runs.own_processes(self.journal, runs.DISPATCHER):
             if one.core is None or one.core in self.seen:
                 continue
             self.seen[one.core], self.still[one.core] = -1, 0
@@ -230,7 +215,6 @@ class _Watch:
         return lost
 
     def forget_dispatchers(self) -> None:
-        """They have ended, or are about to."""
         for pidfd in self.cores:
             self.poll.unregister(pidfd)
             os.close(pidfd)
@@ -262,17 +246,16 @@ def let_go(journal: Journal, page: CounterPage, core: int) -> None:
 
 
 def main() -> None:
-    """Wait, and undo if need be."""
     owner_pid, folder, ready = int(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
     for ignored in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(ignored, signal.SIG_IGN)
     set_thread_name("guardian")
     try:
-        journal = remembered_journal(folder / FILE)
+        journal = runs.remembered_journal(folder / runs.FILE)
     except OSError:
         return  # the run is over already
     with contextlib.suppress(OperationError):  # a full disk: it watches all the same
-        note_process(journal, GUARDIAN, os.getpid())
+        runs.note_process(journal, runs.GUARDIAN, os.getpid())
     cgroups.enter_own_group(GROUP)
     try:
         owner = os.pidfd_open(owner_pid)

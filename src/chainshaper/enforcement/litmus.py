@@ -1,24 +1,20 @@
 """The back end `litmus`: the paper's own servers, where the kernel is LITMUS^RT.
 
-The P-RES plugin implements table-driven reservations (paper, section 2.2.1): threads of one server
-take turns, a smaller priority is better, and the kernel does the gating. All is done by the tools
-that come with LITMUS^RT, with commands that can be printed instead.
+The P-RES plugin implements table-driven reservations (paper, section 2.2.1). All is done by the
+tools that come with LITMUS^RT, with commands that can be printed instead.
 
 A reservation cannot be changed, listed or deleted by itself: all go when the plugin is changed,
 which the kernel refuses while a thread is under SCHED_LITMUS. Another anchor makes new
 reservations, and each thread moves by itself: for the two milliseconds that a command takes, it
 runs freely. Threads that are created by one in a reservation run in it as well, so threads are
-attached one by one, after those of DDS exist. There is no command to detach a thread but to give it
-another class.
+attached one by one, after those of DDS exist, and detached by giving them another class.
 
 `resctl` reads times as decimal milliseconds, turns them into a C double, multiplies it by a million
-and drops what is behind the point. `1.001` becomes 1000999.99… and a nanosecond is lost. So a text
-is chosen that survives this. Its intervals may be written closed, `[2,86]`, or half-open, `[2,86)`,
-which ends one nanosecond earlier. Ours are half-open: `resctl` refuses a closed interval that ends
-with the major cycle, and takes `[2,86] [86,87]` for overlapping. They must ascend, and the kernel
-wants two nanoseconds at least and 1024 intervals at most. A table counts from time zero of
-CLOCK_MONOTONIC; another anchor is reached by turning the slots, which may cut one in two at the end
-of the cycle.
+and drops what is behind the point, so a text is chosen that survives this. Intervals are written
+half-open, `[2,86)`, which ends one nanosecond earlier than `[2,86]`: `resctl` refuses a closed
+interval that ends with the major cycle, and takes `[2,86] [86,87]` for overlapping. They must
+ascend; the kernel wants two nanoseconds at least and 1024 intervals at most. A table counts from
+time zero of CLOCK_MONOTONIC; another anchor is reached by turning the slots.
 
 Upstream: liblitmus, `bin/resctl.c`, `doc/howto-use-resctl.md`, `doc/table-driven-scheduling.md`;
 LITMUS^RT, `litmus/reservations/alloc.c`.
@@ -95,10 +91,6 @@ class Litmus:
         self._since_ns: int | None = None
 
     def assign(self, tid: int, server: str) -> None:
-        """Put a thread into a server; one that has ended is passed over.
-
-        Raises InputError: no such server. OperationError: LITMUS^RT refuses.
-        """
         names = [one.name for one in self._table.servers]
         if server not in names:
             raise InputError(f"no server {server!r}: choose of {', '.join(names)}")
@@ -107,10 +99,6 @@ class Litmus:
             self._attach(tid)
 
     def arm(self, anchor_ns: int) -> None:
-        """Create the reservations, and move all threads into them.
-
-        Raises OperationError: LITMUS^RT refuses; what was done before stays until the release.
-        """
         if not self._ids:
             self._journal.note(NOTE, previous=_active_plugin(self._proc), proc=str(self._proc))
             _run(plugin_command(PLUGIN))
@@ -125,24 +113,17 @@ class Litmus:
         self._since_ns = time.monotonic_ns()
 
     def in_force_from(self) -> int | None:
-        """See :meth:`BackEnd.in_force_from`."""
         return self._since_ns
 
     def counters(self) -> dict[str, ServerCounters]:
-        """Nothing is counted: LITMUS^RT does not tell."""
         return {server.name: ServerCounters() for server in self._table.servers}
 
     def failure(self) -> str | None:
-        """Whether somebody has changed the plugin."""
         if not self._ids or (active := _active_plugin(self._proc)) == PLUGIN:
             return None
         return f"somebody has changed the scheduler plugin from {PLUGIN} to {active}"
 
     def release(self) -> None:
-        """Threads as they were, no reservations, the plugin that was active.
-
-        Raises OperationError: the kernel refuses; the message says what is left.
-        """
         self._ids = {}
         release_threads(self._journal)
         restore_plugin(self._journal)
@@ -258,7 +239,6 @@ def reservation_ids(table: ServerTable, generation: int = 0) -> dict[str, int]:
 
 
 def plugin_command(plugin: str) -> Command:
-    """Activate a scheduler plugin."""
     return ("setsched", plugin)
 
 
@@ -289,7 +269,6 @@ def create_command(
 
 
 def attach_command(tid: int | str, number: int, core: int) -> Command:
-    """Move a running thread to the core, and into its reservation."""
     return ("resctl", "-a", str(tid), "-r", str(number), "-c", str(core))
 
 

@@ -2,21 +2,17 @@
 
 Before a change, the journal learns what was there and what is wanted. Putting back looks at each
 aspect of a thread (:mod:`chainshaper.linux.scheduling`) by itself. One that is as we set it goes
-back to what it was; one that another program has changed since is that program's, and is left and
-said so. A thread that has ended is done with, and one that has its id by now is recognised by its
-start.
+back to what it was; one that another program has changed since is left, and named. A thread that
+has ended is done with; one that has its id by now is recognised by its start.
 
 Threads inherit class and cores from those that create them. What an application starts while it is
-changed is put back as well (:func:`restore_inherited`), if it is the application's beyond doubt:
-
-* a thread of a process in the journal, that process being the same (its id *and* its start);
-* a process that descends from one of these, or did when it was last looked
-  (:func:`note_descendants`), with its threads;
-* a thread that was born in a cgroup of ours.
-
-Of these, what started after the change and has what we gave to its family gets its parent's
-original. Everybody else is a stranger, whatever class, core and cgroup they have, and is left
-alone. So is a daemon whose parent ended before anybody looked; :func:`look_alikes` names both.
+changed is put back as well (:func:`restore_inherited`), if it is the application's beyond doubt: a
+thread of a process in the journal, that process being the same (its id *and* its start); a process
+that descends from one of these, or did when it was last looked (:func:`note_descendants`); a thread
+that was born in a cgroup of ours. Of these, what started after the change and has what we gave to
+its family gets its parent's original. All others are strangers, whatever class, core and cgroup
+they have, and are left alone. So is a daemon whose parent ended before a look; :func:`look_alikes`
+names both.
 
 SCHED_DEADLINE has parameters that the kernel admits only together with all others: threads under
 it are refused.
@@ -28,6 +24,7 @@ from time import CLOCK_BOOTTIME, clock_gettime_ns
 from typing import Any, Literal, TypeAlias
 
 from chainshaper.enforcement.freezer_state import groups_of, run_of
+from chainshaper.linux import scheduling
 from chainshaper.linux.cgroups import threads_in
 from chainshaper.linux.processes import descendants
 from chainshaper.linux.runs import Journal, process_of
@@ -35,13 +32,9 @@ from chainshaper.linux.scheduling import (
     ASPECTS,
     Aspect,
     Scheduling,
-    SchedulingClass,
     SchedulingState,
-    set_state,
-    state_from_json,
     state_of,
     state_text,
-    with_aspect,
 )
 from chainshaper.linux.threads import (
     SCHED_DEADLINE,
@@ -90,7 +83,6 @@ class Change:
 
     @property
     def identity(self) -> tuple[int, int]:
-        """As of :class:`Thread`."""
         return (self.tid, self.started)
 
 
@@ -110,7 +102,7 @@ def change_all(journal: Journal, changes: Iterable[tuple[Thread, Scheduling]]) -
             continue
     for thread, target in note_scheduling(journal, targets):
         try:
-            set_state(thread.tid, target, _different(state_of(thread.tid), target))
+            scheduling.set_state(thread.tid, target, _different(state_of(thread.tid), target))
         except ProcessLookupError:
             continue
         except PermissionError as error:
@@ -300,7 +292,7 @@ def _by_process(changes: Iterable[Change]) -> dict[int, list[Change]]:
 def _target(now: SchedulingState, wanted: Scheduling) -> SchedulingState:
     """What a thread has after a wish is fulfilled: what the wish leaves open stays."""
     if wanted.priority is not None:
-        own = SchedulingClass(wanted.policy, wanted.priority, now.scheduling_class.reset_on_fork)
+        own = replace(now.scheduling_class, policy=wanted.policy, priority=wanted.priority)
         now = replace(now, scheduling_class=own)
     return now if wanted.cores is None else replace(now, cores=tuple(sorted(wanted.cores)))
 
@@ -312,7 +304,7 @@ def _restore(one: Change) -> Outcome:
         now = state_of(one.tid)
         different = _different(now, one.original)
         ours = [a for a in different if _has_been_given(now, one, a)]
-        set_state(one.tid, one.original, ours)
+        scheduling.set_state(one.tid, one.original, ours)
     except ProcessLookupError:
         return Outcome(one.tid, one.comm, "ended")
     except OSError as error:
@@ -331,7 +323,7 @@ def _disinherit(thread: Thread, family: list[Change]) -> Outcome | None:
         target = _without_inheritance(now, thread.started, family)
         if target == now:
             return None
-        set_state(thread.tid, target, _different(now, target))
+        scheduling.set_state(thread.tid, target, _different(now, target))
     except ProcessLookupError:
         return None
     except OSError as error:
@@ -355,7 +347,7 @@ def _without_inheritance(
                 and aspect in _different(state, one.original)
                 and _has_been_given(state, one, aspect)
             ):
-                state = with_aspect(state, aspect, one.original)
+                state = scheduling.with_aspect(state, aspect, one.original)
                 break
     return state
 
@@ -365,14 +357,12 @@ def _has_been_given(state: SchedulingState, one: Change, aspect: Aspect) -> bool
 
 
 def read_change(entry: Mapping[str, Any]) -> Change:
-    """A line of the journal as a value."""
-    before, given = state_from_json(entry["before"]), state_from_json(entry["given"])
+    before, given = (scheduling.state_from_json(entry[name]) for name in ("before", "given"))
     tid, started, pid, at = (int(entry[name]) for name in ("tid", "started", "pid", "at"))
     return Change(tid, started, pid, str(entry["comm"]), at, before, (given,))
 
 
 def _as_entry(thread: Thread, before: SchedulingState, target: SchedulingState) -> dict[str, Any]:
-    """What :func:`read_change` reads."""
     return {
         "tid": thread.tid,
         "started": thread.started,
@@ -399,7 +389,7 @@ def remembered_threads(journal: Journal) -> list[Change]:
         for aspect in ASPECTS:
             known = (original, *earlier.given)
             if all(aspect in _different(change.original, one) for one in known):
-                original = with_aspect(original, aspect, change.original)
+                original = scheduling.with_aspect(original, aspect, change.original)
         given = (*earlier.given, *change.given)
         threads[change.identity] = replace(earlier, original=original, given=given)
     return list(threads.values())

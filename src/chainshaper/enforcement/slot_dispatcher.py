@@ -1,30 +1,28 @@
 """The dispatcher: a process that opens and closes the servers of one core, on that core.
 
+    python -m chainshaper.enforcement.slot_dispatcher JOURNAL OWNER CORE COMMANDS_FD
+
 It sleeps until a boundary, writes ``1`` to the ``cgroup.freeze`` of what closes and then ``0`` to
 that of what opens, and sleeps again. It runs on the core that it gates, above everything there:
-the timer interrupt alone takes the core from a thread whose slot has ended, whatever the writing
-costs afterwards, so a slot is left exactly. The price is that the next thread runs only when the
-dispatcher sleeps again; so between waking and sleeping it does nothing that can wait. All else is
-done at **ticks** between boundaries: counting, commands of the owner, the sign of life, and
-looking for overruns.
+the timer interrupt alone takes the core from a thread whose slot has ended, so a slot is left
+exactly. The price is that the next thread runs only when the dispatcher sleeps again; so between
+waking and sleeping it does nothing that can wait. All else is done at **ticks** between boundaries:
+counting, commands of the owner, the sign of life, and looking for overruns.
 
 A thread that is caught in user mode by the end of its slot still wanted to run: an overrun. The
-kernel remembers for a frozen thread where it was, and shows it in ``/proc/TID/syscall``; -1 is
-user mode. (Its state says nothing any more: freezing wakes sleepers.) A thread that is caught
-inside a system call passes for one that waits.
+kernel shows where a frozen thread was in ``/proc/TID/syscall``; -1 is user mode. (Its state says
+nothing any more: freezing wakes sleepers.) One caught inside a system call passes for one that
+waits.
 
-It must never leave threads frozen: it thaws them however it ends, and ends when the owner is gone.
-Only SIGKILL and SIGSTOP prevent that, which is what guardians are for. Should those be gone
-together with the owner, it undoes the whole run.
+It thaws its threads however it ends, and ends when the owner is gone. Only SIGKILL and SIGSTOP
+prevent that, which is what guardians are for. Should those be gone together with the owner, it
+undoes the whole run.
 
 A table becomes a list of **boundaries**: instants of the cycle with the servers that are open from
-there on. Slots are half-open, so at a boundary that two slots share one server closes and the other
-opens, and nothing is open twice. A boundary stands at 0 always, because cycles of another anchor
-may begin there. Moving to another anchor must let no thread slip between: a new cycle begins where
-an old one ends or would have, whichever is shorter to reach. Either the old cycle is cut short by
-less than half of its length, or all servers wait, closed, for less than that.
-
-    python -m chainshaper.enforcement.slot_dispatcher JOURNAL OWNER CORE COMMANDS_FD
+there on. Slots are half-open, so nothing is open twice. A boundary stands at 0 always, because
+cycles of another anchor may begin there. Moving to another anchor must let no thread slip between:
+either the old cycle is cut short by less than half of its length, or all servers wait, closed, for
+less than that.
 """
 
 import contextlib
@@ -237,18 +235,15 @@ class Dispatcher:
             self.upcoming = following
 
     def thaw_all(self) -> None:
-        """Let every thread run."""
         for server in range(len(self.groups)):
             self._write(server, b"0")
         self.open = None
 
     def _changes(self, boundary: Boundary) -> tuple[list[int], list[int]]:
-        """Servers to close and servers to open at a boundary."""
         before = frozenset(range(len(self.groups))) if self.open is None else self.open
         return sorted(before - boundary.open), sorted(boundary.open - before)
 
     def _note(self, boundary: Boundary, closed: list[int], lateness: int) -> None:
-        """What a switch has to leave behind for later."""
         for server in boundary.starts:
             counters = self.counters[server]
             counters.slots += 1
@@ -330,7 +325,6 @@ class Dispatcher:
                 self.counters[server].overruns += 1
 
     def _obey(self) -> None:
-        """Carry out the owner's commands."""
         try:
             while True:
                 received = os.read(self.commands, 65536)
@@ -417,7 +411,6 @@ def _end(_number: int, _frame: FrameType | None) -> None:
 
 
 def main() -> None:
-    """The process of one core, as the owner starts it."""
     path, owner, core, commands = Path(sys.argv[1]), *map(int, sys.argv[2:5])
     signal.signal(signal.SIGTERM, _end)
     for ignored in (signal.SIGINT, signal.SIGHUP):

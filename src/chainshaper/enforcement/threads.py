@@ -1,23 +1,19 @@
 """Which thread does what in an application, and what each shall get for a plan.
 
 The paper's Thread Allocator (section 4.2). What is known of a thread, the stronger evidence first:
-
-1. a recording saw it: the callbacks that it ran say which nodes it executes;
-2. its name, which DDS implementations choose (:mod:`chainshaper.linux.threads`);
-3. its place: executors spin on the main thread, unless the program arranges it otherwise.
-
-What no evidence covers stays unknown. Which nodes a process has, a recording says (also one of an
-earlier run, where the command line names one of them), or the remap rules of its command line; the
-name of its program is a guess, and called one. Every user can start a process that says so of
-itself: only processes of the users that are asked for are nodes (:mod:`chainshaper.linux.users`).
-Those of others that repeat a node's name are named, and left alone.
+a recording saw the callbacks that it ran; its name, which DDS implementations choose; its place:
+executors spin on the main thread, unless the program arranges it otherwise. Which nodes a process
+has, a recording says (also one of an earlier run, where the command line names one of them), or the
+remap rules of its command line; the name of its program is a guess, and called one. Only processes
+of the users that are asked for are nodes (:mod:`chainshaper.linux.users`); those of others that
+repeat a node's name are named, and left alone.
 
 On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DESIGN section 6):
 
 * DDS threads of the application stand above all servers, on other cores where there are any:
   what they deliver must not wait for what it is delivered to;
 * those of them that receive stand above the others, since they are waited for; where the output is
-  received, they have the first of these cores, which the shaping node keeps clear;
+  received, they have the first of these cores, which the shaping node leaves clear;
 * servers stand below 88 in the order of their own priority, smaller first;
 * who receives what a shaping node publishes stands below all servers, on the shaping node's core:
   idle then, and just awake. It may take as long as it likes, and delays no chain;
@@ -26,8 +22,8 @@ On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DES
   the writer's lock with them and spins on it: above them, it would never let them release it;
 * all others, best effort, are left alone.
 
-All is a function of what was seen at one instant, and a list that can be looked at before anything
-is done. Threads that appear later are found by looking again (:func:`new_and_ended`).
+All is a function of what was seen at one instant. Threads that appear later are found by looking
+again (:func:`new_and_ended`).
 """
 
 import time

@@ -1,10 +1,8 @@
 """Runs from their claim to their end: which cores and nodes, what they say, and undoing them.
 
-Two plans never govern the same core or node, since slots of two plans on one core contradict each
-other, and a thread has one priority only. So a run writes into its journal, before anything else,
-which cores and nodes it is for, and looks at what the others claim. Both happen under a lock of the
-folder of all runs: of two runs that start at the same instant, one is the first. A claim ends with
-its journal.
+Two plans never govern the same core or node, since their slots contradict each other. So a run
+first writes into its journal which cores and nodes it is for, and looks at what the others claim,
+both under a lock of the folder of all runs. A claim ends with its journal.
 
 A run that is in force is asked to end; one whose owner is gone, or does not react, is undone from
 what its journal says, by whichever process is left. Where the journal itself is gone, cgroups of
@@ -31,24 +29,8 @@ from chainshaper.enforcement.scheduling_memory import (
     release_threads,
 )
 from chainshaper.enforcement.servers import ReservationServer, ServerCounters
-from chainshaper.linux import cgroups
-from chainshaper.linux.runs import (
-    DISPATCHER,
-    GUARDIAN,
-    OPENED,
-    PROCESS,
-    STATE_FILE,
-    Journal,
-    discard_journal,
-    find_journals,
-    holder_of,
-    journals_folder,
-    locked,
-    open_journal,
-    own_processes,
-    process_of,
-    read_process,
-)
+from chainshaper.linux import cgroups, runs
+from chainshaper.linux.runs import Journal, find_journals, locked, process_of
 from chainshaper.linux.scheduling import state_of, state_text
 from chainshaper.linux.threads import find_thread, open_process
 from chainshaper.values.errors import OperationError, PlatformError
@@ -105,10 +87,10 @@ def save_run_state(folder: Path, state: RunState) -> None:
 
     Raises OSError: it cannot be written; a plan in force needs it for nothing.
     """
-    partial_file = folder / f"{STATE_FILE}.partial"
+    partial_file = folder / f"{runs.STATE_FILE}.partial"
     try:
         partial_file.write_text(json.dumps(asdict(state)))
-        partial_file.replace(folder / STATE_FILE)
+        partial_file.replace(folder / runs.STATE_FILE)
     except OSError:
         partial_file.unlink(missing_ok=True)  # a part of it would fill the disk for good
         raise
@@ -119,7 +101,7 @@ def find_runs(folder: Path | None = None) -> Iterator[tuple[Journal, RunState | 
     for journal in find_journals(folder):
         state = None
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
-            state = _from_json(json.loads(journal.path.with_name(STATE_FILE).read_text()))
+            state = _from_json(json.loads(journal.path.with_name(runs.STATE_FILE).read_text()))
         if journal.path.exists():  # not over meanwhile
             yield journal, state
 
@@ -173,7 +155,7 @@ def claim_run(
             that begins does not get on with it.
         PlatformError: nothing may be written to the folder.
     """
-    base = journals_folder() if folder is None else folder
+    base = runs.journals_folder() if folder is None else folder
     with _all_runs_locked(base, go_on):
         for other in find_journals(base):
             shared = _shared(other, cores, nodes)
@@ -189,7 +171,7 @@ def claim_run(
                     f"the run {other.name} of process {owner} governs {shared} already: end it "
                     f"first (`chainshaper release {other.name}`)"
                 )
-        journal = open_journal(base)
+        journal = runs.open_journal(base)
         journal.note(CLAIMS, cores=sorted(cores), nodes=sorted(nodes))
         return journal
 
@@ -214,7 +196,7 @@ def _all_runs_locked(base: Path, go_on: Callable[[], None]) -> Iterator[None]:
     def waiting(waited_s: float) -> None:
         go_on()
         if waited_s > PATIENCE_S:
-            holder = holder_of(base)
+            holder = runs.holder_of(base)
             raise OperationError(
                 f"process {holder} begins a run, and has not got on with it for {PATIENCE_S:g} s: "
                 f"let it go on (`kill -CONT {holder}`), or end it (`kill -KILL {holder}`)"
@@ -233,11 +215,11 @@ def _all_runs_locked(base: Path, go_on: Callable[[], None]) -> Iterator[None]:
 
 
 _READERS: Mapping[str, Callable[[Mapping[str, Any]], object]] = {
-    OPENED: process_of,
+    runs.OPENED: process_of,
     CLAIMS: _read_claim,
     KIND: read_change,
     DESCENDANTS: process_of,
-    PROCESS: read_process,
+    runs.PROCESS: runs.read_process,
     freezer.FREEZER: freezer.read_run,
     litmus.NOTE: lambda entry: (str(entry["previous"]), Path(entry["proc"])),
 }
@@ -282,7 +264,7 @@ def undo_run(journal: Journal, *, by_owner: bool = False) -> tuple[str, ...]:
             return ()  # another process was quicker
         except OSError:
             pass  # its folder is gone, and there is no room for another: it is in memory
-        _end_processes(journal, DISPATCHER)
+        _end_processes(journal, runs.DISPATCHER)
         for undo in () if journal.outdated else _STEPS:
             try:
                 undo(journal)
@@ -290,7 +272,7 @@ def undo_run(journal: Journal, *, by_owner: bool = False) -> tuple[str, ...]:
                 left.append(str(error))
         is_over = by_owner or journal.owner is None
         if is_over and not left and not strange_lines(journal):
-            _end_processes(journal, GUARDIAN)
+            _end_processes(journal, runs.GUARDIAN)
             remove_run(journal)
     return tuple(left)
 
@@ -310,7 +292,7 @@ def remove_run(journal: Journal) -> None:
         for path in journal.path.parent.iterdir():
             if path != journal.path and not path.is_dir():
                 path.unlink(missing_ok=True)
-    discard_journal(journal)
+    runs.discard_journal(journal)
 
 
 def release_strays(journals: Iterable[Journal]) -> tuple[tuple[Path, ...], tuple[str, ...]]:
@@ -354,7 +336,7 @@ def _class_text(tid: int) -> str | None:
 
 def _ask_to_end(journal: Journal, owner: int) -> None:
     """Have the owner end the run; one that does not is ended itself."""
-    pidfd = open_process(*journal.read(OPENED, process_of)[0])
+    pidfd = open_process(*journal.read(runs.OPENED, process_of)[0])
     if pidfd is None:
         return
     try:
@@ -385,7 +367,7 @@ def _wait_for_end(journal: Journal) -> bool:
 
 def _hasten(journal: Journal, waited_s: float) -> None:
     """Another process undoes this run: one that was stopped goes on, one that hangs is ended."""
-    holder = holder_of(journal.path.parent)
+    holder = runs.holder_of(journal.path.parent)
     if holder not in (None, os.getpid()):
         with contextlib.suppress(OSError):
             os.kill(holder, signal.SIGCONT)
@@ -396,7 +378,7 @@ def _hasten(journal: Journal, waited_s: float) -> None:
 
 def _end_processes(journal: Journal, role: str) -> None:
     """Kill all processes of a role, this one excepted: one that was stopped hears nothing else."""
-    for one in own_processes(journal, role):
+    for one in runs.own_processes(journal, role):
         if one.pid != os.getpid() and (pidfd := open_process(one.pid, one.started)) is not None:
             with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(pidfd, signal.SIGKILL)

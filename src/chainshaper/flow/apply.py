@@ -2,17 +2,14 @@
 
     find the threads ─► priorities and cores ─► servers ─► anchor ─► arm ─► watch ─► all as before
 
-Nothing of the application is changed but where and when its threads run, and everything that is
-changed stands in a journal first (:mod:`chainshaper.linux.runs`): whatever ends
-the run, this function, a signal or a crash, puts it back. Servers are armed only when all nodes
-run, and released before a command of ours is told to end, since a stopped thread cannot.
+Nothing of the application is changed but where and when its threads run, and every change stands in
+a journal first (:mod:`chainshaper.linux.runs`): whatever ends the run, this function, a signal or a
+crash, puts it back. Servers are armed only when all nodes run, and released before a command of
+ours is to end, since a stopped thread cannot.
 
-Threads come and go. One that appears later gets what the plan says, at the next look. One that ends
-before that has lived with the class, cores and cgroup of the thread that started it, as the kernel
-gives them to all that are born; no look waits for it.
-
-The shaping node is its own server: it holds messages back by itself, so its thread gets a
-priority and a core, and no slots from a back end.
+A thread that appears later gets what the plan says, at the next look; until then it has the class,
+cores and cgroup of the thread that started it. The shaping node is its own server: its thread gets
+a priority and a core, and no slots from a back end.
 """
 
 import contextlib
@@ -26,6 +23,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from chainshaper.enforcement import threads as allocation
 from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, make_back_end
 from chainshaper.enforcement.guardian import Guardians, run_claimed, start_guardians
 from chainshaper.enforcement.scheduling_memory import change_all, look_alikes, note_descendants
@@ -35,16 +33,7 @@ from chainshaper.enforcement.servers import (
     ServerCounters,
     ServerTable,
 )
-from chainshaper.enforcement.threads import (
-    LEFT_ALONE,
-    Allocation,
-    NodeThread,
-    RecordedProcess,
-    left_by_back_end,
-    new_and_ended,
-    plan_scheduling,
-    server_members,
-)
+from chainshaper.enforcement.threads import Allocation, NodeThread, RecordedProcess, server_members
 from chainshaper.enforcement.undoing import (
     RunState,
     ServerState,
@@ -239,7 +228,7 @@ def _await_nodes(run: _Run, wait_ns: int, progress: Callable[[float, str], None]
                 ) from None
             if waited >= wait_ns:
                 raise
-        quiet = found is not None and not any(new_and_ended(found, now))
+        quiet = found is not None and not any(allocation.new_and_ended(found, now))
         if looks and (quiet or looks > _SETTLING_LOOKS or waited >= wait_ns):
             return now
         found = now
@@ -249,10 +238,10 @@ def _await_nodes(run: _Run, wait_ns: int, progress: Callable[[float, str], None]
 
 def _schedule(run: _Run, found: Allocation) -> None:
     """Give threads their priorities and cores, as far as the back end leaves that to us."""
-    wanted = plan_scheduling(run.plan, found, available_cores())
+    wanted = allocation.plan_scheduling(run.plan, found, available_cores())
     changes = (
         (one.thread.thread, one.wanted)
-        for one in left_by_back_end(run.choice.name, wanted)
+        for one in allocation.left_by_back_end(run.choice.name, wanted)
         if one.server is None or run.choice.name != "fifo"  # that is all the latter does
     )
     change_all(run.journal, changes)
@@ -405,7 +394,7 @@ def _keep(
         if run.guardians is not None:
             run.guardians.renew()
         now = _find(run)
-        new, ended = new_and_ended(found, now)
+        new, ended = allocation.new_and_ended(found, now)
         state = replace(state, notes=_with_fleeting(state.notes, latest, ended))
         state, latest = _with_threads(_naming_strangers(state, now), _living(now, state)), new
         try:
@@ -425,7 +414,7 @@ def _naming_strangers(state: RunState, found: Allocation) -> RunState:
     """
     if found.strangers is None:
         return state
-    others = (note for note in state.notes if not note.startswith(LEFT_ALONE))
+    others = (note for note in state.notes if not note.startswith(allocation.LEFT_ALONE))
     return replace(state, notes=(*others, found.strangers))
 
 

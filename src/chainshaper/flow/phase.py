@@ -1,19 +1,17 @@
 """Where in a cycle a chain begins: measured from outside, watched, and given to shaping nodes.
 
-Servers' cycles must be anchored to the chain (DESIGN section 6): a ROS timer fires at its own phase
-of CLOCK_MONOTONIC, and the slot of the chain's server has to open just after it. The timer wakes
-the executor of the chain's first node, which the kernel counts: the third number of
-`/proc/PID/task/TID/schedstat` is how often a thread was put on a core (sched-stats.rst), the second
-for how long it was ready before that. Watched for some cycles, the wake-ups that come once in every
-cycle at the same place are the timer's; of several such places the one after the longest rest is
-where the chain begins.
+Servers' cycles must be anchored to the chain (DESIGN section 6): the slot of its server has to open
+just after its timer. The timer wakes the executor of the chain's first node, which the kernel
+counts: the third number of `/proc/PID/task/TID/schedstat` is how often a thread was put on a core
+(sched-stats.rst), the second for how long it was ready before that. The wake-ups that come once in
+every cycle at the same place are the timer's; of several such places the one after the longest rest
+is where the chain begins.
 
 Outputs without a stamp (a `geometry_msgs/Twist`, say) are released by the cycle, whose beginning no
 message carries: shaping nodes in ROS 2 get it as a parameter. That takes ROS 2 a second or two, in
-a process of its own, as the user of the nodes' processes and in one's environment. As whom we may
-not run, our own environment is used, where ROS 2 is sourced in it. Which participant of the domain
-answers under a node's name, DDS does not prove without its security plug-ins; two that do are
-noticed.
+a process of its own, as the user of the nodes' processes and in one's environment; as whom we may
+not run, in ours. Which participant answers under a node's name, DDS does not prove without its
+security plug-ins; two that do are noticed.
 """
 
 import contextlib

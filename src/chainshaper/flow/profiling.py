@@ -2,11 +2,8 @@
 
 L̄ and L̲, from which slots are computed, are measured with the executors of the chain's nodes under
 SCHED_FIFO at a high priority on one core, and their DDS threads above them on the others. What else
-runs keeps its class, so it cannot disturb the chain; interference that remains is what no schedule
-avoids (section 2.3).
-
-Threads are changed as `apply` changes them: what was there stands in a journal first, and is put
-back whatever ends the run. Threads that appear later get theirs at the next look.
+runs cannot disturb the chain; interference that remains is what no schedule avoids (section 2.3).
+Threads are changed as `apply` changes them; those that appear later get theirs at the next look.
 """
 
 import time

@@ -9,19 +9,11 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from chainshaper.enforcement import threads as allocation
 from chainshaper.enforcement.back_ends import choose_back_end
 from chainshaper.enforcement.litmus import litmus_commands
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
-from chainshaper.enforcement.threads import (
-    Allocation,
-    RecordedProcess,
-    WantedScheduling,
-    allocate,
-    left_by_back_end,
-    plan_scheduling,
-    server_members,
-    strangers_text,
-)
+from chainshaper.enforcement.threads import Allocation, RecordedProcess, WantedScheduling, allocate
 from chainshaper.flow.phase import measure_phase
 from chainshaper.linux.processes import (
     Process,
@@ -85,7 +77,7 @@ def find_threads(
             for process in processes
             if process.user in taken and _hosts(process, found, hosted)
         )
-        strangers = strangers_text(processes, taken, hosted)
+        strangers = allocation.strangers_text(processes, taken, hosted)
         notes += _missing(found, nodes)
         if where is None and not chosen:
             notes += ("no process looks like an application of ROS 2 or DDS",)
@@ -154,14 +146,14 @@ def planned_changes(
     found = find_threads(plan, recording, users=users)
     if back_end != "litmus":
         choice = choose_back_end(back_end)
-        wanted = plan_scheduling(plan, found, available_cores())
-        threads = left_by_back_end(choice.name, wanted)
+        wanted = allocation.plan_scheduling(plan, found, available_cores())
+        threads = allocation.left_by_back_end(choice.name, wanted)
         return Changes(choice.name, choice.reason, threads, (), found.notes)
     notes = found.notes
     try:
         members: dict[str, list[int | str]] = {
             name: [member.thread.tid for member in group]
-            for name, group in server_members(plan, found).items()
+            for name, group in allocation.server_members(plan, found).items()
         }
         if phase_ns is None:
             origin = first_thread(plan, found)
@@ -198,7 +190,7 @@ def first_thread(plan: Plan, found: Allocation) -> Thread:
 
     Raises OperationError: no server holds an executor, or see :func:`.server_members`.
     """
-    members = server_members(plan, found)
+    members = allocation.server_members(plan, found)
     for server in sorted(plan.servers, key=lambda one: (one.slots[0][0], one.priority)):
         for member in members[server.name]:
             if member.thread.role == "executor":

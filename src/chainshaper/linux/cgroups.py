@@ -1,14 +1,11 @@
 """Control groups of version 2, as far as stopping single threads needs them.
 
 Writing ``1`` to a group's ``cgroup.freeze`` stops every thread in it on its way back to user
-space, and ``0`` lets them go on: no signal is delivered, and futexes, condition variables, sleeps
-and polls do not notice. A group holds whole processes by default. A **threaded** group may hold
-some threads of a process while the others stay where they are, on one condition: all groups that
-share a process lie in one *threaded domain* (kernel: Documentation/admin-guide/cgroup-v2.rst,
-"Threads"). So a thread's new group is made directly beneath the group in which the thread is
-now, which has two more merits: the thread keeps every limit that its group puts on it, and the
-way back is always the same, up to the parent. Until the child is removed the parent's type reads
-``domain threaded``; the kernel itself makes it ``domain`` again.
+space, and ``0`` lets them go on. A **threaded** group may have some threads of a process while the
+others stay where they are, on one condition: all groups that share a process lie in one *threaded
+domain* (kernel: Documentation/admin-guide/cgroup-v2.rst, "Threads"). So a thread's new group is
+made directly beneath the group in which the thread is now: it keeps every limit, and the way back
+is always up to the parent. Until the child is removed the parent's type reads ``domain threaded``.
 """
 
 import contextlib

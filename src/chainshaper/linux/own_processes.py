@@ -1,17 +1,13 @@
 """Processes that we start, ours and the user's: how they start, how they end.
 
 A process of ours often has more rights than whoever fills the folder that it is started in. So its
-Python is isolated (``-I``): it finds nothing through the current folder, through PYTHON* variables
-or among the user's own packages. Of what this drops, it gets back by its place, and only if root
-and we alone can change it: our package, and behind all other folders those of the libraries that
-it says it needs.
+Python is isolated (``-I``). Of what this drops, it gets back by its place, and only if root and we
+alone can change it: our package, and behind all other folders those of the libraries that it needs.
 
-The user's command, such as `ros2 launch …`, ends as its terminal would end it. It gets a session of
-its own: Ctrl-C then reaches us alone, and we end it when we are done with it. A background job of a
-script ignores SIGINT, and whatever it starts inherits that: `ros2 launch` would never stop. So the
+The user's command, such as `ros2 launch …`, gets a session of its own: Ctrl-C then reaches us
+alone. A background job of a script ignores SIGINT, and whatever it starts inherits that, so the
 command starts with the default again. It ends by SIGINT to its whole process group, which `ros2
-launch` and every node understand as the order to shut down; then by SIGTERM, then by SIGKILL. What
-it leaves behind in its group when it ends itself is ended too.
+launch` and every node understand as the order to shut down; then by SIGTERM, then by SIGKILL.
 """
 
 import contextlib

@@ -1,19 +1,14 @@
 """Processes that may belong to a ROS 2 or DDS application, and the nodes that they name.
 
-A process takes part in DDS when it has the threads that every participant has, one that receives
-or one for timed events, by the names of a DDS implementation. Fast DDS before 2.13 and others do
-not name theirs: there a mapped library together with further threads has to do. That distinguishes
-a node from what only carries its command line: `ros2 run`, `gdb --args`, or a forked helper (which
-has its parent's command line, but none of its parent's threads).
+A process takes part in DDS when it has a thread that receives or one for timed events, by the names
+of a DDS implementation; where those do not name theirs (Fast DDS before 2.13), a mapped library
+together with further threads has to do. That distinguishes a node from what only carries its
+command line: `ros2 run`, `gdb --args`, or a forked helper.
 
-ROS 2 programs choose their nodes' names themselves, and users override them by remap rules behind
-`--ros-args`, as `ros2 launch` does for every node that a launch file names:
-
-* ``-r __node:=NAME`` and ``-r __ns:=/NAMESPACE`` hold for every node of the process;
-* ``-r OLD:__node:=NAME`` for its node that would be called OLD only.
-
-Of rules that apply, the first one counts. What is quoted for a shell is one argument here, so a
-parameter's value that looks like a rule is not taken for one.
+Users name nodes by remap rules behind `--ros-args`: ``-r __node:=NAME`` and ``-r __ns:=/NAMESPACE``
+hold for every node of the process, ``-r OLD:__node:=NAME`` for its node that would be called OLD
+only. Of rules that apply, the first one counts. What is quoted for a shell is one argument here, so
+a parameter's value that looks like a rule is not taken for one.
 
 Upstream: rcl, `arguments.c` and `remap.c`, whose tests say which rules are valid.
 """
@@ -128,7 +123,6 @@ def _participates(pid: int, threads: tuple[Thread, ...]) -> bool:
 
 
 def takes_ros_arguments(command: Sequence[str]) -> bool:
-    """Whether a command line has arguments for ROS 2."""
     return "--ros-args" in command
 
 

@@ -1,14 +1,13 @@
 """Runs on this machine: the journal of what each has changed, and since when it governs whom.
 
-A run has a folder, `/run/chainshaper/RUN` for root, below `$XDG_RUNTIME_DIR` for others. Both are
-gone when the machine boots again, as is all that was changed; a journal elsewhere says by its boot
-id that it is from before. In the folder are `journal.jsonl`, what a back end needs, `run.json`,
-which the run writes anew every second for whoever wants to look, and `plan.json`, its plan.
+A run has a folder, `/run/chainshaper/RUN` for root, below `$XDG_RUNTIME_DIR` for others, gone when
+the machine boots again, as is all that was changed; a journal elsewhere says by its boot id that it
+is from before. In it are `journal.jsonl`, `run.json`, which the run writes anew every second for
+whoever wants to look, and `plan.json`.
 
 Whatever ends us, SIGKILL included, another process must be able to put things back. So each change
-is first written down: one line of JSON, which is on the disk (`fsync`) before the change is made. A
-later process reads it and undoes what is still there. Each kind of change is undone by the module
-that made it; this one writes and reads the lines.
+is one line of JSON, which is on the disk (`fsync`) before the change is made. Each kind of change
+is undone by the module that made it; this one writes and reads the lines.
 """
 
 import contextlib
@@ -48,7 +47,6 @@ class Journal:
     memory: FileIO | None = None
 
     def note(self, kind: str, **fields: Any) -> None:
-        """:meth:`note_all` for one change."""
         self.note_all(kind, (fields,))
 
     def note_all(self, kind: str, changes: Iterable[Mapping[str, Any]]) -> None:
@@ -135,7 +133,6 @@ class Journal:
 
     @property
     def name(self) -> str:
-        """What the run is called: its folder."""
         return self.path.parent.name
 
     @property
@@ -154,7 +151,6 @@ class Journal:
         return None if has_ended(pid, started) else pid
 
     def _lines(self) -> list[str]:
-        """Whole lines."""
         try:
             content = self.path.read_bytes()
         except FileNotFoundError:
@@ -166,7 +162,6 @@ class Journal:
         return content.decode(errors="replace").split("\n")[:-1]
 
     def _remembered(self) -> bytes:
-        """The file as it is in ``memory``."""
         if self.memory is None or self.memory.closed:
             return b""
         return os.pread(self.memory.fileno(), os.fstat(self.memory.fileno()).st_size, 0)
@@ -202,7 +197,6 @@ def note_process(journal: Journal, role: str, pid: int, core: int | None = None)
 
 
 def read_process(entry: Mapping[str, Any]) -> OwnProcess:
-    """What :func:`note_process` wrote."""
     return OwnProcess(str(entry["role"]), *process_of(entry), entry["core"])
 
 
@@ -314,7 +308,6 @@ def _remove_cut_off_line(descriptor: int) -> int:
 
 
 def boot_id() -> str:
-    """What the kernel calls this boot."""
     return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
@@ -425,7 +418,6 @@ def _own(pids: Collection[int], tids: Collection[int]) -> bool:
 
 
 def _plain(path: Path) -> dict[str, Any] | None:
-    """A file's JSON object, None where there is none."""
     with contextlib.suppress(OSError, ValueError):
         content = json.loads(path.read_text())
         return content if isinstance(content, dict) else None

@@ -43,7 +43,6 @@ class Scheduling:
 
     @property
     def policy(self) -> int:
-        """The scheduling class that goes with ``priority``."""
         if self.priority == 0:
             return os.SCHED_OTHER
         return os.SCHED_RR if self.takes_turns else os.SCHED_FIFO
@@ -99,7 +98,6 @@ def set_state(tid: int, target: SchedulingState, aspects: Iterable[Aspect] = ASP
 
 
 def with_aspect(state: SchedulingState, aspect: Aspect, source: SchedulingState) -> SchedulingState:
-    """A state with one aspect taken from another."""
     values: dict[str, Any] = {aspect: getattr(source, aspect)}
     return replace(state, **values)
 
@@ -157,7 +155,6 @@ def may_use_fifo() -> bool:
 
 
 def available_cores() -> tuple[int, ...]:
-    """The cores this process may run on, ascending."""
     return tuple(sorted(os.sched_getaffinity(0)))
 
 

@@ -1,16 +1,13 @@
 """Which user runs a process, and whose processes a run takes for nodes of its plan.
 
-A node's name is no authentication: every user of the machine can start a process whose command
-line, threads and environment say what a node's say. Only the kernel says who runs a process. So a
-run names users, and what processes of others say about themselves counts for nothing.
+Every user of the machine can start a process whose command line, threads and environment say what a
+node's say. Only the kernel says who runs a process, so a run names users.
 
 A process is a user's when that user both runs it, by all four of its user ids, and has started its
 program. `sudo`, `su` and every other set-user-ID program carry the command line and the environment
-of another user than the one they run as: they are no user's, for as long as they have not started
-another program. Root may start programs for everybody.
-
-In a user namespace of its own a process has the user id that this namespace gives it: outside, and
-so here, a stranger stays a stranger. Who is root in a container without one is root here as well.
+of another user than the one they run as: they are no user's, until they start another program. Root
+may start programs for all. In a user namespace of its own a process has the user id that it has
+outside: a stranger stays a stranger. Who is root in a container without one is root here as well.
 
 Upstream: proc(5), credentials(7), getauxval(3), user_namespaces(7).
 """

@@ -1,12 +1,9 @@
 """The part of libbpf that a struct_ops policy needs, over ctypes.
 
-libbpf.so.1 comes with every distribution that has BPF at all; binding to it directly saves a
-compiler, a kernel-header package and a Python dependency on the machine. An object file is opened,
-adjusted (constants, flags, programs left out), loaded, and its struct_ops map attached, which
-gives a link. The link is a file descriptor: when the process ends, however it ends, the kernel
-closes it and takes the policy away.
-
-Functions raise OSError with what libbpf said; who knows what the object is for says what to do.
+libbpf.so.1 comes with every distribution that has BPF at all; binding to it saves a compiler, a
+kernel-header package and a Python dependency. An object file is opened, adjusted, loaded, and its
+struct_ops map attached, which gives a link: a file descriptor that the kernel closes when the
+process ends, and takes the policy away. Functions raise OSError with what libbpf said.
 """
 
 import ctypes
