@@ -174,6 +174,22 @@ def one_server_plan() -> Plan:
     return plan_for(server("first", "origin", (0, 30)))
 
 
+@contextmanager
+def in_force(folder: Path, *options: str) -> Iterator[tuple[Governed, subprocess.Popen[str]]]:
+    """A node and :func:`one_server_plan` in force on it, by the freezer unless options say else."""
+    with (
+        node_to_govern(folder) as governed,
+        applied(one_server_plan(), folder, *(options or FREEZER)) as run,
+    ):
+        yield governed, run
+
+
+def verb(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """A verb of the command line as a process of its own, and what it said."""
+    command = [*CLI, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=100)
+
+
 def processes_of(run: subprocess.Popen[str], name: str) -> list[int]:
     """Processes of a run by what they do; `apply` itself is the run."""
     if name == "apply":

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from actors import Actor, acting
+from applied_plans import one_server_plan, verb
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from litmus_stand_in import StandIn, install
@@ -29,6 +30,7 @@ from chainshaper.enforcement.scheduling_memory import restore_scheduling
 from chainshaper.enforcement.servers import BackEnd, ReservationServer, ServerTable
 from chainshaper.linux.runs import Journal, find_journals, open_journal
 from chainshaper.linux.scheduling import available_cores, state_of
+from chainshaper.planning import save_plan
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
 MS = 1_000_000
@@ -47,6 +49,19 @@ def test_the_commands_of_a_plan_are_these() -> None:
         "resctl -a 103 -r 1001 -c 1",
         "resctl -a 101 -r 1002 -c 1",
         "resctl -a 102 -r 1002 -c 1",
+    ]
+
+
+def test_litmus_commands_are_printed_on_any_kernel(tmp_path: Path) -> None:
+    path = tmp_path / "plan.yaml"
+    save_plan(one_server_plan(), path)
+    said = verb("apply", path, "--backend", "litmus", "--dry-run")
+    core = available_cores()[-1]
+    number = core * 1000 + 1
+    assert said.stdout.splitlines() == [
+        "setsched P-RES",
+        f"resctl -n {number} -t table-driven -c {core} -m 100 -q 1 '[0,30)'",
+        f"resctl -a TID:/origin -r {number} -c {core}",
     ]
 
 
@@ -176,10 +191,6 @@ def test_every_table_is_taken_and_opens_where_it_should(
 
 def test_intervals_are_half_open() -> None:
     assert interval_text(2 * MS, 86_250_000) == "[2,86.25)"
-
-
-def test_the_stand_in_is_installed_where_it_is_asked_to(tmp_path: Path) -> None:
-    assert install(tmp_path).plugin == "Linux"
 
 
 CORE = available_cores()[-1]
