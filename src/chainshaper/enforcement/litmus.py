@@ -32,7 +32,7 @@ from chainshaper.enforcement.scheduling_memory import note_scheduling, release_t
 from chainshaper.enforcement.servers import ReservationServer, ServerCounters, ServerTable
 from chainshaper.linux.own_processes import is_installed, tool_environment
 from chainshaper.linux.runs import Journal
-from chainshaper.linux.scheduling import SchedulingClass, state_of
+from chainshaper.linux.scheduling import SchedulingClass, set_state, state_of
 from chainshaper.linux.threads import find_thread
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError, PlatformError
@@ -166,7 +166,9 @@ def restore_plugin(journal: Journal) -> None:
 
 def _leave_reservation(tid: int) -> None:
     try:
-        os.sched_setscheduler(tid, os.SCHED_OTHER, os.sched_param(0))
+        ordinary = SchedulingClass(os.SCHED_OTHER, 0, reset_on_fork=False)
+        left = replace(state_of(tid), scheduling_class=ordinary)
+        set_state(tid, left, ["scheduling_class"])
     except ProcessLookupError:
         return
     except OSError as error:

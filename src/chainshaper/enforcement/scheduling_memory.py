@@ -24,7 +24,6 @@ from time import CLOCK_BOOTTIME, clock_gettime_ns
 from typing import Any, Literal, TypeAlias
 
 from chainshaper.enforcement.freezer_state import groups_of, run_of
-from chainshaper.linux import scheduling
 from chainshaper.linux.cgroups import threads_in
 from chainshaper.linux.processes import descendants
 from chainshaper.linux.runs import Journal, process_of
@@ -33,8 +32,13 @@ from chainshaper.linux.scheduling import (
     Aspect,
     Scheduling,
     SchedulingState,
+    after_wish,
+    different_aspects,
+    set_state,
+    state_from_json,
     state_of,
     state_text,
+    with_aspect,
 )
 from chainshaper.linux.threads import (
     SCHED_DEADLINE,
@@ -97,12 +101,12 @@ def change_all(journal: Journal, changes: Iterable[tuple[Thread, Scheduling]]) -
     targets = []
     for thread, wanted in changes:
         try:
-            targets.append((thread, _target(state_of(thread.tid), wanted)))
+            targets.append((thread, after_wish(state_of(thread.tid), wanted)))
         except ProcessLookupError:
             continue
     for thread, target in note_scheduling(journal, targets):
         try:
-            scheduling.set_state(thread.tid, target, _different(state_of(thread.tid), target))
+            set_state(thread.tid, target, different_aspects(state_of(thread.tid), target))
         except ProcessLookupError:
             continue
         except PermissionError as error:
@@ -289,22 +293,14 @@ def _by_process(changes: Iterable[Change]) -> dict[int, list[Change]]:
     return families
 
 
-def _target(now: SchedulingState, wanted: Scheduling) -> SchedulingState:
-    """What a thread has after a wish is fulfilled: what the wish leaves open stays."""
-    if wanted.priority is not None:
-        own = replace(now.scheduling_class, policy=wanted.policy, priority=wanted.priority)
-        now = replace(now, scheduling_class=own)
-    return now if wanted.cores is None else replace(now, cores=tuple(sorted(wanted.cores)))
-
-
 def _restore(one: Change) -> Outcome:
     if start_of(one.pid, one.tid) != one.started:
         return Outcome(one.tid, one.comm, "ended")
     try:
         now = state_of(one.tid)
-        different = _different(now, one.original)
+        different = different_aspects(now, one.original)
         ours = [a for a in different if _has_been_given(now, one, a)]
-        scheduling.set_state(one.tid, one.original, ours)
+        set_state(one.tid, one.original, ours)
     except ProcessLookupError:
         return Outcome(one.tid, one.comm, "ended")
     except OSError as error:
@@ -323,7 +319,7 @@ def _disinherit(thread: Thread, family: list[Change]) -> Outcome | None:
         target = _without_inheritance(now, thread.started, family)
         if target == now:
             return None
-        scheduling.set_state(thread.tid, target, _different(now, target))
+        set_state(thread.tid, target, different_aspects(now, target))
     except ProcessLookupError:
         return None
     except OSError as error:
@@ -344,10 +340,10 @@ def _without_inheritance(
         for one in family:
             if (
                 started >= one.changed_at
-                and aspect in _different(state, one.original)
+                and aspect in different_aspects(state, one.original)
                 and _has_been_given(state, one, aspect)
             ):
-                state = scheduling.with_aspect(state, aspect, one.original)
+                state = with_aspect(state, aspect, one.original)
                 break
     return state
 
@@ -357,7 +353,7 @@ def _has_been_given(state: SchedulingState, one: Change, aspect: Aspect) -> bool
 
 
 def read_change(entry: Mapping[str, Any]) -> Change:
-    before, given = (scheduling.state_from_json(entry[name]) for name in ("before", "given"))
+    before, given = (state_from_json(entry[name]) for name in ("before", "given"))
     tid, started, pid, at = (int(entry[name]) for name in ("tid", "started", "pid", "at"))
     return Change(tid, started, pid, str(entry["comm"]), at, before, (given,))
 
@@ -388,12 +384,8 @@ def remembered_threads(journal: Journal) -> list[Change]:
         original = earlier.original
         for aspect in ASPECTS:
             known = (original, *earlier.given)
-            if all(aspect in _different(change.original, one) for one in known):
-                original = scheduling.with_aspect(original, aspect, change.original)
+            if all(aspect in different_aspects(change.original, one) for one in known):
+                original = with_aspect(original, aspect, change.original)
         given = (*earlier.given, *change.given)
         threads[change.identity] = replace(earlier, original=original, given=given)
     return list(threads.values())
-
-
-def _different(one: SchedulingState, other: SchedulingState) -> list[Aspect]:
-    return [aspect for aspect in ASPECTS if getattr(one, aspect) != getattr(other, aspect)]

@@ -29,7 +29,6 @@ from chainshaper.enforcement.guardian import Guardians, run_claimed, start_guard
 from chainshaper.enforcement.scheduling_memory import change_all, look_alikes, note_descendants
 from chainshaper.enforcement.servers import (
     BackEnd,
-    ReservationServer,
     ServerCounters,
     ServerTable,
 )
@@ -50,7 +49,7 @@ from chainshaper.flow.phase import (
     moved_text,
     tell_phase,
 )
-from chainshaper.flow.threads import LEAD_NS, find_threads, first_thread, server_table
+from chainshaper.flow.threads import LEAD_NS, find_threads, first_thread, server_table, table_of
 from chainshaper.linux.own_processes import end_command, start_command
 from chainshaper.linux.runs import PLAN_FILE, Journal
 from chainshaper.linux.scheduling import available_cores, check_cores
@@ -80,7 +79,7 @@ _SETTLING_LOOKS = 3
 """Nodes that have just started go on to start threads for a while; some never stop."""
 _FLEETING = 3
 """So many threads of a process that a look finds, and the next does not, are worth a note."""
-_NOTHING = ServerCounters(None, None, None, None)
+_NOTHING = ServerCounters()
 
 
 @dataclass(frozen=True)
@@ -250,8 +249,9 @@ def _schedule(run: _Run, found: Allocation) -> None:
 def _initial_state(
     run: _Run, table: ServerTable, command: Sequence[str], plan_path: str
 ) -> RunState:
-    gated = {server.name for server in table.servers}
     keeper = run.choice.name if gates(run.choice.name) else "nobody: priority only"
+    kept_by = {server.name: "gate" for server in run.plan.servers}
+    kept_by |= {server.name: keeper for server in table.servers}
     return RunState(
         run=run.folder.name,
         owner=os.getpid(),
@@ -265,16 +265,8 @@ def _initial_state(
         phase_spread_ns=None,
         drift_ns=None,
         servers=tuple(
-            ServerState(
-                server.name,
-                server.core,
-                server.priority,
-                server.slots,
-                (),
-                keeper if server.name in gated else "gate",
-                _NOTHING,
-            )
-            for server in run.plan.servers
+            ServerState(s.name, s.core, s.priority, s.slots, (), kept_by[s.name], _NOTHING)
+            for s in run.plan.servers
         ),
         notes=tuple(publication_warnings(run.plan)),
         failure=None,
@@ -519,10 +511,7 @@ def publishers_gated(plan: Plan, nodes: "StartedNodes") -> Iterator[None]:
     """
     choice = choose_back_end("freezer")  # the others want threads of the fair class
     planned = [(server, names) for _, server, names in publisher_servers(open_until_done(plan))]
-    table = ServerTable(
-        plan.cycle_ns,
-        tuple(ReservationServer(s.name, s.core, s.priority, s.slots) for s, _ in planned),
-    )
+    table = table_of(plan.cycle_ns, (server for server, _ in planned))
     cores = {server.core for server, _ in planned}
     with run_claimed(cores, {name for _, names in planned for name in names}) as journal:
         servers = make_back_end(choice.name, table, journal)

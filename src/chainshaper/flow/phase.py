@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from chainshaper.enforcement.threads import Allocation
-from chainshaper.linux.scheduling import become_fifo
+from chainshaper.linux.scheduling import become_fifo, set_state, state_of
 from chainshaper.linux.threads import has_ended, start_of
 from chainshaper.planning.plan import Plan, shaping_nodes
 from chainshaper.values.durations import format_duration
@@ -255,12 +255,12 @@ class DriftWatch:
 @contextlib.contextmanager
 def _undisturbed() -> Iterator[None]:
     """The calling thread at a high priority, where it is permitted: it sleeps nearly always."""
-    policy, priority = os.sched_getscheduler(0), os.sched_getparam(0)
+    before = state_of(0)
     become_fifo(WATCHER_PRIORITY)
     try:
         yield
     finally:
-        os.sched_setscheduler(0, policy, priority)
+        set_state(0, before, ["scheduling_class"])
 
 
 @dataclass(frozen=True)

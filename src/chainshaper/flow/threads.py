@@ -5,7 +5,7 @@ What /proc shows is joined with what a recording of the same processes saw, as f
 the same.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -25,7 +25,7 @@ from chainshaper.linux.scheduling import available_cores
 from chainshaper.linux.threads import Thread
 from chainshaper.linux.users import run_users
 from chainshaper.planning.overruns import open_until_done
-from chainshaper.planning.plan import Plan, shaping_nodes
+from chainshaper.planning.plan import Plan, Server, shaping_nodes
 from chainshaper.values.errors import InputError, OperationError
 
 if TYPE_CHECKING:
@@ -172,17 +172,23 @@ def server_table(plan: Plan) -> ServerTable:
     Raises OperationError: there are none.
     """
     gated_by_themselves = {node.thread for node in shaping_nodes(plan)}
-    servers = tuple(
-        ReservationServer(server.name, server.core, server.priority, server.slots)
+    servers = [
+        server
         for server in plan.servers
         if any(thread not in gated_by_themselves for thread in server.threads)
-    )
+    ]
     if not servers:
         raise OperationError(
             "the plan's servers name no threads of the application, so there is nothing to apply: "
             "plan from a recording (`chainshaper plan REC --chain FIRST..LAST`)"
         )
-    return ServerTable(plan.cycle_ns, servers)
+    return table_of(plan.cycle_ns, servers)
+
+
+def table_of(cycle_ns: int, servers: Iterable[Server]) -> ServerTable:
+    """Servers of a plan without their nodes."""
+    bare = (ReservationServer(one.name, one.core, one.priority, one.slots) for one in servers)
+    return ServerTable(cycle_ns, tuple(bare))
 
 
 def first_thread(plan: Plan, found: Allocation) -> Thread:

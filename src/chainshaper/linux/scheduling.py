@@ -97,6 +97,19 @@ def set_state(tid: int, target: SchedulingState, aspects: Iterable[Aspect] = ASP
             os.sched_setaffinity(tid, target.cores)
 
 
+def after_wish(now: SchedulingState, wanted: Scheduling) -> SchedulingState:
+    """What a thread has after a wish is fulfilled: what the wish leaves open stays."""
+    if wanted.priority is not None:
+        own = replace(now.scheduling_class, policy=wanted.policy, priority=wanted.priority)
+        now = replace(now, scheduling_class=own)
+    return now if wanted.cores is None else replace(now, cores=tuple(sorted(wanted.cores)))
+
+
+def different_aspects(one: SchedulingState, other: SchedulingState) -> list[Aspect]:
+    """In what two states differ."""
+    return [aspect for aspect in ASPECTS if getattr(one, aspect) != getattr(other, aspect)]
+
+
 def with_aspect(state: SchedulingState, aspect: Aspect, source: SchedulingState) -> SchedulingState:
     values: dict[str, Any] = {aspect: getattr(source, aspect)}
     return replace(state, **values)
@@ -123,10 +136,9 @@ def apply_scheduling(thread: Thread, wanted: Scheduling) -> None:
     Raises OperationError: the kernel refuses.
     """
     try:
-        if wanted.priority is not None:  # first, as in `set_state`
-            os.sched_setscheduler(thread.tid, wanted.policy, os.sched_param(wanted.priority))
-        if wanted.cores is not None:
-            os.sched_setaffinity(thread.tid, wanted.cores)
+        before = state_of(thread.tid)
+        target = after_wish(before, wanted)
+        set_state(thread.tid, target, different_aspects(before, target))
     except ProcessLookupError:
         return
     except OSError as error:
