@@ -71,8 +71,8 @@ START_NS = 30_000_000_000
 """A command has this long to start all nodes of the plan."""
 
 PHASE_BOUND_NS = 250_000
-"""Shaping nodes are told again where cycles begin when that has moved by more. Watching a thread
-from outside tells nothing finer (:data:`.phase.POLL_NS`)."""
+"""Shaping nodes get the beginning of cycles again when it has moved by more. Watching a thread from
+outside shows nothing finer (:data:`.phase.POLL_NS`)."""
 
 _LOOK_S = 1.0
 _SETTLING_LOOKS = 3
@@ -92,7 +92,7 @@ class Applied:
 
 @dataclass
 class _Run:
-    """What there is to keep together, and to put back, while a plan is in force."""
+    """What belongs together, and is to be put back, while a plan is in force."""
 
     given: Plan
     plan: Plan  # as it is carried out: with room for overruns
@@ -385,18 +385,36 @@ def _keep(
             continue
         if run.guardians is not None:
             run.guardians.renew()
-        now = _find(run)
-        new, ended = allocation.new_and_ended(found, now)
-        state = replace(state, notes=_with_fleeting(state.notes, latest, ended))
-        state, latest = _with_threads(_naming_strangers(state, now), _living(now, state)), new
-        try:
-            note_descendants(run.journal)
-            if new:
-                state = _taken_in(run, servers, now, state)
-            found, untaken = now, ""
-        except OperationError as error:  # a node is on its way up, perhaps: at the next look
-            reason = f"threads that have appeared are as they were: {error}"
-            untaken = "" if run.stop.is_set() else reason
+        found, state, latest, untaken = _look_again(run, servers, found, state, latest)
+
+
+def _look_again(
+    run: _Run,
+    servers: BackEnd,
+    before: Allocation,
+    state: RunState,
+    latest: tuple[NodeThread, ...],
+) -> tuple[Allocation, RunState, tuple[NodeThread, ...], str]:
+    """Threads that have appeared get what the plan says; ``latest`` had when it was looked before.
+
+    Returns the threads that are known now, the state, the new ones, and why these were not taken
+    in, if so: a node is on its way up, perhaps.
+    """
+    now = _find(run)
+    new, ended = allocation.new_and_ended(before, now)
+    state = _naming_strangers(replace(state, notes=_with_fleeting(state.notes, latest, ended)), now)
+    there = {one.thread.tid for one in now.threads}
+    living = {s.name: tuple(t for t in s.threads if t in there) for s in state.servers}
+    state = _with_threads(state, living)
+    try:
+        note_descendants(run.journal)
+        if new:
+            _schedule(run, now)
+            state = _with_threads(state, _assign(run, now, servers, living))
+    except OperationError as error:
+        reason = f"threads that have appeared are as they were: {error}"
+        return before, state, new, "" if run.stop.is_set() else reason
+    return now, state, new, ""
 
 
 def _naming_strangers(state: RunState, found: Allocation) -> RunState:
@@ -419,12 +437,12 @@ def _told(run: _Run) -> tuple[str, ...]:
 
 
 def _failure(run: _Run, servers: BackEnd, state: RunState) -> str | None:
-    """Why the plan is no longer in force: the back end, or nobody is left to govern."""
+    """Why the plan is no longer in force: the back end, or no thread is left to govern."""
     reason = servers.failure()
     if reason is not None:
         return f"the servers failed: {reason}"
     # What we have started ends by itself, and has perhaps still to write down what it saw; and
-    # somebody may have ended both the application and us.
+    # a person may have ended both the application and us.
     if (
         run.command is None
         and not run.stop.is_set()
@@ -456,22 +474,6 @@ def _with_fleeting(
         if times >= _FLEETING
     )
     return tuple(dict.fromkeys((*notes, *said)))
-
-
-def _living(found: Allocation, state: RunState) -> dict[str, tuple[int, ...]]:
-    """The threads of each server that have not ended."""
-    there = {one.thread.tid for one in found.threads}
-    return {one.name: tuple(tid for tid in one.threads if tid in there) for one in state.servers}
-
-
-def _taken_in(run: _Run, servers: BackEnd, found: Allocation, state: RunState) -> RunState:
-    """Threads that appeared later get what the plan says.
-
-    Raises OperationError: not all nodes are there, or a thread has ended again.
-    """
-    already = {one.name: one.threads for one in state.servers}
-    _schedule(run, found)
-    return _with_threads(state, _assign(run, found, servers, already))
 
 
 def _put_back(run: _Run) -> None:

@@ -70,8 +70,11 @@ def find_threads(
         taken |= {process.user for process in chosen if process.user is not None}
     else:
         found = allocate(find_applications(processes), recorded, processes, taken)
-        nodes = {} if where is None else _planned_nodes(where)
-        hosted = None if where is None else nodes.keys() | _receivers(where)
+        servers = () if where is None else where.servers
+        nodes = {thread.node: server.name for server in servers for thread in server.threads}
+        gates = () if where is None else shaping_nodes(where)
+        # Receivers need not run.
+        hosted = None if where is None else nodes.keys() | {r for g in gates for r in g.receivers}
         chosen = tuple(
             process
             for process in processes
@@ -86,16 +89,6 @@ def find_threads(
         notes += ("none of these processes is in the recording: they were started after it",)
     notes += found.notes + (() if strangers is None else (strangers,))
     return replace(found, notes=notes, strangers=strangers)
-
-
-def _planned_nodes(plan: Plan) -> dict[str, str]:
-    """The nodes of a plan's servers, with the server's name."""
-    return {thread.node: server.name for server in plan.servers for thread in server.threads}
-
-
-def _receivers(plan: Plan) -> set[str]:
-    """The nodes that receive what a plan's shaping nodes publish; they need not run."""
-    return {receiver for node in shaping_nodes(plan) for receiver in node.receivers}
 
 
 def _hosts(process: Process, found: Allocation, nodes: Collection[str] | None) -> bool:
