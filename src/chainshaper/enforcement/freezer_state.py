@@ -108,8 +108,7 @@ def groups_of(run: FreezerRun | None, core: int | None = None) -> tuple[Path, ..
 def stray_groups(journals: Iterable[Journal]) -> tuple[Path, ...]:
     """Groups of ours of none of these journals, and whose owner has ended.
 
-    Those with threads that cannot be seen from here are not ours to judge: their owner is where
-    they are, outside of this container.
+    Not those with threads that cannot be seen from here: their owner is outside of this container.
     """
     known = {run.owner for journal in journals if (run := run_of(journal)) is not None}
 
@@ -203,10 +202,7 @@ class CounterPage:
 
 
 def create_page(table: ServerTable) -> tuple[CounterPage, Path, int]:
-    """Make the memory, all numbers 0.
-
-    Returns as well where others find it, and the descriptor: closing it ends that.
-    """
+    """Make the memory, all numbers 0; also where others find it, and the descriptor to close."""
     memory = os.memfd_create("counters")
     each = ctypes.sizeof(_Core) + ctypes.sizeof(_Server)  # there are not more cores than servers
     os.truncate(memory, ctypes.sizeof(ctypes.c_int64) + each * len(table.servers))
@@ -215,10 +211,7 @@ def create_page(table: ServerTable) -> tuple[CounterPage, Path, int]:
 
 
 def open_page(path: Path, table: ServerTable) -> CounterPage:
-    """Map the numbers of a run for reading and writing.
-
-    Raises OSError: its owner has ended, or belongs to another user.
-    """
+    """Map the numbers of a run. Raises OSError: its owner has ended, or is another user's."""
     with path.open("r+b") as file:
         return CounterPage(mmap.mmap(file.fileno(), 0), table)
 

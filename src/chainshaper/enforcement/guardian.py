@@ -75,10 +75,7 @@ class Guardians:
         self.ready[process.pid] = reading
 
     def await_ready(self, go_on: Callable[[], None] = lambda: None) -> None:
-        """Until they watch. ``go_on`` is called again and again meanwhile, and may raise.
-
-        Raises OperationError: one does not start.
-        """
+        """Until they watch; ``go_on`` may raise. Raises OperationError: one does not start."""
         for process in self.processes:
             reading = self.ready.pop(process.pid, None)
             if reading is None:

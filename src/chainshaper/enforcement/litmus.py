@@ -51,9 +51,9 @@ NO_PLUGIN = "Linux"
 def create(table: ServerTable, journal: Journal, proc: Path = PROC) -> "Litmus":
     """Prepare servers; nothing is changed before :meth:`Litmus.arm`.
 
-    What was there is kept in ``journal``. ``proc`` is where LITMUS^RT shows itself. Raises
+    ``journal`` remembers what was there, ``proc`` is where LITMUS^RT shows itself. Raises
     PlatformError: the kernel is not LITMUS^RT, or its tools are not installed. OperationError:
-    somebody else uses the plugin. InputError: the table has what LITMUS^RT cannot do.
+    others use the plugin. InputError: the table has what LITMUS^RT cannot do.
     """
     if not proc.is_dir():
         raise PlatformError(
@@ -232,10 +232,7 @@ def litmus_commands(
 
 
 def reservation_ids(table: ServerTable, generation: int = 0) -> dict[str, int]:
-    """An id per server, different in every generation: a reservation is never changed or freed.
-
-    Ids count for each core apart; `core x 1000 + index` is the documentation's proposal.
-    """
+    """An id per server and core, `core x 1000 + index`, different in every generation."""
     first = generation * len(table.servers) + 1
     return {s.name: s.core * 1000 + index for index, s in enumerate(table.servers, start=first)}
 
@@ -247,7 +244,7 @@ def plugin_command(plugin: str) -> Command:
 def create_command(
     number: int, server: ReservationServer, cycle_ns: int, anchor_ns: int
 ) -> Command:
-    """Create the reservation of a server whose cycles start at ``anchor_ns`` (CLOCK_MONOTONIC).
+    """The reservation of a server whose cycles start at ``anchor_ns`` (CLOCK_MONOTONIC).
 
     Raises InputError: it has more slots, or a shorter one, than the kernel takes.
     """

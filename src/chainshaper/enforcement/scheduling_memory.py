@@ -55,7 +55,7 @@ KIND = "scheduling"
 DESCENDANTS = "descendant"
 
 Fate: TypeAlias = Literal["restored", "unchanged", "ended", "left", "failed"]
-"""``unchanged``: it is as it was already; ``left``: somebody else has changed it since."""
+"""``unchanged``: it is as it was already; ``left``: another program has changed it since."""
 
 _GENERATIONS = 5
 
@@ -91,12 +91,11 @@ class Change:
 
 
 def change_all(journal: Journal, changes: Iterable[tuple[Thread, Scheduling]]) -> None:
-    """Give threads their class and cores, with what was there in the journal.
+    """Give threads their class and cores, with what was there in the journal, on disk first.
 
-    All is written down together before anything is changed. A thread that has ended meanwhile is no
-    error; one that we gave the same before, and has it, is not written down again. Raises
-    OperationError: one runs under SCHED_DEADLINE, the journal cannot be written (then nothing is
-    changed), or the kernel refuses. PlatformError: the privilege to change one is missing.
+    A thread that has ended meanwhile is no error; one that has what we gave it before is not
+    written down again. Raises OperationError: one runs under SCHED_DEADLINE, the journal cannot be
+    written (then nothing is changed), or the kernel refuses. PlatformError: a privilege is missing.
     """
     targets = []
     for thread, wanted in changes:
@@ -227,10 +226,9 @@ def restore_inherited(journal: Journal) -> tuple[Outcome, ...]:
 
 
 def look_alikes(journal: Journal) -> tuple[str, ...]:
-    """Threads that have a real-time class and cores as we gave them, and are not known as ours.
+    """Threads with a real-time class and cores as we gave them, not known as ours, in words.
 
-    They are strangers, or daemons that left their family before anybody looked: left as they are,
-    and named, in sentences. To be asked before all is undone.
+    They are strangers, or daemons that left their family before a look. Ask before the undoing.
     """
     remembered = [] if journal.outdated else remembered_threads(journal)
     known = {one.identity for one in remembered}
@@ -333,7 +331,7 @@ def _without_inheritance(
 ) -> SchedulingState:
     """A thread's scheduling with every aspect that is one of ours replaced by its parent's.
 
-    Which thread was the parent nobody records: the first in the journal with that aspect is
+    The kernel records no parent of a thread: the first in the journal with that aspect is
     taken. Threads that share a class with us there mostly shared one before.
     """
     for aspect in ASPECTS:
@@ -373,7 +371,7 @@ def _as_entry(thread: Thread, before: SchedulingState, target: SchedulingState) 
 def remembered_threads(journal: Journal) -> list[Change]:
     """The threads of a journal, each with its changes joined, in order of their first change.
 
-    Where somebody else changed an aspect between two changes of ours, theirs is the original.
+    Where another program changed an aspect between two changes of ours, theirs is the original.
     """
     threads: dict[tuple[int, int], Change] = {}
     for change in journal.read(KIND, read_change):

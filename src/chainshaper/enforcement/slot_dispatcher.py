@@ -116,7 +116,7 @@ def instants(
 ) -> Iterator[tuple[int, Boundary]]:
     """Every boundary with its time (ns), without end, from the cycle at ``begin_ns`` on.
 
-    Where nothing changes nobody needs to wake up: from the second cycle on such a boundary (only
+    Where nothing changes no dispatcher wakes up: from the second cycle on such a boundary (only
     the one at 0 can be) is left out.
     """
     first, last = boundaries[0], boundaries[-1]
@@ -176,7 +176,7 @@ def next_anchoring(
 
 
 class OpenGroup(NamedTuple):
-    """Files of a cgroup that are held open: looking up a path takes longer than writing."""
+    """Open files of a cgroup: looking up a path takes longer than writing."""
 
     freeze: int
     threads: int
@@ -214,7 +214,7 @@ class Dispatcher:
             closing, opening = self._changes(boundary)
             rest = min(_REST_NS, (following[0] - at) // 2)
             if opening and not closing and self.open == _NOTHING:
-                # Waking an idle core takes longest, and nobody of ours runs who could be delayed.
+                # Waking an idle core takes longest, and delays no thread of ours now.
                 sleep_until(at - _WATCH_NS)
                 watch_until(at)
             else:
@@ -261,7 +261,7 @@ class Dispatcher:
             self._drop_lost(server, value)
 
     def _drop_lost(self, server: int, value: bytes) -> None:
-        """Somebody removed a group, which takes its threads away from us: the others go on."""
+        """A group was removed, which takes its threads away from us: the others go on."""
         for folder, group in list(self.groups[server].items()):
             try:
                 os.pwrite(group.freeze, value, 0)
@@ -348,7 +348,7 @@ class Dispatcher:
                 os.open(f"{folder}/cgroup.freeze", os.O_WRONLY | os.O_CLOEXEC),
                 os.open(f"{folder}/cgroup.threads", os.O_RDONLY | os.O_CLOEXEC),
             )
-        except OSError:  # somebody was quick to remove it
+        except OSError:  # another process was quick to remove it
             self.counters[server].lost += 1
             return
         closed = self.open is not None and server not in self.open

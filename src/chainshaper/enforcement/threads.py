@@ -157,10 +157,7 @@ def new_and_ended(
 def strangers_text(
     processes: Iterable[Process], users: Collection[int], nodes: Collection[str] | None = None
 ) -> str | None:
-    """One line about processes that are none of the users', and carry a name of one of ``nodes``.
-
-    Of any node if none are given.
-    """
+    """One line about others' processes that carry a name of one of ``nodes`` (None: any node)."""
     found = [
         f"{', '.join(names[:_MOST_NAMED])} (process {process.pid} of {user_name(process.user)})"
         for process in processes

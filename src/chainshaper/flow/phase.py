@@ -123,7 +123,7 @@ def watch_wake_ups(
                 ran, waited, times = ran_by_now, waited_by_now, times_by_now
                 progress(min(1.0, (now - started) / for_ns))
         if born is None or has_ended(tid, born):
-            raise ProcessLookupError(tid)  # dead, and nobody has waited for it yet
+            raise ProcessLookupError(tid)  # a zombie
     except (OSError, ValueError) as error:
         raise OperationError(
             f"thread {tid} of process {pid} ended while its phase was measured: start the "
@@ -265,10 +265,9 @@ def _undisturbed() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Telling:
-    """Nodes that are being told, by a process of ours.
+    """Nodes that are being told, by a process of ours, since ``begun`` (s of CLOCK_MONOTONIC).
 
-    ``script`` is None where there is nobody to tell, or it was ``refused``; ``begun`` is s of
-    CLOCK_MONOTONIC.
+    ``script`` is None where no node is to be told, or it was ``refused``.
     """
 
     nodes: tuple[str, ...]
@@ -282,7 +281,7 @@ class Telling:
         return self.script is None or self.script.is_over() or late
 
     def end(self) -> tuple[str, ...]:
-        """What went wrong, in words. To be called when it is over, or nobody waits for it."""
+        """What went wrong, in words: to be called when it is over, or no longer waited for."""
         problem = self.refused
         if self.script is not None:
             late = not self.script.is_over()
@@ -297,7 +296,7 @@ class Telling:
 
 
 NOBODY = Telling((), None, 0.0)
-"""Nobody is being told."""
+"""No node is being told."""
 
 
 def tell_phase(plan: Plan, found: Allocation, phase_ns: int) -> Telling:

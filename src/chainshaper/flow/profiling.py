@@ -127,9 +127,9 @@ def executors_of(
 ) -> list[NodeThread]:
     """The threads that execute these nodes, or publish for them; of all nodes if none are named.
 
-    `ros2 launch` is a node as well, and nobody's chain: what has started other nodes is left out.
-    Where several threads of a process executed before, those that nobody has named are taken for
-    such: they do not differ from others that do next to nothing, as the one that waits for signals.
+    What has started other nodes is left out: `ros2 launch` is a node as well, and in no chain.
+    Where several threads of a process executed before, unnamed ones are taken for such: they do not
+    differ from others that do next to nothing, as the one that waits for signals.
     """
     owners = {one.thread.pid for one in found.threads if one.nodes}
     launchers = {one.parent for one in processes if one.pid in owners}

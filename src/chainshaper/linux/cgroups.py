@@ -57,10 +57,7 @@ def mount_point() -> Path:
 
 
 def mount_options() -> str:
-    """How the version 2 hierarchy is mounted: ``rw,nosuid,nodev,noexec,relatime,nsdelegate``.
-
-    Raises PlatformError: it is not.
-    """
+    """The options of the version 2 hierarchy's mount. Raises PlatformError: it is not mounted."""
     return _mount()[1]
 
 
@@ -70,10 +67,7 @@ def moves_are_quick() -> bool:
 
 
 def remount(options: str) -> None:
-    """Have the hierarchy mounted with these options, if the kernel knows and permits them.
-
-    By a call of the kernel, since `mount` would go on when we are killed meanwhile.
-    """
+    """Have the hierarchy mounted with these options, if the kernel knows and permits them."""
     names = options.split(",")
     flags = _REMOUNT | sum(_MOUNT_FLAGS.get(name, 0) for name in names)
     own = ",".join(name for name in names if name not in _MOUNT_FLAGS)
@@ -174,22 +168,22 @@ def make_threaded_child(parent: Path, name: str) -> Path:
 
 def _why_not_threaded(parent: Path, error: OSError) -> str:
     """What stands in the way of threaded groups: the kernel only says EOPNOTSUPP."""
-    told = f"threads of the cgroup {parent} cannot be frozen one by one"
+    begin = f"threads of the cgroup {parent} cannot be frozen one by one"
     controllers = set(_read(parent / "cgroup.subtree_control").split()) - _THREADED_CONTROLLERS
     if controllers:
         names = ", ".join(sorted(controllers))
         return (
-            f"{told}: it hands the controllers {names} down to its children, which rules threaded "
+            f"{begin}: it hands the controllers {names} down to its children, which rules threaded "
             f"groups out; run the application in a group that does not (its own scope or unit)"
         )
     for child in sorted(parent.iterdir()):
         kind = _read(child / "cgroup.type").strip()
         if kind == "domain" and "populated 1" in _read(child / "cgroup.events"):
             return (
-                f"{told}: its child {child.name} holds processes of its own; run the application "
+                f"{begin}: its child {child.name} holds processes of its own; run the application "
                 f"in a group without others beneath it (its own scope or unit)"
             )
-    return f"{told} ({os.strerror(error.errno or 0)}): {_REMEDY}"
+    return f"{begin} ({os.strerror(error.errno or 0)}): {_REMEDY}"
 
 
 def move_thread(tid: int, folder: Path) -> bool:
@@ -216,10 +210,7 @@ def move_thread(tid: int, folder: Path) -> bool:
 
 
 def threads_in(folder: Path) -> tuple[int, ...]:
-    """The living threads of a group; none when the group is gone.
-
-    Those that cannot be seen from our process namespace (0 for the kernel) are not among them.
-    """
+    """The living threads of a group that can be seen from our process namespace."""
     return tuple(int(tid) for tid in _read(folder / "cgroup.threads").split() if tid != "0")
 
 

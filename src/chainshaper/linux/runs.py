@@ -39,8 +39,7 @@ _LOOK_S = 0.02
 class Journal:
     """A journal on disk; what it says is read anew each time, since others may write to it too.
 
-    ``memory`` is the open file, for those who must be able to undo what it says even where its
-    folder is removed (:meth:`keep`).
+    ``memory`` is the open file, from which it is written again where its folder is removed.
     """
 
     path: Path
@@ -76,9 +75,8 @@ class Journal:
     def entries(self, kind: str | None = None) -> tuple[Mapping[str, Any], ...]:
         """All that was noted, oldest first; a ``kind`` alone if one is given.
 
-        A last line that a crash cut off is left out: what it speaks of was never done. So are lines
-        that are not a journal's (:meth:`strange_lines`). A journal that has been discarded says
-        nothing. Raises OperationError: the file cannot be read.
+        Left out are a last line that a crash cut off (what it speaks of was never done), and lines
+        that are not a journal's. Raises OperationError: the file cannot be read.
         """
         entries = (_entry(line) for line in self._lines())
         return tuple(one for one in entries if one and kind in (None, one["kind"]))
@@ -101,11 +99,7 @@ class Journal:
         return tuple(strange)
 
     def keep(self) -> bool:
-        """See that the file is there; whether it still is to be, and was not discarded.
-
-        Where its folder has been removed, it is written again from ``memory``. Raises OSError: it
-        cannot be.
-        """
+        """See that the file is there, from ``memory`` if need be; whether it was not discarded."""
         if self.memory is None or self.memory.closed:
             return self.path.exists()
         if not self.path.exists():
@@ -174,11 +168,7 @@ def process_of(entry: Mapping[str, Any]) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class OwnProcess:
-    """A process of a run, in its journal; ``core`` is the one that a dispatcher gates.
-
-    A guardian outlives the owner to undo the run, a dispatcher opens and closes the servers of a
-    core. Each is known by its id and its start, so that no other process is ever taken for it.
-    """
+    """A process of a run, in its journal, known by id and start; ``core``: a dispatcher's."""
 
     role: str
     pid: int
@@ -187,10 +177,7 @@ class OwnProcess:
 
 
 def note_process(journal: Journal, role: str, pid: int, core: int | None = None) -> None:
-    """Write down a process of the run, unless it has ended.
-
-    Raises OperationError: the journal cannot be written.
-    """
+    """Write down a process of the run, unless it has ended."""
     started = start_of(pid, pid)
     if started is not None:
         journal.note(PROCESS, role=role, pid=pid, started=started, core=core)
@@ -224,8 +211,7 @@ def _value(entry: Mapping[str, Any], reader: Callable[[Mapping[str, Any]], _T]) 
 def open_journal(folder: str | Path | None = None, run: str | None = None) -> Journal:
     """Begin a journal in ``folder``/``run``; both have defaults.
 
-    Raises OperationError: there is one already, or it cannot be written. PlatformError: the system
-    has no folder for it.
+    Raises OperationError: there is one, or it cannot be written. PlatformError: no folder for it.
     """
     base = journals_folder() if folder is None else Path(folder)
     place = base / (run or f"{time.strftime('%Y%m%dT%H%M%S')}-{os.getpid()}")
@@ -253,18 +239,12 @@ def open_journal(folder: str | Path | None = None, run: str | None = None) -> Jo
 
 
 def remembered_journal(path: Path) -> Journal:
-    """The journal at a path, for a process that must be able to undo what it says.
-
-    Raises OSError: there is none.
-    """
+    """The journal at a path, open for :meth:`Journal.keep`. Raises OSError: there is none."""
     return Journal(path, FileIO(path, "r"))
 
 
 def journals_folder() -> Path:
-    """Where runs have their folders unless another place is named.
-
-    Raises PlatformError: not root, and no session of a user either.
-    """
+    """Where runs have their folders. Raises PlatformError: no root, and no session of a user."""
     if os.geteuid() == 0:
         return Path("/run/chainshaper")
     if unit := os.environ.get("RUNTIME_DIRECTORY"):  # RuntimeDirectory= of a systemd unit
@@ -285,10 +265,7 @@ def find_journals(folder: str | Path | None = None) -> tuple[Journal, ...]:
 
 
 def discard_journal(journal: Journal) -> None:
-    """Remove a journal when all is undone; harmless when it is gone. What else is there stays.
-
-    It is emptied first: who has it open knows then that nothing is left to undo.
-    """
+    """Remove a journal when all is undone. Emptied first: who has it open knows then."""
     with contextlib.suppress(FileNotFoundError):
         os.truncate(journal.path, 0)
         journal.path.unlink()

@@ -101,20 +101,20 @@ def _other_scheduler() -> str | None:
 
 
 def _lacking_privileges() -> list[str]:
-    held = _held_capabilities()
+    granted = _capabilities()
     lacking = []
-    if "CAP_SYS_ADMIN" not in held:
-        lacking += [name for name in ("CAP_BPF", "CAP_PERFMON") if name not in held]
+    if "CAP_SYS_ADMIN" not in granted:
+        lacking += [name for name in ("CAP_BPF", "CAP_PERFMON") if name not in granted]
     if is_realtime_kernel():
         if not may_use_fifo():
             lacking.append("CAP_SYS_NICE")
         limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
-        if "CAP_IPC_LOCK" not in held and limit != resource.RLIM_INFINITY:
+        if "CAP_IPC_LOCK" not in granted and limit != resource.RLIM_INFINITY:
             lacking.append("CAP_IPC_LOCK")
     return lacking
 
 
-def _held_capabilities() -> set[str]:
+def _capabilities() -> set[str]:
     for line in STATUS.read_text().splitlines():
         if line.startswith("CapEff:"):
             mask = int(line.split()[1], 16)
