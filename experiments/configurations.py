@@ -30,7 +30,7 @@ import yaml
 from results import MS, Run
 
 from chainshaper import simulate
-from chainshaper.enforcement.runs.state import RunState
+from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow.apply import apply_plan
 from chainshaper.flow.steps import measure_latency, shape_application
 from chainshaper.linux.scheduling import available_cores, may_use_fifo

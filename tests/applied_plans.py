@@ -12,9 +12,9 @@ import pytest
 from gated import cpu_ns, groups_left, own_cgroup
 from processes import children_of, wait_for
 
-from chainshaper.enforcement.runs.journal import find_journals
 from chainshaper.linux import cgroups
 from chainshaper.linux.processes import descendants
+from chainshaper.linux.runs import find_journals
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import list_threads, parents, start_of
 from chainshaper.planning import Plan, save_plan
@@ -35,8 +35,8 @@ needs_fifo = pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not pe
 
 
 MODULES = {
-    "guardian": "chainshaper.enforcement.runs.guardian",
-    "dispatcher": "chainshaper.enforcement.freezer.slot_dispatcher",
+    "guardian": "chainshaper.enforcement.guardian",
+    "dispatcher": "chainshaper.enforcement.slot_dispatcher",
 }
 FREEZER = ("--backend", "freezer", "--phase", "0ms")
 
@@ -172,6 +172,22 @@ def class_and_cores(pid: int) -> list[tuple[str, int, tuple[int, ...]]]:
 
 def one_server_plan() -> Plan:
     return plan_for(server("first", "origin", (0, 30)))
+
+
+@contextmanager
+def in_force(folder: Path, *options: str) -> Iterator[tuple[Governed, subprocess.Popen[str]]]:
+    """A node and :func:`one_server_plan` in force on it, by the freezer unless options say else."""
+    with (
+        node_to_govern(folder) as governed,
+        applied(one_server_plan(), folder, *(options or FREEZER)) as run,
+    ):
+        yield governed, run
+
+
+def verb(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """A verb of the command line as a process of its own, and what it said."""
+    command = [*CLI, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=100)
 
 
 def processes_of(run: subprocess.Popen[str], name: str) -> list[int]:

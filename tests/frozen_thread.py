@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper.enforcement.freezer.slot_dispatcher import PRIORITY
+from chainshaper.enforcement.slot_dispatcher import PRIORITY
 from chainshaper.gate.decision import sleep_until
 from chainshaper.linux.threads import list_threads
 from chainshaper.workload.live import Enforcement, StartedNodes

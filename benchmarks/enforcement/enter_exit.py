@@ -27,9 +27,9 @@ from rich.console import Console
 from rich.table import Table
 
 from chainshaper.enforcement.back_ends import gates, make_back_end, offered_back_ends
-from chainshaper.enforcement.freezer.back_end import Freezer
-from chainshaper.enforcement.runs.journal import discard_journal, open_journal
+from chainshaper.enforcement.freezer import Freezer
 from chainshaper.enforcement.servers import BackEnd, ReservationServer, ServerTable
+from chainshaper.linux.runs import discard_journal, open_journal
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.workload.stall_watch import measure_stalls
 

@@ -26,11 +26,9 @@ if TYPE_CHECKING:
         find_chain,
         load_named_paths,
     )
-    from chainshaper.enforcement.runs.state import find_runs
-    from chainshaper.enforcement.runs.undoing import end_run
+    from chainshaper.enforcement.undoing import end_run, find_runs
     from chainshaper.flow.apply import apply_plan
     from chainshaper.flow.doctor import examine_machine
-    from chainshaper.flow.dry_run import planned_changes
     from chainshaper.flow.exploration import (
         ApplicationDescription,
         convert_recording,
@@ -57,7 +55,7 @@ if TYPE_CHECKING:
         profile_chains,
         shape_application,
     )
-    from chainshaper.flow.thread_search import find_threads
+    from chainshaper.flow.threads import find_threads, planned_changes
     from chainshaper.planning import (
         Plan,
         PlanRequest,
@@ -100,8 +98,7 @@ _HOMES = {
     ),
     "chainshaper.flow.apply": ("apply_plan",),
     "chainshaper.flow.doctor": ("examine_machine",),
-    "chainshaper.enforcement.runs.state": ("find_runs",),
-    "chainshaper.enforcement.runs.undoing": ("end_run",),
+    "chainshaper.enforcement.undoing": ("end_run", "find_runs"),
     "chainshaper.values.errors": (
         "ChainshaperError",
         "InputError",
@@ -115,7 +112,6 @@ _HOMES = {
         "event_counts",
         "list_chains",
     ),
-    "chainshaper.flow.dry_run": ("planned_changes",),
     "chainshaper.flow.launch_shaping": ("ShapedLaunch", "shape_launch"),
     "chainshaper.flow.launch_splicing": (
         "Splicing",
@@ -156,7 +152,7 @@ _HOMES = {
         "shape_application",
     ),
     "chainshaper.simulation.sweeping": ("sweep",),
-    "chainshaper.flow.thread_search": ("find_threads",),
+    "chainshaper.flow.threads": ("find_threads", "planned_changes"),
     "chainshaper.workload.description": ("Application", "load_application"),
     "chainshaper.workload.live": ("run_application",),
 }

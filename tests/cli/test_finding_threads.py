@@ -12,8 +12,8 @@ from command_line import Running, called, json_of, refused
 from small_chain import DDS_CORE, EXECUTOR_CORE, NODES, PERIOD_NS, small_chain_text
 from story import OFFSET, Story
 
-from chainshaper.flow import thread_search
-from chainshaper.flow.thread_search import find_threads
+from chainshaper.flow import threads
+from chainshaper.flow.threads import find_threads
 from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.planning import Plan, save_plan
 from chainshaper.values.recording import RecordingInfo, write_recording
@@ -151,7 +151,7 @@ def test_a_recording_of_another_machine_or_boot_says_nothing(tmp_path: Path) -> 
 
 
 def test_nothing_found_is_said_and_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(thread_search, "list_processes", tuple)
+    monkeypatch.setattr(threads, "list_processes", tuple)
     finished = called("threads")
     assert finished.code == 0
     assert "note: no process looks like an application of ROS 2 or DDS" in finished.err

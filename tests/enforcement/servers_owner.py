@@ -14,13 +14,14 @@ from contextlib import suppress
 from pathlib import Path
 
 from chainshaper.enforcement.back_ends import make_back_end
-from chainshaper.enforcement.freezer.back_end import Freezer
-from chainshaper.enforcement.runs.guardian import start_guardians
-from chainshaper.enforcement.runs.journal import open_journal
-from chainshaper.enforcement.runs.scheduling_memory import change_scheduling
-from chainshaper.enforcement.runs.undoing import undo_run
+from chainshaper.enforcement.freezer import Freezer
+from chainshaper.enforcement.guardian import start_guardians
+from chainshaper.enforcement.scheduling_memory import change_all
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
-from chainshaper.linux.threads import Scheduling, find_thread
+from chainshaper.enforcement.undoing import undo_run
+from chainshaper.linux.runs import open_journal
+from chainshaper.linux.scheduling import Scheduling
+from chainshaper.linux.threads import find_thread
 from chainshaper.values.errors import PlatformError
 
 MS = 1_000_000
@@ -40,7 +41,7 @@ def main() -> None:
         assert thread is not None
         if sys.argv[1] == "freezer":
             with suppress(PlatformError):
-                change_scheduling(journal, thread, Scheduling(GIVEN, None))
+                change_all(journal, [(thread, Scheduling(GIVEN, None))])
         servers.assign(tid, "gated")
     servers.arm(time.monotonic_ns() + 320 * MS)
     own = [one.pid for one in guardians.processes]

@@ -25,6 +25,7 @@ from applied_plans import (
     class_and_cores,
     command_line,
     ended,
+    in_force,
     leftovers,
     needs_fifo,
     node_to_govern,
@@ -35,11 +36,12 @@ from applied_plans import (
     scheduling,
     server,
     started,
+    verb,
 )
 from gated import cpu_ns, kill, needs_cgroups
 from processes import wait_for
 
-from chainshaper import enforcement
+import chainshaper
 from chainshaper.linux import cgroups
 from chainshaper.planning import save_plan
 
@@ -60,10 +62,7 @@ def test_when_a_dispatcher_is_lost_the_run_ends_and_says_so(
 ) -> None:
     """Also with both guardians: `apply` looks itself, every second."""
     chance = random.Random(f"{number} {guardians}")
-    with (
-        node_to_govern(tmp_path) as governed,
-        applied(one_server_plan(), tmp_path, *FREEZER) as run,
-    ):
+    with in_force(tmp_path) as (governed, run):
         time.sleep(chance.uniform(0, 0.2))
         for pid in processes_of(run, "guardian") if guardians else ():
             kill(pid, guardians or 0)
@@ -107,14 +106,11 @@ def test_what_is_killed_while_a_run_starts_leaves_nothing(tmp_path: Path, victim
 
 
 def test_a_stopped_run_goes_on_being_served_and_can_be_released(tmp_path: Path) -> None:
-    with (
-        node_to_govern(tmp_path) as governed,
-        applied(one_server_plan(), tmp_path, *FREEZER) as run,
-    ):
+    with in_force(tmp_path) as (governed, run):
         run.send_signal(signal.SIGSTOP)
         ran = cpu_ns(governed.pid)
         wait_for(lambda: cpu_ns(governed.pid) > ran + 10 * MS, "some slots")
-        subprocess.run([*CLI, "release"], check=True, capture_output=True)
+        assert verb("release").returncode == 0
         assert run.wait(timeout=20) == 0
         governed.check_as_before()
 
@@ -123,11 +119,7 @@ def test_a_stopped_run_goes_on_being_served_and_can_be_released(tmp_path: Path) 
 def test_lost_guardians_are_replaced_and_the_plan_stays_in_force(
     tmp_path: Path, back_end: str
 ) -> None:
-    options = ("--backend", back_end, "--phase", "0ms")
-    with (
-        node_to_govern(tmp_path) as governed,
-        applied(one_server_plan(), tmp_path, *options) as run,
-    ):
+    with in_force(tmp_path, "--backend", back_end, "--phase", "0ms") as (governed, run):
         lost = processes_of(run, "guardian")
         assert len(lost) == 2
         kill(lost[0], signal.SIGKILL)
@@ -145,10 +137,7 @@ def test_an_application_that_is_killed_ends_the_run_and_it_says_so(tmp_path: Pat
     """At a random moment: mostly its thread is frozen then."""
     chance = random.Random("application")
     for _ in range(2):
-        with (
-            node_to_govern(tmp_path) as governed,
-            applied(one_server_plan(), tmp_path, *FREEZER) as run,
-        ):
+        with in_force(tmp_path) as (governed, run):
             time.sleep(chance.uniform(0, 0.2))
             governed.process.kill()
             governed.process.wait(timeout=20)
@@ -183,7 +172,7 @@ def test_a_node_that_is_started_again_is_taken_in(tmp_path: Path) -> None:
             wait_for(lambda: "chainshaper-" in cgroups.cgroup_of(again.pid).name, "its server")
             assert scheduling(again.pid) != before
             time.sleep(1.1)  # status is written every second
-            said = subprocess.check_output([*CLI, "status", "--json"])
+            said = verb("status", "--json").stdout
             run.send_signal(signal.SIGINT)
             assert run.wait(timeout=20) == 0
             governed.check_as_before()
@@ -280,10 +269,10 @@ def test_steps_of_the_wall_clock_are_not_seen() -> None:
     `gate/decision.py` alone reads the wall clock, since messages are stamped with it; its tests
     step it.
     """
-    package = Path(enforcement.__file__).parents[1]
+    package = Path(chainshaper.__file__).parent
     rooms = [*(package / room for room in ("enforcement", "gate", "linux"))]
     sources = [path for room in rooms for path in room.rglob("*.py")]
-    sources += [package / "flow" / name for name in ("apply.py", "publisher_gating.py")]
+    sources += [package / "flow" / name for name in ("apply.py", "phase.py", "threads.py")]
     wall_clock = re.compile(
         r"CLOCK_REALTIME|\btime\.time(_ns)?\(|\bdatetime\b|\blocaltime|\bgmtime"
     )

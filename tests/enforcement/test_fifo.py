@@ -7,13 +7,11 @@ from pathlib import Path
 import pytest
 from actors import Actor, acting
 
-from chainshaper.enforcement.fifo import create
-from chainshaper.enforcement.runs.journal import Journal, open_journal
-from chainshaper.enforcement.runs.scheduling_memory import change_scheduling
+from chainshaper.enforcement.back_ends import Fifo
+from chainshaper.enforcement.scheduling_memory import change_all
 from chainshaper.enforcement.servers import BackEnd, ReservationServer, ServerTable
-from chainshaper.linux.scheduling import available_cores, may_use_fifo
-from chainshaper.linux.scheduling_state import state_of
-from chainshaper.linux.threads import Scheduling
+from chainshaper.linux.runs import Journal, open_journal
+from chainshaper.linux.scheduling import Scheduling, available_cores, may_use_fifo, state_of
 from chainshaper.values.errors import InputError
 
 pytestmark = pytest.mark.skipif(
@@ -47,7 +45,7 @@ def test_servers_become_priorities_in_their_order_and_go_again(
     journal: Journal, actor: Actor
 ) -> None:
     before = {tid: state_of(tid) for tid in actor.tids.values()}
-    servers: BackEnd = create(TABLE, journal)
+    servers: BackEnd = Fifo(TABLE, journal)
     servers.assign(actor.tids["a"], "chain")
     servers.assign(actor.tids["c"], "output")
     assert {tid: state_of(tid) for tid in actor.tids.values()} == before, "not armed yet"
@@ -66,7 +64,7 @@ def test_servers_become_priorities_in_their_order_and_go_again(
 
 def test_an_asynchronous_publisher_stays_below_its_executor(journal: Journal, actor: Actor) -> None:
     """Its server has the better priority, but it spins on locks that the executor holds."""
-    servers = create(TABLE, journal)
+    servers = Fifo(TABLE, journal)
     servers.assign(actor.tids["dds.asyn.0.1"], "output")
     servers.assign(actor.tids["a"], "chain")
     servers.arm(anchor_ns=0)
@@ -76,7 +74,7 @@ def test_an_asynchronous_publisher_stays_below_its_executor(journal: Journal, ac
 
 
 def test_threads_that_end_are_passed_over(journal: Journal, actor: Actor) -> None:
-    servers = create(TABLE, journal)
+    servers = Fifo(TABLE, journal)
     servers.assign(actor.tids["a"], "chain")
     actor.end("a")
     servers.assign(actor.tids["a"], "chain")
@@ -87,8 +85,8 @@ def test_threads_that_end_are_passed_over(journal: Journal, actor: Actor) -> Non
 def test_threads_that_a_plan_has_scheduled_already_stay_as_they_are(
     journal: Journal, actor: Actor
 ) -> None:
-    change_scheduling(journal, actor.thread("a"), Scheduling(41, None))
-    servers = create(TABLE, journal)
+    change_all(journal, [(actor.thread("a"), Scheduling(41, None))])
+    servers = Fifo(TABLE, journal)
     servers.assign(actor.tids["a"], "chain")
     servers.assign(actor.tids["b"], "output")
     servers.arm(anchor_ns=0)
@@ -100,11 +98,11 @@ def test_threads_that_a_plan_has_scheduled_already_stay_as_they_are(
 
 def test_a_server_that_does_not_exist_is_refused(journal: Journal) -> None:
     with pytest.raises(InputError, match="no server 'chains': choose of chain, output"):
-        create(TABLE, journal).assign(1, "chains")
+        Fifo(TABLE, journal).assign(1, "chains")
 
 
 def test_more_priorities_than_there_are_are_refused(journal: Journal) -> None:
     many = tuple(ReservationServer(f"s{n}", CORE, n, ((0, MS),)) for n in range(1, 45))
     with pytest.raises(InputError, match="44 different server priorities do not fit"):
-        create(ServerTable(100 * MS, many), journal)
-    create(ServerTable(100 * MS, many[:43]), journal)
+        Fifo(ServerTable(100 * MS, many), journal)
+    Fifo(ServerTable(100 * MS, many[:43]), journal)

@@ -24,8 +24,7 @@ from gated import (
 )
 from processes import children_of, wait_for
 
-from chainshaper.enforcement.freezer.back_end import Freezer, create
-from chainshaper.enforcement.runs.journal import discard_journal, open_journal
+from chainshaper.enforcement.freezer import Freezer, create
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.linux.cgroups import (
     QUICK_MOVES,
@@ -37,6 +36,7 @@ from chainshaper.linux.cgroups import (
     remount,
     restore_mount,
 )
+from chainshaper.linux.runs import discard_journal, open_journal
 from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 

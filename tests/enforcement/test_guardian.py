@@ -21,13 +21,12 @@ from applied_plans import Governed, needs_fifo, node_to_govern
 from gated import CORE, MS, ahead_of_others, cpu_ns, groups_left, kill, needs_cgroups
 from processes import children_of, wait_for
 
-from chainshaper.enforcement.freezer.counters import open_page
-from chainshaper.enforcement.freezer.state import run_of
-from chainshaper.enforcement.runs.guardian import GROUP, let_go
-from chainshaper.enforcement.runs.journal import find_journals
-from chainshaper.enforcement.runs.undoing import undo_run
+from chainshaper.enforcement.freezer_state import open_page, run_of
+from chainshaper.enforcement.guardian import GROUP, let_go
+from chainshaper.enforcement.undoing import undo_run
 from chainshaper.linux.cgroups import cgroup_of, mount_options, mount_point
-from chainshaper.linux.scheduling_state import state_of
+from chainshaper.linux.runs import find_journals
+from chainshaper.linux.scheduling import state_of
 from chainshaper.linux.threads import list_threads
 
 pytestmark = [needs_cgroups, needs_fifo]

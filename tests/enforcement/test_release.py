@@ -1,4 +1,4 @@
-"""`status` and `release` do what they can, whoever died, and whatever became of a run's folder."""
+"""`status` and `release` do what they can, whoever died; a second plan for a core is refused."""
 
 import shutil
 import signal
@@ -11,36 +11,36 @@ from pathlib import Path
 
 import pytest
 from applied_plans import (
-    CLI,
     FREEZER,
     MODULES,
-    Governed,
     applied,
+    ended,
+    in_force,
     leftovers,
     needs_fifo,
     node_to_govern,
     one_server_plan,
+    plan_for,
     processes_of,
+    running_node,
     scheduling,
+    server,
+    started,
+    verb,
+    wait_until_in_force,
 )
-from gated import CORE, cpu_ns, groups_left, kill, needs_cgroups, own_cgroup
+from gated import CORE, OTHER_CORE, cpu_ns, groups_left, kill, needs_cgroups, own_cgroup
 from processes import wait_for
 
-from chainshaper.enforcement.runs.guardian import GROUP
-from chainshaper.enforcement.runs.journal import find_journals
-from chainshaper.enforcement.runs.state import RunState
+from chainshaper.enforcement.guardian import GROUP
+from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow.apply import apply_plan
 from chainshaper.linux.cgroups import cgroup_of, mount_options, mount_point
-from chainshaper.linux.scheduling_state import state_of
+from chainshaper.linux.runs import find_journals
+from chainshaper.linux.scheduling import state_of
 from chainshaper.linux.threads import list_threads
 
 pytestmark = [needs_fifo, needs_cgroups]
-
-
-def verb(*arguments: str) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run(
-        [*CLI, *arguments], capture_output=True, text=True, check=False, timeout=100
-    )
 
 
 def ours(run: "subprocess.Popen[str]") -> list[int]:
@@ -54,15 +54,6 @@ def kill_all(run: "subprocess.Popen[str]") -> None:
         for pid in pids:
             kill(pid, number)
     run.wait()
-
-
-@contextmanager
-def in_force(folder: Path, *options: str) -> "Iterator[tuple[Governed, subprocess.Popen[str]]]":
-    with (
-        node_to_govern(folder) as governed,
-        applied(one_server_plan(), folder, *(options or FREEZER)) as run,
-    ):
-        yield governed, run
 
 
 @pytest.mark.parametrize("by", ["release", "apply"])
@@ -238,3 +229,91 @@ def test_what_a_node_forks_under_fifo_is_put_back_and_found_although_its_parent_
         finally:
             for pid in (*forked, parent.pid):
                 kill(pid)
+
+
+def test_of_two_runs_for_one_core_the_second_is_refused_and_changes_nothing(
+    tmp_path: Path,
+) -> None:
+    other = plan_for(server("second", "other", (40, 70)))
+    (tmp_path / "second").mkdir()
+    with node_to_govern(tmp_path) as governed, running_node("other", tmp_path / "other") as beside:
+        before = scheduling(beside.pid)
+        with applied(one_server_plan(), tmp_path, *FREEZER) as first:
+            with started(other, tmp_path / "second", *FREEZER) as second:
+                said = ended(second)
+            assert second.returncode == 1
+            assert f"of process {first.pid} governs core" in said
+            assert "chainshaper release" in said
+            assert scheduling(beside.pid) == before
+            first.send_signal(signal.SIGINT)
+            assert first.wait(timeout=20) == 0
+        governed.check_as_before()
+
+
+def test_of_two_runs_for_one_node_the_second_is_refused(tmp_path: Path) -> None:
+    elsewhere = plan_for(server("second", "origin", (40, 70), core=OTHER_CORE))
+    (tmp_path / "second").mkdir()
+    with node_to_govern(tmp_path) as governed:
+        with applied(one_server_plan(), tmp_path, *FREEZER) as first:
+            with started(elsewhere, tmp_path / "second", "--backend", "fifo") as second:
+                said = ended(second)
+            assert second.returncode == 1
+            assert "governs" in said
+            assert "node /origin already" in said
+            first.send_signal(signal.SIGINT)
+            assert first.wait(timeout=20) == 0
+        governed.check_as_before()
+
+
+@pytest.mark.skipif(
+    one_server_plan().servers[0].core == OTHER_CORE, reason="there is one core only"
+)
+def test_runs_for_different_cores_and_nodes_do_not_mind_each_other(tmp_path: Path) -> None:
+    elsewhere = plan_for(server("second", "other", (40, 70), core=OTHER_CORE))
+    (tmp_path / "second").mkdir()
+    with node_to_govern(tmp_path) as governed, node_to_govern(tmp_path, "other") as other:
+        with (
+            applied(one_server_plan(), tmp_path, *FREEZER) as first,
+            applied(elsewhere, tmp_path / "second", *FREEZER) as second,
+        ):
+            for run in (first, second):
+                run.send_signal(signal.SIGINT)
+                assert run.wait(timeout=20) == 0
+        governed.check_as_before()
+        other.check_as_before()
+
+
+def test_of_runs_that_start_at_the_same_instant_exactly_one_is_in_force(tmp_path: Path) -> None:
+    with node_to_govern(tmp_path) as governed:
+        for _ in range(3):
+            with (
+                started(one_server_plan(), tmp_path, *FREEZER) as one,
+                started(one_server_plan(), tmp_path, *FREEZER) as other,
+            ):
+                wait_for(
+                    lambda: one.poll() is not None or other.poll() is not None,
+                    "one of them to be refused",
+                )
+                winner, loser = (one, other) if other.poll() is not None else (other, one)
+                assert loser.returncode == 1
+                assert f"of process {winner.pid} governs" in ended(loser)
+                wait_until_in_force(winner)
+                winner.send_signal(signal.SIGINT)
+                assert winner.wait(timeout=20) == 0
+            governed.check_as_before()
+
+
+def test_a_run_takes_over_from_one_that_was_killed_with_all_its_processes(tmp_path: Path) -> None:
+    with node_to_govern(tmp_path) as governed:
+        with applied(one_server_plan(), tmp_path, *FREEZER) as first:
+            ours = [pid for name in MODULES for pid in processes_of(first, name)] + [first.pid]
+            for pid in ours:  # nobody sees the others die
+                kill(pid, signal.SIGSTOP)
+            for pid in ours:
+                kill(pid)
+            first.wait()
+        assert leftovers()
+        with applied(one_server_plan(), tmp_path, *FREEZER) as second:
+            second.send_signal(signal.SIGINT)
+            assert second.wait(timeout=20) == 0
+        governed.check_as_before()

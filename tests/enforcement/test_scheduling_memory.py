@@ -14,20 +14,25 @@ import pytest
 from actors import Actor, acting
 from processes import wait_for
 
-from chainshaper.enforcement.runs import journal as journal_module
-from chainshaper.enforcement.runs.journal import Journal, find_journals, open_journal
-from chainshaper.enforcement.runs.scheduling_memory import (
+from chainshaper.enforcement.scheduling_memory import (
     Outcome,
     change_all,
-    change_scheduling,
     look_alikes,
     note_descendants,
     restore_inherited,
     restore_scheduling,
 )
-from chainshaper.linux.scheduling import available_cores, may_use_fifo
-from chainshaper.linux.scheduling_state import SchedulingState, set_state, state_of
-from chainshaper.linux.threads import RESET_ON_FORK, Scheduling, list_threads
+from chainshaper.linux import runs as journal_module
+from chainshaper.linux.runs import Journal, find_journals, open_journal
+from chainshaper.linux.scheduling import (
+    Scheduling,
+    SchedulingState,
+    available_cores,
+    may_use_fifo,
+    set_state,
+    state_of,
+)
+from chainshaper.linux.threads import RESET_ON_FORK, list_threads
 from chainshaper.values.errors import OperationError
 
 pytestmark = pytest.mark.skipif(
@@ -56,8 +61,8 @@ def test_class_and_cores_are_changed_and_put_back(tmp_path: Path, journal: Journ
         os.sched_setscheduler(actor.tids["a"], os.SCHED_RR | RESET_ON_FORK, os.sched_param(7))
         os.setpriority(os.PRIO_PROCESS, actor.tids["b"], 5)
         before = _states(actor)
-        change_scheduling(journal, actor.thread("a"), WANTED)
-        change_scheduling(journal, actor.thread("b"), Scheduling(31, (FIRST,), takes_turns=True))
+        change_all(journal, [(actor.thread("a"), WANTED)])
+        change_all(journal, [(actor.thread("b"), Scheduling(31, (FIRST,), takes_turns=True))])
         a, b = state_of(actor.tids["a"]), state_of(actor.tids["b"])
         assert (a.scheduling_class.policy, a.scheduling_class.priority) == (os.SCHED_FIFO, 30)
         assert (b.scheduling_class.policy, b.scheduling_class.priority) == (os.SCHED_RR, 31)
@@ -74,7 +79,7 @@ def test_several_changes_go_back_to_what_was_there_at_first(
     with acting(tmp_path, "a") as actor:
         before = _states(actor)
         for wanted in (WANTED, Scheduling(None, (FIRST,)), Scheduling(12, None)):
-            change_scheduling(journal, actor.thread("a"), wanted)
+            change_all(journal, [(actor.thread("a"), wanted)])
         restore_scheduling(journal)
         assert _states(actor) == before
 
@@ -83,7 +88,7 @@ def test_what_somebody_else_has_changed_since_is_theirs(tmp_path: Path, journal:
     with acting(tmp_path, "a") as actor:
         tid = actor.tids["a"]
         before = state_of(tid)
-        change_scheduling(journal, actor.thread("a"), WANTED)
+        change_all(journal, [(actor.thread("a"), WANTED)])
         os.sched_setscheduler(tid, os.SCHED_RR, os.sched_param(5))
         (outcome,) = restore_scheduling(journal)
         assert outcome.fate == "left"
@@ -98,9 +103,9 @@ def test_what_somebody_else_set_between_two_changes_is_what_was_there(
 ) -> None:
     with acting(tmp_path, "a") as actor:
         tid = actor.tids["a"]
-        change_scheduling(journal, actor.thread("a"), WANTED)
+        change_all(journal, [(actor.thread("a"), WANTED)])
         os.sched_setscheduler(tid, os.SCHED_RR, os.sched_param(5))
-        change_scheduling(journal, actor.thread("a"), Scheduling(40, None))
+        change_all(journal, [(actor.thread("a"), Scheduling(40, None))])
         assert _fates(restore_scheduling(journal)) == {"a": "restored"}
         held = state_of(tid).scheduling_class
         assert (held.policy, held.priority) == (os.SCHED_RR, 5)
@@ -111,10 +116,10 @@ def test_threads_and_processes_that_have_ended_are_no_error(
 ) -> None:
     with acting(tmp_path, "a", "b") as actor:
         ended = actor.thread("a")
-        change_scheduling(journal, ended, WANTED)
-        change_scheduling(journal, actor.thread("b"), WANTED)
+        change_all(journal, [(ended, WANTED)])
+        change_all(journal, [(actor.thread("b"), WANTED)])
         actor.end("a")
-        change_scheduling(journal, ended, WANTED)
+        change_all(journal, [(ended, WANTED)])
         assert _fates(restore_scheduling(journal)) == {"a": "ended", "b": "restored"}
     assert _fates(restore_scheduling(journal)) == {"a": "ended", "b": "ended"}
 
@@ -123,7 +128,7 @@ def test_a_thread_that_got_the_id_of_one_that_ended_is_not_touched(
     tmp_path: Path, journal: Journal
 ) -> None:
     with acting(tmp_path, "a") as actor:
-        change_scheduling(journal, actor.thread("a"), WANTED)
+        change_all(journal, [(actor.thread("a"), WANTED)])
         text = journal.path.read_text()
         started = actor.thread("a").started
         journal.path.write_text(text.replace(f'"started": {started}', f'"started": {started - 1}'))
@@ -142,7 +147,7 @@ def test_what_threads_inherited_goes_back_to_what_their_parents_had(
         before = state_of(actor.pid)
         early = state_of(actor.tids["early"])
         time.sleep(0.05)  # starts are told in ticks of 10 ms
-        change_scheduling(journal, actor.thread("main"), WANTED)
+        change_all(journal, [(actor.thread("main"), WANTED)])
         time.sleep(0.05)
         actor.begin("late")  # by the main thread
         child = actor.fork()
@@ -164,17 +169,17 @@ def test_a_thread_that_is_changed_after_it_inherited_gets_its_parents_original(
     with acting(tmp_path) as actor:
         before = state_of(actor.pid)
         time.sleep(0.05)
-        change_scheduling(journal, actor.thread("main"), WANTED)
+        change_all(journal, [(actor.thread("main"), WANTED)])
         time.sleep(0.05)
         actor.begin("late")
-        change_scheduling(journal, actor.thread("late"), Scheduling(29, (FIRST,)))
+        change_all(journal, [(actor.thread("late"), Scheduling(29, (FIRST,)))])
         assert set(_fates(restore_scheduling(journal)).values()) == {"restored"}
         assert state_of(actor.tids["late"]) == before
 
 
 def test_a_new_thread_of_a_class_of_its_own_is_left_alone(tmp_path: Path, journal: Journal) -> None:
     with acting(tmp_path) as actor:
-        change_scheduling(journal, actor.thread("main"), WANTED)
+        change_all(journal, [(actor.thread("main"), WANTED)])
         time.sleep(0.05)
         tid = actor.begin("late")
         os.sched_setscheduler(tid, os.SCHED_FIFO, os.sched_param(3))
@@ -184,19 +189,19 @@ def test_a_new_thread_of_a_class_of_its_own_is_left_alone(tmp_path: Path, journa
 
 _APPLIER = """
 import random, sys, time
-from chainshaper.enforcement.runs.journal import open_journal
+from chainshaper.linux.runs import open_journal
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.enforcement.runs.scheduling_memory import change_scheduling
-from chainshaper.linux.threads import Scheduling, list_threads
+from chainshaper.enforcement.scheduling_memory import change_all
+from chainshaper.linux.scheduling import Scheduling
+from chainshaper.linux.threads import list_threads
 
 journal = open_journal(sys.argv[2])
 cores = available_cores()
 print("ready", flush=True)
 while True:
     for thread in list_threads(int(sys.argv[1])):
-        change_scheduling(
-            journal, thread, Scheduling(random.randint(1, 20), (random.choice(cores),))
-        )
+        wanted = Scheduling(random.randint(1, 20), (random.choice(cores),))
+        change_all(journal, [(thread, wanted)])
 """
 
 
@@ -230,7 +235,7 @@ def test_nothing_is_changed_when_it_cannot_be_written_down(
         journal.path.unlink()
         journal.path.mkdir()
         with pytest.raises(OperationError, match=r"so nothing is changed|cannot be read"):
-            change_scheduling(journal, actor.thread("a"), WANTED)
+            change_all(journal, [(actor.thread("a"), WANTED)])
         assert _states(actor) == before
 
 
@@ -240,9 +245,9 @@ def test_what_the_kernel_refuses_names_the_thread_and_what_was_wanted(
     with acting(tmp_path, "a") as actor:
         tid = actor.tids["a"]
         with pytest.raises(OperationError, match=rf"thread {tid} \(a\).*SCHED_FIFO 500"):
-            change_scheduling(journal, actor.thread("a"), Scheduling(500, None))
+            change_all(journal, [(actor.thread("a"), Scheduling(500, None))])
         with pytest.raises(OperationError, match=r"cores 1023: Invalid argument"):
-            change_scheduling(journal, actor.thread("a"), Scheduling(None, (1023,)))
+            change_all(journal, [(actor.thread("a"), Scheduling(None, (1023,)))])
         assert _fates(restore_scheduling(journal)) == {"a": "unchanged"}
 
 
@@ -250,7 +255,7 @@ def test_after_a_boot_nothing_is_touched(
     tmp_path: Path, journal: Journal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with acting(tmp_path, "a") as actor:
-        change_scheduling(journal, actor.thread("a"), WANTED)
+        change_all(journal, [(actor.thread("a"), WANTED)])
         with monkeypatch.context() as another_boot:
             another_boot.setattr(journal_module, "boot_id", lambda: "another")
             assert restore_scheduling(journal) == ()
@@ -272,12 +277,12 @@ def test_sched_deadline_is_refused_and_stays(tmp_path: Path, journal: Journal) -
         if not _set_deadline(actor.tids["a"]):
             pytest.skip("SCHED_DEADLINE is not permitted here")
         with pytest.raises(OperationError, match=r"\(a\).* runs under SCHED_DEADLINE.*chrt"):
-            change_scheduling(journal, actor.thread("a"), WANTED)
+            change_all(journal, [(actor.thread("a"), WANTED)])
         assert state_of(actor.tids["a"]).scheduling_class.policy == 6
         assert restore_scheduling(journal) == ()
         # Somebody may also give it to a thread that we have changed.
         os.sched_setscheduler(actor.tids["a"], os.SCHED_OTHER, os.sched_param(0))
-        change_scheduling(journal, actor.thread("a"), Scheduling(30, None))
+        change_all(journal, [(actor.thread("a"), Scheduling(30, None))])
         assert _set_deadline(actor.tids["a"])
         assert _fates(restore_scheduling(journal)) == {"a": "left"}
         assert state_of(actor.tids["a"]).scheduling_class.policy == 6
@@ -317,7 +322,7 @@ def test_a_descendant_is_known_by_what_was_written_down_when_its_parent_has_ende
 ) -> None:
     with acting(tmp_path) as actor:
         before = state_of(actor.pid)
-        change_scheduling(journal, actor.thread("main"), WANTED)
+        change_all(journal, [(actor.thread("main"), WANTED)])
         time.sleep(0.05)
         between = actor.fork()  # dies with its parent, unless that is told otherwise
         note_descendants(journal)
@@ -338,7 +343,7 @@ def test_a_stranger_with_all_that_we_gave_is_named_and_left(
     (tmp_path / "other").mkdir()
     with acting(tmp_path) as actor, acting(tmp_path / "other") as other:
         time.sleep(0.05)
-        change_scheduling(journal, actor.thread("main"), WANTED)
+        change_all(journal, [(actor.thread("main"), WANTED)])
         assert look_alikes(journal) == ()
         with subprocess.Popen(["sleep", "60"]) as stranger:
             set_state(stranger.pid, state_of(actor.pid), ["scheduling_class", "cores"])

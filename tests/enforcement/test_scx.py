@@ -14,8 +14,7 @@ import pytest
 
 from chainshaper.enforcement.scx import back_end as scx
 from chainshaper.enforcement.scx import libbpf
-from chainshaper.enforcement.scx import requirements as scx_requirements
-from chainshaper.enforcement.scx.loading import POLICY
+from chainshaper.enforcement.scx.back_end import POLICY
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.linux.own_processes import what_happened
 from chainshaper.values.errors import InputError, OperationError, PlatformError
@@ -54,7 +53,7 @@ def test_compiling_the_policy_again_gives_the_same_bytes(tmp_path: Path) -> None
 def test_without_sched_ext_the_remedy_is_a_kernel(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(scx_requirements, "SCHED_EXT", tmp_path / "none")
+    monkeypatch.setattr(scx, "SCHED_EXT", tmp_path / "none")
     assert "CONFIG_SCHED_CLASS_EXT" in (scx.missing() or "")
     with pytest.raises(PlatformError, match="back end scx: this kernel has no sched_ext"):
         scx.create(TABLE)
@@ -67,11 +66,11 @@ def machine(monkeypatch: pytest.MonkeyPatch, folder: Path, capabilities: int) ->
     (sched_ext / "state").write_text("disabled\n")
     status = folder / "status"
     status.write_text(f"Name:\tx\nCapEff:\t{capabilities:016x}\n")
-    monkeypatch.setattr(scx_requirements, "SCHED_EXT", sched_ext)
-    monkeypatch.setattr(scx_requirements, "STATUS", status)
-    monkeypatch.setattr(scx_requirements, "KERNEL_TYPES", status)
-    monkeypatch.setattr(scx_requirements, "load_libbpf", lambda: None)
-    monkeypatch.setattr(scx_requirements, "is_realtime_kernel", lambda: False)
+    monkeypatch.setattr(scx, "SCHED_EXT", sched_ext)
+    monkeypatch.setattr(scx, "STATUS", status)
+    monkeypatch.setattr(scx, "KERNEL_TYPES", status)
+    monkeypatch.setattr(scx, "load_libbpf", lambda: None)
+    monkeypatch.setattr(scx, "is_realtime_kernel", lambda: False)
     return sched_ext
 
 
@@ -96,8 +95,8 @@ def test_lacking_capabilities_are_named(
 
 def test_a_real_time_kernel_needs_two_more(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     machine(monkeypatch, tmp_path, 1 << 39 | 1 << 38)
-    monkeypatch.setattr(scx_requirements, "is_realtime_kernel", lambda: True)
-    monkeypatch.setattr(scx_requirements, "may_use_fifo", lambda: False)
+    monkeypatch.setattr(scx, "is_realtime_kernel", lambda: True)
+    monkeypatch.setattr(scx, "may_use_fifo", lambda: False)
     monkeypatch.setattr("resource.getrlimit", lambda _: (65536, 65536))
     assert "CAP_SYS_NICE and CAP_IPC_LOCK" in (scx.missing() or "")
 
@@ -115,7 +114,7 @@ def test_a_kernel_without_type_information_is_told(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     machine(monkeypatch, tmp_path, 1 << 39 | 1 << 38)
-    monkeypatch.setattr(scx_requirements, "KERNEL_TYPES", tmp_path / "none")
+    monkeypatch.setattr(scx, "KERNEL_TYPES", tmp_path / "none")
     assert "CONFIG_DEBUG_INFO_BTF" in (scx.missing() or "")
 
 
@@ -223,4 +222,4 @@ def test_on_this_machine_arming_needs_make_test_kernel() -> None:
         assert servers.failure() is None
     finally:
         servers.release()
-    assert scx_requirements.scheduler_in_force() is None
+    assert scx.scheduler_in_force() is None

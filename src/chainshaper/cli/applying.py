@@ -21,7 +21,7 @@ from chainshaper.cli.output import (
 from chainshaper.values.errors import InputError, OperationError
 
 if TYPE_CHECKING:
-    from chainshaper.enforcement.runs.state import RunState
+    from chainshaper.enforcement.undoing import RunState
     from chainshaper.planning import Plan
 
 LINE_EVERY = 10
@@ -44,7 +44,7 @@ def threads(
     json: bool = JSON,
 ) -> None:
     """Show the threads of running nodes: executors, DDS threads, publishers; class and cores."""
-    from chainshaper.flow.thread_search import find_threads
+    from chainshaper.flow.threads import find_threads
     from chainshaper.planning import load_plan
     from chainshaper.reporting.threads import threads_json, threads_table
     from chainshaper.sources import open_source
@@ -143,7 +143,7 @@ def apply(
 def _show_changes(plan: "Plan", backend: str, json: bool, **where: Any) -> None:
     import shlex
 
-    from chainshaper.flow.dry_run import planned_changes
+    from chainshaper.flow.threads import planned_changes
     from chainshaper.reporting.servers import changes_table
 
     changes = planned_changes(plan, backend, **where)
@@ -209,9 +209,8 @@ def status(
 
     And the outputs that have a shaping node: which of them go around it, or are silent.
     """
-    from chainshaper.enforcement.freezer.state import stray_groups
-    from chainshaper.enforcement.runs.state import find_runs, runs_as_json
-    from chainshaper.enforcement.runs.undoing import strange_lines
+    from chainshaper.enforcement.freezer_state import stray_groups
+    from chainshaper.enforcement.undoing import find_runs, runs_as_json, strange_lines
     from chainshaper.reporting.servers import runs_table, servers_table
     from chainshaper.splicing.shaped_outputs import find_outputs, output_text
 
@@ -252,9 +251,9 @@ def release(
     ),
 ) -> None:
     """End plans in force, and put back what crashed runs have left changed."""
-    from chainshaper.enforcement.runs.journal import find_journals
-    from chainshaper.enforcement.runs.scheduling_memory import look_alikes
-    from chainshaper.enforcement.runs.undoing import end_run, release_strays
+    from chainshaper.enforcement.scheduling_memory import look_alikes
+    from chainshaper.enforcement.undoing import end_run, release_strays
+    from chainshaper.linux.runs import find_journals
 
     runs = find_journals()
     chosen = [journal for journal in runs if run in (None, journal.path.parent.name)]

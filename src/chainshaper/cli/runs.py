@@ -295,7 +295,7 @@ def profile(
     threads are as before. What happened before the priorities were in force is left out.
     """
     from chainshaper.flow.profiling import chain_nodes, check_profiling, profiling_condition
-    from chainshaper.linux.command_process import check_command
+    from chainshaper.linux.own_processes import check_command
     from chainshaper.sources import open_source
     from chainshaper.values.recording import refuse_existing
 

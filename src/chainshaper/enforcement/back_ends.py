@@ -1,4 +1,4 @@
-"""Which back ends this machine offers, the strongest of them, and making one.
+"""Which back ends this machine offers, the strongest of them, and making one; the back end `fifo`.
 
 Strongest first: **scx** and **litmus** gate in the kernel, to the microsecond; **freezer** gates
 with a dispatcher on any kernel, to some tens of microseconds; **fifo** isolates, and leaves gating
@@ -6,28 +6,29 @@ to the shaping node.
 """
 
 import os
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from chainshaper.enforcement import fifo
-from chainshaper.enforcement.freezer import back_end as freezer
-from chainshaper.enforcement.litmus import back_end as litmus
-from chainshaper.enforcement.runs.journal import Journal
+from chainshaper.enforcement import freezer, litmus
+from chainshaper.enforcement.scheduling_memory import (
+    change_all,
+    release_threads,
+    remembered_threads,
+)
 from chainshaper.enforcement.scx import back_end as scx
-from chainshaper.enforcement.servers import BackEnd, ServerTable
+from chainshaper.enforcement.servers import BackEnd, ServerCounters, ServerTable
+from chainshaper.enforcement.threads import (
+    NodeThread,
+    below_their_siblings,
+    server_priorities,
+    wanted_of_members,
+)
 from chainshaper.linux import cgroups
+from chainshaper.linux.runs import Journal
 from chainshaper.linux.scheduling import may_use_fifo
+from chainshaper.linux.threads import find_thread
 from chainshaper.values.errors import InputError, PlatformError
-
-__all__ = [
-    "BACK_ENDS",
-    "Choice",
-    "Offer",
-    "choose_back_end",
-    "gates",
-    "make_back_end",
-    "offered_back_ends",
-]
 
 
 @dataclass(frozen=True)
@@ -61,12 +62,12 @@ def choose_back_end(name: str = "auto") -> Choice:
     """
     if name not in ("auto", *BACK_ENDS):
         raise InputError(f"no back end {name!r}: choose one of auto, {', '.join(BACK_ENDS)}")
-    offers = offered_back_ends()
     if name != "auto":
-        offer = next(offer for offer in offers if offer.name == name)
-        if offer.missing is not None:
-            raise PlatformError(f"back end {name}: {offer.missing}")
-        return Choice(name, f"asked for; {offer.strength}")
+        strength, missing = _KNOWN[name]
+        if (reason := missing()) is not None:
+            raise PlatformError(f"back end {name}: {reason}")
+        return Choice(name, f"asked for; {strength}")
+    offers = offered_back_ends()
     passed: list[str] = []
     for offer in offers:
         if offer.missing is None:
@@ -80,7 +81,7 @@ def choose_back_end(name: str = "auto") -> Choice:
 
 
 def gates(name: str) -> bool:
-    """Whether a back end keeps threads inside their slots, or only isolates them."""
+    """Whether a back end restricts threads to their slots, or only isolates them."""
     return name != "fifo"
 
 
@@ -104,7 +105,62 @@ def make_back_end(
         case "freezer":
             return freezer.create(table, journal, go_on)
         case _:
-            return fifo.create(table, journal)
+            return Fifo(table, journal)
+
+
+class Fifo:
+    """Servers as SCHED_FIFO priorities, on any kernel, without slots; see :class:`BackEnd`.
+
+    Each server's threads get its core and a real-time priority in the order of the servers. That
+    isolates a chain from what is less important; a shaping node's gate has to do the rest. Several
+    threads of one server take turns under SCHED_RR. Threads that stand in the journal already are
+    left as they are: who carries out a whole plan has given them their priorities
+    (:func:`.threads.plan_scheduling`), in an order that also knows of shaping nodes. Raises
+    InputError: the table has more priorities than there are.
+    """
+
+    name = "fifo"
+
+    def __init__(self, table: ServerTable, journal: Journal) -> None:
+        server_priorities(server.priority for server in table.servers)
+        self._table = table
+        self._journal = journal
+        self._members: dict[str, list[NodeThread]] = {s.name: [] for s in table.servers}
+        self._scheduled = {one.identity for one in remembered_threads(journal)}
+        self._since_ns: int | None = None
+
+    def assign(self, tid: int, server: str) -> None:
+        if server not in self._members:
+            raise InputError(f"no server {server!r}: choose of {', '.join(self._members)}")
+        thread = find_thread(tid)
+        if thread is None or thread.identity in self._scheduled:
+            return
+        self._scheduled.add(thread.identity)
+        self._members[server].append(NodeThread(thread, (), "", ""))
+        if self._since_ns is not None:
+            self._schedule()
+
+    def arm(self, anchor_ns: int) -> None:  # noqa: ARG002 - priorities know no cycle
+        self._schedule()
+        self._since_ns = time.monotonic_ns()
+
+    def in_force_from(self) -> int | None:
+        return self._since_ns
+
+    def counters(self) -> dict[str, ServerCounters]:
+        return {server.name: ServerCounters() for server in self._table.servers}
+
+    def failure(self) -> str | None:
+        return None
+
+    def release(self) -> None:
+        self._since_ns = None
+        release_threads(self._journal)
+
+    def _schedule(self) -> None:
+        wanted = below_their_siblings(wanted_of_members(self._members, self._table.servers))
+        if wanted:
+            change_all(self._journal, ((one.thread.thread, one.wanted) for one in wanted))
 
 
 def _missing_for_litmus() -> str | None:

@@ -2,27 +2,23 @@
 
 A plan says which *nodes* run in which server; by the time it is carried out, nodes have become
 threads. What is left is a **table**: servers with slots that repeat every cycle (paper, section
-2.2.1), and thread ids assigned to them. A back end keeps each assigned thread inside the slots of
-its server, one way or another (DESIGN section 6):
-
-* between slots its threads do not run at all (``fifo`` excepted, which isolates only);
-* where servers overlap on a core, the better priority runs; a smaller number is better;
-* threads of one server take turns;
-* threads of no server run when no server's thread wants to.
-
-Whatever a back end changes it changes back in :meth:`BackEnd.release`, and a crash of ours must
-not leave an application stopped.
+2.2.1), and thread ids assigned to them. Between slots a server's threads do not run at all
+(``fifo`` excepted, which isolates only); where servers overlap on a core, the better priority runs,
+a smaller number; threads of one server take turns; threads of no server run when no server's wants
+to. Whatever a back end changes it changes back, and a crash of ours must not leave an application
+stopped.
 """
 
 from dataclasses import dataclass
 from typing import Protocol
 
-__all__ = ["BackEnd", "ReservationServer", "ServerCounters", "ServerTable"]
-
 
 @dataclass(frozen=True)
 class ReservationServer:
-    """One server: half-open slots in ns after the start of a cycle, ascending, on one core."""
+    """A plan's server without its nodes, which processes read that have Python alone.
+
+    Half-open slots in ns after the start of a cycle, ascending, on one core.
+    """
 
     name: str
     core: int
@@ -40,12 +36,11 @@ class ServerTable:
 
 @dataclass(frozen=True)
 class ServerCounters:
-    """What a server has done since it was armed.
+    """What a server has done since it was armed; None: the back end cannot know.
 
     ``slots`` counts the slots that were opened, ``late_entries`` those of them that opened more
     than 100 us after their start, ``longest_lateness_ns`` the worst of these; ``overruns`` counts
-    the slots at whose end a thread of the server still wanted to run. None: the back end cannot
-    know.
+    the slots at whose end a thread of the server still wanted to run.
     """
 
     slots: int | None = None
@@ -57,9 +52,8 @@ class ServerCounters:
 class BackEnd(Protocol):
     """A table of servers in force on this machine.
 
-    Made by the ``create(table)`` of a back end's module, which changes nothing yet that an
-    application could notice. Then ``assign`` and ``arm`` in any order and number; ``release``
-    ends it.
+    Made by the ``create`` of a back end's module, which changes nothing yet that an application
+    could notice. Then ``assign`` and ``arm`` in any order and number; ``release`` ends it.
     """
 
     name: str
@@ -70,6 +64,7 @@ class BackEnd(Protocol):
         One that has ended is passed over: threads come and go.
 
         Raises:
+            InputError: no such server.
             OperationError: the kernel refuses.
         """
 
@@ -77,6 +72,9 @@ class BackEnd(Protocol):
         """Enforce the slots from now on; cycles start at ``anchor_ns`` (CLOCK_MONOTONIC) + k * CT.
 
         Once more with another anchor, it moves the cycles without letting threads slip between.
+
+        Raises:
+            OperationError: the kernel refuses; what was done before stays until the release.
         """
 
     def in_force_from(self) -> int | None:
@@ -89,4 +87,8 @@ class BackEnd(Protocol):
         """Why the servers are no longer enforced, None while they are."""
 
     def release(self) -> None:
-        """Everything as it was before; harmless when repeated."""
+        """Everything as it was before; harmless when repeated.
+
+        Raises:
+            OperationError: something could not be put back; the rest is.
+        """

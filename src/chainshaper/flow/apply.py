@@ -2,17 +2,14 @@
 
     find the threads ─► priorities and cores ─► servers ─► anchor ─► arm ─► watch ─► all as before
 
-Nothing of the application is changed but where and when its threads run, and everything that is
-changed stands in a journal first (:mod:`chainshaper.enforcement.runs.journal`): whatever ends
-the run, this function, a signal or a crash, puts it back. Servers are armed only when all nodes
-run, and released before a command of ours is told to end, since a stopped thread cannot.
+Nothing of the application is changed but where and when its threads run, and every change stands in
+a journal first (:mod:`chainshaper.linux.runs`): whatever ends the run, this function, a signal or a
+crash, puts it back. Servers are armed only when all nodes run, and released before a command of
+ours is to end, since a stopped thread cannot.
 
-Threads come and go. One that appears later gets what the plan says, at the next look. One that ends
-before that has lived with the class, cores and cgroup of the thread that started it, as the kernel
-gives them to all that are born; no look waits for it.
-
-The shaping node is its own server: it holds messages back by itself, so its thread gets a
-priority and a core, and no slots from a back end.
+A thread that appears later gets what the plan says, at the next look; until then it has the class,
+cores and cgroup of the thread that started it. The shaping node is its own server: its thread gets
+a priority and a core, and no slots from a back end.
 """
 
 import contextlib
@@ -21,71 +18,70 @@ import subprocess
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from chainshaper.enforcement import threads as allocation
 from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, make_back_end
-from chainshaper.enforcement.phase import DriftWatch, measure_phase
-from chainshaper.enforcement.runs.claims import claim_run
-from chainshaper.enforcement.runs.governing import PLAN_FILE
-from chainshaper.enforcement.runs.guardian import Guardians, start_guardians
-from chainshaper.enforcement.runs.journal import Journal
-from chainshaper.enforcement.runs.scheduling_memory import (
-    change_all,
-    look_alikes,
-    note_descendants,
+from chainshaper.enforcement.guardian import Guardians, run_claimed, start_guardians
+from chainshaper.enforcement.scheduling_memory import change_all, look_alikes, note_descendants
+from chainshaper.enforcement.servers import (
+    BackEnd,
+    ServerCounters,
+    ServerTable,
 )
-from chainshaper.enforcement.runs.state import RunState, ServerState, save_run_state
-from chainshaper.enforcement.runs.undoing import strange_lines, undo_run
-from chainshaper.enforcement.servers import BackEnd, ServerCounters, ServerTable
-from chainshaper.enforcement.threads.allocation import (
-    LEFT_ALONE,
-    Allocation,
-    NodeThread,
-    RecordedProcess,
-    new_and_ended,
+from chainshaper.enforcement.threads import Allocation, NodeThread, RecordedProcess, server_members
+from chainshaper.enforcement.undoing import (
+    RunState,
+    ServerState,
+    claim_run,
+    save_run_state,
+    strange_lines,
+    undo_run,
 )
-from chainshaper.enforcement.threads.server_threads import (
-    left_by_back_end,
-    plan_scheduling,
-    server_members,
+from chainshaper.flow.phase import (
+    NOBODY,
+    DriftWatch,
+    Telling,
+    measure_phase,
+    moved_text,
+    tell_phase,
 )
-from chainshaper.flow.dry_run import LEAD_NS, first_thread, server_table
-from chainshaper.flow.shaping_phase import NOBODY, Telling, moved_text, tell_phase
-from chainshaper.flow.thread_search import find_threads
-from chainshaper.linux.command_process import end_command, start_command
+from chainshaper.flow.threads import LEAD_NS, find_threads, first_thread, server_table, table_of
+from chainshaper.linux.own_processes import end_command, start_command
+from chainshaper.linux.runs import PLAN_FILE, Journal
 from chainshaper.linux.scheduling import available_cores, check_cores
+from chainshaper.linux.threads import list_threads
 from chainshaper.linux.users import run_users
-from chainshaper.planning import Plan
 from chainshaper.planning.overruns import (
     open_until_done,
     publication_warnings,
     refuse_offset,
 )
-from chainshaper.planning.plan import shaping_nodes
+from chainshaper.planning.plan import Plan, publisher_servers, shaping_nodes
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 
 if TYPE_CHECKING:
     from chainshaper.values.recording import Recording  # slow to import
+    from chainshaper.workload.live import StartedNodes
 
-__all__ = ["Applied", "apply_plan"]
 
 START_NS = 30_000_000_000
 """A command has this long to start all nodes of the plan."""
 
 PHASE_BOUND_NS = 250_000
-"""Shaping nodes are told again where cycles begin when that has moved by more. Watching a thread
-from outside tells nothing finer (:data:`chainshaper.enforcement.phase.POLL_NS`)."""
+"""Shaping nodes get the beginning of cycles again when it has moved by more. Watching a thread from
+outside shows nothing finer (:data:`.phase.POLL_NS`)."""
 
 _LOOK_S = 1.0
 _SETTLING_LOOKS = 3
 """Nodes that have just started go on to start threads for a while; some never stop."""
 _FLEETING = 3
 """So many threads of a process that a look finds, and the next does not, are worth a note."""
-_NOTHING = ServerCounters(None, None, None, None)
+_NOTHING = ServerCounters()
 
 
 @dataclass(frozen=True)
@@ -98,7 +94,7 @@ class Applied:
 
 @dataclass
 class _Run:
-    """What there is to keep together, and to put back, while a plan is in force."""
+    """What belongs together, and is to be put back, while a plan is in force."""
 
     given: Plan
     plan: Plan  # as it is carried out: with room for overruns
@@ -117,11 +113,7 @@ class _Run:
         return self.journal.path.parent
 
     def go_on(self) -> None:
-        """See whether the run is to come into force still.
-
-        Raises:
-            OperationError: it is to end.
-        """
+        """See whether the run is to come into force still. Raises OperationError: it is to end."""
         _go_on(self.stop)
 
     @property
@@ -239,7 +231,7 @@ def _await_nodes(run: _Run, wait_ns: int, progress: Callable[[float, str], None]
                 ) from None
             if waited >= wait_ns:
                 raise
-        quiet = found is not None and not any(new_and_ended(found, now))
+        quiet = found is not None and not any(allocation.new_and_ended(found, now))
         if looks and (quiet or looks > _SETTLING_LOOKS or waited >= wait_ns):
             return now
         found = now
@@ -249,10 +241,10 @@ def _await_nodes(run: _Run, wait_ns: int, progress: Callable[[float, str], None]
 
 def _schedule(run: _Run, found: Allocation) -> None:
     """Give threads their priorities and cores, as far as the back end leaves that to us."""
-    wanted = plan_scheduling(run.plan, found, available_cores())
+    wanted = allocation.plan_scheduling(run.plan, found, available_cores())
     changes = (
         (one.thread.thread, one.wanted)
-        for one in left_by_back_end(run.choice.name, wanted)
+        for one in allocation.left_by_back_end(run.choice.name, wanted)
         if one.server is None or run.choice.name != "fifo"  # that is all the latter does
     )
     change_all(run.journal, changes)
@@ -261,8 +253,9 @@ def _schedule(run: _Run, found: Allocation) -> None:
 def _initial_state(
     run: _Run, table: ServerTable, command: Sequence[str], plan_path: str
 ) -> RunState:
-    gated = {server.name for server in table.servers}
     keeper = run.choice.name if gates(run.choice.name) else "nobody: priority only"
+    kept_by = {server.name: "gate" for server in run.plan.servers}
+    kept_by |= {server.name: keeper for server in table.servers}
     return RunState(
         run=run.folder.name,
         owner=os.getpid(),
@@ -276,16 +269,8 @@ def _initial_state(
         phase_spread_ns=None,
         drift_ns=None,
         servers=tuple(
-            ServerState(
-                server.name,
-                server.core,
-                server.priority,
-                server.slots,
-                (),
-                keeper if server.name in gated else "gate",
-                _NOTHING,
-            )
-            for server in run.plan.servers
+            ServerState(s.name, s.core, s.priority, s.slots, (), kept_by[s.name], _NOTHING)
+            for s in run.plan.servers
         ),
         notes=tuple(publication_warnings(run.plan)),
         failure=None,
@@ -404,18 +389,36 @@ def _keep(
             continue
         if run.guardians is not None:
             run.guardians.renew()
-        now = _find(run)
-        new, ended = new_and_ended(found, now)
-        state = replace(state, notes=_with_fleeting(state.notes, latest, ended))
-        state, latest = _with_threads(_naming_strangers(state, now), _living(now, state)), new
-        try:
-            note_descendants(run.journal)
-            if new:
-                state = _taken_in(run, servers, now, state)
-            found, untaken = now, ""
-        except OperationError as error:  # a node is on its way up, perhaps: at the next look
-            reason = f"threads that have appeared are as they were: {error}"
-            untaken = "" if run.stop.is_set() else reason
+        found, state, latest, untaken = _look_again(run, servers, found, state, latest)
+
+
+def _look_again(
+    run: _Run,
+    servers: BackEnd,
+    before: Allocation,
+    state: RunState,
+    latest: tuple[NodeThread, ...],
+) -> tuple[Allocation, RunState, tuple[NodeThread, ...], str]:
+    """Threads that have appeared get what the plan says; ``latest`` had when it was looked before.
+
+    Returns the threads that are known now, the state, the new ones, and why these were not taken
+    in, if so: a node is on its way up, perhaps.
+    """
+    now = _find(run)
+    new, ended = allocation.new_and_ended(before, now)
+    state = _naming_strangers(replace(state, notes=_with_fleeting(state.notes, latest, ended)), now)
+    there = {one.thread.tid for one in now.threads}
+    living = {s.name: tuple(t for t in s.threads if t in there) for s in state.servers}
+    state = _with_threads(state, living)
+    try:
+        note_descendants(run.journal)
+        if new:
+            _schedule(run, now)
+            state = _with_threads(state, _assign(run, now, servers, living))
+    except OperationError as error:
+        reason = f"threads that have appeared are as they were: {error}"
+        return before, state, new, "" if run.stop.is_set() else reason
+    return now, state, new, ""
 
 
 def _naming_strangers(state: RunState, found: Allocation) -> RunState:
@@ -425,7 +428,7 @@ def _naming_strangers(state: RunState, found: Allocation) -> RunState:
     """
     if found.strangers is None:
         return state
-    others = (note for note in state.notes if not note.startswith(LEFT_ALONE))
+    others = (note for note in state.notes if not note.startswith(allocation.LEFT_ALONE))
     return replace(state, notes=(*others, found.strangers))
 
 
@@ -438,12 +441,12 @@ def _told(run: _Run) -> tuple[str, ...]:
 
 
 def _failure(run: _Run, servers: BackEnd, state: RunState) -> str | None:
-    """Why the plan is no longer in force: the back end, or nobody is left to govern."""
+    """Why the plan is no longer in force: the back end, or no thread is left to govern."""
     reason = servers.failure()
     if reason is not None:
         return f"the servers failed: {reason}"
     # What we have started ends by itself, and has perhaps still to write down what it saw; and
-    # somebody may have ended both the application and us.
+    # a person may have ended both the application and us.
     if (
         run.command is None
         and not run.stop.is_set()
@@ -477,23 +480,6 @@ def _with_fleeting(
     return tuple(dict.fromkeys((*notes, *said)))
 
 
-def _living(found: Allocation, state: RunState) -> dict[str, tuple[int, ...]]:
-    """The threads of each server that have not ended."""
-    there = {one.thread.tid for one in found.threads}
-    return {one.name: tuple(tid for tid in one.threads if tid in there) for one in state.servers}
-
-
-def _taken_in(run: _Run, servers: BackEnd, found: Allocation, state: RunState) -> RunState:
-    """Threads that appeared later get what the plan says.
-
-    Raises:
-        OperationError: not all nodes are there, or a thread has ended again.
-    """
-    already = {one.name: one.threads for one in state.servers}
-    _schedule(run, found)
-    return _with_threads(state, _assign(run, found, servers, already))
-
-
 def _put_back(run: _Run) -> None:
     """Everything as it was: first let all threads go, then end our command, then the rest."""
     problems: list[str] = []
@@ -514,3 +500,47 @@ def _put_back(run: _Run) -> None:
             f"not everything could be put back: {'; '.join(problems)}; {run.journal.path} says "
             "what was there, `chainshaper release` tries again"
         )
+
+
+@contextlib.contextmanager
+def publishers_gated(plan: Plan, nodes: "StartedNodes") -> Iterator[None]:
+    """Inside, the publisher threads that a plan names run in the slots of their servers only.
+
+    For the live workload (paper, section 3.2.1, design 1): its nodes are ours, so which process
+    each is, and when cycles start, needs not be found or measured. Executors and DDS threads of
+    the same processes run on.
+
+    Raises:
+        PlatformError: threads cannot be frozen here.
+        OperationError: another run governs one of the cores or nodes, a node has no such thread,
+            or the servers failed meanwhile.
+    """
+    choice = choose_back_end("freezer")  # the others want threads of the fair class
+    planned = [(server, names) for _, server, names in publisher_servers(open_until_done(plan))]
+    table = table_of(plan.cycle_ns, (server for server, _ in planned))
+    cores = {server.core for server, _ in planned}
+    with run_claimed(cores, {name for _, names in planned for name in names}) as journal:
+        servers = make_back_end(choice.name, table, journal)
+        try:
+            for server, names in planned:
+                for name in names:
+                    for tid in _publisher_threads(name, nodes):
+                        servers.assign(tid, server.name)
+            servers.arm(nodes.anchor_ns)
+            yield
+            failure = servers.failure()
+        finally:
+            servers.release()
+    if failure is not None:
+        raise OperationError(f"the servers failed while the application ran: {failure}")
+
+
+def _publisher_threads(node: str, nodes: "StartedNodes") -> list[int]:
+    pid = nodes.pids.get(node)
+    found = [t.tid for t in list_threads(pid) if t.role == "publisher"] if pid is not None else []
+    if not found:
+        raise OperationError(
+            f"{node} has no thread that publishes for it: let it publish asynchronously "
+            "(`publication: asynchronous` under `topics`), or plan with --publication synchronous"
+        )
+    return found

@@ -19,8 +19,6 @@ from chainshaper.linux.scheduling import available_cores, may_use_fifo, throttle
 from chainshaper.linux.threads import foreign_realtime_processes
 from chainshaper.values.recording import StallMeterInfo
 
-__all__ = ["Check", "MachineReport", "examine_machine"]
-
 State: TypeAlias = Literal["good", "limited", "absent"]
 
 

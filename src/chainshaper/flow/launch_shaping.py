@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 from chainshaper.analysis import ChainEnumeration, data_flow, graph_of
-from chainshaper.enforcement.runs.state import RunState
+from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow.apply import START_NS, apply_plan
 from chainshaper.flow.exploration import list_chains
 from chainshaper.flow.launch_splicing import Splicing, splice_launch_files

@@ -2,11 +2,8 @@
 
 L̄ and L̲, from which slots are computed, are measured with the executors of the chain's nodes under
 SCHED_FIFO at a high priority on one core, and their DDS threads above them on the others. What else
-runs keeps its class, so it cannot disturb the chain; interference that remains is what no schedule
-avoids (section 2.3).
-
-Threads are changed as `apply` changes them: what was there stands in a journal first, and is put
-back whatever ends the run. Threads that appear later get theirs at the next look.
+runs cannot disturb the chain; interference that remains is what no schedule avoids (section 2.3).
+Threads are changed as `apply` changes them; those that appear later get theirs at the next look.
 """
 
 import time
@@ -16,25 +13,23 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from chainshaper.analysis import data_flow, find_chain, graph_of
-from chainshaper.enforcement.runs.guardian import run_claimed
-from chainshaper.enforcement.runs.journal import Journal
-from chainshaper.enforcement.runs.scheduling_memory import change_all
+from chainshaper.enforcement.guardian import run_claimed
+from chainshaper.enforcement.scheduling_memory import change_all
 from chainshaper.enforcement.servers import ReservationServer
-from chainshaper.enforcement.threads.allocation import (
+from chainshaper.enforcement.threads import (
     Allocation,
     NodeThread,
     RecordedProcess,
     allocate,
+    scheduling_around,
 )
-from chainshaper.enforcement.threads.server_threads import scheduling_around
 from chainshaper.flow.recorded_threads import recorded_processes
 from chainshaper.linux.processes import Process
+from chainshaper.linux.runs import Journal
 from chainshaper.linux.scheduling import available_cores, check_cores, may_use_fifo
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError, PlatformError
 from chainshaper.values.recording import Recording
-
-__all__ = ["chain_nodes", "check_profiling", "executors_of", "profiling_condition"]
 
 START_NS = 30_000_000_000
 """The nodes have this long to appear."""
@@ -69,8 +64,7 @@ def profiling_condition(
 def check_profiling(core: int | None = None) -> int:
     """The core on which executors will run, once it is sure that they may.
 
-    Raises:
-        PlatformError: no such core, or SCHED_FIFO is not permitted.
+    Raises PlatformError: no such core, or SCHED_FIFO is not permitted.
     """
     if not may_use_fifo():
         raise PlatformError(
@@ -85,8 +79,7 @@ def check_profiling(core: int | None = None) -> int:
 def chain_nodes(recording: Recording, chain: str) -> tuple[str, ...]:
     """The nodes of a chain in an earlier recording of the application, in its order.
 
-    Raises:
-        InputError: no such chain.
+    Raises InputError: no such chain.
     """
     graph = graph_of(data_flow(recording.events, recording.info.clock_offset_ns))
     found = find_chain(graph, chain)
@@ -134,9 +127,9 @@ def executors_of(
 ) -> list[NodeThread]:
     """The threads that execute these nodes, or publish for them; of all nodes if none are named.
 
-    `ros2 launch` is a node as well, and nobody's chain: what has started other nodes is left out.
-    Where several threads of a process executed before, those that nobody has named are taken for
-    such: they do not differ from others that do next to nothing, as the one that waits for signals.
+    What has started other nodes is left out: `ros2 launch` is a node as well, and in no chain.
+    Where several threads of a process executed before, unnamed ones are taken for such: they do not
+    differ from others that do next to nothing, as the one that waits for signals.
     """
     owners = {one.thread.pid for one in found.threads if one.nodes}
     launchers = {one.parent for one in processes if one.pid in owners}

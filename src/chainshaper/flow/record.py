@@ -23,26 +23,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeAlias
 
-from chainshaper.enforcement.runs.governing import (
-    Governed,
-    governing,
-    in_force_throughout,
-)
-from chainshaper.enforcement.threads.allocation import strangers_text
+from chainshaper.enforcement.threads import strangers_text
 from chainshaper.flow.exploration import with_trace_events
-from chainshaper.flow.recorded_application import (
+from chainshaper.flow.recorded_threads import (
     known_endpoints,
     recorded_threads_of,
     scheduled_in_real_time,
 )
-from chainshaper.linux.command_process import check_command, end_command, start_command
-from chainshaper.linux.own_processes import end_in_words
+from chainshaper.linux.own_processes import check_command, end_command, end_in_words, start_command
 from chainshaper.linux.processes import (
     Process,
     descendants,
     find_applications,
     list_processes,
 )
+from chainshaper.linux.runs import Governed, governing, in_force_throughout
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import parents
 from chainshaper.linux.users import run_users

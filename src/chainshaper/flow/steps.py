@@ -227,7 +227,7 @@ def shape_application(
 
     ``enforcement`` puts the plan's servers in force while it runs. A shaping node does without;
     the thread of an asynchronous publisher is gated unless somebody else sees to it
-    (:mod:`chainshaper.flow.publisher_gating`).
+    (:func:`chainshaper.flow.apply.publishers_gated`).
 
     Raises:
         InputError: the plan does not fit the application, or has an offset; and what
@@ -236,7 +236,7 @@ def shape_application(
     """
     refuse_offset(plan)
     if any(publisher_servers(plan)) and enforcement is None:
-        from chainshaper.flow.publisher_gating import publishers_gated
+        from chainshaper.flow.apply import publishers_gated
 
         enforcement = partial(publishers_gated, plan)
     period = origin_timer(application).timer_ns

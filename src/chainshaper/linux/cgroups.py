@@ -1,14 +1,11 @@
 """Control groups of version 2, as far as stopping single threads needs them.
 
 Writing ``1`` to a group's ``cgroup.freeze`` stops every thread in it on its way back to user
-space, and ``0`` lets them go on: no signal is delivered, and futexes, condition variables, sleeps
-and polls do not notice. A group holds whole processes by default. A **threaded** group may hold
-some threads of a process while the others stay where they are, on one condition: all groups that
-share a process lie in one *threaded domain* (kernel: Documentation/admin-guide/cgroup-v2.rst,
-"Threads"). So a thread's new group is made directly beneath the group in which the thread is
-now, which has two more merits: the thread keeps every limit that its group puts on it, and the
-way back is always the same, up to the parent. Until the child is removed the parent's type reads
-``domain threaded``; the kernel itself makes it ``domain`` again.
+space, and ``0`` lets them go on. A **threaded** group may have some threads of a process while the
+others stay where they are, on one condition: all groups that share a process lie in one *threaded
+domain* (kernel: Documentation/admin-guide/cgroup-v2.rst, "Threads"). So a thread's new group is
+made directly beneath the group in which the thread is now: it keeps every limit, and the way back
+is always up to the parent. Until the child is removed the parent's type reads ``domain threaded``.
 """
 
 import contextlib
@@ -19,26 +16,6 @@ import time
 from pathlib import Path
 
 from chainshaper.values.errors import OperationError, PlatformError
-
-__all__ = [
-    "QUICK_MOVES",
-    "cgroup_of",
-    "dissolve",
-    "enter_own_group",
-    "has_unseen_threads",
-    "leave_own_group",
-    "make_moves_quick",
-    "make_threaded_child",
-    "mount_options",
-    "mount_point",
-    "move_thread",
-    "moves_are_quick",
-    "options_before_ours",
-    "remount",
-    "remove_own_group",
-    "restore_mount",
-    "threads_in",
-]
 
 MOUNTS = Path("/proc/mounts")
 QUICK_MOVES = "favordynmods"
@@ -75,20 +52,12 @@ _REMEDY = (
 
 
 def mount_point() -> Path:
-    """Where the version 2 hierarchy is mounted.
-
-    Raises:
-        PlatformError: it is not.
-    """
+    """Where the version 2 hierarchy is mounted. Raises PlatformError: it is not."""
     return _mount()[0]
 
 
 def mount_options() -> str:
-    """How the version 2 hierarchy is mounted: ``rw,nosuid,nodev,noexec,relatime,nsdelegate``.
-
-    Raises:
-        PlatformError: it is not.
-    """
+    """The options of the version 2 hierarchy's mount. Raises PlatformError: it is not mounted."""
     return _mount()[1]
 
 
@@ -98,10 +67,7 @@ def moves_are_quick() -> bool:
 
 
 def remount(options: str) -> None:
-    """Have the hierarchy mounted with these options, if the kernel knows and permits them.
-
-    By a call of the kernel, since `mount` would go on when we are killed meanwhile.
-    """
+    """Have the hierarchy mounted with these options, if the kernel knows and permits them."""
     names = options.split(",")
     flags = _REMOUNT | sum(_MOUNT_FLAGS.get(name, 0) for name in names)
     own = ",".join(name for name in names if name not in _MOUNT_FLAGS)
@@ -156,9 +122,8 @@ def _mount() -> tuple[Path, str]:
 def cgroup_of(tid: int) -> Path:
     """The folder of the group in which a thread is.
 
-    Raises:
-        OperationError: there is no such thread.
-        PlatformError: its group cannot be seen from here.
+    Raises OperationError: there is no such thread. PlatformError: its group cannot be seen from
+    here.
     """
     try:
         lines = Path(f"/proc/{tid}/cgroup").read_text().splitlines()
@@ -179,9 +144,8 @@ def cgroup_of(tid: int) -> Path:
 def make_threaded_child(parent: Path, name: str) -> Path:
     """Make an empty threaded group directly beneath the group of the threads it is for.
 
-    Raises:
-        OperationError: the name is taken.
-        PlatformError: the machine or the privileges do not allow it; nothing is left behind.
+    Raises OperationError: the name is taken. PlatformError: the machine or the privileges do not
+    allow it; nothing is left behind.
     """
     folder = parent / name
     try:
@@ -204,30 +168,29 @@ def make_threaded_child(parent: Path, name: str) -> Path:
 
 def _why_not_threaded(parent: Path, error: OSError) -> str:
     """What stands in the way of threaded groups: the kernel only says EOPNOTSUPP."""
-    told = f"threads of the cgroup {parent} cannot be frozen one by one"
+    begin = f"threads of the cgroup {parent} cannot be frozen one by one"
     controllers = set(_read(parent / "cgroup.subtree_control").split()) - _THREADED_CONTROLLERS
     if controllers:
         names = ", ".join(sorted(controllers))
         return (
-            f"{told}: it hands the controllers {names} down to its children, which rules threaded "
+            f"{begin}: it hands the controllers {names} down to its children, which rules threaded "
             f"groups out; run the application in a group that does not (its own scope or unit)"
         )
     for child in sorted(parent.iterdir()):
         kind = _read(child / "cgroup.type").strip()
         if kind == "domain" and "populated 1" in _read(child / "cgroup.events"):
             return (
-                f"{told}: its child {child.name} holds processes of its own; run the application "
+                f"{begin}: its child {child.name} holds processes of its own; run the application "
                 f"in a group without others beneath it (its own scope or unit)"
             )
-    return f"{told} ({os.strerror(error.errno or 0)}): {_REMEDY}"
+    return f"{begin} ({os.strerror(error.errno or 0)}): {_REMEDY}"
 
 
 def move_thread(tid: int, folder: Path) -> bool:
     """Put one thread into a group; False when the thread has ended.
 
-    Raises:
-        PlatformError: the group is of another process, or the privilege is missing.
-        OperationError: the group is gone, or the kernel refuses for a reason of its own.
+    Raises PlatformError: the group is of another process, or the privilege is missing.
+    OperationError: the group is gone, or the kernel refuses for a reason of its own.
     """
     try:
         (folder / "cgroup.threads").write_text(str(tid))
@@ -247,10 +210,7 @@ def move_thread(tid: int, folder: Path) -> bool:
 
 
 def threads_in(folder: Path) -> tuple[int, ...]:
-    """The living threads of a group; none when the group is gone.
-
-    Those that cannot be seen from our process namespace (0 for the kernel) are not among them.
-    """
+    """The living threads of a group that can be seen from our process namespace."""
     return tuple(int(tid) for tid in _read(folder / "cgroup.threads").split() if tid != "0")
 
 

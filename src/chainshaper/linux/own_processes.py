@@ -1,10 +1,13 @@
-"""Processes of ours: how they are started, and how they ended.
+"""Processes that we start, ours and the user's: how they start, how they end.
 
 A process of ours often has more rights than whoever fills the folder that it is started in. So its
-Python is isolated (``-I``): it finds nothing through the current folder, through PYTHON* variables
-or among the user's own packages. Of what this drops, a process gets back what it needs, by its
-place, and only if root and we alone can change it: our package, and behind all other folders those
-of the libraries that it says it needs.
+Python is isolated (``-I``). Of what this drops, it gets back by its place, and only if root and we
+alone can change it: our package, and behind all other folders those of the libraries that it needs.
+
+The user's command, such as `ros2 launch …`, gets a session of its own: Ctrl-C then reaches us
+alone. A background job of a script ignores SIGINT, and whatever it starts inherits that, so the
+command starts with the default again. It ends by SIGINT to its whole process group, which `ros2
+launch` and every node understand as the order to shut down; then by SIGTERM, then by SIGKILL.
 """
 
 import contextlib
@@ -15,26 +18,24 @@ import signal
 import site
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from chainshaper.values.errors import OperationError
+from chainshaper.linux.scheduling import signalled_with_parent
+from chainshaper.linux.threads import read_proc
+from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.trusted_files import why_distrusted
-
-__all__ = [
-    "LIBRARIES",
-    "end_in_words",
-    "is_installed",
-    "module_command",
-    "named_folders",
-    "tool_environment",
-    "what_happened",
-]
 
 LIBRARIES = ("cyclonedds", "llvmlite", "numba", "numpy", "polars", "pydantic", "scipy", "yaml")
 """What processes import that simulate, or have DDS; all others need Python alone."""
 
+PATIENCE_S = 15.0
+"""`ros2 launch` itself gives its nodes 5 s after SIGINT, and 5 s after SIGTERM."""
+
+_LOOK_S = 0.05
 _PACKAGE = Path(__file__).resolve().parents[1]
 _START = (
     "import importlib.util as u, runpy, sys; package, folders, module = sys.argv[1:4]; "
@@ -49,10 +50,8 @@ _START = (
 def module_command(module: str, libraries: Sequence[str] = ()) -> list[str]:
     """How a module runs as a process of ours; its arguments go behind.
 
-    ``libraries`` are found where this process finds them.
-
-    Raises:
-        OperationError: others may change the package, and an isolated Python has no other.
+    ``libraries`` are found where this process finds them. Raises OperationError: others may change
+    the package, and an isolated Python has no other.
     """
     package, reason = str(_PACKAGE / "__init__.py"), why_distrusted(_PACKAGE)
     if reason is not None:
@@ -92,6 +91,77 @@ def tool_environment() -> dict[str, str]:
 def is_installed(tool: str) -> bool:
     """Whether :func:`tool_environment` has this program."""
     return shutil.which(tool, path=tool_environment()["PATH"]) is not None
+
+
+def check_command(command: Sequence[str]) -> None:
+    """See that a command can be started, before anything is done for it.
+
+    Raises InputError: there is no such program, or it may not be executed.
+    """
+    if shutil.which(command[0]) is not None:
+        return
+    if Path(command[0]).is_file() and os.sep in command[0]:
+        raise InputError(f"{command[0]} is not executable: give it the permission (`chmod +x`)")
+    raise InputError(
+        f"{command[0]}: no such command; is its name right, and is the ROS 2 environment sourced "
+        "(`source /opt/ros/…/setup.bash`)?"
+    )
+
+
+def start_command(
+    command: Sequence[str],
+    environment: Mapping[str, str] | None = None,
+    stdout: int | None = None,
+) -> subprocess.Popen[bytes]:
+    """Start the command with ``environment`` added to ours.
+
+    What it prints goes to the file descriptor ``stdout``, or where ours goes. Should we be killed,
+    it gets a SIGINT as from its terminal. Raises InputError: see :func:`check_command`.
+    OperationError: the kernel refuses to run it.
+    """
+    check_command(command)
+    try:
+        return subprocess.Popen(
+            command,
+            env={**os.environ, **(environment or {})},
+            stdout=stdout,
+            start_new_session=True,
+            preexec_fn=partial(_as_from_a_terminal, os.getpid()),  # noqa: PLW1509 - one call
+        )
+    except OSError as error:
+        raise OperationError(f"{command[0]} cannot be started: {error.strerror}") from error
+
+
+def _as_from_a_terminal(parent: int) -> None:
+    for number in (signal.SIGINT, signal.SIGQUIT):
+        signal.signal(number, signal.SIG_DFL)
+    signalled_with_parent(parent, signal.SIGINT)
+
+
+def end_command(started: subprocess.Popen[bytes], patience_s: float = PATIENCE_S) -> None:
+    """End the command and its process group; ``patience_s`` is waited between the signals."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+        if _over(started):
+            return
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(started.pid, number)
+        deadline = time.monotonic() + patience_s
+        while not _over(started) and time.monotonic() < deadline:
+            time.sleep(_LOOK_S)
+
+
+def _over(started: subprocess.Popen[bytes]) -> bool:
+    """Whether it has ended, and no process of its group runs any more (zombies do not)."""
+    if started.poll() is None:
+        return False
+    for entry in os.scandir("/proc"):
+        if entry.name.isdigit():
+            with contextlib.suppress(OSError):
+                stat = read_proc(f"/proc/{entry.name}/stat")
+                state, _, group = stat[stat.rindex(b")") + 2 :].split()[:3]
+                if int(group) == started.pid and state not in (b"Z", b"X"):
+                    return False
+    return True
 
 
 def end_in_words(code: int) -> str:

@@ -1,7 +1,9 @@
-"""Real-time scheduling of this process: what it may have, and taking it.
+"""How threads are scheduled: what this process may have, and setting and restoring any thread's.
 
-Everything here concerns the calling process or thread only. SCHED_FIFO needs CAP_SYS_NICE or an
-RLIMIT_RTPRIO, locked memory CAP_IPC_LOCK or an RLIMIT_MEMLOCK.
+A thread's scheduling has three **aspects**, which the kernel keeps and changes apart from each
+other: its class (policy, priority and the flag that children start without it), its nice value,
+and its cores. SCHED_FIFO needs CAP_SYS_NICE or an RLIMIT_RTPRIO, locked memory CAP_IPC_LOCK or an
+RLIMIT_MEMLOCK.
 """
 
 import ctypes
@@ -9,20 +11,16 @@ import gc
 import os
 import signal
 import threading
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, Literal, TypeAlias
 
-from chainshaper.values.errors import PlatformError
+from chainshaper.linux.threads import POLICIES, RESET_ON_FORK, Thread
+from chainshaper.values.errors import OperationError, PlatformError
 
-__all__ = [
-    "available_cores",
-    "check_cores",
-    "lock_memory",
-    "may_use_fifo",
-    "set_thread_name",
-    "signalled_with_parent",
-    "stop_garbage_collection",
-    "throttle_fraction",
-]
+Aspect: TypeAlias = Literal["scheduling_class", "nice", "cores"]
+ASPECTS: tuple[Aspect, ...] = ("scheduling_class", "nice", "cores")
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
@@ -31,36 +29,152 @@ _THROTTLE_RUNTIME = Path("/proc/sys/kernel/sched_rt_runtime_us")
 _THROTTLE_PERIOD = Path("/proc/sys/kernel/sched_rt_period_us")
 
 
+@dataclass(frozen=True)
+class Scheduling:
+    """What a thread should get; what is None is left alone.
+
+    ``priority`` is that of SCHED_FIFO or, with ``takes_turns``, of SCHED_RR, under which threads
+    of one priority share their time; 0 is an ordinary thread's, of SCHED_OTHER.
+    """
+
+    priority: int | None
+    cores: tuple[int, ...] | None
+    takes_turns: bool = False
+
+    @property
+    def policy(self) -> int:
+        if self.priority == 0:
+            return os.SCHED_OTHER
+        return os.SCHED_RR if self.takes_turns else os.SCHED_FIFO
+
+
+@dataclass(frozen=True)
+class SchedulingClass:
+    """Policy (a number of `sched(7)`), real-time priority, and whether children start without."""
+
+    policy: int
+    priority: int
+    reset_on_fork: bool
+
+
+@dataclass(frozen=True)
+class SchedulingState:
+    """All that the kernel keeps about how a thread is scheduled, SCHED_DEADLINE's numbers apart."""
+
+    scheduling_class: SchedulingClass
+    nice: int
+    cores: tuple[int, ...]
+
+
+def state_of(tid: int) -> SchedulingState:
+    """How a thread is scheduled now. Raises ProcessLookupError: it has ended."""
+    policy = os.sched_getscheduler(tid)
+    return SchedulingState(
+        SchedulingClass(
+            policy=policy & ~RESET_ON_FORK,
+            priority=os.sched_getparam(tid).sched_priority,
+            reset_on_fork=bool(policy & RESET_ON_FORK),
+        ),
+        nice=os.getpriority(os.PRIO_PROCESS, tid),
+        cores=tuple(sorted(os.sched_getaffinity(tid))),
+    )
+
+
+def set_state(tid: int, target: SchedulingState, aspects: Iterable[Aspect] = ASPECTS) -> None:
+    """Give a thread these aspects of a state.
+
+    The class goes first: on a core where a FIFO thread spins, a thread moved there as SCHED_OTHER
+    would not run again. Raises ProcessLookupError: it has ended. OSError: the kernel refuses.
+    """
+    for aspect in sorted(aspects, key=ASPECTS.index):
+        if aspect == "scheduling_class":
+            wanted = target.scheduling_class
+            flag = RESET_ON_FORK if wanted.reset_on_fork else 0
+            os.sched_setscheduler(tid, wanted.policy | flag, os.sched_param(wanted.priority))
+        elif aspect == "nice":
+            os.setpriority(os.PRIO_PROCESS, tid, target.nice)
+        else:
+            os.sched_setaffinity(tid, target.cores)
+
+
+def after_wish(now: SchedulingState, wanted: Scheduling) -> SchedulingState:
+    """What a thread has after a wish is fulfilled: what the wish leaves open stays."""
+    if wanted.priority is not None:
+        own = replace(now.scheduling_class, policy=wanted.policy, priority=wanted.priority)
+        now = replace(now, scheduling_class=own)
+    return now if wanted.cores is None else replace(now, cores=tuple(sorted(wanted.cores)))
+
+
+def different_aspects(one: SchedulingState, other: SchedulingState) -> list[Aspect]:
+    """In what two states differ."""
+    return [aspect for aspect in ASPECTS if getattr(one, aspect) != getattr(other, aspect)]
+
+
+def with_aspect(state: SchedulingState, aspect: Aspect, source: SchedulingState) -> SchedulingState:
+    values: dict[str, Any] = {aspect: getattr(source, aspect)}
+    return replace(state, **values)
+
+
+def state_from_json(values: dict[str, Any]) -> SchedulingState:
+    """What `dataclasses.asdict` made plain."""
+    return SchedulingState(
+        SchedulingClass(**values["scheduling_class"]), values["nice"], tuple(values["cores"])
+    )
+
+
+def state_text(state: SchedulingState) -> str:
+    """A state for a person: ``SCHED_FIFO 87, nice 0, cores 1, 2``."""
+    own = state.scheduling_class
+    policy = POLICIES.get(own.policy, f"policy {own.policy}")
+    priority = f" {own.priority}" if own.priority else ""
+    return f"{policy}{priority}, nice {state.nice}, cores {', '.join(map(str, state.cores))}"
+
+
+def apply_scheduling(thread: Thread, wanted: Scheduling) -> None:
+    """Give a thread of ours its class and cores; one that has ended meanwhile is no error.
+
+    Raises OperationError: the kernel refuses.
+    """
+    try:
+        before = state_of(thread.tid)
+        target = after_wish(before, wanted)
+        set_state(thread.tid, target, different_aspects(before, target))
+    except ProcessLookupError:
+        return
+    except OSError as error:
+        raise OperationError(
+            f"thread {thread.tid} ({thread.comm}) of process {thread.pid}: the kernel refuses "
+            f"priority {wanted.priority} on cores {wanted.cores}: {error.strerror}"
+        ) from error
+
+
+def become_fifo(priority: int) -> bool:
+    """Put the calling thread under SCHED_FIFO; False when that is not permitted."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except OSError:
+        return False
+    return True
+
+
 def may_use_fifo() -> bool:
     """Whether SCHED_FIFO is permitted, found by asking for it on a thread that ends at once."""
-    permitted = False
-
-    def ask() -> None:
-        nonlocal permitted
-        try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-            permitted = True
-        except OSError:
-            permitted = False
-
-    thread = threading.Thread(target=ask)
+    answers: list[bool] = []
+    thread = threading.Thread(target=lambda: answers.append(become_fifo(1)))
     thread.start()
     thread.join()
-    return permitted
+    return answers == [True]
 
 
 def available_cores() -> tuple[int, ...]:
-    """The cores this process may run on, ascending."""
     return tuple(sorted(os.sched_getaffinity(0)))
 
 
 def check_cores(cores: dict[int, str]) -> None:
     """Refuse cores that this machine or process does not have.
 
-    ``cores`` maps each core to what asked for it, for the message.
-
-    Raises:
-        PlatformError: a core is not available.
+    ``cores`` maps each core to what asked for it, for the message. Raises PlatformError: a core is
+    not available.
     """
     available = available_cores()
     for core, user in sorted(cores.items()):

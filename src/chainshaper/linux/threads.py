@@ -1,42 +1,26 @@
-"""Threads as the kernel shows them, and giving them class and cores.
-
-The paper's Thread Allocator (section 4.2) schedules executors, which run the callbacks, and DDS
-threads, which carry the messages, differently. This module looks at single threads; which node
-a thread belongs to is found in :mod:`chainshaper.enforcement.threads.allocation`.
+"""Threads as the kernel shows them, and what their names say.
 
 A thread is identified by its id *and* the time at which it started: ids are used again.
+
+An unmodified process shows little more of a thread than its name. Cyclone DDS has always named its
+threads, Fast DDS does from 2.13 on (ROS 2 Jazzy); before that they carry the name of their process.
+The kernel cuts names to 15 bytes, so what may be longer is compared by its beginning.
+
+Upstream: proc(5); Cyclone DDS, `check_thread_properties` in `ddsi_init.c`, and the names given to
+`ddsi_create_thread`; Fast DDS documentation, "Concurrency and multithreading".
 """
 
+import functools
 import os
 from dataclasses import dataclass
 from pathlib import Path
-
-from chainshaper.linux.dds_threads import DdsKind, ThreadRole, dds_kind, role_of
-from chainshaper.values.errors import OperationError
-
-__all__ = [
-    "POLICIES",
-    "RESET_ON_FORK",
-    "SCHED_DEADLINE",
-    "TICK_NS",
-    "Scheduling",
-    "Thread",
-    "apply_scheduling",
-    "find_thread",
-    "foreign_realtime_processes",
-    "has_ended",
-    "innermost_id",
-    "list_threads",
-    "parents",
-    "read_proc",
-    "start_of",
-]
+from typing import Literal, TypeAlias
 
 SCHED_DEADLINE = 6
 RESET_ON_FORK = getattr(os, "SCHED_RESET_ON_FORK", 0x40000000)
 """A flag that shares the word with the policy."""
 TICK_NS = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
-"""The kernel tells the start of a thread in ticks of 10 ms."""
+"""The kernel shows the start of a thread in ticks of 10 ms."""
 
 POLICIES = {
     os.SCHED_OTHER: "SCHED_OTHER",
@@ -48,6 +32,80 @@ POLICIES = {
     7: "SCHED_LITMUS" if Path("/proc/litmus").is_dir() else "SCHED_EXT",
 }
 
+ThreadRole: TypeAlias = Literal["executor", "publisher", "dds", "unknown"]
+"""``publisher``: sends what executors hand over to it (asynchronous publication, section 2.2)."""
+
+DdsKind: TypeAlias = Literal[
+    "asynchronous publisher",
+    "receive",
+    "delivery",
+    "transmit",
+    "event",
+    "discovery",
+    "lease",
+    "garbage collection",
+    "connection",
+    "housekeeping",
+]
+
+_NAMES: dict[str, DdsKind] = {
+    # Cyclone DDS 0.10 and 11. `event`: heartbeats, retransmissions, discovery announcements.
+    "recv": "receive",
+    "recvUC": "receive",
+    "recvMC": "receive",
+    "tev": "event",
+    "gc": "garbage collection",
+    "lease": "lease",
+    "dq.builtins": "discovery",
+    "sendq": "transmit",
+    "fsm": "connection",
+    "debmon": "housekeeping",
+    "threadmon": "housekeeping",
+    # Fast DDS
+    "dds.tcp_accept": "connection",
+    "dds.tcp_keep": "connection",
+    "dds.shm.wdog": "housekeeping",
+    "dds.log": "housekeeping",
+}
+_PREFIXES: tuple[tuple[str, DdsKind], ...] = (
+    # Cyclone DDS: per channel, `user` unless the configuration defines others.
+    ("dq.", "delivery"),
+    ("xmit.", "transmit"),
+    ("tev.", "event"),
+    # Fast DDS: per participant, port, reader.
+    ("dds.asyn.", "asynchronous publisher"),
+    ("dds.udp.", "receive"),
+    ("dds.tcp.", "receive"),
+    ("dds.shm.", "receive"),
+    ("dds.dsha.", "receive"),
+    ("dds.ev.", "event"),
+    ("dds.ds_ev.", "discovery"),
+    ("dds.tls.", "discovery"),
+    ("dds.", "housekeeping"),
+)
+
+
+@functools.lru_cache(maxsize=1024)
+def dds_kind(comm: str) -> DdsKind | None:
+    """What a DDS thread of this name does; None when it is no DDS thread's name."""
+    if comm in _NAMES:
+        return _NAMES[comm]
+    return next((kind for prefix, kind in _PREFIXES if comm.startswith(prefix)), None)
+
+
+def role_of(comm: str, is_main: bool) -> ThreadRole:
+    """The role of a thread of a node's process, as far as its name shows.
+
+    Executors spin on the main thread unless a program arranges it otherwise, and no program
+    renames its main thread to a DDS thread's name.
+    """
+    if is_main:
+        return "executor"
+    kind = dds_kind(comm)
+    if kind == "asynchronous publisher":
+        return "publisher"
+    return "unknown" if kind is None else "dds"
+
 
 @dataclass(frozen=True)
 class Thread:
@@ -55,7 +113,7 @@ class Thread:
 
     ``started`` counts clock ticks (:data:`TICK_NS`) since the machine booted. ``inner_tid`` is
     the id that the thread has for itself: in a container, tracers record that one. ``role`` and
-    ``kind`` are what its name and place say (:mod:`chainshaper.linux.dds_threads`).
+    ``kind`` are what its name and place say.
     """
 
     tid: int
@@ -75,31 +133,10 @@ class Thread:
         return (self.tid, self.started)
 
 
-@dataclass(frozen=True)
-class Scheduling:
-    """What a thread should get; what is None is left alone.
-
-    ``priority`` is that of SCHED_FIFO or, with ``takes_turns``, of SCHED_RR, under which threads
-    of one priority share their time; 0 is an ordinary thread's, of SCHED_OTHER.
-    """
-
-    priority: int | None
-    cores: tuple[int, ...] | None
-    takes_turns: bool = False
-
-    @property
-    def policy(self) -> int:
-        """The scheduling class that goes with ``priority``."""
-        if self.priority == 0:
-            return os.SCHED_OTHER
-        return os.SCHED_RR if self.takes_turns else os.SCHED_FIFO
-
-
 def list_threads(pid: int) -> tuple[Thread, ...]:
     """The threads of a process, main thread first; empty when the process is gone."""
     try:
-        with os.scandir(f"/proc/{pid}/task") as entries:
-            tids = [int(entry.name) for entry in entries]
+        tids = [int(name) for name in os.listdir(f"/proc/{pid}/task")]  # noqa: PTH208 - quicker
         inner_pid = innermost_id(read_proc(f"/proc/{pid}/status").decode(errors="replace"))
     except OSError:
         return ()
@@ -149,10 +186,8 @@ def _thread(pid: int, tid: int, inner_pid: int | None) -> Thread | None:
 
 def parents() -> dict[int, int]:
     """All processes with their parents, by id."""
-    with os.scandir("/proc") as entries:
-        pids = sorted(int(entry.name) for entry in entries if entry.name.isdigit())
     found = {}
-    for pid in pids:
+    for pid in sorted(int(name) for name in os.listdir("/proc") if name.isdigit()):  # noqa: PTH208
         try:
             found[pid] = int(_stat(f"/proc/{pid}")[1][1])
         except OSError:
@@ -163,8 +198,7 @@ def parents() -> dict[int, int]:
 def read_proc(path: str, folder: int | None = None) -> bytes:
     """A whole file of /proc; ``folder`` is an open one that ``path`` begins in.
 
-    Raises:
-        OSError: what it is about has ended, or belongs to somebody else.
+    Raises OSError: what it is about has ended, or belongs to another user.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC, dir_fd=folder)
     try:
@@ -200,7 +234,7 @@ def start_of(pid: int, tid: int) -> int | None:
 
 
 def has_ended(tid: int, started: int) -> bool:
-    """Whether the thread that started then is gone, or a zombie that nobody has waited for."""
+    """Whether the thread that started then is gone, or a zombie."""
     try:
         fields = _stat(f"/proc/{tid}")[1]
     except OSError:
@@ -208,27 +242,16 @@ def has_ended(tid: int, started: int) -> bool:
     return int(fields[19]) != started or fields[0] in {b"Z", b"X"}
 
 
-def apply_scheduling(thread: Thread, wanted: Scheduling) -> None:
-    """Give a thread its class and cores; a thread that has ended meanwhile is no error.
-
-    The class goes first: on a core where a FIFO thread spins, a thread moved there as
-    SCHED_OTHER would not run again to be promoted.
-
-    Raises:
-        OperationError: the kernel refuses.
-    """
+def open_process(pid: int, started: int) -> int | None:
+    """A pidfd of the process that started then, None when it has ended."""
     try:
-        if wanted.priority is not None:
-            os.sched_setscheduler(thread.tid, wanted.policy, os.sched_param(wanted.priority))
-        if wanted.cores is not None:
-            os.sched_setaffinity(thread.tid, wanted.cores)
+        pidfd = os.pidfd_open(pid)
     except ProcessLookupError:
-        return
-    except OSError as error:
-        raise OperationError(
-            f"thread {thread.tid} ({thread.comm}) of process {thread.pid}: the kernel refuses "
-            f"priority {wanted.priority} on cores {wanted.cores}: {error.strerror}"
-        ) from error
+        return None
+    if start_of(pid, pid) == started:
+        return pidfd
+    os.close(pidfd)
+    return None
 
 
 def foreign_realtime_processes() -> tuple[str, ...]:

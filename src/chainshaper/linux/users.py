@@ -1,16 +1,13 @@
 """Which user runs a process, and whose processes a run takes for nodes of its plan.
 
-A node's name is no authentication: every user of the machine can start a process whose command
-line, threads and environment say what a node's say. Only the kernel says who runs a process. So a
-run names users, and what processes of others say about themselves counts for nothing.
+Every user of the machine can start a process whose command line, threads and environment say what a
+node's say. Only the kernel says who runs a process, so a run names users.
 
 A process is a user's when that user both runs it, by all four of its user ids, and has started its
 program. `sudo`, `su` and every other set-user-ID program carry the command line and the environment
-of another user than the one they run as: they are no user's, for as long as they have not started
-another program. Root may start programs for everybody.
-
-In a user namespace of its own a process has the user id that this namespace gives it: outside, and
-so here, a stranger stays a stranger. Who is root in a container without one is root here as well.
+of another user than the one they run as: they are no user's, until they start another program. Root
+may start programs for all. In a user namespace of its own a process has the user id that it has
+outside: a stranger stays a stranger. Who is root in a container without one is root here as well.
 
 Upstream: proc(5), credentials(7), getauxval(3), user_namespaces(7).
 """
@@ -24,8 +21,6 @@ from contextlib import contextmanager, suppress
 from chainshaper.linux.threads import read_proc
 from chainshaper.values.errors import InputError
 
-__all__ = ["process_folder", "run_users", "user_in", "user_name", "user_of"]
-
 _AT_UID = 11
 _AUXILIARY = struct.Struct("@NN")
 
@@ -33,10 +28,8 @@ _AUXILIARY = struct.Struct("@NN")
 def run_users(named: Collection[str | int] = ()) -> frozenset[int]:
     """The ids of users whose processes a run takes, by their names or numbers.
 
-    By default: who has launched us, also by way of `sudo`, and root.
-
-    Raises:
-        InputError: there is no such user.
+    By default: who has launched us, also by way of `sudo`, and root. Raises InputError: there is no
+    such user.
     """
     if named:
         return frozenset(_user_id(one) for one in named)
@@ -72,8 +65,7 @@ def user_name(user: int | None) -> str:
 def process_folder(pid: int) -> Iterator[int]:
     """A process's folder in /proc, open: what is read from it is never another process's.
 
-    Raises:
-        OSError: there is no such process.
+    Raises OSError: there is no such process.
     """
     folder = os.open(f"/proc/{pid}", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -90,11 +82,7 @@ def user_of(pid: int) -> int | None:
 
 
 def user_in(folder: int) -> int | None:
-    """The same from a process's open folder.
-
-    Raises:
-        OSError: the process has ended.
-    """
+    """The same from a process's open folder. Raises OSError: the process has ended."""
     status = read_proc("status", folder)
     line = next(line for line in status.splitlines() if line.startswith(b"Uid:"))
     user, *others = (int(number) for number in line.split()[1:])

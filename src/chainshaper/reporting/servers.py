@@ -5,10 +5,11 @@ from typing import Any
 
 from rich.table import Table
 
-from chainshaper.enforcement.runs.journal import Journal
-from chainshaper.enforcement.runs.state import RunState, ServerState
-from chainshaper.enforcement.threads.server_threads import WantedScheduling
-from chainshaper.linux.threads import POLICIES, Scheduling
+from chainshaper.enforcement.threads import WantedScheduling
+from chainshaper.enforcement.undoing import RunState, ServerState
+from chainshaper.linux.runs import Journal
+from chainshaper.linux.scheduling import Scheduling
+from chainshaper.linux.threads import POLICIES
 from chainshaper.planning.plan import slot_text
 from chainshaper.reporting.cells import terminal_table
 from chainshaper.values.durations import format_duration

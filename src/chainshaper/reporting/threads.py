@@ -4,7 +4,7 @@ from typing import Any
 
 from rich.table import Table
 
-from chainshaper.enforcement.threads.allocation import Allocation, NodeThread
+from chainshaper.enforcement.threads import Allocation, NodeThread
 from chainshaper.reporting.cells import terminal_table
 
 __all__ = ["threads_json", "threads_table"]

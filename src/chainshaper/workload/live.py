@@ -14,16 +14,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from chainshaper.enforcement.runs.governing import Governed, governing, in_force_throughout
 from chainshaper.gate.decision import clock_offset
 from chainshaper.linux.own_processes import LIBRARIES
-from chainshaper.linux.scheduling import check_cores, may_use_fifo
-from chainshaper.linux.threads import (
-    Scheduling,
-    apply_scheduling,
-    foreign_realtime_processes,
-    list_threads,
-)
+from chainshaper.linux.runs import Governed, governing, in_force_throughout
+from chainshaper.linux.scheduling import Scheduling, apply_scheduling, check_cores, may_use_fifo
+from chainshaper.linux.threads import foreign_realtime_processes, list_threads
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import (

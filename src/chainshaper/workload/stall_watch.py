@@ -16,7 +16,8 @@ import numpy.typing as npt
 import polars as pl
 
 from chainshaper.gate.decision import STALL_NS
-from chainshaper.linux.threads import Scheduling, apply_scheduling, list_threads
+from chainshaper.linux.scheduling import Scheduling, apply_scheduling
+from chainshaper.linux.threads import list_threads
 from chainshaper.values.recording import StallMeterInfo
 from chainshaper.workload import stall_meter
 from chainshaper.workload.event_reading import meter_tables

@@ -20,7 +20,7 @@ from scenes import (
     wait_for_state,
 )
 
-from chainshaper.enforcement.scx.requirements import is_realtime_kernel, missing
+from chainshaper.enforcement.scx.back_end import is_realtime_kernel, missing
 
 
 def killing_the_loader_frees_the_threads() -> str:

@@ -47,7 +47,7 @@ def run_checks(say: Any, names: list[str]) -> None:
     sys.path[:0] = ["/src", "/checks"]
     import kernel_checks
 
-    from chainshaper.enforcement.scx.requirements import is_realtime_kernel
+    from chainshaper.enforcement.scx.back_end import is_realtime_kernel
 
     checks = list(kernel_checks.VIRTUAL_TIME)
     if os.cpu_count() == 2:

@@ -1,1 +1,1 @@
-"""Servers in the kernel's own scheduler: a sched_ext policy, its table and its loader."""
+"""Servers in the kernel: a sched_ext policy, its table and its loader."""

@@ -1,14 +1,15 @@
 """A kicker: on PREEMPT_RT, the process that makes one core decide at each slot boundary.
 
+    python -m chainshaper.enforcement.scx.kicker CORE DESCRIPTOR
+
 PREEMPT_RT kernels refuse BPF timers. Instead, a SCHED_FIFO thread of the lowest priority sleeps on
 the core until the next boundary. Waking up, it pushes whatever ran there back to its queue; asleep
-again, it leaves a core that has to look at the table. Boundaries are computed by the policy's own
-program `table_boundary`, which also writes down when the kicker has promised to be back; that is
-done a little after each boundary, so that it does not delay the threads that wait for one.
+again, it leaves a core that has to look at the table. The policy's own program `table_boundary`
+computes boundaries, and writes down when the kicker has promised to be back: a little after each
+boundary, so that it does not delay the threads that wait for one.
 
-One process per core, because in a thread of the loader it would wait for the interpreter's lock,
-and without children, files or output of its own, so that nothing else delays it. It ends by itself
-when the loader has gone. Run as `python -m chainshaper.enforcement.scx.kicker CORE DESCRIPTOR`.
+One process per core, because a thread of the loader would wait for the interpreter's lock, without
+children, files or output of its own. It ends by itself when the loader has gone.
 """
 
 import ctypes
@@ -22,8 +23,6 @@ from chainshaper.linux.own_processes import module_command
 from chainshaper.linux.scheduling import lock_memory, set_thread_name, stop_garbage_collection
 from chainshaper.values.errors import OperationError
 
-__all__ = ["start_kicker"]
-
 PRIORITY = 1
 _CLOCK_MONOTONIC, _TIMER_ABSTIME = 1, 1
 
@@ -31,10 +30,8 @@ _CLOCK_MONOTONIC, _TIMER_ABSTIME = 1, 1
 def start_kicker(core: int, program: int) -> subprocess.Popen[bytes]:
     """Start the kicker of a core; returns when it is at work.
 
-    ``program`` is the file descriptor of `table_boundary`.
-
-    Raises:
-        OperationError: it cannot be started.
+    ``program`` is the file descriptor of `table_boundary`. Raises OperationError: it cannot be
+    started.
     """
     process = subprocess.Popen(
         [*module_command(__name__), str(core), str(program)],

@@ -1,12 +1,9 @@
 """The part of libbpf that a struct_ops policy needs, over ctypes.
 
-libbpf.so.1 comes with every distribution that has BPF at all; binding to it directly saves a
-compiler, a kernel-header package and a Python dependency on the machine. An object file is opened,
-adjusted (constants, flags, programs left out), loaded, and its struct_ops map attached, which
-gives a link. The link is a file descriptor: when the process ends, however it ends, the kernel
-closes it and takes the policy away.
-
-Functions raise OSError with what libbpf said; who knows what the object is for says what to do.
+libbpf.so.1 comes with every distribution that has BPF at all; binding to it saves a compiler, a
+kernel-header package and a Python dependency. An object file is opened, adjusted, loaded, and its
+struct_ops map attached, which gives a link: a file descriptor that the kernel closes when the
+process ends, and takes the policy away. Functions raise OSError with what libbpf said.
 """
 
 import ctypes
@@ -17,16 +14,6 @@ from pathlib import Path
 from typing import Any
 
 from chainshaper.values.errors import PlatformError
-
-__all__ = [
-    "BpfObject",
-    "ProgramRun",
-    "delete_element",
-    "kernel_enum_value",
-    "load_libbpf",
-    "look_up_element",
-    "update_element",
-]
 
 LIBRARY = "libbpf.so.1"
 OLDEST = (1, 4)
@@ -45,11 +32,7 @@ _messages: list[str] = []
 
 @functools.cache
 def load_libbpf() -> Any:
-    """The library, with its functions declared.
-
-    Raises:
-        PlatformError: it is absent or too old.
-    """
+    """The library, with its functions declared. Raises PlatformError: it is absent or too old."""
     remedy = f"install libbpf {OLDEST[0]}.{OLDEST[1]} or newer (Debian 13: apt install libbpf1)"
     try:
         library = ctypes.CDLL(LIBRARY, use_errno=True)
@@ -113,8 +96,7 @@ def _failure(step: str) -> OSError:
 class BpfObject:
     """An object file: opened first, then adjusted, then loaded into the kernel.
 
-    Raises:
-        OSError: libbpf cannot read it.
+    Raises OSError: libbpf cannot read it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -142,8 +124,7 @@ class BpfObject:
     def load(self) -> None:
         """Have the kernel verify and keep all maps and programs.
 
-        Raises:
-            OSError: the kernel refuses; with the last messages of libbpf.
+        Raises OSError: the kernel refuses; with the last messages of libbpf.
         """
         if self._library.bpf_object__load(self._object):
             raise _failure("loading")
@@ -162,8 +143,7 @@ class BpfObject:
     def attach_operations(self, map_name: str) -> int:
         """Put a struct_ops map in force; the address of its link, for :meth:`detach`.
 
-        Raises:
-            OSError: the kernel refuses.
+        Raises OSError: the kernel refuses.
         """
         link: int | None = self._library.bpf_map__attach_struct_ops(self._map(map_name))
         if not link:
@@ -182,11 +162,7 @@ class BpfObject:
 
 
 def update_element(map_descriptor: int, key: int, value: bytes) -> None:
-    """Write one element of a map with 32-bit keys.
-
-    Raises:
-        OSError: the kernel refuses.
-    """
+    """Write one element of a map with 32-bit keys. Raises OSError: the kernel refuses."""
     number = ctypes.c_uint32(key)
     if load_libbpf().bpf_map_update_elem(map_descriptor, ctypes.byref(number), value, 0):
         raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
@@ -195,8 +171,7 @@ def update_element(map_descriptor: int, key: int, value: bytes) -> None:
 def look_up_element(map_descriptor: int, key: int, size: int) -> bytes:
     """Read one element, of ``size`` bytes, of a map with 32-bit keys.
 
-    Raises:
-        OSError: there is none.
+    Raises OSError: there is none.
     """
     number, value = ctypes.c_uint32(key), ctypes.create_string_buffer(size)
     if load_libbpf().bpf_map_lookup_elem(map_descriptor, ctypes.byref(number), value):
@@ -227,11 +202,7 @@ class ProgramRun:
         self.arguments = (descriptor, ctypes.c_void_p(ctypes.addressof(self._options)))
 
     def __call__(self) -> None:
-        """Run it.
-
-        Raises:
-            OSError: the kernel refuses, or the program reports failure.
-        """
+        """Run it. Raises OSError: the kernel refuses, or the program reports failure."""
         failed = self.function(*self.arguments)
         result = _TEST_RUN_OPTIONS.unpack_from(self._options)[9]
         if failed or result:

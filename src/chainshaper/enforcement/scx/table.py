@@ -12,20 +12,6 @@ from typing import TypeAlias
 from chainshaper.enforcement.servers import ReservationServer, ServerCounters, ServerTable
 from chainshaper.values.errors import InputError
 
-__all__ = [
-    "MAX_CORES",
-    "MAX_SERVERS",
-    "PolicyExit",
-    "ServerIds",
-    "change_word",
-    "check_table",
-    "number_servers",
-    "pack_cores",
-    "pack_servers",
-    "unpack_counters",
-    "unpack_exit",
-]
-
 MAX_SERVERS = 128
 """With id 0, which means best effort."""
 MAX_SLOTS = 64
@@ -52,8 +38,7 @@ ServerIds: TypeAlias = Mapping[str, int]
 def check_table(table: ServerTable) -> None:
     """Refuse a table that the policy cannot hold or that contradicts itself.
 
-    Raises:
-        InputError: a limit is exceeded, a name or slot is wrong.
+    Raises InputError: a limit is exceeded, a name or slot is wrong.
     """
     if table.cycle_ns <= 0:
         raise InputError(f"the cycle time is {table.cycle_ns} ns; it must be positive")
@@ -105,8 +90,7 @@ def _check_server(server: ReservationServer, cycle_ns: int) -> None:
 def number_servers(table: ServerTable, known: ServerIds) -> dict[str, int]:
     """Ids for all servers of a table; those in ``known`` keep theirs, even when no longer used.
 
-    Raises:
-        InputError: no id is left.
+    Raises InputError: no id is left.
     """
     ids = dict(known)
     for server in table.servers:

@@ -26,8 +26,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import polars as pl
 
-from chainshaper.linux.node_names import named_nodes
-from chainshaper.linux.processes import Process
+from chainshaper.linux.processes import Process, named_nodes
 from chainshaper.sources.system import processes_of
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS

@@ -1,12 +1,17 @@
-"""When in a cycle does a chain begin? Measured from outside, without a trace.
+"""Where in a cycle a chain begins: measured from outside, watched, and given to shaping nodes.
 
-Servers' cycles must be anchored to the chain (DESIGN section 6): a ROS timer fires at its own phase
-of CLOCK_MONOTONIC, and the slot of the chain's server has to open just after it. The timer wakes
-the executor of the chain's first node, which the kernel counts: the third number of
-`/proc/PID/task/TID/schedstat` is how often a thread was put on a core (sched-stats.rst), the second
-for how long it was ready before that. Watched for some cycles, the wake-ups that come once in every
-cycle at the same place are the timer's; of several such places the one after the longest rest is
-where the chain begins.
+Servers' cycles must be anchored to the chain (DESIGN section 6): the slot of its server has to open
+just after its timer. The timer wakes the executor of the chain's first node, which the kernel
+counts: the third number of `/proc/PID/task/TID/schedstat` is how often a thread was put on a core
+(sched-stats.rst), the second for how long it was ready before that. The wake-ups that come once in
+every cycle at the same place are the timer's; of several such places the one after the longest rest
+is where the chain begins.
+
+Outputs without a stamp (a `geometry_msgs/Twist`, say) are released by the cycle, whose beginning no
+message carries: shaping nodes in ROS 2 get it as a parameter. That takes ROS 2 a second or two, in
+a process of its own, as the user of the nodes' processes and in one's environment; as whom we may
+not run, in ours. Which participant answers under a node's name, DDS does not prove without its
+security plug-ins; two that do are noticed.
 """
 
 import contextlib
@@ -16,22 +21,21 @@ import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+from chainshaper.enforcement.threads import Allocation
+from chainshaper.linux.scheduling import become_fifo, set_state, state_of
 from chainshaper.linux.threads import has_ended, start_of
+from chainshaper.planning.plan import Plan, shaping_nodes
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 
-__all__ = [
-    "DriftWatch",
-    "Phase",
-    "find_drift",
-    "find_phase",
-    "measure_phase",
-    "watch_wake_ups",
-]
+if TYPE_CHECKING:
+    from chainshaper.sources.ros.interpreter import Environment, Script
+
 
 POLL_NS = 250_000
 WATCHER_PRIORITY = 95
@@ -41,6 +45,8 @@ executor that finds its timer expired needs tens."""
 
 SEEN_IN = 0.8
 """A place counts when wake-ups come there in this share of the cycles."""
+_PATIENCE_S = 20
+"""ROS 2 has started and found the nodes by then, however busy the machine is, or never will."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +72,7 @@ def measure_phase(
 ) -> Phase:
     """Watch a thread for some cycles and find its phase.
 
-    Raises:
-        OperationError: it ended, or does not wake up regularly.
+    Raises OperationError: it ended, or does not wake up regularly.
     """
     found = watch_wake_ups(pid, tid, cycles * cycle_ns, progress)
     phase = find_phase(found, cycle_ns, cycles)
@@ -92,12 +97,10 @@ def watch_wake_ups(
 ) -> npt.NDArray[np.int64]:
     """When a thread became ready to run, each time it did (ns of CLOCK_MONOTONIC).
 
-    A wake-up is known to lie between two looks, and the later of them is taken, minus the time
-    that the thread had to wait for its core. Those after which it ran for less than ``least_ns``
-    are left out. ``rest_ns`` says at any time for how long not to look.
-
-    Raises:
-        OperationError: the thread has ended.
+    A wake-up is known to lie between two looks, and the later of them is taken, minus the time that
+    the thread had to wait for its core. Those after which it ran for less than ``least_ns`` are
+    left out. ``rest_ns`` says at any time for how long not to look. Raises OperationError: the
+    thread has ended.
     """
     # When it woke up (0: a rest begins, or the end), and how long it had run by then.
     found: list[tuple[int, int]] = []
@@ -120,7 +123,7 @@ def watch_wake_ups(
                 ran, waited, times = ran_by_now, waited_by_now, times_by_now
                 progress(min(1.0, (now - started) / for_ns))
         if born is None or has_ended(tid, born):
-            raise ProcessLookupError(tid)  # dead, and nobody has waited for it yet
+            raise ProcessLookupError(tid)  # a zombie
     except (OSError, ValueError) as error:
         raise OperationError(
             f"thread {tid} of process {pid} ended while its phase was measured: start the "
@@ -252,10 +255,100 @@ class DriftWatch:
 @contextlib.contextmanager
 def _undisturbed() -> Iterator[None]:
     """The calling thread at a high priority, where it is permitted: it sleeps nearly always."""
-    policy, priority = os.sched_getscheduler(0), os.sched_getparam(0)
-    with contextlib.suppress(PermissionError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(WATCHER_PRIORITY))
+    before = state_of(0)
+    become_fifo(WATCHER_PRIORITY)
     try:
         yield
     finally:
-        os.sched_setscheduler(0, policy, priority)
+        set_state(0, before, ["scheduling_class"])
+
+
+@dataclass(frozen=True)
+class Telling:
+    """Nodes that are being told, by a process of ours, since ``begun`` (s of CLOCK_MONOTONIC).
+
+    ``script`` is None where no node is to be told, or it was ``refused``.
+    """
+
+    nodes: tuple[str, ...]
+    script: "Script | None"
+    begun: float
+    refused: str | None = None
+
+    def is_over(self) -> bool:
+        """Look whether the nodes know, or never will."""
+        late = time.monotonic() - self.begun > _PATIENCE_S
+        return self.script is None or self.script.is_over() or late
+
+    def end(self) -> tuple[str, ...]:
+        """What went wrong, in words: to be called when it is over, or no longer waited for."""
+        problem = self.refused
+        if self.script is not None:
+            late = not self.script.is_over()
+            _, problem = self.script.end()
+            problem = f"ROS 2 did not answer within {_PATIENCE_S} s" if late else problem
+        if problem is None:
+            return ()
+        return (
+            f"{', '.join(self.nodes)} could not be told where cycles begin ({problem}): outputs "
+            "without a stamp of their chain's beginning will not be in time",
+        )
+
+
+NOBODY = Telling((), None, 0.0)
+"""No node is being told."""
+
+
+def tell_phase(plan: Plan, found: Allocation, phase_ns: int) -> Telling:
+    """Begin to set ``phase_ns`` of a plan's shaping nodes, as far as they are ROS 2's.
+
+    ``phase_ns`` is where the chain begins in every cycle, on CLOCK_MONOTONIC. The nodes of a chain
+    are in one domain: any of them has the environment in which all are found.
+    """
+    pids = {
+        node: one.thread.pid
+        for node in (one.thread.node for one in shaping_nodes(plan))
+        for one in found.threads
+        if node in one.nodes
+    }
+    if not pids:
+        return NOBODY
+    # Who reads what ROS 2 shows reads recordings as well, which is slow to import.
+    from chainshaper.sources.ros import script as ros_script
+    from chainshaper.sources.ros.interpreter import start_with_rclpy
+
+    try:
+        environments = {node: _environment_for(pid) for node, pid in pids.items()}
+        nodes = tuple(node for node, one in environments.items() if _is_ros(one))
+        if not nodes:  # they are the live workload's
+            return NOBODY
+        arguments = ("parameter", "phase_ns", str(phase_ns % plan.cycle_ns), *nodes)
+        script = start_with_rclpy(environments[nodes[0]], ros_script.__file__, *arguments)
+    except OperationError as error:
+        return Telling(tuple(pids), None, 0.0, str(error))
+    return Telling(nodes, script, time.monotonic())
+
+
+def _environment_for(pid: int) -> "Environment":
+    """The environment of a node, or ours where nothing of the node's may be run."""
+    from chainshaper.sources.ros.interpreter import environment_of, own_environment
+
+    try:
+        return environment_of(pid)
+    except OperationError:
+        ours = own_environment()
+        if _is_ros(ours):
+            return ours
+        raise
+
+
+def _is_ros(environment: "Environment") -> bool:
+    return "AMENT_PREFIX_PATH" in environment.variables
+
+
+def moved_text(drift_ns: int) -> str:
+    """What to know when nodes are told again."""
+    return (
+        f"the chain's beginning has moved by {format_duration(drift_ns)} since the plan was put in "
+        "force; shaping nodes are told, and outputs without a stamp follow from the next cycle"
+    )

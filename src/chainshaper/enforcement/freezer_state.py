@@ -1,22 +1,34 @@
-"""What the freezer has changed on this machine, as others find it, and putting it back.
+"""What the freezer's processes share: what it has changed on this machine, and its counters.
 
-Whoever survives must be able to put everything back, and so must a stranger after all of a run's
-processes have been killed at once. So the journal says, *before* anything is changed, which servers
-there will be and how the hierarchy was mounted. Cgroups of ours need no line each: their names say
-which process made them and for which server, so they are found even where the journal is gone. A
-group is made directly beneath the one from which its threads came: their way back is its parent,
-for them and for the children that they have had since.
+The journal says, *before* anything is changed, which servers there will be and how the hierarchy
+was mounted. Cgroups of ours need no line each: their names say which process made them and for
+which server, so a stranger finds them even where the journal is gone. A group is made directly
+beneath the one from which its threads came: their way back is its parent, for them and for the
+children that they have had since.
+
+A dispatcher must not wait, so it writes its numbers to memory that others read. Not to a file on a
+disk: a store to a mapped page that is being written back waits for the disk, for 0.1 s and more.
+The memory belongs to the owner, and is reached through its descriptors. All numbers are 64-bit
+integers in the machine's order, each written by one kind of process only:
+
+    the owner    released: servers that need no dispatcher any more
+    per core     beats (moves as long as its process does), acknowledged (the last command carried
+                 out), real time, and by guardians: let go (when they thawed the threads of one that
+                 was still for a moment, ns), silent (it was still for too long)
+    per server   slots, late entries, longest lateness (ns), overruns (-1: unknown), groups lost
 """
 
 import contextlib
+import ctypes
+import mmap
+import os
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from chainshaper.enforcement.runs.journal import Journal
-from chainshaper.enforcement.servers import ReservationServer, ServerTable
+from chainshaper.enforcement.servers import ReservationServer, ServerCounters, ServerTable
 from chainshaper.linux.cgroups import (
     dissolve,
     has_unseen_threads,
@@ -25,23 +37,9 @@ from chainshaper.linux.cgroups import (
     options_before_ours,
     restore_mount,
 )
+from chainshaper.linux.runs import Journal
 from chainshaper.linux.threads import has_ended, start_of
 from chainshaper.values.errors import PlatformError
-
-__all__ = [
-    "FREEZER",
-    "GROUP_PREFIX",
-    "FreezerRun",
-    "group_name",
-    "groups_of",
-    "note_freezer",
-    "read_run",
-    "restore",
-    "restore_stray_mount",
-    "run_of",
-    "stray_groups",
-    "thaw",
-]
 
 FREEZER = "freezer"
 GROUP_PREFIX = "chainshaper-"
@@ -64,16 +62,11 @@ class FreezerRun:
 
 
 def note_freezer(journal: Journal, run: FreezerRun) -> None:
-    """Write down that servers are about to be made.
-
-    Raises:
-        OperationError: it cannot be written.
-    """
+    """Write down that servers are about to be made. Raises OperationError: it cannot be written."""
     journal.note(FREEZER, **{**asdict(run), "page": str(run.page)})
 
 
 def read_run(entry: Mapping[str, Any]) -> FreezerRun:
-    """What :func:`note_freezer` wrote."""
     table, (pid, started) = entry["table"], entry["owner"]
     servers = tuple(
         ReservationServer(**{**one, "slots": tuple((start, end) for start, end in one["slots"])})
@@ -88,7 +81,6 @@ def read_run(entry: Mapping[str, Any]) -> FreezerRun:
 
 
 def run_of(journal: Journal) -> FreezerRun | None:
-    """The freezer's run, None where there is none."""
     return next(iter(journal.read(FREEZER, read_run)), None)
 
 
@@ -116,8 +108,7 @@ def groups_of(run: FreezerRun | None, core: int | None = None) -> tuple[Path, ..
 def stray_groups(journals: Iterable[Journal]) -> tuple[Path, ...]:
     """Groups of ours of none of these journals, and whose owner has ended.
 
-    Those with threads that cannot be seen from here are not ours to judge: their owner is where
-    they are, outside of this container.
+    Not those with threads that cannot be seen from here: their owner is outside of this container.
     """
     known = {run.owner for journal in journals if (run := run_of(journal)) is not None}
 
@@ -130,7 +121,7 @@ def stray_groups(journals: Iterable[Journal]) -> tuple[Path, ...]:
 
 
 def thaw(groups: Iterable[Path]) -> None:
-    """Let the threads of these groups run; one that is gone holds no thread."""
+    """Let the threads of these groups run; one that is gone has no thread."""
     for folder in groups:
         with contextlib.suppress(OSError):
             (folder / "cgroup.freeze").write_text("0")
@@ -170,3 +161,65 @@ def _groups(wanted: Callable[["re.Match[str]"], bool]) -> tuple[Path, ...]:
             continue
         names = ((folder, _NAME.match(folder.name)) for folder in found)
         return tuple(folder for folder, name in names if name is not None and wanted(name))
+
+
+def _numbers(*names: str) -> list[tuple[str, type[ctypes.c_int64]]]:
+    return [(name, ctypes.c_int64) for name in names]
+
+
+class _Core(ctypes.Structure):
+    beats: int
+    acknowledged: int
+    real_time: int
+    let_go: int
+    silent: int
+    _fields_ = _numbers("beats", "acknowledged", "real_time", "let_go", "silent")
+
+
+class _Server(ctypes.Structure):
+    slots: int
+    late: int
+    longest: int
+    overruns: int
+    lost: int
+    _fields_ = _numbers("slots", "late", "longest", "overruns", "lost")
+
+
+class CounterPage:
+    """The numbers of a table's owner, cores and servers, in memory that is theirs."""
+
+    def __init__(self, memory: mmap.mmap, table: ServerTable) -> None:
+        place = ctypes.sizeof(ctypes.c_int64)
+        self.released = ctypes.c_int64.from_buffer(memory)
+        self.cores: dict[int, _Core] = {}
+        for core in sorted({server.core for server in table.servers}):
+            self.cores[core] = _Core.from_buffer(memory, place)
+            place += ctypes.sizeof(_Core)
+        self.servers: dict[str, _Server] = {}
+        for server in table.servers:
+            self.servers[server.name] = _Server.from_buffer(memory, place)
+            place += ctypes.sizeof(_Server)
+
+
+def create_page(table: ServerTable) -> tuple[CounterPage, Path, int]:
+    """Make the memory, all numbers 0; also where others find it, and the descriptor to close."""
+    memory = os.memfd_create("counters")
+    each = ctypes.sizeof(_Core) + ctypes.sizeof(_Server)  # there are not more cores than servers
+    os.truncate(memory, ctypes.sizeof(ctypes.c_int64) + each * len(table.servers))
+    path = Path(f"/proc/{os.getpid()}/fd/{memory}")
+    return open_page(path, table), path, memory
+
+
+def open_page(path: Path, table: ServerTable) -> CounterPage:
+    """Map the numbers of a run. Raises OSError: its owner has ended, or is another user's."""
+    with path.open("r+b") as file:
+        return CounterPage(mmap.mmap(file.fileno(), 0), table)
+
+
+def read_counters(page: CounterPage) -> dict[str, ServerCounters]:
+    return {
+        name: ServerCounters(
+            its.slots, its.late, its.longest, its.overruns if its.overruns >= 0 else None
+        )
+        for name, its in page.servers.items()
+    }

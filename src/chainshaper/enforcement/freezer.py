@@ -2,16 +2,12 @@
 
 Each server's threads are put into cgroups of its own, and a dispatcher on the server's core opens
 and closes these by freezing them (DESIGN section 6). What a slot does not cover does not run, not
-even on an idle core. Nothing happens between slots to a thread that anybody could see but the
-time: futexes, condition variables, sleeps and polls go on as if the thread had been pre-empted.
-Only ``epoll_wait``, ``recvmsg`` with a timeout, ``sigtimedwait`` and ``semtimedop`` return EINTR.
+even on an idle core. A thread sees nothing of it but the time, except that ``epoll_wait``,
+``recvmsg`` with a timeout, ``sigtimedwait`` and ``semtimedop`` return EINTR.
 
-The owner (this process) starts one dispatcher per core. The run's guardians
-(:mod:`chainshaper.enforcement.runs.guardian`) watch over all of them: whichever is lost, no thread
-stays stopped. Should the owner and all guardians be lost at once, a dispatcher undoes the run.
-
-Threads that a gated thread creates, and processes that it forks, are born in its server and stay
-there: they count as its members and are put back with it.
+The owner (this process) starts one dispatcher per core, and the run's guardians watch over all of
+them: whichever is lost, no thread stays stopped. Threads that a gated thread creates, and processes
+that it forks, are born in its server, count as its members and are put back with it.
 """
 
 import contextlib
@@ -22,30 +18,24 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from chainshaper.enforcement.freezer.counters import create_page, read_counters
-from chainshaper.enforcement.freezer.slot_boundaries import (
-    Anchoring,
-    first_anchoring,
-    next_anchoring,
-)
-from chainshaper.enforcement.freezer.state import (
+from chainshaper.enforcement.freezer_state import (
     GROUP_PREFIX,
     FreezerRun,
+    create_page,
     group_name,
     note_freezer,
+    read_counters,
     restore,
     thaw,
 )
-from chainshaper.enforcement.runs.journal import Journal
-from chainshaper.enforcement.runs.processes import DISPATCHER, note_process
-from chainshaper.enforcement.runs.scheduling_memory import release_threads
+from chainshaper.enforcement.scheduling_memory import release_threads
 from chainshaper.enforcement.servers import ServerCounters, ServerTable
+from chainshaper.enforcement.slot_dispatcher import Anchoring, first_anchoring, next_anchoring
 from chainshaper.linux import cgroups
 from chainshaper.linux.own_processes import end_in_words, module_command
+from chainshaper.linux.runs import DISPATCHER, Journal, note_process
 from chainshaper.linux.threads import has_ended, start_of
 from chainshaper.values.errors import InputError, OperationError, PlatformError
-
-__all__ = ["Freezer", "create"]
 
 # Dispatchers listen every 20 ms at the latest, every 200 ms where boundaries leave no room.
 _HEARD_WITHIN_NS = 300_000_000
@@ -59,11 +49,8 @@ def create(
     """Start the processes for a table; nothing is gated yet.
 
     ``journal`` remembers what was there. ``go_on`` is called again and again while something is
-    waited for, and may raise.
-
-    Raises:
-        OperationError: a process of ours does not start.
-        PlatformError: no cgroup v2 here, or a core is missing.
+    waited for, and may raise. Raises OperationError: a process of ours does not start.
+    PlatformError: no cgroup v2 here, or a core is missing.
     """
     cgroups.mount_point()
     return Freezer(table, journal, go_on)
@@ -83,7 +70,7 @@ class Freezer:
         self._born: dict[int, int] = {}
         self._anchoring: Anchoring | None = None
         self._command = 0
-        self._told: dict[int, int] = {}
+        self._sent: dict[int, int] = {}
         self._released = False
         self._pipes: dict[int, int] = {}
         self._dispatchers: dict[int, subprocess.Popen[str]] = {}
@@ -106,10 +93,9 @@ class Freezer:
     def assign(self, tid: int, server: str) -> None:
         """See :meth:`BackEnd.assign`. While armed, a thread whose server is closed stops at once.
 
-        Raises:
-            InputError: there is no such server.
-            OperationError: it belongs to another run, or the servers are no longer in force.
-            PlatformError: its cgroup or our privileges do not allow it.
+        Raises InputError: there is no such server. OperationError: it belongs to another run, or
+        the servers are no longer in force. PlatformError: its cgroup or our privileges do not allow
+        it.
         """
         if server not in self._cores:
             raise InputError(f"no server is named {server}: {', '.join(self._cores)} are")
@@ -143,12 +129,11 @@ class Freezer:
         else:
             anchoring = next_anchoring(self._anchoring, anchor_ns, cycle, earliest)
         for core in self._pipes:
-            self._tell(core, begin_ns=anchoring.begin_ns, end_ns=anchoring.end_ns)
+            self._send(core, begin_ns=anchoring.begin_ns, end_ns=anchoring.end_ns)
         self._anchoring = anchoring
         self._await_answers()
 
     def in_force_from(self) -> int | None:
-        """When (CLOCK_MONOTONIC, ns) the cycles of the latest :meth:`arm` begin."""
         return None if self._anchoring is None else self._anchoring.begin_ns
 
     def members(self) -> dict[str, tuple[int, ...]]:
@@ -180,11 +165,6 @@ class Freezer:
         return self._dispatcher_failure() or lost
 
     def release(self) -> None:
-        """See :meth:`BackEnd.release`.
-
-        Raises:
-            OperationError: something could not be put back; the rest is.
-        """
         if self._released:
             return
         self._released = True
@@ -199,7 +179,7 @@ class Freezer:
 
     def _start_dispatcher(self, core: int) -> "subprocess.Popen[str]":
         reading, self._pipes[core] = os.pipe()
-        command = module_command("chainshaper.enforcement.freezer.slot_dispatcher")
+        command = module_command("chainshaper.enforcement.slot_dispatcher")
         try:
             process = subprocess.Popen(
                 [*command, str(self._journal.path), str(os.getpid()), str(core), str(reading)],
@@ -248,7 +228,6 @@ class Freezer:
         return f"{ended}: {'; '.join(said.splitlines())}" if said else ended
 
     def _lost(self) -> str | None:
-        """What others have taken from us."""
         for server in self.table.servers:
             if self._page.servers[server.name].lost:
                 return (
@@ -273,7 +252,6 @@ class Freezer:
             raise OperationError(f"the servers are no longer in force: {reason}")
 
     def _parent_for(self, tid: int) -> Path:
-        """The group beneath which the thread's own is, or is to be, made."""
         folder = cgroups.cgroup_of(tid)
         if folder in self._groups:
             return folder.parent
@@ -285,25 +263,22 @@ class Freezer:
         return folder
 
     def _make(self, folder: Path, server: str) -> None:
-        """A new group, made and known to its dispatcher."""
         cgroups.make_threaded_child(folder.parent, folder.name)
         self._groups[folder] = server
-        self._tell(self._cores[server], server=server, folder=str(folder))
+        self._send(self._cores[server], server=server, folder=str(folder))
         if self._anchoring is not None:
             self._await_answers()
 
-    def _tell(self, core: int, **fields: str | int) -> None:
-        """Send a dispatcher a command."""
+    def _send(self, core: int, **fields: str | int) -> None:
         self._command += 1
-        self._told[core] = self._command
+        self._sent[core] = self._command
         line = json.dumps({"number": self._command, **fields}) + "\n"
         with contextlib.suppress(BrokenPipeError):  # `failure` will say what has become of it
             os.write(self._pipes[core], line.encode())
 
     def _await_answers(self) -> None:
-        """Until the dispatchers have carried out what they were sent."""
         deadline = time.monotonic() + _ANSWER_S
-        for core, number in self._told.items():
+        for core, number in self._sent.items():
             while self._page.cores[core].acknowledged < number:
                 self._go_on()
                 self._check_in_force()

@@ -1,22 +1,19 @@
 """A guardian: a process that outlives the owner of a run, and undoes what it leaves behind.
 
-    python -m chainshaper.enforcement.runs.guardian OWNER FOLDER READY_FD
+    python -m chainshaper.enforcement.guardian OWNER FOLDER READY_FD
 
-A dispatcher that is killed leaves its threads frozen, and an owner that is killed leaves an
-application under real-time priorities, or in slots, for ever. So every run has guardians, whatever
-its back end. They learn of a death from a pidfd, at once, and of a dispatcher that hangs from the
-sign of life that stands still. Whoever is lost, a guardian undoes all that the journal says.
-
-There are two of them, which do the same: each is there should the other be killed or stopped at
-the same instant as what they watch over. The owner starts anew the one that it has lost. They are
-out of reach of what befalls the application or the owner: each has a session of its own, a cgroup
-that is neither's, and a priority above the dispatchers'.
+Every run has two guardians, whatever its back end, which do the same: each is there should the
+other be killed or stopped at the same instant as what they watch over. They learn of a death from a
+pidfd, at once, and of a dispatcher that hangs from the sign of life that stands still; then they
+undo all that the journal says. The owner starts anew the one that it has lost. They are out of
+reach of what befalls the application or the owner: each has a session of its own, a cgroup that is
+neither's, and a priority above the dispatchers'.
 
 A dispatcher that gives no sign of life for a tenth of a second may hang, or its core may have been
-taken from the machine for a moment. So its threads are let go first, and questions asked later: one
-that comes back closes what has to be closed, at the price of a cycle or less in which a server's
-threads ran freely; one that stays away for half a second has failed. The sign of life must stand
-still over several looks, rather than for some time: that a machine stalls as a whole is no fault.
+taken from the machine for a moment. So its threads are let go first: one that comes back closes
+what has to be closed, at the price of a cycle or less in which a server's threads ran freely; one
+that stays away for half a second has failed. The sign of life must stand still over several looks,
+rather than for some time: that a machine stalls as a whole is no fault.
 """
 
 import contextlib
@@ -30,24 +27,14 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from chainshaper.enforcement.freezer.counters import CounterPage, open_page
-from chainshaper.enforcement.freezer.state import groups_of, run_of, thaw
-from chainshaper.enforcement.runs.claims import claim_run
-from chainshaper.enforcement.runs.journal import FILE, Journal, remembered_journal
-from chainshaper.enforcement.runs.processes import (
-    DISPATCHER,
-    GUARDIAN,
-    note_process,
-    open_process,
-    own_processes,
-)
-from chainshaper.enforcement.runs.undoing import undo_run
-from chainshaper.linux import cgroups
+from chainshaper.enforcement.freezer_state import CounterPage, groups_of, open_page, run_of, thaw
+from chainshaper.enforcement.undoing import claim_run, undo_run
+from chainshaper.linux import cgroups, runs
 from chainshaper.linux.own_processes import module_command, what_happened
-from chainshaper.linux.scheduling import set_thread_name
+from chainshaper.linux.runs import Journal
+from chainshaper.linux.scheduling import become_fifo, set_thread_name
+from chainshaper.linux.threads import open_process
 from chainshaper.values.errors import OperationError
-
-__all__ = ["Guardians", "let_go", "run_claimed", "start_guardians"]
 
 HOW_MANY = 2
 PRIORITY = 98
@@ -71,7 +58,6 @@ class Guardians:
     """By process: the pipe by which it says that it watches."""
 
     def start_one(self) -> None:
-        """Start one, without waiting for it."""
         reading, writing = os.pipe()
         folder = str(self.journal.path.parent)
         try:
@@ -89,11 +75,7 @@ class Guardians:
         self.ready[process.pid] = reading
 
     def await_ready(self, go_on: Callable[[], None] = lambda: None) -> None:
-        """Until they watch. ``go_on`` is called again and again meanwhile, and may raise.
-
-        Raises:
-            OperationError: one does not start.
-        """
+        """Until they watch; ``go_on`` may raise. Raises OperationError: one does not start."""
         for process in self.processes:
             reading = self.ready.pop(process.pid, None)
             if reading is None:
@@ -113,7 +95,6 @@ class Guardians:
                 )
 
     def renew(self) -> None:
-        """Replace those that were killed, or stopped."""
         for lost in [one for one in self.processes if what_happened(one) is not None]:
             lost.kill()
             lost.wait()
@@ -122,7 +103,6 @@ class Guardians:
             self.start_one()
 
     def end(self) -> None:
-        """End them, when nothing is left to undo."""
         for process in self.processes:
             process.kill()
         for process in self.processes:
@@ -139,9 +119,8 @@ def run_claimed(
 ) -> Iterator[Journal]:
     """A run that governs these, watched over: all in its journal is as before when it is over.
 
-    Raises:
-        OperationError, PlatformError: see :func:`.claim_run` and :meth:`Guardians.await_ready`; or
-            not all could be put back.
+    Raises OperationError, PlatformError: see :func:`.claim_run` and :meth:`Guardians.await_ready`;
+    or not all could be put back.
     """
     journal = claim_run(cores, nodes, folder)
     guardians = None
@@ -199,7 +178,6 @@ class _Watch:
         return False
 
     def keep_journal(self) -> bool:
-        """Whether the run goes on."""
         try:
             return self.journal.keep()
         except OSError:  # its folder is gone, and there is no room for another: it is in memory
@@ -219,7 +197,7 @@ class _Watch:
                 self.page = open_page(run.page, run.table)
             except OSError:  # the owner is gone, which its pidfd will say
                 return False
-        for one in own_processes(self.journal, DISPATCHER):
+        for one in runs.own_processes(self.journal, runs.DISPATCHER):
             if one.core is None or one.core in self.seen:
                 continue
             self.seen[one.core], self.still[one.core] = -1, 0
@@ -234,7 +212,6 @@ class _Watch:
         return lost
 
     def forget_dispatchers(self) -> None:
-        """They have ended, or are about to."""
         for pidfd in self.cores:
             self.poll.unregister(pidfd)
             os.close(pidfd)
@@ -266,24 +243,22 @@ def let_go(journal: Journal, page: CounterPage, core: int) -> None:
 
 
 def main() -> None:
-    """Wait, and undo if need be."""
     owner_pid, folder, ready = int(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
     for ignored in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(ignored, signal.SIG_IGN)
     set_thread_name("guardian")
     try:
-        journal = remembered_journal(folder / FILE)
+        journal = runs.remembered_journal(folder / runs.FILE)
     except OSError:
         return  # the run is over already
     with contextlib.suppress(OperationError):  # a full disk: it watches all the same
-        note_process(journal, GUARDIAN, os.getpid())
+        runs.note_process(journal, runs.GUARDIAN, os.getpid())
     cgroups.enter_own_group(GROUP)
     try:
         owner = os.pidfd_open(owner_pid)
         if os.getppid() != owner_pid:
             raise ProcessLookupError(owner_pid)
-        with contextlib.suppress(PermissionError):
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        become_fifo(PRIORITY)
         with contextlib.suppress(BrokenPipeError):
             os.write(ready, b"!")
         os.close(ready)

@@ -1,41 +1,40 @@
 """Changing the class and cores of threads that are not ours, and putting them back.
 
 Before a change, the journal learns what was there and what is wanted. Putting back looks at each
-aspect of a thread (:mod:`.scheduling_state`) by itself. One that is as we set it goes back to what
-it was; one that somebody else has changed since is theirs, and is left and said so. A thread that
-has ended is done with, and one that has its id by now is recognised by its start.
+aspect of a thread (:mod:`chainshaper.linux.scheduling`) by itself. One that is as we set it goes
+back to what it was; one that another program has changed since is left, and named. A thread that
+has ended is done with; one that has its id by now is recognised by its start.
 
 Threads inherit class and cores from those that create them. What an application starts while it is
-changed is put back as well (:func:`restore_inherited`), if it is the application's beyond doubt:
-
-* a thread of a process in the journal, that process being the same (its id *and* its start);
-* a process that descends from one of these, or did when it was last looked
-  (:func:`note_descendants`), with its threads;
-* a thread that was born in a cgroup of ours.
-
-Of these, what started after the change and has what we gave to its family gets its parent's
-original. Everybody else is a stranger, whatever class, core and cgroup they have, and is left
-alone. So is a daemon whose parent ended before anybody looked; :func:`look_alikes` names both.
+changed is put back as well (:func:`restore_inherited`), if it is the application's beyond doubt: a
+thread of a process in the journal, that process being the same (its id *and* its start); a process
+that descends from one of these, or did when it was last looked (:func:`note_descendants`); a thread
+that was born in a cgroup of ours. Of these, what started after the change and has what we gave to
+its family gets its parent's original. All others are strangers, whatever class, core and cgroup
+they have, and are left alone. So is a daemon whose parent ended before a look; :func:`look_alikes`
+names both.
 
 SCHED_DEADLINE has parameters that the kernel admits only together with all others: threads under
 it are refused.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from time import CLOCK_BOOTTIME, clock_gettime_ns
 from typing import Any, Literal, TypeAlias
 
-from chainshaper.enforcement.freezer.state import groups_of, run_of
-from chainshaper.enforcement.runs.journal import Journal, process_of
+from chainshaper.enforcement.freezer_state import groups_of, run_of
 from chainshaper.linux.cgroups import threads_in
 from chainshaper.linux.processes import descendants
-from chainshaper.linux.scheduling_state import (
+from chainshaper.linux.runs import Journal, process_of
+from chainshaper.linux.scheduling import (
     ASPECTS,
-    SchedulingClass,
+    Aspect,
+    Scheduling,
     SchedulingState,
+    after_wish,
+    different_aspects,
     set_state,
-    state_as_json,
     state_from_json,
     state_of,
     state_text,
@@ -44,7 +43,6 @@ from chainshaper.linux.scheduling_state import (
 from chainshaper.linux.threads import (
     SCHED_DEADLINE,
     TICK_NS,
-    Scheduling,
     Thread,
     find_thread,
     list_threads,
@@ -53,29 +51,11 @@ from chainshaper.linux.threads import (
 )
 from chainshaper.values.errors import OperationError, PlatformError
 
-__all__ = [
-    "DESCENDANTS",
-    "KIND",
-    "Change",
-    "Outcome",
-    "change_all",
-    "change_scheduling",
-    "look_alikes",
-    "note_descendants",
-    "note_scheduling",
-    "read_change",
-    "release_threads",
-    "remembered_threads",
-    "restore_inherited",
-    "restore_scheduling",
-]
-
 KIND = "scheduling"
 DESCENDANTS = "descendant"
 
 Fate: TypeAlias = Literal["restored", "unchanged", "ended", "left", "failed"]
-"""``unchanged``: it is as it was already; ``left``: somebody else has changed it since."""
-
+"""``unchanged``: it is as it was already; ``left``: another program has changed it since."""
 
 _GENERATIONS = 5
 
@@ -107,36 +87,25 @@ class Change:
 
     @property
     def identity(self) -> tuple[int, int]:
-        """As of :class:`Thread`."""
         return (self.tid, self.started)
 
 
-def change_scheduling(journal: Journal, thread: Thread, wanted: Scheduling) -> None:
-    """:func:`change_all` for one thread."""
-    change_all(journal, ((thread, wanted),))
-
-
 def change_all(journal: Journal, changes: Iterable[tuple[Thread, Scheduling]]) -> None:
-    """Give threads their class and cores, with what was there in the journal.
+    """Give threads their class and cores, with what was there in the journal, on disk first.
 
-    All is written down together before anything is changed. A thread that has ended meanwhile is
-    no error; one that we gave the same before, and has it, is not written down again.
-
-    Raises:
-        OperationError: one runs under SCHED_DEADLINE, the journal cannot be written (then nothing
-            is changed), or the kernel refuses.
-        PlatformError: the privilege to change one is missing.
+    A thread that has ended meanwhile is no error; one that has what we gave it before is not
+    written down again. Raises OperationError: one runs under SCHED_DEADLINE, the journal cannot be
+    written (then nothing is changed), or the kernel refuses. PlatformError: a privilege is missing.
     """
     targets = []
     for thread, wanted in changes:
         try:
-            targets.append((thread, _target(state_of(thread.tid), wanted)))
+            targets.append((thread, after_wish(state_of(thread.tid), wanted)))
         except ProcessLookupError:
             continue
     for thread, target in note_scheduling(journal, targets):
         try:
-            now = state_of(thread.tid)
-            set_state(thread.tid, target, [a for a in ASPECTS if _differ(now, target, a)])
+            set_state(thread.tid, target, different_aspects(state_of(thread.tid), target))
         except ProcessLookupError:
             continue
         except PermissionError as error:
@@ -157,15 +126,11 @@ def note_scheduling(
 ) -> tuple[tuple[Thread, SchedulingState], ...]:
     """Write down what threads have before each gets its target; those that are to be changed.
 
-    For what is changed by other means than :func:`change_all`.
-
-    Raises:
-        OperationError: one runs under SCHED_DEADLINE, or the journal cannot be written.
+    For what is changed by other means than :func:`change_all`. Raises OperationError: one runs
+    under SCHED_DEADLINE, or the journal cannot be written.
     """
     known = {one.identity: one for one in remembered_threads(journal)}
-    families: dict[int, list[Change]] = {}
-    for one in known.values():
-        families.setdefault(one.pid, []).append(one)
+    families = _by_process(known.values())
     noted, entries = [], []
     for thread, target in changes:
         try:
@@ -197,11 +162,12 @@ def note_scheduling(
 def note_descendants(journal: Journal) -> None:
     """Write down processes that the journal's have started meanwhile, as long as that shows.
 
-    Raises:
-        OperationError: the journal cannot be written.
+    Raises OperationError: the journal cannot be written.
     """
     remembered = remembered_threads(journal)
-    known = {one.pid for one in remembered} | {pid for pid, _ in _descendants_noted(journal)}
+    known = {one.pid for one in remembered} | {
+        pid for pid, _ in journal.read(DESCENDANTS, process_of)
+    }
     new = [pid for pid in _families(journal, remembered) if pid not in known]
     started = ((pid, start_of(pid, pid)) for pid in new)
     entries = [{"pid": pid, "started": when} for pid, when in started if when is not None]
@@ -224,8 +190,7 @@ def restore_scheduling(journal: Journal) -> tuple[Outcome, ...]:
 def release_threads(journal: Journal) -> None:
     """:func:`restore_scheduling`, where all has to be put back.
 
-    Raises:
-        OperationError: the kernel refuses for some threads; the others are as before.
+    Raises OperationError: the kernel refuses for some threads; the others are as before.
     """
     left = [one for one in restore_scheduling(journal) if one.fate == "failed"]
     if left:
@@ -261,10 +226,9 @@ def restore_inherited(journal: Journal) -> tuple[Outcome, ...]:
 
 
 def look_alikes(journal: Journal) -> tuple[str, ...]:
-    """Threads that have a real-time class and cores as we gave them, and are not known as ours.
+    """Threads with a real-time class and cores as we gave them, not known as ours, in words.
 
-    They are strangers, or daemons that left their family before anybody looked: left as they are,
-    and named, in sentences. To be asked before all is undone.
+    They are strangers, or daemons that left their family before a look. Ask before the undoing.
     """
     remembered = [] if journal.outdated else remembered_threads(journal)
     known = {one.identity for one in remembered}
@@ -302,9 +266,7 @@ def _born_of(journal: Journal, remembered: list[Change]) -> list[tuple[Thread, l
 
 def _families(journal: Journal, remembered: list[Change]) -> dict[int, list[Change]]:
     """Processes that are the application's, each with the changes that it may have inherited."""
-    families: dict[int, list[Change]] = {}
-    for one in remembered:
-        families.setdefault(one.pid, []).append(one)
+    families = _by_process(remembered)
     # A process that had begun when its thread was changed is still the same.
     families = {
         pid: family
@@ -312,7 +274,7 @@ def _families(journal: Journal, remembered: list[Change]) -> dict[int, list[Chan
         if (begun := start_of(pid, pid)) is not None
         and begun <= min(one.changed_at for one in family)
     }
-    for pid, started in _descendants_noted(journal):
+    for pid, started in journal.read(DESCENDANTS, process_of):
         if start_of(pid, pid) == started:
             families.setdefault(pid, remembered)
     parent_of = parents() if families else {}
@@ -322,16 +284,11 @@ def _families(journal: Journal, remembered: list[Change]) -> dict[int, list[Chan
     return families
 
 
-def _descendants_noted(journal: Journal) -> tuple[tuple[int, int], ...]:
-    return journal.read(DESCENDANTS, process_of)
-
-
-def _target(now: SchedulingState, wanted: Scheduling) -> SchedulingState:
-    """What a thread has after a wish is fulfilled: what the wish leaves open stays."""
-    if wanted.priority is not None:
-        held = SchedulingClass(wanted.policy, wanted.priority, now.scheduling_class.reset_on_fork)
-        now = replace(now, scheduling_class=held)
-    return now if wanted.cores is None else replace(now, cores=tuple(sorted(wanted.cores)))
+def _by_process(changes: Iterable[Change]) -> dict[int, list[Change]]:
+    families: dict[int, list[Change]] = {}
+    for one in changes:
+        families.setdefault(one.pid, []).append(one)
+    return families
 
 
 def _restore(one: Change) -> Outcome:
@@ -339,8 +296,8 @@ def _restore(one: Change) -> Outcome:
         return Outcome(one.tid, one.comm, "ended")
     try:
         now = state_of(one.tid)
-        different = [aspect for aspect in ASPECTS if _differ(now, one.original, aspect)]
-        ours = [a for a in different if any(not _differ(now, given, a) for given in one.given)]
+        different = different_aspects(now, one.original)
+        ours = [a for a in different if _has_been_given(now, one, a)]
         set_state(one.tid, one.original, ours)
     except ProcessLookupError:
         return Outcome(one.tid, one.comm, "ended")
@@ -360,7 +317,7 @@ def _disinherit(thread: Thread, family: list[Change]) -> Outcome | None:
         target = _without_inheritance(now, thread.started, family)
         if target == now:
             return None
-        set_state(thread.tid, target, [a for a in ASPECTS if _differ(now, target, a)])
+        set_state(thread.tid, target, different_aspects(now, target))
     except ProcessLookupError:
         return None
     except OSError as error:
@@ -374,43 +331,47 @@ def _without_inheritance(
 ) -> SchedulingState:
     """A thread's scheduling with every aspect that is one of ours replaced by its parent's.
 
-    Which thread was the parent nobody records: the first in the journal with that aspect is
+    The kernel records no parent of a thread: the first in the journal with that aspect is
     taken. Threads that share a class with us there mostly shared one before.
     """
     for aspect in ASPECTS:
         for one in family:
-            if started < one.changed_at or not _differ(state, one.original, aspect):
-                continue
-            if any(not _differ(state, given, aspect) for given in one.given):
+            if (
+                started >= one.changed_at
+                and aspect in different_aspects(state, one.original)
+                and _has_been_given(state, one, aspect)
+            ):
                 state = with_aspect(state, aspect, one.original)
                 break
     return state
 
 
+def _has_been_given(state: SchedulingState, one: Change, aspect: Aspect) -> bool:
+    return any(getattr(state, aspect) == getattr(given, aspect) for given in one.given)
+
+
 def read_change(entry: Mapping[str, Any]) -> Change:
-    """A line of the journal as a value."""
-    before, given = state_from_json(entry["before"]), state_from_json(entry["given"])
+    before, given = (state_from_json(entry[name]) for name in ("before", "given"))
     tid, started, pid, at = (int(entry[name]) for name in ("tid", "started", "pid", "at"))
     return Change(tid, started, pid, str(entry["comm"]), at, before, (given,))
 
 
 def _as_entry(thread: Thread, before: SchedulingState, target: SchedulingState) -> dict[str, Any]:
-    """What :func:`read_change` reads."""
     return {
         "tid": thread.tid,
         "started": thread.started,
         "pid": thread.pid,
         "comm": thread.comm,
         "at": clock_gettime_ns(CLOCK_BOOTTIME) // TICK_NS,
-        "before": state_as_json(before),
-        "given": state_as_json(target),
+        "before": asdict(before),
+        "given": asdict(target),
     }
 
 
 def remembered_threads(journal: Journal) -> list[Change]:
     """The threads of a journal, each with its changes joined, in order of their first change.
 
-    Where somebody else changed an aspect between two changes of ours, theirs is the original.
+    Where another program changed an aspect between two changes of ours, theirs is the original.
     """
     threads: dict[tuple[int, int], Change] = {}
     for change in journal.read(KIND, read_change):
@@ -421,12 +382,8 @@ def remembered_threads(journal: Journal) -> list[Change]:
         original = earlier.original
         for aspect in ASPECTS:
             known = (original, *earlier.given)
-            if all(_differ(change.original, one, aspect) for one in known):
+            if all(aspect in different_aspects(change.original, one) for one in known):
                 original = with_aspect(original, aspect, change.original)
         given = (*earlier.given, *change.given)
         threads[change.identity] = replace(earlier, original=original, given=given)
     return list(threads.values())
-
-
-def _differ(one: SchedulingState, other: SchedulingState, aspect: str) -> bool:
-    return bool(getattr(one, aspect) != getattr(other, aspect))

@@ -1,23 +1,28 @@
 """The dispatcher: a process that opens and closes the servers of one core, on that core.
 
+    python -m chainshaper.enforcement.slot_dispatcher JOURNAL OWNER CORE COMMANDS_FD
+
 It sleeps until a boundary, writes ``1`` to the ``cgroup.freeze`` of what closes and then ``0`` to
 that of what opens, and sleeps again. It runs on the core that it gates, above everything there:
-the timer interrupt alone takes the core from a thread whose slot has ended, whatever the writing
-costs afterwards, so a slot is left exactly. The price is that the next thread runs only when the
-dispatcher sleeps again; so between waking and sleeping it does nothing that can wait. All else is
-done at **ticks** between boundaries: counting, commands of the owner, the sign of life, and
-looking for overruns.
+the timer interrupt alone takes the core from a thread whose slot has ended, so a slot is left
+exactly. The price is that the next thread runs only when the dispatcher sleeps again; so between
+waking and sleeping it does nothing that can wait. All else is done at **ticks** between boundaries:
+counting, commands of the owner, the sign of life, and looking for overruns.
 
 A thread that is caught in user mode by the end of its slot still wanted to run: an overrun. The
-kernel remembers for a frozen thread where it was, and shows it in ``/proc/TID/syscall``; -1 is
-user mode. (Its state says nothing any more: freezing wakes sleepers.) A thread that is caught
-inside a system call passes for one that waits.
+kernel shows where a frozen thread was in ``/proc/TID/syscall``; -1 is user mode. (Its state says
+nothing any more: freezing wakes sleepers.) One caught inside a system call passes for one that
+waits.
 
-It must never leave threads frozen: it thaws them however it ends, and ends when the owner is gone.
-Only SIGKILL and SIGSTOP prevent that, which is what guardians are for. Should those be gone
-together with the owner, it undoes the whole run.
+It thaws its threads however it ends, and ends when the owner is gone. Only SIGKILL and SIGSTOP
+prevent that, which is what guardians are for. Should those be gone together with the owner, it
+undoes the whole run.
 
-    python -m chainshaper.enforcement.freezer.slot_dispatcher JOURNAL OWNER CORE COMMANDS_FD
+A table becomes a list of **boundaries**: instants of the cycle with the servers that are open from
+there on. Slots are half-open, so nothing is open twice. A boundary stands at 0 always, because
+cycles of another anchor may begin there. Moving to another anchor must let no thread slip between:
+either the old cycle is cut short by less than half of its length, or all servers wait, closed, for
+less than that.
 """
 
 import contextlib
@@ -27,27 +32,24 @@ import signal
 import sys
 import time
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
 
-from chainshaper.enforcement.freezer.counters import CounterPage, open_page
-from chainshaper.enforcement.freezer.slot_boundaries import (
-    Anchoring,
-    Boundary,
-    boundaries_of,
-    moved,
-)
-from chainshaper.enforcement.freezer.state import run_of
-from chainshaper.enforcement.runs.journal import remembered_journal
+from chainshaper.enforcement.freezer_state import CounterPage, open_page, run_of
 from chainshaper.enforcement.servers import ServerTable
 from chainshaper.gate.decision import sleep_until, watch_until
-from chainshaper.linux.scheduling import lock_memory, set_thread_name, stop_garbage_collection
+from chainshaper.linux.runs import remembered_journal
+from chainshaper.linux.scheduling import (
+    become_fifo,
+    lock_memory,
+    set_thread_name,
+    stop_garbage_collection,
+)
 from chainshaper.values.errors import ChainshaperError, OperationError, PlatformError
 from chainshaper.values.safe_text import shown
-
-__all__ = ["Dispatcher", "main"]
 
 PRIORITY = 97
 LATE_NS = 100_000
@@ -60,8 +62,121 @@ _FAR = 1 << 62
 _NOTHING: frozenset[int] = frozenset()
 
 
+@dataclass(frozen=True)
+class Boundary:
+    """From ``offset_ns`` into the cycle on, exactly the servers in ``open`` are open.
+
+    ``starts`` are those of them of which a slot begins here. Servers are counted by their place
+    in the table.
+    """
+
+    offset_ns: int
+    open: frozenset[int]
+    starts: frozenset[int]
+
+
+@dataclass(frozen=True)
+class Anchoring:
+    """Cycles start at ``begin_ns`` and every cycle time thereafter; the old ones end at ``end_ns``.
+
+    Both are instants of CLOCK_MONOTONIC. The earlier of the two is when the old cycles are left.
+    """
+
+    begin_ns: int
+    end_ns: int
+
+
+def boundaries_of(
+    cycle_ns: int, slots: tuple[tuple[tuple[int, int], ...], ...]
+) -> tuple[Boundary, ...]:
+    """The boundaries of one cycle, ascending; ``slots`` has one entry per server.
+
+    >>> [(b.offset_ns, set(b.open)) for b in boundaries_of(10, (((0, 4),), ((4, 10),)))]
+    [(0, {0}), (4, {1})]
+    """
+    offsets = {0} | {edge % cycle_ns for own in slots for slot in own for edge in slot}
+    return tuple(
+        Boundary(
+            offset,
+            frozenset(
+                server
+                for server, own in enumerate(slots)
+                if any(start <= offset < end for start, end in own)
+            ),
+            frozenset(
+                server for server, own in enumerate(slots) if any(s == offset for s, _ in own)
+            ),
+        )
+        for offset in sorted(offsets)
+    )
+
+
+def instants(
+    boundaries: tuple[Boundary, ...], cycle_ns: int, begin_ns: int
+) -> Iterator[tuple[int, Boundary]]:
+    """Every boundary with its time (ns), without end, from the cycle at ``begin_ns`` on.
+
+    Where nothing changes no dispatcher wakes up: from the second cycle on such a boundary (only
+    the one at 0 can be) is left out.
+    """
+    first, last = boundaries[0], boundaries[-1]
+    idle = len(boundaries) > 1 and first.open == last.open and not first.starts
+    for boundary in boundaries:
+        yield begin_ns + boundary.offset_ns, boundary
+    while True:
+        begin_ns += cycle_ns
+        for boundary in boundaries[1:] if idle else boundaries:
+            yield begin_ns + boundary.offset_ns, boundary
+
+
+def moved(
+    ahead: Iterator[tuple[int, Boundary]],
+    anchoring: Anchoring,
+    boundaries: tuple[Boundary, ...],
+    cycle_ns: int,
+) -> Iterator[tuple[int, Boundary]]:
+    """The boundaries ``ahead`` until the new anchoring's turn comes, and its own from there on."""
+    turn = min(anchoring.begin_ns, anchoring.end_ns)
+    for at, boundary in ahead:
+        if at >= turn:
+            break
+        yield at, boundary
+    del ahead  # it may itself be a stream that was moved: only the last move matters now
+    if anchoring.end_ns < anchoring.begin_ns:
+        yield anchoring.end_ns, Boundary(cycle_ns, frozenset(), frozenset())
+    yield from instants(boundaries, cycle_ns, anchoring.begin_ns)
+
+
+def first_anchoring(anchor_ns: int, cycle_ns: int, earliest_ns: int) -> Anchoring:
+    """The first start of a cycle at or after ``earliest_ns``; before it nothing is enforced."""
+    begin = anchor_ns + -((anchor_ns - earliest_ns) // cycle_ns) * cycle_ns
+    return Anchoring(begin, begin)
+
+
+def next_anchoring(
+    in_force: Anchoring, anchor_ns: int, cycle_ns: int, earliest_ns: int
+) -> Anchoring:
+    """From the anchoring in force to another anchor, at the first end of a cycle that allows it.
+
+    ``earliest_ns`` is when the change may happen at the earliest. Worked by hand, cycle time 100,
+    cycles at 0, 100, 200, …, not before 950:
+
+        >>> next_anchoring(Anchoring(0, 0), 30, 100, 950)       # wait, closed, from 1000 to 1030
+        Anchoring(begin_ns=1030, end_ns=1000)
+        >>> next_anchoring(Anchoring(0, 0), 80, 100, 950)       # cut the cycle from 900 short
+        Anchoring(begin_ns=980, end_ns=1000)
+    """
+    end = first_anchoring(in_force.begin_ns, cycle_ns, max(earliest_ns, in_force.begin_ns)).begin_ns
+    shift = (anchor_ns - end) % cycle_ns
+    if shift > cycle_ns // 2:
+        shift -= cycle_ns
+    if end + shift < earliest_ns:
+        end += cycle_ns
+    return Anchoring(end + shift, end)
+
+
 class OpenGroup(NamedTuple):
-    """Files of a cgroup that are held open: looking up a path takes longer than writing."""
+    """Open files of a cgroup: looking up a path takes longer than writing."""
 
     freeze: int
     threads: int
@@ -91,11 +206,7 @@ class Dispatcher:
         self.owner = owner
 
     def run(self) -> None:
-        """Until the owner or a signal ends it.
-
-        Raises:
-            OperationError: the owner is gone.
-        """
+        """Until the owner or a signal ends it. Raises OperationError: the owner is gone."""
         while True:
             self._tick_until_boundary()
             at, boundary = self.upcoming
@@ -103,7 +214,7 @@ class Dispatcher:
             closing, opening = self._changes(boundary)
             rest = min(_REST_NS, (following[0] - at) // 2)
             if opening and not closing and self.open == _NOTHING:
-                # Waking an idle core takes longest, and nobody of ours runs who could be delayed.
+                # Waking an idle core takes longest, and delays no thread of ours now.
                 sleep_until(at - _WATCH_NS)
                 watch_until(at)
             else:
@@ -124,18 +235,15 @@ class Dispatcher:
             self.upcoming = following
 
     def thaw_all(self) -> None:
-        """Let every thread run."""
         for server in range(len(self.groups)):
             self._write(server, b"0")
         self.open = None
 
     def _changes(self, boundary: Boundary) -> tuple[list[int], list[int]]:
-        """Servers to close and servers to open at a boundary."""
         before = frozenset(range(len(self.groups))) if self.open is None else self.open
         return sorted(before - boundary.open), sorted(boundary.open - before)
 
     def _note(self, boundary: Boundary, closed: list[int], lateness: int) -> None:
-        """What a switch has to leave behind for later."""
         for server in boundary.starts:
             counters = self.counters[server]
             counters.slots += 1
@@ -153,7 +261,7 @@ class Dispatcher:
             self._drop_lost(server, value)
 
     def _drop_lost(self, server: int, value: bytes) -> None:
-        """Somebody removed a group, which takes its threads away from us: the others go on."""
+        """A group was removed, which takes its threads away from us: the others go on."""
         for folder, group in list(self.groups[server].items()):
             try:
                 os.pwrite(group.freeze, value, 0)
@@ -217,7 +325,6 @@ class Dispatcher:
                 self.counters[server].overruns += 1
 
     def _obey(self) -> None:
-        """Carry out the owner's commands."""
         try:
             while True:
                 received = os.read(self.commands, 65536)
@@ -241,7 +348,7 @@ class Dispatcher:
                 os.open(f"{folder}/cgroup.freeze", os.O_WRONLY | os.O_CLOEXEC),
                 os.open(f"{folder}/cgroup.threads", os.O_RDONLY | os.O_CLOEXEC),
             )
-        except OSError:  # somebody was quick to remove it
+        except OSError:  # another process was quick to remove it
             self.counters[server].lost += 1
             return
         closed = self.open is not None and server not in self.open
@@ -283,17 +390,10 @@ def overrun(groups: Iterable[int]) -> bool | None:
 def become_real_time(core: int) -> bool:
     """Highest class first, then the core, then memory; False when the class is not permitted.
 
-    The class goes first: on a core where a SCHED_FIFO thread spins, a process that moves there
-    as SCHED_OTHER would not run again.
-
-    Raises:
-        PlatformError: the core is not available.
+    The class goes first: on a core where a SCHED_FIFO thread spins, a process that moves there as
+    SCHED_OTHER would not run again. Raises PlatformError: the core is not available.
     """
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-        permitted = True
-    except PermissionError:
-        permitted = False
+    permitted = become_fifo(PRIORITY)
     try:
         os.sched_setaffinity(0, {core})
     except OSError as error:
@@ -311,7 +411,6 @@ def _end(_number: int, _frame: FrameType | None) -> None:
 
 
 def main() -> None:
-    """The process of one core, as the owner starts it."""
     path, owner, core, commands = Path(sys.argv[1]), *map(int, sys.argv[2:5])
     signal.signal(signal.SIGTERM, _end)
     for ignored in (signal.SIGINT, signal.SIGHUP):
@@ -331,7 +430,7 @@ def main() -> None:
         with contextlib.suppress(OSError):  # the owner may be gone, who would read it
             sys.stderr.write(shown(str(error)) + "\n")
         # Guardians have learnt of it earlier. If there is none left, it is for us.
-        from chainshaper.enforcement.runs.undoing import undo_run
+        from chainshaper.enforcement.undoing import undo_run
 
         undo_run(journal)
         sys.exit(error.exit_code)

@@ -1,58 +1,59 @@
 """The back end `litmus`: the paper's own servers, where the kernel is LITMUS^RT.
 
-The P-RES plugin implements table-driven reservations (paper, section 2.2.1): threads of one server
-take turns, a smaller priority is better, and the kernel does the gating. All is done by the tools
-that come with LITMUS^RT, with the commands of :mod:`.resctl`, which can be printed instead.
+The P-RES plugin implements table-driven reservations (paper, section 2.2.1). All is done by the
+tools that come with LITMUS^RT, with commands that can be printed instead.
 
-A reservation cannot be changed. Another anchor makes new reservations, and each thread moves by
-itself: for the two milliseconds that a command takes, it runs freely. Threads that are created by
-one in a reservation run in it as well, so threads are attached one by one, after those of DDS
-exist.
+A reservation cannot be changed, listed or deleted by itself: all go when the plugin is changed,
+which the kernel refuses while a thread is under SCHED_LITMUS. Another anchor makes new
+reservations, and each thread moves by itself: for the two milliseconds that a command takes, it
+runs freely. Threads that are created by one in a reservation run in it as well, so threads are
+attached one by one, after those of DDS exist, and detached by giving them another class.
+
+`resctl` reads times as decimal milliseconds, turns them into a C double, multiplies it by a million
+and drops what is behind the point, so a text is chosen that survives this. Intervals are written
+half-open, `[2,86)`, which ends one nanosecond earlier than `[2,86]`: `resctl` refuses a closed
+interval that ends with the major cycle, and takes `[2,86] [86,87]` for overlapping. They must
+ascend; the kernel wants two nanoseconds at least and 1024 intervals at most. A table counts from
+time zero of CLOCK_MONOTONIC; another anchor is reached by turning the slots.
+
+Upstream: liblitmus, `bin/resctl.c`, `doc/howto-use-resctl.md`, `doc/table-driven-scheduling.md`;
+LITMUS^RT, `litmus/reservations/alloc.c`.
 """
 
 import contextlib
 import os
 import subprocess
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from chainshaper.enforcement.litmus.resctl import (
-    NO_PLUGIN,
-    PLUGIN,
-    Command,
-    attach_command,
-    create_command,
-    litmus_commands,
-    plugin_command,
-    reservation_ids,
-)
-from chainshaper.enforcement.runs.journal import Journal
-from chainshaper.enforcement.runs.scheduling_memory import note_scheduling, release_threads
-from chainshaper.enforcement.servers import ServerCounters, ServerTable
+from chainshaper.enforcement.scheduling_memory import note_scheduling, release_threads
+from chainshaper.enforcement.servers import ReservationServer, ServerCounters, ServerTable
 from chainshaper.linux.own_processes import is_installed, tool_environment
-from chainshaper.linux.scheduling_state import SchedulingClass, state_of
+from chainshaper.linux.runs import Journal
+from chainshaper.linux.scheduling import SchedulingClass, set_state, state_of
 from chainshaper.linux.threads import find_thread
+from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError, PlatformError
-
-__all__ = ["Litmus", "create", "restore_plugin"]
 
 SCHED_LITMUS = 7
 PROC = Path("/proc/litmus")
 NOTE = "litmus-plugin"
 COMMAND_S = 10.0
+Command = tuple[str, ...]
+MOST_INTERVALS = 1024
+SHORTEST_NS = 2
+PLUGIN = "P-RES"
+NO_PLUGIN = "Linux"
 
 
 def create(table: ServerTable, journal: Journal, proc: Path = PROC) -> "Litmus":
     """Prepare servers; nothing is changed before :meth:`Litmus.arm`.
 
-    What was there is kept in ``journal``. ``proc`` is where LITMUS^RT shows itself.
-
-    Raises:
-        PlatformError: the kernel is not LITMUS^RT, or its tools are not installed.
-        OperationError: somebody else uses the plugin.
-        InputError: the table has what LITMUS^RT cannot do.
+    ``journal`` remembers what was there, ``proc`` is where LITMUS^RT shows itself. Raises
+    PlatformError: the kernel is not LITMUS^RT, or its tools are not installed. OperationError:
+    others use the plugin. InputError: the table has what LITMUS^RT cannot do.
     """
     if not proc.is_dir():
         raise PlatformError(
@@ -90,12 +91,6 @@ class Litmus:
         self._since_ns: int | None = None
 
     def assign(self, tid: int, server: str) -> None:
-        """Put a thread into a server; one that has ended is passed over.
-
-        Raises:
-            InputError: no such server.
-            OperationError: LITMUS^RT refuses.
-        """
         names = [one.name for one in self._table.servers]
         if server not in names:
             raise InputError(f"no server {server!r}: choose of {', '.join(names)}")
@@ -104,11 +99,6 @@ class Litmus:
             self._attach(tid)
 
     def arm(self, anchor_ns: int) -> None:
-        """Create the reservations, and move all threads into them.
-
-        Raises:
-            OperationError: LITMUS^RT refuses; what was done before stays until the release.
-        """
         if not self._ids:
             self._journal.note(NOTE, previous=_active_plugin(self._proc), proc=str(self._proc))
             _run(plugin_command(PLUGIN))
@@ -123,25 +113,17 @@ class Litmus:
         self._since_ns = time.monotonic_ns()
 
     def in_force_from(self) -> int | None:
-        """See :meth:`BackEnd.in_force_from`."""
         return self._since_ns
 
     def counters(self) -> dict[str, ServerCounters]:
-        """Nothing is counted: LITMUS^RT does not tell."""
         return {server.name: ServerCounters() for server in self._table.servers}
 
     def failure(self) -> str | None:
-        """Whether somebody has changed the plugin."""
         if not self._ids or (active := _active_plugin(self._proc)) == PLUGIN:
             return None
         return f"somebody has changed the scheduler plugin from {PLUGIN} to {active}"
 
     def release(self) -> None:
-        """Threads as they were, no reservations, the plugin that was active.
-
-        Raises:
-            OperationError: the kernel refuses; the message says what is left.
-        """
         self._ids = {}
         release_threads(self._journal)
         restore_plugin(self._journal)
@@ -170,9 +152,7 @@ def restore_plugin(journal: Journal) -> None:
     """Activate the plugin that was active before ours, from any process; harmless when repeated.
 
     To be called when the threads are restored: the kernel changes no plugin that has threads.
-
-    Raises:
-        OperationError: it refuses.
+    Raises OperationError: it refuses.
     """
     notes = journal.entries(NOTE)
     if not notes or journal.outdated:
@@ -186,7 +166,9 @@ def restore_plugin(journal: Journal) -> None:
 
 def _leave_reservation(tid: int) -> None:
     try:
-        os.sched_setscheduler(tid, os.SCHED_OTHER, os.sched_param(0))
+        ordinary = SchedulingClass(os.SCHED_OTHER, 0, reset_on_fork=False)
+        left = replace(state_of(tid), scheduling_class=ordinary)
+        set_state(tid, left, ["scheduling_class"])
     except ProcessLookupError:
         return
     except OSError as error:
@@ -204,7 +186,7 @@ def _active_plugin(proc: Path) -> str:
         ) from error
 
 
-def _run(command: Command | Sequence[str]) -> None:
+def _run(command: Command) -> None:
     """Run a command of LITMUS^RT's; its complaint becomes ours."""
     try:
         done = subprocess.run(
@@ -224,3 +206,104 @@ def _run(command: Command | Sequence[str]) -> None:
             f"`{' '.join(command)}`: {reason}; LITMUS^RT's own words are in the kernel's log "
             "(`dmesg`)"
         )
+
+
+def litmus_commands(
+    table: ServerTable, members: Mapping[str, Sequence[int | str]], anchor_ns: int
+) -> tuple[Command, ...]:
+    """All commands that put a table in force, in order; ``members`` are thread ids by server.
+
+    What stands for a thread that does not run yet may be a text. Raises InputError: the table has
+    what LITMUS^RT cannot do.
+    """
+    ids = reservation_ids(table)
+    return (
+        plugin_command(PLUGIN),
+        *(
+            create_command(ids[server.name], server, table.cycle_ns, anchor_ns)
+            for server in table.servers
+        ),
+        *(
+            attach_command(tid, ids[server.name], server.core)
+            for server in table.servers
+            for tid in members.get(server.name, ())
+        ),
+    )
+
+
+def reservation_ids(table: ServerTable, generation: int = 0) -> dict[str, int]:
+    """An id per server and core, `core x 1000 + index`, different in every generation."""
+    first = generation * len(table.servers) + 1
+    return {s.name: s.core * 1000 + index for index, s in enumerate(table.servers, start=first)}
+
+
+def plugin_command(plugin: str) -> Command:
+    return ("setsched", plugin)
+
+
+def create_command(
+    number: int, server: ReservationServer, cycle_ns: int, anchor_ns: int
+) -> Command:
+    """The reservation of a server whose cycles start at ``anchor_ns`` (CLOCK_MONOTONIC).
+
+    Raises InputError: it has more slots, or a shorter one, than the kernel takes.
+    """
+    slots = turned(server.slots, cycle_ns, anchor_ns)
+    if len(slots) > MOST_INTERVALS:
+        raise InputError(
+            f"server {server.name} has {len(slots)} slots, and LITMUS^RT takes {MOST_INTERVALS} "
+            "in a reservation: use a shorter cycle, or another back end"
+        )
+    for start, end in server.slots:
+        if end - start < SHORTEST_NS:
+            raise InputError(
+                f"server {server.name}: the slot at {format_duration(start)} is shorter than "
+                f"{SHORTEST_NS} ns, the least that LITMUS^RT takes: make it longer"
+            )
+    return (
+        *("resctl", "-n", str(number), "-t", "table-driven", "-c", str(server.core)),
+        *("-m", milliseconds_text(cycle_ns), "-q", str(server.priority)),
+        *(interval_text(start, end) for start, end in slots),
+    )
+
+
+def attach_command(tid: int | str, number: int, core: int) -> Command:
+    return ("resctl", "-a", str(tid), "-r", str(number), "-c", str(core))
+
+
+def interval_text(start_ns: int, end_ns: int) -> str:
+    """A half-open interval: ``[2,86.5)``."""
+    return f"[{milliseconds_text(start_ns)},{milliseconds_text(end_ns)})"
+
+
+def milliseconds_text(duration_ns: int) -> str:
+    """The shortest decimal milliseconds that `resctl` turns into exactly this duration.
+
+    >>> milliseconds_text(86_500_000)
+    '86.5'
+    """
+    whole, fraction = divmod(duration_ns, 1_000_000)
+    digits = f"{fraction:06d}".rstrip("0")
+    text = f"{whole}.{digits}" if digits else str(whole)
+    if int(float(text) * 1_000_000) != duration_ns:
+        text = f"{whole}.{fraction:06d}5"  # half a nanosecond more, which is dropped
+    return text
+
+
+def turned(
+    slots: Iterable[tuple[int, int]], cycle_ns: int, anchor_ns: int
+) -> tuple[tuple[int, int], ...]:
+    """Slots that count from an anchor, counted from time zero instead; ascending.
+
+    A slot that then lies across the end of the cycle becomes two. A piece of one nanosecond,
+    which the kernel would refuse, is left out.
+
+        >>> turned([(10, 30)], cycle_ns=100, anchor_ns=1080)
+        ((0, 10), (90, 100))
+    """
+    pieces = []
+    for start, end in slots:
+        first = (start + anchor_ns) % cycle_ns
+        last = first + end - start
+        pieces += [(first, min(last, cycle_ns)), (0, max(0, last - cycle_ns))]
+    return tuple(sorted(piece for piece in pieces if piece[1] - piece[0] >= SHORTEST_NS))

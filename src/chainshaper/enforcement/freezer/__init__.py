@@ -1,1 +1,0 @@
-"""Servers by `cgroup.freeze`: threads stopped outside their slots by a dispatcher per core."""

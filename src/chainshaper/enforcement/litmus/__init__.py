@@ -1,1 +1,0 @@
-"""Servers of LITMUS^RT: the paper's own back end."""

@@ -1,1 +1,0 @@
-"""Threads of an application: finding them, naming them, giving them to servers."""

@@ -1,0 +1,402 @@
+"""Runs from their claim to their end: which cores and nodes, what they say, and undoing them.
+
+Two plans never govern the same core or node, since their slots contradict each other. So a run
+first writes into its journal which cores and nodes it is for, and looks at what the others claim,
+both under a lock of the folder of all runs. A claim ends with its journal.
+
+A run that is in force is asked to end; one whose owner is gone, or does not react, is undone from
+what its journal says, by whichever process is left. Where the journal itself is gone, cgroups of
+ours are found by their names.
+"""
+
+import contextlib
+import json
+import os
+import signal
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from chainshaper.enforcement import freezer_state as freezer
+from chainshaper.enforcement import litmus
+from chainshaper.enforcement.scheduling_memory import (
+    DESCENDANTS,
+    KIND,
+    read_change,
+    release_threads,
+)
+from chainshaper.enforcement.servers import ReservationServer, ServerCounters
+from chainshaper.linux import cgroups, runs
+from chainshaper.linux.runs import Journal, find_journals, locked, process_of
+from chainshaper.linux.scheduling import state_of, state_text
+from chainshaper.linux.threads import find_thread, open_process
+from chainshaper.values.errors import OperationError, PlatformError
+
+CLAIMS = "claims"
+PATIENCE_S = 20.0
+"""A run has so long to begin, or to end when asked; who undoes one has half of that."""
+_SHOWN = 200
+
+
+@dataclass(frozen=True)
+class ServerState(ReservationServer):
+    """A server in force, with its threads and counters.
+
+    ``kept_by`` says who restricts its threads to the slots: the back end, or the shaping node's
+    own ``gate``.
+    """
+
+    threads: tuple[int, ...]
+    kept_by: str
+    counters: ServerCounters
+
+
+@dataclass(frozen=True)
+class RunState:
+    """A plan in force. Times are ns of CLOCK_MONOTONIC.
+
+    Cycles start at ``anchor_ns`` and every ``cycle_ns`` from there. ``drift_ns`` is how far the
+    chain's beginning has moved since (None: not looked at again yet), ``failure`` why the servers
+    are no longer enforced. The first cycle that was enforced as a whole started at ``in_force_ns``
+    (None: not yet), enforcing ended at ``ended_ns`` (None: it has not).
+    """
+
+    run: str
+    owner: int
+    plan: str
+    command: tuple[str, ...]
+    back_end: str
+    reason: str
+    started_ns: int
+    cycle_ns: int
+    anchor_ns: int | None
+    phase_spread_ns: int | None
+    drift_ns: int | None
+    servers: tuple[ServerState, ...]
+    notes: tuple[str, ...]
+    failure: str | None
+    in_force_ns: int | None = None
+    ended_ns: int | None = None
+
+
+def save_run_state(folder: Path, state: RunState) -> None:
+    """Write `run.json`; a reader sees the old or the new one, whole.
+
+    Raises OSError: it cannot be written; a plan in force needs it for nothing.
+    """
+    partial_file = folder / f"{runs.STATE_FILE}.partial"
+    try:
+        partial_file.write_text(json.dumps(asdict(state)))
+        partial_file.replace(folder / runs.STATE_FILE)
+    except OSError:
+        partial_file.unlink(missing_ok=True)  # a part of it would fill the disk for good
+        raise
+
+
+def find_runs(folder: Path | None = None) -> Iterator[tuple[Journal, RunState | None]]:
+    """All runs that are not over, crashed ones included, with what they last said of themselves."""
+    for journal in find_journals(folder):
+        state = None
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
+            state = _from_json(json.loads(journal.path.with_name(runs.STATE_FILE).read_text()))
+        if journal.path.exists():  # not over meanwhile
+            yield journal, state
+
+
+def runs_as_json(folder: Path | None = None) -> list[dict[str, Any]]:
+    """The same as plain data: ``alive`` is whether the owner still is.
+
+    ``unreadable`` are lines of the journal that say nothing.
+    """
+    return [
+        {
+            "run": journal.name,
+            "folder": str(journal.path.parent),
+            "alive": journal.owner is not None,
+            "unreadable": strange_lines(journal),
+            "state": None if state is None else asdict(state),
+        }
+        for journal, state in find_runs(folder)
+    ]
+
+
+def _from_json(content: dict[str, Any]) -> RunState:
+    servers = tuple(
+        ServerState(
+            **{
+                **server,
+                "slots": tuple((start, end) for start, end in server["slots"]),
+                "threads": tuple(server["threads"]),
+                "counters": ServerCounters(**server["counters"]),
+            }
+        )
+        for server in content["servers"]
+    )
+    fixed = {"servers": servers} | {name: tuple(content[name]) for name in ("command", "notes")}
+    return RunState(**{**content, **fixed})
+
+
+def claim_run(
+    cores: Collection[int],
+    nodes: Collection[str],
+    folder: Path | None = None,
+    go_on: Callable[[], None] = lambda: None,
+) -> Journal:
+    """Begin a run that governs these cores and nodes: the journal for all that it changes.
+
+    ``folder`` is where runs have their folders (default: :func:`.journals_folder`). While another
+    run begins, ``go_on`` is called again and again, and may raise.
+
+    Raises:
+        OperationError: a living run governs one of them, a crashed one cannot be undone, or one
+            that begins does not get on with it.
+        PlatformError: nothing may be written to the folder.
+    """
+    base = runs.journals_folder() if folder is None else folder
+    with _all_runs_locked(base, go_on):
+        for other in find_journals(base):
+            shared = _shared(other, cores, nodes)
+            owner = other.owner
+            if owner is None and (shared or not other.entries(CLAIMS)):
+                if left := undo_run(other):
+                    raise OperationError(
+                        f"the run {other.name} has crashed, and not all of it can be undone: "
+                        f"{'; '.join(left)}"
+                    )
+            elif shared:
+                raise OperationError(
+                    f"the run {other.name} of process {owner} governs {shared} already: end it "
+                    f"first (`chainshaper release {other.name}`)"
+                )
+        journal = runs.open_journal(base)
+        journal.note(CLAIMS, cores=sorted(cores), nodes=sorted(nodes))
+        return journal
+
+
+def _read_claim(entry: Mapping[str, Any]) -> tuple[set[int], set[str]]:
+    return set(map(int, entry["cores"])), set(map(str, entry["nodes"]))
+
+
+def _shared(other: Journal, cores: Collection[int], nodes: Collection[str]) -> str:
+    """What another run claims of these, in words; empty when nothing."""
+    shared = [
+        f"{kind} {', '.join(map(str, sorted(both)))}"
+        for its_cores, its_nodes in other.read(CLAIMS, _read_claim)
+        for kind, both in (("core", set(cores) & its_cores), ("node", set(nodes) & its_nodes))
+        if both
+    ]
+    return " and ".join(shared)
+
+
+@contextlib.contextmanager
+def _all_runs_locked(base: Path, go_on: Callable[[], None]) -> Iterator[None]:
+    def waiting(waited_s: float) -> None:
+        go_on()
+        if waited_s > PATIENCE_S:
+            holder = runs.holder_of(base)
+            raise OperationError(
+                f"process {holder} begins a run, and has not got on with it for {PATIENCE_S:g} s: "
+                f"let it go on (`kill -CONT {holder}`), or end it (`kill -KILL {holder}`)"
+            )
+
+    with contextlib.ExitStack() as stack:
+        try:
+            base.mkdir(mode=0o755, parents=True, exist_ok=True)  # ours alone: it is believed
+            stack.enter_context(locked(base, waiting))
+        except OSError as error:
+            raise PlatformError(
+                f"{base}, where runs keep a journal of what they change, cannot be used "
+                f"({error.strerror}): run as root, or set $XDG_RUNTIME_DIR to a folder of yours"
+            ) from error
+        yield
+
+
+_READERS: Mapping[str, Callable[[Mapping[str, Any]], object]] = {
+    runs.OPENED: process_of,
+    CLAIMS: _read_claim,
+    KIND: read_change,
+    DESCENDANTS: process_of,
+    runs.PROCESS: runs.read_process,
+    freezer.FREEZER: freezer.read_run,
+    litmus.NOTE: lambda entry: (str(entry["previous"]), Path(entry["proc"])),
+}
+"""All that a journal may speak of, and how it is read."""
+
+
+def end_run(journal: Journal) -> tuple[str, ...]:
+    """End a run: its owner does it, or we do where it is gone or hangs. What could not be undone.
+
+    An owner that was stopped (Ctrl-Z) is made to go on: it could not end otherwise. A run
+    is over afterwards unless something can be tried again.
+
+    Raises:
+        OperationError: the owner is not ours to end.
+    """
+    owner = journal.owner
+    if owner is not None:
+        _ask_to_end(journal, owner)
+    left = undo_run(journal)
+    if left or not journal.path.exists():
+        return left
+    strange = strange_lines(journal)
+    remove_run(journal)
+    return strange
+
+
+def undo_run(journal: Journal, *, by_owner: bool = False) -> tuple[str, ...]:
+    """Undo what a run has changed; what could not be undone, in sentences.
+
+    The run is removed, if its owner is gone or asks for it. It stays where something is left, so
+    that it can be tried again, and where its journal has lines that say nothing. Who is at it
+    while another process is waits, and finds it done.
+    """
+    left: list[str] = []
+    with contextlib.ExitStack() as stack:
+        try:
+            if not journal.keep():
+                return ()
+            waiting = partial(_hasten, journal)
+            stack.enter_context(locked(journal.path.parent, waiting))
+        except FileNotFoundError:
+            return ()  # another process was quicker
+        except OSError:
+            pass  # its folder is gone, and there is no room for another: it is in memory
+        _end_processes(journal, runs.DISPATCHER)
+        for undo in () if journal.outdated else _STEPS:
+            try:
+                undo(journal)
+            except (OperationError, PlatformError) as error:
+                left.append(str(error))
+        is_over = by_owner or journal.owner is None
+        if is_over and not left and not strange_lines(journal):
+            _end_processes(journal, runs.GUARDIAN)
+            remove_run(journal)
+    return tuple(left)
+
+
+def strange_lines(journal: Journal) -> tuple[str, ...]:
+    """Lines of a journal that say nothing, in sentences: what they spoke of is not undone."""
+    return tuple(
+        f"{journal.path}, line {number} is not a line of a journal, so what it may have said is "
+        f"not undone: {line[:_SHOWN]!r}"
+        for number, line in journal.strange_lines(_READERS)
+    )
+
+
+def remove_run(journal: Journal) -> None:
+    """Remove the folder of a run that is over: what it shows of itself, then the journal."""
+    with contextlib.suppress(FileNotFoundError):
+        for path in journal.path.parent.iterdir():
+            if path != journal.path and not path.is_dir():
+                path.unlink(missing_ok=True)
+    runs.discard_journal(journal)
+
+
+def release_strays(journals: Iterable[Journal]) -> tuple[tuple[Path, ...], tuple[str, ...]]:
+    """Dissolve cgroups of ours of which none of these journals speaks, and whose owner has ended.
+
+    Their threads run again, where they were, and the hierarchy is mounted as before. Returns the
+    groups that are gone, and what could not be put back, since nothing says any more what was
+    there.
+    """
+    gone, left = [], []
+    for folder in freezer.stray_groups(journals):
+        tids = cgroups.threads_in(folder)
+        why = cgroups.dissolve(folder)
+        if why is None:
+            gone.append(folder)
+        else:
+            left.append(why)
+        left += [said for tid in tids if (said := _class_text(tid)) is not None]
+    freezer.restore_stray_mount()
+    if left and cgroups.moves_are_quick():
+        left.append(
+            f"{cgroups.mount_point()} is mounted with {cgroups.QUICK_MOVES}, perhaps by that run: "
+            "it does no harm, and is gone with the next boot"
+        )
+    return tuple(gone), tuple(left)
+
+
+def _class_text(tid: int) -> str | None:
+    """What a thread still has of a run whose journal is gone, if that is a real-time class."""
+    thread = find_thread(tid)
+    if thread is None or thread.priority == 0:
+        return None
+    with contextlib.suppress(ProcessLookupError):
+        return (
+            f"thread {tid} ({thread.comm}) of process {thread.pid} runs on under "
+            f"{state_text(state_of(tid))}: the journal that says what it had before is gone; give "
+            f"it back with `chrt --other --pid 0 {tid}` and `taskset --pid --cpu-list CORES {tid}`"
+        )
+    return None
+
+
+def _ask_to_end(journal: Journal, owner: int) -> None:
+    """Have the owner end the run; one that does not is ended itself."""
+    pidfd = open_process(*journal.read(runs.OPENED, process_of)[0])
+    if pidfd is None:
+        return
+    try:
+        for number in (signal.SIGTERM, signal.SIGCONT):
+            signal.pidfd_send_signal(pidfd, number)
+        if not _wait_for_end(journal):
+            signal.pidfd_send_signal(pidfd, signal.SIGKILL)
+            _wait_for_end(journal)
+    except ProcessLookupError:
+        return
+    except PermissionError:
+        raise OperationError(
+            f"the run {journal.name} belongs to process {owner} of another user: end it as that "
+            "user, or as root"
+        ) from None
+    finally:
+        os.close(pidfd)
+
+
+def _wait_for_end(journal: Journal) -> bool:
+    deadline = time.monotonic() + PATIENCE_S
+    while journal.path.exists() and journal.owner is not None:
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+def _hasten(journal: Journal, waited_s: float) -> None:
+    """Another process undoes this run: one that was stopped goes on, one that hangs is ended."""
+    holder = runs.holder_of(journal.path.parent)
+    if holder not in (None, os.getpid()):
+        with contextlib.suppress(OSError):
+            os.kill(holder, signal.SIGCONT)
+        if waited_s > PATIENCE_S / 2:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(holder, signal.SIGKILL)
+
+
+def _end_processes(journal: Journal, role: str) -> None:
+    """Kill all processes of a role, this one excepted: one that was stopped hears nothing else."""
+    for one in runs.own_processes(journal, role):
+        if one.pid != os.getpid() and (pidfd := open_process(one.pid, one.started)) is not None:
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(pidfd, signal.SIGKILL)
+            os.close(pidfd)
+
+
+def _thaw(journal: Journal) -> None:
+    freezer.thaw(freezer.groups_of(freezer.run_of(journal)))
+
+
+def _restore_groups(journal: Journal) -> None:
+    left = freezer.restore(freezer.run_of(journal))
+    if journal.owner is None and strange_lines(journal):  # one of them may have spoken of groups
+        strays = map(cgroups.dissolve, freezer.stray_groups(()))
+        left += tuple(why for why in strays if why is not None)
+    if left:
+        raise OperationError("; ".join(left))
+
+
+_STEPS = (_thaw, release_threads, _restore_groups, litmus.restore_plugin)
+"""Threads run first; those that were born in our groups are known by them, as long as these are."""

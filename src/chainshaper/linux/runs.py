@@ -1,0 +1,401 @@
+"""Runs on this machine: the journal of what each has changed, and since when it governs whom.
+
+A run has a folder, `/run/chainshaper/RUN` for root, below `$XDG_RUNTIME_DIR` for others, gone when
+the machine boots again, as is all that was changed; a journal elsewhere says by its boot id that it
+is from before. In it are `journal.jsonl`, `run.json`, which the run writes anew every second for
+whoever wants to look, and `plan.json`.
+
+Whatever ends us, SIGKILL included, another process must be able to put things back. So each change
+is one line of JSON, which is on the disk (`fsync`) before the change is made. Each kind of change
+is undone by the module that made it; this one writes and reads the lines.
+"""
+
+import contextlib
+import errno
+import fcntl
+import functools
+import json
+import os
+import time
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from io import FileIO
+from pathlib import Path
+from typing import Any, TypeVar
+
+from chainshaper.linux.threads import find_thread, has_ended, read_proc, start_of
+from chainshaper.values.errors import OperationError, PlatformError
+
+_T = TypeVar("_T")
+
+FILE, STATE_FILE, PLAN_FILE = "journal.jsonl", "run.json", "plan.json"
+FORMAT = 1
+OPENED, PROCESS = "opened", "process"
+GUARDIAN, DISPATCHER = "guardian", "dispatcher"
+_LOOK_S = 0.02
+
+
+@dataclass(frozen=True)
+class Journal:
+    """A journal on disk; what it says is read anew each time, since others may write to it too.
+
+    ``memory`` is the open file, from which it is written again where its folder is removed.
+    """
+
+    path: Path
+    memory: FileIO | None = None
+
+    def note(self, kind: str, **fields: Any) -> None:
+        self.note_all(kind, (fields,))
+
+    def note_all(self, kind: str, changes: Iterable[Mapping[str, Any]]) -> None:
+        """Write down changes that are about to be made: plain data that says how to undo each.
+
+        They are on the disk together (one `fsync`), so that many threads take no longer than one.
+        Raises OperationError: they cannot be written; then no change must be made.
+        """
+        lines = b"".join(json.dumps({"kind": kind, **one}).encode() + b"\n" for one in changes)
+        try:
+            self.keep()
+            descriptor = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CLOEXEC)
+            try:
+                size = _remove_cut_off_line(descriptor)
+                if os.write(descriptor, lines) != len(lines):
+                    os.ftruncate(descriptor, size)
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)
+        except OSError as error:
+            raise OperationError(
+                f"{self.path}: what was there before cannot be written down ({error.strerror}), so "
+                "nothing is changed; make room there, or name another folder"
+            ) from error
+
+    def entries(self, kind: str | None = None) -> tuple[Mapping[str, Any], ...]:
+        """All that was noted, oldest first; a ``kind`` alone if one is given.
+
+        Left out are a last line that a crash cut off (what it speaks of was never done), and lines
+        that are not a journal's. Raises OperationError: the file cannot be read.
+        """
+        entries = (_entry(line) for line in self._lines())
+        return tuple(one for one in entries if one and kind in (None, one["kind"]))
+
+    def read(self, kind: str, reader: Callable[[Mapping[str, Any]], _T]) -> tuple[_T, ...]:
+        """The entries of a kind as values; one that ``reader`` cannot make sense of is left out."""
+        found = (_value(entry, reader) for entry in self.entries(kind))
+        return tuple(value for value in found if value is not None)
+
+    def strange_lines(
+        self, readers: Mapping[str, Callable[[Mapping[str, Any]], object]]
+    ) -> tuple[tuple[int, str], ...]:
+        """Lines, with their numbers, that are no entries, or that none of these could read."""
+        strange = []
+        for number, line in enumerate(self._lines(), start=1):
+            entry = _entry(line)
+            reader = readers.get(entry["kind"]) if entry else None
+            if entry is None or reader is None or _value(entry, reader) is None:
+                strange.append((number, line))
+        return tuple(strange)
+
+    def keep(self) -> bool:
+        """See that the file is there, from ``memory`` if need be; whether it was not discarded."""
+        if self.memory is None or self.memory.closed:
+            return self.path.exists()
+        if not self.path.exists():
+            content = self._remembered()
+            if not content:
+                return False
+            self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            written = self.path.with_name(f"{FILE}.{os.getpid()}")
+            try:
+                written.touch(mode=0o600)
+                written.write_bytes(content)
+                with contextlib.suppress(FileExistsError):  # another process of the run was first
+                    os.link(written, self.path)
+            finally:
+                written.unlink(missing_ok=True)
+        with self.path.open("rb") as file:
+            os.dup2(file.fileno(), self.memory.fileno(), inheritable=False)
+        return True
+
+    def size(self) -> int:
+        """How long it is: it only grows."""
+        with contextlib.suppress(OSError):
+            return self.path.stat().st_size
+        return len(self._remembered())
+
+    @property
+    def name(self) -> str:
+        return self.path.parent.name
+
+    @property
+    def outdated(self) -> bool:
+        """Whether the machine has booted since: then nothing of it is left to undo."""
+        opened = self.entries(OPENED)
+        return bool(opened) and opened[0].get("boot_id") != boot_id()
+
+    @property
+    def owner(self) -> int | None:
+        """The process that opened it and still lives; None when it is gone."""
+        opened = self.read(OPENED, process_of)
+        if not opened or self.outdated:
+            return None
+        pid, started = opened[0]
+        return None if has_ended(pid, started) else pid
+
+    def _lines(self) -> list[str]:
+        try:
+            content = self.path.read_bytes()
+        except FileNotFoundError:
+            content = self._remembered()
+        except OSError as error:
+            raise OperationError(
+                f"{self.path}: the journal cannot be read: {error.strerror}"
+            ) from error
+        return content.decode(errors="replace").split("\n")[:-1]
+
+    def _remembered(self) -> bytes:
+        if self.memory is None or self.memory.closed:
+            return b""
+        return os.pread(self.memory.fileno(), os.fstat(self.memory.fileno()).st_size, 0)
+
+
+def process_of(entry: Mapping[str, Any]) -> tuple[int, int]:
+    """The process that an entry names: its id, and when it started."""
+    return int(entry["pid"]), int(entry["started"])
+
+
+@dataclass(frozen=True)
+class OwnProcess:
+    """A process of a run, in its journal, known by id and start; ``core``: a dispatcher's."""
+
+    role: str
+    pid: int
+    started: int
+    core: int | None = None
+
+
+def note_process(journal: Journal, role: str, pid: int, core: int | None = None) -> None:
+    """Write down a process of the run, unless it has ended."""
+    started = start_of(pid, pid)
+    if started is not None:
+        journal.note(PROCESS, role=role, pid=pid, started=started, core=core)
+
+
+def read_process(entry: Mapping[str, Any]) -> OwnProcess:
+    return OwnProcess(str(entry["role"]), *process_of(entry), entry["core"])
+
+
+def own_processes(journal: Journal, role: str) -> tuple[OwnProcess, ...]:
+    """All processes of a role that the run has ever had."""
+    return tuple(one for one in journal.read(PROCESS, read_process) if one.role == role)
+
+
+@functools.lru_cache(maxsize=8192)  # a run reads its journal often, and lines never change
+def _entry(line: str) -> Mapping[str, Any] | None:
+    try:
+        entry = json.loads(line)
+        return entry if isinstance(entry["kind"], str) else None
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return None
+
+
+def _value(entry: Mapping[str, Any], reader: Callable[[Mapping[str, Any]], _T]) -> _T | None:
+    try:
+        return reader(entry)
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError):
+        return None
+
+
+def open_journal(folder: str | Path | None = None, run: str | None = None) -> Journal:
+    """Begin a journal in ``folder``/``run``; both have defaults.
+
+    Raises OperationError: there is one, or it cannot be written. PlatformError: no folder for it.
+    """
+    base = journals_folder() if folder is None else Path(folder)
+    place = base / (run or f"{time.strftime('%Y%m%dT%H%M%S')}-{os.getpid()}")
+    path = place / FILE
+    try:
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))
+        for directory in (place, base):  # the names themselves must survive as well
+            descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+            os.fsync(descriptor)
+            os.close(descriptor)
+    except FileExistsError:
+        raise OperationError(
+            f"{path} exists: that run is going on, or has crashed; undo it first "
+            "(`chainshaper release`)"
+        ) from None
+    except OSError as error:
+        raise OperationError(
+            f"{place}: a journal of changes cannot be written there ({error.strerror}): name "
+            "another folder"
+        ) from error
+    journal, pid = remembered_journal(path), os.getpid()
+    journal.note(OPENED, format=FORMAT, boot_id=boot_id(), pid=pid, started=start_of(pid, pid))
+    return journal
+
+
+def remembered_journal(path: Path) -> Journal:
+    """The journal at a path, open for :meth:`Journal.keep`. Raises OSError: there is none."""
+    return Journal(path, FileIO(path, "r"))
+
+
+def journals_folder() -> Path:
+    """Where runs have their folders. Raises PlatformError: no root, and no session of a user."""
+    if os.geteuid() == 0:
+        return Path("/run/chainshaper")
+    if unit := os.environ.get("RUNTIME_DIRECTORY"):  # RuntimeDirectory= of a systemd unit
+        return Path(unit.split(":")[0])
+    session = os.environ.get("XDG_RUNTIME_DIR")
+    if not session:
+        raise PlatformError(
+            "$XDG_RUNTIME_DIR is not set, so there is no place for the journal of changes: name "
+            "a folder for it, or run in a login session"
+        )
+    return Path(session) / "chainshaper"
+
+
+def find_journals(folder: str | Path | None = None) -> tuple[Journal, ...]:
+    """All journals that have not been discarded, oldest name first."""
+    base = journals_folder() if folder is None else Path(folder)
+    return tuple(Journal(path) for path in sorted(base.glob(f"*/{FILE}")))
+
+
+def discard_journal(journal: Journal) -> None:
+    """Remove a journal when all is undone. Emptied first: who has it open knows then."""
+    with contextlib.suppress(FileNotFoundError):
+        os.truncate(journal.path, 0)
+        journal.path.unlink()
+    if journal.memory is not None:
+        journal.memory.close()
+    with contextlib.suppress(OSError):  # there is more in it, or it is gone
+        journal.path.parent.rmdir()
+
+
+def _remove_cut_off_line(descriptor: int) -> int:
+    """Cut off what a crash, or a full disk, has left of a line; the length of what is left."""
+    size = os.fstat(descriptor).st_size
+    if size and os.pread(descriptor, 1, size - 1) != b"\n":
+        size = os.pread(descriptor, size, 0).rfind(b"\n") + 1
+        os.ftruncate(descriptor, size)
+    return size
+
+
+def boot_id() -> str:
+    return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+
+
+@contextlib.contextmanager
+def locked(folder: Path, waiting: Callable[[float], None]) -> Iterator[None]:
+    """Inside, no other process has this folder locked.
+
+    ``waiting`` is called with the seconds waited so far, again and again; it may raise. Raises
+    OSError: there is no such folder, or it may not be opened.
+    """
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        begun = time.monotonic()
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                waiting(time.monotonic() - begun)
+                time.sleep(_LOOK_S)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def holder_of(folder: Path) -> int | None:
+    """The process that has a folder locked, as far as the kernel shows it (proc_locks(5))."""
+    with contextlib.suppress(OSError):
+        inode = str(folder.stat().st_ino)
+        for line in read_proc("/proc/locks").decode().splitlines():
+            fields = line.split()
+            if fields[1] == "FLOCK" and fields[5].rpartition(":")[2] == inode and fields[4] != "-1":
+                return int(fields[4])
+    return None
+
+
+@dataclass(frozen=True)
+class Governed:
+    """A run that governs processes, as it was seen last (ns of CLOCK_MONOTONIC).
+
+    In force from ``since_ns`` on, where its first whole cycle starts, and seen so at ``seen_ns``;
+    ``until_ns`` is when it ended (None: it has not been seen to).
+    """
+
+    run: str
+    since_ns: int
+    seen_ns: int
+    until_ns: int | None
+    plan: dict[str, Any] | None
+
+
+def governing(
+    pids: Collection[int],
+    now_ns: int,
+    before: Collection[Governed] = (),
+    folder: Path | None = None,
+) -> tuple[Governed, ...]:
+    """The runs that govern threads of these processes, those of an earlier look included.
+
+    To be asked now and then, since a run that is over leaves nothing behind: one that has gone is
+    over since the last look. ``folder`` is where runs have their folders.
+    """
+    found = {one.run: one for one in before}
+    living = set()
+    with contextlib.suppress(OperationError, PlatformError, OSError):
+        for journal in find_journals(folder):
+            name, state = journal.name, _plain(journal.path.with_name(STATE_FILE))
+            if state is None or journal.owner is None:
+                continue
+            with contextlib.suppress(KeyError, TypeError, ValueError):  # not as a run writes it
+                tids = [int(tid) for server in state["servers"] for tid in server["threads"]]
+                known = name in found
+                if state["in_force_ns"] is not None and (known or _own(pids, tids)):
+                    plan_file = journal.path.with_name(PLAN_FILE)
+                    plan = found[name].plan if known else _plain(plan_file)
+                    found[name] = Governed(
+                        name, state["in_force_ns"], now_ns, state.get("ended_ns"), plan
+                    )
+                    living.add(name)
+    return tuple(
+        one if one.run in living or one.until_ns is not None else replace(one, until_ns=one.seen_ns)
+        for one in found.values()
+    )
+
+
+def in_force_throughout(runs: Collection[Governed]) -> Governed | None:
+    """All runs as one: while they were in force together, with the plan if there was one alone.
+
+    Of runs that followed each other the last one counts; None: there was none.
+    """
+    if not runs:
+        return None
+    latest = max(runs, key=lambda one: one.since_ns)
+    others = [
+        one
+        for one in runs
+        if one is not latest and (one.until_ns is None or one.until_ns > latest.since_ns)
+    ]
+    ends = [one.until_ns for one in (latest, *others) if one.until_ns is not None]
+    plan = None if others else latest.plan
+    return replace(latest, until_ns=min(ends, default=None), plan=plan)
+
+
+def _own(pids: Collection[int], tids: Collection[int]) -> bool:
+    """Whether one of the threads is of one of the processes."""
+    found = (find_thread(tid) for tid in tids)
+    return any(thread is not None and thread.pid in pids for thread in found)
+
+
+def _plain(path: Path) -> dict[str, Any] | None:
+    with contextlib.suppress(OSError, ValueError):
+        content = json.loads(path.read_text())
+        return content if isinstance(content, dict) else None
+    return None
