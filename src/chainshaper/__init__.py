@@ -26,16 +26,15 @@ if TYPE_CHECKING:
         find_chain,
         load_named_paths,
     )
+    from chainshaper.analysis.description import ApplicationDescription
     from chainshaper.enforcement.runs.state import find_runs
     from chainshaper.enforcement.runs.undoing import end_run
     from chainshaper.flow.apply import apply_plan
     from chainshaper.flow.doctor import examine_machine
     from chainshaper.flow.dry_run import planned_changes
     from chainshaper.flow.exploration import (
-        ApplicationDescription,
         convert_recording,
         describe_application,
-        event_counts,
         list_chains,
     )
     from chainshaper.flow.launch_shaping import ShapedLaunch, shape_launch
@@ -49,10 +48,6 @@ if TYPE_CHECKING:
     from chainshaper.flow.profiling import profiling_condition
     from chainshaper.flow.record import Recorded, record_command
     from chainshaper.flow.steps import (
-        Comparison,
-        Measurement,
-        compare_recordings,
-        measure_latency,
         plan_recording,
         profile_chains,
         shape_application,
@@ -84,7 +79,13 @@ if TYPE_CHECKING:
         OperationError,
         PlatformError,
     )
-    from chainshaper.values.recording import Recording, open_recording
+    from chainshaper.values.recording import Recording, event_counts, open_recording
+    from chainshaper.verify.measure import (
+        Comparison,
+        Measurement,
+        compare_recordings,
+        measure_latency,
+    )
     from chainshaper.workload.description import Application, load_application
     from chainshaper.workload.live import run_application
 
@@ -109,10 +110,8 @@ _HOMES = {
         "PlatformError",
     ),
     "chainshaper.flow.exploration": (
-        "ApplicationDescription",
         "convert_recording",
         "describe_application",
-        "event_counts",
         "list_chains",
     ),
     "chainshaper.flow.dry_run": ("planned_changes",),
@@ -136,7 +135,14 @@ _HOMES = {
     ),
     "chainshaper.flow.profiling": ("profiling_condition",),
     "chainshaper.flow.record": ("Recorded", "record_command"),
-    "chainshaper.values.recording": ("Recording", "open_recording"),
+    "chainshaper.values.recording": ("Recording", "event_counts", "open_recording"),
+    "chainshaper.verify.measure": (
+        "Comparison",
+        "Measurement",
+        "compare_recordings",
+        "measure_latency",
+    ),
+    "chainshaper.analysis.description": ("ApplicationDescription",),
     "chainshaper.reporting.application_graph": ("write_picture",),
     "chainshaper.reporting.breakdown": ("hop_breakdown",),
     "chainshaper.reporting.figures": ("draw_distribution", "draw_latency"),
@@ -147,10 +153,6 @@ _HOMES = {
     "chainshaper.sources.gate_log": ("read_gate_log",),
     "chainshaper.splicing.shaping_process": ("write_shaping_process", "write_throttler"),
     "chainshaper.flow.steps": (
-        "Comparison",
-        "Measurement",
-        "compare_recordings",
-        "measure_latency",
         "plan_recording",
         "profile_chains",
         "shape_application",

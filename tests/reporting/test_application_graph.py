@@ -9,7 +9,7 @@ import pytest
 from story import Story
 
 from chainshaper.analysis import data_flow, graph_of
-from chainshaper.flow.exploration import ApplicationDescription, services
+from chainshaper.analysis.description import ApplicationDescription, services
 from chainshaper.reporting.application_graph import (
     application_dot,
     application_json,

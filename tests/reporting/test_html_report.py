@@ -21,12 +21,12 @@ from chainshaper import (
     simulate,
     write_report,
 )
-from chainshaper.flow.steps import Measurement
 from chainshaper.planning import publish_slots
 from chainshaper.reporting.html.page import distinct_names, report_page
 from chainshaper.values.durations import milliseconds
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording
+from chainshaper.verify.measure import Measurement
 
 
 class _Reader(HTMLParser):

@@ -9,12 +9,12 @@ from rich.console import Console
 from rich.table import Table
 
 from chainshaper import compare_recordings, draw_distribution, draw_latency
-from chainshaper.flow.steps import Comparison
 from chainshaper.planning import Plan
 from chainshaper.reporting.figures import draw_comparison
 from chainshaper.reporting.tables import comparison_json, comparison_table, plan_table
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
+from chainshaper.verify.measure import Comparison
 
 
 def _text(table: Table) -> str:

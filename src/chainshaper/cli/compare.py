@@ -27,10 +27,10 @@ def compare(
     Where a plan was in force, its prediction is held against the measurement, band by band.
     """
     from chainshaper.cli.output import print_json, show
-    from chainshaper.flow.steps import compare_recordings
     from chainshaper.planning import load_plan
     from chainshaper.reporting.predictions import prediction_table
     from chainshaper.reporting.tables import comparison_json, comparison_table
+    from chainshaper.verify.measure import compare_recordings
 
     in_force = None if plan is None else load_plan(plan)
     comparison = compare_recordings(recordings, chain, in_force)

@@ -41,11 +41,11 @@ def export(
         raise InputError("the format is missing: add --perfetto")
     from chainshaper.cli.output import late_progress, notes, show_line
     from chainshaper.flow.exploration import lost_events
-    from chainshaper.flow.steps import measure_latency
     from chainshaper.planning import load_plan
     from chainshaper.reporting.perfetto import ENDINGS, export_perfetto
     from chainshaper.sources import open_source
     from chainshaper.values.whole_file import new_file
+    from chainshaper.verify.measure import measure_latency
 
     new_file(output, ENDINGS)
     in_force = None if plan is None else load_plan(plan)

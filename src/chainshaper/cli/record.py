@@ -119,9 +119,10 @@ def record_and_show(
         OperationError: the application failed; what was recorded until then is there.
     """
     from chainshaper.cli.output import notes, print_json, show_line, stage_lines
-    from chainshaper.flow.exploration import event_counts, lost_events
+    from chainshaper.flow.exploration import lost_events
     from chainshaper.flow.record import record_command
     from chainshaper.linux.own_processes import end_in_words
+    from chainshaper.values.recording import event_counts
 
     stop = threading.Event()
     with stop_on_signals(stop):

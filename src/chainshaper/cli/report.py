@@ -39,12 +39,12 @@ def report(
     needs no network.
     """
     from chainshaper.cli.output import late_progress, print_json, show_line
-    from chainshaper.flow.steps import Comparison, measure_latency
     from chainshaper.planning import load_plan
     from chainshaper.reporting.html.page import ENDINGS, write_report
     from chainshaper.reporting.tables import comparison_json
     from chainshaper.sources import open_source
     from chainshaper.values.whole_file import new_file
+    from chainshaper.verify.measure import Comparison, measure_latency
 
     new_file(output, ENDINGS)
     in_force = None if plan is None else load_plan(plan)

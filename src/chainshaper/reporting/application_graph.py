@@ -12,11 +12,12 @@ from typing import Any
 
 from rich.table import Table
 
+from chainshaper.analysis.description import ApplicationDescription
 from chainshaper.analysis.objects import INTERNAL_TOPICS
-from chainshaper.flow.exploration import ApplicationDescription, lost_text
 from chainshaper.reporting.cells import terminal_table
 from chainshaper.values.application import Callback
 from chainshaper.values.durations import format_duration
+from chainshaper.values.recording import lost_text
 from chainshaper.values.safe_text import shown
 from chainshaper.values.whole_file import new_file, write_whole
 

@@ -3,10 +3,10 @@
 import json
 from pathlib import Path
 
-from chainshaper.flow.steps import Comparison
 from chainshaper.reporting.figures import draw_comparison
 from chainshaper.reporting.tables import comparison_json
 from chainshaper.values.whole_file import write_whole
+from chainshaper.verify.measure import Comparison
 
 __all__ = ["write_comparison"]
 

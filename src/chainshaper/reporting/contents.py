@@ -4,9 +4,8 @@ from typing import Any
 
 from rich.table import Table
 
-from chainshaper.flow.exploration import event_counts
 from chainshaper.reporting.terminal import PlainTable
-from chainshaper.values.recording import INFO_FILE, Recording
+from chainshaper.values.recording import INFO_FILE, Recording, event_counts
 
 __all__ = ["contents_json", "contents_table"]
 

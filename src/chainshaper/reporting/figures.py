@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import polars as pl
 
-from chainshaper.flow.steps import Measurement
 from chainshaper.planning import BandChoice, publish_slots
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.safe_text import shown
 from chainshaper.values.trusted_files import why_distrusted
 from chainshaper.values.whole_file import new_file, write_whole
+from chainshaper.verify.measure import Measurement
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

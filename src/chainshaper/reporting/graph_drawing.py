@@ -9,10 +9,11 @@ callbacks, or for subscriptions without callback events.
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from chainshaper.flow.exploration import ApplicationDescription, lost_text
+from chainshaper.analysis.description import ApplicationDescription
 from chainshaper.reporting.application_graph import callback_text, short_symbol
 from chainshaper.reporting.layered_layout import Box, Edge, Layout, lay_out
 from chainshaper.values.application import Callback
+from chainshaper.values.recording import lost_text
 from chainshaper.values.safe_text import escape
 
 __all__ = ["application_svg"]

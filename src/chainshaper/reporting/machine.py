@@ -5,10 +5,10 @@ from typing import Any
 import polars as pl
 from rich.table import Table
 
-from chainshaper.flow.doctor import MachineReport
 from chainshaper.reporting.cells import terminal_table
 from chainshaper.reporting.terminal import plain
 from chainshaper.values.durations import format_duration, milliseconds
+from chainshaper.values.machine import MachineReport
 from chainshaper.values.recording import StallMeterInfo
 
 __all__ = ["machine_json", "machine_tables", "stall_rows"]

@@ -13,13 +13,13 @@ from pathlib import Path
 import polars as pl
 
 from chainshaper.analysis import DataFlow, LatencyAnalysis, data_flow, graph_of
-from chainshaper.flow.steps import Measurement
 from chainshaper.reporting.perfetto_format import Slice, Track, encode_trace
 from chainshaper.reporting.timeline import Timeline, timeline_of
 from chainshaper.values import events
 from chainshaper.values.recording import Recording
 from chainshaper.values.safe_text import shown
 from chainshaper.values.whole_file import new_file, write_whole
+from chainshaper.verify.measure import Measurement
 
 __all__ = ["ENDINGS", "export_perfetto"]
 

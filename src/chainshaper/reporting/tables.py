@@ -8,7 +8,6 @@ import polars as pl
 from rich.table import Table
 
 from chainshaper.analysis import LatencyStatistics
-from chainshaper.flow.steps import Comparison, Measurement
 from chainshaper.planning import Plan, band_predictions, publish_slots
 from chainshaper.reporting.application_graph import short_symbol
 from chainshaper.reporting.cells import (
@@ -28,6 +27,7 @@ from chainshaper.reporting.cells import (
 from chainshaper.reporting.predictions import prediction_json
 from chainshaper.reporting.terminal import plain
 from chainshaper.values.durations import milliseconds
+from chainshaper.verify.measure import Comparison, Measurement
 
 __all__ = [
     "bands_table",

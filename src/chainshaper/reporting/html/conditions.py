@@ -6,11 +6,10 @@ from datetime import datetime, timezone
 
 import polars as pl
 
-from chainshaper.flow.exploration import event_counts, lost_text
-from chainshaper.flow.steps import Measurement
 from chainshaper.reporting.html.markup import details, listed, table
 from chainshaper.reporting.html.told import Told
-from chainshaper.values.recording import Recording, ThreadInfo
+from chainshaper.values.recording import Recording, ThreadInfo, event_counts, lost_text
+from chainshaper.verify.measure import Measurement
 
 __all__ = ["condition_tables", "note_lists"]
 

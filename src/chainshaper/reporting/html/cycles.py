@@ -13,9 +13,9 @@ import numpy.typing as npt
 import polars as pl
 
 from chainshaper.analysis.disturbance import overlapping
-from chainshaper.flow.steps import Measurement
 from chainshaper.planning import Plan
 from chainshaper.reporting.timeline import Timeline
+from chainshaper.verify.measure import Measurement
 
 __all__ = ["timeline_data"]
 

@@ -15,7 +15,6 @@ from string import Template
 from typing import Any
 
 from chainshaper.analysis import data_flow
-from chainshaper.flow.steps import Measurement
 from chainshaper.planning import Plan, dump_plan
 from chainshaper.reporting.html import conditions, tables
 from chainshaper.reporting.html.markup import details, paragraph, section
@@ -25,6 +24,7 @@ from chainshaper.reporting.timeline import timeline_of
 from chainshaper.values.errors import InputError
 from chainshaper.values.safe_text import escape, shown
 from chainshaper.values.whole_file import new_file, write_whole
+from chainshaper.verify.measure import Measurement
 
 __all__ = ["ENDINGS", "report_page", "write_report"]
 

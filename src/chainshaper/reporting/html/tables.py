@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import polars as pl
 
 from chainshaper.analysis import REASONS, LatencyStatistics, callback_statistics
-from chainshaper.flow.steps import Measurement
 from chainshaper.planning import Plan
 from chainshaper.reporting.application_graph import short_symbol
 from chainshaper.reporting.breakdown import PARTS, hop_breakdown
@@ -26,6 +25,7 @@ from chainshaper.reporting.html.told import Told
 from chainshaper.reporting.machine import stall_rows
 from chainshaper.reporting.predictions import band_name, late_text, range_ms, verdict
 from chainshaper.values.durations import format_duration
+from chainshaper.verify.measure import Measurement
 from chainshaper.verify.overruns import overruns_text
 from chainshaper.verify.predictions import FigureHeld
 

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from chainshaper.analysis import DataFlow
-from chainshaper.flow.steps import Measurement
 from chainshaper.reporting.timeline import Timeline
+from chainshaper.verify.measure import Measurement
 
 __all__ = ["Told"]
 
