@@ -64,9 +64,9 @@ if TYPE_CHECKING:
         save_plan,
     )
     from chainshaper.reporting.application_graph import write_picture
-    from chainshaper.reporting.breakdown import hop_breakdown
     from chainshaper.reporting.figures import draw_distribution, draw_latency
-    from chainshaper.reporting.html import write_report
+    from chainshaper.reporting.latency import hop_breakdown
+    from chainshaper.reporting.page import write_report
     from chainshaper.reporting.perfetto import export_perfetto
     from chainshaper.simulation import simulate, simulate_latencies
     from chainshaper.simulation.sweeping import sweep
@@ -144,9 +144,9 @@ _HOMES = {
     ),
     "chainshaper.analysis.description": ("ApplicationDescription",),
     "chainshaper.reporting.application_graph": ("write_picture",),
-    "chainshaper.reporting.breakdown": ("hop_breakdown",),
     "chainshaper.reporting.figures": ("draw_distribution", "draw_latency"),
-    "chainshaper.reporting.html": ("write_report",),
+    "chainshaper.reporting.latency": ("hop_breakdown",),
+    "chainshaper.reporting.page": ("write_report",),
     "chainshaper.reporting.perfetto": ("export_perfetto",),
     "chainshaper.simulation": ("simulate", "simulate_latencies"),
     "chainshaper.sources": ("open_source",),

@@ -22,7 +22,7 @@ from chainshaper import (
     write_report,
 )
 from chainshaper.planning import publish_slots
-from chainshaper.reporting.html.page import distinct_names, report_page
+from chainshaper.reporting.page import distinct_names, report_page
 from chainshaper.values.durations import milliseconds
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording
@@ -149,7 +149,10 @@ def test_shares_of_the_hops_are_the_breakdowns(shaped: Recording) -> None:
 
 def test_a_prediction_stands_beside_the_measurement(tmp_path: Path) -> None:
     page = _report(measure_latency(told_run(tmp_path / "told")))
-    assert ["maximum", "30.000 … 31.000", "30.020", "as predicted"] in page.rows["figures"]
+    rows = page.rows["figures"]
+    assert ["maximum", "30.000 … 31.000", "30.020", "as predicted", "", "", ""] in rows
+    band = ["band 1", "[30.000, 31.000)", "30.020", "3 of 3 inside", "0.000", "100.0%", "100.0%"]
+    assert band in rows
 
 
 def test_the_plan_is_there_in_rows_in_yaml_and_drawn(tmp_path: Path) -> None:
@@ -201,7 +204,7 @@ def test_incomplete_cycles_and_overruns_have_numbers_and_reasons(tmp_path: Path)
     assert lost[1].startswith("lost: published, but never taken")
     assert lost[2:] == ["/t1", "2", "2, 3"]
     assert ["incomplete", "2 (2 lost)"] in page.rows["figures"]
-    assert ["too late for their slot", "1"] in page.rows["figures"]
+    assert ["too late for their slot", "1 (1 publish)"] in page.rows["figures"]
     assert ["came when it was open", "0"] in page.rows["figures"]
 
 

@@ -11,9 +11,7 @@ from hypothesis import strategies as st
 from told_run import LATENCY_NS, MS, PERIOD_NS, told_run
 
 from chainshaper import data_flow, measure_latency
-from chainshaper.reporting.html import cycles as cycles_of_page
-from chainshaper.reporting.html.cycles import timeline_data
-from chainshaper.reporting.html.series import latency_histogram, latency_points
+from chainshaper.reporting.page_data import CYCLES, latency_histogram, latency_points, timeline_data
 from chainshaper.reporting.timeline import timeline_of
 from chainshaper.values.recording import Recording
 
@@ -120,7 +118,7 @@ def test_a_timeline_of_many_cycles_keeps_those_that_somebody_looks_for(tmp_path:
     recording = told_run(tmp_path / "told", 900, untaken=(511,), overran=(333,))
     data = _kept(recording, asked=(777,))
     kept = {cycle["n"] for cycle in data["cycles"]}
-    assert len(kept) <= cycles_of_page.CYCLES + 1
+    assert len(kept) <= CYCLES + 1
     assert {333, 511, 777} <= kept, "the longest, the one that broke, the one that was asked for"
     assert data["of"] == 900
     assert data["chosen"] == {"longest": 333, "median": 450, "shortest": 0}

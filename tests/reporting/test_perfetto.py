@@ -19,7 +19,7 @@ from reference_traces import reference_folder
 from told_run import LATENCY_NS, MS, PERIOD_NS, told_run
 
 from chainshaper import data_flow, export_perfetto, measure_latency, open_source
-from chainshaper.reporting.perfetto_format import Slice, Track, Value, encode_trace
+from chainshaper.reporting.perfetto import Slice, Track, Value, encode_trace
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.verify.measure import Measurement

@@ -20,7 +20,7 @@ from chainshaper import measure_latency, save_plan, shape_application, simulate
 from chainshaper.gate.decision import sleep_until
 from chainshaper.planning import Plan, let_per_chain, plan_shaping, publish_slots
 from chainshaper.planning.plan import revised
-from chainshaper.reporting.tables import latency_json
+from chainshaper.reporting.latency import latency_json
 from chainshaper.values.recording import Recording
 from chainshaper.verify.overruns import (
     dropped_in,

@@ -24,7 +24,7 @@ from chainshaper.planning import (
 )
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.plan import revised
-from chainshaper.reporting.predictions import late_text, prediction_json, prediction_table
+from chainshaper.reporting.latency import late_text, prediction_json, prediction_table
 from chainshaper.values.recording import Recording
 from chainshaper.verify.predictions import PredictionHeld, hold_prediction
 

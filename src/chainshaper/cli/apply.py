@@ -77,7 +77,7 @@ def apply(
     from chainshaper.cli.output import notes, print_json, show
     from chainshaper.flow.apply import apply_plan
     from chainshaper.planning import load_plan, plan_warnings
-    from chainshaper.reporting.servers import servers_table
+    from chainshaper.reporting.plans import servers_table
     from chainshaper.values.errors import OperationError
 
     planned, recorded = load_plan(plan), None
@@ -128,7 +128,7 @@ def _show_changes(
 
     from chainshaper.cli.output import notes, print_json, show, show_line
     from chainshaper.flow.dry_run import planned_changes
-    from chainshaper.reporting.servers import changes_table
+    from chainshaper.reporting.plans import changes_table
 
     changes = planned_changes(plan, backend, recording=recording, phase_ns=phase_ns, users=users)
     if json:
@@ -146,7 +146,7 @@ def _show_changes(
 def _watching() -> "Iterator[tuple[Callable[[RunState], None], Callable[[float, str], None]]]":
     """What shows the state of a run, and progress before: a live table, or a line now and then."""
     from chainshaper.cli.output import progress
-    from chainshaper.reporting.servers import run_line, servers_table
+    from chainshaper.reporting.plans import run_line, servers_table
 
     with ExitStack() as shown:
         report = shown.enter_context(progress("applying"))

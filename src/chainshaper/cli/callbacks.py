@@ -10,7 +10,7 @@ def callbacks(trace: TraceArgument, json: JsonOption = False) -> None:
     from chainshaper.analysis import callback_statistics, data_flow
     from chainshaper.cli.output import late_progress, notes, print_json, show, show_line
     from chainshaper.flow.exploration import lost_events
-    from chainshaper.reporting.tables import callback_rows, callback_table
+    from chainshaper.reporting.recordings import callback_rows, callback_table
     from chainshaper.sources import open_source
 
     with late_progress("callbacks") as report:

@@ -37,7 +37,7 @@ def chains(
     from chainshaper.analysis import data_flow, graph_of
     from chainshaper.cli.output import late_progress, notes, print_json, show, show_line
     from chainshaper.flow.exploration import list_chains, lost_events
-    from chainshaper.reporting.chain_list import chain_table, chains_json, count_text
+    from chainshaper.reporting.recordings import chain_table, chains_json, count_text
     from chainshaper.sources import open_source
 
     with late_progress("chains") as report:

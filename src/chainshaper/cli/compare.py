@@ -28,8 +28,7 @@ def compare(
     """
     from chainshaper.cli.output import print_json, show
     from chainshaper.planning import load_plan
-    from chainshaper.reporting.predictions import prediction_table
-    from chainshaper.reporting.tables import comparison_json, comparison_table
+    from chainshaper.reporting.latency import comparison_json, comparison_table, prediction_table
     from chainshaper.verify.measure import compare_recordings
 
     in_force = None if plan is None else load_plan(plan)

@@ -42,12 +42,9 @@ def demo(
     from chainshaper.cli.output import notes, print_json, progress, show, show_line
     from chainshaper.flow.demo import run_demo
     from chainshaper.planning import PlanRequest, plan_warnings
-    from chainshaper.reporting.tables import (
-        callback_table,
-        comparison_json,
-        comparison_table,
-        plan_table,
-    )
+    from chainshaper.reporting.latency import comparison_json, comparison_table
+    from chainshaper.reporting.plans import plan_table
+    from chainshaper.reporting.recordings import callback_table
 
     folder = output or Path(f"chainshaper-demo-{datetime.now():%Y%m%d-%H%M%S}")
     with progress("demo") as report:

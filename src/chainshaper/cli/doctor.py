@@ -16,7 +16,7 @@ def doctor(
     """Examine this machine: scheduling, privileges, tracing, DDS, and its own stalls."""
     from chainshaper.cli.output import print_json, progress, show
     from chainshaper.flow.doctor import examine_machine
-    from chainshaper.reporting.machine import machine_json, machine_tables
+    from chainshaper.reporting.recordings import machine_json, machine_tables
 
     with progress("examining this machine") as report:
         report(0.0, "watching for stalls")

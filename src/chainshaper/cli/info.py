@@ -9,7 +9,7 @@ def info(trace: TraceArgument, json: JsonOption = False) -> None:
     """Show what is in a trace: events, losses, clock, distribution, RMW, hosts, processes."""
     from chainshaper.cli.output import late_progress, notes, print_json, show, show_line
     from chainshaper.flow.exploration import lost_events
-    from chainshaper.reporting.contents import contents_json, contents_table
+    from chainshaper.reporting.recordings import contents_json, contents_table
     from chainshaper.sources import open_source
 
     with late_progress("info") as report:

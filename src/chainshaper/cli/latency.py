@@ -33,8 +33,12 @@ def latency(
     """
     from chainshaper.cli.output import late_progress, notes, print_json, show, show_line
     from chainshaper.flow.exploration import lost_events, named_chain
-    from chainshaper.reporting.breakdown import breakdown_json, breakdown_table
-    from chainshaper.reporting.tables import latency_json, latency_table
+    from chainshaper.reporting.latency import (
+        breakdown_json,
+        breakdown_table,
+        latency_json,
+        latency_table,
+    )
     from chainshaper.sources import open_source
     from chainshaper.verify.measure import measure_latency
     from chainshaper.verify.overruns import dropped_text, overruns_text

@@ -45,7 +45,7 @@ def place_and_print(
     """Find the offsets, write the plans into a folder and print them."""
     from chainshaper.cli.output import notes, print_json, show, show_line
     from chainshaper.planning import place_chains, plan_json, plan_warnings, save_plans
-    from chainshaper.reporting.tables import plan_table
+    from chainshaper.reporting.plans import plan_table
 
     placed, remarks = place_chains(plans, time_limit_s=time_limit)
     written = [] if output is None else save_plans(placed, output)

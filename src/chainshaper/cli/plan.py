@@ -159,8 +159,7 @@ def _print_one(
 ) -> None:
     from chainshaper.cli.output import notes, print_json, show, show_line
     from chainshaper.planning import band_choice, plan_json, plan_warnings, publish_slots, save_plan
-    from chainshaper.reporting.predictions import choice_json, choice_table
-    from chainshaper.reporting.tables import bands_table, plan_table
+    from chainshaper.reporting.plans import bands_table, choice_json, choice_table, plan_table
 
     choice = band_choice(planned, profile, request) if request.bands == "auto" else None
     if output is not None:

@@ -40,8 +40,8 @@ def report(
     """
     from chainshaper.cli.output import late_progress, print_json, show_line
     from chainshaper.planning import load_plan
-    from chainshaper.reporting.html.page import ENDINGS, write_report
-    from chainshaper.reporting.tables import comparison_json
+    from chainshaper.reporting.latency import comparison_json
+    from chainshaper.reporting.page import ENDINGS, write_report
     from chainshaper.sources import open_source
     from chainshaper.values.whole_file import new_file
     from chainshaper.verify.measure import Comparison, measure_latency

@@ -182,7 +182,7 @@ def _shape_launched(
     from chainshaper.cli.signals import stop_on_signals
     from chainshaper.flow.launch_shaping import shape_launch
     from chainshaper.planning import plan_warnings
-    from chainshaper.reporting.tables import comparison_json
+    from chainshaper.reporting.latency import comparison_json
 
     stop = threading.Event()
     with stop_on_signals(stop):
@@ -209,8 +209,7 @@ def _shape_launched(
 
 def _show(shaped: "ShapedLaunch") -> None:
     from chainshaper.cli.output import notes, show, show_line
-    from chainshaper.reporting.predictions import prediction_table
-    from chainshaper.reporting.tables import comparison_table
+    from chainshaper.reporting.latency import comparison_table, prediction_table
 
     held = [one.held for one in shaped.comparison.measurements]
     show(
@@ -223,7 +222,7 @@ def _show(shaped: "ShapedLaunch") -> None:
 
 def _ask(graph: "ApplicationGraph", found: "ChainEnumeration") -> str:
     from chainshaper.cli.output import show
-    from chainshaper.reporting.chain_list import chain_table
+    from chainshaper.reporting.recordings import chain_table
     from chainshaper.values.safe_text import shown
 
     show(chain_table(graph, found))

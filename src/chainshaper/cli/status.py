@@ -25,7 +25,7 @@ def status(
     from chainshaper.enforcement.freezer.state import stray_groups
     from chainshaper.enforcement.runs.state import find_runs, runs_as_json
     from chainshaper.enforcement.runs.undoing import strange_lines
-    from chainshaper.reporting.servers import runs_table, servers_table
+    from chainshaper.reporting.plans import runs_table, servers_table
     from chainshaper.splicing.shaped_outputs import find_outputs, output_text
 
     found = find_outputs()

@@ -61,7 +61,8 @@ def sweep(
     """
     from chainshaper.cli.output import notes, print_json, progress, show, show_line
     from chainshaper.planning import load_plan
-    from chainshaper.reporting.sweeps import draw_sweep, sweep_table
+    from chainshaper.reporting.figures import draw_sweep
+    from chainshaper.reporting.plans import sweep_table
     from chainshaper.simulation.sweeping import parse_axis, rows_beside
     from chainshaper.simulation.sweeping import sweep as run_sweep
     from chainshaper.values.errors import InputError

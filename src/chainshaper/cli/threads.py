@@ -37,7 +37,7 @@ def threads(
     from chainshaper.cli.output import notes, print_json, show
     from chainshaper.flow.thread_search import find_threads
     from chainshaper.planning import load_plan
-    from chainshaper.reporting.threads import threads_json, threads_table
+    from chainshaper.reporting.recordings import threads_json, threads_table
     from chainshaper.sources import open_source
 
     place: int | Plan | None = None

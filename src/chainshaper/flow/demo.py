@@ -21,7 +21,7 @@ import polars as pl
 from chainshaper.analysis import callback_statistics, data_flow
 from chainshaper.flow.steps import plan_recording, shape_application
 from chainshaper.planning import Plan, PlanRequest, save_plan
-from chainshaper.reporting.comparison_files import write_comparison
+from chainshaper.reporting.figures import write_comparison
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import refuse_existing
 from chainshaper.verify.measure import Comparison, compare_recordings

@@ -30,7 +30,7 @@ from chainshaper.linux.processes import Process
 from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.linux.users import run_users
 from chainshaper.planning import Plan, PlanRequest, save_plan
-from chainshaper.reporting.comparison_files import write_comparison
+from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.generated_package import build_package, check_build_tools
 from chainshaper.splicing.launch.command import LaunchCommand, parse_launch_command
 from chainshaper.splicing.launch.folder import NODES

@@ -10,11 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
-
 from chainshaper.analysis.description import ApplicationDescription
 from chainshaper.analysis.objects import INTERNAL_TOPICS
-from chainshaper.reporting.cells import terminal_table
+from chainshaper.reporting.tables import Column, ResultTable, words
 from chainshaper.values.application import Callback
 from chainshaper.values.durations import format_duration
 from chainshaper.values.recording import lost_text
@@ -110,11 +108,10 @@ def application_json(application: ApplicationDescription) -> dict[str, Any]:
     }
 
 
-def application_table(application: ApplicationDescription) -> Table:
+def application_table(application: ApplicationDescription) -> ResultTable:
     """One row per callback, by node."""
-    names = ("node", "process", "callback", "publishes", "function")
-    table = terminal_table("Application", names)
-    table.columns[1].justify = "right"
+    names = [*words("node"), Column("process"), *words("callback", "publishes", "function")]
+    table = ResultTable("Application", names)
     graph = application.graph
     nodes = {(node.name, node.pid) for node in graph.nodes}
     idle = nodes - {(callback.node, callback.pid) for callback in graph.callbacks}
@@ -123,7 +120,7 @@ def application_table(application: ApplicationDescription) -> Table:
         publishes, function = ", ".join(callback.publishes), short_symbol(callback.symbol)
         rows.append((callback.node, callback.pid, callback_text(callback), publishes, function))
     for node, pid, *rest in sorted(rows, key=lambda row: row[:2]):
-        table.add_row(node, str(pid), *rest)
+        table.add(node, str(pid), *rest)
     return table
 
 
