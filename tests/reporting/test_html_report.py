@@ -159,11 +159,10 @@ def test_the_plan_is_there_in_rows_in_yaml_and_drawn(tmp_path: Path) -> None:
     page = _report(measure_latency(told_run(tmp_path / "told")))
     assert ["output", "1", "1", "[30.000, 31.000)", "/chainshaper_t2"] in page.rows["plan-0"]
     assert "shaping_node:" in "".join(page.text)
-    (drawn,) = _data(page)["plans"]
-    assert drawn["cycle"] == PERIOD_NS
-    assert [server["slots"] for server in drawn["servers"] if server["output"]] == [
-        [[30 * MS, 31 * MS]]
-    ]
+    drawn = _data(page)["bars"]["slots-0"]
+    assert drawn["length"] == PERIOD_NS
+    blue = [bar[:2] for _, bars in drawn["rows"] for bar in bars if bar[2] == "series-1"]
+    assert blue == [[30 * MS, 31 * MS]]
 
 
 def test_a_plan_that_several_recordings_share_is_shown_once(tmp_path: Path) -> None:
@@ -213,7 +212,7 @@ def test_where_nobody_watched_no_cycle_is_called_undisturbed(tmp_path: Path) -> 
     titles = [row[0] for row in page.rows["figures"] if len(row) == 1]
     assert not [title for title in titles if "undisturbed" in title]
     assert "told: nobody watched the machine, so its stalls are not known." in page.text
-    assert not _data(page)["recordings"][0]["timeline"]["watched"]
+    assert "told (2 complete cycles)" in page.text
 
 
 def test_a_chain_without_any_complete_cycle_makes_a_page_all_the_same(tmp_path: Path) -> None:
@@ -246,7 +245,7 @@ def test_nothing_that_a_recording_says_becomes_markup(tmp_path: Path) -> None:
     assert page.addresses == []
     assert not re.search(r"<(img|iframe|h1>host|u>|b>|!-- )", text)
     assert evil in [row[0] for row in page.rows["callbacks"]]
-    assert _data(page)["recordings"][0]["timeline"]["threads"][0][0] == evil
+    assert _data(page)["recordings"][0]["timeline"]["rows"][1][0] == evil
     assert ["host", "<h1>host</h1>"] in page.rows["conditions"]
 
 

@@ -11,7 +11,14 @@ from hypothesis import strategies as st
 from told_run import LATENCY_NS, MS, PERIOD_NS, told_run
 
 from chainshaper import data_flow, measure_latency
-from chainshaper.reporting.page_data import CYCLES, latency_histogram, latency_points, timeline_data
+from chainshaper.reporting.page_data import (
+    BARS,
+    CYCLES,
+    KINDS,
+    latency_histogram,
+    latency_points,
+    timeline_data,
+)
 from chainshaper.reporting.timeline import timeline_of
 from chainshaper.values.recording import Recording
 
@@ -98,20 +105,36 @@ def _kept(recording: Recording, asked: Sequence[int] = ()) -> dict[str, Any]:
     return timeline_data(measured, timeline, asked, MS)
 
 
+def _bars(data: dict[str, Any], kind: str) -> list[tuple[Any, ...]]:
+    """``row, start, length, cycle, text, used`` of the bars of one kind."""
+    columns = [data[name] for name in BARS]
+    return [
+        (row, start, length, cycle, data["texts"][text], used)
+        for row, start, length, what, cycle, text, used in zip(*columns, strict=True)
+        if KINDS[what] == kind
+    ]
+
+
 def test_a_timeline_of_few_cycles_keeps_all_of_them(tmp_path: Path) -> None:
     data = _kept(told_run(tmp_path / "told", 3, untaken=(1,)))
     assert [cycle["n"] for cycle in data["cycles"]] == [0, 1, 2]
     one, broken, _ = data["cycles"]
     assert one["hops"] == [
-        [0, None, 0, 4 * MS, 4 * MS + 1000],
-        [1, 5 * MS - 1, 5 * MS, 15 * MS, 15 * MS + 1000],
-        [2, 16 * MS - 1, 16 * MS, LATENCY_NS, LATENCY_NS + 1000],
+        [1, None, 0, 4 * MS, 4 * MS + 1000],
+        [2, 5 * MS - 1, 5 * MS, 15 * MS, 15 * MS + 1000],
+        [3, 16 * MS - 1, 16 * MS, LATENCY_NS, LATENCY_NS + 1000],
     ]
-    assert (one["latency"], one["origin"]) == (LATENCY_NS, 0)
-    assert one["held"] == [16 * MS, LATENCY_NS, None]
-    assert broken["reason"] == "lost (/t1)"
-    assert len(data["lane"]) == 3 * 4 - 3
-    assert data["stalls"] == [[1, PERIOD_NS + 6 * MS, 2 * MS]]
+    assert one["latency"] == LATENCY_NS
+    held = (3, 16 * MS, LATENCY_NS - 16 * MS, 0, "cycle 0: held", None)
+    assert _bars(data, "held")[0] == held
+    names = [name for name, _ in data["rows"]]
+    slot = _bars(data, "slot")[0]
+    assert (names[slot[0]], *slot[1:4]) == ("server chain", 0, 30 * MS, 0)
+    assert slot[4] == "server chain, cycle 0\n[0.000, 30.000) ms"
+    assert broken["about"].startswith("incomplete: lost (/t1); began 0.100 s after the first")
+    assert len(_bars(data, "callback")) == 3 * 4 - 3
+    stall = (names.index("stalls of core 1"), PERIOD_NS + 6 * MS, 2 * MS, -1)
+    assert _bars(data, "stall") == [(*stall, "the machine stalled", None)]
 
 
 def test_a_timeline_of_many_cycles_keeps_those_that_somebody_looks_for(tmp_path: Path) -> None:
@@ -122,6 +145,6 @@ def test_a_timeline_of_many_cycles_keeps_those_that_somebody_looks_for(tmp_path:
     assert {333, 511, 777} <= kept, "the longest, the one that broke, the one that was asked for"
     assert data["of"] == 900
     assert data["chosen"] == {"longest": 333, "median": 450, "shortest": 0}
-    began = dict(enumerate(data["windows"]))
-    inside = [any(low <= start <= high for low, high in began.values()) for start in data["start"]]
+    starts = [start for _, start, *_ in _bars(data, "callback")]
+    inside = [not any(low < start < high for low, high in data["gaps"]) for start in starts]
     assert np.mean(inside) > 0.95, "callbacks of the other cycles are left out"

@@ -29,7 +29,7 @@ from chainshaper.reporting.latency import (
     incomplete_table,
     prediction_table,
 )
-from chainshaper.reporting.page_data import plan_drawing, recording_data
+from chainshaper.reporting.page_data import hop_bars, latency_range, recording_data, slot_bars
 from chainshaper.reporting.plans import plan_table
 from chainshaper.reporting.recordings import (
     callback_table,
@@ -51,6 +51,49 @@ __all__ = ["ENDINGS", "report_page", "write_report"]
 ENDINGS = (".html", ".htm")
 LISTED = 50
 """Rows of a list that may be endless."""
+
+OVER_TIME = (
+    "Crosses: disturbed by the machine. Triangles: beyond the axis. Red ticks: incomplete cycles."
+    " Grey: publish slots. Drag to zoom, double click or Escape to go back; arrow keys walk through"
+    " the cycles, Enter or a click opens one below."
+)
+FEWER_POINTS = (
+    " Of {total} cycles of {name} {drawn} are drawn: of every stretch the shortest and the longest,"
+    " disturbed and not, and of the others every n-th."
+)
+HISTOGRAM = (
+    "Without cycles that the machine disturbed, each recording on a scale of its own. Grey: publish"
+    " slots. Zooming in makes the bins finer; every cycle is counted."
+)
+DISTRIBUTION = "Without cycles that the machine disturbed. Grey: publish slots."
+HOPS = (
+    "Full: computation, from a callback's start to its publication. Pale: communication, from the"
+    " publication before to the start: transport, and waiting for the executor."
+)
+SLOTS = (
+    "Blue: the server in whose slots the output is published. Slots are half-open and drawn at"
+    " least 1.5 pixels wide; drag to zoom."
+)
+TIMELINE = (
+    "Orange: what the cycle itself ran; pale: transport, and waiting; grey: other callbacks; blue:"
+    " slots; hatched: held by the gate; red: stalls. A callback is pale where its end was not"
+    " recorded. Drag, or the arrow keys, move; + and − or Ctrl with the wheel zoom."
+)
+FEWER_CYCLES = (
+    " Of {total} cycles of {name} {number} are here: the longest, the shortest, incomplete ones,"
+    " those asked for, and a sample of the others."
+)
+BUTTONS = (
+    ("longest", "longest", "the longest undisturbed cycle"),
+    ("median", "median", "the undisturbed cycle of median latency"),
+    ("shortest", "shortest", "the shortest undisturbed cycle"),
+    ("previous", "‹", "previous cycle"),
+    ("next", "›", "next cycle"),
+    ("in", "+", "zoom in"),
+    ("out", "−", "zoom out"),
+    ("whole", "whole cycle", "show the whole cycle"),
+)
+HOP_TIMES = ("hop [ms]", "taken", "started", "published", "communication", "computation")
 
 
 @dataclass(frozen=True)
@@ -92,11 +135,14 @@ def report_page(measurements: Sequence[Measurement], cycles: Sequence[int] = ())
     names = distinct_names([measurement.recording.path for measurement in measurements])
     parts = [_part(*named) for named in zip(names, measurements, strict=True)]
     plans = _plans(parts)
+    recordings = [recording_data(one.name, one.measurement, one.timeline, cycles) for one in parts]
     data = {
-        "recordings": [
-            recording_data(one.name, one.measurement, one.timeline, cycles) for one in parts
-        ],
-        "plans": [plan_drawing(plan) for plan in plans.values()],
+        "recordings": recordings,
+        "publishSlots": list(dict.fromkeys(slot for one in recordings for slot in one["slots"])),
+        "longest": max((1, *(time for one in recordings for time in one["points"]["time"][-1:]))),
+        "range": latency_range(recordings),
+        "bars": {"breakdown": hop_bars(names, measurements)}
+        | {f"slots-{number}": slot_bars(plan) for number, plan in enumerate(plans.values())},
     }
     headline = headline_table(names, measurements).html() + "".join(
         _paragraph(f"{name}: {one.left_out.text}.")
@@ -104,7 +150,7 @@ def report_page(measurements: Sequence[Measurement], cycles: Sequence[int] = ())
         if one.left_out.text
     )
     title = f"End-to-end latency of {measurements[0].analysis.chain.spec}"
-    return _filled(title, headline, _sections(parts, plans), data)
+    return _filled(title, headline, _sections(parts, plans, recordings), data)
 
 
 def _part(name: str, measurement: Measurement) -> _Part:
@@ -137,7 +183,9 @@ def _plans(parts: Sequence[_Part]) -> dict[str, Plan]:
     return {", ".join(users): plan for plan, users in found}
 
 
-def _sections(parts: Sequence[_Part], plans: dict[str, Plan]) -> list[str]:
+def _sections(
+    parts: Sequence[_Part], plans: dict[str, Plan], data: Sequence[dict[str, Any]]
+) -> list[str]:
     names = [one.name for one in parts]
     measurements = [one.measurement for one in parts]
     compared = Comparison(measurements[0].analysis.chain.spec, tuple(measurements))
@@ -152,14 +200,12 @@ def _sections(parts: Sequence[_Part], plans: dict[str, Plan]) -> list[str]:
         _section(
             "latency",
             "Latency over time, and its distribution",
-            _chart("over-time", "Latency of every cycle over time"),
-            _chart("histogram", "Histogram of the latency"),
-            _chart("cdf", "Cumulative distribution of the latency"),
+            *_latency_charts(parts, data),
         ),
         _section(
             "hops",
             "Where the time goes",
-            _chart("breakdown", "Mean communication and computation of every hop"),
+            _chart("breakdown", "Mean communication and computation of every hop", HOPS),
             *(
                 _paragraph(f"{one.name}, all complete cycles [ms]:")
                 + breakdown_table(one.measurement.analysis).html()
@@ -170,7 +216,7 @@ def _sections(parts: Sequence[_Part], plans: dict[str, Plan]) -> list[str]:
         _section(
             "cycles",
             "Cycle by cycle",
-            _chart("timeline", "Threads, servers and stalls in one cycle"),
+            _timeline(names, data),
         ),
         _section(
             "overruns",
@@ -260,7 +306,7 @@ def _plan_section(number: int, users: str, plan: Plan) -> str:
     return _section(
         f"plan-{number}",
         f"The plan of {users}",
-        _chart(f"slots-{number}", "The servers' slots over one cycle"),
+        _chart(f"slots-{number}", "The servers' slots over one cycle", SLOTS),
         plan_table(plan).html(),
         _details("The plan as YAML", f"<pre>{escape(dump_plan(plan))}</pre>"),
     )
@@ -296,10 +342,65 @@ def _details(summary: str, content: str, *, unfolded: bool = False) -> str:
     return f"<details{state}><summary>{escape(summary)}</summary>\n{content}\n</details>"
 
 
-def _chart(identifier: str, title: str) -> str:
+def _chart(identifier: str, title: str, caption: str, above: str = "", below: str = "") -> str:
     """A place that the script draws into; without scripts it says so."""
     waiting = _paragraph("This chart is drawn by a script: allow scripts to see it.", "waiting")
-    return f'<figure id="{identifier}" aria-label="{escape(title)}">{waiting}</figure>'
+    return (
+        f'<figure id="{identifier}" aria-label="{escape(title)}">{above}{waiting}'
+        f'<div class="chart" role="group" tabindex="0" aria-label="{escape(title)}"></div>'
+        f"<figcaption>{escape(caption)}</figcaption>{below}</figure>"
+    )
+
+
+def _latency_charts(parts: Sequence[_Part], data: Sequence[dict[str, Any]]) -> list[str]:
+    every, calm, few = [], [], ""
+    for part, one in zip(parts, data, strict=True):
+        total, drawn = one["points"]["of"], len(one["points"]["cycle"])
+        every.append(f"{part.name} ({total} cycles)")
+        watched = part.measurement.longest_stall_ns is not None
+        kind = "undisturbed" if watched else "complete"
+        calm.append(f"{part.name} ({one['histogram']['total']} {kind} cycles)")
+        if drawn < total:
+            few += FEWER_POINTS.format(total=total, name=part.name, drawn=drawn)
+    names = [part.name for part in parts]
+    return [
+        _chart("over-time", "Latency of every cycle over time", OVER_TIME + few, _legend(every)),
+        _chart("histogram", "Histogram of the latency", HISTOGRAM, _legend(calm)),
+        _chart("cdf", "Cumulative distribution of the latency", DISTRIBUTION, _legend(names)),
+    ]
+
+
+def _legend(names: Sequence[str]) -> str:
+    items = (
+        f'<span class="series-{number % 4}">{escape(name)}</span>'
+        for number, name in enumerate(names)
+    )
+    return f'<div class="legend">{"".join(items)}</div>'
+
+
+def _timeline(names: Sequence[str], data: Sequence[dict[str, Any]]) -> str:
+    """The timeline's figure: its controls, and the table of the hops, which the script fills."""
+    caption = TIMELINE
+    for name, timeline in zip(names, (one["timeline"] for one in data), strict=True):
+        if len(timeline["cycles"]) < timeline["of"]:
+            here = len(timeline["cycles"])
+            caption += FEWER_CYCLES.format(total=timeline["of"], name=name, number=here)
+    options = "".join(f"<option>{escape(name)}</option>" for name in names)
+    buttons = [
+        f'<button type="button" value="{value}" title="{title}">{text}</button>'
+        for value, text, title in BUTTONS
+    ]
+    number = '<input type="number" min="0" aria-label="cycle number">'
+    controls = [f'<select aria-label="recording">{options}</select>', *buttons]
+    controls.insert(5, number)
+    head = "".join(f'<th scope="col">{title}</th>' for title in HOP_TIMES)
+    return _chart(
+        "timeline",
+        "Threads, servers and stalls in one cycle",
+        caption,
+        f'<div class="controls">{"".join(controls)}</div><p class="about" aria-live="polite"></p>',
+        f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody></tbody></table></div>',
+    )
 
 
 def _filled(title: str, headline: str, sections: Sequence[str], data: dict[str, Any]) -> str:

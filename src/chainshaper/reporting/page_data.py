@@ -8,7 +8,7 @@ one the longest and the shortest, the median, those without an end, those that w
 number, and a sample of the others. Times are integer ns, counted from the first cycle's start.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,14 +19,17 @@ from chainshaper.analysis.disturbance import overlapping
 from chainshaper.planning import Plan, publish_slots
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.reporting.latency import PARTS, hop_breakdown
+from chainshaper.reporting.tables import ms, slots_ms
 from chainshaper.reporting.timeline import Timeline
 from chainshaper.verify.measure import Measurement
 
 __all__ = [
+    "hop_bars",
     "latency_histogram",
     "latency_points",
-    "plan_drawing",
+    "latency_range",
     "recording_data",
+    "slot_bars",
     "timeline_data",
 ]
 
@@ -43,6 +46,14 @@ SLICES = 20_000
 EXTREMES = 20
 """How many of the longest cycles, and of the shortest, are among them in any case."""
 
+KINDS = ("cycle", "callback", "unended", "held", "slot", "stall")
+BARS = ("row", "start", "length", "kind", "cycle", "text", "used")
+"""What bars the timeline has, and what is said of each."""
+
+FAR = 10**15
+"""Outside every recording: 11 days."""
+
+Bar = tuple[float, float, str, float, str]
 Times = npt.NDArray[np.int64]
 
 
@@ -57,17 +68,6 @@ def recording_data(
         "slots": _output_slots(measurement.plan),
         "points": latency_points(measurement.analysis.traversals, zero),
         "histogram": latency_histogram(measurement.analysis.traversals),
-        "hops": [
-            {
-                "name": f"{row['callback']} → {row['topic']}",
-                **{
-                    part: [row[f"{part}_ns"]["mean"], row[f"{part}_share"]]
-                    for part in PARTS
-                    if row[f"{part}_ns"] is not None
-                },
-            }
-            for row in hop_breakdown(measurement.analysis).iter_rows(named=True)
-        ],
         "timeline": timeline_data(measurement, timeline, cycles, zero),
     }
 
@@ -80,20 +80,51 @@ def _output_slots(plan: Plan | None) -> list[tuple[int, int]]:
     return [(start + delay, end + delay) for start, end in publish_slots(plan)]
 
 
-def plan_drawing(plan: Plan) -> dict[str, Any]:
-    """The servers' slots over one cycle."""
+def latency_range(recordings: Sequence[dict[str, Any]]) -> tuple[float, float]:
+    """The range of undisturbed latencies and slots, with a little air."""
+    ends = [end for one in recordings for slot in one["slots"] for end in slot]
+    for histogram in (one["histogram"] for one in recordings if one["histogram"]["bin"]):
+        first, *_, last = histogram["bin"][0], histogram["bin"][-1]
+        ends += [first * histogram["width"], (last + 1) * histogram["width"]]
+    if not ends:
+        return 0, 1e6
+    low, high = min(ends), max(ends)
+    air = max((high - low) * 0.04, high * 1e-4)
+    return 0 if low < 0.25 * high else low - air, high + air
+
+
+def hop_bars(names: Sequence[str], measurements: Sequence[Measurement]) -> dict[str, Any]:
+    """Mean communication (pale) and computation (full) of every hop, a row per recording."""
+    rows, longest = [], 1.0
+    for series, (name, measurement) in enumerate(zip(names, measurements, strict=True)):
+        bars: list[Bar] = []
+        at = 0.0
+        for number, hop in enumerate(hop_breakdown(measurement.analysis).iter_rows(named=True)):
+            for part in (part for part in PARTS if hop[f"{part}_ns"] is not None):
+                mean, share = hop[f"{part}_ns"]["mean"], hop[f"{part}_share"]
+                opacity = 0.35 if part == "communication" else 0.8 if number % 2 else 1
+                text = f"{hop['callback']} → {hop['topic']}\n{part} {ms(mean)} ms, {share:.1%}"
+                bars.append((at, at + mean, f"series-{series % 4}", opacity, text))
+                at += mean
+        rows.append((name, bars))
+        longest = max(longest, at)
+    label = "mean, from the start of the cycle"
+    return {"label": label, "length": longest * 1.01, "rows": rows}
+
+
+def slot_bars(plan: Plan) -> dict[str, Any]:
+    """The servers' slots over one cycle, a row per server."""
     publishing = publish_slots(plan)
-    return {
-        "cycle": plan.cycle_ns,
-        "servers": [
-            {
-                "name": f"{server.name}: core {server.core}, priority {server.priority}",
-                "slots": server.slots,
-                "output": server.slots == publishing,
-            }
-            for server in plan.servers
-        ],
-    }
+    rows = []
+    for server in plan.servers:
+        look = "series-1" if server.slots == publishing else "slot"
+        bars = [
+            (start, end, look, 1, f"{server.name}\n{slots_ms((start, end))} ms")
+            for start, end in server.slots
+        ]
+        where = f"{server.name}: core {server.core}, priority {server.priority}"
+        rows.append((where, bars))
+    return {"label": "in the cycle", "length": plan.cycle_ns, "zoom": "x", "rows": rows}
 
 
 def latency_points(traversals: pl.DataFrame, zero: int, limit: int = POINTS) -> dict[str, Any]:
@@ -132,49 +163,154 @@ def latency_points(traversals: pl.DataFrame, zero: int, limit: int = POINTS) -> 
 def latency_histogram(traversals: pl.DataFrame, bins: int = BINS) -> dict[str, Any]:
     """Undisturbed latencies counted in bins [n·width, (n+1)·width) of a width that is 10^k ns.
 
-    ``bin`` are the numbers n of those that are not empty, ``count`` how many are in them.
+    ``bin`` are the numbers n of those that are not empty, ``count`` how many are in them, ``total``
+    how many there are.
     """
     kept = traversals.filter(pl.col("complete") & ~pl.col("disturbed"))["latency_ns"].to_numpy()
     if not len(kept):
-        return {"width": 1, "bin": [], "count": []}
+        return {"width": 1, "bin": [], "count": [], "total": 0}
     width = 1
     while int(kept.max()) // width - int(kept.min()) // width >= bins:
         width *= 10
     numbers, counts = np.unique(kept // width, return_counts=True)
-    return {"width": width, "bin": numbers.tolist(), "count": counts.tolist()}
+    counted = {"bin": numbers.tolist(), "count": counts.tolist()}
+    return {"width": width, **counted, "total": len(kept)}
 
 
 def timeline_data(
     measurement: Measurement, timeline: Timeline, cycles: Sequence[int], zero: int
 ) -> dict[str, Any]:
-    """The timeline of the cycles that are kept, and which of them are worst, median and best."""
-    traversals = measurement.analysis.traversals
-    kept = _kept_cycles(traversals, timeline.slices.height, cycles)
-    windows = _windows(traversals.filter(pl.col("traversal").is_in(kept)), timeline)
-    began, ended = windows
-    slices = _inside(timeline.slices, began, ended)
-    lanes = timeline.threads.select("pid", "tid").with_row_index("lane")
-    slices = slices.join(lanes, on=["pid", "tid"], how="left", maintain_order="left")
-    names = {callback.id: callback.label for callback in measurement.analysis.graph.callbacks}
-    used, numbers = np.unique(slices["callback_id"].to_numpy(), return_inverse=True)
+    """The timeline around the cycles in the page, and which of them are worst, median and best.
+
+    ``rows`` are the chain, threads, servers and cores, each with a remark; ``gaps`` are stretches
+    of which the page has nothing. Bars are in the columns of :data:`BARS`: ``kind`` is the number
+    of one of :data:`KINDS`, ``cycle`` -1 where it is of none, ``text`` its number in ``texts``,
+    ``used`` the execution time.
+    """
+    analysis = measurement.analysis
+    chosen = _cycles_in_page(analysis.traversals, timeline.slices.height, cycles)
+    traversals = analysis.traversals.filter(pl.col("traversal").is_in(chosen))
+    began, ended = _windows(traversals, timeline)
+    threads = timeline.threads.select("pid", "tid").with_row_index("row", offset=1)
+    hops = _hops(measurement, timeline, traversals, threads)
+    rows, bars = _bars(measurement, timeline, traversals, (began, ended), threads, hops)
+    texts = {text: number for number, text in enumerate(dict.fromkeys(bar[5] for bar in bars))}
+    table = [(row, at - zero, *rest, texts[text], used) for row, at, *rest, text, used in bars]
+    columns = zip(*table, strict=True) if table else [()] * len(BARS)
+    edges = [-FAR, *np.column_stack([began - zero, ended - zero]).ravel().tolist(), FAR]
+    labels = {callback.id: callback.label for callback in analysis.graph.callbacks}
+    passed = zip(analysis.chain.callbacks, analysis.chain.topics, strict=True)
     return {
-        "threads": timeline.threads.select("nodes", pl.col("about").fill_null("")).rows(),
-        "callbacks": [names[callback] for callback in used.tolist()],
-        "lane": slices["lane"].to_list(),
-        "callback": numbers.tolist(),
-        "start": (slices["start"] - zero).to_list(),
-        "length": (slices["end"] - slices["start"]).to_list(),
-        "used": slices["execution_ns"].to_list(),
-        "unended": np.flatnonzero(~slices["ended"].to_numpy()).tolist(),
-        "windows": np.column_stack([began - zero, ended - zero]).tolist(),
-        "cycles": _cycles(measurement, timeline, kept, lanes, zero),
-        "of": traversals.height,
-        "chosen": _chosen(traversals),
-        "stalls": _stalls(timeline, began, ended, zero),
-        "watched": measurement.longest_stall_ns is not None,
-        "assumed": bool(timeline.origins["assumed"].any()),
-        "servers": _servers(measurement.plan),
+        "rows": rows,
+        **dict(zip(BARS, map(list, columns), strict=True)),
+        "texts": list(texts),
+        "gaps": list(zip(edges[::2], edges[1::2], strict=True)),
+        "cycles": _cycles(traversals, hops, zero),
+        "hops": [f"{labels[callback]} → {topic}" for callback, topic in passed],
+        "of": analysis.traversals.height,
+        "chosen": _chosen(analysis.traversals),
     }
+
+
+def _bars(  # noqa: PLR0917 - what a timeline is made of
+    measurement: Measurement,
+    timeline: Timeline,
+    traversals: pl.DataFrame,
+    windows: tuple[Times, Times],
+    threads: pl.DataFrame,
+    hops: pl.DataFrame,
+) -> tuple[list[tuple[str, str]], list[tuple[Any, ...]]]:
+    """The timeline's rows, and its bars: cycles, callbacks, what gates did, slots, stalls."""
+    cycle, callback, unended, held, slot, stall = range(len(KINDS))
+    labels = {one.id: one.label for one in measurement.analysis.graph.callbacks}
+    servers = () if measurement.plan is None else measurement.plan.servers
+    stalls = _inside(timeline.stalls.sort("start"), *windows)
+    rows = [("chain", ""), *timeline.threads.select("nodes", pl.col("about").fill_null("")).rows()]
+    server_rows = {one.name: number for number, one in enumerate(servers, start=len(rows))}
+    rows += [(f"server {one.name}", f"core {one.core}, priority {one.priority}") for one in servers]
+    cores = {core: number for number, core in enumerate(dict.fromkeys(stalls["core"]), len(rows))}
+    rows += [("stalls" if core is None else f"stalls of core {core}", "") for core in cores]
+    bars: list[tuple[Any, ...]] = []
+    for number, start, latency, hit in _rows(
+        traversals.filter("complete"), "traversal", "start", "latency_ns", "disturbed"
+    ):
+        text = f"cycle {number}{', disturbed by the machine' if hit else ''}"
+        bars.append((0, start, latency, cycle, number, text, None))
+    slices = _inside(timeline.slices, *windows).join(
+        threads, on=["pid", "tid"], maintain_order="left"
+    )
+    for row, one, start, end, whole, used in _rows(
+        slices, "row", "callback_id", "start", "end", "ended", "execution_ns"
+    ):
+        text, kind = labels[one], callback if whole else unended
+        text += "" if whole else "\nits end was not recorded"
+        bars.append((row, start, end - start, kind, -1, text, used))
+    holds = timeline.holds.join(hops, on=["traversal", "hop"], maintain_order="left")
+    for row, number, arrival, let_go, overrun in _rows(
+        holds, "row", "traversal", "arrival", "let_go", "overrun"
+    ):
+        text = f"cycle {number}: held{f', overran: {overrun}' if overrun else ''}"
+        bars.append((row, arrival, let_go - arrival, held, number, text, None))
+    slots = timeline.slots.join(traversals.select("traversal"), on="traversal", how="semi")
+    origins = timeline.origins.select("traversal", "origin", "assumed")
+    for name, number, start, end, origin, assumed in _rows(
+        slots.join(origins, on="traversal", maintain_order="left"),
+        *("server", "traversal", "start", "end", "origin", "assumed"),
+    ):
+        text = f"server {name}, cycle {number}\n{slots_ms((start - origin, end - origin))} ms"
+        text += "\nthe cycle's start is not recorded but assumed" if assumed else ""
+        bars.append((server_rows[name], start, end - start, slot, number, text, None))
+    for core, start, end in stalls.iter_rows():
+        text = "the machine stalled"
+        bars.append((cores[core], start, end - start, stall, -1, text, None))
+    return rows, bars
+
+
+def _rows(frame: pl.DataFrame, *columns: str) -> Iterator[tuple[Any, ...]]:
+    return frame.select(columns).iter_rows()
+
+
+def _hops(
+    measurement: Measurement, timeline: Timeline, traversals: pl.DataFrame, threads: pl.DataFrame
+) -> pl.DataFrame:
+    """``traversal, hop, row`` and the times of the hops, counted from their cycle's start."""
+    times = (pl.col(name) - pl.col("begun") for name in ("take", "start", "publish", "end"))
+    return (
+        measurement.analysis.hops.join(
+            traversals.select("traversal", begun="start"), on="traversal"
+        )
+        .join(timeline.slices.select("instance", "pid", "tid"), on="instance", how="left")
+        .join(threads, on=["pid", "tid"], how="left")
+        .sort("traversal", "hop")
+        .select("traversal", "hop", "row", *times)
+    )
+
+
+def _cycles(traversals: pl.DataFrame, hops: pl.DataFrame, zero: int) -> list[dict[str, Any]]:
+    """Each cycle in the page; its hops ``[row, take, start, publish, end]`` count from its start.
+
+    ``length`` is the time that it takes on the timeline.
+    """
+    hops_of: dict[int, list[list[int | None]]] = {}
+    for traversal, _, *hop in hops.iter_rows():
+        hops_of.setdefault(traversal, []).append(hop)
+    found = []
+    for row in traversals.iter_rows(named=True):
+        number, start = row["traversal"], row["start"]
+        own = hops_of.get(number, [])
+        state = f"incomplete: {row['reason']} ({row['broken_at']})"
+        about = f"{ms(row['latency_ns'])} ms" if row["complete"] else state
+        about += ", disturbed by the machine" if row["disturbed"] else ""
+        received = None if row["received"] is None else row["received"] - start
+        about += "" if received is None else f"; {ms(received)} ms at the subscriber"
+        about += f"; began {(start - zero) / 1e9:.3f} s after the first"
+        cycle = {"n": number, "start": start - zero, "hops": own, "about": about}
+        if row["complete"]:
+            cycle["latency"] = row["latency_ns"]
+        ends = [time for hop in own for time in hop[2:] if time is not None]
+        cycle["length"] = max(1000, row["latency_ns"] or 0, received or 0, *ends)
+        found.append(cycle)
+    return found
 
 
 def _chosen(traversals: pl.DataFrame) -> dict[str, int]:
@@ -189,7 +325,7 @@ def _chosen(traversals: pl.DataFrame) -> dict[str, int]:
     return {name: int(numbers[place]) for name, place in chosen.items()}
 
 
-def _kept_cycles(traversals: pl.DataFrame, slices: int, asked: Sequence[int]) -> list[int]:
+def _cycles_in_page(traversals: pl.DataFrame, slices: int, asked: Sequence[int]) -> list[int]:
     """All cycles where they are few; else those asked for, extremes, incomplete, and a sample."""
     per_cycle = max(1.0, slices / max(1, traversals.height))
     room = max(2 * EXTREMES + 1, min(CYCLES, int(SLICES / per_cycle)))
@@ -230,65 +366,3 @@ def _windows(kept: pl.DataFrame, timeline: Timeline) -> tuple[Times, Times]:
 def _inside(slices: pl.DataFrame, began: Times, ended: Times) -> pl.DataFrame:
     start, end = slices["start"].to_numpy(), slices["end"].to_numpy()
     return slices.filter(pl.Series(overlapping(start, end, began, ended), dtype=pl.Boolean))
-
-
-def _cycles(
-    measurement: Measurement,
-    timeline: Timeline,
-    kept: Sequence[int],
-    lanes: pl.DataFrame,
-    zero: int,
-) -> list[dict[str, Any]]:
-    """Each kept cycle; its hops ``[lane, take, start, publish, end]`` count from its start."""
-    cycles = measurement.analysis.traversals.filter(pl.col("traversal").is_in(kept))
-    times = (pl.col(name) - pl.col("begun") for name in ("take", "start", "publish", "end"))
-    hops = (
-        measurement.analysis.hops.join(cycles.select("traversal", begun="start"), on="traversal")
-        .join(timeline.slices.select("instance", "pid", "tid"), on="instance", how="left")
-        .join(lanes, on=["pid", "tid"], how="left")
-        .sort("traversal", "hop")
-        .select("traversal", "lane", *times)
-    )
-    hops_of: dict[int, list[list[int | None]]] = {}
-    for traversal, *hop in hops.iter_rows():
-        hops_of.setdefault(traversal, []).append(hop)
-    origins = timeline.origins.select("traversal", "origin")
-    held = timeline.holds.unique("traversal", keep="last", maintain_order=True)
-    rows = cycles.join(origins, on="traversal", how="left", maintain_order="left").join(
-        held.select("traversal", "arrival", "let_go", "overrun"),
-        on="traversal",
-        how="left",
-        maintain_order="left",
-    )
-    found = []
-    for row in rows.iter_rows(named=True):
-        number, start = row["traversal"], row["start"]
-        cycle = {"n": number, "start": start - zero, "hops": hops_of.get(number, [])}
-        if row["complete"]:
-            cycle["latency"] = row["latency_ns"]
-        else:
-            cycle["reason"] = f"{row['reason']} ({row['broken_at']})"
-        if row["disturbed"]:
-            cycle["disturbed"] = 1
-        for name in ("received", "origin"):
-            if row[name] is not None:
-                cycle[name] = row[name] - start
-        if row["arrival"] is not None:
-            cycle["held"] = [row["arrival"] - start, row["let_go"] - start, row["overrun"]]
-        found.append(cycle)
-    return found
-
-
-def _stalls(timeline: Timeline, began: Times, ended: Times, zero: int) -> list[list[int]]:
-    inside = _inside(timeline.stalls.sort("start"), began, ended)
-    lasted = pl.col("end") - pl.col("start")
-    rows = inside.select(pl.col("core").fill_null(-1), pl.col("start") - zero, lasted)
-    return [list(row) for row in rows.iter_rows()]
-
-
-def _servers(plan: Plan | None) -> list[list[Any]]:
-    servers = () if plan is None else plan.servers
-    return [
-        [server.name, f"core {server.core}, priority {server.priority}", server.slots]
-        for server in servers
-    ]
