@@ -21,8 +21,8 @@ from chainshaper.planning import PlanRequest
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.verify.measure import measure_latency
-from chainshaper.workload.asynchronous import AsynchronousWriter, PublisherThread
 from chainshaper.workload.description import Application
+from chainshaper.workload.executor import AsynchronousWriter, PublisherThread
 from chainshaper.workload.live import run_application
 
 MS = 1_000_000

@@ -15,7 +15,7 @@ from chainshaper.analysis import (
     graph_of,
     load_named_paths,
 )
-from chainshaper.analysis.close_names import close_names
+from chainshaper.analysis.chains import close_names
 from chainshaper.analysis.description import ApplicationDescription, services
 from chainshaper.sources import open_source
 from chainshaper.sources.lttng.event_fields import table_name
