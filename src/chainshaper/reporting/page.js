@@ -32,7 +32,6 @@ function rounded(rough) {
  */
 function chart(id, spec) {
   const frame = document.querySelector(`#${id} .chart`);
-  frame.previousElementSibling.remove(); // the words for readers without scripts
   let view, box, svg, layer, marker, marks = [], focused = -1, drag = null, width = 0;
   const scale = {
     x: (value) => box.left + (value - view.x[0]) / (view.x[1] - view.x[0]) * box.width,

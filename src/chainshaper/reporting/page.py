@@ -52,48 +52,7 @@ ENDINGS = (".html", ".htm")
 LISTED = 50
 """Rows of a list that may be endless."""
 
-OVER_TIME = (
-    "Crosses: disturbed by the machine. Triangles: beyond the axis. Red ticks: incomplete cycles."
-    " Grey: publish slots. Drag to zoom, double click or Escape to go back; arrow keys walk through"
-    " the cycles, Enter or a click opens one below."
-)
-FEWER_POINTS = (
-    " Of {total} cycles of {name} {drawn} are drawn: of every stretch the shortest and the longest,"
-    " disturbed and not, and of the others every n-th."
-)
-HISTOGRAM = (
-    "Without cycles that the machine disturbed, each recording on a scale of its own. Grey: publish"
-    " slots. Zooming in makes the bins finer; every cycle is counted."
-)
-DISTRIBUTION = "Without cycles that the machine disturbed. Grey: publish slots."
-HOPS = (
-    "Full: computation, from a callback's start to its publication. Pale: communication, from the"
-    " publication before to the start: transport, and waiting for the executor."
-)
-SLOTS = (
-    "Blue: the server in whose slots the output is published. Slots are half-open and drawn at"
-    " least 1.5 pixels wide; drag to zoom."
-)
-TIMELINE = (
-    "Orange: what the cycle itself ran; pale: transport, and waiting; grey: other callbacks; blue:"
-    " slots; hatched: held by the gate; red: stalls. A callback is pale where its end was not"
-    " recorded. Drag, or the arrow keys, move; + and − or Ctrl with the wheel zoom."
-)
-FEWER_CYCLES = (
-    " Of {total} cycles of {name} {number} are here: the longest, the shortest, incomplete ones,"
-    " those asked for, and a sample of the others."
-)
-BUTTONS = (
-    ("longest", "longest", "the longest undisturbed cycle"),
-    ("median", "median", "the undisturbed cycle of median latency"),
-    ("shortest", "shortest", "the shortest undisturbed cycle"),
-    ("previous", "‹", "previous cycle"),
-    ("next", "›", "next cycle"),
-    ("in", "+", "zoom in"),
-    ("out", "−", "zoom out"),
-    ("whole", "whole cycle", "show the whole cycle"),
-)
-HOP_TIMES = ("hop [ms]", "taken", "started", "published", "communication", "computation")
+WAITING = '<p class="waiting">This chart is drawn by a script: allow scripts to see it.</p>'
 
 
 @dataclass(frozen=True)
@@ -136,21 +95,29 @@ def report_page(measurements: Sequence[Measurement], cycles: Sequence[int] = ())
     parts = [_part(*named) for named in zip(names, measurements, strict=True)]
     plans = _plans(parts)
     recordings = [recording_data(one.name, one.measurement, one.timeline, cycles) for one in parts]
+    times = [time for one in recordings for time in one["points"]["time"][-1:]]
     data = {
         "recordings": recordings,
         "publishSlots": list(dict.fromkeys(slot for one in recordings for slot in one["slots"])),
-        "longest": max((1, *(time for one in recordings for time in one["points"]["time"][-1:]))),
+        "longest": max([1, *times]),
         "range": latency_range(recordings),
         "bars": {"breakdown": hop_bars(names, measurements)}
         | {f"slots-{number}": slot_bars(plan) for number, plan in enumerate(plans.values())},
     }
-    headline = headline_table(names, measurements).html() + "".join(
-        _paragraph(f"{name}: {one.left_out.text}.")
-        for name, one in zip(names, measurements, strict=True)
-        if one.left_out.text
+    folder = resources.files("chainshaper.reporting")
+    page, style, script = (
+        (folder / name).read_text("utf-8") for name in ("page.html", "page.css", "page.js")
     )
-    title = f"End-to-end latency of {measurements[0].analysis.chain.spec}"
-    return _filled(title, headline, _sections(parts, plans, recordings), data)
+    digest = base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
+    return Template(page).substitute(
+        _tables(parts, plans),
+        **_beside_charts(parts, recordings),
+        title=escape(f"End-to-end latency of {measurements[0].analysis.chain.spec}"),
+        style=style,
+        data=_embedded(data),
+        script=script,
+        digest=digest,
+    )
 
 
 def _part(name: str, measurement: Measurement) -> _Part:
@@ -183,59 +150,72 @@ def _plans(parts: Sequence[_Part]) -> dict[str, Plan]:
     return {", ".join(users): plan for plan, users in found}
 
 
-def _sections(
-    parts: Sequence[_Part], plans: dict[str, Plan], data: Sequence[dict[str, Any]]
-) -> list[str]:
+def _tables(parts: Sequence[_Part], plans: dict[str, Plan]) -> dict[str, str]:
+    """What the page's tables say, by the places that the template has for them."""
     names = [one.name for one in parts]
     measurements = [one.measurement for one in parts]
     compared = Comparison(measurements[0].analysis.chain.spec, tuple(measurements))
+    left_out = [(one.name, one.measurement.left_out.text) for one in parts]
     incomplete = incomplete_table(names, measurements)
-    return [
-        _section(
-            "figures",
-            "Before and after" if len(parts) > 1 else "Figures",
-            comparison_table(compared, names).html(),
-            *map(_prediction, parts),
+    hops = [(one.name, breakdown_table(one.measurement.analysis).html()) for one in parts]
+    notes = [(one.name, dict.fromkeys(one.measurement.analysis.notes)) for one in parts]
+    items = "".join(f"<li>{escape(f'{name}: {note}')}</li>" for name, own in notes for note in own)
+    conditions = condition_table(names, measurements).html(), *map(_recorded_threads, parts)
+    return {
+        "headline": headline_table(names, measurements).html()
+        + "".join(_paragraph(f"{name}: {text}.") for name, text in left_out if text),
+        "before_and_after": "Before and after" if len(parts) > 1 else "Figures",
+        "comparison": comparison_table(compared, names).html(),
+        "predictions": "\n".join(map(_prediction, parts)),
+        "hops": "\n".join(
+            _paragraph(f"{name}, all complete cycles [ms]:") + table for name, table in hops
         ),
-        _section(
-            "latency",
-            "Latency over time, and its distribution",
-            *_latency_charts(parts, data),
-        ),
-        _section(
-            "hops",
-            "Where the time goes",
-            _chart("breakdown", "Mean communication and computation of every hop", HOPS),
-            *(
-                _paragraph(f"{one.name}, all complete cycles [ms]:")
-                + breakdown_table(one.measurement.analysis).html()
-                for one in parts
-            ),
-        ),
-        _section("callbacks", "Callbacks", *map(_callbacks, parts)),
-        _section(
-            "cycles",
-            "Cycle by cycle",
-            _timeline(names, data),
-        ),
-        _section(
-            "overruns",
-            "Overruns and incomplete cycles",
-            *map(_overruns, parts),
-            incomplete.html()
-            if incomplete.rows
-            else _paragraph("Every cycle that began is complete."),
-        ),
-        _section("stalls", "Stalls of the machine", *map(_stalls, parts)),
-        *(_plan_section(number, *one) for number, one in enumerate(plans.items())),
-        _section(
-            "conditions",
-            "What was recorded, where and how",
-            condition_table(names, measurements).html(),
-            *map(_recorded_threads, parts),
-            _notes(parts),
-        ),
-    ]
+        "callbacks": "\n".join(map(_callbacks, parts)),
+        "overruns": "\n".join(map(_overruns, parts)),
+        "incomplete": incomplete.html()
+        if incomplete.rows
+        else _paragraph("Every cycle that began is complete."),
+        "stalls": "\n".join(map(_stalls, parts)),
+        "plans": "\n".join(_plan(number, *one) for number, one in enumerate(plans.items())),
+        "conditions": "\n".join([*conditions, f'<ul class="notes">{items}</ul>']),
+    }
+
+
+def _beside_charts(parts: Sequence[_Part], data: Sequence[dict[str, Any]]) -> dict[str, str]:
+    """Legends, choices, and what charts leave out."""
+    every, sample, points, cycles = [], [], "", ""
+    for part, one in zip(parts, data, strict=True):
+        total, drawn = one["points"]["of"], len(one["points"]["cycle"])
+        number, here = one["timeline"]["of"], len(one["timeline"]["cycles"])
+        kind = "complete" if part.measurement.longest_stall_ns is None else "undisturbed"
+        every.append(f"{part.name} ({total} cycles)")
+        sample.append(f"{part.name} ({one['histogram']['total']} {kind} cycles)")
+        if drawn < total:
+            points += (
+                f" Of {total} cycles of {part.name} {drawn} are drawn: of every stretch the"
+                " shortest and the longest, disturbed and not, and of the others every n-th."
+            )
+        if here < number:
+            cycles += (
+                f" Of {number} cycles of {part.name} {here} are here: the longest, the shortest,"
+                " incomplete ones, those asked for, and a sample of the others."
+            )
+    return {
+        "legend": _legend(every),
+        "legend_of_sample": _legend(sample),
+        "fewer_points": escape(points),
+        "fewer_cycles": escape(cycles),
+        "options": "".join(f"<option>{escape(part.name)}</option>" for part in parts),
+        "waiting": WAITING,
+    }
+
+
+def _legend(names: Sequence[str]) -> str:
+    items = (
+        f'<span class="series-{number % 4}">{escape(name)}</span>'
+        for number, name in enumerate(names)
+    )
+    return f'<div class="legend">{"".join(items)}</div>'
 
 
 def _prediction(part: _Part) -> str:
@@ -302,13 +282,17 @@ def _stalls(part: _Part) -> str:
     return _paragraph(about) + stall_table(meter, stalls).html()
 
 
-def _plan_section(number: int, users: str, plan: Plan) -> str:
-    return _section(
-        f"plan-{number}",
-        f"The plan of {users}",
-        _chart(f"slots-{number}", "The servers' slots over one cycle", SLOTS),
-        plan_table(plan).html(),
-        _details("The plan as YAML", f"<pre>{escape(dump_plan(plan))}</pre>"),
+def _plan(number: int, users: str, plan: Plan) -> str:
+    title = "The servers' slots over one cycle"
+    return (
+        f'<section id="plan-{number}">\n<h2>{escape(f"The plan of {users}")}</h2>\n'
+        f'<figure id="slots-{number}">'
+        f'<div class="chart" role="group" tabindex="0" aria-label="{title}">{WAITING}</div>'
+        "<figcaption>Blue: the server in whose slots the output is published. Slots are half-open"
+        " and drawn at least 1.5 pixels wide; drag to zoom.</figcaption></figure>\n"
+        + plan_table(plan).html()
+        + _details("The plan as YAML", f"<pre>{escape(dump_plan(plan))}</pre>")
+        + "</section>"
     )
 
 
@@ -318,106 +302,13 @@ def _recorded_threads(part: _Part) -> str:
     return _details(f"Threads of {part.name} ({len(threads)})", table) if threads else ""
 
 
-def _notes(parts: Sequence[_Part]) -> str:
-    """What a reader of the figures must know, recording by recording."""
-    items = "".join(
-        f"<li>{escape(f'{one.name}: {note}')}</li>"
-        for one in parts
-        for note in dict.fromkeys(one.measurement.analysis.notes)
-    )
-    return f'<ul class="notes">{items}</ul>' if items else ""
-
-
-def _section(identifier: str, title: str, *contents: str) -> str:
-    body = "\n".join(content for content in contents if content)
-    return f'<section id="{identifier}">\n<h2>{escape(title)}</h2>\n{body}\n</section>'
-
-
-def _paragraph(text: str, kind: str = "about") -> str:
-    return f'<p class="{kind}">{escape(text)}</p>' if text else ""
+def _paragraph(text: str) -> str:
+    return f'<p class="about">{escape(text)}</p>' if text else ""
 
 
 def _details(summary: str, content: str, *, unfolded: bool = False) -> str:
     state = " open" if unfolded else ""
     return f"<details{state}><summary>{escape(summary)}</summary>\n{content}\n</details>"
-
-
-def _chart(identifier: str, title: str, caption: str, above: str = "", below: str = "") -> str:
-    """A place that the script draws into; without scripts it says so."""
-    waiting = _paragraph("This chart is drawn by a script: allow scripts to see it.", "waiting")
-    return (
-        f'<figure id="{identifier}" aria-label="{escape(title)}">{above}{waiting}'
-        f'<div class="chart" role="group" tabindex="0" aria-label="{escape(title)}"></div>'
-        f"<figcaption>{escape(caption)}</figcaption>{below}</figure>"
-    )
-
-
-def _latency_charts(parts: Sequence[_Part], data: Sequence[dict[str, Any]]) -> list[str]:
-    every, calm, few = [], [], ""
-    for part, one in zip(parts, data, strict=True):
-        total, drawn = one["points"]["of"], len(one["points"]["cycle"])
-        every.append(f"{part.name} ({total} cycles)")
-        watched = part.measurement.longest_stall_ns is not None
-        kind = "undisturbed" if watched else "complete"
-        calm.append(f"{part.name} ({one['histogram']['total']} {kind} cycles)")
-        if drawn < total:
-            few += FEWER_POINTS.format(total=total, name=part.name, drawn=drawn)
-    names = [part.name for part in parts]
-    return [
-        _chart("over-time", "Latency of every cycle over time", OVER_TIME + few, _legend(every)),
-        _chart("histogram", "Histogram of the latency", HISTOGRAM, _legend(calm)),
-        _chart("cdf", "Cumulative distribution of the latency", DISTRIBUTION, _legend(names)),
-    ]
-
-
-def _legend(names: Sequence[str]) -> str:
-    items = (
-        f'<span class="series-{number % 4}">{escape(name)}</span>'
-        for number, name in enumerate(names)
-    )
-    return f'<div class="legend">{"".join(items)}</div>'
-
-
-def _timeline(names: Sequence[str], data: Sequence[dict[str, Any]]) -> str:
-    """The timeline's figure: its controls, and the table of the hops, which the script fills."""
-    caption = TIMELINE
-    for name, timeline in zip(names, (one["timeline"] for one in data), strict=True):
-        if len(timeline["cycles"]) < timeline["of"]:
-            here = len(timeline["cycles"])
-            caption += FEWER_CYCLES.format(total=timeline["of"], name=name, number=here)
-    options = "".join(f"<option>{escape(name)}</option>" for name in names)
-    buttons = [
-        f'<button type="button" value="{value}" title="{title}">{text}</button>'
-        for value, text, title in BUTTONS
-    ]
-    number = '<input type="number" min="0" aria-label="cycle number">'
-    controls = [f'<select aria-label="recording">{options}</select>', *buttons]
-    controls.insert(5, number)
-    head = "".join(f'<th scope="col">{title}</th>' for title in HOP_TIMES)
-    return _chart(
-        "timeline",
-        "Threads, servers and stalls in one cycle",
-        caption,
-        f'<div class="controls">{"".join(controls)}</div><p class="about" aria-live="polite"></p>',
-        f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody></tbody></table></div>',
-    )
-
-
-def _filled(title: str, headline: str, sections: Sequence[str], data: dict[str, Any]) -> str:
-    folder = resources.files("chainshaper.reporting")
-    page, style, script = (
-        (folder / name).read_text("utf-8") for name in ("page.html", "page.css", "page.js")
-    )
-    digest = base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
-    return Template(page).substitute(
-        title=escape(title),
-        headline=headline,
-        style=style,
-        sections="\n".join(sections),
-        data=_embedded(data),
-        script=script,
-        digest=digest,
-    )
 
 
 def _embedded(data: dict[str, Any]) -> str:
