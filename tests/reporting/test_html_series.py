@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 from hypothesis import given
 from hypothesis import strategies as st
-from told_run import LATENCY_NS, MS, PERIOD_NS, told_run
+from known_run import LATENCY_NS, MS, PERIOD_NS, known_run
 
 from chainshaper import data_flow, measure_latency
 from chainshaper.reporting.page_data import (
@@ -98,7 +98,7 @@ def test_a_hundred_thousand_cycles_fit_a_page() -> None:
     assert 0.1 < np.mean(middle) < 0.5
 
 
-def _kept(recording: Recording, asked: Sequence[int] = ()) -> dict[str, Any]:
+def _page_data(recording: Recording, asked: Sequence[int] = ()) -> dict[str, Any]:
     measured = measure_latency(recording)
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
     timeline = timeline_of(recording, flow, measured.analysis, measured.plan)
@@ -116,7 +116,7 @@ def _bars(data: dict[str, Any], kind: str) -> list[tuple[Any, ...]]:
 
 
 def test_a_timeline_of_few_cycles_keeps_all_of_them(tmp_path: Path) -> None:
-    data = _kept(told_run(tmp_path / "told", 3, untaken=(1,)))
+    data = _page_data(known_run(tmp_path / "known", 3, untaken=(1,)))
     assert [cycle["n"] for cycle in data["cycles"]] == [0, 1, 2]
     one, broken, _ = data["cycles"]
     assert one["hops"] == [
@@ -138,8 +138,8 @@ def test_a_timeline_of_few_cycles_keeps_all_of_them(tmp_path: Path) -> None:
 
 
 def test_a_timeline_of_many_cycles_keeps_those_that_somebody_looks_for(tmp_path: Path) -> None:
-    recording = told_run(tmp_path / "told", 900, untaken=(511,), overran=(333,))
-    data = _kept(recording, asked=(777,))
+    recording = known_run(tmp_path / "known", 900, untaken=(511,), overran=(333,))
+    data = _page_data(recording, asked=(777,))
     kept = {cycle["n"] for cycle in data["cycles"]}
     assert len(kept) <= CYCLES + 1
     assert {333, 511, 777} <= kept, "the longest, the one that broke, the one that was asked for"

@@ -95,7 +95,7 @@ def shape_application(
     """Splice the plan's shaping node into an application, run it and record it.
 
     ``enforcement`` puts the plan's servers in force while it runs. A shaping node does without;
-    the thread of an asynchronous publisher is gated unless somebody else sees to it
+    the thread of an asynchronous publisher is gated unless ``enforcement`` does so
     (:mod:`chainshaper.flow.publisher_gating`).
 
     Raises:

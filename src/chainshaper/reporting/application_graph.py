@@ -63,10 +63,10 @@ def without_internals(application: ApplicationDescription) -> ApplicationDescrip
     ]
     publishers = {t: nodes for t, nodes in graph.publishers.items() if not is_internal(t)}
     subscribers = {t: nodes for t, nodes in graph.subscribers.items() if not is_internal(t)}
-    kept = replace(
+    shown_graph = replace(
         graph, callbacks=tuple(callbacks), publishers=publishers, subscribers=subscribers
     )
-    return replace(application, graph=kept)
+    return replace(application, graph=shown_graph)
 
 
 def application_json(application: ApplicationDescription) -> dict[str, Any]:
@@ -153,15 +153,15 @@ def short_symbol(symbol: str | None) -> str:
 
 def _without_brackets(text: str) -> str:
     """The text outside all <…>, (…) and {…}."""
-    depth, kept = 0, []
+    depth, outside = 0, []
     for character in text:
         if character in "<({":
             depth += 1
         if depth == 0:
-            kept.append(character)
+            outside.append(character)
         if character in ">)}":
             depth -= 1
-    return "".join(kept)
+    return "".join(outside)
 
 
 def application_dot(application: ApplicationDescription) -> str:

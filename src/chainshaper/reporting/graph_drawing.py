@@ -17,6 +17,7 @@ crosses a box. Parts that are not connected are laid out one below the other.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from graphlib import TopologicalSorter
+from itertools import accumulate
 
 import numpy as np
 
@@ -285,9 +286,13 @@ def lay_out(boxes: Sequence[Box], edges: Sequence[Edge]) -> Layout:
             edge = edges[number]
             (x, y), (to_x, to_y) = corners[edge.source], corners[edge.target]
             start = (x + boxes[edge.source].width, y + edge.leaves)
-            between = _passing(places[number], graph, lefts, top - lowest)
-            backwards = graph.layer[edge.source] > graph.layer[edge.target]
-            between = between[::-1] if backwards else between
+            between = [
+                (side, graph.y[place] + PLACE_HEIGHT / 2 + top - lowest)
+                for place in places[number]
+                for side in lefts[graph.layer[place]]
+            ]
+            if graph.layer[edge.source] > graph.layer[edge.target]:
+                between.reverse()
             routes[number] = [start, *between, (to_x, to_y + edge.enters)]
         below = max(graph.y[v] + graph.height[v] for v in graph.y) - lowest
         width = max(width, lefts[-1][1])
@@ -379,7 +384,7 @@ def _layers(chosen: list[int], pairs: list[tuple[int, int]]) -> dict[int, int]:
 
 
 def _sort_columns(graph: _Columns) -> None:
-    """Order each column by the mean position of its neighbours; the best order seen is kept."""
+    """Order each column by the mean position of its neighbours; the best order seen stays."""
     before, after = _neighbours(graph)
     best = [list(column) for column in graph.columns]
     fewest = _crossings(graph)
@@ -441,10 +446,8 @@ def _choose_heights(graph: _Columns) -> None:
     """Heights that let edges run straight, column by column, back and forth."""
     before, after = _neighbours(graph)
     for column in graph.columns:
-        top = 0.0
-        for vertex in column:
-            graph.y[vertex] = top
-            top += graph.height[vertex] + ROW_GAP
+        tops = accumulate((graph.height[vertex] + ROW_GAP for vertex in column), initial=0.0)
+        graph.y.update(zip(column, tops, strict=False))
     for sweep in range(SWEEPS):
         last = sweep >= SWEEPS - 4
         forwards = sweep % 2 == 0
@@ -468,11 +471,12 @@ def _choose_heights(graph: _Columns) -> None:
 def _apart(
     graph: _Columns, column: list[int], wanted: list[float], weights: list[float]
 ) -> list[float]:
-    """The heights nearest to ``wanted`` that keep order and gaps (isotonic regression)."""
-    offsets, offset = [], 0.0
-    for vertex in column:
-        offsets.append(offset)
-        offset += graph.height[vertex] + ROW_GAP
+    """The heights nearest to ``wanted`` that keep order and gaps (isotonic regression).
+
+    SciPy has one, too, but takes longer to import than a whole drawing.
+    """
+    sizes = (graph.height[vertex] + ROW_GAP for vertex in column)
+    offsets = list(accumulate(sizes, initial=0.0))[:-1]
     blocks: list[tuple[float, float, int]] = []  # mean, weight, members
     for want, weight, offset in zip(wanted, weights, offsets, strict=True):
         mean, heavy, members = want - offset, weight, 1
@@ -493,14 +497,3 @@ def _lefts(graph: _Columns, boxes: Sequence[Box]) -> list[tuple[float, float]]:
         sides.append((left, left + width))
         left += width + COLUMN_GAP
     return sides
-
-
-def _passing(
-    places: list[int], graph: _Columns, lefts: list[tuple[float, float]], down: float
-) -> list[tuple[float, float]]:
-    """The way points at which an edge enters and leaves the columns that it passes."""
-    points = []
-    for place in places:
-        height = graph.y[place] + PLACE_HEIGHT / 2 + down
-        points += [(side, height) for side in lefts[graph.layer[place]]]
-    return points

@@ -166,15 +166,17 @@ def latency_histogram(traversals: pl.DataFrame, bins: int = BINS) -> dict[str, A
     ``bin`` are the numbers n of those that are not empty, ``count`` how many are in them, ``total``
     how many there are.
     """
-    kept = traversals.filter(pl.col("complete") & ~pl.col("disturbed"))["latency_ns"].to_numpy()
-    if not len(kept):
+    latencies = traversals.filter(pl.col("complete") & ~pl.col("disturbed"))[
+        "latency_ns"
+    ].to_numpy()
+    if not len(latencies):
         return {"width": 1, "bin": [], "count": [], "total": 0}
     width = 1
-    while int(kept.max()) // width - int(kept.min()) // width >= bins:
+    while int(latencies.max()) // width - int(latencies.min()) // width >= bins:
         width *= 10
-    numbers, counts = np.unique(kept // width, return_counts=True)
+    numbers, counts = np.unique(latencies // width, return_counts=True)
     counted = {"bin": numbers.tolist(), "count": counts.tolist()}
-    return {"width": width, **counted, "total": len(kept)}
+    return {"width": width, **counted, "total": len(latencies)}
 
 
 def timeline_data(
@@ -346,10 +348,10 @@ def _cycles_in_page(traversals: pl.DataFrame, slices: int, asked: Sequence[int])
     return sorted(list(dict.fromkeys(candidates))[: room + len(asked)])
 
 
-def _windows(kept: pl.DataFrame, timeline: Timeline) -> tuple[Times, Times]:
+def _windows(traversals: pl.DataFrame, timeline: Timeline) -> tuple[Times, Times]:
     """From a little before each cycle to a little behind its output's reception; merged."""
     slots = timeline.slots.group_by("traversal").agg(closes=pl.col("end").max())
-    rows = kept.join(slots, on="traversal", how="left", maintain_order="left")
+    rows = traversals.join(slots, on="traversal", how="left", maintain_order="left")
     usual = rows["latency_ns"].median()
     length = int(usual) if isinstance(usual, float) else 100_000_000
     ends = rows.select(
