@@ -63,8 +63,8 @@ if TYPE_CHECKING:
         plan_shaping,
         save_plan,
     )
-    from chainshaper.reporting.application_graph import write_picture
     from chainshaper.reporting.figures import draw_distribution, draw_latency
+    from chainshaper.reporting.graph_drawing import write_picture
     from chainshaper.reporting.latency import hop_breakdown
     from chainshaper.reporting.page import write_report
     from chainshaper.reporting.perfetto import export_perfetto
@@ -143,7 +143,7 @@ _HOMES = {
         "measure_latency",
     ),
     "chainshaper.analysis.description": ("ApplicationDescription",),
-    "chainshaper.reporting.application_graph": ("write_picture",),
+    "chainshaper.reporting.graph_drawing": ("write_picture",),
     "chainshaper.reporting.figures": ("draw_distribution", "draw_latency"),
     "chainshaper.reporting.latency": ("hop_breakdown",),
     "chainshaper.reporting.page": ("write_report",),

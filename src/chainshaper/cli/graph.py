@@ -35,12 +35,11 @@ def graph(
     from chainshaper.cli.output import late_progress, notes, print_json, show, show_line
     from chainshaper.flow.exploration import describe_application, lost_events
     from chainshaper.reporting.application_graph import (
-        ENDINGS,
         application_json,
         application_table,
         without_internals,
-        write_picture,
     )
+    from chainshaper.reporting.graph_drawing import ENDINGS, write_picture
     from chainshaper.sources import open_source
     from chainshaper.values.whole_file import new_file
 

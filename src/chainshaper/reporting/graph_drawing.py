@@ -1,33 +1,51 @@
-"""The application graph as a picture (SVG): nodes as boxes of callbacks, topics between them.
+"""The application graph as a picture: SVG with a layout of ours, or DOT for Graphviz.
 
-Arrows run from the callback that publishes a topic to the callbacks that it triggers. A dashed
-arrow is a message that one callback reads and another callback of the node publishes for it
-(synchronisers, stored messages). An arrow at a node's title stands for publications outside its
-callbacks, or for subscriptions without callback events.
+Nodes are boxes of callbacks, with topics between them. Arrows run from the callback that publishes
+a topic to the callbacks that it triggers. A dashed arrow is a message that one callback reads and
+another callback of the node publishes for it (synchronisers, stored messages). An arrow at a node's
+title stands for publications outside its callbacks, or for subscriptions without callback events.
 
-The layout is that of Sugiyama, Tagawa and Toda (1981), in four steps: edges that close cycles are
-turned around; every box gets a layer (a column), as far left as its predecessors permit; boxes of
-a column are sorted so that few edges cross (barycentres, swept back and forth); and heights are
-chosen so that edges run straight. The last step is exact for one column given its neighbours: least
-squares under the order and the gaps between boxes, which is isotonic regression (pool adjacent
-violators). Edges over several columns pass them through places of their own, so that no arrow
-crosses a box. Parts that are not connected are laid out one below the other.
+The layout is that of Sugiyama, Tagawa and Toda (1981): edges that close cycles are turned around;
+every box gets a layer (a column), as far left as its predecessors permit; boxes of a column are
+sorted so that few edges cross (barycentres, swept back and forth); heights are chosen so that edges
+run straight, exactly for one column given its neighbours: least squares under the order and the
+gaps between boxes, which is isotonic regression (pool adjacent violators). Edges over several
+columns pass them through places of their own, so that no arrow crosses a box. Parts that are not
+connected are laid out one below the other.
 """
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from graphlib import TopologicalSorter
 from itertools import accumulate
+from pathlib import Path
 
 import numpy as np
 
 from chainshaper.analysis.description import ApplicationDescription
-from chainshaper.reporting.application_graph import callback_text, short_symbol
+from chainshaper.reporting.application_graph import (
+    application_json,
+    callback_text,
+    short_symbol,
+    without_internals,
+)
 from chainshaper.values.application import Callback
 from chainshaper.values.recording import lost_text
-from chainshaper.values.safe_text import escape
+from chainshaper.values.safe_text import escape, shown
+from chainshaper.values.whole_file import new_file, write_whole
 
-__all__ = ["Box", "Edge", "application_svg", "lay_out"]
+__all__ = [
+    "ENDINGS",
+    "Box",
+    "Edge",
+    "application_dot",
+    "application_svg",
+    "lay_out",
+    "write_picture",
+]
+
+ENDINGS = (".svg", ".dot", ".json")
 
 COLUMN_GAP = 48.0
 ROW_GAP = 22.0
@@ -265,6 +283,64 @@ def _document(layout: Layout, parts: list[str]) -> str:
             "",
         ]
     )
+
+
+def application_dot(application: ApplicationDescription) -> str:
+    """The graph in the language of Graphviz: a cluster per node, ellipses for topics."""
+    graph = application.graph
+    lines = ["digraph application {", "  rankdir=LR;", "  node [fontname=Helvetica, fontsize=11];"]
+    if any(application.lost.values()):
+        lines.append(f"  label={_quoted(lost_text(application.lost))};")
+    number = {(node.name, node.pid): index for index, node in enumerate(graph.nodes)}
+    for callback in graph.callbacks:
+        number.setdefault((callback.node, callback.pid), len(number))
+    for (name, pid), index in number.items():
+        lines.append(f"  subgraph cluster_{index} {{")
+        lines.append(f"    label={_quoted(f'{name} (process {pid})')};")
+        lines.append(f'    node_{index} [shape=point, style=invis, label=""];')
+        for callback in graph.callbacks:
+            if (callback.node, callback.pid) == (name, pid):
+                text = callback_text(callback) + "\n" + short_symbol(callback.symbol)
+                label = _quoted(text.strip())
+                lines.append(f"    callback_{callback.id} [shape=box, label={label}];")
+        lines.append("  }")
+    lines += [f"  {_quoted(topic)} [shape=ellipse];" for topic in graph.topics]
+    for callback in graph.callbacks:
+        vertex = f"callback_{callback.id}"
+        if callback.kind == "subscription" and callback.topic is not None:
+            lines.append(f"  {_quoted(callback.topic)} -> {vertex};")
+        elif callback.kind in {"service", "client"} and callback.topic is not None:
+            lines.append(f"  {_quoted(callback.topic)} [shape=cds];")
+            lines.append(f"  {_quoted(callback.topic)} -> {vertex};")
+        for topic in callback.publishes:
+            style = " [style=dashed]" if topic in callback.passes_on else ""
+            lines.append(f"  {vertex} -> {_quoted(topic)}{style};")
+    return "\n".join([*lines, "}", ""])
+
+
+def _quoted(text: str) -> str:
+    escaped = shown(text, but="\n").replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+    return f'"{escaped}"'
+
+
+def write_picture(
+    application: ApplicationDescription, path: str | Path, *, everything: bool = False
+) -> Path:
+    """Write the graph as .svg, .dot or .json, by the ending of ``path``, whole or not at all.
+
+    Raises:
+        InputError: it exists, its folder does not, or its ending says no known format.
+        OperationError: it cannot be written.
+    """
+    path = new_file(path, ENDINGS)
+    drawn = application if everything else without_internals(application)
+    if path.suffix == ".json":
+        text = json.dumps(application_json(application), indent=2) + "\n"
+    elif path.suffix == ".dot":
+        text = application_dot(drawn)
+    else:
+        text = application_svg(drawn)
+    return write_whole(path, [text.encode()])
 
 
 def lay_out(boxes: Sequence[Box], edges: Sequence[Edge]) -> Layout:
