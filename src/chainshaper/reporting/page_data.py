@@ -207,7 +207,7 @@ def timeline_data(
         **dict(zip(BARS, map(list, columns), strict=True)),
         "texts": list(texts),
         "gaps": list(zip(edges[::2], edges[1::2], strict=True)),
-        "cycles": _cycles(traversals, hops, zero),
+        "cycles": _cycles(traversals, hops, timeline.slots, zero),
         "hops": [f"{labels[callback]} → {topic}" for callback, topic in passed],
         "of": analysis.traversals.height,
         "chosen": _chosen(analysis.traversals),
@@ -247,16 +247,18 @@ def _bars(  # noqa: PLR0917 - what a timeline is made of
         text, kind = labels[one], callback if whole else unended
         text += "" if whole else "\nits end was not recorded"
         bars.append((row, start, end - start, kind, -1, text, used))
-    holds = timeline.holds.join(hops, on=["traversal", "hop"], maintain_order="left")
+    held_at = hops.drop_nulls("row")
+    holds = timeline.holds.join(held_at, on=["traversal", "hop"], maintain_order="left")
     for row, number, arrival, let_go, overrun in _rows(
         holds, "row", "traversal", "arrival", "let_go", "overrun"
     ):
         text = f"cycle {number}: held{f', overran: {overrun}' if overrun else ''}"
         bars.append((row, arrival, let_go - arrival, held, number, text, None))
-    slots = timeline.slots.join(traversals.select("traversal"), on="traversal", how="semi")
-    origins = timeline.origins.select("traversal", "origin", "assumed")
+    # A cycle that two traversals share has its slots once, with either of them.
+    shown = timeline.origins.join(traversals.select("traversal"), on="traversal", how="semi")
+    slots = timeline.slots.join(timeline.origins, on="traversal", maintain_order="left")
     for name, number, start, end, origin, assumed in _rows(
-        slots.join(origins, on="traversal", maintain_order="left"),
+        slots.join(shown, on="origin", how="semi", maintain_order="left"),
         *("server", "traversal", "start", "end", "origin", "assumed"),
     ):
         text = f"server {name}, cycle {number}\n{slots_ms((start - origin, end - origin))} ms"
@@ -288,11 +290,14 @@ def _hops(
     )
 
 
-def _cycles(traversals: pl.DataFrame, hops: pl.DataFrame, zero: int) -> list[dict[str, Any]]:
+def _cycles(
+    traversals: pl.DataFrame, hops: pl.DataFrame, slots: pl.DataFrame, zero: int
+) -> list[dict[str, Any]]:
     """Each cycle in the page; its hops ``[row, take, start, publish, end]`` count from its start.
 
-    ``length`` is the time that it takes on the timeline.
+    ``length`` is the time that it takes on the timeline, with its servers' slots.
     """
+    closes = dict(slots.group_by("traversal").agg(pl.col("end").max()).iter_rows())
     hops_of: dict[int, list[list[int | None]]] = {}
     for traversal, _, *hop in hops.iter_rows():
         hops_of.setdefault(traversal, []).append(hop)
@@ -310,6 +315,7 @@ def _cycles(traversals: pl.DataFrame, hops: pl.DataFrame, zero: int) -> list[dic
         if row["complete"]:
             cycle["latency"] = row["latency_ns"]
         ends = [time for hop in own for time in hop[2:] if time is not None]
+        ends.append(closes.get(number, start) - start)
         cycle["length"] = max(1000, row["latency_ns"] or 0, received or 0, *ends)
         found.append(cycle)
     return found
