@@ -45,9 +45,7 @@ def test_what_the_gate_held_lies_between_arrival_and_release(tmp_path: Path) -> 
     assert rows == [(0, 17 * MS, 31 * MS + 20_000, 0, None), (1, late, late, None, "publish")]
 
 
-def test_a_gate_without_callback_events_is_known_by_its_process_and_message(
-    tmp_path: Path,
-) -> None:
+def test_a_gate_without_callback_events_is_known_by_its_process_and_message(tmp_path: Path) -> None:
     """A Python node's gate names no callback that any other event names."""
     recording = known_run(tmp_path / "known", cycles=2)
     tables = {name: recording.events[name] for name in recording.events}

@@ -373,6 +373,7 @@ function plotTimeline() {
     select.selectedIndex = which;
     timeline = recordings[which].timeline;
     number.max = timeline.of - 1;
+    host.querySelector(".waiting")?.remove();
     for (const one of buttons) one.disabled = !(one.value in actions || one.value in timeline.chosen);
   }
 

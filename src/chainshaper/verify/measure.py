@@ -153,9 +153,7 @@ def longest_stall(recording: Recording) -> int | None:
 
 
 def compare_recordings(
-    recordings: Sequence[Recording | str | Path],
-    chain: str | None = None,
-    plan: Plan | None = None,
+    recordings: Sequence[Recording | str | Path], chain: str | None = None, plan: Plan | None = None
 ) -> Comparison:
     """Measure the same chain in several recordings.
 
