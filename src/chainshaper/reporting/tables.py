@@ -8,8 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, TypeAlias
 
-from rich.console import RenderableType
-from rich.table import Table
+from rich.table import Table as RichTable
 from rich.text import Text
 
 from chainshaper.planning.plan_parts import Server
@@ -73,20 +72,20 @@ class ResultTable:
         """A line between the rows before and behind it, on the terminal."""
         self.rows.append(_Row("line", (), False))
 
-    def __rich__(self) -> Table:
+    def __rich__(self) -> RichTable:
         """The table for the terminal, without details."""
         used = [number for number, column in enumerate(self.columns) if not column.detail]
-        table = PlainTable(
-            title=self.title,
-            caption=self.caption,
+        table = RichTable(
+            title=plain(self.title, "table.title"),
+            caption=plain(self.caption, "table.caption"),
             title_justify="left",
             show_header=any(column.title for column in self.columns),
             show_footer=any(column.footer for column in self.columns),
         )
         for title, left, footer, _ in (self.columns[number] for number in used):
             table.add_column(
-                title,
-                footer,
+                plain(title),
+                plain(footer),
                 justify="left" if left else "right",
                 overflow="fold" if left else "ellipsis",
             )
@@ -98,8 +97,8 @@ class ResultTable:
                 indent = "  "
                 table.add_row(plain(str(cells[0]), "bold"))
             elif kind == "row" and not detail:
-                first, *others = (cells[number] for number in used)
-                table.add_row(indent + first if isinstance(first, str) else first, *others)
+                first, *others = (plain(cells[number]) for number in used)
+                table.add_row(Text(indent) + first, *others)
         return table
 
     def html(self) -> str:
@@ -132,23 +131,6 @@ class ResultTable:
 
 def _kind(words: bool) -> str:
     return ' class="words"' if words else ""
-
-
-class PlainTable(Table):
-    """Rich's table, whose title, caption, headers and cells are what they say."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if name in ("title", "caption"):
-            value = plain(value, f"table.{name}")
-        super().__setattr__(name, value)
-
-    def add_column(
-        self, header: RenderableType = "", footer: RenderableType = "", **options: Any
-    ) -> None:
-        super().add_column(plain(header), plain(footer), **options)
-
-    def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
-        super().add_row(*map(plain, cells), **options)
 
 
 def plain(text: Any, style: str = "") -> Any:
