@@ -65,7 +65,6 @@ if TYPE_CHECKING:
     )
     from chainshaper.reporting.figures import draw_distribution, draw_latency
     from chainshaper.reporting.graph_drawing import write_picture
-    from chainshaper.reporting.latency import hop_breakdown
     from chainshaper.reporting.page import write_report
     from chainshaper.reporting.perfetto import export_perfetto
     from chainshaper.simulation import simulate, simulate_latencies
@@ -80,6 +79,7 @@ if TYPE_CHECKING:
         PlatformError,
     )
     from chainshaper.values.recording import Recording, event_counts, open_recording
+    from chainshaper.verify.breakdown import hop_breakdown
     from chainshaper.verify.measure import (
         Comparison,
         Measurement,
@@ -145,7 +145,7 @@ _HOMES = {
     "chainshaper.analysis.description": ("ApplicationDescription",),
     "chainshaper.reporting.graph_drawing": ("write_picture",),
     "chainshaper.reporting.figures": ("draw_distribution", "draw_latency"),
-    "chainshaper.reporting.latency": ("hop_breakdown",),
+    "chainshaper.verify.breakdown": ("hop_breakdown",),
     "chainshaper.reporting.page": ("write_report",),
     "chainshaper.reporting.perfetto": ("export_perfetto",),
     "chainshaper.simulation": ("simulate", "simulate_latencies"),

@@ -1,12 +1,5 @@
 """A chain's latency, as tables and as plain data: its figures, recordings beside each other, a
-prediction beside its measurement, where the time goes, and what has no latency or came late.
-
-A hop is a callback of the chain. Its *communication* is the time from the publication before it to
-its own start: transport, and waiting for its executor. Its *computation* is the time from its
-start to its publication: execution, pre-emption, and, where another callback of the node publishes
-for it (a synchroniser), waiting for that one. Over a complete traversal the two add up to the
-latency, so mean shares add up to one.
-"""
+prediction beside its measurement, where the time goes, and what has no latency."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -31,6 +24,7 @@ from chainshaper.reporting.tables import (
     words,
 )
 from chainshaper.values.durations import milliseconds
+from chainshaper.verify.breakdown import PARTS, hop_breakdown, part_shares
 from chainshaper.verify.measure import Comparison, Measurement
 from chainshaper.verify.predictions import BandHeld, FigureHeld, PredictionHeld
 
@@ -40,7 +34,6 @@ __all__ = [
     "comparison_json",
     "comparison_table",
     "headline_table",
-    "hop_breakdown",
     "incomplete_table",
     "late_text",
     "latency_json",
@@ -60,7 +53,6 @@ FIGURES = (
 
 ALL = frozenset(title for title, _ in FIGURES)
 LATE = frozenset(("came late", "maximum", "jitter (max − min)"))
-PARTS = ("communication", "computation")
 
 CONVENTION = (
     "at_start: every output leaves as its slot starts, as a gate does it; at_end: at its slot's"
@@ -334,56 +326,10 @@ def range_ms(figure: FigureHeld) -> str:
     return f"{milliseconds(figure.from_ns)} … {milliseconds(figure.to_ns)}"
 
 
-def hop_breakdown(analysis: LatencyAnalysis) -> pl.DataFrame:
-    """Communication and computation of every hop of a chain, over its complete traversals.
-
-    One row per hop: ``hop`` (from 0), ``callback_id``, ``node``, ``callback`` (a short text),
-    ``topic`` (that it publishes), ``count``, ``by_sibling`` (how often another callback of the
-    node published for it), and for both parts ``…_ns``, a struct ``{min, mean, max}`` in ns (null
-    without traversals, and for the first hop's communication), and ``…_share`` of the mean latency.
-    """
-    callbacks = {callback.id: callback for callback in analysis.graph.callbacks}
-    complete = analysis.traversals.filter("complete")
-    hops = analysis.hops.join(complete.select("traversal"), on="traversal", how="semi")
-    latency = complete["latency_ns"].mean()
-    found = hops.group_by("hop").agg(
-        pl.len().alias("count"),
-        (pl.col("via") == "sibling").sum().alias("by_sibling"),
-        *(_summary(part) for part in PARTS),
-    )
-    rows = pl.DataFrame(
-        {
-            "hop": range(len(analysis.chain.callbacks)),
-            "callback_id": analysis.chain.callbacks,
-            "node": [callbacks[number].node for number in analysis.chain.callbacks],
-            "callback": [callbacks[number].label for number in analysis.chain.callbacks],
-            "topic": analysis.chain.topics,
-        },
-        schema_overrides={"hop": pl.UInt8, "callback_id": pl.UInt32},
-    )
-    joined = rows.join(found, on="hop", how="left", maintain_order="left")
-    means = [pl.col(f"{part}_ns").struct.field("mean").alias(f"{part}_share") for part in PARTS]
-    return joined.with_columns(
-        pl.col("count", "by_sibling").fill_null(0),
-        *(mean / pl.lit(latency, dtype=pl.Float64) for mean in means),
-    )
-
-
-def _summary(part: str) -> pl.Expr:
-    values = pl.col(f"{part}_ns")
-    summary = pl.struct(min=values.min(), mean=values.mean(), max=values.max())
-    return pl.when(values.count() > 0).then(summary).alias(f"{part}_ns")
-
-
-def _shares(frame: pl.DataFrame) -> dict[str, float | None]:
-    shares = {part: frame[f"{part}_share"].drop_nulls() for part in PARTS}
-    return {part: float(one.sum()) if len(one) else None for part, one in shares.items()}
-
-
 def breakdown_json(analysis: LatencyAnalysis) -> dict[str, Any]:
     """The breakdown as plain data: ``hops``, and the two parts' shares of the mean latency."""
     frame = hop_breakdown(analysis)
-    shares = {f"{part}_share": share for part, share in _shares(frame).items()}
+    shares = {f"{part}_share": share for part, share in part_shares(frame).items()}
     return {"hops": frame.to_dicts(), **shares}
 
 
@@ -392,7 +338,7 @@ def breakdown_table(analysis: LatencyAnalysis) -> ResultTable:
     frame = hop_breakdown(analysis)
     cycles = Column("cycles", footer=str(analysis.statistics.count), detail=True)
     columns = [Column("hop", words=True, footer="together"), cycles]
-    for part, share in _shares(frame).items():
+    for part, share in part_shares(frame).items():
         columns += [
             Column(f"{part}\nmin", detail=True),
             *figures(f"{part}\nmean", "max"),

@@ -18,9 +18,9 @@ import polars as pl
 from chainshaper.analysis.disturbance import overlapping
 from chainshaper.planning import Plan, publish_slots
 from chainshaper.planning.overruns import cycles_until_output
-from chainshaper.reporting.latency import PARTS, hop_breakdown
 from chainshaper.reporting.tables import ms, slots_ms
 from chainshaper.reporting.timeline import Timeline
+from chainshaper.verify.breakdown import PARTS, hop_breakdown
 from chainshaper.verify.measure import Measurement
 
 __all__ = [
