@@ -47,6 +47,7 @@ EXTREMES = 20
 """How many of the longest cycles, and of the shortest, are among them in any case."""
 
 KINDS = ("cycle", "callback", "unended", "held", "slot", "stall")
+CYCLE, CALLBACK, UNENDED, HELD, SLOT, STALL = range(len(KINDS))
 BARS = ("row", "start", "length", "kind", "cycle", "text", "used")
 """What bars the timeline has, and what is said of each."""
 
@@ -54,6 +55,7 @@ FAR = 10**15
 """Outside every recording: 11 days."""
 
 Bar = tuple[float, float, str, float, str]
+TimelineBar = tuple[int, int, int, int, int, str, int | None]
 Times = npt.NDArray[np.int64]
 
 
@@ -221,9 +223,8 @@ def _bars(  # noqa: PLR0917 - what a timeline is made of
     windows: tuple[Times, Times],
     threads: pl.DataFrame,
     hops: pl.DataFrame,
-) -> tuple[list[tuple[str, str]], list[tuple[Any, ...]]]:
+) -> tuple[list[tuple[str, str]], list[TimelineBar]]:
     """The timeline's rows, and its bars: cycles, callbacks, what gates did, slots, stalls."""
-    cycle, callback, unended, held, slot, stall = range(len(KINDS))
     labels = {one.id: one.label for one in measurement.analysis.graph.callbacks}
     servers = () if measurement.plan is None else measurement.plan.servers
     stalls = _inside(timeline.stalls.sort("start"), *windows)
@@ -232,46 +233,55 @@ def _bars(  # noqa: PLR0917 - what a timeline is made of
     rows += [(f"server {one.name}", f"core {one.core}, priority {one.priority}") for one in servers]
     cores = {core: number for number, core in enumerate(dict.fromkeys(stalls["core"]), len(rows))}
     rows += [("stalls" if core is None else f"stalls of core {core}", "") for core in cores]
-    bars: list[tuple[Any, ...]] = []
-    for number, start, latency, hit in _rows(
-        traversals.filter("complete"), "traversal", "start", "latency_ns", "disturbed"
-    ):
-        text = f"cycle {number}{', disturbed by the machine' if hit else ''}"
-        bars.append((0, start, latency, cycle, number, text, None))
     slices = _inside(timeline.slices, *windows).join(
         threads, on=["pid", "tid"], maintain_order="left"
     )
-    for row, one, start, end, whole, used in _rows(
-        slices, "row", "callback_id", "start", "end", "ended", "execution_ns"
-    ):
-        text, kind = labels[one], callback if whole else unended
-        text += "" if whole else "\nits end was not recorded"
-        bars.append((row, start, end - start, kind, -1, text, used))
-    held_at = hops.drop_nulls("row")
-    holds = timeline.holds.join(held_at, on=["traversal", "hop"], maintain_order="left")
-    for row, number, arrival, let_go, overrun in _rows(
-        holds, "row", "traversal", "arrival", "let_go", "overrun"
-    ):
-        text = f"cycle {number}: held{f', overran: {overrun}' if overrun else ''}"
-        bars.append((row, arrival, let_go - arrival, held, number, text, None))
-    # A cycle that two traversals share has its slots once, with either of them.
-    shown = timeline.origins.join(traversals.select("traversal"), on="traversal", how="semi")
-    slots = timeline.slots.join(timeline.origins, on="traversal", maintain_order="left")
-    for name, number, start, end, origin, assumed in _rows(
-        slots.join(shown, on="origin", how="semi", maintain_order="left"),
-        *("server", "traversal", "start", "end", "origin", "assumed"),
-    ):
-        text = f"server {name}, cycle {number}\n{slots_ms((start - origin, end - origin))} ms"
-        text += "\nthe cycle's start is not recorded but assumed" if assumed else ""
-        bars.append((server_rows[name], start, end - start, slot, number, text, None))
+    bars = [
+        *_cycle_bars(traversals.filter("complete")),
+        *_callback_bars(slices, labels),
+        *_held_bars(timeline.holds, hops.drop_nulls("row")),
+        *_server_bars(timeline, traversals, server_rows),
+    ]
     for core, start, end in stalls.iter_rows():
-        text = "the machine stalled"
-        bars.append((cores[core], start, end - start, stall, -1, text, None))
+        bars.append((cores[core], start, end - start, STALL, -1, "the machine stalled", None))
     return rows, bars
 
 
-def _rows(frame: pl.DataFrame, *columns: str) -> Iterator[tuple[Any, ...]]:
-    return frame.select(columns).iter_rows()
+def _cycle_bars(complete: pl.DataFrame) -> Iterator[TimelineBar]:
+    columns = ("traversal", "start", "latency_ns", "disturbed")
+    for cycle, start, latency, hit in complete.select(columns).iter_rows():
+        text = f"cycle {cycle}{', disturbed by the machine' if hit else ''}"
+        yield 0, start, latency, CYCLE, cycle, text, None
+
+
+def _callback_bars(slices: pl.DataFrame, labels: dict[int, str]) -> Iterator[TimelineBar]:
+    columns = ("row", "callback_id", "start", "end", "ended", "execution_ns")
+    for row, callback, start, end, whole, used in slices.select(columns).iter_rows():
+        text = labels[callback] + ("" if whole else "\nits end was not recorded")
+        yield row, start, end - start, CALLBACK if whole else UNENDED, -1, text, used
+
+
+def _held_bars(holds: pl.DataFrame, hops: pl.DataFrame) -> Iterator[TimelineBar]:
+    columns = ("row", "traversal", "arrival", "let_go", "overrun")
+    found = holds.join(hops, on=["traversal", "hop"], maintain_order="left").select(columns)
+    for row, cycle, arrival, let_go, overrun in found.iter_rows():
+        text = f"cycle {cycle}: held{f', overran: {overrun}' if overrun else ''}"
+        yield row, arrival, let_go - arrival, HELD, cycle, text, None
+
+
+def _server_bars(
+    timeline: Timeline, traversals: pl.DataFrame, rows: dict[str, int]
+) -> Iterator[TimelineBar]:
+    # A cycle that two traversals share has its slots once, with either of them.
+    shown = timeline.origins.join(traversals.select("traversal"), on="traversal", how="semi")
+    slots = timeline.slots.join(timeline.origins, on="traversal", maintain_order="left").join(
+        shown, on="origin", how="semi", maintain_order="left"
+    )
+    columns = ("server", "traversal", "start", "end", "origin", "assumed")
+    for server, cycle, start, end, origin, assumed in slots.select(columns).iter_rows():
+        text = f"server {server}, cycle {cycle}\n{slots_ms((start - origin, end - origin))} ms"
+        text += "\nthe cycle's start is not recorded but assumed" if assumed else ""
+        yield rows[server], start, end - start, SLOT, cycle, text, None
 
 
 def _hops(
