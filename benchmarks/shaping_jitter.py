@@ -21,8 +21,8 @@ from rich.console import Console
 from rich.table import Table
 
 from chainshaper.flow.demo import run_demo
-from chainshaper.flow.steps import Measurement
 from chainshaper.values.durations import milliseconds
+from chainshaper.verify.measure import Measurement
 
 SOURCE = "".join(
     f"#include <stdio.h>\nint f{i}(int x) {{ return x * {i} + (x >> {i % 31}); }}\n"

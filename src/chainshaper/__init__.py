@@ -26,14 +26,13 @@ if TYPE_CHECKING:
         find_chain,
         load_named_paths,
     )
+    from chainshaper.analysis.description import ApplicationDescription
     from chainshaper.enforcement.undoing import end_run, find_runs
     from chainshaper.flow.apply import apply_plan
     from chainshaper.flow.doctor import examine_machine
     from chainshaper.flow.exploration import (
-        ApplicationDescription,
         convert_recording,
         describe_application,
-        event_counts,
         list_chains,
     )
     from chainshaper.flow.launch_shaping import ShapedLaunch, shape_launch
@@ -47,10 +46,6 @@ if TYPE_CHECKING:
     from chainshaper.flow.profiling import profiling_condition
     from chainshaper.flow.record import Recorded, record_command
     from chainshaper.flow.steps import (
-        Comparison,
-        Measurement,
-        compare_recordings,
-        measure_latency,
         plan_recording,
         profile_chains,
         shape_application,
@@ -66,10 +61,9 @@ if TYPE_CHECKING:
         plan_shaping,
         save_plan,
     )
-    from chainshaper.reporting.application_graph import write_picture
-    from chainshaper.reporting.breakdown import hop_breakdown
     from chainshaper.reporting.figures import draw_distribution, draw_latency
-    from chainshaper.reporting.html import write_report
+    from chainshaper.reporting.graph_drawing import write_picture
+    from chainshaper.reporting.page import write_report
     from chainshaper.reporting.perfetto import export_perfetto
     from chainshaper.simulation import simulate, simulate_latencies
     from chainshaper.simulation.sweeping import sweep
@@ -82,7 +76,14 @@ if TYPE_CHECKING:
         OperationError,
         PlatformError,
     )
-    from chainshaper.values.recording import Recording, open_recording
+    from chainshaper.values.recording import Recording, event_counts, open_recording
+    from chainshaper.verify.breakdown import hop_breakdown
+    from chainshaper.verify.measure import (
+        Comparison,
+        Measurement,
+        compare_recordings,
+        measure_latency,
+    )
     from chainshaper.workload.description import Application, load_application
     from chainshaper.workload.live import run_application
 
@@ -106,10 +107,8 @@ _HOMES = {
         "PlatformError",
     ),
     "chainshaper.flow.exploration": (
-        "ApplicationDescription",
         "convert_recording",
         "describe_application",
-        "event_counts",
         "list_chains",
     ),
     "chainshaper.flow.launch_shaping": ("ShapedLaunch", "shape_launch"),
@@ -132,21 +131,24 @@ _HOMES = {
     ),
     "chainshaper.flow.profiling": ("profiling_condition",),
     "chainshaper.flow.record": ("Recorded", "record_command"),
-    "chainshaper.values.recording": ("Recording", "open_recording"),
-    "chainshaper.reporting.application_graph": ("write_picture",),
-    "chainshaper.reporting.breakdown": ("hop_breakdown",),
+    "chainshaper.values.recording": ("Recording", "event_counts", "open_recording"),
+    "chainshaper.verify.measure": (
+        "Comparison",
+        "Measurement",
+        "compare_recordings",
+        "measure_latency",
+    ),
+    "chainshaper.analysis.description": ("ApplicationDescription",),
+    "chainshaper.reporting.graph_drawing": ("write_picture",),
     "chainshaper.reporting.figures": ("draw_distribution", "draw_latency"),
-    "chainshaper.reporting.html": ("write_report",),
+    "chainshaper.verify.breakdown": ("hop_breakdown",),
+    "chainshaper.reporting.page": ("write_report",),
     "chainshaper.reporting.perfetto": ("export_perfetto",),
     "chainshaper.simulation": ("simulate", "simulate_latencies"),
     "chainshaper.sources": ("open_source",),
     "chainshaper.sources.gate_log": ("read_gate_log",),
     "chainshaper.splicing.shaping_process": ("write_shaping_process", "write_throttler"),
     "chainshaper.flow.steps": (
-        "Comparison",
-        "Measurement",
-        "compare_recordings",
-        "measure_latency",
         "plan_recording",
         "profile_chains",
         "shape_application",

@@ -176,8 +176,8 @@ def test_pictures_and_pages_are_well_formed(recording: Recording, folder: Path) 
     harmless(called("report", recording.path, "-o", page))
     harmless(called("export", recording.path, "--perfetto", "-o", trace))
     harmless(called("compare", recording.path, recording.path, "--figures", figures))
-    from chainshaper.flow.steps import measure_latency
     from chainshaper.reporting.figures import draw_latency
+    from chainshaper.verify.measure import measure_latency
 
     draw_latency([measure_latency(recording, CHAIN)], curve)
     for picture in (svg, curve):

@@ -8,9 +8,9 @@ import pytest
 from command_line import called, chainshaper, json_of
 from small_chain import DDS_CORE, EXECUTOR_CORE, small_chain_text
 
-from chainshaper.flow.steps import measure_latency
 from chainshaper.planning.plan_file import load_plan
 from chainshaper.values.recording import Recording, open_recording
+from chainshaper.verify.measure import measure_latency
 
 VERBS = (
     "demo",

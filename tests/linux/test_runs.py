@@ -24,7 +24,6 @@ from chainshaper.enforcement.undoing import (
     remove_run,
     save_run_state,
 )
-from chainshaper.flow.steps import measure_latency
 from chainshaper.linux import runs as module
 from chainshaper.linux.runs import (
     Governed,
@@ -42,6 +41,7 @@ from chainshaper.planning import Plan, plan_shaping
 from chainshaper.planning.plan_file import save_plan
 from chainshaper.values.errors import OperationError, PlatformError
 from chainshaper.values.recording import open_recording
+from chainshaper.verify.measure import measure_latency
 
 
 def test_what_is_noted_can_be_read_back_in_order(tmp_path: Path) -> None:

@@ -9,15 +9,13 @@ import pytest
 from story import Story
 
 from chainshaper.analysis import data_flow, graph_of
-from chainshaper.flow.exploration import ApplicationDescription, services
+from chainshaper.analysis.description import ApplicationDescription, services
 from chainshaper.reporting.application_graph import (
-    application_dot,
     application_json,
     short_symbol,
     without_internals,
-    write_picture,
 )
-from chainshaper.reporting.graph_drawing import application_svg
+from chainshaper.reporting.graph_drawing import application_dot, application_svg, write_picture
 
 
 @pytest.fixture

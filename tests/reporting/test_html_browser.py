@@ -11,23 +11,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 from chromium import Page, opened
+from known_run import LATENCY_NS, known_run
 from matplotlib import image
-from told_run import LATENCY_NS, told_run
 
-from chainshaper.flow.steps import measure_latency
-from chainshaper.reporting.html.page import write_report
+from chainshaper.reporting.page import write_report
 from chainshaper.values.durations import milliseconds
+from chainshaper.verify.measure import measure_latency
 
 CHARTS = ("over-time", "histogram", "cdf", "breakdown", "timeline", "slots-0")
 
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run before shaping, told without its plan, and one after it with all that can happen."""
+    """A run before shaping, known without its plan, and one after it with all that can happen."""
     folder = tmp_path_factory.mktemp("report")
-    before = told_run(folder / "before", 8, plan=None)
+    before = known_run(folder / "before", 8, plan=None)
     evil = "/<script>alert('x')</script>"
-    after = told_run(folder / "after", 8, first=evil, untaken=(6,), overran=(5,))
+    after = known_run(folder / "after", 8, first=evil, untaken=(6,), overran=(5,))
     return write_report([measure_latency(before), measure_latency(after)], folder / "report.html")
 
 

@@ -8,15 +8,20 @@ import numpy as np
 import polars as pl
 from hypothesis import given
 from hypothesis import strategies as st
-from told_run import LATENCY_NS, MS, PERIOD_NS, told_run
+from known_run import LATENCY_NS, MS, PERIOD_NS, known_run
 
 from chainshaper.analysis.flow import data_flow
-from chainshaper.flow.steps import measure_latency
-from chainshaper.reporting.html import cycles as cycles_of_page
-from chainshaper.reporting.html.cycles import timeline_data
-from chainshaper.reporting.html.series import latency_histogram, latency_points
+from chainshaper.reporting.page_data import (
+    BARS,
+    CYCLES,
+    KINDS,
+    latency_histogram,
+    latency_points,
+    timeline_data,
+)
 from chainshaper.reporting.timeline import timeline_of
 from chainshaper.values.recording import Recording
+from chainshaper.verify.measure import measure_latency
 
 
 def _traversals(latencies: Sequence[int | None], disturbed: Sequence[bool]) -> pl.DataFrame:
@@ -94,37 +99,53 @@ def test_a_hundred_thousand_cycles_fit_a_page() -> None:
     assert 0.1 < np.mean(middle) < 0.5
 
 
-def _kept(recording: Recording, asked: Sequence[int] = ()) -> dict[str, Any]:
+def _page_data(recording: Recording, asked: Sequence[int] = ()) -> dict[str, Any]:
     measured = measure_latency(recording)
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
     timeline = timeline_of(recording, flow, measured.analysis, measured.plan)
     return timeline_data(measured, timeline, asked, MS)
 
 
+def _bars(data: dict[str, Any], kind: str) -> list[tuple[Any, ...]]:
+    """``row, start, length, cycle, text, used`` of the bars of one kind."""
+    columns = [data[name] for name in BARS]
+    return [
+        (row, start, length, cycle, data["texts"][text], used)
+        for row, start, length, what, cycle, text, used in zip(*columns, strict=True)
+        if KINDS[what] == kind
+    ]
+
+
 def test_a_timeline_of_few_cycles_keeps_all_of_them(tmp_path: Path) -> None:
-    data = _kept(told_run(tmp_path / "told", 3, untaken=(1,)))
+    data = _page_data(known_run(tmp_path / "known", 3, untaken=(1,)))
     assert [cycle["n"] for cycle in data["cycles"]] == [0, 1, 2]
     one, broken, _ = data["cycles"]
     assert one["hops"] == [
-        [0, None, 0, 4 * MS, 4 * MS + 1000],
-        [1, 5 * MS - 1, 5 * MS, 15 * MS, 15 * MS + 1000],
-        [2, 16 * MS - 1, 16 * MS, LATENCY_NS, LATENCY_NS + 1000],
+        [1, None, 0, 4 * MS, 4 * MS + 1000],
+        [2, 5 * MS - 1, 5 * MS, 15 * MS, 15 * MS + 1000],
+        [3, 16 * MS - 1, 16 * MS, LATENCY_NS, LATENCY_NS + 1000],
     ]
-    assert (one["latency"], one["origin"]) == (LATENCY_NS, 0)
-    assert one["held"] == [16 * MS, LATENCY_NS, None]
-    assert broken["reason"] == "lost (/t1)"
-    assert len(data["lane"]) == 3 * 4 - 3
-    assert data["stalls"] == [[1, PERIOD_NS + 6 * MS, 2 * MS]]
+    assert one["latency"] == LATENCY_NS
+    held = (3, 16 * MS, LATENCY_NS - 16 * MS, 0, "cycle 0: held", None)
+    assert _bars(data, "held")[0] == held
+    names = [name for name, _ in data["rows"]]
+    slot = _bars(data, "slot")[0]
+    assert (names[slot[0]], *slot[1:4]) == ("server chain", 0, 30 * MS, 0)
+    assert slot[4] == "server chain, cycle 0\n[0.000, 30.000) ms"
+    assert broken["about"].startswith("incomplete: lost (/t1); began 0.100 s after the first")
+    assert len(_bars(data, "callback")) == 3 * 4 - 3
+    stall = (names.index("stalls of core 1"), PERIOD_NS + 6 * MS, 2 * MS, -1)
+    assert _bars(data, "stall") == [(*stall, "the machine stalled", None)]
 
 
 def test_a_timeline_of_many_cycles_keeps_those_that_somebody_looks_for(tmp_path: Path) -> None:
-    recording = told_run(tmp_path / "told", 900, untaken=(511,), overran=(333,))
-    data = _kept(recording, asked=(777,))
+    recording = known_run(tmp_path / "known", 900, untaken=(511,), overran=(333,))
+    data = _page_data(recording, asked=(777,))
     kept = {cycle["n"] for cycle in data["cycles"]}
-    assert len(kept) <= cycles_of_page.CYCLES + 1
+    assert len(kept) <= CYCLES + 1
     assert {333, 511, 777} <= kept, "the longest, the one that broke, the one that was asked for"
     assert data["of"] == 900
     assert data["chosen"] == {"longest": 333, "median": 450, "shortest": 0}
-    began = dict(enumerate(data["windows"]))
-    inside = [any(low <= start <= high for low, high in began.values()) for start in data["start"]]
+    starts = [start for _, start, *_ in _bars(data, "callback")]
+    inside = [not any(low < start < high for low, high in data["gaps"]) for start in starts]
     assert np.mean(inside) > 0.95, "callbacks of the other cycles are left out"

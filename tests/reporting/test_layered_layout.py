@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from chainshaper.reporting.layered_layout import Box, Edge, lay_out
+from chainshaper.reporting.graph_drawing import Box, Edge, lay_out
 
 
 def drawn(seed: int) -> tuple[list[Box], list[Edge]]:

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 from command_line import called, json_of
-from told_run import LATENCY_NS, MS, PERIOD_NS, told_run
+from known_run import LATENCY_NS, MS, PERIOD_NS, known_run
 
-from chainshaper.flow.steps import measure_latency
 from chainshaper.values.recording import InForceInfo, open_recording
+from chainshaper.verify.measure import measure_latency
 
 
 @pytest.mark.parametrize(
@@ -24,7 +24,7 @@ def test_what_no_plan_governed_is_left_out(
     since: int, until: int | None, starts: list[int], text: str | None, tmp_path: Path
 ) -> None:
     in_force = InForceInfo(since_ns=since, until_ns=until)
-    recording = told_run(tmp_path / "told", cycles=4, overran=(0,), in_force=in_force)
+    recording = known_run(tmp_path / "known", cycles=4, overran=(0,), in_force=in_force)
     measured = measure_latency(recording)
     cycles = measured.analysis.traversals
     assert cycles["start"].to_list() == [cycle * PERIOD_NS + MS for cycle in starts]
@@ -40,12 +40,12 @@ def test_what_no_plan_governed_is_left_out(
         assert text in (measured.left_out.text or "")
         words = " ".join(called("compare", recording.path, recording.path).out.split())
         assert "left out" in " ".join(shown.out.split())
-        assert "told: left out" in words
+        assert "known: left out" in words
 
 
 def test_over_all_cycles_late_outputs_maximum_and_jitter_are_shown(tmp_path: Path) -> None:
     """The last output arrives at the end of its slot, and leaves at once."""
-    recording = told_run(tmp_path / "told", cycles=2, overran=(1,))
+    recording = known_run(tmp_path / "known", cycles=2, overran=(1,))
     longest = 31 * MS
     values = json_of("latency", recording.path)
     assert (values["late"], values["max_all_ns"]) == (1, longest)
@@ -58,7 +58,7 @@ def test_over_all_cycles_late_outputs_maximum_and_jitter_are_shown(tmp_path: Pat
 
 
 def test_a_recording_from_before_says_nothing_and_is_read_whole(tmp_path: Path) -> None:
-    recording = told_run(tmp_path / "told")
+    recording = known_run(tmp_path / "known")
     file = recording.path / "recording.json"
     file.write_text(file.read_text().replace('"in_force": null', '"was_not_there": null'))
     measured = measure_latency(open_recording(recording.path))

@@ -1,13 +1,8 @@
-"""The trace for Perfetto holds what the recording holds, by the rules of the format.
-
-The files are read here by a reader of protobuf's wire format that knows no message, and where
-Perfetto's own Python package is installed also by its schema.
-"""
+"""The trace for Perfetto holds what the recording holds, read by Perfetto's own schema."""
 
 import importlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,93 +10,54 @@ import pytest
 from command_line import called, refused
 from hypothesis import given
 from hypothesis import strategies as st
+from known_run import LATENCY_NS, MS, PERIOD_NS, known_run
 from reference_traces import reference_folder
-from told_run import LATENCY_NS, MS, PERIOD_NS, told_run
 
 from chainshaper.analysis.flow import data_flow
-from chainshaper.flow.steps import Measurement, measure_latency
-from chainshaper.reporting.perfetto import export_perfetto
-from chainshaper.reporting.perfetto_format import Slice, Track, Value, encode_trace
+from chainshaper.reporting.perfetto import Slice, Track, Value, encode_trace, export_perfetto
 from chainshaper.sources import open_source
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording
+from chainshaper.verify.measure import Measurement, measure_latency
 
 BEGIN, END, INSTANT = 1, 2, 3
-
-Fields = dict[int, list[Any]]
-
-
-def _number(data: bytes, at: int) -> tuple[int, int]:
-    value = shift = 0
-    while True:
-        byte = data[at]
-        value |= (byte & 0x7F) << shift
-        at, shift = at + 1, shift + 7
-        if byte < 0x80:
-            return value, at
+SCHEMA: Any = importlib.import_module("perfetto.protos.perfetto.trace.perfetto_trace_pb2")
 
 
-def _fields(data: bytes) -> Fields:
-    """A message's fields by number: integers, or bytes."""
-    found: Fields = {}
-    at = 0
-    while at < len(data):
-        key, at = _number(data, at)
-        value: int | bytes
-        if key & 7 == 0:
-            value, at = _number(data, at)
-        elif key & 7 == 1:
-            value, at = int.from_bytes(data[at : at + 8], "little"), at + 8
-        else:
-            assert key & 7 == 2, "a wire type that the format does not use"
-            length, at = _number(data, at)
-            value, at = data[at : at + length], at + length
-            assert len(value) == length
-        found.setdefault(key >> 3, []).append(value)
-    return found
-
-
-@dataclass
 class _Trace:
-    """What a file says, in the order in which it says it."""
+    """What a file says: descriptors of tracks, ``track, time, type, name, event`` in order."""
 
-    tracks: dict[int, Fields] = field(default_factory=dict)
-    events: list[tuple[int, int, int, str, Fields]] = field(default_factory=list)
-
-    @classmethod
-    def of(cls, parts: Iterator[bytes] | bytes) -> "_Trace":
-        trace = cls()
+    def __init__(self, parts: Iterator[bytes] | bytes) -> None:
         data = parts if isinstance(parts, bytes) else b"".join(parts)
-        for content in _fields(data)[1]:
-            packet = _fields(content)
-            if 60 in packet:
-                described = _fields(packet[60][0])
-                assert described[1][0] not in trace.tracks
-                assert described.get(5, [None])[0] in {None, *trace.tracks}, "a parent comes first"
-                trace.tracks[described[1][0]] = described
-            elif 11 in packet:
-                event = _fields(packet[11][0])
-                name = event.get(23, [b""])[0].decode()
-                trace.events.append((event[11][0], packet[8][0], event[9][0], name, event))
-        return trace
+        self.whole = SCHEMA.Trace.FromString(data)
+        self.tracks: dict[int, Any] = {}
+        self.events: list[tuple[int, int, int, str, Any]] = []
+        for packet in self.whole.packet:
+            one, event = packet.track_descriptor, packet.track_event
+            if packet.HasField("track_descriptor"):
+                assert one.uuid not in self.tracks
+                assert not one.HasField("parent_uuid") or one.parent_uuid in self.tracks
+                self.tracks[one.uuid] = one
+            elif packet.HasField("track_event"):
+                about = (event.track_uuid, packet.timestamp, event.type, event.name, event)
+                self.events.append(about)
+        self.whole.DiscardUnknownFields()
+        assert self.whole.ByteSize() == len(data), "some field is none of the schema's"
 
     def name(self, track: int) -> str:
-        """Of a track; of a thread with its process's number."""
-        described = self.tracks[track]
-        if 4 in described:
-            thread = _fields(described[4][0])
-            return f"{thread[1][0]} {thread[5][0].decode()}"
-        return str(described[2][0].decode()) if 2 in described else ""
+        """Of a track; of a thread with its process's number; empty for a process."""
+        one = self.tracks[track]
+        of_thread = f"{one.thread.pid} {one.thread.thread_name}"
+        return of_thread if one.HasField("thread") else str(one.name)
 
-    def group(self, track: int) -> str:
-        """The name of a track's parent, empty for a process."""
-        return self.name(self.tracks[track][5][0])
+    def threads(self) -> list[int]:
+        return [track for track, one in self.tracks.items() if one.HasField("thread")]
 
     def slices(self, group: str) -> list[tuple[str, int, int, int]]:
         """``name, start, end, track`` of a group's slices; every track nests, in order of time."""
         found = []
-        for track, described in self.tracks.items():
-            if 5 not in described or self.group(track) != group:
+        for track, one in self.tracks.items():
+            if not one.HasField("parent_uuid") or self.name(one.parent_uuid) != group:
                 continue
             stack: list[tuple[str, int]] = []
             last = 0
@@ -116,29 +72,21 @@ class _Trace:
             assert not stack, "every beginning has its end"
         return sorted(found, key=lambda one: (one[1], -one[2]))
 
-    def instants(self, name: str) -> int:
-        return sum(kind == INSTANT and name in text for _, _, kind, text, _ in self.events)
-
     def flows(self) -> tuple[Counter[int], Counter[int]]:
         """How often each arrow begins and ends."""
-        begun = Counter(flow for *_, event in self.events for flow in event.get(47, ()))
-        ended = Counter(flow for *_, event in self.events for flow in event.get(48, ()))
+        begun = Counter(flow for *_, event in self.events for flow in event.flow_ids)
+        ended = Counter(flow for *_, event in self.events for flow in event.terminating_flow_ids)
         return begun, ended
 
 
 def _exported(source: Recording | Measurement, folder: Path) -> _Trace:
-    return _Trace.of(export_perfetto(source, folder / "trace.pftrace").read_bytes())
+    return _Trace(export_perfetto(source, folder / "trace.pftrace").read_bytes())
 
 
 def test_a_run_known_by_hand_is_written_as_it_was(tmp_path: Path) -> None:
-    trace = _exported(measure_latency(told_run(tmp_path / "told", cycles=2)), tmp_path)
-    threads = [trace.name(track) for track, one in trace.tracks.items() if 4 in one]
-    assert threads == [
-        "1 /first",
-        "2 /second (SCHED_FIFO 80, core 1)",
-        "3 /chainshaper_t2",
-        "4 /actuator",
-    ]
+    trace = _exported(measure_latency(known_run(tmp_path / "known", cycles=2)), tmp_path)
+    names = ("1 /first", "2 /second (SCHED_FIFO 80, core 1)", "3 /chainshaper_t2", "4 /actuator")
+    assert tuple(map(trace.name, trace.threads())) == names
     chain = [(name, start, end) for name, start, end, _ in trace.slices("Chain")]
     assert chain[:4] == [
         ("cycle 0", MS, MS + LATENCY_NS),
@@ -164,10 +112,11 @@ def test_a_run_known_by_hand_is_written_as_it_was(tmp_path: Path) -> None:
 
 def _same_counts(recording: Recording, trace: _Trace) -> None:
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
-    own = [track for track, one in trace.tracks.items() if 4 in one]
+    own = trace.threads()
     callbacks = sum(kind == BEGIN and track in own for track, _, kind, _, _ in trace.events)
     assert callbacks == flow.instances.height
-    assert trace.instants("publish ") == flow.publications.height
+    published = [one for one in trace.events if one[2] == INSTANT and "publish " in one[3]]
+    assert len(published) == flow.publications.height
     taken = flow.takes["publication"].drop_nulls()
     begun, ended = trace.flows()
     assert set(begun.values()) | set(ended.values()) <= {1}, "an arrow has one begin and one end"
@@ -176,11 +125,11 @@ def _same_counts(recording: Recording, trace: _Trace) -> None:
 
 
 def test_arrows_lead_from_publications_to_the_callbacks_that_read_them(tmp_path: Path) -> None:
-    recording = told_run(tmp_path / "told", cycles=1)
+    recording = known_run(tmp_path / "known", cycles=1)
     trace = _exported(recording, tmp_path)
     arrows: dict[int, list[tuple[str, int, str]]] = {}
     for track, time, _, name, event in sorted(trace.events, key=lambda event: event[1]):
-        for flow in [*event.get(47, ()), *event.get(48, ())]:
+        for flow in (*event.flow_ids, *event.terminating_flow_ids):
             arrows.setdefault(flow, []).append((trace.name(track)[2:9], time, name))
     assert list(arrows.values()) == [
         [("/first", 5 * MS, "publish /t1"), ("/second", 6 * MS, "/second ← /t1")],
@@ -214,7 +163,7 @@ def test_real_traces_lose_nothing_on_the_way(name: str, tmp_path: Path) -> None:
 
 
 def test_incomplete_cycles_are_marked_where_they_began(tmp_path: Path) -> None:
-    trace = _exported(measure_latency(told_run(tmp_path / "told", untaken=(1,))), tmp_path)
+    trace = _exported(measure_latency(known_run(tmp_path / "known", untaken=(1,))), tmp_path)
     marks = [(time, name) for _, time, kind, name, _ in trace.events if kind == INSTANT]
     assert (PERIOD_NS + MS, "cycle 1 incomplete: lost") in marks
 
@@ -228,7 +177,7 @@ intervals = st.lists(
 @given(intervals)
 def test_slices_nest_on_every_track_whatever_they_overlap(spans: Sequence[tuple[int, int]]) -> None:
     families = [[Slice(start, end, f"{n}")] for n, (start, end) in enumerate(spans)]
-    trace = _Trace.of(encode_trace([Track("group", "row", families)], 0))
+    trace = _Trace(encode_trace([Track("group", "row", families)], 0))
     read = trace.slices("group")
     assert sorted((start, end) for _, start, end, _ in read) == sorted(spans)
     assert {trace.name(track) for *_, track in read} <= {"row"}, "the viewer shows them as one row"
@@ -239,86 +188,56 @@ def test_names_and_arguments_arrive_as_they_are(name: str, number: int, truth: b
     name = name.encode("utf-8", errors="replace").decode()
     arguments: dict[str, Value] = {"number": number, "truth": truth, "text": name, "nothing": None}
     one = Slice(1, 2, name, arguments)
-    trace = _Trace.of(encode_trace([Track("group", name, [[one]])], 0))
+    trace = _Trace(encode_trace([Track("group", name, [[one]])], 0))
     (event,) = (event for *_, kind, _, event in trace.events if kind == BEGIN)
-    told = [_fields(argument) for argument in event[4]]
-    assert event[23] == [name.encode()]
-    assert [one[10][0] for one in told] == [b"number", b"truth", b"text"]
-    assert told[0][4] == [number % 2**64]
-    assert told[1][2] == [truth]
-    assert told[2][6] == [name.encode()]
+    assert event.name == name
+    first, second, third = event.debug_annotations
+    assert (first.name, first.int_value) == ("number", number)
+    assert (second.name, second.bool_value) == ("truth", truth)
+    assert (third.name, third.string_value) == ("text", name)
 
 
-def test_perfettos_own_schema_reads_it(tmp_path: Path) -> None:
-    module = "perfetto.protos.perfetto.trace.perfetto_trace_pb2"
-    pytest.importorskip(module, reason="Perfetto's Python package is not installed")
-    schema = importlib.import_module(module)
-    recording = told_run(tmp_path / "told", cycles=2)
-    data = export_perfetto(measure_latency(recording), tmp_path / "t.pftrace").read_bytes()
-    trace = schema.Trace.FromString(data)
-    trace.DiscardUnknownFields()
-    assert trace.ByteSize() == len(data), "some field is none of the schema's"
-    own = _Trace.of(data)
-    events = [packet for packet in trace.packet if packet.HasField("track_event")]
-    told = [
-        (
-            packet.track_event.track_uuid,
-            packet.timestamp,
-            packet.track_event.type,
-            packet.track_event.name,
-        )
-        for packet in events
-    ]
-    assert told == [event[:4] for event in own.events]
-    threads = {
-        packet.track_descriptor.thread.tid: packet.track_descriptor.thread.thread_name
-        for packet in trace.packet
-        if packet.track_descriptor.HasField("thread")
-    }
-    assert threads[1] == "/first"
-    arguments = {
-        one.name: one.int_value
-        for one in next(
-            packet.track_event.debug_annotations
-            for packet in events
-            if packet.track_event.name == "cycle 0"
-        )
-    }
-    assert arguments["latency_ns"] == LATENCY_NS
-    clocks = {clock.clock_id: clock.timestamp for clock in trace.packet[0].clock_snapshot.clocks}
-    builtin = schema.BuiltinClock.Value
+def test_cycles_have_their_latency_and_clocks_their_offset(tmp_path: Path) -> None:
+    recording = known_run(tmp_path / "known", cycles=2)
+    trace = _exported(measure_latency(recording), tmp_path)
+    (cycle,) = (event for *_, name, event in trace.events if name == "cycle 0")
+    values = {one.name: one.int_value for one in cycle.debug_annotations}
+    assert values["latency_ns"] == LATENCY_NS
+    snapshot = trace.whole.packet[0].clock_snapshot.clocks
+    clocks = {clock.clock_id: clock.timestamp for clock in snapshot}
+    builtin = SCHEMA.BuiltinClock.Value
     wall = clocks[builtin("BUILTIN_CLOCK_REALTIME")] - clocks[builtin("BUILTIN_CLOCK_BOOTTIME")]
     assert wall == recording.info.clock_offset_ns
 
 
 def test_the_command_writes_it_and_never_over_another(tmp_path: Path) -> None:
-    told = told_run(tmp_path / "told")
+    known = known_run(tmp_path / "known")
     file = tmp_path / "trace.pftrace"
-    finished = called("export", "--perfetto", told.path, "-o", file)
+    finished = called("export", "--perfetto", known.path, "-o", file)
     assert (finished.code, finished.out) == (0, f"{file}\n")
     written = file.read_bytes()
-    assert [name for name, *_ in _Trace.of(written).slices("Chain") if "cycle" in name]
-    again = refused(2, "export", "--perfetto", told.path, "-o", file)
+    assert [name for name, *_ in _Trace(written).slices("Chain") if "cycle" in name]
+    again = refused(2, "export", "--perfetto", known.path, "-o", file)
     assert "exists already and is not overwritten" in again
     assert file.read_bytes() == written
-    assert "add --perfetto" in refused(2, "export", told.path, "-o", tmp_path / "x.pftrace")
-    wrong = refused(2, "export", "--perfetto", told.path, "-o", tmp_path / "trace.json")
+    assert "add --perfetto" in refused(2, "export", known.path, "-o", tmp_path / "x.pftrace")
+    wrong = refused(2, "export", "--perfetto", known.path, "-o", tmp_path / "trace.json")
     assert "ends in .pftrace or .perfetto-trace" in wrong
-    absent = refused(2, "export", "--perfetto", told.path, "-o", tmp_path / "no" / "t.pftrace")
+    absent = refused(2, "export", "--perfetto", known.path, "-o", tmp_path / "no" / "t.pftrace")
     assert "no such folder to write t.pftrace into" in absent
 
 
 def test_a_recording_without_a_chain_is_exported_without_one(tmp_path: Path) -> None:
-    told = told_run(tmp_path / "told", chain=None)
-    finished = called("export", "--perfetto", told.path, "-o", tmp_path / "t.pftrace")
+    known = known_run(tmp_path / "known", chain=None)
+    finished = called("export", "--perfetto", known.path, "-o", tmp_path / "t.pftrace")
     assert finished.code == 0
-    trace = _Trace.of((tmp_path / "t.pftrace").read_bytes())
+    trace = _Trace((tmp_path / "t.pftrace").read_bytes())
     assert trace.slices("Chain") == []
-    _same_counts(told, trace)
+    _same_counts(known, trace)
 
 
 def test_a_trace_on_a_full_disk_leaves_nothing(tmp_path: Path, full_disk: Path) -> None:
     path = full_disk / "trace.pftrace"
     with pytest.raises(OperationError, match=f"{path}: the file cannot be written.*No space"):
-        export_perfetto(told_run(tmp_path / "told"), path)
+        export_perfetto(known_run(tmp_path / "known"), path)
     assert not [file for file in full_disk.iterdir() if "trace" in file.name]

@@ -6,17 +6,18 @@ from pathlib import Path
 
 import pytest
 from rich.console import Console
-from rich.table import Table
 
-from chainshaper.flow.steps import Comparison, compare_recordings
 from chainshaper.planning import Plan
 from chainshaper.reporting.figures import draw_comparison, draw_distribution, draw_latency
-from chainshaper.reporting.tables import comparison_json, comparison_table, plan_table
+from chainshaper.reporting.latency import comparison_json, comparison_table
+from chainshaper.reporting.plans import plan_table
+from chainshaper.reporting.tables import ResultTable
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
+from chainshaper.verify.measure import Comparison, compare_recordings
 
 
-def _text(table: Table) -> str:
+def _text(table: ResultTable) -> str:
     console = Console(file=io.StringIO(), width=160)
     console.print(table)
     assert isinstance(console.file, io.StringIO)

@@ -13,13 +13,14 @@ from schedules import application, simulated
 from small_chain import small_chain
 
 from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
-from chainshaper.flow.steps import measure_latency, plan_recording
+from chainshaper.flow.steps import plan_recording
 from chainshaper.planning import Plan
 from chainshaper.simulation import arrays, simulate, simulate_latencies
 from chainshaper.simulation.samples import measured_costs, with_recorded_times
 from chainshaper.values.durations import parse_duration
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording, open_recording
+from chainshaper.verify.measure import measure_latency
 from chainshaper.workload.description import Application, ExecutionTime, load_application
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -17,13 +17,14 @@ from command_line import called, json_of
 from small_chain import PERIOD_NS, small_chain
 
 from chainshaper import simulate
-from chainshaper.flow.steps import measure_latency, shape_application
+from chainshaper.flow.steps import shape_application
 from chainshaper.gate.decision import sleep_until
 from chainshaper.planning import Plan, let_per_chain, plan_shaping, publish_slots
 from chainshaper.planning.plan import revised
 from chainshaper.planning.plan_file import save_plan
-from chainshaper.reporting.tables import latency_json
+from chainshaper.reporting.latency import latency_json
 from chainshaper.values.recording import Recording
+from chainshaper.verify.measure import measure_latency
 from chainshaper.verify.overruns import (
     dropped_in,
     dropped_text,

@@ -13,12 +13,7 @@ from rich.console import Console
 from small_chain import small_chain
 
 from chainshaper.analysis import LatencyAnalysis, latency_statistics
-from chainshaper.flow.steps import (
-    compare_recordings,
-    measure_latency,
-    plan_recording,
-    shape_application,
-)
+from chainshaper.flow.steps import plan_recording, shape_application
 from chainshaper.planning import (
     Modes,
     Plan,
@@ -29,8 +24,9 @@ from chainshaper.planning import (
 )
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.plan import revised
-from chainshaper.reporting.predictions import late_text, prediction_json, prediction_table
+from chainshaper.reporting.latency import late_text, prediction_json, prediction_table
 from chainshaper.values.recording import Recording
+from chainshaper.verify.measure import compare_recordings, measure_latency
 from chainshaper.verify.predictions import PredictionHeld, hold_prediction
 
 MS = 1_000_000
@@ -238,10 +234,7 @@ def test_of_a_gated_publisher_too_the_place_is_judged_and_no_average_is_as_predi
 ) -> None:
     """56.8 ms beside 58.5 … 68.5 ms was called as predicted, since chains began late."""
     profile = replace(
-        PROFILE,
-        latencies_ns=np.array([40, 57.5]) * MS,
-        nodes=("/a", "/b"),
-        topics=("/x", "/y"),
+        PROFILE, latencies_ns=np.array([40, 57.5]) * MS, nodes=("/a", "/b"), topics=("/x", "/y")
     )
     profile = replace(profile, latencies_ns=profile.latencies_ns.astype(np.int64))
     plan = plan_chain(

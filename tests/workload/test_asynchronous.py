@@ -16,10 +16,11 @@ from processes import children_of, wait_for
 from small_chain import PERIOD_NS, small_chain
 
 from chainshaper.analysis import LatencyAnalysis
-from chainshaper.flow.steps import measure_latency, plan_recording
+from chainshaper.flow.steps import plan_recording
 from chainshaper.planning import PlanRequest
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording
+from chainshaper.verify.measure import measure_latency
 from chainshaper.workload.description import Application
 from chainshaper.workload.executor import AsynchronousWriter, PublisherThread
 from chainshaper.workload.live import run_application

@@ -7,9 +7,10 @@ import pytest
 from small_chain import DDS_CORE, EXECUTOR_CORE, PERIOD_NS, small_chain
 
 from chainshaper import simulate
-from chainshaper.flow.steps import measure_latency, plan_recording, shape_application
+from chainshaper.flow.steps import plan_recording, shape_application
 from chainshaper.planning import PlanRequest
 from chainshaper.values.yaml_file import AS_YAML
+from chainshaper.verify.measure import measure_latency
 from chainshaper.verify.overruns import dropped_in
 from chainshaper.workload.description import Application
 from chainshaper.workload.live import run_application

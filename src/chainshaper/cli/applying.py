@@ -46,7 +46,7 @@ def threads(
     """Show the threads of running nodes: executors, DDS threads, publishers; class and cores."""
     from chainshaper.flow.threads import find_threads
     from chainshaper.planning import load_plan
-    from chainshaper.reporting.threads import threads_json, threads_table
+    from chainshaper.reporting.recordings import threads_json, threads_table
     from chainshaper.sources import open_source
 
     place: int | Plan | None = None
@@ -103,7 +103,7 @@ def apply(
     """
     from chainshaper.flow.apply import apply_plan
     from chainshaper.planning import load_plan, plan_warnings
-    from chainshaper.reporting.servers import servers_table
+    from chainshaper.reporting.plans import servers_table
 
     planned, recorded = load_plan(plan), None
     if recording is not None:
@@ -144,7 +144,7 @@ def _show_changes(plan: "Plan", backend: str, json: bool, **where: Any) -> None:
     import shlex
 
     from chainshaper.flow.threads import planned_changes
-    from chainshaper.reporting.servers import changes_table
+    from chainshaper.reporting.plans import changes_table
 
     changes = planned_changes(plan, backend, **where)
     if json:
@@ -161,7 +161,7 @@ def _show_changes(plan: "Plan", backend: str, json: bool, **where: Any) -> None:
 @contextmanager
 def _watching() -> "Iterator[tuple[Callable[[RunState], None], Callable[[float, str], None]]]":
     """What shows the state of a run, and progress before: a live table, or a line now and then."""
-    from chainshaper.reporting.servers import run_line, servers_table
+    from chainshaper.reporting.plans import run_line, servers_table
 
     with ExitStack() as shown:
         report = shown.enter_context(progress("applying"))
@@ -211,7 +211,7 @@ def status(
     """
     from chainshaper.enforcement.freezer_state import stray_groups
     from chainshaper.enforcement.undoing import find_runs, runs_as_json, strange_lines
-    from chainshaper.reporting.servers import runs_table, servers_table
+    from chainshaper.reporting.plans import runs_table, servers_table
     from chainshaper.splicing.shaped_outputs import find_outputs, output_text
 
     found = find_outputs()
@@ -290,7 +290,7 @@ def doctor(
 ) -> None:
     """Examine this machine: scheduling, privileges, tracing, DDS, and its own stalls."""
     from chainshaper.flow.doctor import examine_machine
-    from chainshaper.reporting.machine import machine_json, machine_tables
+    from chainshaper.reporting.recordings import machine_json, machine_tables
 
     with progress("examining this machine") as report:
         report(0.0, "watching for stalls")

@@ -104,8 +104,7 @@ def _print_one(
     json: bool,
 ) -> None:
     from chainshaper.planning import band_choice, plan_json, plan_warnings, publish_slots, save_plan
-    from chainshaper.reporting.predictions import choice_json, choice_table
-    from chainshaper.reporting.tables import bands_table, plan_table
+    from chainshaper.reporting.plans import bands_table, choice_json, choice_table, plan_table
 
     choice = band_choice(planned, profile, request) if request.bands == "auto" else None
     if output is not None:
@@ -150,7 +149,7 @@ def _place_and_print(
     plans: "Sequence[Plan]", output: Path | None, json: bool, time_limit: float = 60.0
 ) -> None:
     from chainshaper.planning import place_chains, plan_json, plan_warnings, save_plans
-    from chainshaper.reporting.tables import plan_table
+    from chainshaper.reporting.plans import plan_table
 
     placed, remarks = place_chains(plans, time_limit_s=time_limit)
     written = [] if output is None else save_plans(placed, output)
@@ -203,7 +202,8 @@ def sweep(
     Ended before it is whole, it keeps the finished points beside the file that it writes; the same
     command goes on with the others.
     """
-    from chainshaper.reporting.sweeps import draw_sweep, sweep_table
+    from chainshaper.reporting.figures import draw_sweep
+    from chainshaper.reporting.plans import sweep_table
     from chainshaper.simulation.sweeping import parse_axis, rows_beside
     from chainshaper.simulation.sweeping import sweep as run_sweep
     from chainshaper.values.whole_file import new_file

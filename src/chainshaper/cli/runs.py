@@ -87,12 +87,9 @@ def demo(
     """
     from chainshaper.flow.demo import run_demo
     from chainshaper.planning import plan_warnings
-    from chainshaper.reporting.tables import (
-        callback_table,
-        comparison_json,
-        comparison_table,
-        plan_table,
-    )
+    from chainshaper.reporting.latency import comparison_json, comparison_table
+    from chainshaper.reporting.plans import plan_table
+    from chainshaper.reporting.recordings import callback_table
 
     folder = output or Path(f"chainshaper-demo-{datetime.now():%Y%m%d-%H%M%S}")
     with progress("demo") as report:
@@ -223,9 +220,10 @@ def record(
 
 def _record_and_show(output: Path, command: list[str], json: bool, **how: Any) -> None:
     """Record, and say what came of it; ``how`` goes to :func:`chainshaper.record_command`."""
-    from chainshaper.flow.exploration import event_counts, lost_events
+    from chainshaper.flow.exploration import lost_events
     from chainshaper.flow.record import record_command
     from chainshaper.linux.own_processes import end_in_words
+    from chainshaper.values.recording import event_counts
 
     stop = threading.Event()
     with stop_on_signals(stop):
@@ -415,8 +413,7 @@ def _shape_launched(command: list[str], folder: Path, json: bool, **how: Any) ->
     """The whole flow; ``how`` goes to :func:`chainshaper.shape_launch`."""
     from chainshaper.flow.launch_shaping import shape_launch
     from chainshaper.planning import plan_warnings
-    from chainshaper.reporting.predictions import prediction_table
-    from chainshaper.reporting.tables import comparison_json, comparison_table
+    from chainshaper.reporting.latency import comparison_json, comparison_table, prediction_table
 
     stop = threading.Event()
     with stop_on_signals(stop):
@@ -439,7 +436,7 @@ def _shape_launched(command: list[str], folder: Path, json: bool, **how: Any) ->
 
 
 def _ask(graph: "ApplicationGraph", found: "ChainEnumeration") -> str:
-    from chainshaper.reporting.chain_list import chain_table
+    from chainshaper.reporting.recordings import chain_table
     from chainshaper.values.safe_text import shown
 
     show(chain_table(graph, found))

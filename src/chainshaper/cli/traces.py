@@ -19,7 +19,7 @@ from chainshaper.values.errors import InputError
 def info(trace: list[Path] = TRACE, json: bool = JSON) -> None:
     """Show what is in a trace: events, losses, clock, distribution, RMW, hosts, processes."""
     from chainshaper.flow.exploration import lost_events
-    from chainshaper.reporting.contents import contents_json, contents_table
+    from chainshaper.reporting.recordings import contents_json, contents_table
     from chainshaper.sources import open_source
 
     with late_progress("info") as progress:
@@ -49,12 +49,11 @@ def graph(
     """Show the application: nodes, callbacks with kind, period and function, topics, services."""
     from chainshaper.flow.exploration import describe_application, lost_events
     from chainshaper.reporting.application_graph import (
-        ENDINGS,
         application_json,
         application_table,
         without_internals,
-        write_picture,
     )
+    from chainshaper.reporting.graph_drawing import ENDINGS, write_picture
     from chainshaper.sources import open_source
     from chainshaper.values.whole_file import new_file
 
@@ -81,7 +80,7 @@ def callbacks(trace: list[Path] = TRACE, json: bool = JSON) -> None:
     """Show every callback of a recording or trace: kind, count, execution and response time."""
     from chainshaper.analysis import callback_statistics, data_flow
     from chainshaper.flow.exploration import lost_events
-    from chainshaper.reporting.tables import callback_rows, callback_table
+    from chainshaper.reporting.recordings import callback_rows, callback_table
     from chainshaper.sources import open_source
 
     with late_progress("callbacks") as progress:
@@ -117,7 +116,7 @@ def chains(
     """
     from chainshaper.analysis import data_flow, graph_of
     from chainshaper.flow.exploration import list_chains, lost_events
-    from chainshaper.reporting.chain_list import chain_table, chains_json, count_text
+    from chainshaper.reporting.recordings import chain_table, chains_json, count_text
     from chainshaper.sources import open_source
 
     with late_progress("chains") as progress:
@@ -152,10 +151,14 @@ def latency(
     topic, message by message. A second table shows in which hop the time went.
     """
     from chainshaper.flow.exploration import lost_events, named_chain
-    from chainshaper.flow.steps import measure_latency
-    from chainshaper.reporting.breakdown import breakdown_json, breakdown_table
-    from chainshaper.reporting.tables import latency_json, latency_table
+    from chainshaper.reporting.latency import (
+        breakdown_json,
+        breakdown_table,
+        latency_json,
+        latency_table,
+    )
     from chainshaper.sources import open_source
+    from chainshaper.verify.measure import measure_latency
     from chainshaper.verify.overruns import dropped_text, overruns_text
 
     if instances and not json:
@@ -212,9 +215,8 @@ def compare(
 
     Where a plan was in force, its prediction stands beside the measurement, band by band.
     """
-    from chainshaper.flow.steps import compare_recordings
-    from chainshaper.reporting.predictions import prediction_table
-    from chainshaper.reporting.tables import comparison_json, comparison_table
+    from chainshaper.reporting.latency import comparison_json, comparison_table, prediction_table
+    from chainshaper.verify.measure import compare_recordings
 
     comparison = compare_recordings(recordings, chain, plan_in_force(plan))
     if figures is not None:
@@ -248,11 +250,11 @@ def report(
     timeline of single cycles, overruns, stalls, the plan, and how all of it was recorded. The page
     needs no network.
     """
-    from chainshaper.flow.steps import Comparison, measure_latency
-    from chainshaper.reporting.html.page import ENDINGS, write_report
-    from chainshaper.reporting.tables import comparison_json
+    from chainshaper.reporting.latency import comparison_json
+    from chainshaper.reporting.page import ENDINGS, write_report
     from chainshaper.sources import open_source
     from chainshaper.values.whole_file import new_file
+    from chainshaper.verify.measure import Comparison, measure_latency
 
     new_file(output, ENDINGS)
     in_force = plan_in_force(plan)
@@ -287,10 +289,10 @@ def export(
     if not perfetto:
         raise InputError("the format is missing: add --perfetto")
     from chainshaper.flow.exploration import lost_events
-    from chainshaper.flow.steps import measure_latency
     from chainshaper.reporting.perfetto import ENDINGS, export_perfetto
     from chainshaper.sources import open_source
     from chainshaper.values.whole_file import new_file
+    from chainshaper.verify.measure import measure_latency
 
     new_file(output, ENDINGS)
     in_force = plan_in_force(plan)

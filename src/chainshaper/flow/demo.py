@@ -19,16 +19,12 @@ from pathlib import Path
 import polars as pl
 
 from chainshaper.analysis import callback_statistics, data_flow
-from chainshaper.flow.steps import (
-    Comparison,
-    compare_recordings,
-    plan_recording,
-    shape_application,
-)
+from chainshaper.flow.steps import plan_recording, shape_application
 from chainshaper.planning import Plan, PlanRequest, save_plan
-from chainshaper.reporting.comparison_files import write_comparison
+from chainshaper.reporting.figures import write_comparison
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import refuse_existing
+from chainshaper.verify.measure import Comparison, compare_recordings
 from chainshaper.workload.description import load_application
 from chainshaper.workload.live import Progress, run_application
 

@@ -9,38 +9,13 @@ import platform
 import resource
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Literal, TypeAlias
-
-import polars as pl
 
 from chainshaper.enforcement.back_ends import offered_back_ends
 from chainshaper.linux.scheduling import available_cores, may_use_fifo, throttle_fraction
 from chainshaper.linux.threads import foreign_realtime_processes
-from chainshaper.values.recording import StallMeterInfo
+from chainshaper.values.machine import Check, MachineReport, State
 
-State: TypeAlias = Literal["good", "limited", "absent"]
-
-
-@dataclass(frozen=True)
-class Check:
-    """One ability: ``needed_for`` says what goes without it, ``remedy`` what would bring it."""
-
-    name: str
-    state: State
-    found: str
-    needed_for: str
-    remedy: str = ""
-
-
-@dataclass(frozen=True)
-class MachineReport:
-    """All checks, and the stalls seen while watching every core (`machine_stall` table)."""
-
-    checks: tuple[Check, ...]
-    stalls: pl.DataFrame
-    stall_meter: StallMeterInfo
-    watched_ns: int
+__all__ = ["examine_machine"]
 
 
 def examine_machine(watch_ns: int = 5_000_000_000) -> MachineReport:

@@ -4,11 +4,7 @@ The functions behind `chainshaper info`, `graph`, `chains` and `convert`. All of
 :func:`chainshaper.sources.open_source` opened.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-
-import polars as pl
 
 from chainshaper.analysis import (
     ChainEnumeration,
@@ -20,65 +16,31 @@ from chainshaper.analysis import (
     load_named_paths,
 )
 from chainshaper.analysis.chains import close_names
-from chainshaper.analysis.matching import latest_before
-from chainshaper.analysis.objects import named_nodes
+from chainshaper.analysis.description import ApplicationDescription, services
 from chainshaper.sources import open_source
 from chainshaper.sources.lttng.trace import table_name
-from chainshaper.values import events
-from chainshaper.values.application import ApplicationGraph
 from chainshaper.values.errors import InputError
-from chainshaper.values.recording import Recording, RecordingInfo, write_recording
+from chainshaper.values.recording import (
+    Recording,
+    RecordingInfo,
+    event_counts,
+    lost_text,
+    write_recording,
+)
 
 __all__ = [
-    "ApplicationDescription",
     "convert_recording",
     "describe_application",
-    "event_counts",
     "list_chains",
     "lost_events",
-    "lost_text",
     "named_chain",
-    "services",
     "with_trace_events",
 ]
-
-
-def event_counts(recording: Recording) -> pl.DataFrame:
-    """How often each event happened: ``event, count``, ordered by event.
-
-    Names are the tracer's own, with the provider (``ros2:callback_start``), also of events that the
-    analysis makes no use of, and also in a recording that was converted from a trace; where we
-    recorded ourselves they are the names of the tables.
-    """
-    counts = getattr(recording.events, "counts", recording.info.trace_events)
-    if not counts:
-        counts = {name: frame.height for name, frame in recording.events.items()}
-    rows = sorted((name, count) for name, count in counts.items() if count)
-    return pl.DataFrame(rows, schema={"event": pl.String, "count": pl.Int64}, orient="row")
 
 
 def lost_events(info: RecordingInfo) -> str:
     """What was lost while recording, in words for below a table; "nothing" is said as well."""
     return lost_text(info.lost)
-
-
-def lost_text(lost: Mapping[str, int]) -> str:
-    """The same from the counts by reason."""
-    reasons = [f"{count} {what.replace('_', ' ')}" for what, count in lost.items() if count]
-    return f"lost while recording: {', '.join(reasons) or 'nothing'}"
-
-
-def services(tables: events.EventTables) -> pl.DataFrame:
-    """All services: ``service, role, node, pid``, one row per server and client."""
-    nodes = named_nodes(tables).rename({"handle": "node_handle", "valid_from": "created"})
-    found = []
-    for role, name in (("server", "rcl_service_init"), ("client", "rcl_client_init")):
-        ends = events.table(tables, name).select(
-            "time", "pid", "node_handle", service="service_name", role=pl.lit(role)
-        )
-        joined = latest_before(ends, nodes, ["pid", "node_handle"], "time", "created")
-        found.append(joined.select("service", "role", "node", "pid"))
-    return pl.concat(found).unique().sort("service", "role", "node", "pid")
 
 
 def list_chains(
@@ -147,20 +109,6 @@ def with_trace_events(recording: Recording) -> RecordingInfo:
         notes += (f"{count} events of kinds that chainshaper makes no use of were not kept: "
                   f"{', '.join(left)}.",)  # fmt: skip
     return info.model_copy(update={"trace_events": counts, "notes": notes})
-
-
-@dataclass(frozen=True)
-class ApplicationDescription:
-    """Everything that a picture of an application shows.
-
-    ``services`` is the frame of :func:`services`; ``lost`` and ``notes`` are what a reader must
-    know about how complete it is.
-    """
-
-    graph: ApplicationGraph
-    services: pl.DataFrame
-    lost: dict[str, int]
-    notes: tuple[str, ...]
 
 
 def describe_application(recording: Recording | str | Path) -> ApplicationDescription:

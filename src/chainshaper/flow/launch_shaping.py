@@ -25,12 +25,12 @@ from chainshaper.flow.exploration import list_chains
 from chainshaper.flow.launch_splicing import Splicing, splice_launch_files
 from chainshaper.flow.profiling import chain_nodes, profiling_condition
 from chainshaper.flow.record import Scheduling, record_command
-from chainshaper.flow.steps import Comparison, compare_recordings, plan_recording
+from chainshaper.flow.steps import plan_recording
 from chainshaper.linux.processes import Process
 from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.linux.users import run_users
 from chainshaper.planning import Plan, PlanRequest, save_plan
-from chainshaper.reporting.comparison_files import write_comparison
+from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.generated_package import build_package, check_build_tools
 from chainshaper.splicing.launch.command import LaunchCommand, parse_launch_command
 from chainshaper.splicing.launch.folder import NODES
@@ -38,6 +38,7 @@ from chainshaper.splicing.shaping_process import NodeKind
 from chainshaper.values.application import ApplicationGraph
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 from chainshaper.values.recording import Recording, refuse_existing
+from chainshaper.verify.measure import Comparison, compare_recordings
 
 __all__ = ["ShapedLaunch", "shape_launch"]
 

@@ -1,4 +1,4 @@
-"""The steps of the flow as functions: measure → plan → shape → compare.
+"""The steps of the flow as functions: from recordings to a plan, and a run shaped by it.
 
 Each joins two rooms of the library (analysis and planning, splicing and workload), so that none
 of them needs to know the other. Each verb of the command line is one call of a function here or
@@ -6,160 +6,30 @@ in a room.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
+from chainshaper.analysis import analyse_latency, data_flow
 from chainshaper.flow.profiles import profile_of
 from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain
 from chainshaper.planning.overruns import refuse_offset
 from chainshaper.planning.plan import publisher_servers
 from chainshaper.sources import open_source
 from chainshaper.splicing.application import splice_application
-from chainshaper.values import events
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
-from chainshaper.verify.overruns import dropped_in, into_open_slots, overruns_in
-from chainshaper.verify.predictions import PredictionHeld, due_of, hold_prediction
+from chainshaper.verify.measure import chain_of, longest_stall
 from chainshaper.workload.description import Application
 from chainshaper.workload.live import Enforcement, Progress, origin_timer, run_application
 
 __all__ = [
-    "Comparison",
-    "Measurement",
-    "chain_of",
-    "compare_recordings",
-    "measure_latency",
     "plan_recording",
     "profile_chains",
     "shape_application",
 ]
 
 _STANDARD = PlanRequest()
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """What was recorded before the plan came into force, and after its release (ns)."""
-
-    before_ns: int = 0
-    after_ns: int = 0
-
-    @property
-    def text(self) -> str | None:
-        """In words; None where it is nothing."""
-        parts = [
-            f"the {which} {format_duration(round(lasted, -6))}, {when}"
-            for which, lasted, when in (
-                ("first", self.before_ns, "before the plan came into force"),
-                ("last", self.after_ns, "after it was released"),
-            )
-            if round(lasted, -6)
-        ]
-        return f"left out: {' and '.join(parts)}" if parts else None
-
-
-@dataclass(frozen=True)
-class Measurement:
-    """A recording with its chain's latency analysis.
-
-    ``longest_stall_ns`` is the machine's own during the recording (None: nobody watched it),
-    ``overruns`` counts outputs that came too late for their publish slot, per policy that was
-    applied to them: ``wait``, ``discard``, ``publish`` (None: nothing was gated);
-    ``into_open_slots`` those that came in time, but too late to be held until their slot's start
-    (None: no gate decided), and ``dropped`` messages that were lost at a gate, per reason. ``plan``
-    is the plan in force, and ``held`` its prediction beside this measurement. All of it is about
-    the time in which the plan was in force, where the recording says when that was: ``left_out``
-    names the rest.
-    """
-
-    recording: Recording
-    analysis: LatencyAnalysis
-    longest_stall_ns: int | None
-    overruns: dict[str, int] | None
-    into_open_slots: int | None
-    dropped: dict[str, int] | None
-    plan: Plan | None
-    held: PredictionHeld | None
-    left_out: LeftOut
-
-
-@dataclass(frozen=True)
-class Comparison:
-    """The same chain in several recordings, usually before and after shaping."""
-
-    chain: str
-    measurements: tuple[Measurement, ...]
-
-
-def chain_of(recording: Recording, chain: str | None) -> str:
-    """The chain that was asked for, or the one that the recording itself names.
-
-    Raises:
-        InputError: neither names one.
-    """
-    named = chain or recording.info.chain
-    if named is None:
-        raise InputError(
-            f"{recording.path} names no chain of interest: give one with --chain FIRST..LAST, "
-            "such as --chain /t1../t5"
-        )
-    return named
-
-
-def measure_latency(
-    recording: Recording | str | Path, chain: str | None = None, plan: Plan | None = None
-) -> Measurement:
-    """Analyse the end-to-end latency of one chain in a recording.
-
-    ``plan`` is the plan in force, for recordings that do not know it themselves.
-    """
-    if not isinstance(recording, Recording):
-        recording = open_source(recording)
-    if plan is None and recording.info.plan is not None:
-        plan = Plan.model_validate(recording.info.plan, strict=False)
-    spell, left_out = _in_force(recording)
-    analysis = analyse_latency(
-        recording,
-        chain_of(recording, chain),
-        due=() if plan is None else due_of(plan),
-        between=spell,
-    )
-    if spell is not None:
-        recording = replace(recording, events=events.happened(recording.events, *spell))
-    planned_for = plan is not None and plan.chain.output in (None, analysis.chain.topics[-1])
-    return Measurement(
-        recording=recording,
-        analysis=analysis,
-        longest_stall_ns=_longest_stall(recording),
-        overruns=overruns_in(recording, plan, analysis),
-        into_open_slots=into_open_slots(recording, plan),
-        dropped=dropped_in(recording),
-        plan=plan,
-        held=hold_prediction(plan, analysis) if plan and planned_for else None,
-        left_out=left_out,
-    )
-
-
-def _in_force(recording: Recording) -> tuple[tuple[int, int | None] | None, LeftOut]:
-    """When the plan was in force, if not throughout, and what was recorded besides."""
-    spell, starts = recording.info.in_force, events.table(recording.events, "callback_start")
-    if spell is None or not starts.height:
-        return None, LeftOut()
-    first, last = int(starts["time"][0]), int(starts["time"][-1])
-    before = max(0, min(spell.since_ns, last) - first)
-    after = 0 if spell.until_ns is None else max(0, last - max(spell.until_ns, first))
-    within = (spell.since_ns, spell.until_ns) if before or after else None
-    return within, LeftOut(before, after)
-
-
-def _longest_stall(recording: Recording) -> int | None:
-    if recording.info.stall_meter is None:
-        return None
-    stalls = events.table(recording.events, "machine_stall")
-    return int(stalls["duration"].max() or 0)  # type: ignore[arg-type]
 
 
 def profile_chains(
@@ -180,7 +50,7 @@ def profile_chains(
     if not isinstance(recording, Recording):
         recording = open_source(recording)
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
-    stall = _longest_stall(recording)
+    stall = longest_stall(recording)
     return tuple(
         profile_of(
             recording,
@@ -226,7 +96,7 @@ def shape_application(
     """Splice the plan's shaping node into an application, run it and record it.
 
     ``enforcement`` puts the plan's servers in force while it runs. A shaping node does without;
-    the thread of an asynchronous publisher is gated unless somebody else sees to it
+    the thread of an asynchronous publisher is gated unless ``enforcement`` does so
     (:func:`chainshaper.flow.apply.publishers_gated`).
 
     Raises:
@@ -256,25 +126,3 @@ def shape_application(
         command=command,
         progress=progress,
     )
-
-
-def compare_recordings(
-    recordings: Sequence[Recording | str | Path],
-    chain: str | None = None,
-    plan: Plan | None = None,
-) -> Comparison:
-    """Measure the same chain in several recordings.
-
-    ``plan`` was in force in the last of them, should that not say so itself.
-
-    Raises:
-        InputError: fewer than two recordings, or a chain that one of them does not have.
-    """
-    if len(recordings) < 2:
-        raise InputError("a comparison needs two recordings, such as `compare before after`")
-    *first, last = recordings
-    measurements = [
-        *(measure_latency(recording, chain) for recording in first),
-        measure_latency(last, chain, plan),
-    ]
-    return Comparison(measurements[0].analysis.chain.spec, tuple(measurements))

@@ -1,36 +1,26 @@
-"""The application graph as plain data, as a table and as DOT; pictures are written from here.
+"""The application graph as plain data and as a table.
 
 What every node has for itself (parameter services, /rosout, /parameter_events) says nothing about
 an application and is left out of tables and pictures unless asked for; in JSON it is marked.
 """
 
-import json
 import re
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-from rich.table import Table
-
-from chainshaper.flow.exploration import ApplicationDescription, lost_text
-from chainshaper.reporting.cells import terminal_table
+from chainshaper.analysis.description import ApplicationDescription
+from chainshaper.reporting.tables import Column, ResultTable, words
 from chainshaper.values.application import INTERNAL_TOPICS, Callback
 from chainshaper.values.durations import format_duration
-from chainshaper.values.safe_text import shown
-from chainshaper.values.whole_file import new_file, write_whole
 
 __all__ = [
-    "ENDINGS",
-    "application_dot",
     "application_json",
     "application_table",
     "is_internal",
     "short_symbol",
     "without_internals",
-    "write_picture",
 ]
 
-ENDINGS = (".svg", ".dot", ".json")
 _CALLBACK_FIELDS = (
     *("id", "node", "pid", "kind", "topic", "period_ns", "symbol", "publishes", "passes_on"),
 )
@@ -63,10 +53,10 @@ def without_internals(application: ApplicationDescription) -> ApplicationDescrip
     ]
     publishers = {t: nodes for t, nodes in graph.publishers.items() if not is_internal(t)}
     subscribers = {t: nodes for t, nodes in graph.subscribers.items() if not is_internal(t)}
-    kept = replace(
+    shown_graph = replace(
         graph, callbacks=tuple(callbacks), publishers=publishers, subscribers=subscribers
     )
-    return replace(application, graph=kept)
+    return replace(application, graph=shown_graph)
 
 
 def application_json(application: ApplicationDescription) -> dict[str, Any]:
@@ -108,11 +98,10 @@ def application_json(application: ApplicationDescription) -> dict[str, Any]:
     }
 
 
-def application_table(application: ApplicationDescription) -> Table:
+def application_table(application: ApplicationDescription) -> ResultTable:
     """One row per callback, by node."""
-    names = ("node", "process", "callback", "publishes", "function")
-    table = terminal_table("Application", names)
-    table.columns[1].justify = "right"
+    names = [*words("node"), Column("process"), *words("callback", "publishes", "function")]
+    table = ResultTable("Application", names)
     graph = application.graph
     nodes = {(node.name, node.pid) for node in graph.nodes}
     idle = nodes - {(callback.node, callback.pid) for callback in graph.callbacks}
@@ -121,7 +110,7 @@ def application_table(application: ApplicationDescription) -> Table:
         publishes, function = ", ".join(callback.publishes), short_symbol(callback.symbol)
         rows.append((callback.node, callback.pid, callback_text(callback), publishes, function))
     for node, pid, *rest in sorted(rows, key=lambda row: row[:2]):
-        table.add_row(node, str(pid), *rest)
+        table.add(node, str(pid), *rest)
     return table
 
 
@@ -154,72 +143,12 @@ def short_symbol(symbol: str | None) -> str:
 
 def _without_brackets(text: str) -> str:
     """The text outside all <…>, (…) and {…}."""
-    depth, kept = 0, []
+    depth, outside = 0, []
     for character in text:
         if character in "<({":
             depth += 1
         if depth == 0:
-            kept.append(character)
+            outside.append(character)
         if character in ">)}":
             depth -= 1
-    return "".join(kept)
-
-
-def application_dot(application: ApplicationDescription) -> str:
-    """The graph in the language of Graphviz: a cluster per node, ellipses for topics."""
-    graph = application.graph
-    lines = ["digraph application {", "  rankdir=LR;", "  node [fontname=Helvetica, fontsize=11];"]
-    if any(application.lost.values()):
-        lines.append(f"  label={_quoted(lost_text(application.lost))};")
-    number = {(node.name, node.pid): index for index, node in enumerate(graph.nodes)}
-    for callback in graph.callbacks:
-        number.setdefault((callback.node, callback.pid), len(number))
-    for (name, pid), index in number.items():
-        lines.append(f"  subgraph cluster_{index} {{")
-        lines.append(f"    label={_quoted(f'{name} (process {pid})')};")
-        lines.append(f'    node_{index} [shape=point, style=invis, label=""];')
-        for callback in graph.callbacks:
-            if (callback.node, callback.pid) == (name, pid):
-                text = callback_text(callback) + "\n" + short_symbol(callback.symbol)
-                label = _quoted(text.strip())
-                lines.append(f"    callback_{callback.id} [shape=box, label={label}];")
-        lines.append("  }")
-    lines += [f"  {_quoted(topic)} [shape=ellipse];" for topic in graph.topics]
-    for callback in graph.callbacks:
-        vertex = f"callback_{callback.id}"
-        if callback.kind == "subscription" and callback.topic is not None:
-            lines.append(f"  {_quoted(callback.topic)} -> {vertex};")
-        elif callback.kind in {"service", "client"} and callback.topic is not None:
-            lines.append(f"  {_quoted(callback.topic)} [shape=cds];")
-            lines.append(f"  {_quoted(callback.topic)} -> {vertex};")
-        for topic in callback.publishes:
-            style = " [style=dashed]" if topic in callback.passes_on else ""
-            lines.append(f"  {vertex} -> {_quoted(topic)}{style};")
-    return "\n".join([*lines, "}", ""])
-
-
-def _quoted(text: str) -> str:
-    escaped = shown(text, but="\n").replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
-    return f'"{escaped}"'
-
-
-def write_picture(
-    application: ApplicationDescription, path: str | Path, *, everything: bool = False
-) -> Path:
-    """Write the graph as .svg, .dot or .json, by the ending of ``path``, whole or not at all.
-
-    Raises:
-        InputError: it exists, its folder does not, or its ending says no known format.
-        OperationError: it cannot be written.
-    """
-    path = new_file(path, ENDINGS)
-    drawn = application if everything else without_internals(application)
-    if path.suffix == ".json":
-        text = json.dumps(application_json(application), indent=2) + "\n"
-    elif path.suffix == ".dot":
-        text = application_dot(drawn)
-    else:
-        from chainshaper.reporting.graph_drawing import application_svg
-
-        text = application_svg(drawn)
-    return write_whole(path, [text.encode()])
+    return "".join(outside)

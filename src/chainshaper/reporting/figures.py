@@ -1,10 +1,11 @@
-"""Figures: end-to-end latency per cycle, and its distribution with the publish slots drawn in.
+"""Figures: latency per cycle, its distribution with the publish slots, figure 7, sweeps.
 
-Both are drawn from recordings alone, so they can be made again at any time. The colours stay
-apart for colour-blind readers and in grey print.
+All are drawn from recordings or plans alone. The colours stay apart for colour-blind readers and
+in grey print.
 """
 
 import io
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,12 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import polars as pl
 
-from chainshaper.flow.steps import Measurement
 from chainshaper.planning import BandChoice, publish_slots
+from chainshaper.reporting.latency import comparison_json
+from chainshaper.reporting.plans import sweep_axes, sweep_value
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.safe_text import shown
 from chainshaper.values.trusted_files import why_distrusted
 from chainshaper.values.whole_file import new_file, write_whole
+from chainshaper.verify.measure import Comparison, Measurement
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,12 +30,24 @@ __all__ = [
     "draw_curve",
     "draw_distribution",
     "draw_latency",
-    "new_figure",
-    "save_figure",
+    "draw_sweep",
+    "write_comparison",
 ]
 
 COLOURS = ("#d95f02", "#1b6ca8", "#4d9221", "#7b3294")
 SIZE_INCHES = (9.0, 4.2)
+MOST_LINES = 12
+
+
+def write_comparison(comparison: Comparison, folder: Path) -> None:
+    """Write `comparison.json`, `latency.png` and `distribution.png` into a folder.
+
+    Raises:
+        OperationError: they cannot be written.
+    """
+    draw_comparison(comparison.measurements, folder)
+    text = json.dumps(comparison_json(comparison), indent=2) + "\n"
+    write_whole(folder / "comparison.json", [text.encode()])
 
 
 def draw_comparison(measurements: Sequence[Measurement], folder: str | Path) -> tuple[Path, Path]:
@@ -59,7 +74,7 @@ def draw_latency(measurements: Sequence[Measurement], path: str | Path) -> Path:
     Crosses mark cycles that the machine disturbed. The picture ends a little above the highest
     undisturbed cycle.
     """
-    figure, axes = new_figure()
+    figure, axes = _new_figure()
     for index, measurement in enumerate(measurements):
         frame = measurement.analysis.traversals.filter("complete")
         cycles = np.arange(len(frame))
@@ -76,12 +91,12 @@ def draw_latency(measurements: Sequence[Measurement], path: str | Path) -> Path:
     axes.set(xlabel="cycle (crosses: disturbed by the machine)", ylabel="end-to-end latency [ms]")
     axes.set_title(f"Chain {measurements[0].analysis.chain.spec}", loc="left")
     axes.legend(loc="lower right")
-    return save_figure(figure, path)
+    return _save_figure(figure, path)
 
 
 def draw_distribution(measurements: Sequence[Measurement], path: str | Path) -> Path:
     """Cumulative distribution of the latency over undisturbed cycles, publish slots shaded."""
-    figure, axes = new_figure()
+    figure, axes = _new_figure()
     for index, measurement in enumerate(measurements):
         frame = measurement.analysis.traversals.filter(pl.col("complete") & ~pl.col("disturbed"))
         latency = np.sort(frame["latency_ns"].to_numpy()) / 1e6
@@ -101,7 +116,7 @@ def draw_distribution(measurements: Sequence[Measurement], path: str | Path) -> 
     axes.set(xlabel="end-to-end latency [ms]", ylabel="share of cycles")
     axes.set_title(f"Chain {measurements[0].analysis.chain.spec}", loc="left")
     axes.legend(loc="upper left")
-    return save_figure(figure, path)
+    return _save_figure(figure, path)
 
 
 def draw_curve(choice: BandChoice, path: str | Path) -> Path:
@@ -112,7 +127,7 @@ def draw_curve(choice: BandChoice, path: str | Path) -> Path:
         OperationError: it cannot be written.
     """
     path = new_file(path)
-    figure, axes = new_figure()
+    figure, axes = _new_figure()
     bands = [len(placement.slot_ends_ns) for placement in choice.curve]
     means = [placement.mean_ns / 1e6 for placement in choice.curve]
     axes.plot(bands, means, "o-", color=COLOURS[1], label="best placement")
@@ -128,10 +143,38 @@ def draw_curve(choice: BandChoice, path: str | Path) -> Path:
     axes.set_xticks(bands)
     axes.set(xlabel="number of latency bands", ylabel="average latency, eq. 5 [ms]")
     axes.legend(loc="upper right")
-    return save_figure(figure, path)
+    return _save_figure(figure, path)
 
 
-def new_figure(panels: int = 1) -> tuple[Any, Any]:
+def draw_sweep(frame: pl.DataFrame, path: Path) -> Path:
+    """Average and jitter over the first axis, a line for each combination of the others.
+
+    Raises:
+        OperationError: the picture cannot be written.
+    """
+    first, *others = sweep_axes(frame)
+    places = {value: place for place, value in enumerate(frame[first].unique(maintain_order=True))}
+    figure, panels = _new_figure(panels=2)
+    lines = frame.partition_by(others, maintain_order=True) if others else [frame]
+    for points in lines[:MOST_LINES]:
+        name = ", ".join(
+            f"{axis.removesuffix('_ns')} {sweep_value(axis, points[axis][0])}" for axis in others
+        )
+        for axes, column in zip(panels, ("mean_ns", "jitter_ns"), strict=True):
+            # A point that failed has no value: the line has a gap there.
+            heights = (points[column] / 1e6).to_list()
+            axes.plot([places[value] for value in points[first]], heights, "o-", label=name)
+    for axes, title in zip(panels, ("average latency", "jitter, max − min"), strict=True):
+        axes.set_xticks(list(places.values()), [sweep_value(first, value) for value in places])
+        axes.set(xlabel=first.removesuffix("_ns"), ylabel=f"{title} [ms]")
+        axes.set_ylim(bottom=0)
+    if others:
+        more = f" (the first {MOST_LINES} of {len(lines)})" if len(lines) > MOST_LINES else ""
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper left", title=more)
+    return _save_figure(figure, path)
+
+
+def _new_figure(panels: int = 1) -> tuple[Any, Any]:
     """A figure and its axes; of several panels, beside each other, a sequence of axes."""
     import matplotlib as mpl
 
@@ -156,7 +199,7 @@ def _limit_to_cycle(
         (axes.set_ylim if vertical else axes.set_xlim)(0, highest / 1e6 * 1.15)
 
 
-def save_figure(figure: Any, path: str | Path) -> Path:
+def _save_figure(figure: Any, path: str | Path) -> Path:
     """Write a figure, as its file's ending says, whole or not at all.
 
     Raises:

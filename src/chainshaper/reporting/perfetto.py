@@ -2,30 +2,73 @@
 
 What is in it: the threads of every process with their callbacks; each publication as an instant,
 with an arrow to the callback that took the message; what asynchronous publishers' threads sent;
-and, as rows of their own, the traversals of the chain with their hops, what the gate held back,
+and, as rows of their own, the traversals of the chain with their hops, what the gate retained,
 the slots of the servers, and stalls of the machine. Times are ns of the recording's event clock.
+
+A trace is a sequence of packets in protobuf's encoding; each packet describes a track, or an event
+of one. Slices of one track must nest: a track whose slices overlap otherwise is written as
+several of one name, which the viewer shows as one. Numbers of fields and enumerations are those of
+`protos/perfetto/trace/` (perfetto.dev, "Advanced Guide to Programmatic Trace Generation").
 """
 
-from collections.abc import Iterator
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
+from typing import TypeAlias
 
 import polars as pl
 
 from chainshaper.analysis import DataFlow, LatencyAnalysis, data_flow, graph_of
-from chainshaper.flow.steps import Measurement
-from chainshaper.reporting.perfetto_format import Slice, Track, encode_trace
 from chainshaper.reporting.timeline import Timeline, timeline_of
 from chainshaper.values import events
 from chainshaper.values.recording import Recording
 from chainshaper.values.safe_text import shown
 from chainshaper.values.whole_file import new_file, write_whole
+from chainshaper.verify.measure import Measurement
 
-__all__ = ["ENDINGS", "export_perfetto"]
+__all__ = ["ENDINGS", "Slice", "Track", "Value", "encode_trace", "export_perfetto"]
 
 ENDINGS = (".pftrace", ".perfetto-trace")
 
-Thread = tuple[int, int]
+BEGIN, END, INSTANT = 1, 2, 3  # TrackEvent.Type
+REALTIME, TRACE_TIME = 1, 6  # BuiltinClock; time stamps without a clock's number are of the second
+EXPLICIT = 3  # TrackDescriptor.ChildTracksOrdering: by rank
+VARINT, FIXED64, LENGTH = 0, 1, 2  # protobuf's wire types
+SEQUENCE = 1  # one writer wrote all of it
+
+Value: TypeAlias = str | int | bool | None
+Thread: TypeAlias = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Slice:
+    """What lasted from ``start`` to ``end`` (ns), or happened at ``start`` (``end`` None).
+
+    ``flows`` are the numbers of arrows that begin here, ``ends_flows`` of those that end here.
+    Arguments that are None are not written.
+    """
+
+    start: int
+    end: int | None
+    name: str
+    arguments: Mapping[str, Value] = field(default_factory=dict)
+    flows: Sequence[int] = ()
+    ends_flows: Sequence[int] = ()
+
+
+@dataclass(frozen=True)
+class Track:
+    """One row: a thread (pid, tid) of a process, or a row of a named group beside them.
+
+    ``owner`` is the process's or the group's name. ``slices`` are families: a slice and those
+    that lie within it, which stay together.
+    """
+
+    owner: str
+    name: str
+    families: Sequence[Sequence[Slice]]
+    thread: Thread | None = None
 
 
 def export_perfetto(source: Recording | Measurement, path: str | Path) -> Path:
@@ -43,7 +86,7 @@ def export_perfetto(source: Recording | Measurement, path: str | Path) -> Path:
     timeline = timeline_of(recording, flow, analysis, plan)
     tracks = _thread_tracks(recording, flow, timeline)
     if analysis is not None:
-        tracks += [*_chain_track(analysis), *_gate_tracks(analysis, timeline)]
+        tracks += [_chain_track(analysis), *_gate_tracks(analysis, timeline)]
     tracks += [*_server_tracks(timeline), *_stall_tracks(timeline)]
     shown_tracks = [_shown(track) for track in tracks]
     return write_whole(path, encode_trace(shown_tracks, recording.info.clock_offset_ns))
@@ -51,34 +94,25 @@ def export_perfetto(source: Recording | Measurement, path: str | Path) -> Path:
 
 def _shown(track: Track) -> Track:
     """A track with all its texts as they are shown."""
-    families = [
-        [
-            replace(
-                one,
-                name=shown(one.name),
-                arguments={
-                    name: shown(value) if isinstance(value, str) else value
-                    for name, value in one.arguments.items()
-                },
-            )
-            for one in family
-        ]
-        for family in track.families
-    ]
+    families = [[_shown_slice(one) for one in family] for family in track.families]
     return replace(track, owner=shown(track.owner), name=shown(track.name), families=families)
+
+
+def _shown_slice(one: Slice) -> Slice:
+    arguments = {
+        name: shown(value) if isinstance(value, str) else value
+        for name, value in one.arguments.items()
+    }
+    return replace(one, name=shown(one.name), arguments=arguments)
 
 
 def _thread_tracks(recording: Recording, flow: DataFlow, timeline: Timeline) -> list[Track]:
     rows: dict[Thread, list[Slice]] = {}
-    for found in (_callbacks(flow, timeline), _publications(flow), _unread(flow), _sends(flow)):
+    for found in (_callbacks(flow, timeline), _messages(flow), _sends(flow)):
         for thread, one in found:
             rows.setdefault(thread, []).append(one)
-    nodes = {
-        (pid, tid): (names, about)
-        for pid, tid, names, about in timeline.threads.select(
-            "pid", "tid", "nodes", "about"
-        ).iter_rows()
-    }
+    known = timeline.threads.select("pid", "tid", "nodes", "about").iter_rows()
+    nodes = {(pid, tid): (names, about) for pid, tid, names, about in known}
     comms = {(thread.pid, thread.tid): thread.comm for thread in recording.info.threads}
     tracks = []
     for thread in [*(t for t in nodes if t in rows), *sorted(rows.keys() - nodes.keys())]:
@@ -89,12 +123,17 @@ def _thread_tracks(recording: Recording, flow: DataFlow, timeline: Timeline) -> 
     return tracks
 
 
+def _arrows(flow: DataFlow, end: str) -> dict[int, list[int]]:
+    """The numbers of the arrows at each ``publication``, or at each ``instance`` that reads."""
+    taken = flow.takes.drop_nulls(["publication", end]).group_by(end).agg("take")
+    return {at: [take + 1 for take in takes] for at, takes in taken.iter_rows()}
+
+
 def _callbacks(flow: DataFlow, timeline: Timeline) -> Iterator[tuple[Thread, Slice]]:
-    callbacks = {callback.id: callback for callback in graph_of(flow).callbacks}
-    ends = flow.takes.drop_nulls(["instance", "publication"]).group_by("instance").agg("take")
-    arrows = {instance: [take + 1 for take in takes] for instance, takes in ends.iter_rows()}
+    labels = {callback.id: callback for callback in graph_of(flow).callbacks}
+    arrows = _arrows(flow, "instance")
     for row in timeline.slices.iter_rows(named=True):
-        callback = callbacks[row["callback_id"]]
+        callback = labels[row["callback_id"]]
         arguments = {
             "function": callback.symbol,
             "instance": row["instance"],
@@ -106,24 +145,20 @@ def _callbacks(flow: DataFlow, timeline: Timeline) -> Iterator[tuple[Thread, Sli
         yield (row["pid"], row["tid"]), one
 
 
-def _publications(flow: DataFlow) -> Iterator[tuple[Thread, Slice]]:
-    taken = flow.takes.drop_nulls("publication").group_by("publication").agg("take")
-    arrows = {publication: [take + 1 for take in takes] for publication, takes in taken.iter_rows()}
+def _messages(flow: DataFlow) -> Iterator[tuple[Thread, Slice]]:
+    """Publications; and takes whose message no callback got: its arrow ends at the take."""
+    arrows = _arrows(flow, "publication")
     for row in flow.publications.iter_rows(named=True):
+        flows = arrows.get(row["publication"], ())
         arguments = {
             "publication": row["publication"],
             "source_timestamp": row["source_timestamp"],
-            "taken_by": len(arrows.get(row["publication"], ())),
+            "taken_by": len(flows),
         }
-        flows = arrows.get(row["publication"], ())
         one = Slice(row["time"], None, f"publish {row['topic']}", arguments, flows=flows)
         yield (row["pid"], row["tid"]), one
-
-
-def _unread(flow: DataFlow) -> Iterator[tuple[Thread, Slice]]:
-    """Messages that were taken, but that no callback got: their arrow ends at the take."""
-    taken = flow.takes.filter(pl.col("publication").is_not_null() & pl.col("instance").is_null())
-    for row in taken.iter_rows(named=True):
+    unread = flow.takes.filter(pl.col("publication").is_not_null() & pl.col("instance").is_null())
+    for row in unread.iter_rows(named=True):
         one = Slice(row["time"], None, f"take {row['topic']}", ends_flows=[row["take"] + 1])
         yield (row["pid"], row["tid"]), one
 
@@ -135,7 +170,7 @@ def _sends(flow: DataFlow) -> Iterator[tuple[Thread, Slice]]:
         yield (row["pid"], row["tid"]), Slice(row["time"], end, row["outcome"], arguments)
 
 
-def _chain_track(analysis: LatencyAnalysis) -> Iterator[Track]:
+def _chain_track(analysis: LatencyAnalysis) -> Track:
     """Traversals, each with the computation of its hops inside; incomplete ones as instants."""
     nodes = {callback.id: callback.node for callback in analysis.graph.callbacks}
     hops: dict[int, list[Slice]] = {}
@@ -148,21 +183,17 @@ def _chain_track(analysis: LatencyAnalysis) -> Iterator[Track]:
     for row in analysis.traversals.iter_rows(named=True):
         number = row["traversal"]
         if row["complete"]:
-            arguments = {
-                "latency_ns": row["latency_ns"],
-                "disturbed": row["disturbed"],
-                "reception_ns": row["reception_ns"],
-            }
+            arguments = {key: row[key] for key in ("latency_ns", "disturbed", "reception_ns")}
             whole = Slice(row["start"], row["end"], f"cycle {number}", arguments)
             families.append([whole, *hops.get(number, ())])
         else:
             what = f"cycle {number} incomplete: {row['reason']}"
             families.append([Slice(row["start"], None, what, {"topic": row["broken_at"]})])
-    yield Track("Chain", analysis.chain.spec, families)
+    return Track("Chain", analysis.chain.spec, families)
 
 
 def _gate_tracks(analysis: LatencyAnalysis, timeline: Timeline) -> Iterator[Track]:
-    """What the shaping nodes held, from arrival until they let it go (or gave it up)."""
+    """What the shaping nodes retained, from arrival until they let it go (or gave it up)."""
     node_of = {callback.id: callback.node for callback in analysis.graph.callbacks}
     for (hop,), rows in timeline.holds.group_by("hop", maintain_order=True):
         families = []
@@ -184,9 +215,7 @@ def _server_tracks(timeline: Timeline) -> Iterator[Track]:
     for (server,), rows in timeline.slots.group_by("server", maintain_order=True):
         slots = [
             [Slice(start, end, f"slot {slot + 1}", {"cycle": traversal})]
-            for traversal, slot, start, end in rows.select(
-                "traversal", "slot", "start", "end"
-            ).iter_rows()
+            for traversal, _, slot, start, end in rows.iter_rows()
         ]
         yield Track("Servers", str(server), slots)
 
@@ -194,7 +223,136 @@ def _server_tracks(timeline: Timeline) -> Iterator[Track]:
 def _stall_tracks(timeline: Timeline) -> Iterator[Track]:
     for (core,), rows in timeline.stalls.group_by("core", maintain_order=True):
         where = "all cores" if core is None else f"core {core}"
-        stalls = [
-            [Slice(start, end, "stall")] for start, end in rows.select("start", "end").iter_rows()
-        ]
+        stalls = [[Slice(start, end, "stall")] for _, start, end in rows.iter_rows()]
         yield Track("Stalls of the machine", where, stalls)
+
+
+def encode_trace(tracks: Sequence[Track], clock_offset_ns: int) -> Iterator[bytes]:
+    """The file, packet by packet. ``clock_offset_ns`` leads to CLOCK_REALTIME."""
+    first = min((one.start for track in tracks for f in track.families for one in f), default=0)
+    yield _packet(_clocks(first, clock_offset_ns))
+    owners: dict[str | int, int] = {}
+    uuid = 0
+    for rank, track in enumerate(tracks):
+        key = track.owner if track.thread is None else track.thread[0]
+        if key not in owners:
+            uuid += 1
+            owners[key] = uuid
+            yield _packet(_message(60, _owner(uuid, track)))
+        for number, lane in enumerate(_lanes(track.families)):
+            uuid += 1
+            as_thread = track.thread if number == 0 else None  # a thread has one track of its own
+            yield _packet(_message(60, _row(uuid, owners[key], track.name, rank, as_thread)))
+            yield from _events(uuid, lane)
+
+
+def _lanes(families: Sequence[Sequence[Slice]]) -> list[list[Slice]]:
+    """Families over as few lanes as they need so that those of a lane do not overlap partly."""
+    lanes: list[list[Slice]] = []
+    open_until: list[list[int]] = []  # per lane the ends of what is open, outermost first
+    for family in sorted(families, key=lambda f: (f[0].start, -_end(f[0]))):
+        start, end = family[0].start, _end(family[0])
+        for ends in open_until:
+            while ends and ends[-1] <= start:
+                ends.pop()
+        fits = (not ends or (end <= ends[-1] and len(family) == 1) for ends in open_until)
+        number = next((number for number, fit in enumerate(fits) if fit), len(lanes))
+        if number == len(lanes):
+            lanes.append([])
+            open_until.append([])
+        lanes[number].extend(family)
+        open_until[number].append(end)
+    return lanes or [[]]
+
+
+def _end(one: Slice) -> int:
+    return one.start if one.end is None else one.end
+
+
+def _events(uuid: int, lane: list[Slice]) -> Iterator[bytes]:
+    """The events of one track in order of time: what begins last ends first."""
+    open_until: list[int] = []
+    end = _message(11, _integer(9, END) + _integer(11, uuid))
+    for one in sorted(lane, key=lambda s: (s.start, -_end(s))):
+        while open_until and open_until[-1] <= one.start:
+            yield _packet(_integer(8, open_until.pop()) + end)
+        if one.end is not None:
+            open_until.append(one.end)
+        yield _packet(_integer(8, one.start) + _message(11, _beginning(uuid, one)))
+    while open_until:
+        yield _packet(_integer(8, open_until.pop()) + end)
+
+
+def _beginning(uuid: int, one: Slice) -> bytes:
+    return b"".join(
+        [
+            _integer(9, INSTANT if one.end is None else BEGIN),
+            _integer(11, uuid),
+            _text(23, one.name),
+            *(_argument(name, value) for name, value in one.arguments.items() if value is not None),
+            *(_fixed64(47, flow) for flow in one.flows),
+            *(_fixed64(48, flow) for flow in one.ends_flows),
+        ]
+    )
+
+
+def _argument(name: str, value: Value) -> bytes:
+    if isinstance(value, str):
+        return _message(4, _text(10, name) + _text(6, value))
+    return _message(4, _text(10, name) + _integer(2 if isinstance(value, bool) else 4, value or 0))
+
+
+def _owner(uuid: int, track: Track) -> bytes:
+    if track.thread is None:
+        return _integer(1, uuid) + _text(2, track.owner) + _integer(11, EXPLICIT)
+    process = _integer(1, track.thread[0]) + _text(6, track.owner)
+    return _integer(1, uuid) + _message(3, process)
+
+
+def _row(uuid: int, owner: int, name: str, rank: int, thread: Thread | None) -> bytes:
+    described = _integer(1, uuid) + _integer(5, owner)
+    if thread is None:
+        return described + _text(2, name) + _integer(12, rank)
+    pid, tid = thread
+    return described + _message(4, _integer(1, pid) + _integer(2, tid) + _text(5, name))
+
+
+def _clocks(now: int, offset: int) -> bytes:
+    """The trace's clock and the wall clock at one instant."""
+    readings = ((TRACE_TIME, now), (REALTIME, now + offset))
+    return _message(
+        6, b"".join(_message(1, _integer(1, clock) + _integer(2, time)) for clock, time in readings)
+    )
+
+
+def _packet(content: bytes) -> bytes:
+    return _message(1, content + _integer(10, SEQUENCE))
+
+
+def _message(number: int, content: bytes) -> bytes:
+    return _varint(number << 3 | LENGTH) + _varint(len(content)) + content
+
+
+@lru_cache(maxsize=4096)  # names come again and again
+def _text(number: int, value: str) -> bytes:
+    return _message(number, value.encode("utf-8", errors="replace"))
+
+
+def _integer(number: int, value: int) -> bytes:
+    return _varint(number << 3 | VARINT) + _varint(value & 0xFFFF_FFFF_FFFF_FFFF)
+
+
+def _fixed64(number: int, value: int) -> bytes:
+    return _varint(number << 3 | FIXED64) + value.to_bytes(8, "little")
+
+
+def _varint(value: int) -> bytes:
+    """Seven bits a byte, the lowest first; the eighth says that more follow."""
+    if value <= 0x7F:
+        return value.to_bytes(1, "little")
+    encoded = bytearray()
+    while value > 0x7F:
+        encoded.append(value & 0x7F | 0x80)
+        value >>= 7
+    encoded.append(value)
+    return bytes(encoded)

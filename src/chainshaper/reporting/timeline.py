@@ -1,7 +1,7 @@
 """What happened when, thread by thread: the rows that a timeline draws, wherever it is drawn.
 
 The report's page and the trace for Perfetto show the same things: the threads that ran callbacks,
-the callbacks, the messages between them, the slots of the servers, what the gate held back, and
+the callbacks, the messages between them, the slots of the servers, what the gate retained, and
 stalls of the machine. Times are ns of the event clock throughout.
 """
 
@@ -128,7 +128,7 @@ def _origins(
 ) -> pl.DataFrame:
     """The gate says from when it counted; else the chain's stamp, or where cycles seem to start.
 
-    Cycles that the recording does not tell are taken to start as
+    Cycles of which the recording says nothing are taken to start as
     :mod:`chainshaper.analysis.punctuality` takes them.
     """
     if analysis is None or plan is None:
@@ -136,16 +136,16 @@ def _origins(
             schema={"traversal": pl.UInt32(), "origin": pl.Int64(), "assumed": pl.Boolean()}
         )
     last = len(analysis.chain.callbacks) - 1
-    told = holds.filter(pl.col("hop") == last).select("traversal", told="origin")
+    decided = holds.filter(pl.col("hop") == last).select("traversal", decided="origin")
     rows = analysis.traversals.select("traversal", "start").join(
-        told.unique("traversal"), on="traversal", how="left", maintain_order="left"
+        decided.unique("traversal"), on="traversal", how="left", maintain_order="left"
     )
     from_cycle = plan.shaping_node is None or due_of(plan)[0].from_cycle
     late = lateness_in_cycle(rows["start"], plan.cycle_ns) if from_cycle else 0
     return rows.select(
         "traversal",
-        pl.coalesce("told", pl.col("start") - pl.lit(late)).alias("origin"),
-        pl.col("told").is_null().alias("assumed"),
+        pl.coalesce("decided", pl.col("start") - pl.lit(late)).alias("origin"),
+        pl.col("decided").is_null().alias("assumed"),
     )
 
 

@@ -33,6 +33,8 @@ __all__ = [
     "RecordingInfo",
     "StallMeterInfo",
     "ThreadInfo",
+    "event_counts",
+    "lost_text",
     "open_recording",
     "refuse_existing",
     "write_recording",
@@ -226,6 +228,26 @@ def _unreadable(file: Path, error: BaseException) -> InputError:
 
 def _checksum(content: bytes | memoryview) -> str:
     return f"crc32:{zlib.crc32(content):08x}"
+
+
+def event_counts(recording: Recording) -> pl.DataFrame:
+    """How often each event happened: ``event, count``, ordered by event.
+
+    Names are the tracer's own, with the provider (``ros2:callback_start``), also of events that the
+    analysis makes no use of, and also in a recording that was converted from a trace; where we
+    recorded ourselves they are the names of the tables.
+    """
+    counts = getattr(recording.events, "counts", recording.info.trace_events)
+    if not counts:
+        counts = {name: frame.height for name, frame in recording.events.items()}
+    rows = sorted((name, count) for name, count in counts.items() if count)
+    return pl.DataFrame(rows, schema={"event": pl.String, "count": pl.Int64}, orient="row")
+
+
+def lost_text(lost: Mapping[str, int]) -> str:
+    """What was lost while recording, by reason, in words; "nothing" is said as well."""
+    reasons = [f"{count} {what.replace('_', ' ')}" for what, count in lost.items() if count]
+    return f"lost while recording: {', '.join(reasons) or 'nothing'}"
 
 
 def open_recording(path: str | Path) -> Recording:

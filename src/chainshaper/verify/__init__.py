@@ -1,1 +1,1 @@
-"""A plan held against what was measured: predictions and overruns."""
+"""What was measured: latency, its comparison, a plan's prediction beside it, overruns."""

@@ -6,11 +6,12 @@ from typing import Any
 import pytest
 from quick_chain import quick_chain
 
-from chainshaper.flow.steps import measure_latency, plan_recording
+from chainshaper.flow.steps import plan_recording
 from chainshaper.planning import PlanRequest
 from chainshaper.simulation import simulate
 from chainshaper.simulation.sweeping.grid import grid_of, points_of
 from chainshaper.simulation.sweeping.points import FIGURES, OTHER_RUN, profile_at, row_at
+from chainshaper.verify.measure import measure_latency
 from chainshaper.workload.description import Application
 
 MS = 1_000_000

@@ -7,15 +7,11 @@ for it (a synchroniser), waiting for that one. Over a complete traversal the two
 latency, so mean shares add up to one.
 """
 
-from typing import Any
-
 import polars as pl
-from rich.table import Table
 
 from chainshaper.analysis import LatencyAnalysis
-from chainshaper.reporting.cells import ms, percent, terminal_table
 
-__all__ = ["breakdown_json", "breakdown_table", "hop_breakdown"]
+__all__ = ["PARTS", "hop_breakdown", "part_shares"]
 
 PARTS = ("communication", "computation")
 
@@ -32,7 +28,7 @@ def hop_breakdown(analysis: LatencyAnalysis) -> pl.DataFrame:
     complete = analysis.traversals.filter("complete")
     hops = analysis.hops.join(complete.select("traversal"), on="traversal", how="semi")
     latency = complete["latency_ns"].mean()
-    figures = hops.group_by("hop").agg(
+    found = hops.group_by("hop").agg(
         pl.len().alias("count"),
         (pl.col("via") == "sibling").sum().alias("by_sibling"),
         *(_summary(part) for part in PARTS),
@@ -47,7 +43,7 @@ def hop_breakdown(analysis: LatencyAnalysis) -> pl.DataFrame:
         },
         schema_overrides={"hop": pl.UInt8, "callback_id": pl.UInt32},
     )
-    joined = rows.join(figures, on="hop", how="left", maintain_order="left")
+    joined = rows.join(found, on="hop", how="left", maintain_order="left")
     means = [pl.col(f"{part}_ns").struct.field("mean").alias(f"{part}_share") for part in PARTS]
     return joined.with_columns(
         pl.col("count", "by_sibling").fill_null(0),
@@ -61,30 +57,7 @@ def _summary(part: str) -> pl.Expr:
     return pl.when(values.count() > 0).then(summary).alias(f"{part}_ns")
 
 
-def breakdown_json(analysis: LatencyAnalysis) -> dict[str, Any]:
-    """The breakdown as plain data: ``hops``, and the two parts' shares of the mean latency."""
-    frame = hop_breakdown(analysis)
-    shares = {
-        f"{part}_share": frame[f"{part}_share"].sum() if frame[f"{part}_share"].count() else None
-        for part in PARTS
-    }
-    return {"hops": frame.to_dicts(), **shares}
-
-
-def breakdown_table(analysis: LatencyAnalysis) -> Table:
-    """Every hop's communication and computation, and their shares of the mean latency."""
-    table = terminal_table("Where it goes, hop by hop [ms]", ("callback", "publishes"))
-    table.show_footer, table.columns[0].footer = True, "together"
-    frame = hop_breakdown(analysis)
-    for part in PARTS:
-        shares = frame[f"{part}_share"].drop_nulls().to_list()
-        table.add_column(f"{part}\nmean", justify="right")
-        table.add_column("max", justify="right")
-        table.add_column("share", percent(sum(shares) if shares else None), justify="right")
-    for row in frame.iter_rows(named=True):
-        cells = [row["callback"], row["topic"]]
-        for part in PARTS:
-            times = row[f"{part}_ns"] or {"mean": None, "max": None}
-            cells += [ms(times["mean"]), ms(times["max"]), percent(row[f"{part}_share"])]
-        table.add_row(*cells)
-    return table
+def part_shares(frame: pl.DataFrame) -> dict[str, float | None]:
+    """The parts' shares of the mean latency, over all hops; None without traversals."""
+    shares = {part: frame[f"{part}_share"].drop_nulls() for part in PARTS}
+    return {part: float(one.sum()) if len(one) else None for part, one in shares.items()}

@@ -1,4 +1,4 @@
-"""A shaped run of three nodes that is told, not recorded, so that every figure is known by hand.
+"""A shaped run of three nodes that is written, not recorded: every figure is known by hand.
 
 /first runs every 100 ms from 1 ms on and publishes /t1 after 4 ms; /second starts 1 ms later and
 publishes after 10 ms more; what it publishes arrives at the shaping node 1 ms later, 16 ms after
@@ -22,14 +22,14 @@ from chainshaper.values.recording import (
     write_recording,
 )
 
-__all__ = ["LATENCY_NS", "MS", "PERIOD_NS", "told_plan", "told_run"]
+__all__ = ["LATENCY_NS", "MS", "PERIOD_NS", "known_plan", "known_run"]
 
 MS = 1_000_000
 PERIOD_NS = 100 * MS
 LATENCY_NS = 30 * MS + 20_000
 
 
-def told_plan(**changes: Any) -> Plan:
+def known_plan(**changes: Any) -> Plan:
     """Single-band shaping for latencies up to 27 ms: publish slot [30 ms, 31 ms)."""
     return plan_shaping(
         np.array([15, 27]) * MS,
@@ -44,7 +44,7 @@ def told_plan(**changes: Any) -> Plan:
     )
 
 
-def told_run(
+def known_run(
     folder: Path,
     cycles: int = 3,
     *,
@@ -58,7 +58,7 @@ def told_run(
     Outputs of ``overran`` arrive at the shaping node 1 ms behind the slot, and leave at once.
     ``facts`` are further fields of `recording.json`.
     """
-    plan = told_plan()
+    plan = known_plan()
     assert plan.shaping_node is not None
     story = Story()
     gate = f"/{plan.shaping_node.name}"
@@ -97,34 +97,20 @@ def told_run(
         )
         story.runs(actuator, out + MS, out + 2 * MS, reads=out)
     story.event("machine_stall", PERIOD_NS + 7 * MS, 9, cpu=1, duration=2 * MS)
-    info = RecordingInfo(
-        **{
-            "source": "live",
-            "host": "robot",
-            "clock_offset_ns": OFFSET,
-            "chain": "/t1../t2",
-            "plan": plan.model_dump(mode="json"),
-            "threads": (
-                ThreadInfo(
-                    tid=2,
-                    pid=2,
-                    comm="second",
-                    node="/second",
-                    role="executor",
-                    policy="SCHED_FIFO",
-                    priority=80,
-                    cores=(1,),
-                ),
-            ),
-            "stall_meter": StallMeterInfo(
-                cores=(0, 1),
-                period_ns=MS,
-                threshold_ns=100_000,
-                wakeups=600,
-                median_lateness_ns=(20_000, 30_000),
-                realtime=True,
-            ),
-            **facts,
-        }
-    )
+    thread = {"tid": 2, "pid": 2, "comm": "second", "node": "/second", "role": "executor"}
+    scheduling = {"policy": "SCHED_FIFO", "priority": 80, "cores": (1,)}
+    stall_meter = StallMeterInfo(
+        cores=(0, 1), period_ns=MS, threshold_ns=100_000, wakeups=600,
+        median_lateness_ns=(20_000, 30_000), realtime=True,
+    )  # fmt: skip
+    own = {
+        "source": "live",
+        "host": "robot",
+        "clock_offset_ns": OFFSET,
+        "chain": "/t1../t2",
+        "plan": plan.model_dump(mode="json"),
+        "threads": (ThreadInfo.model_validate(thread | scheduling),),
+        "stall_meter": stall_meter,
+    }
+    info = RecordingInfo.model_validate(own | facts)
     return write_recording(folder, story.tables(), info)
