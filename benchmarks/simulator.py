@@ -24,9 +24,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from chainshaper import simulate
-from chainshaper.simulation.simulating import simulate_latencies
-from chainshaper.workload.description import load_application
+from chainshaper import load_application, simulate, simulate_latencies
 
 os.environ.setdefault("POLARS_MAX_THREADS", "1")
 

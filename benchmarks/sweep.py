@@ -13,8 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from chainshaper import sweep
-from chainshaper.workload.description import load_application
+from chainshaper import load_application, sweep
 
 EXAMPLE = Path(__file__).parents[1] / "examples/synthetic_chain.yaml"
 GRIDS: Mapping[str, Mapping[str, Sequence[Any]]] = {

@@ -29,19 +29,22 @@ import polars as pl
 import yaml
 from results import MS, Run
 
-from chainshaper import simulate
+from chainshaper import (
+    apply_plan,
+    measure_latency,
+    open_recording,
+    run_application,
+    shape_application,
+    simulate,
+)
 from chainshaper.enforcement.undoing import RunState
-from chainshaper.flow.apply import apply_plan
-from chainshaper.flow.steps import shape_application
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.planning import Plan, Slot
 from chainshaper.planning.plan import publisher_servers
 from chainshaper.splicing.application import splice_application
 from chainshaper.values.errors import OperationError
-from chainshaper.values.recording import Recording, open_recording
-from chainshaper.verify.measure import measure_latency
+from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application, application_as_written
-from chainshaper.workload.live import run_application
 
 __all__ = [
     "Options",

@@ -17,8 +17,8 @@ from configurations import Panel, draw_latencies, live, parse_options, simulated
 from numpy.typing import NDArray
 from results import MS, PICTURES, Line, Run, lines_of, save
 
+from chainshaper import load_application
 from chainshaper.planning import Plan, plan_shaping
-from chainshaper.workload.description import load_application
 
 APPLICATION = Path(__file__).parents[1] / "examples" / "asynchronous_chain.yaml"
 PERIOD_NS = 100 * MS

@@ -15,8 +15,9 @@ from dataclasses import replace
 from configurations import Options, Panel, draw_latencies, live, parse_options, simulated
 from results import HERE, MS, PICTURES, Line, Run, lines_of, save
 
+from chainshaper import load_application
 from chainshaper.planning import Plan, over_cores, plan_shaping, with_sink
-from chainshaper.workload.description import Application, load_application
+from chainshaper.workload.description import Application
 
 APPLICATION = HERE / "dag.yaml"
 PERIOD_NS = 764 * MS

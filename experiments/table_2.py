@@ -18,10 +18,9 @@ from configurations import latencies_of, parse_options
 from results import MS, Line, Run, save
 from table_3 import FIFO, run_under_fifo
 
-from chainshaper import simulate
+from chainshaper import load_application, open_recording, simulate
 from chainshaper.analysis import callback_statistics, data_flow
-from chainshaper.values.recording import Recording, open_recording
-from chainshaper.workload.description import load_application
+from chainshaper.values.recording import Recording
 
 CALLBACKS = {
     "throttler, rear": ("/throttler", "/lidar_rear/points_raw"),

@@ -21,11 +21,12 @@ from configurations import Options, Panel, draw_latencies, live, parse_options, 
 from results import HERE, MS, PICTURES, Line, Run, Value, lines_of, save
 from table_4 import plans
 
+from chainshaper import load_application
 from chainshaper.flow.steps import plan_recording
 from chainshaper.planning import Plan, PlanRequest, publish_slots
 from chainshaper.simulation.samples import with_recorded_times
 from chainshaper.values.errors import ChainshaperError
-from chainshaper.workload.description import Application, load_application
+from chainshaper.workload.description import Application
 
 __all__ = ["FIFO", "PERIOD_NS", "run_under_fifo"]
 

@@ -17,10 +17,9 @@ from tempfile import TemporaryDirectory
 from configurations import Panel, draw_latencies, latencies_of, live, parse_options, simulated
 from results import HERE, MS, PICTURES, Line, Run, lines_of, save
 
-from chainshaper import simulate
-from chainshaper.flow.steps import plan_recording
+from chainshaper import load_application, plan_recording, simulate
 from chainshaper.planning import Plan, PlanRequest, let_per_callback, let_per_chain
-from chainshaper.workload.description import Application, load_application
+from chainshaper.workload.description import Application
 
 SYNTHETIC = HERE.parent / "examples" / "asynchronous_chain.yaml"
 VALET_PARKING = HERE / "avp_drawn.yaml"

@@ -23,13 +23,12 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from chainshaper import simulate
+from chainshaper import load_application, open_recording, run_application, simulate
 from chainshaper.analysis import analyse_latency
 from chainshaper.analysis.disturbance import ordinary_pace, relative_pace
 from chainshaper.simulation.samples import measured_costs
-from chainshaper.values.recording import Recording, open_recording
-from chainshaper.workload.description import Application, load_application
-from chainshaper.workload.live import run_application
+from chainshaper.values.recording import Recording
+from chainshaper.workload.description import Application
 
 MS = 1_000_000
 MEDIAN_MS, P99_MS, MAXIMA = 0.3, 1.5, 0.03

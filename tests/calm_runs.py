@@ -9,8 +9,8 @@ from pathlib import Path
 
 from small_chain import PERIOD_NS
 
+from chainshaper import measure_latency
 from chainshaper.values.recording import Recording
-from chainshaper.verify.measure import measure_latency
 
 __all__ = ["calm_run"]
 

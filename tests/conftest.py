@@ -13,10 +13,9 @@ from calm_runs import calm_run
 from hypothesis import settings
 from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain, small_chain_text
 
-from chainshaper.flow.steps import shape_application
+from chainshaper import run_application, shape_application
 from chainshaper.planning import Plan, plan_shaping
 from chainshaper.values.recording import Recording
-from chainshaper.workload.live import run_application
 
 CYCLES = 12
 

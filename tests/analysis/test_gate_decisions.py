@@ -2,9 +2,9 @@
 
 import polars as pl
 
+from chainshaper import analyse_latency
 from chainshaper.analysis import data_flow
 from chainshaper.analysis.departures import gate_decisions
-from chainshaper.analysis.latency import analyse_latency
 from chainshaper.values.recording import Recording
 
 

@@ -12,8 +12,8 @@ from command_line import Running, called, json_of, refused
 from small_chain import DDS_CORE, EXECUTOR_CORE, NODES, PERIOD_NS, small_chain_text
 from story import OFFSET, Story
 
+from chainshaper import find_threads
 from chainshaper.flow import threads
-from chainshaper.flow.threads import find_threads
 from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.planning import Plan, save_plan
 from chainshaper.values.recording import RecordingInfo, write_recording

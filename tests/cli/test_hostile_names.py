@@ -21,12 +21,9 @@ import pytest
 from command_line import Finished, called
 from small_chain import small_chain
 
-from chainshaper import simulate
+from chainshaper import load_plan, open_source, plan_recording, save_plan, simulate
 from chainshaper.cli.app import VERBS
-from chainshaper.flow.steps import plan_recording
 from chainshaper.planning.plan import revised
-from chainshaper.planning.plan_file import load_plan, save_plan
-from chainshaper.sources import open_source
 from chainshaper.values.recording import Recording, write_recording
 from chainshaper.values.safe_text import shown
 

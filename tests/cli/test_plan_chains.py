@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from command_line import called, json_of, refused
 
+from chainshaper import load_plan, plan_shaping, save_plan
 from chainshaper.planning import Modes, Plan
 from chainshaper.planning.plan import revised
-from chainshaper.planning.plan_file import load_plan, save_plan
-from chainshaper.planning.shaping import plan_shaping
 from chainshaper.values.recording import Recording
 
 MS = 1_000_000

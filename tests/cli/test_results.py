@@ -8,9 +8,8 @@ import pytest
 from command_line import called, chainshaper, json_of
 from small_chain import DDS_CORE, EXECUTOR_CORE, small_chain_text
 
-from chainshaper.planning.plan_file import load_plan
-from chainshaper.values.recording import Recording, open_recording
-from chainshaper.verify.measure import measure_latency
+from chainshaper import load_plan, measure_latency, open_recording
+from chainshaper.values.recording import Recording
 
 VERBS = (
     "demo",

@@ -16,9 +16,9 @@ from command_line import called, json_of, refused
 from processes import wait_for
 from strangers import NOBODY, named, needs_root, open_folder, strange
 
+from chainshaper import find_threads
 from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow import apply as applying
-from chainshaper.flow.threads import find_threads
 from chainshaper.linux.processes import read_process
 from chainshaper.linux.threads import has_ended, list_threads, start_of
 from chainshaper.linux.users import run_users, user_of

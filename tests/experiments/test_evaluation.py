@@ -11,12 +11,8 @@ import table_5
 from configurations import Options, simulated
 from results import MS, Run
 
-from chainshaper.workload.description import (
-    Application,
-    ExecutionTime,
-    SimulationDescription,
-    load_application,
-)
+from chainshaper import load_application
+from chainshaper.workload.description import Application, ExecutionTime, SimulationDescription
 
 NOTHING = ExecutionTime(constant_ns=0)
 

@@ -9,8 +9,8 @@ import table_4
 from avp_sample import avp_sample
 from results import MS
 
+from chainshaper import load_application
 from chainshaper.simulation import simulate_latencies
-from chainshaper.workload.description import load_application
 
 
 def test_the_written_description_is_the_calibrated_one() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from command_line import refused
 
-from chainshaper.flow.launch_shaping import shape_launch
+from chainshaper import shape_launch
 from chainshaper.values.errors import InputError, PlatformError
 
 

@@ -12,14 +12,13 @@ from command_line import called, json_of, refused
 from lttng_node import chain_command, required_node
 from processes import wait_for
 
+from chainshaper import InputError, OperationError, PlatformError, open_recording
 from chainshaper.enforcement.threads import RecordedProcess, RecordedThread, allocate
 from chainshaper.flow import profiling
 from chainshaper.flow.profiling import chain_nodes, executors_of, profiling_condition
 from chainshaper.linux.processes import list_processes
 from chainshaper.linux.scheduling import SchedulingState, available_cores, may_use_fifo, state_of
 from chainshaper.linux.threads import Thread, list_threads
-from chainshaper.values.errors import InputError, OperationError, PlatformError
-from chainshaper.values.recording import open_recording
 
 pytestmark = pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here")
 

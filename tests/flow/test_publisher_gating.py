@@ -9,10 +9,9 @@ from calm_runs import calm_run
 from gated import needs_cgroups
 from small_chain import PERIOD_NS, small_chain
 
-from chainshaper.flow.steps import shape_application
+from chainshaper import measure_latency, shape_application
 from chainshaper.planning import Plan, plan_shaping
 from chainshaper.planning.plan import publisher_servers
-from chainshaper.verify.measure import measure_latency
 from chainshaper.workload.description import Application, CallbackDescription
 
 MS = 1_000_000

@@ -15,10 +15,11 @@ from lttng_node import chain_command, required_node
 from processes import wait_for
 from ros2 import ros2_environment
 
+from chainshaper import open_recording
 from chainshaper.flow import record
 from chainshaper.values.errors import OperationError
 from chainshaper.values.events import EventTables
-from chainshaper.values.recording import RecordingInfo, open_recording
+from chainshaper.values.recording import RecordingInfo
 
 CYCLES = 30
 

@@ -16,6 +16,7 @@ from applied_plans import needs_fifo
 from gated import needs_cgroups
 from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain_text
 
+from chainshaper import measure_latency, open_recording, save_plan
 from chainshaper.enforcement.servers import ServerCounters
 from chainshaper.enforcement.undoing import (
     RunState,
@@ -38,10 +39,7 @@ from chainshaper.linux.runs import (
     remembered_journal,
 )
 from chainshaper.planning import Plan, plan_shaping
-from chainshaper.planning.plan_file import save_plan
 from chainshaper.values.errors import OperationError, PlatformError
-from chainshaper.values.recording import open_recording
-from chainshaper.verify.measure import measure_latency
 
 
 def test_what_is_noted_can_be_read_back_in_order(tmp_path: Path) -> None:

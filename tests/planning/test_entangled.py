@@ -4,12 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper import simulate
+from chainshaper import measure_latency, simulate
 from chainshaper.flow.steps import plan_recording, profile_chains
 from chainshaper.planning import Plan, PlanRequest, place_chains, plan_chains, publish_slots
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
-from chainshaper.verify.measure import measure_latency
 from chainshaper.workload.description import Application, load_application
 
 MS = 1_000_000

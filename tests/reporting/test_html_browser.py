@@ -14,9 +14,8 @@ from chromium import Page, opened
 from known_run import LATENCY_NS, known_run
 from matplotlib import image
 
-from chainshaper.reporting.page import write_report
+from chainshaper import measure_latency, write_report
 from chainshaper.values.durations import milliseconds
-from chainshaper.verify.measure import measure_latency
 
 CHARTS = ("over-time", "histogram", "cdf", "breakdown", "timeline", "slots-0")
 

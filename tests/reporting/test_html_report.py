@@ -12,16 +12,21 @@ from command_line import called, json_of, refused
 from known_run import LATENCY_NS, MS, PERIOD_NS, known_plan, known_run
 from small_chain import small_chain
 
-from chainshaper import simulate
-from chainshaper.flow.steps import plan_recording
+from chainshaper import (
+    compare_recordings,
+    hop_breakdown,
+    measure_latency,
+    plan_recording,
+    save_plan,
+    simulate,
+    write_report,
+)
 from chainshaper.planning import publish_slots
-from chainshaper.planning.plan_file import save_plan
-from chainshaper.reporting.page import distinct_names, report_page, write_report
+from chainshaper.reporting.page import distinct_names, report_page
 from chainshaper.values.durations import milliseconds
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording
-from chainshaper.verify.breakdown import hop_breakdown
-from chainshaper.verify.measure import Measurement, compare_recordings, measure_latency
+from chainshaper.verify.measure import Measurement
 
 
 class _Reader(HTMLParser):

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from known_run import LATENCY_NS, MS, PERIOD_NS, known_run
 
-from chainshaper.analysis.flow import data_flow
+from chainshaper import data_flow, measure_latency
 from chainshaper.reporting.page_data import (
     BARS,
     CYCLES,
@@ -21,7 +21,6 @@ from chainshaper.reporting.page_data import (
 )
 from chainshaper.reporting.timeline import timeline_of
 from chainshaper.values.recording import Recording
-from chainshaper.verify.measure import measure_latency
 
 
 def _traversals(latencies: Sequence[int | None], disturbed: Sequence[bool]) -> pl.DataFrame:

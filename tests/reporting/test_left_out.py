@@ -6,8 +6,8 @@ import pytest
 from command_line import called, json_of
 from known_run import LATENCY_NS, MS, PERIOD_NS, known_run
 
-from chainshaper.values.recording import InForceInfo, open_recording
-from chainshaper.verify.measure import measure_latency
+from chainshaper import measure_latency, open_recording
+from chainshaper.values.recording import InForceInfo
 
 
 @pytest.mark.parametrize(

@@ -13,12 +13,11 @@ from hypothesis import strategies as st
 from known_run import LATENCY_NS, MS, PERIOD_NS, known_run
 from reference_traces import reference_folder
 
-from chainshaper.analysis.flow import data_flow
-from chainshaper.reporting.perfetto import Slice, Track, Value, encode_trace, export_perfetto
-from chainshaper.sources import open_source
+from chainshaper import data_flow, export_perfetto, measure_latency, open_source
+from chainshaper.reporting.perfetto import Slice, Track, Value, encode_trace
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording
-from chainshaper.verify.measure import Measurement, measure_latency
+from chainshaper.verify.measure import Measurement
 
 BEGIN, END, INSTANT = 1, 2, 3
 SCHEMA: Any = importlib.import_module("perfetto.protos.perfetto.trace.perfetto_trace_pb2")

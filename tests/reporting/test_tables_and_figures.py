@@ -7,14 +7,15 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from chainshaper import compare_recordings, draw_distribution, draw_latency
 from chainshaper.planning import Plan
-from chainshaper.reporting.figures import draw_comparison, draw_distribution, draw_latency
+from chainshaper.reporting.figures import draw_comparison
 from chainshaper.reporting.latency import comparison_json, comparison_table
 from chainshaper.reporting.plans import plan_table
 from chainshaper.reporting.tables import ResultTable
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
-from chainshaper.verify.measure import Comparison, compare_recordings
+from chainshaper.verify.measure import Comparison
 
 
 def _text(table: ResultTable) -> str:

@@ -5,12 +5,11 @@ from pathlib import Path
 import polars as pl
 from known_run import MS, PERIOD_NS, known_plan, known_run
 
-from chainshaper.analysis.flow import data_flow
+from chainshaper import data_flow, measure_latency
 from chainshaper.planning import Plan, publish_slots
 from chainshaper.planning.plan import revised
 from chainshaper.reporting.timeline import Timeline, timeline_of
 from chainshaper.values.recording import Recording
-from chainshaper.verify.measure import measure_latency
 
 
 def _timeline(recording: Recording, plan: Plan | None = None) -> Timeline:

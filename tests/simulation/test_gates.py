@@ -11,9 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from schedules import MS, application, begin_of, simulated
 
-from chainshaper import simulate
+from chainshaper import plan_recording, simulate
 from chainshaper.analysis import analyse_latency
-from chainshaper.flow.steps import plan_recording
 from chainshaper.gate.decision import Gate, Modes, Overrun, missed, release_of
 from chainshaper.planning import PlanRequest
 from chainshaper.simulation import layout as at

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from small_chain import EXECUTOR_CORE, small_chain
 
-from chainshaper.flow.steps import shape_application
+from chainshaper import shape_application
 from chainshaper.planning import Plan, let_per_callback, let_per_chain, plan_shaping, publish_slots
 from chainshaper.planning.overruns import Writer
 from chainshaper.planning.plan import revised

@@ -10,8 +10,8 @@ import pytest
 import yaml
 from launch_cases import CASES, Case, plan_for, splice_case, texts_of
 
-from chainshaper.flow.launch_splicing import splice_launch_files
-from chainshaper.planning.plan import Plan, revised
+from chainshaper import Plan, splice_launch_files
+from chainshaper.planning.plan import revised
 from chainshaper.splicing.launch.actions import NodeAction, SetRemap, flattened
 from chainshaper.splicing.launch.file import read_launch_file, read_text
 from chainshaper.values.errors import InputError

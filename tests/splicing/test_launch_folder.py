@@ -8,8 +8,8 @@ from unittest import mock
 import pytest
 from launch_cases import plan_for
 
-from chainshaper.flow.launch_splicing import Splicing, splice_launch_files, undo_splice
-from chainshaper.planning.plan import Plan, revised
+from chainshaper import Plan, Splicing, splice_launch_files, undo_splice
+from chainshaper.planning.plan import revised
 from chainshaper.values.errors import InputError, OperationError
 
 NDT = '<launch>\n  <node pkg="l" exec="n" name="ndt"/>\n</launch>\n'

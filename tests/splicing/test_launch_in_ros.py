@@ -14,7 +14,7 @@ import pytest
 from launch_cases import CASES, PACKAGES, ROBOTS, Case, splice_case
 from ros2 import ros2_environment
 
-from chainshaper.flow.launch_splicing import ThrottledInput, splice_throttlers
+from chainshaper import ThrottledInput, splice_throttlers
 
 pytestmark = pytest.mark.ros2
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from launch_cases import plan_for
 
-from chainshaper.flow.launch_splicing import Splicing, splice_launch_files
+from chainshaper import Splicing, splice_launch_files
 from chainshaper.planning.plan import revised
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from launch_cases import plan_for
 
-from chainshaper.flow.launch_splicing import splice_launch_files
+from chainshaper import splice_launch_files
 from chainshaper.splicing.launch.actions import NodeAction, Unreadable, flattened
 from chainshaper.splicing.launch.file import read_text
 from chainshaper.splicing.launch.substitutions import Surroundings, resolve

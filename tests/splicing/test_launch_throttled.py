@@ -7,13 +7,8 @@ import pytest
 import yaml
 from launch_cases import ROBOTS, plan_for
 
-from chainshaper.flow.launch_splicing import (
-    Splicing,
-    ThrottledInput,
-    splice_launch_files,
-    splice_throttlers,
-    undo_splice,
-)
+from chainshaper import splice_launch_files, splice_throttlers, undo_splice
+from chainshaper.flow.launch_splicing import Splicing, ThrottledInput
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording, open_recording
 

@@ -20,7 +20,7 @@ import pytest
 from processes import wait_for
 from ros2 import ros2_environment
 
-from chainshaper.flow.launch_splicing import splice_launch_files
+from chainshaper import splice_launch_files
 from chainshaper.planning import Plan, plan_shaping
 from chainshaper.splicing.generated_package import build_package
 from chainshaper.splicing.launch.folder import NODES

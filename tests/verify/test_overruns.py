@@ -16,15 +16,12 @@ import pytest
 from command_line import called, json_of
 from small_chain import PERIOD_NS, small_chain
 
-from chainshaper import simulate
-from chainshaper.flow.steps import shape_application
+from chainshaper import measure_latency, save_plan, shape_application, simulate
 from chainshaper.gate.decision import sleep_until
 from chainshaper.planning import Plan, let_per_chain, plan_shaping, publish_slots
 from chainshaper.planning.plan import revised
-from chainshaper.planning.plan_file import save_plan
 from chainshaper.reporting.latency import latency_json
 from chainshaper.values.recording import Recording
-from chainshaper.verify.measure import measure_latency
 from chainshaper.verify.overruns import (
     dropped_in,
     dropped_text,

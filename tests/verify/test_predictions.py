@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from rich.console import Console
 from small_chain import small_chain
 
+from chainshaper import compare_recordings, measure_latency, plan_recording, shape_application
 from chainshaper.analysis import LatencyAnalysis, latency_statistics
-from chainshaper.flow.steps import plan_recording, shape_application
 from chainshaper.planning import (
     Modes,
     Plan,
@@ -26,7 +26,6 @@ from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.plan import revised
 from chainshaper.reporting.latency import late_text, prediction_json, prediction_table
 from chainshaper.values.recording import Recording
-from chainshaper.verify.measure import compare_recordings, measure_latency
 from chainshaper.verify.predictions import PredictionHeld, hold_prediction
 
 MS = 1_000_000

@@ -7,14 +7,13 @@ import pytest
 from calm_runs import calm_run
 from small_chain import DDS_CORE, EXECUTOR_CORE
 
-from chainshaper import simulate
+from chainshaper import run_application, simulate
 from chainshaper.analysis import analyse_latency
 from chainshaper.simulation.samples import with_recorded_times
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.workload import dds
 from chainshaper.workload.computing import computing, load_function
 from chainshaper.workload.description import Application, load_application
-from chainshaper.workload.live import run_application
 
 TEXT = f"""\
 name: sums

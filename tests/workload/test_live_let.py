@@ -6,14 +6,13 @@ import polars as pl
 import pytest
 from small_chain import DDS_CORE, EXECUTOR_CORE, PERIOD_NS, small_chain
 
-from chainshaper import simulate
-from chainshaper.flow.steps import plan_recording, shape_application
+from chainshaper import plan_recording, run_application, simulate
+from chainshaper.flow.steps import shape_application
 from chainshaper.planning import PlanRequest
 from chainshaper.values.yaml_file import AS_YAML
 from chainshaper.verify.measure import measure_latency
 from chainshaper.verify.overruns import dropped_in
 from chainshaper.workload.description import Application
-from chainshaper.workload.live import run_application
 
 
 def test_let_per_callback_has_no_jitter_of_a_period(tmp_path: Path) -> None:

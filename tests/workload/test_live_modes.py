@@ -7,13 +7,12 @@ import pytest
 from calm_runs import calm_run
 from small_chain import EXECUTOR_CORE, small_chain_text
 
-from chainshaper.flow.steps import shape_application
+from chainshaper import measure_latency, shape_application
 from chainshaper.planning import Modes, Plan
 from chainshaper.planning.plan import revised
 from chainshaper.splicing.application import splice_application
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
-from chainshaper.verify.measure import measure_latency
 from chainshaper.workload.description import Application, load_application
 
 MS = 1_000_000

@@ -12,17 +12,15 @@ from numpy.typing import NDArray
 from processes import children_of, real_time_threads
 from small_chain import DDS_CORE, EXECUTOR_CORE, NODES, PERIOD_NS, small_chain, small_chain_text
 
-from chainshaper.flow.steps import shape_application
+from chainshaper import measure_latency, run_application, shape_application
 from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.planning import Plan, publish_slots
 from chainshaper.planning.plan import revised
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import Recording, ThreadInfo
-from chainshaper.verify.measure import measure_latency
 from chainshaper.workload import live
 from chainshaper.workload.description import Application, load_application
 from chainshaper.workload.execution import ExecutionTimes
-from chainshaper.workload.live import run_application
 
 CYCLES = 12
 

@@ -5,11 +5,10 @@ from pathlib import Path
 from calm_runs import calm_run
 from small_chain import DDS_CORE, EXECUTOR_CORE
 
-from chainshaper import simulate
+from chainshaper import run_application, simulate
 from chainshaper.analysis import analyse_latency
 from chainshaper.workload.description import load_application
 from chainshaper.workload.executor import Synchroniser
-from chainshaper.workload.live import run_application
 
 TEXT = f"""\
 name: fusion
