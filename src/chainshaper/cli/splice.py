@@ -1,14 +1,14 @@
-"""`chainshaper splice`: put shaping nodes, or throttlers, into copies of launch files."""
+"""`chainshaper splice`: start shaping nodes, or throttlers, together with launch files."""
 
+import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import typer
 
 from chainshaper.cli.options import JsonOption
 from chainshaper.cli.plan_options import FallbackOption
 from chainshaper.values.errors import InputError
-from chainshaper.values.plan_choices import Fallback
 
 if TYPE_CHECKING:
     from chainshaper.flow.launch_splicing import Splicing, ThrottledInput
@@ -21,17 +21,7 @@ __all__ = ["splice"]
 NodeKind: TypeAlias = Literal["python", "cpp", "typed"]
 """How the shaping node is made."""
 
-
-class _Launched(NamedTuple):
-    """What is launched, and into what its copies are edited, whichever node is put in."""
-
-    files: list[str]
-    arguments: dict[str, str]
-    folder: Path
-    node: NodeKind
-    message_type: str | None
-    recording: Path | None
-    fallback: Fallback | None
+_FOR_ALL_TYPES = "a throttler is for all types: choose --node python or cpp, and no --type"
 
 
 def splice(
@@ -45,8 +35,8 @@ def splice(
         list[str] | None,
         typer.Argument(
             metavar="LAUNCH... [NAME:=VALUE...]",
-            help="The launch files (.py, .xml, .yaml), and launch arguments that are not at their "
-            "defaults, as for `ros2 launch`.",
+            help="The launch files (.py, .xml, .yaml) and, for --dry-run, launch arguments; or, "
+            "behind --, a `ros2 run …`.",
             show_default=False,
         ),
     ] = None,
@@ -54,7 +44,7 @@ def splice(
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", metavar="DIR", help="Folder for the copies.", show_default=False
+            "--output", "-o", metavar="DIR", help="Folder for the launch file.", show_default=False
         ),
     ],
     throttle: Annotated[
@@ -94,16 +84,24 @@ def splice(
     build: Annotated[
         bool, typer.Option("--build", help="Build the shaping node's package with colcon.")
     ] = False,
+    dry_run: Annotated[
+        bool,
+        typer.Option(
+            "--dry-run",
+            help="Write nothing, and show what would be redirected: the launch files are carried "
+            "out in this ROS 2 environment, but no process is started.",
+        ),
+    ] = False,
     undo: Annotated[
         bool, typer.Option("--undo", help="Remove DIR again, unless it was changed since.")
     ] = False,
     json: JsonOption = False,
 ) -> None:
-    """Edit copies of launch files: the output is remapped, and a shaping node republishes it.
+    """Write a launch file that includes yours, starts a shaping node, and redirects the output.
 
-    With --throttle an input is, and a throttler republishes it once a period; do this first, then
-    record and plan, and splice the plan into the copy. Shows a diff. Launch the copy that it names;
-    the originals stay as they are.
+    With --throttle an input is redirected, and a throttler republishes it once a period; do this
+    first, then record and plan, and splice the plan into its launch file. Launch the file that it
+    names, with your launch arguments; your launch files stay as they are.
     """
     from chainshaper.cli.output import print_json, show_line
     from chainshaper.flow.launch_splicing import undo_splice
@@ -120,54 +118,63 @@ def splice(
         raise InputError("--node python needs no building: leave out --build, or choose another")
     if build:
         check_build_tools()  # before anything is written
-    words = launch or []
+    words = [*([str(plan)] if throttle and plan is not None else []), *(launch or [])]
+    ran = words[:2] == ["ros2", "run"]
+    arguments = {} if ran else dict(word.split(":=", 1) for word in words if ":=" in word)
+    files = words if ran else [word for word in words if ":=" not in word]
+    common: dict[str, Any] = {"arguments": arguments, "dry_run": dry_run}
     if throttle:
-        words = [*([] if plan is None else [str(plan)]), *words]
-    arguments = dict(word.split(":=", 1) for word in words if ":=" in word)
-    files = [word for word in words if ":=" not in word]
-    launched = _Launched(files, arguments, output, node, message_type, recording, fallback)
-    if throttle:
-        splicing = _throttled(throttle, launched)
+        if fallback is not None:
+            raise InputError("a throttler has no fallback: --fallback goes with a plan")
+        if message_type is not None:
+            raise InputError(_FOR_ALL_TYPES)
+        splicing = _throttled(throttle, files, output, node, recording, common)
     elif plan is None or not files:
         raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
     else:
-        splicing = _shaped(plan, launched)
-    setup = _built(splicing) if build else None
-    _print(splicing, setup, json)
+        common |= {"message_type": message_type, "fallback": fallback}
+        splicing = _shaped(plan, files, output, node, recording, common)
+    setup = _built(splicing) if build and not dry_run else None
+    if json:
+        print_json(_values(splicing, setup))
+        return
+    _show(splicing, arguments, setup)
 
 
-def _shaped(plan: Path, launched: _Launched) -> "Splicing":
+def _shaped(
+    plan: Path,
+    files: list[str],
+    output: Path,
+    node: NodeKind,
+    recording: Path | None,
+    more: dict[str, Any],
+) -> "Splicing":
     from chainshaper.cli.output import notes
     from chainshaper.flow.launch_splicing import splice_launch_files
     from chainshaper.planning import load_plan, plan_warnings
 
     planned = load_plan(plan)
     notes(plan_warnings(planned))
-    return splice_launch_files(
-        *(planned, launched.files, launched.folder),
-        node=launched.node,
-        arguments=launched.arguments,
-        message_type=launched.message_type,
-        recording=_opened(launched.recording or _own_recording(planned)),
-        fallback=launched.fallback,
-    )
+    known = _opened(recording or _own_recording(planned))
+    return splice_launch_files(planned, files, output, node=node, recording=known, **more)
 
 
-def _throttled(inputs: list[str], launched: _Launched) -> "Splicing":
+def _throttled(
+    inputs: list[str],
+    files: list[str],
+    output: Path,
+    node: NodeKind,
+    recording: Path | None,
+    more: dict[str, Any],
+) -> "Splicing":
     from chainshaper.flow.launch_splicing import splice_throttlers
 
-    if launched.fallback is not None:
-        raise InputError("a throttler has no fallback: --fallback goes with a plan")
-    if launched.node == "typed" or launched.message_type is not None:
-        raise InputError("a throttler is for all types: choose --node python or cpp, and no --type")
-    if not launched.files:
+    if node == "typed":
+        raise InputError(_FOR_ALL_TYPES)
+    if not files:
         raise InputError("give the launch files: `splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`")
-    return splice_throttlers(
-        *([_input(text) for text in inputs], launched.files, launched.folder),
-        node=launched.node,
-        arguments=launched.arguments,
-        recording=_opened(launched.recording),
-    )
+    parsed, known = [_input(text) for text in inputs], _opened(recording)
+    return splice_throttlers(parsed, files, output, node=node, recording=known, **more)
 
 
 def _input(text: str) -> "ThrottledInput":
@@ -201,23 +208,29 @@ def _opened(recording: Path | None) -> "Recording | None":
 
 def _built(splicing: "Splicing") -> Path:
     from chainshaper.splicing.generated_package import build_package
-    from chainshaper.splicing.launch.folder import NODES
+    from chainshaper.splicing.spliced_launch import NODES
 
     return build_package(splicing.folder / NODES)
 
 
-def _print(splicing: "Splicing", setup: Path | None, json: bool) -> None:
-    from chainshaper.cli.output import notes, print_json, show_line
+def _show(splicing: "Splicing", arguments: dict[str, str], setup: Path | None) -> None:
+    from chainshaper.cli.output import notes, show_line
 
-    if json:
-        print_json(_values(splicing, setup))
-        return
-    show_line(splicing.diff.rstrip("\n").expandtabs())
+    for one in splicing.redirects:
+        verb = "publishes" if one.kind == "publisher" else "subscribes to"
+        for node in one.nodes:
+            show_line(f"{node} {verb} {one.target} in place of {one.topic}, for {one.added[0]}")
+    for found in splicing.redirected:
+        for started in found["redirected"]:
+            show_line(f"would add to {started['as']}: {' '.join(started['rules']) or 'nothing'}")
     notes(splicing.notes)
+    if splicing.redirected:
+        return
     if setup is not None:
         show_line(f"source {setup}")
-    for copy in splicing.launch.values():
-        show_line(f"ros2 launch {copy}")
+    words = [f"{name}:={value}" for name, value in arguments.items()]
+    for file in dict.fromkeys(splicing.launch.values()):
+        show_line(shlex.join(["ros2", "launch", str(file), *words]))
 
 
 def _values(splicing: "Splicing", setup: Path | None) -> dict[str, Any]:
@@ -229,6 +242,7 @@ def _values(splicing: "Splicing", setup: Path | None) -> dict[str, Any]:
         "standbys": [one.standby.name for one in splicing.processes if one.standby is not None],
         "logs": [str(log) for log in splicing.logs],
         "setup": None if setup is None else str(setup),
+        "redirected": [dict(one) for one in splicing.redirected],
         "diff": splicing.diff,
         "notes": list(splicing.notes),
     }
