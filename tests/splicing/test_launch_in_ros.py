@@ -165,10 +165,15 @@ import sys
 from launch import LaunchDescription
 from launch.actions import ExecuteProcess, RegisterEventHandler, TimerAction
 from launch.event_handlers import OnProcessStart
-from launch_ros.actions import LifecycleNode, Node
+from launch_ros.actions import *
+from launch_ros.descriptions import ComposableNode
 
 PROGRAM = [{program!r}, "publisher", {log!r}]
 MORE = dict(executable="python3", arguments=PROGRAM, remappings=[("output", "/pose")])
+TALKER = [ComposableNode(package="composition", plugin="composition::Talker", name="ndt",
+                         remappings=[("chatter", "/pose")])]
+CONTAINER = dict(package="rclcpp_components", executable="component_container", name="c",
+                 namespace="")
 RUN = [*("python3", *PROGRAM), "--ros-args", "-r", "__node:=ndt", "-r", "output:=/pose"]
 
 
@@ -214,6 +219,15 @@ def launched(tmp_path: Path, environment: dict[str, str]) -> Iterator[Any]:
         ("Node(name='ndt', namespace='loc', **MORE)", "/loc/ndt"),
         ("Node(**MORE)", "/publisher"),  # the program gives the name
         ("LifecycleNode(name='ndt', namespace='', **MORE)", "/ndt"),
+        (
+            "ComposableNodeContainer(composable_node_descriptions=TALKER, **CONTAINER)",
+            "/ndt",
+        ),
+        (
+            "Node(**CONTAINER), "
+            "LoadComposableNodes(target_container='c', composable_node_descriptions=TALKER)",
+            "/ndt",
+        ),
         ("ExecuteProcess(cmd=RUN)", "/ndt"),
         ("ExecuteProcess(cmd=[' '.join(RUN)], shell=True)", "/ndt"),
         ("TimerAction(period=3.0, actions=[Node(name='ndt', **MORE)])", "/ndt"),
@@ -226,8 +240,11 @@ def launched(tmp_path: Path, environment: dict[str, str]) -> Iterator[Any]:
     ],
 )
 def test_a_launch_that_redirects_what_is_meant_goes_on(
-    launched: Any, actions: str, publisher: str
+    launched: Any, environment: dict[str, str], actions: str, publisher: str
 ) -> None:
+    prefixes = environment["AMENT_PREFIX_PATH"].split(os.pathsep)
+    if "TALKER" in actions and not any((Path(p) / "share/composition").is_dir() for p in prefixes):
+        pytest.skip("ROS 2's package composition is not installed")
     code, said = launched(actions, publisher)
     assert f"/pose of {publisher} is redirected: /pose_tmp" in said, said
     assert code == 0, said

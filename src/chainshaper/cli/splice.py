@@ -21,8 +21,6 @@ __all__ = ["splice"]
 NodeKind: TypeAlias = Literal["python", "cpp", "typed"]
 """How the shaping node is made."""
 
-_FOR_ALL_TYPES = "a throttler is for all types: choose --node python or cpp, and no --type"
-
 
 def splice(
     plan: Annotated[
@@ -105,7 +103,8 @@ def splice(
     """
     from chainshaper.cli.output import print_json, show_line
     from chainshaper.flow.launch_splicing import undo_splice
-    from chainshaper.splicing.generated_package import check_build_tools
+    from chainshaper.splicing.generated_package import build_package, check_build_tools
+    from chainshaper.splicing.spliced_launch import NODES
 
     if undo:
         undo_splice(output)
@@ -122,33 +121,29 @@ def splice(
     ran = words[:2] == ["ros2", "run"]
     arguments = {} if ran else dict(word.split(":=", 1) for word in words if ":=" in word)
     files = words if ran else [word for word in words if ":=" not in word]
-    common: dict[str, Any] = {"arguments": arguments, "dry_run": dry_run}
+    common: dict[str, Any] = {"launch_files": files, "output": output, "node": node}
+    common |= {"arguments": arguments, "dry_run": dry_run}
     if throttle:
         if fallback is not None:
             raise InputError("a throttler has no fallback: --fallback goes with a plan")
-        if message_type is not None:
-            raise InputError(_FOR_ALL_TYPES)
-        splicing = _throttled(throttle, files, output, node, recording, common)
+        if message_type is not None or node == "typed":
+            raise InputError(
+                "a throttler is for all types: choose --node python or cpp, and no --type"
+            )
+        splicing = _throttled(throttle, recording, common)
     elif plan is None or not files:
         raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
     else:
         common |= {"message_type": message_type, "fallback": fallback}
-        splicing = _shaped(plan, files, output, node, recording, common)
-    setup = _built(splicing) if build and not dry_run else None
+        splicing = _shaped(plan, recording, common)
+    setup = build_package(splicing.folder / NODES) if build and not dry_run else None
     if json:
         print_json(_values(splicing, setup))
         return
     _show(splicing, arguments, setup)
 
 
-def _shaped(
-    plan: Path,
-    files: list[str],
-    output: Path,
-    node: NodeKind,
-    recording: Path | None,
-    more: dict[str, Any],
-) -> "Splicing":
+def _shaped(plan: Path, recording: Path | None, common: dict[str, Any]) -> "Splicing":
     from chainshaper.cli.output import notes
     from chainshaper.flow.launch_splicing import splice_launch_files
     from chainshaper.planning import load_plan, plan_warnings
@@ -156,25 +151,16 @@ def _shaped(
     planned = load_plan(plan)
     notes(plan_warnings(planned))
     known = _opened(recording or _own_recording(planned))
-    return splice_launch_files(planned, files, output, node=node, recording=known, **more)
+    return splice_launch_files(planned, recording=known, **common)
 
 
-def _throttled(
-    inputs: list[str],
-    files: list[str],
-    output: Path,
-    node: NodeKind,
-    recording: Path | None,
-    more: dict[str, Any],
-) -> "Splicing":
+def _throttled(inputs: list[str], recording: Path | None, common: dict[str, Any]) -> "Splicing":
     from chainshaper.flow.launch_splicing import splice_throttlers
 
-    if node == "typed":
-        raise InputError(_FOR_ALL_TYPES)
-    if not files:
+    if not common["launch_files"]:
         raise InputError("give the launch files: `splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`")
-    parsed, known = [_input(text) for text in inputs], _opened(recording)
-    return splice_throttlers(parsed, files, output, node=node, recording=known, **more)
+    parsed = [_input(text) for text in inputs]
+    return splice_throttlers(parsed, recording=_opened(recording), **common)
 
 
 def _input(text: str) -> "ThrottledInput":
@@ -204,13 +190,6 @@ def _opened(recording: Path | None) -> "Recording | None":
     from chainshaper.sources import open_source
 
     return open_source(recording)
-
-
-def _built(splicing: "Splicing") -> Path:
-    from chainshaper.splicing.generated_package import build_package
-    from chainshaper.splicing.spliced_launch import NODES
-
-    return build_package(splicing.folder / NODES)
 
 
 def _show(splicing: "Splicing", arguments: dict[str, str], setup: Path | None) -> None:

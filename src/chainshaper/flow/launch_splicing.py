@@ -13,13 +13,14 @@ import difflib
 import json
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from chainshaper.planning.plan import Plan, ShapingNode, revised
 from chainshaper.sources.ros.interpreter import own_environment, run_with_rclpy
 from chainshaper.splicing import redirection
+from chainshaper.splicing.redirection import Redirect
 from chainshaper.splicing.shaping_process import (
     STANDBY,
     NodeKind,
@@ -30,7 +31,6 @@ from chainshaper.splicing.shaping_process import (
 from chainshaper.splicing.spliced_launch import (
     LOGS,
     NODES,
-    Redirect,
     is_run,
     launch_file_name,
     launch_text,
@@ -272,7 +272,7 @@ def _tried(
     asked = {
         "files": [] if is_run(words) else words,
         "processes": [{"cmd": words}] if is_run(words) else [],
-        "redirects": [asdict(one) for one in redirects],
+        "redirects": [one.values() for one in redirects],
         "arguments": arguments,
         "folder": str(Path.cwd()),
     }
@@ -284,7 +284,7 @@ def _tried(
     if problem is not None:
         raise OperationError(f"{', '.join(words)} cannot be carried out: {problem}")
     found: list[dict[str, Any]] = json.loads(said.splitlines()[-1])  # behind what is logged
-    problems = [one["problem"] for one in found if one["problem"]]
+    problems = [f"{one['topic']}: {one['problem']}" for one in found if one["problem"]]
     if problems:
         raise OperationError("; ".join(problems))
     return found

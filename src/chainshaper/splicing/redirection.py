@@ -71,6 +71,11 @@ class Redirect:
     others: list[str] = field(default_factory=list)
     elsewhere: list[str] = field(default_factory=list)
 
+    def values(self) -> dict[str, Any]:
+        """What a launch file says of it, and a dry run is asked."""
+        keys = ("kind", "topic", "target", "nodes", "added")
+        return {key: getattr(self, key) for key in keys}
+
     def see(
         self,
         rules: Sequence[str],
@@ -296,10 +301,8 @@ def _begin(context: Any, redirects: Sequence[Redirect]) -> list[Any] | None:
     if hasattr(context.locals, _DRY_RUN):
         return None
     within_s = float(context.launch_configurations.get(WITHIN, WITHIN_S))
-    listen, check = (
-        OpaqueFunction(function=_listen),
-        OpaqueFunction(function=_check, args=[redirects]),
-    )
+    listen = OpaqueFunction(function=_listen)
+    check = OpaqueFunction(function=_check, args=[redirects])
     return [
         TimerAction(period=max(0.0, within_s - DISCOVERY_S), actions=[listen]),
         TimerAction(period=within_s, actions=[check]),
@@ -400,12 +403,13 @@ def dry_run(
             carry_out(inner, context)
 
     ExecuteLocal.execute = lambda action, context: action.prepare(context)
-    ExecutableInPackage.perform = lambda one, context: context.perform_substitution(
-        one.executable[0]
+    ExecutableInPackage.perform = lambda one, context: "".join(
+        context.perform_substitution(part) for part in one.executable
     )
     LifecycleNode.execute = Node.execute
     LoadComposableNodes.execute = load
-    TimerAction.execute = lambda action, _: action.actions
+    for timer in (TimerAction, *TimerAction.__subclasses__()):
+        timer.execute = lambda action, _: action.actions
     RegisterEventHandler.execute = lambda action, _: action.event_handler.describe()[1]
     os.chdir(folder)
     parts = [Redirect(**one) for one in redirects]
@@ -413,28 +417,25 @@ def dry_run(
     context = LaunchContext()
     context.extend_globals({_DRY_RUN: True})
     context._set_asyncio_loop(asyncio.new_event_loop())
-    sources = [AnyLaunchDescriptionSource(file) for file in files]
-    handed_on = arguments.items()
-    for action in (
-        *(ExecuteProcess(**one) for one in processes),
-        *(IncludeLaunchDescription(one, launch_arguments=handed_on) for one in sources),
-    ):
-        carry_out(action, context)
-    results = []
-    for one in parts:
-        maybe = [it.node for it in one.started if not it.named]
-        problem = one.twice() or one.mistake([], maybe)
-        results.append(
-            {
-                "topic": one.topic,
-                "target": one.target,
-                "problem": problem and one.message(problem, [], []),
-                "redirected": [
-                    {"node": it.node, "as": it.label, "rules": it.rules} for it in one.started
-                ],
-            }
-        )
-    return results
+    for one in processes:
+        carry_out(ExecuteProcess(**one), context)
+    for file in files:
+        source = AnyLaunchDescriptionSource(file)
+        carry_out(IncludeLaunchDescription(source, launch_arguments=arguments.items()), context)
+    return [_found(one) for one in parts]
+
+
+def _found(redirect: Redirect) -> dict[str, Any]:
+    """What a dry run found: who would be redirected, or what is wrong with that."""
+    maybe = [one.node for one in redirect.started if not one.named]
+    return {
+        "topic": redirect.topic,
+        "target": redirect.target,
+        "problem": redirect.twice() or redirect.mistake([], maybe),
+        "redirected": [
+            {"node": one.node, "as": one.label, "rules": one.rules} for one in redirect.started
+        ],
+    }
 
 
 if __name__ == "__main__":

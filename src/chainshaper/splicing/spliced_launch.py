@@ -15,10 +15,10 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from pprint import pformat
-from typing import Any, Literal
+from typing import Any
 
 from chainshaper.splicing import redirection
 from chainshaper.splicing.shaping_process import RESPAWN, ShapingProcess
@@ -30,7 +30,6 @@ __all__ = [
     "LOGS",
     "NODES",
     "LaunchCommand",
-    "Redirect",
     "is_run",
     "launch_file_name",
     "launch_text",
@@ -75,20 +74,6 @@ def generate_launch_description():
     spec.loader.exec_module(redirection)
     return redirection.launch_description(LAUNCH_FILES, PROCESSES, REDIRECTS)
 '''
-
-
-@dataclass(frozen=True)
-class Redirect:
-    """Nodes, by their full names, are to have ``target`` in place of ``topic``.
-
-    ``added`` are the nodes that stand between the two.
-    """
-
-    kind: Literal["publisher", "subscription"]
-    topic: str
-    target: str
-    nodes: tuple[str, ...]
-    added: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -191,7 +176,9 @@ def launch_file_name(words: Sequence[str]) -> str:
 
 
 def launch_text(
-    words: Sequence[str], processes: Sequence[ShapingProcess], redirects: Sequence[Redirect]
+    words: Sequence[str],
+    processes: Sequence[ShapingProcess],
+    redirects: Sequence[redirection.Redirect],
 ) -> str:
     """The text of the launch file that starts processes and includes launch files.
 
@@ -204,7 +191,7 @@ def launch_text(
         what=re.sub(r"[^\w., -]", "_", what),  # a file's name cannot end the text it stands in
         files=pformat([] if run else list(words), width=96),
         processes=pformat([*map(_keywords, every), *run], width=96, sort_dicts=False),
-        redirects=pformat([asdict(one) for one in redirects], width=96, sort_dicts=False),
+        redirects=pformat([one.values() for one in redirects], width=96, sort_dicts=False),
     )
 
 
