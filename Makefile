@@ -7,6 +7,7 @@ demo: .venv/.ready
 
 # What only computes runs beside what needs the machine (tests/conftest.py).
 test: lint
+	scripts/test-tools
 	$(MAKE) --jobs=2 --output-sync=line test-computing test-machine
 
 test-computing:
@@ -24,6 +25,7 @@ lint: .venv/.ready-dev
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
+	.venv/bin/lint-imports --no-cache
 
 # Needs a quiet machine and about a quarter of an hour; prints tables, asserts nothing.
 benchmark: .venv/.ready-dev

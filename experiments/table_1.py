@@ -19,8 +19,7 @@ from results import MS, PICTURES, Line, Run, Value, lines_of, save
 
 from chainshaper import load_application
 from chainshaper.planning import CallbackTimes, Plan, plan_shaping, server_per_callback
-from chainshaper.workload.description import Application
-from chainshaper.workload.distributions import ExecutionTime
+from chainshaper.workload.description import Application, ExecutionTime
 
 APPLICATION = Path(__file__).parents[1] / "examples" / "synthetic_chain.yaml"
 PERIOD_NS = 100 * MS

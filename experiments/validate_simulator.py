@@ -25,7 +25,7 @@ import polars as pl
 
 from chainshaper import load_application, open_recording, run_application, simulate
 from chainshaper.analysis import analyse_latency
-from chainshaper.analysis.pace import ordinary_pace, relative_pace
+from chainshaper.analysis.disturbance import ordinary_pace, relative_pace
 from chainshaper.simulation.samples import measured_costs
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application

@@ -1,9 +1,11 @@
 """What several rooms' tests stand on: a real recording, and a disk that is full."""
 
 import os
+import re
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pytest
@@ -35,6 +37,8 @@ COMPUTING = {
 COMPUTING |= {"sources/ctf", "splicing", "values"}
 LIVE_RUNS = {"unshaped", "shaped"}
 
+Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
+
 
 @pytest.hookimpl(tryfirst=True)  # before the command line's choice of marks is looked at
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -44,6 +48,38 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         live = LIVE_RUNS & set(getattr(item, "fixturenames", ()))
         if folder in COMPUTING and not live and not item.get_closest_marker("ros2"):
             item.add_marker("computing")
+
+
+ALLOWED_SKIPS = [
+    re.compile(line)
+    for line in Path(__file__).with_name("allowed_skips.txt").read_text().splitlines()
+    if line and not line.startswith("#")
+]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """In CI a skip is a failure, unless its reason is in allowed_skips.txt."""
+    report = yield
+    return _no_hidden_skip(report)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    """The same for a whole file that skips."""
+    report = yield
+    return _no_hidden_skip(report)
+
+
+def _no_hidden_skip(report: Report) -> Report:
+    if os.environ.get("CI") != "true" or report.outcome != "skipped" or hasattr(report, "wasxfail"):
+        return report
+    text = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
+    reason = text.removeprefix("Skipped: ")
+    if not any(pattern.search(reason) for pattern in ALLOWED_SKIPS):
+        report.outcome = "failed"
+        report.longrepr = f"CI=true, and tests/allowed_skips.txt has no such skip: {reason}"
+    return report
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 
 import pytest
 
-from chainshaper.analysis.close_names import close_names
+from chainshaper.analysis.chains import close_names
 
 NAMES = (
     "/lidar_front/points_raw",

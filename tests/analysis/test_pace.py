@@ -3,7 +3,7 @@
 import numpy as np
 import polars as pl
 
-from chainshaper.analysis.pace import ordinary_pace, relative_pace
+from chainshaper.analysis.disturbance import ordinary_pace, relative_pace
 
 
 def _tables() -> dict[str, pl.DataFrame]:

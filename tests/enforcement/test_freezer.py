@@ -30,9 +30,12 @@ from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.linux.cgroups import (
     QUICK_MOVES,
     cgroup_of,
+    make_moves_quick,
     mount_options,
     moves_are_quick,
+    options_before_ours,
     remount,
+    restore_mount,
 )
 from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.values.errors import InputError, OperationError, PlatformError
@@ -289,22 +292,58 @@ def test_threads_that_end_inside_and_outside_their_slots_are_no_failure(tmp_path
         assert back_end.failure() is None
 
 
-def test_others_that_move_processes_make_nobody_wait_meanwhile(tmp_path: Path) -> None:
-    mounted = mount_options()
-    remount(f"{mounted},{QUICK_MOVES}")
+@pytest.fixture
+def plain() -> Iterator[str]:
+    """The mount options without the one that freezers set; afterwards they are as they were."""
+    found, ours = mount_options(), options_before_ours()
+    plain = ",".join(name for name in found.split(",") if name != QUICK_MOVES)
     try:
-        if not moves_are_quick():
-            pytest.skip(f"this kernel, or our privileges, do not allow the option {QUICK_MOVES}")
-        with freezer(tmp_path / "theirs", server("a", (0, 1))) as back_end:
-            back_end.release()
-            assert moves_are_quick(), "somebody else wanted it so"
+        remount(f"{plain},{QUICK_MOVES}")
+        allowed = moves_are_quick()
+        restore_mount(plain)
+        if not allowed or moves_are_quick():
+            pytest.skip(f"this kernel, or our privileges, do not let us set {QUICK_MOVES}")
+        yield plain
     finally:
-        remount(mounted)
+        restore_mount(plain)
+        if found != plain:
+            remount(found) if ours is None else make_moves_quick(ours)
+        assert mount_options() == found
+
+
+def test_others_that_move_processes_make_nobody_wait_meanwhile(tmp_path: Path, plain: str) -> None:
+    remount(f"{plain},{QUICK_MOVES}")
+    with freezer(tmp_path / "theirs", server("a", (0, 1))) as back_end:
+        back_end.release()
+        assert moves_are_quick(), "somebody else wanted it so"
+    remount(plain)
     with freezer(tmp_path / "ours", server("a", (0, 1))):
-        assert mount_options() == f"{mounted},{QUICK_MOVES}"
+        assert mount_options() == f"{plain},{QUICK_MOVES}"
     with pytest.raises(PlatformError), freezer(tmp_path, server("a", (0, 1), core=99)):
         pass
-    assert mount_options() == mounted
+    assert mount_options() == plain
+
+
+def test_what_a_run_without_a_journal_left_mounted_is_not_taken_for_another_program_s(
+    tmp_path: Path, plain: str
+) -> None:
+    make_moves_quick(plain)  # and nothing else says who did
+    journal = open_journal(tmp_path)
+    create(ServerTable(CYCLE, (server("a", (0, 1)),)), journal).release()
+    discard_journal(journal)
+    assert mount_options() == plain
+
+
+def test_the_last_of_two_runs_at_once_leaves_it_mounted_as_the_first_found_it(
+    tmp_path: Path, plain: str
+) -> None:
+    table = ServerTable(CYCLE, (server("a", (0, 1)),))
+    journals = [open_journal(tmp_path, name) for name in ("first", "second")]
+    runs = [create(table, journal) for journal in journals]
+    for run, journal in zip(runs, journals, strict=True):
+        run.release()
+        discard_journal(journal)
+    assert mount_options() == plain
 
 
 def test_a_group_that_somebody_removes_is_told(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ make them run again.
 
 import os
 import random
+import select
 import signal
 import subprocess
 import sys
@@ -17,10 +18,12 @@ from pathlib import Path
 
 import pytest
 from applied_plans import Governed, needs_fifo, node_to_govern
-from gated import CORE, MS, cpu_ns, groups_left, kill, needs_cgroups
+from gated import CORE, MS, ahead_of_others, cpu_ns, groups_left, kill, needs_cgroups
 from processes import children_of, wait_for
 
-from chainshaper.enforcement.runs.guardian import GROUP
+from chainshaper.enforcement.freezer.counters import open_page
+from chainshaper.enforcement.freezer.state import run_of
+from chainshaper.enforcement.runs.guardian import GROUP, let_go
 from chainshaper.enforcement.runs.journal import find_journals
 from chainshaper.enforcement.runs.undoing import undo_run
 from chainshaper.linux.cgroups import cgroup_of, mount_options, mount_point
@@ -226,11 +229,29 @@ def test_threads_of_a_silent_dispatcher_are_let_go_first_and_closed_again_if_it_
 ) -> None:
     with run_on(node) as run:
         groups = groups_left(run.owner.pid)
-        kill(run.dispatchers[0], STOP)
-        wait_for(lambda: not run.is_frozen(), "the thread to be let go", pause=0.001)
-        kill(run.dispatchers[0], signal.SIGCONT)
+        # It has to go on before guardians give it up, 0.4 s later: others must not delay that.
+        with (groups[0] / "cgroup.events").open() as events, ahead_of_others(os.getpid()):
+            changes = select.poll()
+            changes.register(events, select.POLLPRI)
+            kill(run.dispatchers[0], STOP)
+            while run.is_frozen():
+                assert changes.poll(20_000), "the thread was not let go"
+                events.read()
+            kill(run.dispatchers[0], signal.SIGCONT)
         wait_for(run.is_frozen, "it to be closed again")
         assert groups_left(run.owner.pid) == groups
+        assert run.ask("failure") == "None"
+
+
+def test_threads_that_a_guardian_lets_go_when_the_dispatcher_is_back_are_closed_again(
+    node: Governed,
+) -> None:
+    with run_on(node) as run:
+        (journal,) = find_journals(run.runs)
+        freezer = run_of(journal)
+        assert freezer is not None
+        let_go(journal, open_page(freezer.page, freezer.table), CORE)  # as the slower of two may
+        wait_for(run.is_frozen, "it to be closed again")
         assert run.ask("failure") == "None"
 
 

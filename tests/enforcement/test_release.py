@@ -30,7 +30,7 @@ from chainshaper.enforcement.runs.guardian import GROUP
 from chainshaper.enforcement.runs.journal import find_journals
 from chainshaper.enforcement.runs.state import RunState
 from chainshaper.flow.apply import apply_plan
-from chainshaper.linux.cgroups import cgroup_of, mount_point
+from chainshaper.linux.cgroups import cgroup_of, mount_options, mount_point
 from chainshaper.linux.scheduling_state import state_of
 from chainshaper.linux.threads import list_threads
 
@@ -100,6 +100,7 @@ def test_a_run_whose_folder_is_removed_has_it_again_and_can_be_released(tmp_path
 def test_without_a_journal_threads_run_again_and_what_cannot_be_put_back_is_named(
     tmp_path: Path,
 ) -> None:
+    mounted = mount_options()
     with in_force(tmp_path) as (governed, run):
         kill_all(run)
         for journal in find_journals():
@@ -114,6 +115,7 @@ def test_without_a_journal_threads_run_again_and_what_cannot_be_put_back_is_name
         assert cgroup_of(governed.pid) == governed.cgroup
         ran = cpu_ns(governed.pid)
         wait_for(lambda: cpu_ns(governed.pid) > ran, "the node to run on")
+        assert mount_options() == mounted
         assert "nothing was left behind" in verb("release").stdout
 
 

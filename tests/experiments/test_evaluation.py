@@ -12,8 +12,7 @@ from configurations import Options, simulated
 from results import MS, Run
 
 from chainshaper import load_application
-from chainshaper.workload.description import Application
-from chainshaper.workload.distributions import ExecutionTime, SimulationDescription
+from chainshaper.workload.description import Application, ExecutionTime, SimulationDescription
 
 NOTHING = ExecutionTime(constant_ns=0)
 

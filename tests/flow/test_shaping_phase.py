@@ -24,21 +24,38 @@ from chainshaper.flow import shaping_phase
 from chainshaper.flow.shaping_phase import NOBODY, Telling
 from chainshaper.planning import Plan
 from chainshaper.sources.ros.interpreter import Script
+from chainshaper.values.errors import OperationError
 
 
 @contextmanager
 def applied(
-    plan: Plan, folder: Path, tell: Callable[[int], Telling], monkeypatch: pytest.MonkeyPatch
+    plan: Plan,
+    folder: Path,
+    tell: Callable[[int], Telling],
+    monkeypatch: pytest.MonkeyPatch,
+    stop: threading.Event | None = None,
 ) -> Iterator[list[RunState]]:
-    """The plan in force, with what was seen of its state; drift is looked for all the time."""
+    """The plan in force, with what was seen of its state; drift is looked for all the time.
+
+    Raises:
+        OperationError: it does not come into force.
+    """
     states: list[RunState] = []
-    stop = threading.Event()
+    failures: list[OperationError] = []
+    stop = stop or threading.Event()
     monkeypatch.setattr(applying, "tell_phase", lambda _plan, _found, phase_ns: tell(phase_ns))
     monkeypatch.setattr(applying, "_LOOK_S", 0.2)
     monkeypatch.setattr(DriftWatch, "EVERY_S", 0.1)
     monkeypatch.setattr(DriftWatch, "CYCLES", 5)
     how = {"back_end": "fifo", "stop": stop, "watch": states.append, "folder": folder / "runs"}
-    run = threading.Thread(target=applying.apply_plan, args=(plan,), kwargs=how)
+
+    def apply() -> None:
+        try:
+            applying.apply_plan(plan, **how)  # type: ignore[arg-type]
+        except OperationError as error:
+            failures.append(error)
+
+    run = threading.Thread(target=apply)
     run.start()
     try:
         yield states
@@ -46,6 +63,8 @@ def applied(
         stop.set()
         run.join(10)
         assert not run.is_alive(), "it waits for somebody"
+    if failures:
+        raise failures[0]
 
 
 def telling(*command: str) -> Telling:
@@ -92,15 +111,18 @@ def test_it_can_be_stopped_before_the_nodes_were_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tellings: list[Telling] = []
+    stop = threading.Event()
 
     def tell(_: int) -> Telling:
         tellings.append(telling("sleep", "600"))
+        stop.set()
         return tellings[-1]
 
     plan = plan_for(server("first", "steady", (0, 30)))
     with (
         running_node("steady", tmp_path / "steady"),
-        applied(plan, tmp_path, tell, monkeypatch),
+        pytest.raises(OperationError, match="asked to end before the plan was in force"),
+        applied(plan, tmp_path, tell, monkeypatch, stop),
     ):
         wait_for(lambda: bool(tellings), "the nodes to be told")
     (only,) = tellings

@@ -22,10 +22,21 @@ void publish(char word, std::int64_t number)
   }
 }
 
-// The folder of pages, "shaping", the page's name, the port to listen at, how long to hold (ns).
+// The folder of pages, "shaping" (or "counting"), the page's name, the port to listen at, how long to hold (ns).
 int main(int, char ** argv)
 {
   chainshaper::Turn turn(argv[3], "/t5", {argv[1]});
+  if (std::string(argv[2]) == "counting") {
+    for (std::size_t number = 0; number < chainshaper::dropped_names.size(); ++number) {
+      for (std::size_t i = 0; i <= number; ++i) {
+        turn.count(
+          static_cast<chainshaper::Dropped>(number), static_cast<std::int64_t>(number),
+          number % 2 == 1);
+      }
+    }
+    turn.count({}, {}, false);
+    return 0;
+  }
   const int inbox = socket(AF_INET, SOCK_DGRAM, 0);
   sockaddr_in address{};
   address.sin_family = AF_INET;

@@ -1,5 +1,9 @@
 """A shaping node or a standby without ROS 2: takes datagrams, writes what it publishes to stdout.
 
+With ``counting`` instead it counts, for the gate's reasons in their order, one message more of each
+that was dropped than of the one before, with its number lost before each, every second reason late;
+and then one that was published.
+
 Arguments: the folder of pages, ``shaping`` or ``standby``, the name of the page, the port to
 listen at, and for how long the shaping node holds a message (ns). A message is its number, which
 names it as well.
@@ -12,6 +16,7 @@ import threading
 import time
 from contextlib import suppress
 
+from chainshaper.gate import decision as gate
 from chainshaper.gate import handover
 
 
@@ -22,6 +27,13 @@ def publish(word: bytes, number: int) -> None:
 def main() -> None:
     folder, what, name, port, hold = sys.argv[1:]
     handover.page_folders = lambda: iter([folder])
+    if what == "counting":
+        turn = handover.Turn(name, "/t5")
+        for number, reason in enumerate(gate.DROPPED):
+            for _ in range(number + 1):
+                turn.count(reason, number, late=number % 2 == 1)
+        turn.count(None, None, late=False)
+        return
     inbox = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     if what == "shaping":
         turn = handover.Turn(name, "/t5")

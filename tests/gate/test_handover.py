@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from chainshaper import splicing
+from chainshaper.gate.decision import DROPPED
 from chainshaper.gate.handover import RING, Page, Standby, Turn, open_page
 
 MS = 1_000_000
@@ -249,6 +250,21 @@ def test_a_node_that_starts_again_goes_on_where_cycles_began(folder: Path) -> No
     turn.hold(None, 12_345, 2)
     assert (Turn("t5", "/t5").phase_ns, turn.page["mode"]) == (12_345, 2)
     assert turn.page.topic == "/t5"
+
+
+@pytest.mark.parametrize("language", ["python", "cpp"])
+def test_what_a_node_counts_is_in_the_page_for_those_who_look(
+    folder: Path, in_cpp: Path, language: str
+) -> None:
+    program = [str(in_cpp)] if language == "cpp" else [sys.executable, str(PROCESS)]
+    command = [*program, str(folder), "counting", "t5", "0", "0"]
+    for times in (1, 2):  # a node that starts again goes on counting
+        subprocess.run(command, check=True, timeout=60)
+        page = Page(str(folder), "t5.0.v1")
+        assert [page[reason] for reason in DROPPED] == [times, 2 * times, 3 * times, 4 * times]
+        assert page["published"] == times
+        assert page["lost_by_dds"] == times * (0 + 2 * 1 + 3 * 2 + 4 * 3)
+        assert page["late"] == times * (2 + 4)
 
 
 @pytest.mark.parametrize("how", ["mode", "owner", "link", "file", "foreign page"])

@@ -56,9 +56,9 @@ def test_one_place_starts_python() -> None:
         for path in SOURCES.rglob("*.py")
         if re.search(r"sys\.executable|multiprocessing|ProcessPool", path.read_text())
     }
-    in_nodes = {"enforcement/kept_core.py", "splicing/nodes/python/gate_log.py"}
+    in_nodes = {"gate/clear_core.py", "splicing/nodes/python/gate_log.py"}
     again = "splicing/nodes/python/respawning.py"
-    assert starting.keys() == {"enforcement/own_processes.py", *in_nodes, again}
+    assert starting.keys() == {"linux/own_processes.py", *in_nodes, again}
     for name in in_nodes:
         assert '[sys.executable, "-I", "-S", "-c"' in starting[name]
 
@@ -113,8 +113,9 @@ def test_python_dash_m_imports_from_no_current_folder(tmp_path: Path) -> None:
 def copied(folder: Path) -> Path:
     """The package where nothing but PYTHONPATH leads to, as colcon installs it."""
     root = folder / "install"
-    names = ["__init__.py", "errors.py", "trusted_files.py", "enforcement/__init__.py"]
-    for name in (*names, "enforcement/own_processes.py"):
+    names = ["__init__.py", "values/__init__.py", "values/errors.py", "values/trusted_files.py"]
+    names += ["linux/__init__.py"]
+    for name in (*names, "linux/own_processes.py"):
         place = root / "chainshaper" / name
         place.parent.mkdir(parents=True, exist_ok=True)
         place.write_bytes((SOURCES / name).read_bytes())

@@ -1,5 +1,7 @@
 """A program with the trace points of ROS 2, without ROS 2, and runs of it under the eBPF tracer."""
 
+import atexit
+import functools
 import os
 import shutil
 import subprocess
@@ -76,10 +78,27 @@ def skip_without_bpftrace() -> None:
         pytest.skip("bpftrace is not installed")
     if os.geteuid() != 0:
         pytest.skip("tracing with eBPF needs root")
+    _mount_tracefs()
     trial = ["bpftrace", "-e", "BEGIN { exit(); } tracepoint:sched:sched_switch { }"]
     run = subprocess.run(trial, capture_output=True, text=True, check=False, timeout=60)
     if run.returncode:
-        pytest.skip(f"bpftrace does not work here: {run.stderr.strip()}")
+        pytest.skip(f"bpftrace does not work here: {run.stderr.strip().splitlines()[-1:]}")
+
+
+@functools.cache
+def _mount_tracefs() -> None:
+    """bpftrace finds `tracepoint:sched:sched_switch` there; mounted until the tests end."""
+    folder = Path("/sys/kernel/tracing")
+    if not (folder / "events").exists():
+        mounted = subprocess.run(
+            ["mount", "-t", "tracefs", "tracefs", str(folder)],
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        if mounted.returncode:
+            pytest.skip(
+                f"{folder} has no tracefs, and it cannot be mounted: {mounted.stderr.strip()}"
+            )
+        atexit.register(subprocess.run, ["umount", str(folder)], check=False)
 
 
 def build(prefix: Path, *flags: str, version: str = "8.2.3") -> Program:

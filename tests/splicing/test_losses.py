@@ -16,6 +16,7 @@ from processes import wait_for
 from chainshaper.planning import Plan
 from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log, rows_missing
+from chainshaper.splicing.shaped_outputs import ShapedOutput, find_outputs, output_text
 from chainshaper.splicing.shaping_process import ShapingProcess, write_shaping_process
 
 MS = 1_000_000
@@ -52,6 +53,15 @@ def came_out(run: NodeRun) -> list[str]:
     return [words["payload"] for words in run.said if words.get("published") == "/t3"]
 
 
+def outputs(folder: Path) -> tuple[ShapedOutput, ...]:
+    return find_outputs(iter([str(folder / "outputs"), str(folder / "chainshaper" / "outputs")]))
+
+
+def counted(folder: Path) -> int:
+    """How many messages of the one output `status` knows of, those that DDS lost included."""
+    return sum(output.published + sum(output.lost.values()) for output in outputs(folder))
+
+
 def wait_for_rows(run: NodeRun, log: Path, count: int) -> pl.DataFrame:
     """The log, when it has so many rows."""
     run.hear(lambda words: words.get("event") == "spinning") if not run.said else None
@@ -76,6 +86,8 @@ def test_bursts_leave_as_planned_and_the_rest_is_counted(
             time.sleep((plan.cycle_ns - time.monotonic_ns() % plan.cycle_ns) / 1e9)
             sent += send(run, size, burst * size)
             wait_for_rows(run, log, len(sent))
+        wait_for(lambda: counted(tmp_path) == len(sent), "all to be counted")
+        (output,) = outputs(tmp_path)
         assert run.end() == 0
     out, rows = came_out(run), read_gate_log(log)
     dropped = Counter(rows["dropped"].drop_nulls())
@@ -83,6 +95,11 @@ def test_bursts_leave_as_planned_and_the_rest_is_counted(
     assert rows["release"].count() == len(out)
     assert out == [payload for payload in sent if payload in out], "in the order they came"
     assert dropped[lost] > 0
+    assert (output.published, output.lost) == (len(out), dropped)
+    assert output.late == rows["overrun"].count()
+    said_of_it = f"so far {len(out)} messages published, {output.late} late, "
+    assert said_of_it in output_text(output)
+    assert f", {dropped[lost]} {lost}" in output_text(output)
     assert set(dropped) <= {lost, "overflowed"}
     if messages == "all-in-order":
         assert len(out) >= bursts * 10, "the history has room for ten"
@@ -111,7 +128,10 @@ def test_what_dds_lost_before_the_gate_is_counted(tmp_path: Path, plan: Plan) ->
         for number in (5, 6, 9, 10, 2):  # the last is from a publisher that was started again
             send(run, 1, number)
         rows = wait_for_rows(run, log, 5)
+        wait_for(lambda: counted(tmp_path) == 5 + 2, "all to be counted")
+        (output,) = outputs(tmp_path)
         assert run.end() == 0
+    assert output.lost["lost by DDS"] == 2
     assert rows["lost"].to_list() == [0, 0, 2, 0, 0]
     assert any("2 lost by DDS" in words.get("log", "") for words in run.said)
 

@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import tempfile
 from pathlib import Path
 
 import polars as pl
@@ -99,12 +100,18 @@ def test_places_that_cannot_take_a_folder_are_refused_before(
     assert refuse_existing("rec") == Path("rec")
 
 
-def test_a_folder_without_permission_is_refused_before(tmp_path: Path) -> None:
-    if os.geteuid() == 0:
-        pytest.skip("root may write anywhere")
-    tmp_path.chmod(0o555)
-    with pytest.raises(InputError, match=f"{tmp_path}: no permission to write rec into it"):
-        refuse_existing(tmp_path / "rec")
+def test_a_folder_without_permission_is_refused_before() -> None:
+    """Root may write anywhere: a test that runs as root becomes another user meanwhile."""
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o555)
+        if as_root := os.geteuid() == 0:
+            os.setresuid(65534, 65534, 0)
+        try:
+            with pytest.raises(InputError, match=f"{folder}: no permission to write rec into it"):
+                refuse_existing(Path(folder) / "rec")
+        finally:
+            if as_root:
+                os.setresuid(0, 0, 0)
 
 
 def test_the_mount_point_of_a_disk_is_refused_before(full_disk: Path) -> None:

@@ -20,8 +20,8 @@ from chainshaper.flow.steps import measure_latency, plan_recording
 from chainshaper.planning import PlanRequest
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording
-from chainshaper.workload.asynchronous import AsynchronousWriter, PublisherThread
 from chainshaper.workload.description import Application
+from chainshaper.workload.executor import AsynchronousWriter, PublisherThread
 from chainshaper.workload.live import run_application
 
 MS = 1_000_000

@@ -8,7 +8,7 @@ from small_chain import DDS_CORE, EXECUTOR_CORE
 from chainshaper import run_application, simulate
 from chainshaper.analysis import analyse_latency
 from chainshaper.workload.description import load_application
-from chainshaper.workload.synchronising import Synchroniser
+from chainshaper.workload.executor import Synchroniser
 
 TEXT = f"""\
 name: fusion

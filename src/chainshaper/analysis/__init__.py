@@ -13,23 +13,23 @@ from chainshaper.analysis.chains import (
     ChainEnumeration,
     enumerate_chains,
     find_chain,
+    load_named_paths,
     parse_chain,
 )
 from chainshaper.analysis.disturbance import disturbed
 from chainshaper.analysis.flow import DataFlow, data_flow
 from chainshaper.analysis.graph import application_graph, graph_of
 from chainshaper.analysis.instances import callback_instances
-from chainshaper.analysis.latency import LatencyAnalysis, analyse_latency
-from chainshaper.analysis.messages import publications, takes
-from chainshaper.analysis.named_paths import load_named_paths
-from chainshaper.analysis.objects import Objects, resolve_objects
-from chainshaper.analysis.statistics import (
+from chainshaper.analysis.latency import (
+    LatencyAnalysis,
     LatencyStatistics,
+    analyse_latency,
     callback_statistics,
     latency_statistics,
 )
-from chainshaper.analysis.subscriber import reception
-from chainshaper.analysis.traversals import REASONS, Traversals, traverse
+from chainshaper.analysis.messages import publications, takes
+from chainshaper.analysis.objects import Objects, resolve_objects
+from chainshaper.analysis.traversals import REASONS, Traversals, reception, traverse
 
 __all__ = [
     "REASONS",

@@ -4,24 +4,57 @@ A chain is written ``FIRST..LAST``, with more way points where several paths mat
 are topics or nodes. A chain that begins with a topic starts at the callback that publishes it,
 and every chain ends with the publication of its last topic (paper, section 2.3); a chain that
 ends with a node ends with what that node publishes, or, if it publishes nothing, with the topic
-that it subscribes to.
+that it subscribes to. CARET's ``named_paths`` are read as well (upstream: tier4/caret_analyze,
+`architecture.yaml`; only the paths, the rest comes from the recording).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import SequenceMatcher
+from pathlib import Path
 
-from chainshaper.analysis.close_names import close_names
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
 from chainshaper.analysis.objects import INTERNAL_TOPICS
-from chainshaper.analysis.paths import Path, PathSearch, Stage, Vertex
+from chainshaper.analysis.paths import Path as GraphPath
+from chainshaper.analysis.paths import PathSearch, Stage, Vertex
 from chainshaper.values.application import ApplicationGraph, Callback, Chain
 from chainshaper.values.errors import InputError
+from chainshaper.values.yaml_file import PlainData, compose, read_text
 
 __all__ = [
     "ChainEnumeration",
+    "close_names",
     "enumerate_chains",
     "find_chain",
+    "load_named_paths",
     "parse_chain",
 ]
+
+MOST = 3
+CLOSE = 0.6
+"""Likeness (0 to 1) from which a name is worth mentioning."""
+
+WORSE = 0.15
+"""How much less alike than the best one a name may be."""
+
+
+def close_names(name: str, names: Iterable[str]) -> list[str]:
+    """Up to three of ``names`` that are like ``name``, the likeliest first."""
+    scores = {other: _likeness(name, other) for other in names}
+    best = max(scores.values(), default=0.0)
+    close = [n for n, score in scores.items() if score >= max(CLOSE, best - WORSE)]
+    return sorted(close, key=lambda other: (-scores[other], other))[:MOST]
+
+
+def _likeness(first: str, second: str) -> float:
+    a, b = (text.lower().strip("/") for text in (first, second))
+    whole = SequenceMatcher(None, a, b, autojunk=False).ratio()
+    last_a, last_b = a.rpartition("/")[2], b.rpartition("/")[2]
+    last = 0.95 * SequenceMatcher(None, last_a, last_b, autojunk=False).ratio()
+    contains = 0.9 if min(len(a), len(b)) > 2 and (a in b or b in a) else 0.0
+    return max(whole, last, contains)
+
 
 HANDFUL = 5
 
@@ -217,7 +250,7 @@ def _sources(graph: ApplicationGraph) -> set[int]:
     }
 
 
-def _chain(spec: str | None, path: Path) -> Chain:
+def _chain(spec: str | None, path: GraphPath) -> Chain:
     callbacks = tuple(vertex for vertex in path if isinstance(vertex, int))
     topics = tuple(vertex for vertex in path if isinstance(vertex, str))
     written = spec if spec is not None else "..".join(topics)
@@ -272,3 +305,59 @@ def _ambiguous(graph: ApplicationGraph, spec: str, chains: Sequence[Chain], comp
         names = [callbacks[chain.callbacks[0]].label, *chain.topics]
         lines.append(f"  {' → '.join(names)}{remedy}")
     return "\n".join(lines)
+
+
+UNDEFINED = {None, "UNDEFINED"}
+
+
+class _PathNode(BaseModel):
+    model_config = ConfigDict(frozen=True)
+
+    node_name: str
+    publish_topic_name: str | None = None
+
+
+class _NamedPath(BaseModel):
+    model_config = ConfigDict(frozen=True)
+
+    path_name: str
+    node_chain: tuple[_PathNode, ...] = Field(min_length=1)
+
+
+class _Architecture(BaseModel):
+    model_config = ConfigDict(frozen=True)
+
+    named_paths: tuple[_NamedPath, ...]
+
+
+def load_named_paths(file: str | Path) -> dict[str, str]:
+    """The named paths of a CARET architecture file: path name → chain as we write it.
+
+    Each node of a path becomes a way point together with the topic it publishes. A last node
+    that publishes nothing ends the chain with the topic it subscribes to, which is what the node
+    before it publishes.
+
+    Raises:
+        InputError: not readable, not YAML, no ``named_paths``, a path without nodes.
+    """
+    path = Path(file)
+    root = compose(read_text(path, "CARET's architecture file"), path)
+    plain = PlainData(path, ours=False)
+    try:
+        architecture = _Architecture.model_validate(None if root is None else plain.of(root))
+    except ValidationError as error:
+        raise InputError(
+            f"{plain.problems(error, _Architecture)}; chains are read from the `named_paths` of a"
+            " CARET architecture file, each with its `path_name` and `node_chain`"
+        ) from error
+    return {path.path_name: _way_points(path) for path in architecture.named_paths}
+
+
+def _way_points(path: _NamedPath) -> str:
+    waypoints: list[str] = []
+    for place, node in enumerate(path.node_chain):
+        if node.publish_topic_name not in UNDEFINED:
+            waypoints += [node.node_name, str(node.publish_topic_name)]
+        elif place < len(path.node_chain) - 1:
+            waypoints.append(node.node_name)
+    return "..".join(waypoints)

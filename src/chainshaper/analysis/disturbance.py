@@ -2,12 +2,12 @@
 
 Virtual machines and firmware stop all threads of a core now and then, for up to several ms. A
 sleeper at the highest priority, run beside the application, sees it: a row of `machine_stall`
-says that on core ``cpu`` nobody ran from ``time`` for ``duration``. A latency measured across a
+says that on core ``cpu`` no thread ran from ``time`` for ``duration``. A latency measured across a
 stall says something about the machine, not about the application.
 
 A cycle is disturbed by stalls **before the moment at which its output was due** (`due_at` of
 :mod:`~chainshaper.analysis.punctuality`), and by no other: what happens to an output that is late
-already, and waits for a later slot, is no excuse for it. Nor is looked at whether it was late:
+already, and waits for a later slot, is no excuse for it. Whether it was late plays no part:
 
 * **At two instants** any stall disturbs what a gate lets go: where the origin is taken (between the
   traversal's start and the anchor's origin), and around the moment at which the output was due.
@@ -16,8 +16,14 @@ already, and waits for a later slot, is no excuse for it. Nor is looked at wheth
   the cycle's own latency: only more than that disturbs.
 * A traversal that began before its disturbed predecessor was computed may have queued behind it,
   and counts as disturbed with it, unless the plan has them overlap (logical execution time).
+
+A core can also run without a stall, and yet at half its **pace**: a neighbour of a virtual machine
+uses the same hardware, caches are cold, the clock is throttled. Each wake-up of the stall meter is
+the same work; `machine_pace` says what CPU time it took. A pace is relative to an ordinary one: 2
+means that everything takes twice as long.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,14 +33,51 @@ import polars as pl
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.gate.decision import STALL_NS
 from chainshaper.values import events
+from chainshaper.values.events import EventTables
 
 __all__ = [
     "COMPUTING_THRESHOLD_NS",
     "disturbed",
+    "ordinary_pace",
     "overlapping",
+    "relative_pace",
     "stalled_after",
     "stalled_within",
 ]
+
+
+def ordinary_pace(tables: EventTables) -> dict[int, float]:
+    """The median CPU time of a wake-up on each core that was watched (ns)."""
+    frame = events.table(tables, "machine_pace", ["cpu"])
+    medians = frame.group_by("cpu").median().select("cpu", "cpu_time").iter_rows()
+    return {core: median for core, median in medians if median}
+
+
+def relative_pace(
+    tables: EventTables,
+    start: npt.NDArray[np.int64],
+    end: npt.NDArray[np.int64],
+    ordinary: Mapping[int, float],
+) -> npt.NDArray[np.float64]:
+    """Per core of ``ordinary`` a row: the mean pace in each window [start, end) of ``start``.
+
+    Not a number where the core was not watched. A window begins with the stretch of wake-ups that
+    was under way.
+    """
+    frame = events.table(tables, "machine_pace", ["cpu"]).sort("time")
+    rows = []
+    for core, usual in ordinary.items():
+        time, cpu_time = (
+            frame.filter(cpu=core)[column].to_numpy() for column in ("time", "cpu_time")
+        )
+        first = np.maximum(np.searchsorted(time, start, side="right") - 1, 0)
+        behind = np.searchsorted(time, end, side="left")
+        total = np.concatenate(([0], np.cumsum(cpu_time)))
+        count = behind - first
+        used = np.where(count > 0, total[behind] - total[np.minimum(first, behind)], np.nan)
+        rows.append(used / np.maximum(count, 1) / usual)
+    return np.array(rows).reshape(len(ordinary), len(start))
+
 
 WAKING_NS = 200_000
 """A gate wakes up and publishes within this time of a release: a stall this shortly before or

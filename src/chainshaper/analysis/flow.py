@@ -10,9 +10,12 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from chainshaper.analysis.assumed import with_assumed_readers, with_assumed_writers
 from chainshaper.analysis.departures import with_departures
-from chainshaper.analysis.instances import callback_instances
+from chainshaper.analysis.instances import (
+    callback_instances,
+    with_assumed_readers,
+    with_assumed_writers,
+)
 from chainshaper.analysis.matching import by_number, latest_before
 from chainshaper.analysis.messages import link_takes, publications, takes
 from chainshaper.analysis.objects import Objects, resolve_objects
@@ -27,7 +30,7 @@ class DataFlow:
 
     * ``objects``: who exists, see :class:`~chainshaper.analysis.objects.Objects`.
     * ``instances``: see :func:`~chainshaper.analysis.instances.callback_instances`, with those
-      that no event shows added (:mod:`~chainshaper.analysis.assumed`). An instance's number is
+      that no event shows added (:mod:`~chainshaper.analysis.instances`). An instance's number is
       its row.
     * ``publications``: see :func:`~chainshaper.analysis.messages.publications`, with the
       ``instance`` in which each was published and its ``callback_id`` (null: outside callbacks),

@@ -2,8 +2,19 @@
 
 An event rarely names what it belongs to. It carries an address, which means whatever was last
 created there, or it belongs to whatever its thread was doing at that moment. Both questions are
-"the latest row before this one with the same key" (or the next after it), an asof join, whose
-cost is linear in the rows once both sides are sorted by time.
+"the latest row before this one with the same key" (or the next after it): an asof join.
+
+Events come sorted by time, so one compiled walk over both tables that remembers the latest row of
+each key is enough. Keys are few (threads, handles) and times many: a lookup stays in the nearest
+cache, and a row costs some ten nanoseconds. Columns are read where they lie
+(:mod:`chainshaper.values.compiled.memory`). A key is a table of three rows (address, bytes per
+value), of which unused ones have 0 bytes. The table of keys has ``slots`` rows, a power of two, of
+(three numbers, whether it is taken, the latest row), and one more whose first number counts them.
+
+The same walk pairs `callback_end` with `callback_start`: an instance ends with the next event of
+the same callback on the same thread, if that is an end. Clocks tick coarsely and simulators
+exactly, so an instance may begin in the nanosecond in which the one before ended (end first), or
+last no time at all (start first): it is the former when one was open before that nanosecond.
 """
 
 from dataclasses import dataclass
@@ -15,8 +26,10 @@ import numpy.typing as npt
 import polars as pl
 
 from chainshaper.values.compiled import kernel
+from chainshaper.values.compiled.memory import compiled, get, load_half, load_word, put, store_word
 
 __all__ = [
+    "KEY_ROW",
     "Keys",
     "by_number",
     "first_after",
@@ -25,9 +38,12 @@ __all__ = [
     "key_table",
     "latest_before",
     "nearest",
+    "place_of",
+    "walk",
+    "walk_pairs",
 ]
 
-_walk = kernel("chainshaper.analysis.asof", "walk")
+_walk = kernel("chainshaper.analysis.matching", "walk")
 _FIRST_SLOTS = 1024
 _MOST_KEYS = 3
 _NONE = 0xFFFFFFFF
@@ -132,7 +148,7 @@ def _by_polars(
 
 
 def key_table(slots: int) -> npt.NDArray[np.int64]:
-    """An empty table of keys, as compiled walks want it (:mod:`~chainshaper.analysis.asof`)."""
+    """An empty table of keys, as compiled walks want it (:mod:`~chainshaper.analysis.matching`)."""
     return np.zeros((slots + 1, 5), np.int64)
 
 
@@ -204,3 +220,158 @@ def by_number(rows: pl.DataFrame, number: str, column: str, height: int) -> pl.S
     """
     values = pl.repeat(None, height, dtype=rows.schema[column], eager=True).alias(column)
     return values.scatter(rows[number], rows[column])
+
+
+# mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
+
+# Kernels take many numbers rather than objects, which are slow to pass.
+# ruff: noqa: PLR0917
+
+
+KEY_ROW = 8 * 5
+LATEST = 4
+NONE = np.uint64(0xFFFFFFFF)
+FULL = -1
+
+
+@compiled(inline=True)
+def number_at(column, row):
+    """A key column's value in a row, whatever its sign."""
+    address, width = get(column, 0), get(column, 1)
+    if width == 8:
+        return np.int64(load_word(address + 8 * row))
+    if width == 4:
+        return np.int64(load_half(address + 4 * row))
+    return np.int64(0)
+
+
+@compiled()
+def place_of(table, slots, columns, row, add):
+    """The address of a row's key in a table; with ``add`` it gets one, 0 once that is half full.
+
+    Without ``add``, 0 for a key that is not there.
+    """
+    first, second = number_at(columns, row), number_at(columns + 16, row)
+    third = number_at(columns + 32, row)
+    mixed = (np.uint64(first) * np.uint64(0x9E3779B97F4A7C15)) ^ (
+        np.uint64(second) * np.uint64(0xC2B2AE3D27D4EB4F)
+    )
+    mixed = (mixed ^ (mixed >> np.uint64(29))) + np.uint64(third) * np.uint64(0x165667B19E3779F9)
+    at = np.int64((mixed >> np.uint64(17)) & np.uint64(slots - 1))
+    place = table + at * KEY_ROW
+    while get(place, 3) != 0:
+        if get(place, 0) == first and get(place, 1) == second and get(place, 2) == third:
+            return place
+        at = (at + 1) & (slots - 1)
+        place = table + at * KEY_ROW
+    count = table + slots * KEY_ROW
+    if add == 0 or 2 * get(count, 0) >= slots:
+        return np.int64(0)
+    put(count, 0, get(count, 0) + 1)
+    put(place, 0, first)
+    put(place, 1, second)
+    put(place, 2, third)
+    put(place, 3, np.int64(1))
+    return place
+
+
+@compiled()
+def walk(left, at, count, right, times, others, step, strictly, found, table, slots):
+    """Fill ``found`` (uint32) with the row of ``right`` that matches each row of ``left``.
+
+    That is the last one at or before it (``step`` 1), or the first one at or after it (``step``
+    −1: the walk begins at the end). ``at`` and ``times`` (int64, ns) ascend, ``left`` and ``right``
+    are their keys. Returns how many rows have none, which NONE stands for, or FULL where ``slots``
+    are too few for all keys.
+    """
+    row, other = (0, 0) if step > 0 else (count - 1, others - 1)
+    missing = 0
+    for _ in range(count):
+        now = get(at, row)
+        while 0 <= other < others and (get(times, other) - now) * step + strictly <= 0:
+            place = place_of(table, slots, right, other, 1)
+            if place == 0:
+                return FULL
+            put(place, LATEST, other)
+            other += step
+        place = place_of(table, slots, left, row, 0)
+        if place == 0:
+            store_word(found + 4 * row, NONE)
+            missing += 1
+        else:
+            store_word(found + 4 * row, np.uint64(get(place, LATEST)))
+        row += step
+    return missing
+
+
+# mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
+
+# Kernels take many numbers rather than objects, which are slow to pass.
+# ruff: noqa: PLR0917
+
+
+# What is kept per key: 1 + the open start, or 0; starts minus ends; the moment of its latest end,
+# and whether it was open before that.
+OPEN, DEPTH, MOMENT, WAS_OPEN = 0, 1, 2, 3
+STATE_ROW = 8 * 4
+
+
+@compiled(inline=True)
+def end_at(place, moment, early, row, found):
+    """Note an end: the ``early`` ones close what was open before this moment, others the rest."""
+    if get(place, MOMENT) != moment:
+        put(place, MOMENT, moment)
+        put(place, WAS_OPEN, np.int64(1) if get(place, DEPTH) > 0 else np.int64(0))
+    if get(place, WAS_OPEN) == early:
+        if get(place, OPEN) > 0:
+            store_word(found + 4 * (get(place, OPEN) - 1), np.uint64(row))
+        put(place, OPEN, np.int64(0))
+        put(place, DEPTH, get(place, DEPTH) - 1)
+
+
+@compiled()
+def walk_ends(ends, first, last, moment, early, found, table, states, slots):
+    """Note the ends [first, last) of a moment; 0, or FULL."""
+    for row in range(first, last):
+        key = place_of(table, slots, ends, row, np.int64(1))
+        if key == 0:
+            return np.int64(FULL)
+        end_at(states + (key - table) // KEY_ROW * STATE_ROW, moment, early, row, found)
+    return np.int64(0)
+
+
+@compiled()
+def walk_pairs(starts, began, start_count, ends, ended, end_count, found, table, states, slots):
+    """For every start write the row of its end to ``found`` (uint32; other rows are left alone).
+
+    ``starts`` and ``ends`` are keys as in :mod:`~chainshaper.analysis.matching`, ``began`` and
+    ``ended`` their ascending times; ``states`` has four zeros for each of the ``slots``. Returns
+    0, or FULL where those are too few for all keys.
+    """
+    i = j = moment = np.int64(0)
+    while i < start_count or j < end_count:
+        now = get(began, i) if i < start_count else get(ended, j)
+        if j < end_count and get(ended, j) < now:
+            now = get(ended, j)
+        next_i, next_j = i, j
+        while next_i < start_count and get(began, next_i) == now:
+            next_i += 1
+        while next_j < end_count and get(ended, next_j) == now:
+            next_j += 1
+        moment += 1
+        # First the ends of what was open before this moment, then starts, then other ends.
+        status = walk_ends(ends, j, next_j, moment, np.int64(1), found, table, states, slots)
+        if status < 0:
+            return status
+        for row in range(i, next_i):
+            key = place_of(table, slots, starts, row, np.int64(1))
+            if key == 0:
+                return np.int64(FULL)
+            place = states + (key - table) // KEY_ROW * STATE_ROW
+            put(place, OPEN, row + 1)
+            put(place, DEPTH, get(place, DEPTH) + 1)
+        status = walk_ends(ends, j, next_j, moment, np.int64(0), found, table, states, slots)
+        if status < 0:
+            return status
+        i, j = next_i, next_j
+    return np.int64(0)

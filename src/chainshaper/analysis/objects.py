@@ -1,13 +1,15 @@
 """Who exists: nodes, publishers, subscriptions, timers, services and their callbacks.
 
 Events name objects by handles: addresses that are unique only within one process, and only until
-they are freed. The same number may stand for another object later, in the same process or in
-one that got the old process's number. So a handle is looked up as (process, handle, time): the
-object created there last, at or before the event.
+they are freed. So a handle is looked up as (process, handle, time): the object created there last,
+at or before the event. A subscription that is destroyed and created again gets another address,
+one with intra-process communication has two at once: in a graph and in statistics each is one
+callback, with one ``callback_id`` (:func:`numbered`). Two timers of one node with the same period
+are two, however alike they look.
 
-Handles that were never initialised are nobody's: `ros_discovery_info` is published and taken
-under such (Cyclone DDS), as is everything that existed before tracing began. What cannot be
-known because of that is said in words in ``notes``.
+Handles that were never initialised belong to no object: `ros_discovery_info` is published and
+taken under such (Cyclone DDS), as is everything that existed before tracing began. ``notes`` says
+in words what cannot be known because of that.
 
 Upstream: ros2_tracing, `tracetools/include/tracetools/tracetools.h`; the order of the events is
 that of rclcpp's constructors.
@@ -17,11 +19,17 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from chainshaper.analysis.identity import numbered
 from chainshaper.analysis.matching import first_after, latest_before, nearest
 from chainshaper.values import events
 
-__all__ = ["CALLBACK_SCHEMA", "INTERNAL_TOPICS", "Objects", "named_nodes", "resolve_objects"]
+__all__ = [
+    "CALLBACK_SCHEMA",
+    "INTERNAL_TOPICS",
+    "Objects",
+    "named_nodes",
+    "numbered",
+    "resolve_objects",
+]
 
 INTERNAL_TOPICS = frozenset(("/parameter_events", "/rosout", "/clock", "/_chainshaper_rehearsal"))
 """Topics that every node has for itself, or every shaping node: they connect no computation."""
@@ -352,3 +360,57 @@ def _notes(tables: events.EventTables, callbacks: pl.DataFrame) -> tuple[str, ..
             "counted as its output."
         )
     return tuple(notes)
+
+
+def numbered(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFrame:
+    """Add ``callback_id``: registrations of what is the same callback to a person share one.
+
+    Two registrations are one callback when they belong to the same subscription (intra-process
+    twins), or when node, kind, topic, period and symbol agree and the first was done before the
+    second began: its address was reused, or its last instance started before.
+    """
+    missing = pl.format("unknown (process {})", "pid")
+    callbacks = callbacks.sort("valid_from", "handle", maintain_order=True).with_columns(
+        named=pl.col("node").is_not_null(), node=pl.col("node").fill_null(missing)
+    )
+    identity = ["pid", "kind", "node", "topic", "period_ns", "symbol"]
+    last_start = _last_starts(tables, callbacks, identity)
+    latest: dict[tuple[object, ...], tuple[int, int]] = {}  # identity → (id, row) seen last
+    of_subscription: dict[int, int] = {}
+    ids: list[int] = []
+    count = 0
+    columns = [*identity, "subscription", "valid_from", "valid_to", "named"]
+    for row, values in enumerate(callbacks.select(columns).iter_rows()):
+        *key, subscription, valid_from, _, named = values
+        found = of_subscription.get(subscription)
+        if found is None and named and tuple(key) in latest:
+            previous, at = latest[tuple(key)]
+            freed = callbacks["valid_to"][at]
+            ended = last_start.get(at)
+            if (freed is not None and freed <= valid_from) or (
+                ended is not None and ended < valid_from
+            ):
+                found = previous
+        number = count if found is None else found
+        count = max(count, number + 1)
+        ids.append(number)
+        latest[tuple(key)] = (number, row)
+        if subscription is not None:
+            of_subscription.setdefault(subscription, number)
+    return callbacks.drop("named").with_columns(pl.Series("callback_id", ids, dtype=pl.UInt32))
+
+
+def _last_starts(
+    tables: events.EventTables, callbacks: pl.DataFrame, identity: list[str]
+) -> dict[int, int]:
+    """Row of a registration → time of its last instance, for those that look alike."""
+    alike = callbacks.with_row_index("row").filter(pl.len().over(identity) > 1)
+    if alike.is_empty():
+        return {}
+    handles = alike.select("pid", callback="handle").unique()
+    starts = events.table(tables, "callback_start").select("time", "pid", "callback")
+    starts = starts.join(handles, on=["pid", "callback"], how="semi")
+    owner = alike.select("row", "valid_from", "pid", callback="handle")
+    found = latest_before(starts, owner, ["pid", "callback"], "time", "valid_from")
+    last = found.drop_nulls("row").group_by("row").agg(pl.col("time").max())
+    return dict(last.select("row", "time").iter_rows())

@@ -20,6 +20,9 @@ the same start; two messages that go into one publication are two traversals wit
 chain's first topic begins no traversal: callbacks may publish on a condition, and no data flowed
 that could be late. They are counted in ``silent``. Further down, where data had arrived, an
 instance that publishes nothing leaves its traversal incomplete.
+
+**Reception.** The latency ends at the publication; the node that acts on the output subscribes to
+it, and its callback starts later: after transport, and after whatever else its executor is doing.
 """
 
 from dataclasses import dataclass
@@ -33,7 +36,7 @@ from chainshaper.analysis.matching import by_number, first_after, in_order
 from chainshaper.analysis.messages import overwritten_in
 from chainshaper.values.application import ApplicationGraph, Callback, Chain
 
-__all__ = ["REASONS", "Traversals", "traverse"]
+__all__ = ["REASONS", "Traversals", "reception", "traverse"]
 
 REASONS: dict[str, str] = {
     "lost": "published, but never taken, though a later message of the topic was",
@@ -335,3 +338,35 @@ def _published_at(flow: DataFlow, hop: int, chain: Chain) -> pl.Expr:
     put = _looked_up(flow.publications, "intra_time", f"publication_{hop}")
     through_buffer = _looked_up(flow.takes, "intra_process", f"take_{hop + 1}")
     return pl.when(through_buffer).then(put).otherwise(time)
+
+
+def reception(
+    flow: DataFlow, traversals: Traversals, graph: ApplicationGraph, node: str | None = None
+) -> pl.DataFrame:
+    """When a callback of the output's subscriber started with each traversal's message.
+
+    One row per traversal, in order: ``traversal``, ``received`` (start of the callback instance
+    that took the output, null if there is none) and ``reception_ns`` (from the traversal's
+    start). The subscriber is that of ``node``, by default the first subscription callback of the
+    last topic that received anything at all.
+    """
+    topic = traversals.chain.topics[-1]
+    candidates = [
+        callback.id
+        for callback in graph.callbacks
+        if callback.kind == "subscription"
+        and callback.topic == topic
+        and node in {None, callback.node}
+    ]
+    taken = flow.takes.filter(
+        pl.col("callback_id").is_in(candidates)
+        & pl.col("publication").is_not_null()
+        & pl.col("instance").is_not_null()
+    ).select("callback_id", "publication", "instance")
+    taken = taken.filter(pl.col("callback_id") == pl.col("callback_id").min())
+    # Of several takes the first: what is laid out last stays.
+    reader = by_number(taken.reverse(), "publication", "instance", flow.publications.height)
+    received = flow.instances["start"].gather(reader.gather(traversals.frame["publication"]))
+    return traversals.frame.select(
+        "traversal", received=received, reception_ns=received - pl.col("start")
+    )

@@ -19,7 +19,7 @@ from chainshaper.analysis import (
     graph_of,
     load_named_paths,
 )
-from chainshaper.analysis.close_names import close_names
+from chainshaper.analysis.chains import close_names
 from chainshaper.analysis.matching import latest_before
 from chainshaper.analysis.objects import named_nodes
 from chainshaper.sources import open_source

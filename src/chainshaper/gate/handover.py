@@ -55,6 +55,13 @@ FIELDS = (
     "bypassing_since_ns",  # 0: a shaping node is in force
     "bypassed",  # how many messages the standby has dealt with: so many are in its ring
     "bypassed_before",  # how many of these before the present time without a shaping node
+    "published",  # how many messages shaping nodes have published
+    "replaced",  # how many they have dropped, for each of the gate's reasons
+    "surplus",
+    "overflowed",
+    "discarded",
+    "lost_by_dds",  # how many are missing in what they have received
+    "late",  # how many came behind the last slot that they were due in
 )
 """Numbers of 8 bytes at the beginning of a page, in this order."""
 
@@ -320,6 +327,15 @@ class Turn:
     def drop(self, key: int | None) -> None:
         """A message that was received has no room any more, and is never published."""
         self.page.note(key, bypassed=False)
+
+    def count(self, dropped: str | None, lost: int | None, *, late: bool) -> None:
+        """A message has been published, or was ``dropped`` for that reason of the gate.
+
+        ``lost`` are those that are missing before it (None: not known).
+        """
+        self.page[dropped or "published"] += 1
+        self.page["lost_by_dds"] += lost or 0
+        self.page["late"] += late
 
     def _come_into_force(self, key: int | None) -> bool:
         give_up = time.monotonic_ns() + self.GIVE_UP_NS

@@ -27,13 +27,16 @@ __all__ = [
     "enter_own_group",
     "has_unseen_threads",
     "leave_own_group",
+    "make_moves_quick",
     "make_threaded_child",
     "mount_options",
     "mount_point",
     "move_thread",
     "moves_are_quick",
+    "options_before_ours",
     "remount",
     "remove_own_group",
+    "restore_mount",
     "threads_in",
 ]
 
@@ -44,6 +47,12 @@ QUICK_MOVES = "favordynmods"
 Without it whoever moves a process to another group (a service manager, a container engine) waits
 for a grace period of RCU, which is 10 to 30 ms, and holds meanwhile what freezing needs as well:
 a slot opens so much later. Forks and exits become a little slower with it.
+"""
+_BEFORE = "trusted.chainshaper.mount"
+"""Attribute of the hierarchy's root: its mount options before a run of ours changed them.
+
+A journal says the same, but may be lost, and the option then looks like another program's. The
+attribute is in the kernel's memory, as the option is, so it lasts as long.
 """
 _REMOUNT = 32
 _MOUNT_FLAGS = {
@@ -98,6 +107,37 @@ def remount(options: str) -> None:
     own = ",".join(name for name in names if name not in _MOUNT_FLAGS)
     folder = os.fsencode(mount_point())
     ctypes.CDLL(None).mount(b"none", folder, b"cgroup2", ctypes.c_ulong(flags), own.encode())
+
+
+def options_before_ours() -> str | None:
+    """The mount options that a run which begins now has to restore when it ends.
+
+    Those of now; where a run of ours has set :data:`QUICK_MOVES` and not restored yet, those that
+    it found. None: another program has set it, so it stays.
+    """
+    options = mount_options()
+    return options if QUICK_MOVES not in options.split(",") else _noted_options()
+
+
+def make_moves_quick(before: str) -> None:
+    """Have the hierarchy mounted with :data:`QUICK_MOVES` besides the options ``before``."""
+    with contextlib.suppress(OSError):  # without the privilege there is no remounting either
+        os.setxattr(mount_point(), _BEFORE, before.encode())
+    remount(f"{before},{QUICK_MOVES}")
+
+
+def restore_mount(before: str) -> None:
+    """Undo :func:`make_moves_quick`; harmless when repeated."""
+    if moves_are_quick():
+        remount(before)
+    with contextlib.suppress(OSError):  # it is gone already
+        os.removexattr(mount_point(), _BEFORE)
+
+
+def _noted_options() -> str | None:
+    with contextlib.suppress(OSError):
+        return os.getxattr(mount_point(), _BEFORE).decode()
+    return None
 
 
 def _mount() -> tuple[Path, str]:

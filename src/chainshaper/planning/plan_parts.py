@@ -173,8 +173,8 @@ class ShapingNode(Part):
     the chain's own output (`chain.publisher`), where it is known. ``receivers`` are nodes that
     subscribe to the output: while the plan is in force their executors run under SCHED_FIFO below
     all servers, so that what comes in time is taken in time. ``depth`` is how many messages may
-    wait in it; None: as many as the histories of the output's publisher and subscribers have room
-    for, as far as they are known, and 10 at least.
+    wait in it; None: as many as the history of the output's publisher has room for, as far as that
+    is known, and 10 at least. The histories of its subscribers do not count.
     """
 
     name: Annotated[str, AfterValidator(_node_name)]

@@ -5,7 +5,7 @@ of one writer in order). Optionally a DDS thread of the subscriber's process wor
 A history keeps the last ``depth`` messages: a newer one overwrites the oldest.
 
 An asynchronous publisher hands its message to the publisher thread of its process. Its own
-history keeps those that are not sent yet; see :mod:`chainshaper.workload.asynchronous`.
+history keeps those that are not sent yet; see :mod:`chainshaper.workload.executor`.
 """
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False

@@ -20,8 +20,12 @@ from chainshaper.sources import open_source
 from chainshaper.values import events
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
-from chainshaper.workload.description import Application, CallbackDescription
-from chainshaper.workload.distributions import ExecutionTime, SimulationDescription
+from chainshaper.workload.description import (
+    Application,
+    CallbackDescription,
+    ExecutionTime,
+    SimulationDescription,
+)
 
 __all__ = ["measured_costs", "with_recorded_times"]
 

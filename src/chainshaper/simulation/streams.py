@@ -6,7 +6,7 @@ import numpy as np
 
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.layout import Int64s, Machine
-from chainshaper.workload.distributions import ExecutionTime
+from chainshaper.workload.description import ExecutionTime
 from chainshaper.workload.execution import BLOCK, blocks
 
 __all__ = ["Streams"]

@@ -13,7 +13,7 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
-from chainshaper.analysis.close_names import close_names
+from chainshaper.analysis.chains import close_names
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
 __all__ = [

@@ -14,6 +14,7 @@ from typing import Literal, TypeAlias
 
 from pydantic import TypeAdapter, ValidationError
 
+from chainshaper.gate.decision import DROPPED
 from chainshaper.gate.handover import Page, page_folders
 from chainshaper.values.durations import format_duration
 from chainshaper.values.yaml_file import FullName
@@ -32,6 +33,9 @@ class ShapedOutput:
     when one is, but nothing would stand in for it. ``since_ns`` (CLOCK_MONOTONIC) is since when it
     is bypassed or silent, with how many ``messages``; ``messages_in_all`` counts since the machine
     has booted. The processes are None where there is none. ``starts`` counts those of the node.
+
+    Shaping nodes have ``published`` so many since then, and ``lost`` so many, by reason; of both,
+    ``late`` came behind the last slot that they were due in.
     """
 
     topic: str
@@ -42,6 +46,9 @@ class ShapedOutput:
     messages: int
     messages_in_all: int
     starts: int
+    published: int
+    lost: dict[str, int]
+    late: int
     page: str
 
 
@@ -64,7 +71,14 @@ def find_outputs(folders: Iterator[str] | None = None) -> tuple[ShapedOutput, ..
 
 
 def output_text(output: ShapedOutput) -> str:
-    """The state of an output in a line."""
+    """The state of an output in a line, with what the gate has counted."""
+    counted = f"{output.published} messages published, {output.late} late"
+    lost = "".join(f", {count} {why}" for why, count in output.lost.items())
+    state = _state_text(output)
+    return f"{state}; so far {counted}{lost}" if output.published or lost else state
+
+
+def _state_text(output: ShapedOutput) -> str:
     if output.state == "shaped":
         return f"{output.topic} is shaped by process {output.shaping_node}"
     if output.state == "no standby":
@@ -106,6 +120,13 @@ def _looked_at(page: Page) -> ShapedOutput | None:
             messages=page["bypassed"] - page["bypassed_before"] if since else 0,
             messages_in_all=page["bypassed"],
             starts=page["starts"],
+            published=page["published"],
+            lost={
+                why: count
+                for why in (*DROPPED, "lost by DDS")
+                if (count := page[why.replace(" ", "_").lower()])
+            },
+            late=page["late"],
             page=page.path,
         )
     finally:

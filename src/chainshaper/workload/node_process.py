@@ -23,12 +23,18 @@ from chainshaper.linux.scheduling import (
     stop_garbage_collection,
 )
 from chainshaper.workload import dds, protocol
-from chainshaper.workload.asynchronous import AsynchronousWriter, PublisherThread, noting_sends
 from chainshaper.workload.computing import Work, computing, load_function, spending
 from chainshaper.workload.event_log import ABSENT, LAYOUT, EventLog, number_of
 from chainshaper.workload.execution import ExecutionTimes
-from chainshaper.workload.executor import Executor, SubscriptionEntity, Timer
-from chainshaper.workload.synchronising import Synchroniser
+from chainshaper.workload.executor import (
+    AsynchronousWriter,
+    Executor,
+    PublisherThread,
+    SubscriptionEntity,
+    Synchroniser,
+    Timer,
+    noting_sends,
+)
 
 __all__ = ["NodeProcess", "main"]
 

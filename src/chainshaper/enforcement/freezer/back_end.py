@@ -89,7 +89,7 @@ class Freezer:
         self._dispatchers: dict[int, subprocess.Popen[str]] = {}
         self._ends: dict[int, str] = {}
         self._page, page, self._memory = create_page(table)
-        mounts = None if cgroups.moves_are_quick() else cgroups.mount_options()
+        mounts = cgroups.options_before_ours()
         pid = os.getpid()
         self._run = FreezerRun((pid, start_of(pid, pid) or 0), table, page, mounts)
         try:
@@ -98,7 +98,7 @@ class Freezer:
                 self._dispatchers[core] = self._start_dispatcher(core)
             self._wait_until_running()
             if mounts is not None:
-                cgroups.remount(f"{mounts},{cgroups.QUICK_MOVES}")
+                cgroups.make_moves_quick(mounts)
         except BaseException:
             self._end()
             raise

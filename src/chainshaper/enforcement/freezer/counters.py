@@ -7,10 +7,11 @@ reached through the owner's descriptors for as long as the owner lives. All numb
 integers in the machine's order, each written by one kind of process only:
 
     the owner    released
-    per core     beats, acknowledged, real time, and (by guardians) silent
+    per core     beats, acknowledged, real time, and (by guardians) let go (ns), silent
     per server   slots, late entries, longest lateness (ns), overruns, groups lost
 
 ``beats`` moves as long as its process does; one that did not for too long was ``silent``.
+A guardian that thaws the threads of one that is still for a moment says when it has: ``let go``.
 ``acknowledged`` is the number of the last command that a dispatcher has carried out. Servers that
 are ``released`` need no dispatcher any more. Overruns of -1 cannot be known here.
 """
@@ -33,8 +34,9 @@ class _Core(ctypes.Structure):
     beats: int
     acknowledged: int
     real_time: int
+    let_go: int
     silent: int
-    _fields_ = _numbers("beats", "acknowledged", "real_time", "silent")
+    _fields_ = _numbers("beats", "acknowledged", "real_time", "let_go", "silent")
 
 
 class _Server(ctypes.Structure):

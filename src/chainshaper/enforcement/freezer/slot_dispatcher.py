@@ -87,6 +87,7 @@ class Dispatcher:
         self.ahead: Iterator[tuple[int, Boundary]] = iter(())
         self.unexamined: set[int] = set()
         self.last_tick = self.last_sign = time.monotonic_ns()
+        self.let_go = self.own.let_go
         self.owner = owner
 
     def run(self) -> None:
@@ -185,12 +186,18 @@ class Dispatcher:
         self._obey()
 
     def _give_sign(self, now: int) -> None:
-        """Show that we live. After long without that, a guardian has thawed what we closed."""
+        """Show that we live. What a guardian has thawed meanwhile, we close again.
+
+        That is so after long without a sign. Of two guardians the other may thaw after we are back:
+        each says so when it has done it.
+        """
         self.own.beats += 1
-        if now - self.last_sign > _THAWED_AFTER_NS and self.open is not None:
+        let_go = self.own.let_go
+        thawed = let_go != self.let_go or now - self.last_sign > _THAWED_AFTER_NS
+        if thawed and self.open is not None:
             for server in sorted(set(range(len(self.groups))) - self.open):
                 self._write(server, b"1")
-        self.last_sign = now
+        self.last_sign, self.let_go = now, let_go
 
     def _examine(self) -> None:
         """Count overruns of servers that have closed, as soon as their threads have stopped."""

@@ -22,7 +22,8 @@ from chainshaper.linux.cgroups import (
     has_unseen_threads,
     mount_point,
     moves_are_quick,
-    remount,
+    options_before_ours,
+    restore_mount,
 )
 from chainshaper.linux.threads import has_ended, start_of
 from chainshaper.values.errors import PlatformError
@@ -36,6 +37,7 @@ __all__ = [
     "note_freezer",
     "read_run",
     "restore",
+    "restore_stray_mount",
     "run_of",
     "stray_groups",
     "thaw",
@@ -144,9 +146,18 @@ def restore(run: FreezerRun | None) -> tuple[str, ...]:
     thaw(groups)
     left = tuple(why for folder in groups if (why := dissolve(folder)) is not None)
     before = None if run is None else run.mount_options
-    if before is not None and moves_are_quick():
-        remount(before)
+    if before is not None:
+        restore_mount(before)
     return left
+
+
+def restore_stray_mount() -> None:
+    """Mount the hierarchy as it was before a run whose journal is gone, if no group is in use."""
+    with contextlib.suppress(PlatformError):
+        in_use = not moves_are_quick() or _groups(lambda _: True)
+        before = None if in_use else options_before_ours()
+        if before is not None:
+            restore_mount(before)
 
 
 def _groups(wanted: Callable[["re.Match[str]"], bool]) -> tuple[Path, ...]:

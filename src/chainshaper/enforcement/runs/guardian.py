@@ -25,6 +25,7 @@ import select
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -46,7 +47,7 @@ from chainshaper.linux.own_processes import module_command, what_happened
 from chainshaper.linux.scheduling import set_thread_name
 from chainshaper.values.errors import OperationError
 
-__all__ = ["Guardians", "run_claimed", "start_guardians"]
+__all__ = ["Guardians", "let_go", "run_claimed", "start_guardians"]
 
 HOW_MANY = 2
 PRIORITY = 98
@@ -248,15 +249,20 @@ class _Watch:
             if beats == 0:
                 continue  # it starts; the owner waits for it
             if self.still[core] == LOOKS_UNTIL_THAWED:
-                self.let_go(core)
+                let_go(self.journal, page, core)
             if self.still[core] >= LOOKS_UNTIL_HUNG:
                 page.cores[core].silent = 1
                 return True
         return False
 
-    def let_go(self, core: int) -> None:
-        """Thaw the threads of all servers of a core; they stay in their groups."""
-        thaw(groups_of(run_of(self.journal), core))
+
+def let_go(journal: Journal, page: CounterPage, core: int) -> None:
+    """Thaw the threads of all servers of a core; they stay in their groups.
+
+    The dispatcher may be back by then, and have closed them: it has to know.
+    """
+    thaw(groups_of(run_of(journal), core))
+    page.cores[core].let_go = time.monotonic_ns()
 
 
 def main() -> None:

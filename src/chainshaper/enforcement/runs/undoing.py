@@ -133,8 +133,9 @@ def remove_run(journal: Journal) -> None:
 def release_strays(journals: Iterable[Journal]) -> tuple[tuple[Path, ...], tuple[str, ...]]:
     """Dissolve cgroups of ours of which none of these journals speaks, and whose owner has ended.
 
-    Their threads run again, where they were. Returns the groups that are gone, and what could not
-    be put back, since nothing says any more what was there.
+    Their threads run again, where they were, and the hierarchy is mounted as before. Returns the
+    groups that are gone, and what could not be put back, since nothing says any more what was
+    there.
     """
     gone, left = [], []
     for folder in freezer.stray_groups(journals):
@@ -145,6 +146,7 @@ def release_strays(journals: Iterable[Journal]) -> tuple[tuple[Path, ...], tuple
         else:
             left.append(why)
         left += [said for tid in tids if (said := _class_text(tid)) is not None]
+    freezer.restore_stray_mount()
     if left and cgroups.moves_are_quick():
         left.append(
             f"{cgroups.mount_point()} is mounted with {cgroups.QUICK_MOVES}, perhaps by that run: "

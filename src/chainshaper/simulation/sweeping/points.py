@@ -15,7 +15,7 @@ import numpy as np
 import polars as pl
 
 from chainshaper.analysis import latency_statistics
-from chainshaper.analysis.statistics import PERCENTILES
+from chainshaper.analysis.latency import PERCENTILES
 from chainshaper.flow.steps import profile_chains
 from chainshaper.planning import Plan, Profile, plan_chain, publish_slots
 from chainshaper.planning.overruns import cycles_until_output

@@ -19,7 +19,7 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from rclpy.subscription import Subscription
 from std_msgs.msg import String
 
-from chainshaper.gate.decision import Gate, Modes, Release, Shaper
+from chainshaper.gate.decision import Gate, Held, Modes, Release, Shaper
 from chainshaper.gate.handover import Turn
 from chainshaper.splicing.nodes.python.callback_events import create_subscription
 from chainshaper.splicing.nodes.python.endpoints import (
@@ -213,7 +213,7 @@ class Shaping:
         served = False
         while rclpy.ok():
             for gone in overflowed:
-                self._log.write(gone)
+                self._note(gone)
             overflowed.clear()
             if not waiting or (served and self._shaper.nothing_due()):
                 break
@@ -255,9 +255,16 @@ class Shaping:
         elif turn is not None:
             turn.done(key)
         self._readiness.relax()
-        self._log.write(held, published, stalled)
+        self._note(held, published, stalled)
         if not self._shaper.queue.waiting:
             gc.collect()  # here is time for it; all that is older is frozen
+
+    def _note(self, held: Held, published: int | None = None, stalled: int | None = None) -> None:
+        """Note what became of a message: in the log, and for the standby and `status`."""
+        self._log.write(held, published, stalled)
+        if self._turn is not None:
+            late = held.release.overrun is not None
+            self._turn.count(held.dropped, held.message.lost, late=late)
 
     def _shape_uninformed(self, payload: bytes) -> None:
         self._shape(payload, {})

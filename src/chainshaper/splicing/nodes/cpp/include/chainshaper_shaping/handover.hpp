@@ -12,6 +12,7 @@
 #include <unistd.h>
 
 #include <algorithm>
+#include <array>
 #include <cerrno>
 #include <cstdint>
 #include <cstdlib>
@@ -22,6 +23,7 @@
 #include <string>
 #include <vector>
 
+#include "gate.hpp"
 #include "shaper.hpp"
 
 namespace chainshaper
@@ -31,7 +33,8 @@ namespace chainshaper
 enum class Field
 {
   holder, taken, first, acknowledged, until_ns, released, phase_ns, phase_known, mode, started_ns,
-  failed_starts, starts, standby, listening, silent, bypassing_since_ns, bypassed, bypassed_before
+  failed_starts, starts, standby, listening, silent, bypassing_since_ns, bypassed, bypassed_before,
+  published, replaced, surplus, overflowed, discarded, lost_by_dds, late
 };
 
 class Page
@@ -79,7 +82,7 @@ public:
 
   std::int64_t get(Field field) const {return read(static_cast<std::size_t>(field));}
   void set(Field field, std::int64_t value) {write(static_cast<std::size_t>(field), value);}
-  void add(Field field) {set(field, get(field) + 1);}
+  void add(Field field, std::int64_t more = 1) {set(field, get(field) + more);}
 
   bool lock() {return locks(publishing);}
 
@@ -336,6 +339,16 @@ public:
 
   // A message that was received has no room any more, and is never published.
   void drop(std::int64_t key) {page_->note_released(key);}
+
+  // A message has been published, or was dropped; so many were missing before it.
+  void count(std::optional<Dropped> dropped, std::optional<std::int64_t> lost, bool late)
+  {
+    constexpr std::array<Field, dropped_names.size()> reasons{
+      Field::replaced, Field::surplus, Field::overflowed, Field::discarded};
+    page_->add(dropped ? reasons[static_cast<std::size_t>(*dropped)] : Field::published);
+    page_->add(Field::lost_by_dds, lost.value_or(0));
+    page_->add(Field::late, late ? 1 : 0);
+  }
 
 private:
   static constexpr std::int64_t at_once_ns = 30'000'000'000;

@@ -501,6 +501,9 @@ private:
     std::optional<std::int64_t> stalled_ns = {})
   {
     log_.write(shaper_.queue.gate, held, published_ns, stalled_ns);
+    if (turn_) {
+      turn_->count(held.dropped, held.waiting.lost, held.release.overrun.has_value());
+    }
     const std::int64_t now = monotonic_ns();
     if (said_ns_ != 0 && now - said_ns_ < 10'000'000'000) {
       return;
