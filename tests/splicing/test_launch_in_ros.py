@@ -244,7 +244,7 @@ def test_a_launch_that_redirects_what_is_meant_goes_on(
 ) -> None:
     prefixes = environment["AMENT_PREFIX_PATH"].split(os.pathsep)
     if "TALKER" in actions and not any((Path(p) / "share/composition").is_dir() for p in prefixes):
-        pytest.skip("ROS 2's package composition is not installed")
+        pytest.skip("the package composition is not installed in this ROS 2")
     code, said = launched(actions, publisher)
     assert f"/pose of {publisher} is redirected: /pose_tmp" in said, said
     assert code == 0, said

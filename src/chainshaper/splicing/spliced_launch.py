@@ -21,6 +21,7 @@ from pprint import pformat
 from typing import Any
 
 from chainshaper.splicing import redirection
+from chainshaper.splicing.redirection import Redirect
 from chainshaper.splicing.shaping_process import RESPAWN, ShapingProcess
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.whole_file import open_to_all
@@ -49,8 +50,8 @@ _WITH_VALUE = ("--launch-prefix", "--launch-prefix-filter")
 _SIGNS = {
     ".py": "generate_launch_description",
     ".xml": "<launch",
-    ".yaml": r"(?m)^['\"{]*launch\b",
-    ".yml": r"(?m)^['\"{]*launch\b",
+    ".yaml": r"(?m)^[\s'\"{]*launch\b",
+    ".yml": r"(?m)^[\s'\"{]*launch\b",
     ".launch": "launch",
 }
 """What the text of a launch file has in it, by the end of its name."""
@@ -178,7 +179,7 @@ def launch_file_name(words: Sequence[str]) -> str:
 def launch_text(
     words: Sequence[str],
     processes: Sequence[ShapingProcess],
-    redirects: Sequence[redirection.Redirect],
+    redirects: Sequence[Redirect],
 ) -> str:
     """The text of the launch file that starts processes and includes launch files.
 
