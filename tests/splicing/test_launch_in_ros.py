@@ -149,7 +149,7 @@ def test_a_dry_run_fails_where_nothing_would_be_redirected_or_too_much(
     node = '<node pkg="l" exec="n" name="{}"/>'
     arguments = ("splice", plan, robot, "-o", tmp_path / "out", "--dry-run")
     for names, said in {
-        ("icp", "player"): "no node /ndt was started, only /icp, /player",
+        ("icp", "player"): "no node /ndt runs; started were /icp, /player",
         ("ndt", "ndt"): "more was redirected than meant: /ndt was started more than once",
     }.items():
         robot.write_text(f"<launch>{''.join(map(node.format, names))}</launch>")
@@ -255,8 +255,8 @@ def test_a_launch_that_redirects_what_is_meant_goes_on(
     [
         (
             "Node(name='icp', **MORE)",
-            "/pose: nothing was redirected: no node /ndt was started, only /icp. Publishers found: "
-            "of /pose /icp; of /pose_tmp none.",
+            "/pose: nothing was redirected: no node /ndt runs; started were /icp. Publishers "
+            "found: of /pose /icp; of /pose_tmp none.",
         ),
         (
             "Node(name='ndt', **MORE), Node(name='ndt', **MORE)",

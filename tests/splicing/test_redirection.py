@@ -172,8 +172,8 @@ UNNAMED = "n --ros-args"
         ([NAMED], ["/shaping"], ["/ndt"], None),
         ([NAMED], ["/shaping", "/standby"], [], None),  # it may publish later
         ([UNNAMED], [], ["/ndt"], None),
-        ([UNNAMED], [], [], "nothing was redirected: no node /ndt was started, only an unnamed"),
-        ([], ["/icp"], [], "nothing was redirected: no node /ndt was started, only none"),
+        ([UNNAMED], [], [], "nothing was redirected: no node /ndt runs; started were an unnamed"),
+        ([], ["/icp"], [], "nothing was redirected: no node /ndt runs; started were none"),
         ([f"{NAMED} -r /pose:=/x"], [], [], "nothing was redirected: /ndt has another topic"),
         ([NAMED], ["/icp"], ["/ndt"], "/icp publishes it past /shaping, /standby"),
         ([NAMED], [], ["/ndt", "/icp"], "more was redirected than meant: /icp publishes /pose_tmp"),
@@ -192,6 +192,11 @@ def test_anybody_may_subscribe_to_a_throttled_topic() -> None:
     assert redirect.mistake(["/icp"], ["/ndt", "/icp"]) == "/icp subscribes to it past " + (
         "/shaping, /standby"
     )
+
+
+def test_a_node_that_has_ended_is_redirected_no_more() -> None:
+    redirect = started(pose(), NAMED, ended=True)
+    assert (redirect.mistake([], []) or "").startswith("nothing was redirected: no node /ndt runs")
 
 
 def test_a_node_is_redirected_once_unless_it_has_ended() -> None:

@@ -118,16 +118,16 @@ class Redirect:
     def mistake(self, on_topic: Sequence[str], on_target: Sequence[str]) -> str | None:
         """What is wrong with who has the topic and who the target, in words, if anything is.
 
-        A node that launch has started under its name need not have the target yet.
+        A node that launch runs under its name need not have the target yet.
         """
-        known = {*on_target, *(one.node for one in self.started if one.named)}
+        known = {*on_target, *(one.node for one in self.started if one.named and one.runs)}
         lacking = [node for node in self.nodes if node not in known]
         elsewhere = [node for node in lacking if node in self.elsewhere]
         if elsewhere:
             return f"nothing was redirected: {_names(elsewhere)} has another topic in place of it"
         if lacking:
             others = _names(self.others)
-            return f"nothing was redirected: no node {_names(lacking)} was started, only {others}"
+            return f"nothing was redirected: no node {_names(lacking)} runs; started were {others}"
         if self.kind == "subscription":
             past = [one for one in on_topic if one in self.nodes]
             return f"{_names(past)} subscribes to it past {_names(self.added)}" if past else None
