@@ -231,65 +231,8 @@ def axes(chance: random.Random, folder: Path, recording: Recording) -> Arguments
             "--workers", "1")  # fmt: skip
 
 
-LAUNCH_XML = """<launch>
-  <arg name="pose" default="/pose"/>
-  <let name="twice" value="$(var pose)_$(env HOME x)"/>
-  <group scoped="true" if="$(var pose)">
-    <push_ros_namespace namespace="/robot"/>
-    <set_remap from="/a" to="/b"/>
-    <node pkg="l" exec="n" name="third" args="-r /c:=/d"><remap from="out" to="/t3"/></node>
-  </group>
-  <include file="$(dirname)/other.launch.yaml"><arg name="x" value="1"/></include>
-</launch>
-"""
-LAUNCH_YAML = """launch:
-- arg: {name: pose, default: /pose}
-- group:
-    - push_ros_namespace: {namespace: /robot}
-    - node: {pkg: l, exec: n, name: third, remap: [{from: out, to: /t3}]}
-- include: {file: $(dirname)/other.launch.py}
-"""
-LAUNCH_PYTHON = """import os
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, GroupAction
-from launch_ros.actions import Node
-def generate_launch_description():
-    names = ['third', 'fourth']
-    made = [Node(package='l', executable='n', name=name) for name in names[:1]]
-    for number in range(3):
-        made.append(Node(package='l', executable='n', name='n%d' % number))
-    return LaunchDescription([
-        DeclareLaunchArgument('pose', default_value=os.path.join('/a', 'b')),
-        GroupAction(made),
-    ])
-"""
-
-
-def launch_files(
-    chance: random.Random, folder: Path, recording: Recording, plan: Plan
-) -> Arguments:
-    """Launch files in three languages."""
-    texts = {"xml": LAUNCH_XML, "yaml": LAUNCH_YAML, "py": LAUNCH_PYTHON}
-    damaged = chance.choice([*texts])
-    for ending, text in texts.items():
-        file = folder / f"other.launch.{ending}"
-        file.write_text(text)
-        if ending == damaged:
-            if chance.random() < 0.7:
-                words = re.findall(r"[\w/$()]+|\W", text)
-                for _ in range(chance.choice([1, 1, 2, 4])):
-                    words[chance.randrange(len(words))] = chance.choice([*words, *SCALARS, ""])
-                file.write_bytes("".join(words).encode("utf-8", "surrogateescape"))
-            else:
-                _damaged_bytes(chance, file)
-    (folder / "plan.yaml").write_text(dump_plan(plan))
-    first = folder / f"other.launch.{damaged}"
-    return ("splice", folder / "plan.yaml", first, "-o", folder / "out")
-
-
 KINDS: tuple[Callable[..., Arguments], ...] = (
     bytes_of_tables, columns_of_tables, facts_of_recordings, traces, applications, plans, axes,
-    launch_files,
 )  # fmt: skip
 
 
@@ -316,8 +259,7 @@ def test_whatever_is_damaged_there_is_a_result_or_one_message(
     for number in range(FIRST, FIRST + CASES):
         with _case(kind.__name__, number, tmp_path / str(number)) as folder:
             chance = random.Random(f"{kind.__name__} {number}")
-            needs_plan = kind in (plans, launch_files)
-            arguments = kind(chance, folder, recording, *([plan] if needs_plan else []))
+            arguments = kind(chance, folder, recording, *([plan] if kind is plans else []))
             started = time.monotonic()
             finished = called(*arguments)
             assert time.monotonic() - started < SECONDS, arguments

@@ -194,8 +194,8 @@ def test_pictures_and_pages_are_well_formed(recording: Recording, folder: Path) 
 def test_a_plan_and_a_launch_file_are_named_harmlessly(plan: Path, folder: Path) -> None:
     launch = folder / f"robot{IN_A_PATH}.launch.xml"
     launch.write_text('<launch><node pkg="p" exec="e" name="a&#x202e;b"/></launch>')
-    harmless(called("splice", plan, launch, "-o", folder / "spliced"), code=2)
-    launch.write_text("<launch><node pkg=")
+    harmless(called("splice", plan, launch, "-o", folder / "spliced"))
+    launch.write_text("<robot/>")
     harmless(called("splice", plan, launch, "-o", folder / "spliced"), code=2)
     broken = folder / "broken.yaml"
     broken.write_text(plan.read_text().replace("cycle: ", "cycle: x"))

@@ -18,24 +18,23 @@ def files(tmp_path: Path, plan: Plan) -> tuple[Path, Path, Path]:
     return tmp_path / "plan.yaml", tmp_path / "robot.launch.xml", tmp_path / "spliced"
 
 
-def test_it_shows_a_diff_and_what_to_launch(files: tuple[Path, Path, Path]) -> None:
+def test_it_shows_what_is_redirected_and_what_to_launch(files: tuple[Path, Path, Path]) -> None:
     plan, robot, folder = files
-    finished = called("splice", plan, robot, "-o", folder)
-    lines = finished.out.splitlines()
+    finished = called("splice", plan, robot, "n:=1 2", "-o", folder)
     assert finished.code == 0
     (said,) = finished.err.splitlines()
     assert said.startswith("note: the sample is small: 2 cycles"), "before the plan is used"
-    assert lines[:2] == [f"--- {robot}", f"+++ {folder}/robot.launch.xml"]
-    assert '-  <node pkg="robot" exec="third" name="third"/>' in lines
-    assert '+    <remap from="/t3" to="/t3_tmp"/>' in lines
-    assert lines[-1] == f"ros2 launch {folder}/robot.launch.xml"
+    assert finished.out.splitlines() == [
+        "/third publishes /t3_tmp in place of /t3, for /chainshaper_t3",
+        f"ros2 launch {folder}/robot.launch.py 'n:=1 2'",
+    ]
     assert robot.read_text() == ROBOT
 
 
 def test_its_json_says_the_same(files: tuple[Path, Path, Path]) -> None:
     plan, robot, folder = files
     said = json_of("splice", plan, robot, "-o", folder)
-    copy = str(folder / "robot.launch.xml")
+    copy = str(folder / "robot.launch.py")
     assert said["folder"] == str(folder)
     assert said["launch"] == {str(robot): copy}
     assert said["originals"] == {copy: str(robot)}
@@ -44,16 +43,25 @@ def test_its_json_says_the_same(files: tuple[Path, Path, Path]) -> None:
     assert said["logs"] == [
         str(folder / f"logs/{name}.csv") for name in ("chainshaper_t3", "chainshaper_t3_standby")
     ]
-    assert said["diff"].startswith(f"--- {robot}\n")
-    assert (said["notes"], said["setup"]) == ([], None)
+    assert said["diff"].startswith("--- /dev/null\n")
+    assert (said["notes"], said["setup"], said["redirected"]) == ([], None, [])
 
 
 def test_notes_go_to_standard_error(files: tuple[Path, Path, Path]) -> None:
     plan, robot, folder = files
-    robot.write_text(ROBOT.replace(' name="third"', ""))
-    finished = called("splice", plan, robot, "-o", folder)
-    assert "note: " in finished.err
-    assert "the remap is bound to the name third" in finished.err
+    assert called("splice", plan, robot, "-o", folder).code == 0
+    finished = called("splice", plan, folder / "robot.launch.py", "-o", folder)
+    assert f"note: {folder}/robot.launch.py: spliced from its original, {robot}" in finished.err
+
+
+def test_what_ros2_run_starts_is_given_behind_two_dashes(files: tuple[Path, Path, Path]) -> None:
+    plan, _, folder = files
+    run = ("ros2", "run", "robot", "third", "--ros-args", "-r", "__node:=third")
+    finished = called("splice", plan, "-o", folder, "--", *run)
+    assert finished.out.splitlines()[-1] == f"ros2 launch {folder}/third.launch.py"
+    throttled = folder.with_name("throttled")
+    finished = called("splice", "--throttle", "/third:/t1=1s", "-o", throttled, "--", *run)
+    assert finished.out.splitlines()[-1] == f"ros2 launch {throttled}/third.launch.py"
 
 
 def test_the_fallback_is_the_plan_s_or_the_option_s(files: tuple[Path, Path, Path]) -> None:
@@ -68,21 +76,11 @@ def test_the_fallback_is_the_plan_s_or_the_option_s(files: tuple[Path, Path, Pat
     assert "a throttler has no fallback" in refusal
 
 
-def test_launch_arguments_are_written_as_for_ros2_launch(files: tuple[Path, Path, Path]) -> None:
-    plan, robot, folder = files
-    robot.write_text(
-        '<launch><arg name="n" default="other"/>'
-        '<node pkg="robot" exec="third" name="$(var n)"/></launch>'
-    )
-    assert "nobody publishes /t3" in refused(2, "splice", plan, robot, "-o", folder)
-    assert called("splice", plan, robot, "n:=third", "-o", folder).code == 0
-
-
 def test_a_throttler_needs_no_plan(files: tuple[Path, Path, Path]) -> None:
     _, robot, folder = files
     said = json_of("splice", "--throttle", "/third:/t1=100ms", robot, "n:=1", "-o", folder)
     assert said["nodes"] == ["chainshaper_throttler"]
-    assert '+    <remap from="/t1" to="/t1_throttled"/>\n' in said["diff"]
+    assert "'target': '/t1_throttled'" in said["diff"]
     assert called("splice", "--undo", "-o", folder).out == f"{folder} is removed\n"
 
 

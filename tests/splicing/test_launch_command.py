@@ -1,10 +1,10 @@
-"""Which launch file a `ros2 launch …` means, and the same command for a copy of it."""
+"""Which launch file a `ros2 launch …` means, and the same command for another one."""
 
 from pathlib import Path
 
 import pytest
 
-from chainshaper.splicing.launch.command import parse_launch_command
+from chainshaper.splicing.spliced_launch import parse_launch_command
 from chainshaper.values.errors import InputError
 
 ROS2 = "/opt/ros/jazzy/bin/ros2"

@@ -1,307 +1,314 @@
-"""Launch files before and after splicing: `launch_files/` holds them, from simple to nasty."""
+"""What splicing writes for launch files: the nodes that it adds, and whose topics it redirects."""
 
-import hashlib
+import ast
 import json
-import re
-import xml.etree.ElementTree as ET  # our own files
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
-from launch_cases import CASES, Case, plan_for, splice_case, texts_of
+from launch_cases import NDT, ROBOTS, plan_for
 
-from chainshaper import Plan, splice_launch_files
+from chainshaper import Plan, Splicing, ThrottledInput, splice_launch_files, splice_throttlers
 from chainshaper.planning.plan import revised
-from chainshaper.splicing.launch.actions import NodeAction, SetRemap, flattened
-from chainshaper.splicing.launch.file import read_launch_file, read_text
-from chainshaper.values.errors import InputError
-from chainshaper.values.recording import open_recording
+from chainshaper.values.errors import InputError, PlatformError
+from chainshaper.values.recording import Recording, open_recording
 
-LAUNCH = Path(__file__).parent / "launch_files"
+MS = 1_000_000
+REAR = ThrottledInput(topic="/rear", period_ns=100 * MS)
+FRONT = ThrottledInput(topic="/front", period_ns=100 * MS)
+PLAN = plan_for("/ndt", "/pose")
 
 
-def _hashes(folder: Path) -> dict[str, str]:
+def launched(spliced: Splicing) -> dict[str, Any]:
+    """The values in the launch file, by their names."""
+    (file,) = set(spliced.launch.values())
     return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
+        statement.targets[0].id: ast.literal_eval(statement.value)
+        for statement in ast.parse(file.read_text()).body
+        if isinstance(statement, ast.Assign) and isinstance(statement.targets[0], ast.Name)
     }
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_the_copies_are_as_they_should_be_and_the_originals_as_they_were(
-    case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def redirects(spliced: Splicing) -> dict[str, tuple[str, tuple[str, ...]]]:
+    return {one["topic"]: (one["target"], one["nodes"]) for one in launched(spliced)["REDIRECTS"]}
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Path:
+    path = tmp_path / "robot.launch.xml"
+    path.write_text(NDT)
+    return path
+
+
+def recorded(folder: Path, *endpoints: tuple[str, str, str], type_: str | None = None) -> Recording:
+    """A recording that saw nothing but who has which topic: nodes, topics, kinds."""
+    place = folder / "recording"
+    place.mkdir()
+    keys = ("node", "topic", "kind")
+    seen = [{**dict(zip(keys, one, strict=True)), "type": type_} for one in endpoints]
+    info = {"source": "lttng", "clock_offset_ns": 0, "endpoints": seen}
+    (place / "recording.json").write_text(json.dumps(info))
+    return open_recording(place)
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Recording:
+    """One in which a player publishes two inputs, and one node subscribes to each."""
+    return recorded(
+        tmp_path,
+        *[
+            (node, topic, kind)
+            for topic in ("/rear", "/front")
+            for node, kind in (("/player", "publisher"), ("/fusion", "subscription"))
+        ],
+    )
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_the_user_s_file_is_included_as_it_is(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(ROBOTS[name])
+    spliced = splice_launch_files(PLAN, [tmp_path / name], tmp_path / "out")
+    assert (tmp_path / name).read_text() == ROBOTS[name]
+    assert spliced.launch == {tmp_path / name: tmp_path / "out/robot.launch.py"}
+    assert spliced.originals == {tmp_path / "out/robot.launch.py": tmp_path / name}
+    written = launched(spliced)
+    assert written["LAUNCH_FILES"] == [str(tmp_path / name)]
+    (redirect,) = written["REDIRECTS"]
+    assert redirect == {
+        "kind": "publisher",
+        "topic": "/pose",
+        "target": "/pose_tmp",
+        "nodes": ("/ndt",),
+        "added": ("/chainshaper_pose", "/chainshaper_pose_standby"),
+    }
+    assert "+++ " + str(tmp_path / "out/robot.launch.py") in spliced.diff
+
+
+@pytest.mark.parametrize("folder", ["out", "two words", "a'b", "a$b", 'a"b', "a\\b", "a#b", "a\nb"])
+def test_both_nodes_are_started_with_their_files_and_again_when_they_end(
+    robot: Path, folder: str
 ) -> None:
-    spliced = splice_case(case, tmp_path, monkeypatch)
-
-    before, now = (_hashes(folder / "before") for folder in (case.folder, tmp_path))
-    assert now == before
-    wanted = {path.name: path.read_bytes().decode() for path in (case.folder / "after").iterdir()}
-    assert texts_of(tmp_path) == wanted
-    notes = [note.replace(str(tmp_path / "before"), "{BEFORE}") for note in spliced.notes]
-    for begin in case.notes:
-        assert any(note.startswith(f"{{BEFORE}}/{begin}") for note in notes), notes
-
-
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_copies_are_launch_files_with_the_same_nodes(
-    case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    spliced = splice_case(case, tmp_path, monkeypatch)
-
-    for copy, original in spliced.originals.items():
-        if "written by `chainshaper splice`" in copy.read_text():
-            continue
-        before, after = (
-            [
-                (action.label, action.name, action.namespace, action.conditions)
-                for action in flattened(read_launch_file(file).actions)
-                if isinstance(action, NodeAction)
-            ]
-            for file in (original, copy)
-        )
-        assert after == before
+    spliced = splice_launch_files(PLAN, [robot], robot.parent / folder)
+    nodes = robot.parent / folder / "shaping_nodes"
+    for process in launched(spliced)["PROCESSES"]:
+        name, words = process["name"], process["cmd"]
+        assert (process["respawn"], process["respawn_delay"]) == (True, 0.1)
+        assert words[:2] == ["python3", str(nodes / f"{name}.py")]
+        assert words[-2:] == ["--params-file", str(nodes / f"{name}.yaml")]
+        assert {"__ns:=/", f"__node:={name}", "input:=/pose_tmp", "output:=/pose"} <= {*words}
+        assert all(Path(word).is_file() for word in (words[1], words[-1]))
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_comments_and_line_ends_stay(
-    case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    spliced = splice_case(case, tmp_path, monkeypatch)
-
-    for copy, original in spliced.originals.items():
-        text, was = copy.read_bytes().decode(), original.read_bytes().decode()
-        if "written by `chainshaper splice`" in text:
-            continue
-        comments = re.compile(r"<!--.*?-->" if "<" in was[:5] else r"#[^'\"\n]*$", re.M | re.S)
-        assert comments.findall(text) == comments.findall(was)
-        if "\r\n" in was:
-            assert text.count("\n") == text.count("\r\n")
-
-
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_splicing_again_gives_the_same(
-    case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    spliced = splice_case(case, tmp_path, monkeypatch)
-    first = _hashes(tmp_path / "after")
-    plan = plan_for(case.publisher, case.output)
-
-    originals = [tmp_path / "before" / name for name in case.launch]
-    copies = list(spliced.launch.values())
-    for files in (originals, copies, [*originals, *copies]):
-        again = splice_launch_files(plan, files, tmp_path / "after", arguments=case.arguments)
-        assert _hashes(tmp_path / "after") == first
-        assert again.diff == spliced.diff or files is copies
+def test_a_package_s_node_is_started_with_its_parameters_and_remaps(robot: Path) -> None:
+    spliced = splice_launch_files(PLAN, [robot], robot.parent / "out", node="cpp")
+    node, standby = launched(spliced)["PROCESSES"]
+    nodes = robot.parent / "out/shaping_nodes"
+    assert (nodes / node["package"] / "package.xml").is_file()
+    assert node == {
+        "package": "chainshaper_shaping",
+        "executable": "shaping_node",
+        "namespace": "/",
+        "parameters": [str(nodes / "chainshaper_pose.yaml")],
+        "remappings": [("input", "/pose_tmp"), ("output", "/pose")],
+        "name": "chainshaper_pose",
+        "output": "screen",
+        "respawn": True,
+        "respawn_delay": 0.1,
+    }
+    assert standby["respawn"]
 
 
-def test_a_copy_spliced_into_another_folder_is_spliced_from_its_original(tmp_path: Path) -> None:
-    robot = tmp_path / "robot.launch.xml"
-    robot.write_text('<launch><node pkg="l" exec="n" name="ndt"/></launch>')
-    plan = plan_for("/ndt", "/pose")
-    splice_launch_files(plan, [robot], tmp_path / "one")
+def test_several_launch_files_are_launched_together(robot: Path) -> None:
+    other = robot.with_name("sensing.launch.yaml")
+    other.write_text("launch: []\n")
+    spliced = splice_launch_files(PLAN, [robot, other, robot], robot.parent / "out")
+    assert spliced.launch == dict.fromkeys([robot, other], robot.parent / "out/robot.launch.py")
+    assert launched(spliced)["LAUNCH_FILES"] == [str(robot), str(other)]
 
-    again = splice_launch_files(plan, [tmp_path / "one/robot.launch.xml"], tmp_path / "two")
 
-    texts = [(tmp_path / name / "robot.launch.xml").read_text() for name in ("one", "two")]
-    assert texts[1] == texts[0].replace(str(tmp_path / "one"), str(tmp_path / "two"))
-    assert texts[1].count("<remap") == 1
+def test_what_ros2_run_starts_is_launched(tmp_path: Path) -> None:
+    words = ["ros2", "run", "l", "n", "--ros-args", "-r", "__node:=ndt"]
+    spliced = splice_launch_files(PLAN, words, tmp_path / "out")
+    assert spliced.launch == {Path("n"): tmp_path / "out/n.launch.py"}
+    written = launched(spliced)
+    assert (written["LAUNCH_FILES"], written["PROCESSES"][-1]["cmd"]) == ([], words)
+    again = splice_launch_files(PLAN, [*spliced.launch.values()], tmp_path / "again")
+    assert launched(again)["PROCESSES"][-1]["cmd"] == words
+
+
+def test_splicing_again_or_from_the_spliced_one_gives_the_same(robot: Path) -> None:
+    out = robot.parent / "out"
+    first = splice_launch_files(PLAN, [robot], out)
+    text = (out / "robot.launch.py").read_text()
+    for given in ([robot], [*first.launch.values()]):
+        again = splice_launch_files(PLAN, given, out)
+        assert again.diff == first.diff
+        assert (out / "robot.launch.py").read_text() == text
     assert f"spliced from its original, {robot}" in again.notes[0]
 
 
-def test_conditions_of_both_sides_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (case,) = (case for case in CASES if case.name == "xml_variables_and_conditions")
-    splice_case(case, tmp_path, monkeypatch)
-
-    nodes = ET.parse(tmp_path / "after/robot.launch.xml").getroot().findall("node")  # noqa: S314
-    assert [(node.get("if"), node.get("unless")) for node in nodes] == [
-        ("$(var simulated)", None),
-        (None, "$(var simulated)"),
-    ]
-    assert [[one.get("to") for one in node.findall("remap")] for node in nodes] == [
-        ["/pose_tmp"]
-    ] * 2
-
-
-def test_all_shaping_nodes_of_a_plan_are_spliced(tmp_path: Path) -> None:
-    robot = tmp_path / "robot.launch.yaml"
-    robot.write_text(
-        "launch:\n"
-        "- node: {pkg: a, exec: a, name: first, remap: [{from: out, to: /t1}]}\n"
-        "- node: {pkg: a, exec: a, name: second}\n"
-    )
-    plan = _with_further_node(plan_for("/second", "/t2"), "/t1")
-    recording = open_recording(_recording_with_publishers(tmp_path, {"/t1": "/first"}))
-
-    spliced = splice_launch_files(plan, [robot], tmp_path / "out", recording=recording)
-
-    assert [process.name for process in spliced.processes] == ["chainshaper_t2", "chainshaper_t1"]
-    launched = yaml.safe_load((tmp_path / "out/robot.launch.yaml").read_text())["launch"]
-    *started, first, second = launched
-    nodes = ("chainshaper_t2", "chainshaper_t2_standby", "chainshaper_t1", "chainshaper_t1_standby")
-    for node, process in zip(nodes, started, strict=True):
-        assert f"/{node}.py" in process["executable"]["cmd"]
-    assert first["node"]["remap"] == [{"from": "out", "to": "/t1_tmp"}]
-    assert second["node"]["remap"] == [{"from": "/t2", "to": "/t2_tmp"}]
-
-
-def test_a_plan_that_names_its_publishers_needs_no_recording(tmp_path: Path) -> None:
-    robot = tmp_path / "robot.launch.yaml"
-    robot.write_text(
-        "launch:\n- node: {pkg: a, exec: a, name: first}\n- node: {pkg: a, exec: a, name: second}\n"
-    )
-    plan = _with_further_node(plan_for("/second", "/t2"), "/t1", publisher="/first")
-
-    splice_launch_files(plan, [robot], tmp_path / "out")
-
-    *_, first, second = yaml.safe_load((tmp_path / "out/robot.launch.yaml").read_text())["launch"]
-    assert first["node"]["remap"] == [{"from": "/t1", "to": "/t1_tmp"}]
-    assert second["node"]["remap"] == [{"from": "/t2", "to": "/t2_tmp"}]
-
-
-def test_one_node_may_publish_two_of_the_topics(tmp_path: Path) -> None:
-    robot = tmp_path / "robot.launch.py"
-    robot.write_text(
-        "from launch import LaunchDescription\n"
-        "from launch_ros.actions import Node\n"
-        "def generate_launch_description():\n"
-        "    common = []\n"
-        "    return LaunchDescription([Node(executable='a', name='one', remappings=common)])\n"
-    )
-    plan = _with_further_node(plan_for("/one", "/t2"), "/t1")
-    recording = open_recording(_recording_with_publishers(tmp_path, {"/t1": "/one"}))
-
-    splice_launch_files(plan, [robot], tmp_path / "out", recording=recording)
-
-    copy = (tmp_path / "out/robot.launch.py").read_text()
-    assert "remappings=[('/t2', '/t2_tmp'), ('/t1', '/t1_tmp'), *common]" in copy
-
-
-def test_who_publishes_a_further_topic_must_be_known(tmp_path: Path) -> None:
-    plan = _with_further_node(plan_for("/second", "/t2"), "/t1")
-    robot = tmp_path / "robot.launch.yaml"
-    robot.write_text("launch:\n- node: {pkg: a, exec: a, name: second}\n")
-
-    with pytest.raises(InputError, match="does not say who publishes /t1: name a recording"):
-        splice_launch_files(plan, [robot], tmp_path / "out")
-
-
-def test_two_publishers_of_the_output_are_refused(tmp_path: Path) -> None:
-    robot = tmp_path / "robot.launch.yaml"
-    robot.write_text("launch:\n- node: {pkg: a, exec: a, name: ndt}\n")
-    folder = _recording_with_publishers(tmp_path, {"/pose": "/ndt"}, {"/pose": "/other"})
-
-    with pytest.raises(InputError, match="/pose has 2 publishers, /ndt, /other"):
-        splice_launch_files(
-            plan_for("/ndt", "/pose"), [robot], tmp_path / "out", recording=open_recording(folder)
-        )
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_standby_is_no_second_publisher(tmp_path: Path) -> None:
-    robot = tmp_path / "robot.launch.yaml"
-    robot.write_text("launch:\n- node: {pkg: a, exec: a, name: ndt}\n")
-    nodes = ({"/pose": "/chainshaper_pose"}, {"/pose": "/chainshaper_pose_standby"})
-    recording = open_recording(_recording_with_publishers(tmp_path, *nodes))
-
-    spliced = splice_launch_files(
-        plan_for("/ndt", "/pose"), [robot], tmp_path / "out", recording=recording
-    )
-
-    assert len(spliced.launch) == 1
-
-
-def test_a_package_s_node_is_started_with_its_parameters_and_remaps(tmp_path: Path) -> None:
-    for name, text in {
-        "robot.launch.xml": '<launch>\n  <node pkg="l" exec="n" name="ndt"/>\n</launch>',
-        "robot.launch.yaml": "launch:\n- node: {pkg: l, exec: n, name: ndt}\n",
-        "robot.launch.py": "from launch import LaunchDescription\n"
-        "from launch_ros.actions import Node\n"
-        "def generate_launch_description():\n"
-        "    return LaunchDescription([Node(package='l', executable='n', name='ndt')])\n",
-    }.items():
-        (tmp_path / name).write_text(text)
-        out = tmp_path / f"{name}.spliced"
-
-        spliced = splice_launch_files(plan_for("/ndt", "/pose"), [tmp_path / name], out, node="cpp")
-
-        (process,) = spliced.processes
-        assert (out / "shaping_nodes" / str(process.package) / "package.xml").is_file()
-        file = read_launch_file(out / name)
-        nodes = [action for action in flattened(file.actions) if isinstance(action, NodeAction)]
-        assert nodes[0].label == f"{process.package}/{process.executable}"
-        assert (nodes[0].name, nodes[0].namespace) == (("chainshaper_pose",), ("/",))
-        pairs = [(rule.match, rule.target) for rule in nodes[0].rules]
-        assert pairs == [(("input",), ("/pose_tmp",)), (("output",), ("/pose",))]
-        assert str(process.parameters_file) in (out / name).read_text()
-
-
-def test_a_typed_node_takes_its_type_from_the_recording(tmp_path: Path) -> None:
-    robot = tmp_path / "robot.launch.xml"
-    robot.write_text('<launch><node pkg="l" exec="n" name="ndt"/></launch>')
-    folder = _recording_with_publishers(tmp_path, {"/pose": "/ndt"}, type_="std_msgs/msg/Header")
-
-    spliced = splice_launch_files(
-        plan_for("/ndt", "/pose"),
-        [robot],
-        tmp_path / "out",
-        node="typed",
-        recording=open_recording(folder),
-    )
-
-    assert spliced.processes[0].package == "shaping_std_msgs_header"
-
-
-@pytest.mark.parametrize("suffix", ["xml", "yaml", "py"])
-def test_a_folder_with_spaces_is_one_word_on_the_command_line(tmp_path: Path, suffix: str) -> None:
-    case = {"xml": "xml_plain", "yaml": "yaml_plain", "py": "python_loop"}[suffix]
-    (source,) = (LAUNCH / case / "before").iterdir()
-    publisher, output = ("/node5", "/t5") if suffix == "py" else ("/ndt", "/pose")
-    folder = tmp_path / "two words"
-
-    spliced = splice_launch_files(plan_for(publisher, output), [source], folder)
-
-    text = (folder / source.name).read_text().replace("&apos;", "'")
-    script = (spliced.processes[0].command or ())[1]
-    assert f"'{script}'" in text
-
-
-def _with_further_node(plan: Plan, output: str, publisher: str | None = None) -> Plan:
+def with_further_node(plan: Plan, output: str, publisher: str | None = None) -> Plan:
     """The plan with a shaping node for another topic, in slots of its own."""
     assert plan.shaping_node is not None
     name = "chainshaper" + output.replace("/", "_")
-    node = plan.shaping_node.model_copy(
-        update={
-            "name": name,
-            "output": output,
-            "input": f"{output}_tmp",
-            "publisher": publisher,
-        }
-    )
-    server = plan.servers[-1].model_copy(
-        update={"name": name, "slots": ((90_000_000, 91_000_000),), "threads": (node.thread,)}
-    )
+    change = {"name": name, "output": output, "input": f"{output}_tmp", "publisher": publisher}
+    node = plan.shaping_node.model_copy(update=change)
+    slots = {"name": name, "slots": ((90 * MS, 91 * MS),), "threads": (node.thread,)}
+    server = plan.servers[-1].model_copy(update=slots)
     return revised(plan, servers=(*plan.servers, server), further_shaping_nodes=(node,))
 
 
-def _recording_with_publishers(
-    folder: Path, *topics: dict[str, str], type_: str | None = None
-) -> Path:
-    """A recording that saw nothing but who publishes what."""
-    place = folder / "recording"
-    place.mkdir()
-    endpoints = [
-        {"node": node, "topic": topic, "kind": "publisher", "type": type_}
-        for one in topics
-        for topic, node in one.items()
-    ]
-    info = {"source": "lttng", "clock_offset_ns": 0, "endpoints": endpoints}
-    (place / "recording.json").write_text(json.dumps(info))
-    return place
+@pytest.mark.parametrize("known", ["by the plan", "by a recording"])
+def test_all_shaping_nodes_of_a_plan_are_spliced(robot: Path, known: str) -> None:
+    by_plan = known == "by the plan"
+    plan = with_further_node(plan_for("/second", "/t2"), "/t1", "/first" if by_plan else None)
+    seen = None if by_plan else recorded(robot.parent, ("/first", "/t1", "publisher"))
+    spliced = splice_launch_files(plan, [robot], robot.parent / "out", recording=seen)
+    names = ["chainshaper_t2", "chainshaper_t1"]
+    assert [process.name for process in spliced.processes] == names
+    started = [process["name"] for process in launched(spliced)["PROCESSES"]]
+    assert started == [f"{name}{end}" for name in names for end in ("", "_standby")]
+    wanted = {"/t2": ("/t2_tmp", ("/second",)), "/t1": ("/t1_tmp", ("/first",))}
+    assert redirects(spliced) == wanted
 
 
-def test_rules_for_a_scope_are_read_with_their_names() -> None:
-    text = '<launch><set_remap from="ndt:out" to="/pose"/></launch>'
-    (action,) = read_text(Path("/robot.launch.xml"), text).actions
-    assert isinstance(action, SetRemap)
-    assert (action.rule.match, action.rule.target) == (("ndt:out",), ("/pose",))
+def test_a_typed_node_takes_its_type_from_the_recording(robot: Path) -> None:
+    seen = recorded(robot.parent, ("/ndt", "/pose", "publisher"), type_="std_msgs/msg/Header")
+    out = robot.parent / "out"
+    spliced = splice_launch_files(PLAN, [robot], out, node="typed", recording=seen)
+    assert spliced.processes[0].package == "shaping_std_msgs_header"
+
+
+def test_a_standby_is_no_second_publisher(robot: Path) -> None:
+    names = ("/chainshaper_pose", "/chainshaper_pose_standby")
+    seen = recorded(robot.parent, *[(name, "/pose", "publisher") for name in names])
+    spliced = splice_launch_files(PLAN, [robot], robot.parent / "out", recording=seen)
+    assert redirects(spliced) == {"/pose": ("/pose_tmp", ("/ndt",))}
+
+
+def test_an_input_reaches_its_subscribers_by_way_of_one_throttler(
+    robot: Path, recording: Recording
+) -> None:
+    out = robot.parent / "out"
+    spliced = splice_throttlers([REAR, FRONT], [robot], out, recording=recording)
+    (process,) = launched(spliced)["PROCESSES"]  # one throttler, as in the paper
+    assert process["name"] == "chainshaper_throttler"
+    wanted = {topic: (f"{topic}_throttled", ("/fusion",)) for topic in ("/rear", "/front")}
+    assert redirects(spliced) == wanted
+    assert {one["kind"] for one in launched(spliced)["REDIRECTS"]} == {"subscription"}
+    read = yaml.safe_load(spliced.processes[0].parameters_file.read_text())
+    parameters = read["/**"]["ros__parameters"]
+    assert parameters["inputs"] == ["/rear", "/front"]
+    assert parameters["outputs"] == ["/rear_throttled", "/front_throttled"]
+    assert (parameters["period_ns"], parameters["fifo_priority"]) == (100 * MS, 85)
+
+
+def test_inputs_of_other_periods_have_a_throttler_of_their_own(
+    robot: Path, recording: Recording
+) -> None:
+    inputs = [REAR, ThrottledInput(topic="/front", period_ns=50 * MS)]
+    spliced = splice_throttlers(inputs, [robot], robot.parent / "out", recording=recording)
+    names = ["chainshaper_throttler", "chainshaper_throttler_2"]
+    assert [process.name for process in spliced.processes] == names
+    added = [one["added"] for one in launched(spliced)["REDIRECTS"]]
+    assert added == [(f"/{name}",) for name in names]
+
+
+def test_named_subscribers_need_no_recording(robot: Path) -> None:
+    inputs = [REAR.model_copy(update={"subscriber": node}) for node in ("/fusion", "/icp")]
+    spliced = splice_throttlers(inputs, [robot], robot.parent / "out", node="cpp")
+    assert redirects(spliced) == {"/rear": ("/rear_throttled", ("/fusion", "/icp"))}
+    assert launched(spliced)["PROCESSES"][0]["executable"] == "throttler"
+
+
+def test_a_plan_is_spliced_into_the_throttled_launch_file(
+    robot: Path, recording: Recording
+) -> None:
+    out = robot.parent / "throttled"
+    throttled = splice_throttlers([REAR], [robot], out, recording=recording)
+    text = (out / "robot.launch.py").read_text()
+    shaped = splice_launch_files(PLAN, [*throttled.launch.values()], robot.parent / "shaped")
+    again = splice_launch_files(PLAN, [*shaped.launch.values()], robot.parent / "again")
+    for spliced in (shaped, again):
+        assert launched(spliced)["LAUNCH_FILES"] == [str(out / "robot.launch.py")]
+        assert list(redirects(spliced)) == ["/pose"]
+    same = splice_throttlers([REAR], [*throttled.launch.values()], out, recording=recording)
+    assert (out / "robot.launch.py").read_text() == text
+    assert same.diff == throttled.diff
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.launch.xml", "<robot/>", "a.launch.xml: no launch file"),
+        ("a.launch.yaml", "robot: 1\n", "a.launch.yaml: no launch file"),
+        ("a.launch.yaml", "", "a.launch.yaml: no launch file"),
+        ("a.launch.py", "print('hello')\n", "a.launch.py: no launch file"),
+        ("a.launch", "nothing", "a.launch: no launch file"),
+        ("a.txt", NDT, "a.txt: a launch file's name ends in .py, .xml, .yaml, .yml or .launch"),
+    ],
+)
+def test_what_is_no_launch_file_is_refused(
+    tmp_path: Path, name: str, text: str, message: str
+) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError) as caught:
+        splice_launch_files(PLAN, [tmp_path / name], tmp_path / "spliced")
+    assert message in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_file_that_is_not_there_or_not_text_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "no.launch.xml"
+    for message in (r"no\.launch\.xml: cannot be read \(No such file", "1: not a text in UTF-8"):
+        with pytest.raises(InputError, match=message):
+            splice_launch_files(PLAN, [file], tmp_path / "spliced")
+        file.write_bytes(b"<launch>\xff</launch>")
+
+
+def test_a_plan_that_shapes_nothing_or_does_not_know_the_publisher_is_refused(robot: Path) -> None:
+    unknown = revised(PLAN, chain=PLAN.chain.model_copy(update={"publisher": None}))
+    further = with_further_node(plan_for("/s", "/t2"), "/t1")
+    for plan, message in (
+        (revised(PLAN, shaping_node=None), "the plan has no `shaping_node`, so there is nothing"),
+        (unknown, "the plan does not say who publishes /pose: name a rec"),
+        (further, "does not say who publishes /t1: name a recording"),
+    ):
+        with pytest.raises(InputError, match=message):
+            splice_launch_files(plan, [robot], robot.parent / "out")
+    assert not (robot.parent / "out").exists()
+
+
+def test_two_publishers_of_the_output_are_refused(robot: Path) -> None:
+    seen = recorded(robot.parent, *[(node, "/pose", "publisher") for node in ("/ndt", "/other")])
+    with pytest.raises(InputError, match="/pose has 2 publishers, /ndt, /other"):
+        splice_launch_files(PLAN, [robot], robot.parent / "out", recording=seen)
+
+
+@pytest.mark.parametrize(
+    ("topic", "with_recording", "message"),
+    [
+        ("/rear", False, "who subscribes to /rear is not known: name a recording"),
+        ("/side", True, "what somebody does: /front, /rear"),
+    ],
+)
+def test_what_cannot_be_throttled_is_named_and_nothing_written(
+    topic: str, with_recording: bool, message: str, robot: Path, recording: Recording
+) -> None:
+    known = recording if with_recording else None
+    one = REAR.model_copy(update={"topic": topic})
+    with pytest.raises(InputError, match=message):
+        splice_throttlers([one], [robot], robot.parent / "out", recording=known)
+    assert not (robot.parent / "out").exists()
+
+
+def test_a_dry_run_without_ros_2_says_what_it_needs(
+    robot: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", "/usr/bin:/bin")
+    for name in ("PYTHONPATH", "AMENT_PREFIX_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(PlatformError, match="a dry run needs ROS 2: source its setup"):
+        splice_launch_files(PLAN, [robot], robot.parent / "out", dry_run=True)
+    assert not (robot.parent / "out").exists()

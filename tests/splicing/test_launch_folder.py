@@ -1,4 +1,4 @@
-"""The folder of spliced launch files: whole or absent, replaced or removed only while ours."""
+"""The folder of a spliced launch file: whole or absent, replaced or removed only while ours."""
 
 import json
 import shutil
@@ -6,13 +6,11 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
-from launch_cases import plan_for
+from launch_cases import NDT, plan_for
 
 from chainshaper import Plan, Splicing, splice_launch_files, undo_splice
 from chainshaper.planning.plan import revised
-from chainshaper.values.errors import InputError, OperationError
-
-NDT = '<launch>\n  <node pkg="l" exec="n" name="ndt"/>\n</launch>\n'
+from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 
 
 @pytest.fixture
@@ -40,9 +38,10 @@ def _tree(folder: Path) -> dict[str, bytes]:
     }
 
 
-def test_it_holds_the_copies_the_shaping_nodes_and_a_manifest(spliced: Splicing) -> None:
+def test_in_it_are_a_launch_file_the_shaping_nodes_and_a_manifest(spliced: Splicing) -> None:
     assert set(_tree(spliced.folder)) == {
-        "robot.launch.xml",
+        "redirection.py",
+        "robot.launch.py",
         "shaping_nodes/chainshaper_pose.py",
         "shaping_nodes/chainshaper_pose.yaml",
         "shaping_nodes/chainshaper_pose_standby.py",
@@ -75,7 +74,13 @@ def test_what_running_and_building_leave_does_not_keep_it_from_being_removed(
 
 @pytest.mark.parametrize(
     "name",
-    ["robot.launch.xml", "shaping_nodes/chainshaper_pose.yaml", "mine.txt", "mine/logs/a.csv"],
+    [
+        "robot.launch.py",
+        "redirection.py",
+        "shaping_nodes/chainshaper_pose.yaml",
+        "mine.txt",
+        "mine/logs/a.csv",
+    ],
 )
 def test_what_the_user_changed_or_added_is_neither_removed_nor_replaced(
     spliced: Splicing, robot: Path, plan: Plan, name: str
@@ -96,7 +101,7 @@ def test_what_the_user_changed_or_added_is_neither_removed_nor_replaced(
 def test_what_the_user_removed_does_not_keep_the_rest_from_being_removed(
     spliced: Splicing,
 ) -> None:
-    (spliced.folder / "robot.launch.xml").unlink()
+    (spliced.folder / "robot.launch.py").unlink()
     undo_splice(spliced.folder)
     assert not spliced.folder.exists()
 
@@ -145,7 +150,7 @@ def test_the_same_again_leaves_the_folder_with_its_logs_as_it_is(
 def test_an_empty_folder_may_be_filled(tmp_path: Path, robot: Path, plan: Plan) -> None:
     (tmp_path / "empty").mkdir()
     assert splice_launch_files(plan, [robot], tmp_path / "empty").folder == tmp_path / "empty"
-    assert (tmp_path / "empty/robot.launch.xml").is_file()
+    assert (tmp_path / "empty/robot.launch.py").is_file()
 
 
 def test_a_folder_without_a_parent_is_refused(tmp_path: Path, robot: Path, plan: Plan) -> None:
@@ -179,9 +184,28 @@ def test_a_copy_whose_original_is_gone_names_the_original(
 ) -> None:
     shutil.move(robot, tmp_path / "elsewhere.launch.xml")
     with pytest.raises(InputError, match=r"robot\.launch\.xml: cannot be read \(No such file"):
-        splice_launch_files(plan, [spliced.folder / "robot.launch.xml"], tmp_path / "again")
+        splice_launch_files(plan, [spliced.folder / "robot.launch.py"], tmp_path / "again")
 
 
 def test_the_manifest_names_the_originals(spliced: Splicing, robot: Path) -> None:
     manifest = json.loads((spliced.folder / "splice.json").read_text())
-    assert manifest["copies"] == {"robot.launch.xml": str(robot)}
+    assert manifest["copies"] == {"robot.launch.py": [str(robot)]}
+
+
+def test_a_folder_of_copies_from_an_earlier_version_is_known(
+    spliced: Splicing, robot: Path, plan: Plan, tmp_path: Path
+) -> None:
+    path = spliced.folder / "splice.json"
+    manifest = json.loads(path.read_text())
+    path.write_text(json.dumps({**manifest, "copies": {"robot.launch.py": str(robot)}}))
+    (again,) = splice_launch_files(plan, [*spliced.launch.values()], tmp_path / "again").originals
+    assert f"LAUNCH_FILES = [{str(robot)!r}]" in again.read_text()
+    undo_splice(spliced.folder)
+
+
+def test_a_folder_that_cannot_be_written_leaves_nothing(
+    full_disk: Path, robot: Path, plan: Plan
+) -> None:
+    with pytest.raises(ChainshaperError, match="No space left"):
+        splice_launch_files(plan, [robot], full_disk / "spliced")
+    assert [path.name for path in full_disk.iterdir()] == ["filling"]

@@ -1,7 +1,8 @@
-"""`chainshaper splice`: put shaping nodes, or throttlers, into copies of launch files."""
+"""`chainshaper splice`: start shaping nodes, or throttlers, together with launch files."""
 
+import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from chainshaper.cli.options import JSON, NODE, NodeKind, argument, option, wish
 from chainshaper.cli.output import notes, print_json, show_line
@@ -10,19 +11,8 @@ from chainshaper.values.plan_choices import Fallback
 
 if TYPE_CHECKING:
     from chainshaper.flow.launch_splicing import Splicing, ThrottledInput
+    from chainshaper.planning import Plan
     from chainshaper.values.recording import Recording
-
-
-class _Launched(NamedTuple):
-    """What is launched, and into what its copies are edited, whichever node is put in."""
-
-    files: list[str]
-    arguments: dict[str, str]
-    folder: Path
-    node: NodeKind
-    message_type: str | None
-    recording: Path | None
-    fallback: Fallback | None
 
 
 def splice(
@@ -30,11 +20,11 @@ def splice(
     launch: list[str] | None = argument(
         None,
         "LAUNCH... [NAME:=VALUE...]",
-        "The launch files (.py, .xml, .yaml), and launch arguments that are not at their "
-        "defaults, as for `ros2 launch`.",
+        "The launch files (.py, .xml, .yaml) and, for --dry-run, launch arguments; or, behind --, "
+        "a `ros2 run …`.",
     ),
     *,
-    output: Path = option(..., "--output -o DIR", "Folder for the copies."),
+    output: Path = option(..., "--output -o DIR", "Folder for the launch file."),
     throttle: list[str] | None = option(
         None,
         "--throttle [NODE:]TOPIC=PERIOD",
@@ -55,18 +45,24 @@ def splice(
     ),
     fallback: Fallback | None = wish("fallback", default=None),
     build: bool = option(False, "--build", "Build the shaping node's package with colcon."),
+    dry_run: bool = option(
+        False,
+        "--dry-run",
+        "Write nothing, and show what would be redirected: the launch files are carried out in "
+        "this ROS 2 environment, but no process is started.",
+    ),
     undo: bool = option(False, "--undo", "Remove DIR again, unless it was changed since."),
     json: bool = JSON,
 ) -> None:
-    """Edit copies of launch files: the output is remapped, and a shaping node republishes it.
+    """Write a launch file that includes yours, starts a shaping node, and redirects the output.
 
-    With --throttle an input is, and a throttler republishes it once a period; do this first, then
-    record and plan, and splice the plan into the copy. Shows a diff. Launch the copy that it names;
-    the originals stay as they are.
+    With --throttle an input is redirected, and a throttler republishes it once a period; do this
+    first, then record and plan, and splice the plan into its launch file. Launch the file that it
+    names, with your launch arguments; your launch files stay as they are.
     """
     from chainshaper.flow.launch_splicing import undo_splice
     from chainshaper.splicing.generated_package import build_package, check_build_tools
-    from chainshaper.splicing.launch.folder import NODES
+    from chainshaper.splicing.spliced_launch import NODES
 
     if undo:
         undo_splice(output)
@@ -79,55 +75,49 @@ def splice(
         raise InputError("--node python needs no building: leave out --build, or choose another")
     if build:
         check_build_tools()  # before anything is written
-    words = launch or []
+    words = [*([str(plan)] if throttle and plan is not None else []), *(launch or [])]
+    ran = words[:2] == ["ros2", "run"]
+    arguments = {} if ran else dict(word.split(":=", 1) for word in words if ":=" in word)
+    files = words if ran else [word for word in words if ":=" not in word]
+    common: dict[str, Any] = {"launch_files": files, "output": output, "node": node}
+    common |= {"arguments": arguments, "dry_run": dry_run}
     if throttle:
-        words = [*([] if plan is None else [str(plan)]), *words]
-    arguments = dict(word.split(":=", 1) for word in words if ":=" in word)
-    files = [word for word in words if ":=" not in word]
-    launched = _Launched(files, arguments, output, node, message_type, recording, fallback)
-    if throttle:
-        splicing = _throttled(throttle, launched)
+        if fallback is not None:
+            raise InputError("a throttler has no fallback: --fallback goes with a plan")
+        if message_type is not None or node == "typed":
+            raise InputError(
+                "a throttler is for all types: choose --node python or cpp, and no --type"
+            )
+        splicing = _throttled(throttle, recording, common)
     elif plan is None or not files:
         raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
     else:
-        splicing = _shaped(plan, launched)
-    setup = build_package(splicing.folder / NODES) if build else None
-    _print(splicing, setup, json)
+        common |= {"message_type": message_type, "fallback": fallback}
+        splicing = _shaped(plan, recording, common)
+    setup = build_package(splicing.folder / NODES) if build and not dry_run else None
+    if json:
+        print_json(_values(splicing, setup))
+        return
+    _show(splicing, arguments, setup)
 
 
-def _shaped(plan: Path, launched: _Launched) -> "Splicing":
+def _shaped(plan: Path, recording: Path | None, common: dict[str, Any]) -> "Splicing":
     from chainshaper.flow.launch_splicing import splice_launch_files
     from chainshaper.planning import load_plan, plan_warnings
 
     planned = load_plan(plan)
     notes(plan_warnings(planned))
-    own = planned.evidence.recording
-    known = Path(own) if own and Path(own).is_dir() else None
-    return splice_launch_files(
-        *(planned, launched.files, launched.folder),
-        node=launched.node,
-        arguments=launched.arguments,
-        message_type=launched.message_type,
-        recording=_opened(launched.recording or known),
-        fallback=launched.fallback,
-    )
+    known = _opened(recording or _own_recording(planned))
+    return splice_launch_files(planned, recording=known, **common)
 
 
-def _throttled(inputs: list[str], launched: _Launched) -> "Splicing":
+def _throttled(inputs: list[str], recording: Path | None, common: dict[str, Any]) -> "Splicing":
     from chainshaper.flow.launch_splicing import splice_throttlers
 
-    if launched.fallback is not None:
-        raise InputError("a throttler has no fallback: --fallback goes with a plan")
-    if launched.node == "typed" or launched.message_type is not None:
-        raise InputError("a throttler is for all types: choose --node python or cpp, and no --type")
-    if not launched.files:
+    if not common["launch_files"]:
         raise InputError("give the launch files: `splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`")
-    return splice_throttlers(
-        *([_input(text) for text in inputs], launched.files, launched.folder),
-        node=launched.node,
-        arguments=launched.arguments,
-        recording=_opened(launched.recording),
-    )
+    parsed = [_input(text) for text in inputs]
+    return splice_throttlers(parsed, recording=_opened(recording), **common)
 
 
 def _input(text: str) -> "ThrottledInput":
@@ -146,6 +136,11 @@ def _input(text: str) -> "ThrottledInput":
         )
 
 
+def _own_recording(plan: "Plan") -> Path | None:
+    own = Path(plan.evidence.recording or "")
+    return own if plan.evidence.recording and own.is_dir() else None
+
+
 def _opened(recording: Path | None) -> "Recording | None":
     if recording is None:
         return None
@@ -154,25 +149,34 @@ def _opened(recording: Path | None) -> "Recording | None":
     return open_source(recording)
 
 
-def _print(splicing: "Splicing", setup: Path | None, json: bool) -> None:
-    if json:
-        print_json(
-            {
-                "folder": str(splicing.folder),
-                "launch": {str(file): str(copy) for file, copy in splicing.launch.items()},
-                "originals": {str(copy): str(file) for copy, file in splicing.originals.items()},
-                "nodes": [one.name for one in splicing.processes],
-                "standbys": [one.standby.name for one in splicing.processes if one.standby],
-                "logs": [str(log) for log in splicing.logs],
-                "setup": None if setup is None else str(setup),
-                "diff": splicing.diff,
-                "notes": list(splicing.notes),
-            }
-        )
-        return
-    show_line(splicing.diff.rstrip("\n").expandtabs())
+def _show(splicing: "Splicing", arguments: dict[str, str], setup: Path | None) -> None:
+    for one in splicing.redirects:
+        verb = "publishes" if one.kind == "publisher" else "subscribes to"
+        for node in one.nodes:
+            show_line(f"{node} {verb} {one.target} in place of {one.topic}, for {one.added[0]}")
+    for found in splicing.redirected:
+        for started in found["redirected"]:
+            show_line(f"would add to {started['as']}: {' '.join(started['rules']) or 'nothing'}")
     notes(splicing.notes)
+    if splicing.redirected:
+        return
     if setup is not None:
         show_line(f"source {setup}")
-    for copy in splicing.launch.values():
-        show_line(f"ros2 launch {copy}")
+    words = [f"{name}:={value}" for name, value in arguments.items()]
+    for file in dict.fromkeys(splicing.launch.values()):
+        show_line(shlex.join(["ros2", "launch", str(file), *words]))
+
+
+def _values(splicing: "Splicing", setup: Path | None) -> dict[str, Any]:
+    return {
+        "folder": str(splicing.folder),
+        "launch": {str(file): str(copy) for file, copy in splicing.launch.items()},
+        "originals": {str(copy): str(file) for copy, file in splicing.originals.items()},
+        "nodes": [process.name for process in splicing.processes],
+        "standbys": [one.standby.name for one in splicing.processes if one.standby is not None],
+        "logs": [str(log) for log in splicing.logs],
+        "setup": None if setup is None else str(setup),
+        "redirected": [dict(one) for one in splicing.redirected],
+        "diff": splicing.diff,
+        "notes": list(splicing.notes),
+    }

@@ -32,9 +32,8 @@ from chainshaper.linux.users import run_users
 from chainshaper.planning import Plan, PlanRequest, save_plan
 from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.generated_package import build_package, check_build_tools
-from chainshaper.splicing.launch.command import LaunchCommand, parse_launch_command
-from chainshaper.splicing.launch.folder import NODES
 from chainshaper.splicing.shaping_process import NodeKind
+from chainshaper.splicing.spliced_launch import NODES, LaunchCommand, parse_launch_command
 from chainshaper.values.application import ApplicationGraph
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 from chainshaper.values.recording import Recording, refuse_existing
@@ -190,7 +189,7 @@ def _spliced(
 
 
 def _with_shaping_node(launch: LaunchCommand, splicing: Splicing) -> list[str]:
-    """The command that launches the copy, in the environment that its shaping node needs."""
+    """The command that launches both, in the environment that the shaping node needs."""
     words = launch.with_file(next(iter(splicing.launch.values())))
     if all(process.package is None for process in splicing.processes):
         return words

@@ -1,32 +1,26 @@
 """Splicing nodes into launch files: the paper's Republisher Editor and Throttler (4.2, 5.1).
 
-The functions behind `chainshaper splice`. Launch files are followed as `ros2 launch` would follow
-them, without running anything; copies of the files that have to change are written into a folder,
-together with the nodes that they start. Originals are never touched.
+The functions behind `chainshaper splice`. Nothing of the user's is edited, copied or parsed: a
+launch file is written that includes the user's, starts our nodes, and redirects a topic where
+`ros2 launch` starts the node that has it (:mod:`chainshaper.splicing.redirection`).
 
-A shaping node stands behind an output: its publisher is remapped, and subscribers notice nothing. A
-throttler stands before an input: its subscribers are remapped, because what publishes it, a player
-or a driver, often is started elsewhere.
+A shaping node stands behind an output: its publisher is redirected, and subscribers notice nothing.
+A throttler stands before an input: its subscribers are redirected, because what publishes it, a
+player or a driver, often is started elsewhere.
 """
 
+import difflib
+import json
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from chainshaper.planning.plan import Plan, ShapingNode, revised
-from chainshaper.splicing.launch.edit import Copies, edited_copies, unified_diff
-from chainshaper.splicing.launch.file import read_launch_file
-from chainshaper.splicing.launch.folder import (
-    LOGS,
-    NODES,
-    new_folder,
-    original_of,
-    remove_folder,
-    usable,
-)
-from chainshaper.splicing.launch.targets import Wanted
-from chainshaper.splicing.launch.walk import follow
+from chainshaper.sources.ros.interpreter import own_environment, run_with_rclpy
+from chainshaper.splicing import redirection
+from chainshaper.splicing.redirection import Redirect
 from chainshaper.splicing.shaping_process import (
     STANDBY,
     NodeKind,
@@ -34,7 +28,18 @@ from chainshaper.splicing.shaping_process import (
     write_shaping_process,
     write_throttler,
 )
-from chainshaper.values.errors import InputError
+from chainshaper.splicing.spliced_launch import (
+    LOGS,
+    NODES,
+    is_run,
+    launch_file_name,
+    launch_text,
+    new_folder,
+    original_words,
+    remove_folder,
+    usable,
+)
+from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.plan_choices import Fallback
 from chainshaper.values.yaml_file import FullName, Part, PositiveDuration
 
@@ -53,17 +58,22 @@ __all__ = [
 THROTTLER = "chainshaper_throttler"
 THROTTLER_PRIORITY = 85
 """Of SCHED_FIFO, until `apply` puts it into its server: it is to wake in time from the start."""
-_Remaps: TypeAlias = list[tuple[Wanted, ShapingProcess]]
+
+DRY_RUN_S = 120.0
+"""How long a dry run may take."""
+
+_Written: TypeAlias = tuple[list[ShapingProcess], list[Redirect]]
 
 
 @dataclass(frozen=True)
 class Splicing:
     """What was spliced.
 
-    ``launch`` maps each launch file that changed to the copy to launch instead; ``originals`` maps
-    every copy to what it was made from. ``processes`` are the nodes that were added, ``logs`` where
-    shaping nodes and their standbys note what they did. ``diff`` is a unified diff of all launch
-    files, ``notes`` what to know before relying on it.
+    ``launch`` maps each launch file (or the executable of `ros2 run`) to the one to launch instead,
+    ``originals`` that one to the first that it includes. ``processes`` are the nodes that were
+    added, ``logs`` where shaping nodes and their standbys note what they did. ``redirects`` are the
+    nodes that get another topic, ``redirected`` what a dry run found of each. ``diff`` is the new
+    launch file as a unified diff, ``notes`` what to know before relying on it.
     """
 
     folder: Path
@@ -73,6 +83,8 @@ class Splicing:
     logs: tuple[Path, ...]
     diff: str
     notes: tuple[str, ...]
+    redirects: tuple[Redirect, ...]
+    redirected: tuple[Mapping[str, Any], ...] = ()
 
 
 class ThrottledInput(Part):
@@ -96,38 +108,54 @@ def splice_launch_files(
     message_type: str | None = None,
     recording: "Recording | None" = None,
     fallback: Fallback | None = None,
+    dry_run: bool = False,
 ) -> Splicing:
-    """Write copies of launch files that start the plan's shaping nodes, into a new folder.
+    """Write a launch file that starts the plan's shaping nodes and launch files, into a new folder.
 
-    ``arguments`` are launch arguments by name, where the files are launched with other values
-    than their defaults. ``recording`` is one of the application: it tells who publishes a topic
-    and of which type it is, as far as the plan does not. ``fallback`` goes before the plan's. A
-    folder that was spliced before and not changed since is replaced.
+    ``launch_files`` may be the words of `ros2 run …` as well. ``recording`` is one of the
+    application: it tells who publishes a topic and of which type it is, as far as the plan does
+    not. ``fallback`` goes before the plan's. A folder that was spliced before and not changed since
+    is replaced. With ``dry_run`` nothing is written: the launch files are carried out in our own
+    ROS 2 environment with launch ``arguments``, except that no process is started.
 
     Raises:
-        InputError: the plan shapes nothing; nobody publishes its output, or a node's name
-            matches twice; a mistake in a launch file, with its line; the folder is not ours.
-        OperationError: a remap can only be changed by hand; the folder cannot be written.
+        InputError: the plan shapes nothing, or does not say who publishes; no launch file; the
+            folder is not ours.
+        OperationError: the folder cannot be written; a dry run finds that nothing would be
+            redirected, or more than is meant.
+        PlatformError: there is no ROS 2 environment for a dry run.
     """
+    if plan.shaping_node is None:
+        raise InputError(
+            "the plan has no `shaping_node`, so there is nothing to splice: plan again with"
+            " `chainshaper plan REC --chain FIRST..LAST -o plan.yaml`"
+        )
     folder = usable(Path(output))
-    wanted = _wanted(plan, recording)
+    graph = None if recording is None else _graph(recording)
+    nodes = (plan.shaping_node, *plan.further_shaping_nodes)
+    publishers = {one.name: _publisher(plan, one, graph) for one in nodes}
     plan = plan if fallback is None else revised(plan, fallback=fallback)
-    logs = {shaping.name: folder / LOGS / f"{shaping.name}.csv" for shaping, _ in wanted}
+    logs = {one.name: folder / LOGS / f"{one.name}.csv" for one in nodes}
 
-    def written(nodes: Path) -> _Remaps:
-        return [
-            (
-                want,
-                write_shaping_process(
-                    *(plan, shaping, node, nodes),
-                    message_type=message_type or _type_of(shaping.output, recording),
-                    log=logs[shaping.name],
-                ),
+    def written(place: Path) -> _Written:
+        made = [
+            write_shaping_process(
+                *(plan, one, node, place),
+                message_type=message_type or _type_of(one.output, recording),
+                log=logs[one.name],
             )
-            for shaping, want in wanted
+            for one in nodes
+        ]
+        return made, [
+            Redirect(
+                *("publisher", one.output, one.input, (publishers[one.name],)),
+                added=(f"/{one.name}", f"/{one.name}{STANDBY}"),
+            )
+            for one in nodes
         ]
 
-    spliced = _spliced(launch_files, folder, arguments, written, throttled=False)
+    dry = dict(arguments or {}) if dry_run else None
+    spliced = _spliced(launch_files, folder, written, throttled=False, dry=dry)
     standbys = [log.with_stem(f"{log.stem}{STANDBY}") for log in logs.values()]
     return replace(spliced, logs=(*logs.values(), *standbys))
 
@@ -140,74 +168,45 @@ def splice_throttlers(
     node: Literal["python", "cpp"] = "python",
     arguments: Mapping[str, str] | None = None,
     recording: "Recording | None" = None,
+    dry_run: bool = False,
 ) -> Splicing:
-    """Write copies of launch files whose nodes get these inputs by way of a throttler.
+    """Write a launch file whose nodes get these inputs by way of a throttler.
 
     It takes ``/points`` and republishes it as ``/points_throttled``, where the subscribers listen
     now. Inputs with the same period have one throttler, as in the paper. A plan is spliced into
-    such copies later, since it is made from a recording of them. The rest is as for
+    such a launch file later, since it is made from a recording of it. The rest is as for
     :func:`splice_launch_files`.
 
     Raises:
-        InputError: who subscribes to a topic is not known, or is not started by the launch files;
-            and what :func:`splice_launch_files` refuses.
-        OperationError: a remap can only be changed by hand; the folder cannot be written.
+        InputError: who subscribes to a topic is not known; and what :func:`splice_launch_files`
+            refuses.
+        OperationError, PlatformError: as for :func:`splice_launch_files`.
     """
     if not inputs:
         raise InputError("no input to throttle: name one, such as /points_raw=100ms")
     folder = usable(Path(output))
     graph = None if recording is None else _graph(recording)
-    by_period: dict[int, list[Wanted]] = {}
+    by_period: dict[int, dict[str, tuple[str, ...]]] = {}
     for one in inputs:
-        by_period.setdefault(one.period_ns, []).extend(_subscriptions(one, graph))
+        topics = by_period.setdefault(one.period_ns, {})
+        nodes = (*topics.get(one.topic, ()), *_subscribers(one, graph))
+        topics[one.topic] = tuple(dict.fromkeys(nodes))
 
-    def written(nodes: Path) -> _Remaps:
-        remaps: _Remaps = []
-        for number, (period_ns, wanted) in enumerate(by_period.items(), start=1):
-            process = write_throttler(
-                *({want.topic: want.target for want in wanted}, period_ns, node, nodes),
-                name=THROTTLER if number == 1 else f"{THROTTLER}_{number}",
-                fifo_priority=THROTTLER_PRIORITY,
-            )
-            remaps += [(want, process) for want in wanted]
-        return remaps
+    def written(place: Path) -> _Written:
+        made, redirects = [], []
+        for number, (period_ns, topics) in enumerate(by_period.items(), start=1):
+            name = THROTTLER if number == 1 else f"{THROTTLER}_{number}"
+            targets = {topic: f"{topic}_throttled" for topic in topics}
+            how: dict[str, Any] = {"name": name, "fifo_priority": THROTTLER_PRIORITY}
+            made.append(write_throttler(targets, period_ns, node, place, **how))
+            redirects += [
+                Redirect("subscription", topic, targets[topic], nodes, (f"/{name}",))
+                for topic, nodes in topics.items()
+            ]
+        return made, redirects
 
-    return _spliced(launch_files, folder, arguments, written, throttled=True)
-
-
-def _spliced(
-    launch_files: Sequence[str | Path],
-    folder: Path,
-    arguments: Mapping[str, str] | None,
-    written: Callable[[Path], _Remaps],
-    *,
-    throttled: bool,
-) -> Splicing:
-    """The copies; ``written`` writes the nodes into a folder and tells which remaps they need."""
-    given = [Path(file).absolute() for file in launch_files]
-    files = [original_of(file, throttled=not throttled) for file in given]
-    notes = [
-        f"{copy}: spliced from its original, {file}"
-        for copy, file in zip(given, files, strict=True)
-        if copy != file
-    ]
-    walk = follow([read_launch_file(file) for file in dict.fromkeys(files)], dict(arguments or {}))
-    originals: dict[str, str] = {}
-    with new_folder(folder, originals, throttled=throttled) as partial:
-        remaps = [(want, _moved(made, partial, folder)) for want, made in written(partial / NODES)]
-        copies = edited_copies(walk, remaps, folder)
-        for copy in copies.files:
-            (partial / copy.name).write_bytes(copy.text.encode())
-            originals[copy.name] = str(copy.original)
-    return Splicing(
-        folder=folder,
-        launch={file: folder / name for file, name in copies.launch.items()},
-        originals={folder / name: Path(original) for name, original in originals.items()},
-        processes=tuple(dict.fromkeys(process for _, process in remaps)),
-        logs=(),
-        diff="".join(unified_diff(copy, folder) for copy in copies.files),
-        notes=(*notes, *copies.notes, *_unchanged(files, copies)),
-    )
+    dry = dict(arguments or {}) if dry_run else None
+    return _spliced(launch_files, folder, written, throttled=True, dry=dry)
 
 
 def undo_splice(folder: str | Path) -> None:
@@ -220,7 +219,78 @@ def undo_splice(folder: str | Path) -> None:
     remove_folder(Path(folder))
 
 
-def _subscriptions(one: ThrottledInput, graph: "ApplicationGraph | None") -> list[Wanted]:
+def _spliced(
+    launch_files: Sequence[str | Path],
+    folder: Path,
+    written: Callable[[Path], _Written],
+    *,
+    throttled: bool,
+    dry: dict[str, str] | None,
+) -> Splicing:
+    """The folder, or with launch arguments for a ``dry`` run none.
+
+    ``written`` writes our nodes into one, and says what is redirected to them.
+    """
+    given = [str(word) for word in launch_files]
+    words = original_words(given, throttled=not throttled)
+    files = [Path(given[3])] if is_run(given) else [Path(word).absolute() for word in given]
+    name = launch_file_name(words)
+    copy, found = folder / name, []
+    if dry is not None:
+        with tempfile.TemporaryDirectory() as nowhere:
+            made, redirects = written(Path(nowhere))
+            text = launch_text(words, made, redirects)
+        found = _tried(words, redirects, dry)
+    else:
+        with new_folder(folder, {name: words}, throttled=throttled) as partial:
+            made, redirects = written(partial / NODES)
+            made = [_moved(one, partial, folder) for one in made]
+            text = launch_text(words, made, redirects)
+            (partial / name).write_text(text, encoding="utf-8")
+    diff = difflib.unified_diff([], text.splitlines(keepends=True), "/dev/null", str(copy))
+    return Splicing(
+        folder=folder,
+        launch=dict.fromkeys(files, copy),
+        originals={} if is_run(words) else {copy: Path(words[0])},
+        processes=tuple(made),
+        logs=(),
+        diff="".join(diff),
+        notes=tuple(
+            f"{file}: spliced from its original, {', '.join(words)}"
+            for file in files
+            if not is_run(given) and str(file) not in words
+        ),
+        redirects=tuple(redirects),
+        redirected=tuple(found),
+    )
+
+
+def _tried(
+    words: Sequence[str], redirects: Sequence[Redirect], arguments: Mapping[str, str]
+) -> list[dict[str, Any]]:
+    """What `ros2 launch` would redirect, found without starting a process."""
+    asked = {
+        "files": [] if is_run(words) else words,
+        "processes": [{"cmd": words}] if is_run(words) else [],
+        "redirects": [one.values() for one in redirects],
+        "arguments": arguments,
+        "folder": str(Path.cwd()),
+    }
+    said, problem = run_with_rclpy(
+        *(own_environment(), redirection.__file__, json.dumps(asked)), within_s=DRY_RUN_S
+    )
+    if problem is not None and "No module named 'launch" in problem:
+        raise PlatformError(f"a dry run needs ROS 2: source its setup.bash first ({problem})")
+    if problem is not None:
+        raise OperationError(f"{', '.join(words)} cannot be carried out: {problem}")
+    found: list[dict[str, Any]] = json.loads(said.splitlines()[-1])  # behind what is logged
+    problems = [f"{one['topic']}: {one['problem']}" for one in found if one["problem"]]
+    if problems:
+        raise OperationError("; ".join(problems))
+    return found
+
+
+def _subscribers(one: ThrottledInput, graph: "ApplicationGraph | None") -> list[str]:
     nodes = [one.subscriber] if one.subscriber else []
     if not nodes and graph is not None:
         nodes = sorted(graph.subscribers.get(one.topic, ()))
@@ -234,8 +304,7 @@ def _subscriptions(one: ThrottledInput, graph: "ApplicationGraph | None") -> lis
             f"who subscribes to {one.topic} is not known: name a recording of the application with"
             f" --recording REC, or the node with --throttle NODE:{one.topic}=PERIOD"
         )
-    target = f"{one.topic}_throttled"
-    return [Wanted(node, "subscribes to", one.topic, target) for node in nodes]
+    return nodes
 
 
 def _graph(recording: "Recording") -> "ApplicationGraph":
@@ -251,20 +320,6 @@ def _graph(recording: "Recording") -> "ApplicationGraph":
         known = named[one.kind].get(one.topic, ())
         named[one.kind][one.topic] = tuple(dict.fromkeys((*known, one.node)))
     return replace(graph, publishers=named["publisher"], subscribers=named["subscription"])
-
-
-def _wanted(plan: Plan, recording: "Recording | None") -> list[tuple[ShapingNode, Wanted]]:
-    """The shaping nodes of a plan, each with the node that publishes what it shapes."""
-    if plan.shaping_node is None:
-        raise InputError(
-            "the plan has no `shaping_node`, so there is nothing to splice: plan again with"
-            " `chainshaper plan REC --chain FIRST..LAST -o plan.yaml`"
-        )
-    graph = None if recording is None else _graph(recording)
-    return [
-        (node, Wanted(_publisher(plan, node, graph), "publishes", node.output, node.input))
-        for node in (plan.shaping_node, *plan.further_shaping_nodes)
-    ]
 
 
 def _publisher(plan: Plan, node: ShapingNode, graph: "ApplicationGraph | None") -> str:
@@ -299,11 +354,3 @@ def _moved(process: ShapingProcess, here: Path, there: Path) -> ShapingProcess:
     parameters = there / process.parameters_file.relative_to(here)
     standby = process.standby and _moved(process.standby, here, there)
     return replace(process, command=command, parameters_file=parameters, standby=standby)
-
-
-def _unchanged(files: Sequence[Path], copies: Copies) -> list[str]:
-    return [
-        f"{file}: nothing to change, launch it as before"
-        for file in dict.fromkeys(files)
-        if file not in copies.launch
-    ]

@@ -1,1 +1,0 @@
-"""Launch files in their three languages: reading, following and editing copies of them."""

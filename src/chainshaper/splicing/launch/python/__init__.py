@@ -1,1 +1,0 @@
-"""Python launch files: read without being run, edited where it is safe."""

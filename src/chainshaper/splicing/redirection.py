@@ -1,0 +1,442 @@
+"""Redirects topics of nodes while `ros2 launch` starts them, in the Python of ROS 2.
+
+`splice` writes this file beside the launch file that loads it, so it needs the standard library,
+`launch` and `launch_ros` only. Two functions of these know a node's name and remap rules in full,
+for whatever reason it is started: `Executable.prepare` has made the command line of a process, and
+`get_composable_node_load_request` the request to a container (Humble to Rolling). Behind both,
+rules are added for the nodes that are meant, each bound to the node's name (``ndt:/pose:=…``).
+
+ROS 2 follows the first rule that matches a name, and does not match the result again (upstream:
+`rcl_remap_first_match`). So a rule that leads to the topic is preceded by ours for the same name,
+and a last one is for a node that uses the topic's own name.
+"""
+
+import itertools
+import json
+import os
+import re
+import shlex
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+WITHIN = "chainshaper_within"
+WITHIN_S = 30.0
+"""A launch argument and its default (s): how long after its start the application has to run."""
+
+DISCOVERY_S = 5.0
+"""How long before that it begins to listen for the publishers and subscriptions that there are."""
+
+_DRY_RUN = "chainshaper_dry_run"
+_RULE = re.compile(r"(?:(\w+):(?!//|=))?(?:rostopic://)?([^:]+):=(.+)", re.DOTALL)
+_FOR_A_SHELL = re.compile(r"[;&|<>()$`*?~#\n]")
+
+
+@dataclass
+class Started:
+    """A process or component that is, or may be, ``node``; ``rules`` are those that were added.
+
+    ``named`` is whether the launch says its name. Otherwise the executable may be of that name,
+    and ROS 2 follows the rules if it is. ``action`` is a process's.
+    """
+
+    node: str
+    label: str
+    named: bool
+    rules: Sequence[str]
+    action: Any = None
+
+    @property
+    def runs(self) -> bool:
+        """Whether it has not ended, as far as launch knows."""
+        return getattr(self.action, "return_code", None) is None
+
+
+@dataclass
+class Redirect:
+    """``nodes`` (full names) have ``target`` in place of ``topic``, as a ``kind`` of endpoint.
+
+    ``kind`` is ``publisher`` or ``subscription``; ``added`` are our own nodes, which have the topic
+    instead. ``others`` and ``elsewhere`` are for messages: what else was started, and who is of a
+    meant name and has another topic by a rule of its own.
+    """
+
+    kind: str
+    topic: str
+    target: str
+    nodes: Sequence[str]
+    added: Sequence[str]
+    started: list[Started] = field(default_factory=list)
+    others: list[str] = field(default_factory=list)
+    elsewhere: list[str] = field(default_factory=list)
+
+    def values(self) -> dict[str, Any]:
+        """What a launch file says of it, and a dry run is asked."""
+        keys = ("kind", "topic", "target", "nodes", "added")
+        return {key: getattr(self, key) for key in keys}
+
+    def see(
+        self,
+        rules: Sequence[str],
+        name: str | None,
+        namespace: str | None,
+        label: str,
+        action: Any = None,
+    ) -> list[tuple[int, str]]:
+        """Rules to add to those of a process or component, each before the one of a place.
+
+        ``name`` and ``namespace`` are None where the executable decides; one that is given a name
+        only is taken to stand in no namespace.
+        """
+        added: list[tuple[int, str]] = []
+        label = f"{(namespace or '').rstrip('/')}/{name}" if name else f"an unnamed one ({label})"
+        if label not in self.added:
+            self.others.append(label)
+        for node in self.nodes:
+            where, _, base = node.rpartition("/")
+            there = where if namespace is None and name is None else namespace or ""
+            if name not in (None, base) or there.strip("/") != where.strip("/"):
+                continue
+            own = redirecting(rules, node, self.topic, self.target)
+            if own is None:
+                self.elsewhere += [node] if name else []
+                continue
+            texts = [rule for _, rule in own]
+            self.started.append(Started(node, label, name is not None, texts, action))
+            added += own
+        return sorted(added, key=lambda one: one[0])
+
+    def twice(self) -> str | None:
+        """Which node was started again while it runs, in words, if one was."""
+        running = [one.node for one in self.started if one.named and one.runs]
+        twice = [node for node in self.nodes if running.count(node) > 1]
+        if not twice:
+            return None
+        return f"more was redirected than meant: {_names(twice)} was started more than once"
+
+    def mistake(self, on_topic: Sequence[str], on_target: Sequence[str]) -> str | None:
+        """What is wrong with who has the topic and who the target, in words, if anything is.
+
+        A node that launch runs under its name need not have the target yet.
+        """
+        known = {*on_target, *(one.node for one in self.started if one.named and one.runs)}
+        lacking = [node for node in self.nodes if node not in known]
+        elsewhere = [node for node in lacking if node in self.elsewhere]
+        if elsewhere:
+            return f"nothing was redirected: {_names(elsewhere)} has another topic in place of it"
+        if lacking:
+            others = _names(self.others)
+            return f"nothing was redirected: no node {_names(lacking)} runs; started were {others}"
+        if self.kind == "subscription":
+            past = [one for one in on_topic if one in self.nodes]
+            return f"{_names(past)} subscribes to it past {_names(self.added)}" if past else None
+        surplus = [one for one in on_target if one not in self.nodes]
+        if surplus:
+            return f"more was redirected than meant: {_names(surplus)} publishes {self.target} too"
+        past = [one for one in on_topic if one not in self.added]
+        return f"{_names(past)} publishes it past {_names(self.added)}" if past else None
+
+    def message(self, problem: str, on_topic: Sequence[str], on_target: Sequence[str]) -> str:
+        """A problem with all that a person needs to see what it comes from."""
+        return (
+            f"{self.topic}: {problem}. {self.kind.capitalize()}s found: of {self.topic} "
+            f"{_names(on_topic)}; of {self.target} {_names(on_target)}. Correct the plan or the "
+            f"launch files and splice again; where the node starts later, launch with {WITHIN}:=60"
+        )
+
+
+def redirecting(
+    rules: Sequence[str], node: str, topic: str, target: str
+) -> list[tuple[int, str]] | None:
+    """Rules that give a node a target in place of a topic, each before the rule of a place.
+
+    None: its own rules give it another topic.
+    """
+    base = node.rpartition("/")[2]
+    added: list[tuple[int, str]] = []
+    there, matches = False, set()
+    for place, rule in enumerate(rules):
+        found = _RULE.fullmatch(rule)
+        if found is None or found[1] not in (None, base) or found[2].startswith("__"):
+            continue
+        match, leads_to = expanded(found[2], node), expanded(found[3], node)
+        if match in matches:
+            continue
+        matches.add(match)
+        there = there or leads_to == target
+        if leads_to == topic:
+            added.append((place, f"{base}:{found[2]}:={target}"))
+    if topic not in matches:
+        added.append((len(rules), f"{base}:{topic}:={target}"))
+    return added if added or there else None
+
+
+def expanded(name: str, node: str) -> str:
+    """The full name of what a node calls ``name``: absolute, relative, or private (``~/…``)."""
+    where, _, base = node.rpartition("/")
+    name = name.removeprefix("rostopic://").replace("{node}", base)
+    name = name.replace("{ns}", where).replace("{namespace}", where)
+    if name == "~" or name.startswith("~/"):
+        return node + name[1:]
+    return name if name.startswith("/") else f"{where}/{name}"
+
+
+def redirect_command(
+    words: list[str], redirects: Sequence[Redirect], label: str = "", action: Any = None
+) -> None:
+    """Add rules to a command line in place, as far as it starts a node of ROS 2.
+
+    Of what a shell carries out, one plain command is understood.
+    """
+    shell, parts = getattr(action, "shell", False), words
+    if shell:
+        text = " ".join(words)
+        try:
+            parts = [] if _FOR_A_SHELL.search(text) else shlex.split(text)
+        except ValueError:
+            parts = []
+    runs = (one.endswith("ros2") and two == "run" for one, two in itertools.pairwise(parts))
+    if "--ros-args" not in parts and not any(runs):
+        return
+    for redirect in redirects:
+        places = list(_places(parts))
+        rules = [parts[place + 1] for place in places]
+        name = _of_rule(rules, "__node", "__name")
+        added = redirect.see(rules, name, _of_rule(rules, "__ns"), label, action)
+        for number, rule in reversed(added):
+            if number < len(places):
+                parts[places[number] : places[number]] = ["-r", rule]
+            else:
+                parts += ["--ros-args", "-r", rule]
+    if shell:
+        words[:] = [shlex.join(parts)]
+
+
+def redirect_request(request: Any, redirects: Sequence[Redirect]) -> None:
+    """Add rules to a request to load a component (`composition_interfaces/srv/LoadNode`)."""
+    for redirect in redirects:
+        rules = list(request.remap_rules)
+        name = _of_rule(rules, "__node", "__name") or request.node_name or None
+        namespace = _of_rule(rules, "__ns") or request.node_namespace or None
+        for number, rule in reversed(redirect.see(rules, name, namespace, request.plugin_name)):
+            rules.insert(number, rule)
+        request.remap_rules = rules
+
+
+def _places(words: Sequence[str]) -> Iterator[int]:
+    """Where the ``-r`` of the remap rules stand among the words of a command line."""
+    for_ros = rule = False
+    for place, word in enumerate(words[:-1]):
+        for_ros = word == "--ros-args" or (for_ros and word != "--")
+        rule = for_ros and not rule and word in ("-r", "--remap")
+        if rule:
+            yield place
+
+
+def _of_rule(rules: Sequence[str], *kinds: str) -> str | None:
+    """The name or namespace that rules give to every node of a process."""
+    found = (_RULE.fullmatch(rule) for rule in rules)
+    return next((one[3] for one in found if one and not one[1] and one[2] in kinds), None)
+
+
+def _names(names: Sequence[str]) -> str:
+    return ", ".join(dict.fromkeys(names)) or "none"
+
+
+def launch_description(
+    files: Sequence[str], processes: Sequence[dict[str, Any]], redirects: Sequence[dict[str, Any]]
+) -> Any:
+    """What the launch file beside this module launches: our nodes, and the user's launch files.
+
+    ``processes`` are keyword arguments of `Node` or `ExecuteProcess`. Arguments that the files
+    require are declared here too, because launch wants to see them handed on.
+    """
+    from launch import LaunchContext, LaunchDescription, LaunchDescriptionSource
+    from launch.actions import (
+        DeclareLaunchArgument,
+        ExecuteProcess,
+        IncludeLaunchDescription,
+        OpaqueFunction,
+    )
+    from launch.launch_description_sources import AnyLaunchDescriptionSource
+    from launch.substitutions import LaunchConfiguration
+    from launch_ros.actions import Node
+
+    parts = [Redirect(**one) for one in redirects]
+    actions: list[Any] = [OpaqueFunction(function=_begin, args=[parts])]
+    actions += [(Node if "package" in one else ExecuteProcess)(**one) for one in processes]
+    for file in files:
+        description = AnyLaunchDescriptionSource(file).get_launch_description(LaunchContext())
+        required = [
+            argument
+            for argument, includes in (
+                description.get_launch_arguments_with_include_launch_description_actions()
+            )
+            if includes is None and argument.default_value is None
+            if not argument._conditionally_included
+        ]
+        actions += [
+            DeclareLaunchArgument(one.name, description=one.description) for one in required
+        ]
+        actions.append(
+            IncludeLaunchDescription(
+                LaunchDescriptionSource(description, file, "spliced launch file"),
+                launch_arguments=[(one.name, LaunchConfiguration(one.name)) for one in required],
+            )
+        )
+    within = DeclareLaunchArgument(
+        WITHIN,
+        default_value=str(WITHIN_S),
+        description="after how many seconds a topic that was not redirected ends the launch",
+    )
+    return LaunchDescription([within, *actions])
+
+
+def _begin(context: Any, redirects: Sequence[Redirect]) -> list[Any] | None:
+    """Redirect from here on, and see whether all is right when the application runs."""
+    from launch.actions import OpaqueFunction, TimerAction
+
+    redirect_from_now_on(redirects)
+    if hasattr(context.locals, _DRY_RUN):
+        return None
+    within_s = float(context.launch_configurations.get(WITHIN, WITHIN_S))
+    listen = OpaqueFunction(function=_listen)
+    check = OpaqueFunction(function=_check, args=[redirects])
+    return [
+        TimerAction(period=max(0.0, within_s - DISCOVERY_S), actions=[listen]),
+        TimerAction(period=within_s, actions=[check]),
+    ]
+
+
+def _listen(context: Any) -> None:
+    """Take part in ROS 2, so that its graph is known when it is asked for."""
+    from launch_ros.ros_adapters import get_ros_node
+
+    get_ros_node(context)
+
+
+def redirect_from_now_on(redirects: Sequence[Redirect]) -> None:
+    """Let whatever this process launches be redirected.
+
+    Raises:
+        AttributeError: this `launch_ros` makes its requests in another way.
+    """
+    from launch.descriptions import Executable
+    from launch_ros.actions import load_composable_nodes as loading
+
+    prepare, requested = Executable.prepare, loading.get_composable_node_load_request
+
+    def prepare_redirected(executable: Any, context: Any, action: Any) -> None:
+        prepare(executable, context, action)
+        # The action takes this very list.
+        redirect_command(executable.final_cmd, redirects, executable.final_name, action)
+
+    def request_redirected(description: Any, context: Any) -> Any:
+        request = requested(description, context)
+        if request is not None:  # its condition does not hold
+            redirect_request(request, redirects)
+        return request
+
+    Executable.prepare = prepare_redirected
+    loading.get_composable_node_load_request = request_redirected
+
+
+def _check(context: Any, redirects: Sequence[Redirect]) -> None:
+    """Hold what was redirected against the graph of ROS 2.
+
+    Raises:
+        RuntimeError: nothing was redirected, or more than is meant. It ends the launch.
+    """
+    import launch.logging
+    from launch_ros.ros_adapters import get_ros_node
+
+    logger, asked = launch.logging.get_logger("chainshaper"), get_ros_node(context)
+    messages = []
+    for one in redirects:
+        ask = getattr(asked, f"get_{one.kind}s_info_by_topic")
+        found = [[_full_name(info) for info in ask(topic)] for topic in (one.topic, one.target)]
+        mistake = one.twice() or one.mistake(*found)
+        messages += [one.message(mistake, *found)] if mistake else []
+        there = "is redirected" if {*one.nodes} <= {*found[1]} else "is redirected when it comes"
+        logger.info(f"{one.topic} of {_names(one.nodes)} {there}: {one.target}")
+    if messages:
+        raise RuntimeError("; ".join(messages))
+
+
+def _full_name(info: Any) -> str:
+    return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+
+
+def dry_run(
+    files: Sequence[str],
+    processes: Sequence[dict[str, Any]],
+    redirects: Sequence[dict[str, Any]],
+    arguments: dict[str, str],
+    folder: str,
+) -> list[dict[str, Any]]:
+    """Carry out launch files in a folder without starting a process; what would be redirected.
+
+    Timers fire at once, and what event handlers would start is started.
+    """
+    import asyncio
+
+    from launch import LaunchContext
+    from launch.actions import (
+        ExecuteProcess,
+        IncludeLaunchDescription,
+        RegisterEventHandler,
+        TimerAction,
+    )
+    from launch.actions.execute_local import ExecuteLocal
+    from launch.launch_description_sources import AnyLaunchDescriptionSource
+    from launch_ros.actions import LifecycleNode, LoadComposableNodes, Node
+    from launch_ros.actions import load_composable_nodes as loading
+    from launch_ros.substitutions import ExecutableInPackage
+
+    def load(action: Any, context: Any) -> None:
+        for one in action._LoadComposableNodes__composable_node_descriptions:
+            loading.get_composable_node_load_request(one, context)
+
+    def carry_out(entity: Any, context: Any) -> None:
+        for inner in entity.visit(context) or ():
+            carry_out(inner, context)
+
+    ExecuteLocal.execute = lambda action, context: action.prepare(context)
+    ExecutableInPackage.perform = lambda one, context: "".join(
+        context.perform_substitution(part) for part in one.executable
+    )
+    LifecycleNode.execute = Node.execute
+    LoadComposableNodes.execute = load
+    for timer in (TimerAction, *TimerAction.__subclasses__()):
+        timer.execute = lambda action, _: action.actions
+    RegisterEventHandler.execute = lambda action, _: action.event_handler.describe()[1]
+    os.chdir(folder)
+    parts = [Redirect(**one) for one in redirects]
+    redirect_from_now_on(parts)
+    context = LaunchContext()
+    context.extend_globals({_DRY_RUN: True})
+    context._set_asyncio_loop(asyncio.new_event_loop())
+    for one in processes:
+        carry_out(ExecuteProcess(**one), context)
+    for file in files:
+        source = AnyLaunchDescriptionSource(file)
+        carry_out(IncludeLaunchDescription(source, launch_arguments=arguments.items()), context)
+    return [_found(one) for one in parts]
+
+
+def _found(redirect: Redirect) -> dict[str, Any]:
+    """What a dry run found: who would be redirected, or what is wrong with that."""
+    maybe = [one.node for one in redirect.started if not one.named]
+    return {
+        "topic": redirect.topic,
+        "target": redirect.target,
+        "problem": redirect.twice() or redirect.mistake([], maybe),
+        "redirected": [
+            {"node": one.node, "as": one.label, "rules": one.rules} for one in redirect.started
+        ],
+    }
+
+
+if __name__ == "__main__":
+    sys.stdout.write(json.dumps(dry_run(**json.loads(sys.argv[1]))) + "\n")

@@ -1,0 +1,360 @@
+"""A folder with the launch file that splicing writes: whole or absent, and known as ours.
+
+Beside the launch file stand what redirects topics (:mod:`.redirection`) and the nodes that are
+added; the user's launch files stay where they are. A manifest, `splice.json`, names every file with
+its hash, so that the folder can be replaced or removed again as long as nobody has changed it. What
+running and building leave there does not count as a change: Python's caches, logs of the shaping
+nodes, colcon's folders.
+"""
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from pprint import pformat
+from typing import Any
+
+from chainshaper.splicing import redirection
+from chainshaper.splicing.redirection import Redirect
+from chainshaper.splicing.shaping_process import RESPAWN, ShapingProcess
+from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.whole_file import open_to_all
+from chainshaper.values.yaml_file import read_text
+
+__all__ = [
+    "LOGS",
+    "NODES",
+    "LaunchCommand",
+    "is_run",
+    "launch_file_name",
+    "launch_text",
+    "new_folder",
+    "original_words",
+    "parse_launch_command",
+    "remove_folder",
+    "usable",
+]
+
+MANIFEST = "splice.json"
+NODES = "shaping_nodes"
+LOGS = "logs"
+_FORMAT = 1
+_DERIVED = {LOGS, *(f"{NODES}/{name}" for name in ("build", "install", "log"))}
+_WITH_VALUE = ("--launch-prefix", "--launch-prefix-filter")
+_SIGNS = {
+    ".py": "generate_launch_description",
+    ".xml": "<launch",
+    ".yaml": r"(?m)^[\s'\"{]*launch\b",
+    ".yml": r"(?m)^[\s'\"{]*launch\b",
+    ".launch": "launch",
+}
+"""What the text of a launch file has in it, by the end of its name."""
+
+_TEXT = '''"""Starts {what} with nodes added; written by `chainshaper splice`."""
+
+import importlib.util
+from pathlib import Path
+
+LAUNCH_FILES = {files}
+
+PROCESSES = {processes}
+
+REDIRECTS = {redirects}
+
+
+def generate_launch_description():
+    path = Path(__file__).resolve().with_name("redirection.py")
+    spec = importlib.util.spec_from_file_location("redirection", path)
+    redirection = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(redirection)
+    return redirection.launch_description(LAUNCH_FILES, PROCESSES, REDIRECTS)
+'''
+
+
+@dataclass(frozen=True)
+class LaunchCommand:
+    """`ros2 launch …` as it was typed.
+
+    ``before`` and ``after`` are the words around those that name the launch ``file``;
+    ``arguments`` are launch arguments by name.
+    """
+
+    before: tuple[str, ...]
+    file: Path
+    after: tuple[str, ...]
+    arguments: dict[str, str]
+
+    def with_file(self, file: Path) -> list[str]:
+        """The command that launches another file in the same way."""
+        return [*self.before, str(file), *self.after]
+
+
+def parse_launch_command(command: Sequence[str]) -> LaunchCommand:
+    """Find the launch file of a command: named by its path, or by a package and its name there.
+
+    Upstream: ros2launch, `command/launch.py` and `api/api.py`.
+
+    Raises:
+        InputError: it is not `ros2 launch`, or there is no such package or launch file.
+    """
+    words = list(command)
+    if len(words) < 3 or Path(words[0]).name != "ros2" or words[1] != "launch":
+        raise InputError(
+            f"`{' '.join(command)}` is not `ros2 launch …`: a shaping node can be added to launch "
+            "files only; for other ways of starting see `chainshaper run` and `chainshaper splice`"
+        )
+    at = 2
+    while at < len(words) and words[at].startswith("-"):
+        at += 2 if words[at] in _WITH_VALUE else 1
+    if at >= len(words):
+        raise InputError("no launch file given: `ros2 launch PACKAGE FILE`, or `ros2 launch FILE`")
+    first = words[at]
+    if Path(first).is_file():
+        return _command(words, at, at + 1, Path(first))
+    share = _package_share(first)
+    if share is None:
+        raise InputError(
+            f"{first}: neither a launch file nor a package of this environment; is it sourced "
+            "(`source install/setup.bash`)?"
+        )
+    if at + 1 >= len(words):
+        raise InputError(f"no launch file given: `ros2 launch {first} FILE`")
+    return _command(words, at, at + 2, _file_of_package(share, first, words[at + 1]))
+
+
+def _package_share(package: str) -> Path | None:
+    """The share folder of a package in the environment, found as `ament_index` finds it."""
+    for prefix in filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)):
+        if (Path(prefix) / "share/ament_index/resource_index/packages" / package).is_file():
+            return Path(prefix) / "share" / package
+    return None
+
+
+def _command(words: list[str], start: int, end: int, file: Path) -> LaunchCommand:
+    after = words[end:]
+    arguments = dict(word.split(":=", 1) for word in after if ":=" in word)
+    return LaunchCommand(tuple(words[:start]), file.absolute(), tuple(after), arguments)
+
+
+def _file_of_package(share: Path, package: str, name: str) -> Path:
+    found = [Path(folder) / name for folder, _, files in os.walk(share) if name in files]
+    if not found:
+        raise InputError(f"package {package} has no launch file {name} in {share}")
+    if len(found) > 1:
+        raise InputError(
+            f"package {package} has {len(found)} files {name}: give the path of the one that is "
+            f"meant, {' or '.join(map(str, sorted(found)))}"
+        )
+    return found[0]
+
+
+def _check_launch_file(path: Path) -> None:
+    """Look at a launch file as far as a mistaken one would be noticed; launch alone reads it.
+
+    Raises:
+        InputError: there is no such file, or it is no launch file.
+    """
+    if path.suffix not in _SIGNS:
+        raise InputError(
+            f"{path}: a launch file's name ends in .py, .xml, .yaml, .yml or .launch: give one"
+        )
+    if not re.search(_SIGNS[path.suffix], read_text(path, "what `ros2 launch` starts")):
+        raise InputError(
+            f"{path}: no launch file: it has no `launch`, or no `generate_launch_description`"
+        )
+
+
+def launch_file_name(words: Sequence[str]) -> str:
+    """The name of the launch file that stands for others, or for `ros2 run …`."""
+    name = words[3] if is_run(words) else Path(words[0]).name
+    return re.sub(r"([.]launch)?([.](py|xml|ya?ml|launch))?$", "", name, count=1) + ".launch.py"
+
+
+def launch_text(
+    words: Sequence[str],
+    processes: Sequence[ShapingProcess],
+    redirects: Sequence[Redirect],
+) -> str:
+    """The text of the launch file that starts processes and includes launch files.
+
+    ``words`` are the files, or `ros2 run …`.
+    """
+    run = [{"cmd": [*words], "output": "screen"}] if is_run(words) else []
+    every = [one for process in processes for one in (process, process.standby) if one is not None]
+    what = words[3] if run else ", ".join(Path(word).name for word in words)
+    return _TEXT.format(
+        what=re.sub(r"[^\w., -]", "_", what),  # a file's name cannot end the text it stands in
+        files=pformat([] if run else list(words), width=96),
+        processes=pformat([*map(_keywords, every), *run], width=96, sort_dicts=False),
+        redirects=pformat([one.values() for one in redirects], width=96, sort_dicts=False),
+    )
+
+
+def is_run(words: Sequence[str]) -> bool:
+    """Whether words are `ros2 run PACKAGE EXECUTABLE …` in place of launch files."""
+    return len(words) > 3 and Path(words[0]).name == "ros2" and words[1] == "run"
+
+
+def _keywords(process: ShapingProcess) -> dict[str, Any]:
+    """Arguments of launch's `ExecuteProcess`, or of `Node`."""
+    common = {"name": process.name, "output": "screen", **RESPAWN}
+    if process.command is not None:
+        return {"cmd": process.command_line, **common}
+    return {
+        "package": process.package,
+        "executable": process.executable,
+        "namespace": process.namespace,
+        "parameters": [str(process.parameters_file)],
+        "remappings": list(process.remappings),
+        **common,
+    }
+
+
+def usable(folder: Path) -> Path:
+    """The absolute path of the folder to write, once it is sure that nothing would be lost.
+
+    Raises:
+        InputError: it has something in it that is not ours, or was changed.
+    """
+    folder = folder.absolute()
+    if not folder.parent.is_dir():
+        raise InputError(f"{folder.parent}: no such folder to write {folder.name} into")
+    if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        _refuse_changed(folder, "not overwritten: name another, or remove it")
+    return folder
+
+
+def _refuse_changed(folder: Path, consequence: str) -> None:
+    manifest = _manifest(folder)
+    if manifest is None:
+        raise InputError(
+            f"{folder} was not written by `chainshaper splice`, so it is {consequence}"
+        )
+    found = _hashes(folder)
+    changed = sorted(
+        name for name, digest in found.items() if manifest["files"].get(name, "") != digest
+    )
+    if changed:
+        raise InputError(
+            f"{folder}: {', '.join(changed)} was changed or added since it was written, so it is"
+            f" {consequence}"
+        )
+
+
+def _manifest(folder: Path) -> dict[str, Any] | None:
+    """What was written: ``copies`` (launch files of ours, with the words that they stand for),
+    ``files`` (SHA-256 by name), and whether it has a throttler.
+    """
+    try:
+        values = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
+        if values["format"] == _FORMAT:
+            copies = {  # earlier versions copied each launch file
+                name: [words] if isinstance(words, str) else list(words)
+                for name, words in values["copies"].items()
+            }
+            throttled = bool(values.get("throttled"))
+            return {"copies": copies, "files": dict(values["files"]), "throttled": throttled}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        pass
+    return None
+
+
+def _hashes(folder: Path) -> dict[str, str]:
+    """The hash of every file that counts, by its path below the folder."""
+    found: dict[str, str] = {}
+    for path in folder.rglob("*"):
+        name = path.relative_to(folder)
+        derived = "__pycache__" in name.parts or not _DERIVED.isdisjoint(map(str, name.parents))
+        if path.is_file() and not derived and str(name) != MANIFEST:
+            found[str(name)] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return found
+
+
+def original_words(words: Sequence[str], *, throttled: bool = False) -> list[str]:
+    """Launch files as they were before splicing, each once, or `ros2 run …` as it is.
+
+    With ``throttled`` a launch file that has a throttler is an original too.
+    """
+    if is_run(words):
+        return list(words)
+    found: list[str] = []
+    for word in words:
+        file = Path(word).absolute()
+        manifest = _manifest(file.parent)
+        ours = manifest is not None and file.name in manifest["copies"]
+        if manifest is None or not ours or (throttled and manifest["throttled"]):
+            _check_launch_file(file)
+            found.append(str(file))
+        else:
+            found += original_words(manifest["copies"][file.name], throttled=throttled)
+    return list(dict.fromkeys(found)) if not is_run(found) else found
+
+
+@contextmanager
+def new_folder(
+    folder: Path, copies: Mapping[str, Sequence[str]], *, throttled: bool = False
+) -> Iterator[Path]:
+    """A folder to fill, which takes the place of ``folder`` when all went well.
+
+    ``copies`` are the launch files in it, with the words that they stand for.
+
+    Raises:
+        OperationError: it cannot be written; nothing is left behind, an older one stays.
+    """
+    partial: Path | None = None
+    try:
+        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.partial-", dir=folder.parent))
+        shutil.copyfile(redirection.__file__, partial / "redirection.py")
+        yield partial
+        (partial / LOGS).mkdir()
+        manifest = {"throttled": throttled, "copies": dict(copies), "files": _hashes(partial)}
+        text = json.dumps({"format": _FORMAT, **manifest}, indent=2) + "\n"
+        (partial / MANIFEST).write_text(text, encoding="utf-8")
+        open_to_all(partial)
+        if _manifest(folder) != manifest or _hashes(folder) != manifest["files"]:
+            _replace(folder, partial)
+    except OSError as error:
+        raise OperationError(f"{folder}: cannot be written: {error}") from error
+    finally:
+        if partial is not None and partial.exists():
+            shutil.rmtree(partial, ignore_errors=True)
+
+
+def _replace(folder: Path, new: Path) -> None:
+    """Put a new folder in the place of an older one of ours, which comes back if that fails."""
+    if not folder.exists():
+        new.rename(folder)
+        return
+    aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.older-", dir=folder.parent))
+    folder.rename(aside)
+    try:
+        new.rename(folder)
+    except OSError:
+        aside.rename(folder)
+        raise
+    shutil.rmtree(aside, ignore_errors=True)
+
+
+def remove_folder(folder: Path) -> None:
+    """Remove a folder of ours, all of it or nothing.
+
+    Raises:
+        InputError: it is not ours, or something in it was changed or added since.
+        OperationError: it cannot be removed.
+    """
+    folder = folder.absolute()
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder, so there is nothing to undo")
+    _refuse_changed(folder, "not removed: move away what you need, and remove the rest")
+    try:
+        aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.older-", dir=folder.parent))
+        folder.rename(aside)
+        shutil.rmtree(aside)
+    except OSError as error:
+        raise OperationError(f"{folder}: cannot be removed: {error}") from error

@@ -1,0 +1,211 @@
+"""Which rules redirect a node, in all ways to write a command line or a request; without ROS 2."""
+
+import shlex
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from chainshaper.splicing.redirection import (
+    Redirect,
+    expanded,
+    redirect_command,
+    redirect_request,
+    redirecting,
+)
+
+
+def pose(*nodes: str, kind: str = "publisher") -> Redirect:
+    return Redirect(kind, "/pose", "/pose_tmp", nodes or ("/ndt",), ("/shaping", "/standby"))
+
+
+def topic_of(name: str, node: str, rules: list[str]) -> str:
+    """What `rcl_remap_first_match` makes of a name: written down a second time, for topics."""
+    base, full = node.rpartition("/")[2], expanded(name, node)
+    for rule in rules:
+        match, target = rule.split(":=", 1)
+        owner, colon, rest = match.partition(":")
+        if colon and owner not in ("rostopic", base):
+            continue
+        if not match.startswith("__") and expanded(rest if owner == base else match, node) == full:
+            return expanded(target, node)
+    return full
+
+
+@pytest.mark.parametrize(
+    ("rules", "added"),
+    [
+        ([], {"/pose": 0}),
+        (["out:=/pose"], {"out": 0, "/pose": 1}),
+        (["/loc/out:=/pose", "out:=/pose"], {"/loc/out": 0, "/pose": 2}),  # one name: the first
+        (["points:=/p", "out:=/pose"], {"out": 1, "/pose": 2}),
+        (["ndt:out:=/pose"], {"out": 0, "/pose": 1}),
+        (["planner:out:=/pose"], {"/pose": 1}),
+        (["rostopic://out:=rostopic:///pose"], {"out": 0, "/pose": 1}),
+        (["rosservice://out:=/pose"], {"/pose": 1}),
+        (["~/out:=/pose", "__node:=ndt", "__ns:=/loc"], {"~/out": 0, "/pose": 3}),
+        (["{node}/out:=/pose"], {"{node}/out": 0, "/pose": 1}),
+        (["/pose:=/other", "out:=/pose"], {"out": 1}),
+        (["out:=/other", "out:=/pose"], {"/pose": 2}),  # the second is never followed
+    ],
+)
+def test_every_name_that_has_the_topic_gets_the_target(
+    rules: list[str], added: dict[str, int]
+) -> None:
+    found = redirecting(rules, "/loc/ndt", "/pose", "/pose_tmp")
+    assert found == [(place, f"ndt:{match}:=/pose_tmp") for match, place in added.items()]
+
+
+def test_a_node_that_has_another_topic_is_not_redirected() -> None:
+    assert redirecting(["/pose:=/other"], "/ndt", "/pose", "/pose_tmp") is None
+
+
+def test_what_a_person_has_remapped_to_the_target_counts() -> None:
+    assert redirecting(["/pose:=/pose_tmp"], "/ndt", "/pose", "/pose_tmp") == []
+
+
+NAMES = st.sampled_from(["out", "~/out", "/pose", "pose", "/loc/out", "/loc/pose", "ndt/out", "x"])
+RULES = st.lists(
+    st.builds(
+        lambda owner, match, target: f"{owner}{match}:={target}",
+        *(st.sampled_from(["", "ndt:", "planner:", "rostopic://"]), NAMES, NAMES),
+    ),
+    max_size=6,
+)
+
+
+@given(RULES, NAMES, st.sampled_from(["/ndt", "/loc/ndt"]))
+def test_exactly_the_topic_is_redirected_whatever_the_rules(
+    rules: list[str], name: str, node: str
+) -> None:
+    added = redirecting(rules, node, "/pose", "/pose_tmp") or []
+    after = list(rules)
+    for place, rule in reversed(added):
+        after.insert(place, rule)
+    was, now = topic_of(name, node, rules), topic_of(name, node, after)
+    assert now == ("/pose_tmp" if was == "/pose" else was)
+    for other in ("/planner", "/loc/planner"):
+        assert topic_of(name, other, after) == topic_of(name, other, rules)
+
+
+@pytest.mark.parametrize(
+    ("command", "wanted"),
+    [
+        ("n --ros-args -r __node:=ndt", "{0} --ros-args -r ndt:/pose:=/pose_tmp"),
+        ("n -r x:=y --ros-args -r __node:=ndt", "{0} --ros-args -r ndt:/pose:=/pose_tmp"),
+        (
+            "n --ros-args --remap a:=/pose -r __node:=ndt -- -r b:=/pose",
+            "n --ros-args -r ndt:a:=/pose_tmp --remap a:=/pose -r __node:=ndt -- -r b:=/pose"
+            " --ros-args -r ndt:/pose:=/pose_tmp",
+        ),
+        ("ros2 run l n", "{0} --ros-args -r ndt:/pose:=/pose_tmp"),
+        ("nice ros2 run l n --ros-args -r __ns:=/", "{0} --ros-args -r ndt:/pose:=/pose_tmp"),
+        ("n --ros-args -r __node:=ndt -r __ns:=/a", "{0}"),
+        ("n --ros-args -r __node:=icp", "{0}"),
+        ("n --ros-args -r a:__node:=ndt", "{0} --ros-args -r ndt:/pose:=/pose_tmp"),
+        ("ls -r x", "{0}"),
+    ],
+)
+@pytest.mark.parametrize("shell", [False, True])
+def test_a_command_line_is_redirected_if_it_starts_the_node(
+    command: str, wanted: str, shell: bool
+) -> None:
+    words = [command] if shell else command.split()
+    redirect_command(words, [pose()], "n-1", SimpleNamespace(shell=shell))
+    assert shlex.split(" ".join(words)) == wanted.format(command).split()
+
+
+@pytest.mark.parametrize("command", ["ros2 run l n; ls", "ros2 run l $N", "ros2 run 'l n", ""])
+def test_what_only_a_shell_understands_is_left_alone(command: str) -> None:
+    words, action = [command], SimpleNamespace(**{"shell": True})
+    redirect_command(words, [pose()], "n-1", action)
+    assert words == [command]
+
+
+def test_all_topics_of_a_node_are_redirected() -> None:
+    words = ["n", "--ros-args", "-r", "__node:=ndt", "-r", "o:=/pose", "-r", "i:=/rear"]
+    rear = Redirect("subscription", "/rear", "/rear_throttled", ["/ndt"], ["/throttler"])
+    redirect_command(words, [pose(), rear])
+    rules = [word for word in words if ":=" in word]
+    assert topic_of("o", "/ndt", rules) == "/pose_tmp"
+    assert topic_of("i", "/ndt", rules) == "/rear_throttled"
+
+
+@pytest.mark.parametrize(
+    ("name", "namespace", "redirected"),
+    [
+        ("ndt", "", True),
+        ("ndt", "/", True),
+        ("ndt", "/a", False),
+        ("", "", True),
+        ("", "/a", False),
+        ("icp", "", False),
+    ],
+)
+def test_a_request_for_a_component_is_redirected_if_it_loads_the_node(
+    name: str, namespace: str, redirected: bool
+) -> None:
+    rules = ["out:=/pose"]
+    request = SimpleNamespace(
+        node_name=name, node_namespace=namespace, plugin_name="l::N", remap_rules=rules
+    )
+    redirect_request(request, [pose()])
+    ours = ["ndt:out:=/pose_tmp", "out:=/pose", "ndt:/pose:=/pose_tmp"]
+    assert request.remap_rules == (ours if redirected else rules)
+
+
+def started(redirect: Redirect, *commands: str, ended: bool = False) -> Redirect:
+    for number, command in enumerate(commands):
+        action = SimpleNamespace(shell=False, return_code=0 if ended and number == 0 else None)
+        redirect_command(command.split(), [redirect], f"n-{number}", action)
+    return redirect
+
+
+NAMED = "n --ros-args -r __node:=ndt"
+UNNAMED = "n --ros-args"
+
+
+@pytest.mark.parametrize(
+    ("commands", "on_topic", "on_target", "mistake"),
+    [
+        ([NAMED], ["/shaping"], ["/ndt"], None),
+        ([NAMED], ["/shaping", "/standby"], [], None),  # it may publish later
+        ([UNNAMED], [], ["/ndt"], None),
+        ([UNNAMED], [], [], "nothing was redirected: no node /ndt runs; started were an unnamed"),
+        ([], ["/icp"], [], "nothing was redirected: no node /ndt runs; started were none"),
+        ([f"{NAMED} -r /pose:=/x"], [], [], "nothing was redirected: /ndt has another topic"),
+        ([NAMED], ["/icp"], ["/ndt"], "/icp publishes it past /shaping, /standby"),
+        ([NAMED], [], ["/ndt", "/icp"], "more was redirected than meant: /icp publishes /pose_tmp"),
+    ],
+)
+def test_what_was_started_is_held_against_the_graph(
+    commands: list[str], on_topic: list[str], on_target: list[str], mistake: str | None
+) -> None:
+    found = started(pose(), *commands).mistake(on_topic, on_target)
+    assert (found is None) if mistake is None else (found or "").startswith(mistake), found
+
+
+def test_anybody_may_subscribe_to_a_throttled_topic() -> None:
+    redirect = started(pose("/ndt", "/icp", kind="subscription"), NAMED)
+    assert redirect.mistake(["/other"], ["/ndt", "/icp", "/rviz"]) is None
+    assert redirect.mistake(["/icp"], ["/ndt", "/icp"]) == "/icp subscribes to it past " + (
+        "/shaping, /standby"
+    )
+
+
+def test_a_node_that_has_ended_is_redirected_no_more() -> None:
+    redirect = started(pose(), NAMED, ended=True)
+    assert (redirect.mistake([], []) or "").startswith("nothing was redirected: no node /ndt runs")
+
+
+def test_a_node_is_redirected_once_unless_it_has_ended() -> None:
+    assert started(pose(), NAMED).twice() is None
+    assert started(pose(), NAMED, NAMED, ended=True).twice() is None
+    twice = "more was redirected than meant: /ndt was started more than once"
+    assert started(pose(), NAMED, NAMED).twice() == twice
+
+
+def test_a_message_names_the_topic_and_who_was_found() -> None:
+    said = pose().message("it failed", ["/icp"], [])
+    assert said.startswith("/pose: it failed. Publishers found: of /pose /icp; of /pose_tmp none.")
