@@ -57,6 +57,7 @@ if TYPE_CHECKING:
         profile_chains,
         shape_application,
     )
+    from chainshaper.flow.sweep import sweep
     from chainshaper.flow.thread_search import find_threads
     from chainshaper.planning import (
         Plan,
@@ -74,7 +75,6 @@ if TYPE_CHECKING:
     from chainshaper.reporting.html import write_report
     from chainshaper.reporting.perfetto import export_perfetto
     from chainshaper.simulation import simulate, simulate_latencies
-    from chainshaper.simulation.sweeping import sweep
     from chainshaper.sources import open_source
     from chainshaper.sources.gate_log import read_gate_log
     from chainshaper.splicing.shaping_process import write_shaping_process, write_throttler
@@ -155,7 +155,7 @@ _HOMES = {
         "profile_chains",
         "shape_application",
     ),
-    "chainshaper.simulation.sweeping": ("sweep",),
+    "chainshaper.flow.sweep": ("sweep",),
     "chainshaper.flow.thread_search": ("find_threads",),
     "chainshaper.workload.description": ("Application", "load_application"),
     "chainshaper.workload.live": ("run_application",),

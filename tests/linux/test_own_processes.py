@@ -22,7 +22,6 @@ MODULES = [
     "chainshaper.enforcement.freezer.slot_dispatcher",
     "chainshaper.enforcement.runs.guardian",
     "chainshaper.enforcement.scx.kicker",
-    "chainshaper.simulation.sweeping.worker",
     "chainshaper.workload.node_process",
     "chainshaper.workload.stall_meter",
 ]

@@ -39,7 +39,7 @@ def sweep(
     ] = 100_000,
     seed: Annotated[int | None, typer.Option(min=0, help="Instead of the description's.")] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes that compute. Default: one per core.")
+        int | None, typer.Option(min=1, help="Threads that compute. Default: one per core.")
     ] = None,
     scheduler: Annotated[
         str | None,
@@ -60,10 +60,11 @@ def sweep(
     command goes on with the others.
     """
     from chainshaper.cli.output import notes, print_json, progress, show, show_line
+    from chainshaper.flow.sweep import sweep as run_sweep
     from chainshaper.planning import load_plan
     from chainshaper.reporting.sweeps import draw_sweep, sweep_table
-    from chainshaper.simulation.sweeping import parse_axis, rows_beside
-    from chainshaper.simulation.sweeping import sweep as run_sweep
+    from chainshaper.simulation.grid import parse_axis
+    from chainshaper.simulation.sweeping import rows_beside
     from chainshaper.values.errors import InputError
     from chainshaper.values.whole_file import new_file
     from chainshaper.workload.description import load_application

@@ -10,12 +10,13 @@ those below it change as time goes on. Times are integer nanoseconds.
 most of these functions need.)
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Int64s", "Machine"]
+__all__ = ["Int64s", "Machine", "Memory", "refer_to_places"]
 
 Int64s = npt.NDArray[np.int64]
 
@@ -272,3 +273,84 @@ class Machine:
     counts: Int64s
     logs: tuple[Int64s, ...]
     latencies: Int64s
+
+
+class Memory:
+    """One array with areas of rows, and what it takes to refer to their rows."""
+
+    def __init__(self, areas: Mapping[str, Int64s]) -> None:
+        self._columns = {name: area.shape[1] for name, area in areas.items()}
+        self._first: dict[str, int] = {}
+        self._areas: dict[str, Int64s] = {}
+        self.array = np.zeros(sum(area.size for area in areas.values()), dtype=np.int64)
+        first = 0
+        for name, area in areas.items():
+            self._first[name] = first
+            self._areas[name] = self.array[first : first + area.size].reshape(area.shape)
+            self._areas[name][:] = area
+            first += area.size
+
+    def __getitem__(self, name: str) -> Int64s:
+        """An area, as a view with a row per thing."""
+        return self._areas[name]
+
+    def place(self, name: str, row: int) -> int:
+        """Where a row of an area begins."""
+        return int(self._first[name] + row * self._columns[name])
+
+    def refer(
+        self, name: str, column: int, target: str, rows: npt.NDArray[np.bool_] | None = None
+    ) -> None:
+        """Turn a column's numbers of rows of ``target`` into their places."""
+        numbers = self._areas[name][:, column]
+        chosen = numbers != NONE if rows is None else rows & (numbers != NONE)
+        numbers[chosen] = self._first[target] + numbers[chosen] * self._columns[target]
+
+
+def refer_to_places(memory: Memory) -> None:
+    """Turn the numbers of rows into places, and note where the areas are."""
+    memory.refer("threads", T_CORE, "cores")
+    memory.refer("threads", T_FIRST, "entities")
+    memory.refer("threads", T_END, "entities")
+    for column in (T_WAKE, T_TAKE, T_PUBLISH, T_RECEIVE, T_DELIVERY):
+        memory.refer("threads", column, "streams")
+    memory.refer("threads", T_PUBLISHER_THREAD, "threads")
+    memory.refer("threads", T_DDS_THREAD, "threads")
+    memory.refer("entities", E_THREAD, "threads")
+    memory.refer("entities", E_EXECUTION, "streams")
+    memory.refer("entities", E_PUBLISHERS, "publishers")
+    memory.refer("entities", E_PUBLISHERS_END, "publishers")
+    memory.refer("entities", E_HISTORY, "rings")
+    synchronising = memory["entities"][:, E_BODY] == SYNCHRONISE
+    memory.refer("entities", E_BODY_ROW, "gates", ~synchronising)
+    memory.refer("entities", E_BODY_ROW, "synchronisers", synchronising)
+    memory.refer("publishers", P_FIRST, "readers")
+    memory.refer("publishers", P_END, "readers")
+    memory.refer("publishers", P_MODES, "announced")
+    memory.refer("readers", R_ENTITY, "entities")
+    memory.refer("gates", G_SLOTS, "slots")
+    memory.refer("gates", G_SLOTS_END, "slots")
+    memory.refer("gates", G_BANDS, "bands")
+    memory.refer("gates", G_CHANGES, "changes")
+    memory.refer("synchronisers", S_FIRST, "inputs")
+    memory.refer("synchronisers", S_END, "inputs")
+    memory.refer("inputs", I_RING, "rings")
+    memory.refer("cores", C_FIRST, "core_threads")
+    memory.refer("cores", C_END, "core_threads")
+    memory.refer("core_threads", 0, "threads")
+    for column in (C_TABLE, C_TABLE_END, C_NEXT):
+        memory.refer("cores", column, "boundaries")
+    messages = memory["messages"]
+    messages[:-1, M_NEXT] = [memory.place("messages", row) for row in range(1, len(messages))]
+    for kind in range(LOG_KINDS):
+        stride = memory[f"log {kind}"].shape[1]
+        memory["counts"][kind] = (memory.place(f"log {kind}", 0), stride, 0)
+    control = memory["control"][0]
+    control[X_CORES] = memory.place("cores", 0)
+    control[X_CORES_END] = memory.place("cores", len(memory["cores"]))
+    control[X_FREE] = memory.place("messages", 0)
+    control[X_HEAP] = control[X_HEAP_END] = memory.place("heap", 0)
+    control[X_HEAP_LIMIT] = memory.place("heap", len(memory["heap"]) - RESERVE)
+    control[X_LOGS] = memory.place("counts", 0)
+    control[X_LATENCIES] = memory.place("latencies", 0)
+    control[X_LATENCIES_END] = control[X_LATENCIES] + memory["latencies"].shape[1]

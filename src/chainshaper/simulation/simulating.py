@@ -10,10 +10,8 @@ from chainshaper.planning.overruns import open_until_done
 from chainshaper.planning.plan import Plan
 from chainshaper.planning.publisher_threads import publisher_servers
 from chainshaper.simulation import layout as at
-from chainshaper.simulation.arrays import Timing, build_machine
+from chainshaper.simulation.arrays import Streams, System, Timing, build_machine, build_system
 from chainshaper.simulation.layout import Int64s, Machine
-from chainshaper.simulation.streams import Streams
-from chainshaper.simulation.system import System, build_system
 from chainshaper.simulation.tables import Names, created_objects, event_frames, name_objects
 from chainshaper.splicing.application import splice_application
 from chainshaper.values.compiled import kernel
@@ -89,6 +87,7 @@ def simulate_latencies(
     *,
     cycles: int = 320,
     seed: int | None = None,
+    progress: Progress | None = None,
 ) -> Int64s:
     """The end-to-end latencies of an application's chain, by simulation (ns, one per cycle).
 
@@ -99,7 +98,7 @@ def simulate_latencies(
     Raises: as :func:`simulate`.
     """
     simulation = _prepare(application, plan, cycles, seed, events=False, switches=False)
-    for _ in _run(simulation):
+    for _ in _run(simulation, progress):
         pass
     return simulation.machine.latencies
 

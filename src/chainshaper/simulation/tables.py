@@ -14,8 +14,8 @@ import numpy.typing as npt
 import polars as pl
 
 from chainshaper.simulation import layout as at
+from chainshaper.simulation.arrays import System
 from chainshaper.simulation.layout import NONE, Machine
-from chainshaper.simulation.system import System
 from chainshaper.values import events
 from chainshaper.workload.event_log import WORDS
 
