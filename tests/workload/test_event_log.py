@@ -9,8 +9,9 @@ import pytest
 from chainshaper.gate.decision import ANCHORS, DROPPED, LATE, MESSAGES
 from chainshaper.values import events
 from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS, EventLog, number_of
-from chainshaper.workload.event_reading import ProcessLog, event_tables, meter_tables
+from chainshaper.workload.live import ProcessLog, event_tables
 from chainshaper.workload.stall_meter import NO_PACE
+from chainshaper.workload.stall_watch import meter_tables
 
 
 def _process(log: EventLog, pid: int = 100, core: int | None = 1) -> ProcessLog:

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from chainshaper.workload.protocol import send_events
+from chainshaper.workload.event_log import send_events
 
 
 class _Interrupted(io.RawIOBase):

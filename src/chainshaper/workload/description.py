@@ -190,7 +190,7 @@ class CallbackDescription(Part):
     a message of every input has come, with the stamp of the first input's. Executors look at
     callbacks of the ``kind`` service and client, whose subscription carries requests or
     responses, behind those of topics. One that ``computes`` calls a Python function instead of
-    spending time (:mod:`chainshaper.workload.computing`).
+    spending time (:mod:`chainshaper.workload.executor`).
     """
 
     timer_ns: PositiveDuration | None = None

@@ -14,6 +14,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
+import polars as pl
+
 from chainshaper.enforcement.runs.governing import Governed, governing, in_force_throughout
 from chainshaper.gate.decision import clock_offset
 from chainshaper.linux.own_processes import LIBRARIES
@@ -24,6 +27,7 @@ from chainshaper.linux.threads import (
     foreign_realtime_processes,
     list_threads,
 )
+from chainshaper.values import events
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import (
@@ -39,11 +43,25 @@ from chainshaper.workload.description import (
     CallbackDescription,
     application_as_written,
 )
-from chainshaper.workload.event_reading import ProcessLog, event_tables, meter_tables
+from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS
 from chainshaper.workload.launcher import Child, end_all, first_casualty, start_child
-from chainshaper.workload.stall_watch import far_from, promote_meters, read_meters, start_meters
+from chainshaper.workload.stall_watch import (
+    far_from,
+    meter_tables,
+    promote_meters,
+    read_meters,
+    start_meters,
+)
 
-__all__ = ["Enforcement", "Progress", "StartedNodes", "origin_timer", "run_application"]
+__all__ = [
+    "Enforcement",
+    "ProcessLog",
+    "Progress",
+    "StartedNodes",
+    "event_tables",
+    "origin_timer",
+    "run_application",
+]
 
 Progress = Callable[[float, str], None]
 """Called with the share done (0 to 1) and what is being done."""
@@ -351,6 +369,66 @@ def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[Thread
         )
         for child, node in children
         for thread in list_threads(child.pid)
+    )
+
+
+_MAY_BE_ABSENT = {"gate_release": ("release", "slot")}
+
+
+@dataclass(frozen=True)
+class ProcessLog:
+    """What one process recorded: rows of :mod:`~chainshaper.workload.event_log`, and objects."""
+
+    pid: int
+    core: int | None  # the one its executor was pinned to
+    rows: bytes
+    objects: tuple[dict[str, Any], ...]
+    modes: tuple[str, ...] = ()  # that its gate knows
+
+
+def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataFrame]:
+    """The event tables of all processes, sorted by time.
+
+    Events before ``from_ns`` (the warm-up) are left out, objects are not: they exist throughout.
+    """
+    parts: dict[str, list[pl.DataFrame]] = {}
+    for log in logs:
+        rows = np.frombuffer(log.rows, dtype=np.int64).reshape(-1, WIDTH)
+        rows = rows[rows[:, 1] >= from_ns]
+        for number, (name, fields) in enumerate(LAYOUT):
+            mine = rows[rows[:, 0] == number]
+            if len(mine):
+                columns = {"time": mine[:, 1]}
+                columns |= {field: mine[:, 2 + i] for i, field in enumerate(fields)}
+                parts.setdefault(name, []).append(_typed(name, pl.DataFrame(columns), log))
+        for created in log.objects:
+            name = created["event"]
+            fields_of = {key: [value] for key, value in created.items() if key != "event"}
+            parts.setdefault(name, []).append(_typed(name, pl.DataFrame(fields_of), log))
+    return {
+        name: pl.concat(frames).sort("time", maintain_order=True)
+        for name, frames in sorted(parts.items())
+    }
+
+
+def _typed(name: str, frame: pl.DataFrame, log: ProcessLog) -> pl.DataFrame:
+    frame = frame.with_columns(
+        pl.when(pl.col(field) != ABSENT).then(pl.col(field)).alias(field)
+        for field in _MAY_BE_ABSENT.get(name, ())
+    )
+    frame = frame.with_columns(
+        pl.col(field).replace_strict(dict(enumerate(words)), default=None, return_dtype=pl.String())
+        for field, words in {**WORDS, "mode": log.modes}.items()
+        if field in frame.columns
+    )
+    tid = pl.col("tid") if "tid" in frame.columns else pl.lit(log.pid)  # executors: the main thread
+    types = {**events.FIELDS[name], **events.OPTIONAL_FIELDS.get(name, {})}
+    return frame.select(
+        pl.col("time").cast(pl.Int64),
+        pl.lit(log.pid, dtype=pl.Int32).alias("pid"),
+        tid.cast(pl.Int32).alias("tid"),
+        pl.lit(log.core, dtype=pl.Int32).alias("cpu"),
+        *(pl.col(field).cast(type_) for field, type_ in types.items() if field in frame.columns),
     )
 
 

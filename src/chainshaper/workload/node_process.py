@@ -1,7 +1,7 @@
 """One node of the live workload, in a process of its own: ``python -m …node_process``.
 
 Started by :mod:`chainshaper.workload.live`, with which it talks as
-:mod:`chainshaper.workload.protocol` says. This module imports little on purpose: every page of
+:mod:`chainshaper.workload.event_log` says. This module imports little on purpose: every page of
 it is locked into memory.
 """
 
@@ -22,9 +22,17 @@ from chainshaper.linux.scheduling import (
     signalled_with_parent,
     stop_garbage_collection,
 )
-from chainshaper.workload import dds, protocol
-from chainshaper.workload.computing import Work, computing, load_function, spending
-from chainshaper.workload.event_log import ABSENT, LAYOUT, EventLog, number_of
+from chainshaper.workload import dds
+from chainshaper.workload.event_log import (
+    ABSENT,
+    LAYOUT,
+    EventLog,
+    number_of,
+    receive,
+    send,
+    send_events,
+    wait_for_leave,
+)
 from chainshaper.workload.execution import ExecutionTimes
 from chainshaper.workload.executor import (
     AsynchronousWriter,
@@ -33,7 +41,11 @@ from chainshaper.workload.executor import (
     SubscriptionEntity,
     Synchroniser,
     Timer,
+    Work,
+    computing,
+    load_function,
     noting_sends,
+    spending,
 )
 
 __all__ = ["NodeProcess", "main"]
@@ -453,16 +465,16 @@ class NodeProcess:
 
 def main() -> None:
     """Run one node as the launcher says."""
-    spec = protocol.receive()
+    spec = receive()
     signalled_with_parent(spec["parent"], signal.SIGKILL)
     set_thread_name(spec["node"].strip("/").replace("/", "."))
     node = NodeProcess(spec)
     missing = node.wait_for_counterparts(time.monotonic_ns() + spec["discovery_ns"])
-    protocol.send(missing=missing, memory_locked=lock_memory())
-    times = protocol.receive()
+    send(missing=missing, memory_locked=lock_memory())
+    times = receive()
     node.run(times["start_ns"], times["last_timer_ns"], times["stop_ns"])
-    protocol.send_events(node.log.rows.tobytes(), objects=node.log.objects)
-    protocol.wait_for_leave()
+    send_events(node.log.rows.tobytes(), objects=node.log.objects)
+    wait_for_leave()
     os._exit(0)  # DDS teardown of a closed domain is of use to nobody, and not always quick
 
 
