@@ -19,9 +19,9 @@ from chainshaper.values.errors import InputError
 from chainshaper.workload.description import Application, CallbackDescription, ExecutionTime
 from chainshaper.workload.event_log import WORDS
 from chainshaper.workload.execution import BLOCK, blocks
-from chainshaper.workload.live import node_name
+from chainshaper.workload.live import Timing, node_name
 
-__all__ = ["Streams", "System", "Timing", "build_machine", "build_system"]
+__all__ = ["Streams", "System", "build_machine", "build_system"]
 
 FIRST_PID = 1000
 ORDERS = {
@@ -269,17 +269,6 @@ BEST_EFFORT = 1000
 KINDS = ("timer", "subscription", "service", "client")
 EXECUTORS = ("single-threaded", "static", "events")
 COSTS = ("wake_up", "take", "publish", "receive", "delivery")
-
-
-@dataclass(frozen=True)
-class Timing:
-    """The instants of a simulated run (ns); as in the live workload's."""
-
-    start_ns: int
-    anchor_ns: int
-    record_from_ns: int
-    last_timer_ns: int
-    stop_ns: int
 
 
 def build_machine(

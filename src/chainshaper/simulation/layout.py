@@ -307,39 +307,39 @@ class Memory:
         numbers[chosen] = self._first[target] + numbers[chosen] * self._columns[target]
 
 
+_REFERENCES = {
+    "threads": {
+        "cores": (T_CORE,),
+        "entities": (T_FIRST, T_END),
+        "streams": (T_WAKE, T_TAKE, T_PUBLISH, T_RECEIVE, T_DELIVERY),
+        "threads": (T_PUBLISHER_THREAD, T_DDS_THREAD),
+    },
+    "entities": {
+        "threads": (E_THREAD,),
+        "streams": (E_EXECUTION,),
+        "publishers": (E_PUBLISHERS, E_PUBLISHERS_END),
+        "rings": (E_HISTORY,),
+    },
+    "publishers": {"readers": (P_FIRST, P_END), "announced": (P_MODES,)},
+    "readers": {"entities": (R_ENTITY,)},
+    "gates": {"slots": (G_SLOTS, G_SLOTS_END), "bands": (G_BANDS,), "changes": (G_CHANGES,)},
+    "synchronisers": {"inputs": (S_FIRST, S_END)},
+    "inputs": {"rings": (I_RING,)},
+    "cores": {"core_threads": (C_FIRST, C_END), "boundaries": (C_TABLE, C_TABLE_END, C_NEXT)},
+    "core_threads": {"threads": (0,)},
+}
+"""Columns that refer to rows: by area, and by the area whose rows they mean."""
+
+
 def refer_to_places(memory: Memory) -> None:
     """Turn the numbers of rows into places, and note where the areas are."""
-    memory.refer("threads", T_CORE, "cores")
-    memory.refer("threads", T_FIRST, "entities")
-    memory.refer("threads", T_END, "entities")
-    for column in (T_WAKE, T_TAKE, T_PUBLISH, T_RECEIVE, T_DELIVERY):
-        memory.refer("threads", column, "streams")
-    memory.refer("threads", T_PUBLISHER_THREAD, "threads")
-    memory.refer("threads", T_DDS_THREAD, "threads")
-    memory.refer("entities", E_THREAD, "threads")
-    memory.refer("entities", E_EXECUTION, "streams")
-    memory.refer("entities", E_PUBLISHERS, "publishers")
-    memory.refer("entities", E_PUBLISHERS_END, "publishers")
-    memory.refer("entities", E_HISTORY, "rings")
+    for area, targets in _REFERENCES.items():
+        for target, columns in targets.items():
+            for column in columns:
+                memory.refer(area, column, target)
     synchronising = memory["entities"][:, E_BODY] == SYNCHRONISE
     memory.refer("entities", E_BODY_ROW, "gates", ~synchronising)
     memory.refer("entities", E_BODY_ROW, "synchronisers", synchronising)
-    memory.refer("publishers", P_FIRST, "readers")
-    memory.refer("publishers", P_END, "readers")
-    memory.refer("publishers", P_MODES, "announced")
-    memory.refer("readers", R_ENTITY, "entities")
-    memory.refer("gates", G_SLOTS, "slots")
-    memory.refer("gates", G_SLOTS_END, "slots")
-    memory.refer("gates", G_BANDS, "bands")
-    memory.refer("gates", G_CHANGES, "changes")
-    memory.refer("synchronisers", S_FIRST, "inputs")
-    memory.refer("synchronisers", S_END, "inputs")
-    memory.refer("inputs", I_RING, "rings")
-    memory.refer("cores", C_FIRST, "core_threads")
-    memory.refer("cores", C_END, "core_threads")
-    memory.refer("core_threads", 0, "threads")
-    for column in (C_TABLE, C_TABLE_END, C_NEXT):
-        memory.refer("cores", column, "boundaries")
     messages = memory["messages"]
     messages[:-1, M_NEXT] = [memory.place("messages", row) for row in range(1, len(messages))]
     for kind in range(LOG_KINDS):

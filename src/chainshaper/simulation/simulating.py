@@ -10,7 +10,7 @@ from chainshaper.planning.overruns import open_until_done
 from chainshaper.planning.plan import Plan
 from chainshaper.planning.publisher_threads import publisher_servers
 from chainshaper.simulation import layout as at
-from chainshaper.simulation.arrays import Streams, System, Timing, build_machine, build_system
+from chainshaper.simulation.arrays import Streams, System, build_machine, build_system
 from chainshaper.simulation.layout import Int64s, Machine
 from chainshaper.simulation.tables import Names, created_objects, event_frames, name_objects
 from chainshaper.splicing.application import splice_application
@@ -26,7 +26,7 @@ from chainshaper.values.recording import (
     write_recording,
 )
 from chainshaper.workload.description import Application, application_as_written
-from chainshaper.workload.live import WARM_UP_CYCLES, completion_ns, origin_timer
+from chainshaper.workload.live import WARM_UP_CYCLES, origin_timer, timing_of
 
 __all__ = ["simulate", "simulate_latencies"]
 
@@ -176,18 +176,10 @@ def _prepare(
                 f" but {application.chain} of {application.name!r} has {format_duration(period)}:"
                 " plan again from a recording of this application"
             )
-        application = _with_plan(application, plan)
+        if plan.shaping_node is not None or any(publisher_servers(plan)):  # not in a baseline
+            application = splice_application(application, plan)
     system = build_system(application, follow_chain=not events)
-    first = START_NS + timer.phase_ns + WARM_UP_CYCLES * period
-    end = first + cycles * period
-    apart = min(1_000_000, period // 10)
-    timing = Timing(
-        start_ns=START_NS,
-        anchor_ns=START_NS + timer.phase_ns,
-        record_from_ns=first - apart,
-        last_timer_ns=end - apart,
-        stop_ns=end + completion_ns(application, period),
-    )
+    timing = timing_of(application, cycles, START_NS)
     slowest = max((cb.timer_ns or 0) + cb.phase_ns for _, cb in application.callbacks())
     if timing.stop_ns + slowest > LONGEST_NS:
         raise InputError(
@@ -207,15 +199,8 @@ def _prepare(
         warm_up=WARM_UP_CYCLES,
     )
     return _Simulation(
-        system, machine, streams, name_objects(system, machine, cores), first - apart
+        system, machine, streams, name_objects(system, machine, cores), timing.record_from_ns
     )
-
-
-def _with_plan(application: Application, plan: Plan) -> Application:
-    """With what the plan adds to the application itself; baselines have servers only."""
-    if plan.shaping_node is None and not any(publisher_servers(plan)):
-        return application
-    return splice_application(application, plan)
 
 
 def _thread_infos(system: System, names: Names) -> tuple[ThreadInfo, ...]:

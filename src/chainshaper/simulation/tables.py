@@ -73,14 +73,8 @@ def name_objects(system: System, machine: Machine, cores: Sequence[int]) -> Name
         namespace, _, name = process.node.rpartition("/")
         nodes.append(handle(number))
         note("rcl_init", number, context_handle=handle(number), version="simulation")
-        note(
-            "rcl_node_init",
-            number,
-            node_handle=nodes[number],
-            rmw_handle=handle(number),
-            node_name=name,
-            namespace=namespace or "/",
-        )
+        named = {"node_name": name, "namespace": namespace or "/"}
+        note("rcl_node_init", number, node_handle=nodes[number], rmw_handle=handle(number), **named)
     publishers = []
     for publisher in system.publishers:
         own, rmw = handle(publisher.process), handle(publisher.process)
@@ -117,12 +111,8 @@ def name_objects(system: System, machine: Machine, cores: Sequence[int]) -> Name
                 queue_depth=system.application.topic(entity.topic).depth,
             )
             note("rclcpp_subscription_init", owner, subscription_handle=own, subscription=rclcpp)
-            note(
-                "rclcpp_subscription_callback_added",
-                owner,
-                subscription=rclcpp,
-                callback=callback,
-            )
+            added = "rclcpp_subscription_callback_added"
+            note(added, owner, subscription=rclcpp, callback=callback)
         filtered = "message_filters::" if entity.described.synchronises else ""
         symbol = f"{filtered}{system.processes[owner].node}::callback{entity.index}"
         note("rclcpp_callback_register", owner, callback=callback, symbol=symbol)

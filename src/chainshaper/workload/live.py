@@ -58,9 +58,11 @@ __all__ = [
     "ProcessLog",
     "Progress",
     "StartedNodes",
+    "Timing",
     "event_tables",
     "origin_timer",
     "run_application",
+    "timing_of",
 ]
 
 Progress = Callable[[float, str], None]
@@ -147,7 +149,7 @@ def run_application(
         _allocate_threads(application, nodes, realtime)
         promote_meters(meters, realtime)
         lead = LEAD_NS if enforcement is None else LEAD_NS + ENFORCING_NS
-        timing = _Timing.of(application, timer, cycles, time.monotonic_ns() + lead)
+        timing = timing_of(application, cycles, time.monotonic_ns() + lead)
         offset_before = clock_offset()
         with _enforced(enforcement, nodes, timing):
             for child in [*nodes.values(), *meters.values()]:
@@ -204,16 +206,9 @@ def origin_timer(application: Application) -> CallbackDescription:
     return next(callback for callback in starts if callback.timer_ns is not None)
 
 
-def completion_ns(application: Application, period_ns: int) -> int:
-    """How long a run goes on behind its last cycle, so that what has begun is completed."""
-    gates = [callback.gate for _, callback in application.callbacks() if callback.gate is not None]
-    held = max((gate.due_cycles for gate in gates), default=0)
-    return max(2 * period_ns, 200_000_000) + held * period_ns
-
-
 @dataclass(frozen=True)
-class _Timing:
-    """The instants of a run (ns of CLOCK_MONOTONIC)."""
+class Timing:
+    """The instants of a run (ns), live or simulated: from the timers' common start to the end."""
 
     start_ns: int
     anchor_ns: int
@@ -222,28 +217,32 @@ class _Timing:
     stop_ns: int
     meter_from_ns: int
 
-    @classmethod
-    def of(
-        cls, application: Application, timer: CallbackDescription, cycles: int, start: int
-    ) -> "_Timing":
-        period = timer.timer_ns or 0
-        first = start + timer.phase_ns + WARM_UP_CYCLES * period
-        end = first + cycles * period
-        gates = [cb.gate for _, cb in application.callbacks() if cb.gate is not None]
-        releases = [opens for gate in gates for opens, _ in gate.slots] or [0]
-        return cls(
-            start_ns=start,
-            anchor_ns=start + timer.phase_ns,
-            # Just before the first recorded expiry: instances are not cut in two.
-            record_from_ns=first - min(1_000_000, period // 10),
-            last_timer_ns=end - min(1_000_000, period // 10),
-            stop_ns=end + completion_ns(application, period),
-            meter_from_ns=start + timer.phase_ns + far_from(releases),
-        )
+
+def timing_of(application: Application, cycles: int, start: int) -> Timing:
+    """The instants of a run that begins at ``start``; what has begun in its last cycle completes.
+
+    It is recorded from just before the first recorded expiry: instances are not cut in two.
+    """
+    timer = origin_timer(application)
+    period = timer.timer_ns or 0
+    anchor = start + timer.phase_ns
+    first = anchor + WARM_UP_CYCLES * period
+    end, apart = first + cycles * period, min(1_000_000, period // 10)
+    gates = [cb.gate for _, cb in application.callbacks() if cb.gate is not None]
+    releases = [opens for gate in gates for opens, _ in gate.slots] or [0]
+    held = max((gate.due_cycles for gate in gates), default=0)
+    return Timing(
+        start_ns=start,
+        anchor_ns=anchor,
+        record_from_ns=first - apart,
+        last_timer_ns=end - apart,
+        stop_ns=end + max(2 * period, 200_000_000) + held * period,
+        meter_from_ns=anchor + far_from(releases),
+    )
 
 
 def _enforced(
-    enforcement: Enforcement | None, nodes: dict[str, Child], timing: _Timing
+    enforcement: Enforcement | None, nodes: dict[str, Child], timing: Timing
 ) -> AbstractContextManager[object]:
     if enforcement is None:
         return nullcontext()
@@ -325,7 +324,7 @@ def _allocate_threads(application: Application, nodes: dict[str, Child], realtim
 def _watch(
     nodes: dict[str, Child],
     meters: dict[int, Child],
-    timing: _Timing,
+    timing: Timing,
     progress: Progress,
 ) -> tuple[tuple[ThreadInfo, ...], tuple[Governed, ...]]:
     """Wait for the end of the run; the threads as they were while it lasted.

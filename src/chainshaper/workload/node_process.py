@@ -50,6 +50,7 @@ from chainshaper.workload.executor import (
 
 __all__ = ["NodeProcess", "main"]
 
+GATE_FIELDS = ("cycle_ns", "anchor", "overrun", "due_cycles", "messages", "depth")
 FIRST_HANDLE = 0x55D0_0000_0100
 """Handles are like real addresses: unique in this process and reused by the others."""
 
@@ -210,11 +211,8 @@ class NodeProcess:
             topic_name=topic,
             queue_depth=self.spec["topics"][topic]["depth"],
         )
-        self.log.init(
-            "rclcpp_subscription_init",
-            subscription_handle=entity.handle,
-            subscription=rclcpp_handle,
-        )
+        own = {"subscription_handle": entity.handle, "subscription": rclcpp_handle}
+        self.log.init("rclcpp_subscription_init", **own)
         self.log.init(
             "rclcpp_subscription_callback_added", subscription=rclcpp_handle, callback=handle
         )
@@ -325,13 +323,8 @@ class NodeProcess:
         shaper = Shaper(
             Gate(
                 slots=tuple((begin, finish) for begin, finish in gate["slots"]),
-                cycle_ns=gate["cycle_ns"],
-                anchor=gate["anchor"],
-                overrun=gate["overrun"],
-                due_cycles=gate["due_cycles"],
-                messages=gate["messages"],
-                depth=gate["depth"],
                 modes=modes and Modes(modes["bands"], modes["default"], modes["late"]),
+                **{name: gate[name] for name in GATE_FIELDS},
             ),
             gate["spin_ns"],
             get_ready,
