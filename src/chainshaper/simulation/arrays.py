@@ -13,7 +13,7 @@ import numpy as np
 from chainshaper.analysis.chains import find_chain
 from chainshaper.planning.plan import Plan, Server, Thread, shaping_nodes
 from chainshaper.simulation import layout as at
-from chainshaper.simulation.layout import FOREVER, NONE, Int64s, Machine, Memory, refer_to_places
+from chainshaper.simulation.layout import FOREVER, NONE, Int64s, Memory, refer_to_places
 from chainshaper.values.application import ApplicationGraph, Callback, Chain, Node
 from chainshaper.values.errors import InputError
 from chainshaper.workload.description import Application, CallbackDescription, ExecutionTime
@@ -245,15 +245,15 @@ class Streams:
         rows[:, at.D_CONSTANT] = self._constants
         return rows
 
-    def fill(self, machine: Machine) -> None:
+    def fill(self, memory: Memory) -> None:
         """Draw for all streams that run short (all, the first time)."""
-        first = machine.first_draw
+        first, rows, draws = memory.place("draws", 0), memory["streams"], memory["draws"]
         for stream, source in enumerate(self._sources):
-            row, begin = machine.streams[stream], first + stream * AHEAD
+            row, begin = rows[stream], first + stream * AHEAD
             if source is None or (row[at.D_NEXT] and row[at.D_NEXT] < row[at.D_LIMIT] - BLOCK):
                 continue
             used = (int(row[at.D_NEXT]) - begin) // BLOCK * BLOCK if row[at.D_NEXT] else AHEAD
-            values = machine.draws[stream]
+            values = draws[stream]
             values[: AHEAD - used] = values[used:].copy()
             for place in range(AHEAD - used, AHEAD, BLOCK):
                 values[place : place + BLOCK] = next(source)
@@ -281,7 +281,7 @@ def build_machine(
     switches: bool,
     latencies: int,
     warm_up: int,
-) -> tuple[Machine, tuple[int, ...]]:
+) -> tuple[Memory, tuple[int, ...]]:
     """The arrays of a system before anything has happened, and the numbers of its cores.
 
     ``events`` and ``switches`` say what is logged, ``latencies`` for how many instances of the
@@ -363,18 +363,8 @@ def build_machine(
         memory["heap"][order] = due, order, at.EXPIRY, memory.place("entities", row)
     control[at.X_COUNTER] = len(expiries)
     control[at.X_HEAP_END] = memory.place("heap", len(expiries))
-    machine = Machine(
-        memory=memory.array,
-        threads=memory["threads"],
-        streams=memory["streams"],
-        draws=memory["draws"],
-        first_draw=memory.place("draws", 0),
-        counts=memory["counts"],
-        logs=tuple(memory[f"log {kind}"] for kind in range(at.LOG_KINDS)),
-        latencies=memory["latencies"][0],
-    )
-    streams.fill(machine)
-    return machine, tuple(places)
+    streams.fill(memory)
+    return memory, tuple(places)
 
 
 def _rows(rows: Sequence[Sequence[int]], columns: int) -> Int64s:
@@ -400,12 +390,6 @@ def _assigned(system: System, plan: Plan | None) -> dict[int, Server]:
                 )
             found[threads[thread]] = server
     return found
-
-
-def _always_open(plan: Plan, server: Server) -> bool:
-    """A shaping node holds its messages itself: its thread needs no slot to run in."""
-    nodes = shaping_nodes(plan)
-    return any(node.thread in server.threads for node in nodes)
 
 
 def _cores(
@@ -449,8 +433,11 @@ def _cores(
 
 def _slot_table(plan: Plan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
     """Rows (offset in the cycle, mask of the servers that are open from then on)."""
+    # A shaping node holds its messages itself: its thread needs no slot to run in.
+    shaping = {node.thread for node in shaping_nodes(plan)}
     slots = [
-        ((0, plan.cycle_ns),) if _always_open(plan, server) else server.slots for server in ranked
+        server.slots if shaping.isdisjoint(server.threads) else ((0, plan.cycle_ns),)
+        for server in ranked
     ]
     offsets = {0} | {instant for own in slots for slot in own for instant in slot}
     return [

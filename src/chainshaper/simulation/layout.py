@@ -11,12 +11,11 @@ most of these functions need.)
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Int64s", "Machine", "Memory", "refer_to_places"]
+__all__ = ["Int64s", "Memory", "refer_to_places"]
 
 Int64s = npt.NDArray[np.int64]
 
@@ -257,24 +256,6 @@ A_FIRST, A_STRIDE, A_COUNT, LOG_COLUMNS = range(4)
 SENT_OUTCOME, EXPIRED, OVERWRITTEN = range(3)
 
 
-@dataclass(frozen=True)
-class Machine:
-    """A system's array, and views of those areas of it that Python reads.
-
-    ``draws``: values per stream, from the place ``first_draw`` on. ``logs``: per kind a row per
-    field.
-    """
-
-    memory: Int64s
-    threads: Int64s
-    streams: Int64s
-    draws: Int64s
-    first_draw: int
-    counts: Int64s
-    logs: tuple[Int64s, ...]
-    latencies: Int64s
-
-
 class Memory:
     """One array with areas of rows, and what it takes to refer to their rows."""
 
@@ -307,7 +288,7 @@ class Memory:
         numbers[chosen] = self._first[target] + numbers[chosen] * self._columns[target]
 
 
-_REFERENCES = {
+_REFERENCES: Mapping[str, Mapping[str, tuple[int, ...]]] = {
     "threads": {
         "cores": (T_CORE,),
         "entities": (T_FIRST, T_END),

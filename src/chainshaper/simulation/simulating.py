@@ -11,7 +11,7 @@ from chainshaper.planning.plan import Plan
 from chainshaper.planning.publisher_threads import publisher_servers
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.arrays import Streams, System, build_machine, build_system
-from chainshaper.simulation.layout import Int64s, Machine
+from chainshaper.simulation.layout import Int64s, Memory
 from chainshaper.simulation.tables import Names, created_objects, event_frames, name_objects
 from chainshaper.splicing.application import splice_application
 from chainshaper.values.compiled import kernel
@@ -100,7 +100,8 @@ def simulate_latencies(
     simulation = _prepare(application, plan, cycles, seed, events=False, switches=False)
     for _ in _run(simulation, progress):
         pass
-    return simulation.machine.latencies
+    latencies: Int64s = simulation.machine["latencies"][0]
+    return latencies
 
 
 def _refuse_functions(application: Application) -> None:
@@ -118,7 +119,7 @@ class _Simulation:
     """A system with its machine, ready to run."""
 
     system: System
-    machine: Machine
+    machine: Memory
     streams: Streams
     names: Names
     record_from_ns: int
@@ -128,9 +129,9 @@ def _run(
     simulation: _Simulation, progress: Progress | None = None
 ) -> Iterator[dict[str, pl.DataFrame]]:
     """Run to the end; the event tables part by part as they fill up, objects first."""
-    machine, control = simulation.machine, simulation.machine.memory
+    machine, control = simulation.machine, simulation.machine.array
     yield created_objects(simulation.names)
-    while (reason := _run_engine(machine.memory.ctypes.data)) != at.OVER:
+    while (reason := _run_engine(control.ctypes.data)) != at.OVER:
         if reason == at.MESSAGES_FULL:
             raise OperationError(
                 "messages pile up without end: an executor or a publisher thread that never gets"
@@ -149,7 +150,7 @@ def _run(
 
 def _flush(simulation: _Simulation) -> dict[str, pl.DataFrame]:
     frames = event_frames(simulation.system, simulation.names, simulation.machine)
-    simulation.machine.counts[:, at.A_COUNT] = 0
+    simulation.machine["counts"][:, at.A_COUNT] = 0
     return frames
 
 

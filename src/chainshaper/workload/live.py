@@ -151,7 +151,9 @@ def run_application(
         lead = LEAD_NS if enforcement is None else LEAD_NS + ENFORCING_NS
         timing = timing_of(application, cycles, time.monotonic_ns() + lead)
         offset_before = clock_offset()
-        with _enforced(enforcement, nodes, timing):
+        pids = {node_name(name): child.pid for name, child in nodes.items()}
+        started = StartedNodes(pids, timing.anchor_ns)
+        with nullcontext() if enforcement is None else enforcement(started):
             for child in [*nodes.values(), *meters.values()]:
                 child.tell(**asdict(timing))
             threads, governed = _watch(nodes, meters, timing, progress)
@@ -239,15 +241,6 @@ def timing_of(application: Application, cycles: int, start: int) -> Timing:
         stop_ns=end + max(2 * period, 200_000_000) + held * period,
         meter_from_ns=anchor + far_from(releases),
     )
-
-
-def _enforced(
-    enforcement: Enforcement | None, nodes: dict[str, Child], timing: Timing
-) -> AbstractContextManager[object]:
-    if enforcement is None:
-        return nullcontext()
-    pids = {node_name(name): child.pid for name, child in nodes.items()}
-    return enforcement(StartedNodes(pids, timing.anchor_ns))
 
 
 def _start_nodes(
