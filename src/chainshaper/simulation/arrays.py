@@ -84,7 +84,7 @@ class System:
     """An application with everything that runs in it, numbered as in the engine's arrays.
 
     ``readers`` are the entities that each topic's messages reach. ``chain`` has its callbacks by
-    entity; it is empty where nobody follows it.
+    entity; it is empty where it is not followed.
     """
 
     application: Application
@@ -306,8 +306,8 @@ def build_machine(
     synchronisers, inputs, synchroniser_rows = _synchronisers(system, ring)
     entities = _entity_rows(system, timing, streams, {**gate_rows, **synchroniser_rows}, ring)
     publishers, readers, announced = _publishers(system)
-    held = sum(system.application.topic(p.topic).depth for p in system.publishers)
-    pool = POOL + len(rings) + held + at.RESERVE
+    unsent = sum(system.application.topic(p.topic).depth for p in system.publishers)
+    pool = POOL + len(rings) + unsent + at.RESERVE
     heap = pool + len(entities) + len(threads) + at.RESERVE
     entries = LOG_ENTRIES if events else 0
     areas = {

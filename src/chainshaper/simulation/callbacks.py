@@ -443,7 +443,7 @@ def _hold(m, thread):
 
 @compiled()
 def _look(m, entity, gate):
-    """What has come meanwhile may leave for the message that is held, or leave no room for it."""
+    """What has come meanwhile may leave for the one at the gate, or leave no room for it."""
     if m[entity + at.E_WAITING] == m[entity + at.E_DEPTH]:
         drop(m, gate, at.OVERFLOWED)
         return

@@ -235,7 +235,7 @@ def _sends(names: Names, machine: Memory) -> pl.DataFrame:
 def _switches(system: System, names: Names, machine: Memory) -> pl.DataFrame:
     """What ran where: `sched_switch`, the idle thread being number 0."""
     times, following, core, before, runnable, _ = _log(machine, at.L_SWITCH)
-    # One place more than threads are: NONE, the last one, is nobody.
+    # One place more than threads are: NONE, the last one, is the idle thread.
     tids = np.append(names.tids, 0).astype(np.int32)
     pids = np.append(names.pids, 0).astype(np.int32)
     comms = np.array([*names.comms, "swapper"])

@@ -135,7 +135,7 @@ def send_events(events: bytes, **fields: Any) -> None:
     """What was recorded, behind a line that says how much it is."""
     send(bytes=len(events), **fields)
     # A process that is frozen while it writes has written a part; without a buffer
-    # (PYTHONUNBUFFERED) nobody but us writes the rest.
+    # (PYTHONUNBUFFERED) no other layer writes the rest.
     left = memoryview(events)
     while left:
         left = left[sys.stdout.buffer.write(left) :]

@@ -18,7 +18,7 @@ is not sent any more.
 
 A reservation server may keep this thread from running while the executor goes on (section 3.2.1).
 So what it waits for, it waits for in the kernel: without the interpreter's lock, and without any
-lock of DDS. Woken while it is kept from running, it stops before it returns to user space, and
+lock of DDS. Woken while its server is closed, it stops before it returns to user space, and
 the executor, which only appends and wakes, never waits for it. Stopped in the midst of sending,
 however, it holds both, and the process stands still: a publish slot has to be far longer than a
 send (:mod:`chainshaper.planning.publication`).
@@ -195,7 +195,7 @@ class AsynchronousWriter:
     """The history of one writer, between the executor and the publisher thread.
 
     ``write`` gives a message and its source timestamp to DDS. Taking and appending are single
-    steps of the interpreter, so no lock is needed that somebody could be stopped with.
+    steps of the interpreter, so no lock is needed that a stopped thread could hold.
     """
 
     def __init__(

@@ -115,7 +115,7 @@ def run_application(
     does without. ``plan`` is stored with the recording. A few cycles before the recorded ones
     warm the caches and are left out. ``enforcement`` is entered when all nodes stand ready and
     their threads have their scheduling, and left when the run is over, however it ends, before
-    any node is asked to leave: a thread that is kept from running could not.
+    any node is asked to leave: a thread whose server is closed could not.
 
     Raises:
         InputError: ``output`` exists.
@@ -259,7 +259,7 @@ def _start_nodes(
 
 
 def _ros_arguments(name: str) -> tuple[str, ...]:
-    """A node's name as ROS 2 programs get it: whoever looks at its command line knows it."""
+    """A node's name as ROS 2 programs get it: its command line shows it."""
     namespace, _, base = node_name(name).rpartition("/")
     return ("--ros-args", "-r", f"__node:={base}", "-r", f"__ns:={namespace or '/'}")
 

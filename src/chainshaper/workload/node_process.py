@@ -147,7 +147,7 @@ class NodeProcess:
     def _work(
         self, index: int, callback: dict[str, Any], publishers: list["TracedPublisher"]
     ) -> Work:
-        """What the callback does: compute as a function of somebody's, or spend drawn times."""
+        """What the callback does: call the function that it names, or spend drawn times."""
         if callback["computes"] is not None:
             function = load_function(callback["computes"])
             return computing(callback["computes"], function, len(publishers))
@@ -346,8 +346,8 @@ class NodeProcess:
         that threads it outranks can deliver; only then are its events recorded. It does not
         pause when another message has to leave meanwhile.
 
-        What comes while one is held waits at the gate. The executor has it worked off before it
-        takes the next: a message is recorded as taken when it is its turn.
+        What comes while one waits for its release waits behind it. The executor has it worked off
+        before it takes the next: a message is recorded as taken when it is its turn.
 
         Delay that no other thread caused is recorded like the stall meter's own findings. A
         message that is dropped is recorded, and not published.
@@ -468,7 +468,7 @@ def main() -> None:
     node.run(times["start_ns"], times["last_timer_ns"], times["stop_ns"])
     send_events(node.log.rows.tobytes(), objects=node.log.objects)
     wait_for_leave()
-    os._exit(0)  # DDS teardown of a closed domain is of use to nobody, and not always quick
+    os._exit(0)  # DDS teardown of a closed domain is of no use, and not always quick
 
 
 if __name__ == "__main__":
