@@ -1,9 +1,9 @@
-"""Points of a sweep per second, with one and with several processes.
+"""Points of a sweep per second, with one and with several threads.
 
     python benchmarks/sweep.py [--cycles 100000] [--workers 1 2]
 
 The five-node chain of examples/synthetic_chain.yaml in 20 plans (bands × ε), which share a profile,
-and in 20 variants of the application, which do not. Starting processes is part of the time.
+and in 20 variants of the application, which do not.
 """
 
 import argparse

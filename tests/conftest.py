@@ -32,7 +32,6 @@ COMPUTING = {
     "planning",
     "reporting",
     "simulation",
-    "simulation/sweeping",
 }
 COMPUTING |= {"sources/ctf", "splicing", "values"}
 LIVE_RUNS = {"unshaped", "shaped"}

@@ -50,6 +50,7 @@ if TYPE_CHECKING:
         profile_chains,
         shape_application,
     )
+    from chainshaper.flow.sweep import sweep
     from chainshaper.flow.threads import find_threads, planned_changes
     from chainshaper.planning import (
         Plan,
@@ -66,7 +67,6 @@ if TYPE_CHECKING:
     from chainshaper.reporting.page import write_report
     from chainshaper.reporting.perfetto import export_perfetto
     from chainshaper.simulation import simulate, simulate_latencies
-    from chainshaper.simulation.sweeping import sweep
     from chainshaper.sources import open_source
     from chainshaper.sources.gate_log import read_gate_log
     from chainshaper.splicing.shaping_process import write_shaping_process, write_throttler
@@ -153,7 +153,7 @@ _HOMES = {
         "profile_chains",
         "shape_application",
     ),
-    "chainshaper.simulation.sweeping": ("sweep",),
+    "chainshaper.flow.sweep": ("sweep",),
     "chainshaper.flow.threads": ("find_threads", "planned_changes"),
     "chainshaper.workload.description": ("Application", "load_application"),
     "chainshaper.workload.live": ("run_application",),

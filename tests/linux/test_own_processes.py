@@ -32,7 +32,6 @@ MODULES = [
     "chainshaper.enforcement.slot_dispatcher",
     "chainshaper.enforcement.guardian",
     "chainshaper.enforcement.scx.kicker",
-    "chainshaper.simulation.sweeping.worker",
     "chainshaper.workload.node_process",
     "chainshaper.workload.stall_meter",
 ]

@@ -72,21 +72,9 @@ MISTAKES = {
         "no topic or node is called ''",
         "FIRST..LAST",
     ),
-    "missing key": Mistake(
-        "name: two nodes\n",
-        "",
-        1,
-        "name",
-        "is missing",
-        "add it",
-    ),
+    "missing key": Mistake("name: two nodes\n", "", 1, "name", "is missing", "add it"),
     "missing part": Mistake(
-        "  dds: {core: 0, priority: 90}\n",
-        "",
-        3,
-        "scheduling.dds",
-        "is missing",
-        "add it",
+        "  dds: {core: 0, priority: 90}\n", "", 3, "scheduling.dds", "is missing", "add it"
     ),
     "key twice": Mistake(
         "    core: 0\n",
@@ -97,20 +85,10 @@ MISTAKES = {
         "remove one",
     ),
     "node twice": Mistake(
-        "  planner:\n",
-        "  lidar:\n",
-        10,
-        "nodes.lidar",
-        "a second time",
-        "remove one",
+        "  planner:\n", "  lidar:\n", 10, "nodes.lidar", "a second time", "remove one"
     ),
     "node twice with a slash": Mistake(
-        "  planner:\n",
-        "  /lidar:\n",
-        10,
-        "nodes./lidar",
-        "the same name as 'lidar'",
-        "rename one",
+        "  planner:\n", "  /lidar:\n", 10, "nodes./lidar", "the same name as 'lidar'", "rename one"
     ),
     "misspelt key": Mistake(
         "    core: 0\n",
@@ -121,20 +99,10 @@ MISTAKES = {
         "did you mean 'core'?",
     ),
     "strange key": Mistake(
-        "    core: 0\n",
-        "    colour: red\n",
-        11,
-        "nodes.planner.colour",
-        "unknown key",
-        "remove it",
+        "    core: 0\n", "    colour: red\n", 11, "nodes.planner.colour", "unknown key", "remove it"
     ),
     "key of Python": Mistake(
-        "timer: 50ms",
-        "timer_ns: 50ms",
-        9,
-        LIDAR + ".timer_ns",
-        "unknown key",
-        "write 'timer'",
+        "timer: 50ms", "timer_ns: 50ms", 9, LIDAR + ".timer_ns", "unknown key", "write 'timer'"
     ),
     "no unit": Mistake(
         "timer: 50ms",
@@ -145,12 +113,7 @@ MISTAKES = {
         "a number and a unit",
     ),
     "wrong unit": Mistake(
-        "timer: 50ms",
-        "timer: 50m",
-        9,
-        LIDAR + ".timer",
-        "'50m' is not a duration",
-        "such as 250us",
+        "timer: 50ms", "timer: 50m", 9, LIDAR + ".timer", "'50m' is not a duration", "such as 250us"
     ),
     "negative": Mistake(
         "[2ms, 6ms]",
@@ -161,12 +124,7 @@ MISTAKES = {
         "0ms or more",
     ),
     "zero period": Mistake(
-        "timer: 50ms",
-        "timer: 0ms",
-        9,
-        LIDAR + ".timer",
-        "is zero",
-        "longer than 0ms",
+        "timer: 50ms", "timer: 0ms", 9, LIDAR + ".timer", "is zero", "longer than 0ms"
     ),
     "endless": Mistake(
         "timer: 50ms",
@@ -185,12 +143,7 @@ MISTAKES = {
         "exchange the two",
     ),
     "one limit": Mistake(
-        "[2ms, 6ms]",
-        "[2ms]",
-        9,
-        LIDAR + ".execution.uniform[1]",
-        "is missing",
-        "add it",
+        "[2ms, 6ms]", "[2ms]", 9, LIDAR + ".execution.uniform[1]", "is missing", "add it"
     ),
     "two distributions": Mistake(
         "{uniform: [2ms, 6ms]}",
@@ -201,12 +154,7 @@ MISTAKES = {
         "constant, uniform, normal",
     ),
     "normal without limits": Mistake(
-        ", within: [4ms, 14ms]",
-        "",
-        14,
-        PLANNER + ".execution",
-        "`within",
-        "needs it",
+        ", within: [4ms, 14ms]", "", 14, PLANNER + ".execution", "`within", "needs it"
     ),
     "limits that leave nothing": Mistake(
         "within: [4ms, 14ms]",
@@ -233,12 +181,7 @@ MISTAKES = {
         "`subscription: TOPIC`",
     ),
     "no trigger": Mistake(
-        "timer: 50ms, ",
-        "",
-        9,
-        LIDAR,
-        "either `timer: PERIOD`",
-        "`subscription: TOPIC`",
+        "timer: 50ms, ", "", 9, LIDAR, "either `timer: PERIOD`", "`subscription: TOPIC`"
     ),
     "phase of a subscription": Mistake(
         "subscription: /scan",
@@ -305,12 +248,7 @@ MISTAKES = {
         "write one",
     ),
     "depth of nothing": Mistake(
-        "depth: 3",
-        "depth: 0",
-        17,
-        "topics./command.depth",
-        "0",
-        "greater than or equal to 1",
+        "depth: 3", "depth: 0", 17, "topics./command.depth", "0", "greater than or equal to 1"
     ),
     "unknown word": Mistake(
         "{depth: 3}",

@@ -12,8 +12,8 @@ from chainshaper.analysis import analyse_latency
 from chainshaper.simulation.samples import with_recorded_times
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.workload import dds
-from chainshaper.workload.computing import computing, load_function
 from chainshaper.workload.description import Application, load_application
+from chainshaper.workload.executor import computing, load_function
 
 TEXT = f"""\
 name: sums
@@ -102,7 +102,7 @@ def test_a_function_that_fails_ends_the_run_with_its_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     application = _application(tmp_path, monkeypatch, numbers="sums:squares")
-    with pytest.raises(OperationError, match=r"sums:squares failed at .*computing.py:\d+: TypeErr"):
+    with pytest.raises(OperationError, match=r"sums:squares failed at .*executor.py:\d+: TypeErr"):
         run_application(application, tmp_path / "rec", cycles=3, realtime=False)
     assert not (tmp_path / "rec").exists()
 

@@ -1,5 +1,8 @@
-"""The event log: what a process records is what the tables hold."""
+"""The event log: what a process records is what the tables have, and arrives whole."""
 
+import io
+import json
+import sys
 from array import array
 from typing import Any
 
@@ -7,9 +10,18 @@ import polars as pl
 import pytest
 
 from chainshaper.values import events
-from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS, EventLog, number_of
-from chainshaper.workload.event_reading import ProcessLog, event_tables, meter_tables
+from chainshaper.workload.event_log import (
+    ABSENT,
+    LAYOUT,
+    WIDTH,
+    WORDS,
+    EventLog,
+    number_of,
+    send_events,
+)
+from chainshaper.workload.live import ProcessLog, event_tables
 from chainshaper.workload.stall_meter import NO_PACE
+from chainshaper.workload.stall_watch import meter_tables
 
 
 def _process(log: EventLog, pid: int = 100, core: int | None = 1) -> ProcessLog:
@@ -128,3 +140,42 @@ def test_stalls_come_from_meters_and_gates() -> None:
     assert paces.rows() == [(50, 11, 11, 0, 90, 12)]
     for name, table in meter_tables([]).items():
         assert table.schema == events.empty(name).schema
+
+
+class _Interrupted(io.RawIOBase):
+    """A pipe whose writer is stopped again and again: each write takes a part only."""
+
+    def __init__(self) -> None:
+        self.received = b""
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: object) -> int:
+        part = bytes(data)[:7]  # type: ignore[call-overload]
+        self.received += part
+        return len(part)
+
+
+class _Unbuffered:
+    """Standard output as PYTHONUNBUFFERED makes it: text goes through, bytes have no buffer."""
+
+    def __init__(self, pipe: _Interrupted) -> None:
+        self.buffer = pipe
+
+    def write(self, text: str) -> None:
+        self.buffer.received += text.encode()
+
+    def flush(self) -> None:
+        self.buffer.flush()
+
+
+def test_events_arrive_whole_when_the_writer_is_frozen_in_the_middle(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pipe, events = _Interrupted(), bytes(range(256)) * 3
+    monkeypatch.setattr(sys, "stdout", _Unbuffered(pipe))
+    send_events(events, objects=[])
+    line, _, rest = pipe.received.partition(b"\n")
+    assert json.loads(line) == {"bytes": len(events), "objects": []}
+    assert rest == events

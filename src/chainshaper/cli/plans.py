@@ -185,7 +185,7 @@ def sweep(
     cycles: int = option(100_000, "--cycles", "Cycles to plan from, and to judge by.", min=1),
     seed: int | None = SEED,
     workers: int | None = option(
-        None, "--workers", "Processes that compute. Default: one per core.", min=1
+        None, "--workers", "Threads that compute. Default: one per core.", min=1
     ),
     scheduler: str | None = option(
         None,
@@ -202,10 +202,11 @@ def sweep(
     Ended before it is whole, it keeps the finished points beside the file that it writes; the same
     command goes on with the others.
     """
+    from chainshaper.flow.sweep import sweep as run_sweep
     from chainshaper.reporting.figures import draw_sweep
     from chainshaper.reporting.plans import sweep_table
-    from chainshaper.simulation.sweeping import parse_axis, rows_beside
-    from chainshaper.simulation.sweeping import sweep as run_sweep
+    from chainshaper.simulation.grid import parse_axis
+    from chainshaper.simulation.sweeping import rows_beside
     from chainshaper.values.whole_file import new_file
     from chainshaper.workload.description import load_application
 

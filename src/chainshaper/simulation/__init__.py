@@ -4,14 +4,14 @@ The same description, the same execution times for the same seed, the same event
 everything downstream cannot tell a simulated recording from a live one, but for its `source`.
 :func:`simulate` writes a recording, :func:`simulate_latencies` gives the chain's latencies only.
 
-    system       what runs, in words: processes, threads, entities, publishers
-    arrays       the same in integers (layout: their columns, memory: all in one array)
-    streams      execution times, costs and delays, drawn in blocks
-    engine       cores and the order of events        \\
-    executor     ROS 2's executors, step by step        compiled by Numba
-    callbacks    what callbacks do                      (gate_kernel: the gate's decision,
-    messages     how messages travel                  /  queues: what all is kept in)
+    arrays       what runs, in words, and the same in integers (layout: all in one array)
+    engine       cores, executors, and the order of events      \\
+    callbacks    what callbacks do, how messages travel          compiled by Numba
+    gate_kernel  the gate's decision                            /
     tables       the engine's log as event tables
+    samples      execution times and costs as a recording has them
+    grid         a sweep's axes, and what a combination of their values means
+    sweeping     a sweep's points: computed by threads, or by a Dask cluster
 """
 
 from chainshaper.simulation.simulating import simulate, simulate_latencies

@@ -1,20 +1,265 @@
-"""From a system in words to the engine's arrays, row by row."""
+"""What is simulated: an application in words (:class:`System`), then in the engine's arrays.
 
-from collections.abc import Callable, Sequence
+The words are plain values between the description, which people write, and the arrays, which the
+engine runs on. Their order is that of the arrays' rows, so a row's number in the engine's log
+leads back to a name.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from chainshaper.analysis.chains import find_chain
 from chainshaper.planning.plan import Plan, Server, Thread, shaping_nodes
 from chainshaper.simulation import layout as at
-from chainshaper.simulation.layout import FOREVER, NONE, Int64s, Machine
-from chainshaper.simulation.memory import Memory, refer_to_places
-from chainshaper.simulation.streams import AHEAD, Streams
-from chainshaper.simulation.system import Entity, SimulatedThread, System
+from chainshaper.simulation.layout import FOREVER, NONE, Int64s, Memory, refer_to_places
+from chainshaper.values.application import ApplicationGraph, Callback, Chain, Node
 from chainshaper.values.errors import InputError
+from chainshaper.workload.description import Application, CallbackDescription, ExecutionTime
 from chainshaper.workload.event_log import WORDS
+from chainshaper.workload.execution import BLOCK, blocks
+from chainshaper.workload.live import Timing, node_name
 
-__all__ = ["Timing", "build_machine"]
+__all__ = ["Streams", "System", "build_machine", "build_system"]
+
+FIRST_PID = 1000
+ORDERS = {
+    "single-threaded": ("timer", "subscription", "service", "client"),
+    "static": ("subscription", "timer", "client", "service"),
+    "events": ("timer", "subscription", "service", "client"),
+}
+"""The order in which executors look at what is ready (rclcpp's Jazzy)."""
+
+
+@dataclass(frozen=True)
+class Entity:
+    """A timer or a subscription with its callback.
+
+    ``index`` is the callback's place in its node, ``number`` the input of a synchronising
+    callback, ``topic`` None for a timer. ``listens`` for modes on behalf of the gate.
+    """
+
+    process: int
+    index: int
+    number: int
+    kind: str
+    topic: str | None
+    described: CallbackDescription
+    publishers: tuple[int, ...]
+    listens: bool = False
+
+
+@dataclass(frozen=True)
+class Publisher:
+    """One callback's publisher of a topic."""
+
+    process: int
+    topic: str
+    asynchronous: bool
+
+
+@dataclass(frozen=True)
+class SimulatedThread:
+    """A thread; ``role`` is executor, publisher or dds."""
+
+    process: int
+    tid: int
+    role: str
+    core: int
+    priority: int
+
+
+@dataclass(frozen=True)
+class Process:
+    """A node's process."""
+
+    node: str
+    key: str  # the node's name in the description
+    pid: int
+
+
+@dataclass(frozen=True)
+class System:
+    """An application with everything that runs in it, numbered as in the engine's arrays.
+
+    ``readers`` are the entities that each topic's messages reach. ``chain`` has its callbacks by
+    entity; it is empty where it is not followed.
+    """
+
+    application: Application
+    processes: tuple[Process, ...]
+    threads: tuple[SimulatedThread, ...]
+    entities: tuple[Entity, ...]
+    publishers: tuple[Publisher, ...]
+    readers: Mapping[str, tuple[int, ...]]
+    chain: Chain
+    modes: tuple[str, ...]
+
+
+def build_system(application: Application, *, follow_chain: bool) -> System:
+    """Everything that runs in an application; ``follow_chain`` if its chain has to be known.
+
+    Raises:
+        InputError: the application's chain is not one path through it.
+    """
+    processes = tuple(
+        Process(node_name(key), key, FIRST_PID + 10 * number)
+        for number, key in enumerate(application.nodes)
+    )
+    entities: list[Entity] = []
+    publishers: list[Publisher] = []
+    for number, process in enumerate(processes):
+        own = list(_entities(application, number, process.key, publishers))
+        order = ORDERS[application.simulation.executor]
+        entities += sorted(own, key=lambda entity: order.index(entity.kind))
+    readers: dict[str, tuple[int, ...]] = {}
+    for number, entity in enumerate(entities):
+        if entity.topic is not None:
+            readers[entity.topic] = (*readers.get(entity.topic, ()), number)
+    announced = {mode: 0 for _, cb in application.callbacks() for mode in cb.announces}
+    known = {
+        mode: 0
+        for _, cb in application.callbacks()
+        if cb.gate is not None and cb.gate.modes is not None
+        for mode in cb.gate.modes.bands
+    }
+    return System(
+        application=application,
+        processes=processes,
+        threads=tuple(_threads(application, processes, publishers)),
+        entities=tuple(entities),
+        publishers=tuple(publishers),
+        readers=readers,
+        chain=(
+            find_chain(_graph(processes, entities, publishers), application.chain)
+            if follow_chain
+            else Chain(application.chain, (), ())
+        ),
+        modes=tuple(announced | known),
+    )
+
+
+def _entities(
+    application: Application, process: int, key: str, publishers: list[Publisher]
+) -> Iterator[Entity]:
+    """A node's entities in the order of registration; their publishers are added to the list."""
+    for index, described in enumerate(application.nodes[key].callbacks):
+        first = len(publishers)
+        for topic in described.publishes:
+            asynchronous = application.topic(topic).publication == "asynchronous"
+            publishers.append(Publisher(process, topic, asynchronous))
+        own = tuple(range(first, len(publishers)))
+        if described.timer_ns is not None:
+            yield Entity(process, index, 0, "timer", None, described, own)
+        listens = described.gate is not None and described.gate.modes is not None
+        for number, topic in enumerate(described.subscriptions):
+            if listens and number == 0:
+                yield Entity(process, index, number, "subscription", topic, described, (), True)
+            else:
+                yield Entity(process, index, number, described.kind, topic, described, own)
+
+
+def _threads(
+    application: Application, processes: tuple[Process, ...], publishers: list[Publisher]
+) -> Iterator[SimulatedThread]:
+    for number, process in enumerate(processes):
+        executor = application.scheduling_of(process.key)
+        yield SimulatedThread(number, process.pid, "executor", executor.core, executor.priority)
+        if any(p.asynchronous for p in publishers if p.process == number):
+            priority = max(1, executor.priority - 1)  # as the live workload has it
+            yield SimulatedThread(number, process.pid + 1, "publisher", executor.core, priority)
+        if application.simulation.receive is not None:
+            dds = application.dds_scheduling_of(process.key)
+            yield SimulatedThread(number, process.pid + 2, "dds", dds.core, dds.priority)
+
+
+def _graph(
+    processes: tuple[Process, ...], entities: list[Entity], publishers: list[Publisher]
+) -> ApplicationGraph:
+    callbacks = [
+        Callback(
+            id=number,
+            kind="timer" if entity.kind == "timer" else "subscription",
+            node=processes[entity.process].node,
+            pid=processes[entity.process].pid,
+            handle=number,
+            topic=entity.topic,
+            period_ns=entity.described.timer_ns,
+            publishes=tuple(publishers[publisher].topic for publisher in entity.publishers),
+        )
+        for number, entity in enumerate(entities)
+    ]
+    writers: dict[str, tuple[str, ...]] = {}
+    readers: dict[str, tuple[str, ...]] = {}
+    for publisher in publishers:
+        node = processes[publisher.process].node
+        writers[publisher.topic] = (*writers.get(publisher.topic, ()), node)
+    for entity in entities:
+        if entity.topic is not None:
+            node = processes[entity.process].node
+            readers[entity.topic] = (*readers.get(entity.topic, ()), node)
+    nodes = tuple(Node(process.node, process.pid) for process in processes)
+    return ApplicationGraph(nodes, tuple(callbacks), writers, readers)
+
+
+AHEAD = 16 * BLOCK
+"""So many values of every stream are drawn beforehand."""
+
+FIRST_COST = 1 << 20
+"""Costs are numbered from here, callbacks of a node from 0: no two draw the same sequence."""
+
+
+class Streams:
+    """All streams of a simulation: drawn in Python, consumed by the engine.
+
+    A callback's stream is that of the live workload, value for value: it depends on the seed, the
+    node's full name and the callback's place in it. So does a cost's; constants need no drawing.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+        self._constants: list[int] = []
+        self._sources: list[Iterator[Int64s] | None] = []
+
+    def callback(self, times: ExecutionTime, node: str, index: int) -> int:
+        """The number of a stream of execution times (ns)."""
+        constant = times.constant_ns
+        values = (
+            None if constant is not None else blocks(times.model_dump(), self._seed, node, index)
+        )
+        self._sources.append(values)
+        self._constants.append(at.NONE if constant is None else constant)
+        return len(self._sources) - 1
+
+    def cost(self, times: ExecutionTime, node: str, number: int) -> int:
+        """The number of a stream of costs or delays (ns)."""
+        return self.callback(times, node, FIRST_COST + number)
+
+    def __len__(self) -> int:
+        return len(self._sources)
+
+    def rows(self) -> Int64s:
+        """The streams' rows of the engine's array, before any value is drawn."""
+        rows = np.zeros((len(self), at.STREAM_COLUMNS), dtype=np.int64)
+        rows[:, at.D_CONSTANT] = self._constants
+        return rows
+
+    def fill(self, memory: Memory) -> None:
+        """Draw for all streams that run short (all, the first time)."""
+        first, rows, draws = memory.place("draws", 0), memory["streams"], memory["draws"]
+        for stream, source in enumerate(self._sources):
+            row, begin = rows[stream], first + stream * AHEAD
+            if source is None or (row[at.D_NEXT] and row[at.D_NEXT] < row[at.D_LIMIT] - BLOCK):
+                continue
+            used = (int(row[at.D_NEXT]) - begin) // BLOCK * BLOCK if row[at.D_NEXT] else AHEAD
+            values = draws[stream]
+            values[: AHEAD - used] = values[used:].copy()
+            for place in range(AHEAD - used, AHEAD, BLOCK):
+                values[place : place + BLOCK] = next(source)
+            row[at.D_NEXT] = row[at.D_NEXT] - used if row[at.D_NEXT] else begin
+            row[at.D_LIMIT] = begin + AHEAD - at.RESERVE
+
 
 LOG_ENTRIES = 1 << 17
 POOL = 4096
@@ -24,17 +269,6 @@ BEST_EFFORT = 1000
 KINDS = ("timer", "subscription", "service", "client")
 EXECUTORS = ("single-threaded", "static", "events")
 COSTS = ("wake_up", "take", "publish", "receive", "delivery")
-
-
-@dataclass(frozen=True)
-class Timing:
-    """The instants of a simulated run (ns); as in the live workload's."""
-
-    start_ns: int
-    anchor_ns: int
-    record_from_ns: int
-    last_timer_ns: int
-    stop_ns: int
 
 
 def build_machine(
@@ -47,7 +281,7 @@ def build_machine(
     switches: bool,
     latencies: int,
     warm_up: int,
-) -> tuple[Machine, tuple[int, ...]]:
+) -> tuple[Memory, tuple[int, ...]]:
     """The arrays of a system before anything has happened, and the numbers of its cores.
 
     ``events`` and ``switches`` say what is logged, ``latencies`` for how many instances of the
@@ -70,10 +304,10 @@ def build_machine(
     _describe_threads(system, threads, streams)
     gates, slots, bands, gate_rows = _gates(system, timing)
     synchronisers, inputs, synchroniser_rows = _synchronisers(system, ring)
-    entities = _entities(system, timing, streams, {**gate_rows, **synchroniser_rows}, ring)
+    entities = _entity_rows(system, timing, streams, {**gate_rows, **synchroniser_rows}, ring)
     publishers, readers, announced = _publishers(system)
-    held = sum(system.application.topic(p.topic).depth for p in system.publishers)
-    pool = POOL + len(rings) + held + at.RESERVE
+    unsent = sum(system.application.topic(p.topic).depth for p in system.publishers)
+    pool = POOL + len(rings) + unsent + at.RESERVE
     heap = pool + len(entities) + len(threads) + at.RESERVE
     entries = LOG_ENTRIES if events else 0
     areas = {
@@ -129,18 +363,8 @@ def build_machine(
         memory["heap"][order] = due, order, at.EXPIRY, memory.place("entities", row)
     control[at.X_COUNTER] = len(expiries)
     control[at.X_HEAP_END] = memory.place("heap", len(expiries))
-    machine = Machine(
-        memory=memory.array,
-        threads=memory["threads"],
-        streams=memory["streams"],
-        draws=memory["draws"],
-        first_draw=memory.place("draws", 0),
-        counts=memory["counts"],
-        logs=tuple(memory[f"log {kind}"] for kind in range(at.LOG_KINDS)),
-        latencies=memory["latencies"][0],
-    )
-    streams.fill(machine)
-    return machine, tuple(places)
+    streams.fill(memory)
+    return memory, tuple(places)
 
 
 def _rows(rows: Sequence[Sequence[int]], columns: int) -> Int64s:
@@ -166,12 +390,6 @@ def _assigned(system: System, plan: Plan | None) -> dict[int, Server]:
                 )
             found[threads[thread]] = server
     return found
-
-
-def _always_open(plan: Plan, server: Server) -> bool:
-    """A shaping node holds its messages itself: its thread needs no slot to run in."""
-    nodes = shaping_nodes(plan)
-    return any(node.thread in server.threads for node in nodes)
 
 
 def _cores(
@@ -215,8 +433,11 @@ def _cores(
 
 def _slot_table(plan: Plan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
     """Rows (offset in the cycle, mask of the servers that are open from then on)."""
+    # A shaping node holds its messages itself: its thread needs no slot to run in.
+    shaping = {node.thread for node in shaping_nodes(plan)}
     slots = [
-        ((0, plan.cycle_ns),) if _always_open(plan, server) else server.slots for server in ranked
+        server.slots if shaping.isdisjoint(server.threads) else ((0, plan.cycle_ns),)
+        for server in ranked
     ]
     offsets = {0} | {instant for own in slots for slot in own for instant in slot}
     return [
@@ -332,7 +553,7 @@ def _synchronisers(
     return _rows(synchronisers, at.SYNCHRONISER_COLUMNS), _rows(inputs, at.INPUT_COLUMNS), rows
 
 
-def _entities(
+def _entity_rows(
     system: System,
     timing: Timing,
     streams: Streams,

@@ -10,14 +10,14 @@ those below it change as time goes on. Times are integer nanoseconds.
 most of these functions need.)
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import numpy as np
 import numpy.typing as npt
 
 from chainshaper.gate.decision import CHANGES
 
-__all__ = ["Int64s", "Machine"]
+__all__ = ["Int64s", "Memory", "refer_to_places"]
 
 Int64s = npt.NDArray[np.int64]
 
@@ -258,19 +258,82 @@ A_FIRST, A_STRIDE, A_COUNT, LOG_COLUMNS = range(4)
 SENT_OUTCOME, EXPIRED, OVERWRITTEN = range(3)
 
 
-@dataclass(frozen=True)
-class Machine:
-    """A system's array, and views of those areas of it that Python reads.
+class Memory:
+    """One array with areas of rows, and what it takes to refer to their rows."""
 
-    ``draws``: values per stream, from the place ``first_draw`` on. ``logs``: per kind a row per
-    field.
-    """
+    def __init__(self, areas: Mapping[str, Int64s]) -> None:
+        self._columns = {name: area.shape[1] for name, area in areas.items()}
+        self._first: dict[str, int] = {}
+        self._areas: dict[str, Int64s] = {}
+        self.array = np.zeros(sum(area.size for area in areas.values()), dtype=np.int64)
+        first = 0
+        for name, area in areas.items():
+            self._first[name] = first
+            self._areas[name] = self.array[first : first + area.size].reshape(area.shape)
+            self._areas[name][:] = area
+            first += area.size
 
-    memory: Int64s
-    threads: Int64s
-    streams: Int64s
-    draws: Int64s
-    first_draw: int
-    counts: Int64s
-    logs: tuple[Int64s, ...]
-    latencies: Int64s
+    def __getitem__(self, name: str) -> Int64s:
+        """An area, as a view with a row per thing."""
+        return self._areas[name]
+
+    def place(self, name: str, row: int) -> int:
+        """Where a row of an area begins."""
+        return int(self._first[name] + row * self._columns[name])
+
+    def refer(
+        self, name: str, column: int, target: str, rows: npt.NDArray[np.bool_] | None = None
+    ) -> None:
+        """Turn a column's numbers of rows of ``target`` into their places."""
+        numbers = self._areas[name][:, column]
+        chosen = numbers != NONE if rows is None else rows & (numbers != NONE)
+        numbers[chosen] = self._first[target] + numbers[chosen] * self._columns[target]
+
+
+_REFERENCES: Mapping[str, Mapping[str, tuple[int, ...]]] = {
+    "threads": {
+        "cores": (T_CORE,),
+        "entities": (T_FIRST, T_END),
+        "streams": (T_WAKE, T_TAKE, T_PUBLISH, T_RECEIVE, T_DELIVERY),
+        "threads": (T_PUBLISHER_THREAD, T_DDS_THREAD),
+    },
+    "entities": {
+        "threads": (E_THREAD,),
+        "streams": (E_EXECUTION,),
+        "publishers": (E_PUBLISHERS, E_PUBLISHERS_END),
+        "rings": (E_HISTORY,),
+    },
+    "publishers": {"readers": (P_FIRST, P_END), "announced": (P_MODES,)},
+    "readers": {"entities": (R_ENTITY,)},
+    "gates": {"slots": (G_SLOTS, G_SLOTS_END), "bands": (G_BANDS,), "changes": (G_CHANGES,)},
+    "synchronisers": {"inputs": (S_FIRST, S_END)},
+    "inputs": {"rings": (I_RING,)},
+    "cores": {"core_threads": (C_FIRST, C_END), "boundaries": (C_TABLE, C_TABLE_END, C_NEXT)},
+    "core_threads": {"threads": (0,)},
+}
+"""Columns that refer to rows: by area, and by the area whose rows they mean."""
+
+
+def refer_to_places(memory: Memory) -> None:
+    """Turn the numbers of rows into places, and note where the areas are."""
+    for area, targets in _REFERENCES.items():
+        for target, columns in targets.items():
+            for column in columns:
+                memory.refer(area, column, target)
+    synchronising = memory["entities"][:, E_BODY] == SYNCHRONISE
+    memory.refer("entities", E_BODY_ROW, "gates", ~synchronising)
+    memory.refer("entities", E_BODY_ROW, "synchronisers", synchronising)
+    messages = memory["messages"]
+    messages[:-1, M_NEXT] = [memory.place("messages", row) for row in range(1, len(messages))]
+    for kind in range(LOG_KINDS):
+        stride = memory[f"log {kind}"].shape[1]
+        memory["counts"][kind] = (memory.place(f"log {kind}", 0), stride, 0)
+    control = memory["control"][0]
+    control[X_CORES] = memory.place("cores", 0)
+    control[X_CORES_END] = memory.place("cores", len(memory["cores"]))
+    control[X_FREE] = memory.place("messages", 0)
+    control[X_HEAP] = control[X_HEAP_END] = memory.place("heap", 0)
+    control[X_HEAP_LIMIT] = memory.place("heap", len(memory["heap"]) - RESERVE)
+    control[X_LOGS] = memory.place("counts", 0)
+    control[X_LATENCIES] = memory.place("latencies", 0)
+    control[X_LATENCIES_END] = control[X_LATENCIES] + memory["latencies"].shape[1]

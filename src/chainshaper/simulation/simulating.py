@@ -9,10 +9,8 @@ import polars as pl
 from chainshaper.planning.overruns import open_until_done
 from chainshaper.planning.plan import Plan, publisher_servers
 from chainshaper.simulation import layout as at
-from chainshaper.simulation.arrays import Timing, build_machine
-from chainshaper.simulation.layout import Int64s, Machine
-from chainshaper.simulation.streams import Streams
-from chainshaper.simulation.system import System, build_system
+from chainshaper.simulation.arrays import Streams, System, build_machine, build_system
+from chainshaper.simulation.layout import Int64s, Memory
 from chainshaper.simulation.tables import Names, created_objects, event_frames, name_objects
 from chainshaper.splicing.application import splice_application
 from chainshaper.values.compiled import kernel
@@ -27,7 +25,7 @@ from chainshaper.values.recording import (
     write_recording,
 )
 from chainshaper.workload.description import Application, application_as_written
-from chainshaper.workload.live import WARM_UP_CYCLES, completion_ns, origin_timer
+from chainshaper.workload.live import WARM_UP_CYCLES, origin_timer, timing_of
 
 __all__ = ["simulate", "simulate_latencies"]
 
@@ -88,6 +86,7 @@ def simulate_latencies(
     *,
     cycles: int = 320,
     seed: int | None = None,
+    progress: Progress | None = None,
 ) -> Int64s:
     """The end-to-end latencies of an application's chain, by simulation (ns, one per cycle).
 
@@ -98,9 +97,10 @@ def simulate_latencies(
     Raises: as :func:`simulate`.
     """
     simulation = _prepare(application, plan, cycles, seed, events=False, switches=False)
-    for _ in _run(simulation):
+    for _ in _run(simulation, progress):
         pass
-    return simulation.machine.latencies
+    latencies: Int64s = simulation.machine["latencies"][0]
+    return latencies
 
 
 def _refuse_functions(application: Application) -> None:
@@ -118,7 +118,7 @@ class _Simulation:
     """A system with its machine, ready to run."""
 
     system: System
-    machine: Machine
+    machine: Memory
     streams: Streams
     names: Names
     record_from_ns: int
@@ -128,9 +128,9 @@ def _run(
     simulation: _Simulation, progress: Progress | None = None
 ) -> Iterator[dict[str, pl.DataFrame]]:
     """Run to the end; the event tables part by part as they fill up, objects first."""
-    machine, control = simulation.machine, simulation.machine.memory
+    machine, control = simulation.machine, simulation.machine.array
     yield created_objects(simulation.names)
-    while (reason := _run_engine(machine.memory.ctypes.data)) != at.OVER:
+    while (reason := _run_engine(control.ctypes.data)) != at.OVER:
         if reason == at.MESSAGES_FULL:
             raise OperationError(
                 "messages pile up without end: an executor or a publisher thread that never gets"
@@ -149,7 +149,7 @@ def _run(
 
 def _flush(simulation: _Simulation) -> dict[str, pl.DataFrame]:
     frames = event_frames(simulation.system, simulation.names, simulation.machine)
-    simulation.machine.counts[:, at.A_COUNT] = 0
+    simulation.machine["counts"][:, at.A_COUNT] = 0
     return frames
 
 
@@ -176,18 +176,10 @@ def _prepare(
                 f" but {application.chain} of {application.name!r} has {format_duration(period)}:"
                 " plan again from a recording of this application"
             )
-        application = _with_plan(application, plan)
+        if plan.shaping_node is not None or any(publisher_servers(plan)):  # not in a baseline
+            application = splice_application(application, plan)
     system = build_system(application, follow_chain=not events)
-    first = START_NS + timer.phase_ns + WARM_UP_CYCLES * period
-    end = first + cycles * period
-    apart = min(1_000_000, period // 10)
-    timing = Timing(
-        start_ns=START_NS,
-        anchor_ns=START_NS + timer.phase_ns,
-        record_from_ns=first - apart,
-        last_timer_ns=end - apart,
-        stop_ns=end + completion_ns(application, period),
-    )
+    timing = timing_of(application, cycles, START_NS)
     slowest = max((cb.timer_ns or 0) + cb.phase_ns for _, cb in application.callbacks())
     if timing.stop_ns + slowest > LONGEST_NS:
         raise InputError(
@@ -207,15 +199,8 @@ def _prepare(
         warm_up=WARM_UP_CYCLES,
     )
     return _Simulation(
-        system, machine, streams, name_objects(system, machine, cores), first - apart
+        system, machine, streams, name_objects(system, machine, cores), timing.record_from_ns
     )
-
-
-def _with_plan(application: Application, plan: Plan) -> Application:
-    """With what the plan adds to the application itself; baselines have servers only."""
-    if plan.shaping_node is None and not any(publisher_servers(plan)):
-        return application
-    return splice_application(application, plan)
 
 
 def _thread_infos(system: System, names: Names) -> tuple[ThreadInfo, ...]:

@@ -14,8 +14,8 @@ import numpy.typing as npt
 import polars as pl
 
 from chainshaper.simulation import layout as at
-from chainshaper.simulation.layout import NONE, Machine
-from chainshaper.simulation.system import System
+from chainshaper.simulation.arrays import System
+from chainshaper.simulation.layout import NONE, Memory
 from chainshaper.values import events
 from chainshaper.workload.event_log import WORDS
 
@@ -48,7 +48,7 @@ class Names:
     created: Mapping[str, list[dict[str, Any]]]
 
 
-def name_objects(system: System, machine: Machine, cores: Sequence[int]) -> Names:
+def name_objects(system: System, machine: Memory, cores: Sequence[int]) -> Names:
     """Give every object a handle, unique in its process, and note its creation.
 
     ``cores`` has the number of each of the machine's cores.
@@ -73,14 +73,8 @@ def name_objects(system: System, machine: Machine, cores: Sequence[int]) -> Name
         namespace, _, name = process.node.rpartition("/")
         nodes.append(handle(number))
         note("rcl_init", number, context_handle=handle(number), version="simulation")
-        note(
-            "rcl_node_init",
-            number,
-            node_handle=nodes[number],
-            rmw_handle=handle(number),
-            node_name=name,
-            namespace=namespace or "/",
-        )
+        named = {"node_name": name, "namespace": namespace or "/"}
+        note("rcl_node_init", number, node_handle=nodes[number], rmw_handle=handle(number), **named)
     publishers = []
     for publisher in system.publishers:
         own, rmw = handle(publisher.process), handle(publisher.process)
@@ -117,12 +111,8 @@ def name_objects(system: System, machine: Machine, cores: Sequence[int]) -> Name
                 queue_depth=system.application.topic(entity.topic).depth,
             )
             note("rclcpp_subscription_init", owner, subscription_handle=own, subscription=rclcpp)
-            note(
-                "rclcpp_subscription_callback_added",
-                owner,
-                subscription=rclcpp,
-                callback=callback,
-            )
+            added = "rclcpp_subscription_callback_added"
+            note(added, owner, subscription=rclcpp, callback=callback)
         filtered = "message_filters::" if entity.described.synchronises else ""
         symbol = f"{filtered}{system.processes[owner].node}::callback{entity.index}"
         note("rclcpp_callback_register", owner, callback=callback, symbol=symbol)
@@ -158,7 +148,7 @@ def created_objects(names: Names) -> dict[str, pl.DataFrame]:
     return tables
 
 
-def event_frames(system: System, names: Names, machine: Machine) -> dict[str, pl.DataFrame]:
+def event_frames(system: System, names: Names, machine: Memory) -> dict[str, pl.DataFrame]:
     """What is in the log, as event tables; only those in which there is something."""
     started, (callback, used, *_) = _entries(names, machine, at.L_START)
     ended, (ended_callback, ended_used, *_) = _entries(names, machine, at.L_END)
@@ -207,12 +197,12 @@ def event_frames(system: System, names: Names, machine: Machine) -> dict[str, pl
     return {name: frame for name, frame in frames.items() if frame.height}
 
 
-def _log(machine: Machine, kind: int) -> at.Int64s:
+def _log(machine: Memory, kind: int) -> at.Int64s:
     """The entries of a kind: a row of times, one of threads, and one for each field."""
-    return machine.logs[kind][:, : machine.counts[kind, at.A_COUNT]]
+    return machine[f"log {kind}"][:, : machine["counts"][kind, at.A_COUNT]]
 
 
-def _entries(names: Names, machine: Machine, kind: int) -> tuple[Columns, list[at.Int64s]]:
+def _entries(names: Names, machine: Memory, kind: int) -> tuple[Columns, list[at.Int64s]]:
     """The columns that all events have, and the fields, of the entries of a kind."""
     times, threads, *fields = _log(machine, kind)
     columns = {
@@ -230,7 +220,7 @@ def _frame(common: Columns, **fields: npt.NDArray[Any]) -> pl.DataFrame:
     )
 
 
-def _sends(names: Names, machine: Machine) -> pl.DataFrame:
+def _sends(names: Names, machine: Memory) -> pl.DataFrame:
     """Sends are logged when they are over; an event has the time at which one began."""
     over, (publisher, timestamp, outcome, duration) = _entries(names, machine, at.L_SEND)
     return _frame(
@@ -242,10 +232,10 @@ def _sends(names: Names, machine: Machine) -> pl.DataFrame:
     ).sort("time", maintain_order=True)
 
 
-def _switches(system: System, names: Names, machine: Machine) -> pl.DataFrame:
+def _switches(system: System, names: Names, machine: Memory) -> pl.DataFrame:
     """What ran where: `sched_switch`, the idle thread being number 0."""
     times, following, core, before, runnable, _ = _log(machine, at.L_SWITCH)
-    # One place more than threads are: NONE, the last one, is nobody.
+    # One place more than threads are: NONE, the last one, is the idle thread.
     tids = np.append(names.tids, 0).astype(np.int32)
     pids = np.append(names.pids, 0).astype(np.int32)
     comms = np.array([*names.comms, "swapper"])
@@ -271,14 +261,14 @@ def _switches(system: System, names: Names, machine: Machine) -> pl.DataFrame:
     )
 
 
-def _core_rows(machine: Machine) -> at.Int64s:
+def _core_rows(machine: Memory) -> at.Int64s:
     rows: at.Int64s = (
-        machine.threads[:, at.T_CORE] - machine.memory[at.X_CORES]
+        machine["threads"][:, at.T_CORE] - machine.array[at.X_CORES]
     ) // at.CORE_COLUMNS
     return rows
 
 
-def _releases(system: System, names: Names, machine: Machine) -> pl.DataFrame:
+def _releases(system: System, names: Names, machine: Memory) -> pl.DataFrame:
     columns, fields = _entries(names, machine, at.L_RELEASE)
     callback, source, arrival, release, origin, slot, cycles, stamped, overrun, mode, why = fields
     frame = _frame(

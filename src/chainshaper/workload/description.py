@@ -102,7 +102,7 @@ def _constant(nanoseconds: int) -> ExecutionTime:
 
 
 class SimulationDescription(Part):
-    """What a simulation has to be told and a machine knows by itself.
+    """What a machine has by itself and a simulation needs as a value.
 
     CPU time: ``wake_up`` of a thread until it is at work, ``take`` of a message until its callback
     begins, ``publish`` of a message, by its executor or its publisher thread, ``receive`` of a
@@ -190,7 +190,7 @@ class CallbackDescription(Part):
     a message of every input has come, with the stamp of the first input's. Executors look at
     callbacks of the ``kind`` service and client, whose subscription carries requests or
     responses, behind those of topics. One that ``computes`` calls a Python function instead of
-    spending time (:mod:`chainshaper.workload.computing`).
+    spending time (:mod:`chainshaper.workload.executor`).
     """
 
     timer_ns: PositiveDuration | None = None

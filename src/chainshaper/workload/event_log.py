@@ -3,10 +3,22 @@
 A trace point appends a few integers to an array in locked memory, in one step, so that threads
 may share the log; names are written once, at start-up. Nothing touches a file or a pipe before
 the run is over. The layout is read back by
-:mod:`chainshaper.workload.event_reading`, which turns it into the tables of
-:mod:`chainshaper.values.events`.
+:mod:`chainshaper.workload.live`, which turns it into the tables of
+:mod:`chainshaper.values.events`. Nothing heavy is imported: the pages are locked into memory.
+
+A process and the launcher talk in lines of JSON on pipes, and bytes at the end:
+
+1. launcher → process: what it is;
+2. process → launcher: that it is ready;
+3. launcher → process: when to start and stop (ns of CLOCK_MONOTONIC);
+4. process → launcher: one line with the size of its events, then the events;
+5. launcher → process: an empty line: leave.
+
+Between 3 and 4 neither touches a pipe, so that talking never disturbs what is measured.
 """
 
+import json
+import sys
 from array import array
 from collections.abc import Callable
 from time import monotonic_ns
@@ -14,7 +26,18 @@ from typing import Any
 
 from chainshaper.gate.decision import ANCHORS, DROPPED, LATE, MESSAGES
 
-__all__ = ["ABSENT", "LAYOUT", "WIDTH", "WORDS", "EventLog", "number_of"]
+__all__ = [
+    "ABSENT",
+    "LAYOUT",
+    "WIDTH",
+    "WORDS",
+    "EventLog",
+    "number_of",
+    "receive",
+    "send",
+    "send_events",
+    "wait_for_leave",
+]
 
 LAYOUT: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("callback_start", ("callback", "thread_time", "is_intra_process")),
@@ -93,3 +116,34 @@ class EventLog:
             extend((number, time_ns, *fields, *padding))
 
         return record
+
+
+def receive() -> dict[str, Any]:
+    """The launcher's next line; ends this process when the launcher is gone."""
+    line = sys.stdin.readline()
+    if not line:
+        sys.exit(0)
+    received: dict[str, Any] = json.loads(line)
+    return received
+
+
+def send(**fields: Any) -> None:
+    """One line to the launcher."""
+    sys.stdout.write(json.dumps(fields) + "\n")
+    sys.stdout.flush()
+
+
+def send_events(events: bytes, **fields: Any) -> None:
+    """What was recorded, behind a line that says how much it is."""
+    send(bytes=len(events), **fields)
+    # A process that is frozen while it writes has written a part; without a buffer
+    # (PYTHONUNBUFFERED) no other layer writes the rest.
+    left = memoryview(events)
+    while left:
+        left = left[sys.stdout.buffer.write(left) :]
+    sys.stdout.buffer.flush()
+
+
+def wait_for_leave() -> None:
+    """Stay until everybody is done: a participant that leaves early disturbs the others."""
+    sys.stdin.readline()

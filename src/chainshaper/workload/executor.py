@@ -1,4 +1,4 @@
-"""What runs callbacks and sends messages in a node: executor, synchroniser, publisher thread.
+"""What runs in a node: executor, synchroniser, publisher thread, and what callbacks do.
 
 **Executor.** The order in which a node's callbacks run is part of what is measured, so it follows
 rclcpp's `SingleThreadedExecutor` (Casini et al., ECRTS 2019): wait until something is ready, take a
@@ -18,24 +18,42 @@ is not sent any more.
 
 A reservation server may keep this thread from running while the executor goes on (section 3.2.1).
 So what it waits for, it waits for in the kernel: without the interpreter's lock, and without any
-lock of DDS. Woken while it is kept from running, it stops before it returns to user space, and
+lock of DDS. Woken while its server is closed, it stops before it returns to user space, and
 the executor, which only appends and wakes, never waits for it. Stopped in the midst of sending,
 however, it holds both, and the process stands still: a publish slot has to be far longer than a
 send (:mod:`chainshaper.planning.overruns`).
+
+**Work.** Most descriptions only say how long a callback computes. One that ``computes:
+MODULE:FUNCTION`` does real work instead: the function is called with the serialized messages that
+it is for (none for a timer, the whole set for a synchronising callback, in the order of
+``synchronises``) and returns the serialized message to publish on every topic of the callback, or
+None: nothing then. :func:`~chainshaper.workload.dds.data_of` and
+:func:`~chainshaper.workload.dds.data_message` open and make messages; the stamp of the header, from
+which gates count, is the function's to pass on.
 """
 
+import importlib
 import queue
+import sys
 import threading
 import time
+import traceback
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import cycle
+from pathlib import Path
 from time import monotonic_ns
 from typing import Any, Generic, TypeAlias, TypeVar
 
+from chainshaper.gate.decision import origin_of
+from chainshaper.linux.own_processes import named_folders
 from chainshaper.linux.scheduling import set_thread_name
+from chainshaper.values.trusted_files import why_distrusted
+from chainshaper.workload import dds
 from chainshaper.workload.dds import GuardCondition, Message, Subscription, WaitSet
 from chainshaper.workload.event_log import EventLog, number_of
+from chainshaper.workload.execution import ExecutionTimes, spend
 
 __all__ = [
     "AsynchronousWriter",
@@ -45,7 +63,11 @@ __all__ = [
     "SubscriptionEntity",
     "Synchroniser",
     "Timer",
+    "Work",
+    "computing",
+    "load_function",
     "noting_sends",
+    "spending",
 ]
 
 
@@ -173,7 +195,7 @@ class AsynchronousWriter:
     """The history of one writer, between the executor and the publisher thread.
 
     ``write`` gives a message and its source timestamp to DDS. Taking and appending are single
-    steps of the interpreter, so no lock is needed that somebody could be stopped with.
+    steps of the interpreter, so no lock is needed that a stopped thread could hold.
     """
 
     def __init__(
@@ -244,3 +266,84 @@ def noting_sends(record: Callable[..., None], rmw_handle: int) -> Note:
         )
 
     return note
+
+
+Work = Callable[[Sequence[dds.Message], int, int], Iterable[bytes]]
+"""Called with the messages, and the wall clock and the thread's CPU clock (ns) at the callback's
+start; gives what is published on each topic, in their order. Nothing: nothing is published."""
+
+
+def spending(times: ExecutionTimes, templates: Sequence[bytearray], announced: list[bytes]) -> Work:
+    """Spend the next execution time; the first message's stamp is passed on to all topics.
+
+    ``templates`` has a message per topic. What is ``announced`` is published in turn instead.
+    All that a callback does before it publishes is part of its execution time, so messages are
+    made first.
+    """
+    announcements = cycle(announced)
+
+    def work(messages: Sequence[dds.Message], wall_ns: int, cpu_ns: int) -> Sequence[bytes]:
+        stamp = (origin_of(messages[0].payload) or 0) if messages else wall_ns
+        made = [
+            next(announcements, None) or dds.stamp_message(template, stamp)
+            for template in templates
+        ]
+        spend(times.next(), cpu_ns)
+        return made
+
+    return work
+
+
+def computing(name: str, function: Callable[..., object], topics: int) -> Work:
+    """Call a loaded function; what it raises ends the process with one line that says where."""
+
+    def work(messages: Sequence[dds.Message], _wall_ns: int, _cpu_ns: int) -> Sequence[bytes]:
+        try:
+            made = function(*(message.payload for message in messages))
+        except Exception as error:
+            at = traceback.extract_tb(error.__traceback__)[-1]
+            sys.exit(f"{name} failed at {at.filename}:{at.lineno}: {_in_words(error)}")
+        if made is None:
+            return ()
+        if not isinstance(made, bytes):
+            sys.exit(
+                f"{name} returned {type(made).__name__}: return the message to publish as bytes, "
+                "or None"
+            )
+        return (made,) * topics
+
+    return work
+
+
+def load_function(name: str) -> Callable[..., object]:
+    """The function that ``MODULE:FUNCTION`` names; ends the process if there is none.
+
+    Modules are found where Python finds them, on PYTHONPATH, or in the working directory, unless
+    others may change what is there.
+    """
+    module, _, attribute = name.partition(":")
+    places = {folder: why_distrusted(folder) for folder in (*named_folders(), str(Path.cwd()))}
+    sys.path += [folder for folder, reason in places.items() if reason is None]
+    try:
+        found = getattr(importlib.import_module(module), attribute, None)
+    except Exception as error:
+        at = traceback.extract_tb(error.__traceback__)[-1]
+        where = "" if at.filename.startswith("<frozen") else f" ({at.filename}:{at.lineno})"
+        sys.exit(
+            f"{name} cannot be loaded: {_in_words(error)}{where}; its module has to be installed, "
+            f"on PYTHONPATH, or in the working directory {Path.cwd()}"
+            + "".join(f"; not {place}: {reason}" for place, reason in places.items() if reason)
+        )
+    if found is None:
+        sys.exit(f"{name} cannot be loaded: {_file(module)} has no {attribute}")
+    if not callable(found):
+        sys.exit(f"{name} cannot be called: name a function")
+    return found  # type: ignore[no-any-return]
+
+
+def _in_words(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+def _file(module: str) -> str:
+    return getattr(sys.modules[module], "__file__", None) or module

@@ -43,7 +43,7 @@ class Child:
         """Its next line, waited for as long as it takes or, between its parts, ``within_s``.
 
         Raises:
-            OperationError: it died instead, or kept silent.
+            OperationError: it died instead, or was silent.
         """
         line = self._take(lambda received: received.find(b"\n") + 1, within_s)
         try:

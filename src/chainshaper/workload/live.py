@@ -14,11 +14,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
+import polars as pl
+
 from chainshaper.gate.decision import clock_offset
 from chainshaper.linux.own_processes import LIBRARIES
 from chainshaper.linux.runs import Governed, governing, in_force_throughout
 from chainshaper.linux.scheduling import Scheduling, apply_scheduling, check_cores, may_use_fifo
 from chainshaper.linux.threads import foreign_realtime_processes, list_threads
+from chainshaper.values import events
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import (
@@ -34,11 +38,27 @@ from chainshaper.workload.description import (
     CallbackDescription,
     application_as_written,
 )
-from chainshaper.workload.event_reading import ProcessLog, event_tables, meter_tables
+from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS
 from chainshaper.workload.launcher import Child, end_all, first_casualty, start_child
-from chainshaper.workload.stall_watch import far_from, promote_meters, read_meters, start_meters
+from chainshaper.workload.stall_watch import (
+    far_from,
+    meter_tables,
+    promote_meters,
+    read_meters,
+    start_meters,
+)
 
-__all__ = ["Enforcement", "Progress", "StartedNodes", "origin_timer", "run_application"]
+__all__ = [
+    "Enforcement",
+    "ProcessLog",
+    "Progress",
+    "StartedNodes",
+    "Timing",
+    "event_tables",
+    "origin_timer",
+    "run_application",
+    "timing_of",
+]
 
 Progress = Callable[[float, str], None]
 """Called with the share done (0 to 1) and what is being done."""
@@ -90,7 +110,7 @@ def run_application(
     does without. ``plan`` is stored with the recording. A few cycles before the recorded ones
     warm the caches and are left out. ``enforcement`` is entered when all nodes stand ready and
     their threads have their scheduling, and left when the run is over, however it ends, before
-    any node is asked to leave: a thread that is kept from running could not.
+    any node is asked to leave: a thread whose server is closed could not.
 
     Raises:
         InputError: ``output`` exists.
@@ -124,9 +144,11 @@ def run_application(
         _allocate_threads(application, nodes, realtime)
         promote_meters(meters, realtime)
         lead = LEAD_NS if enforcement is None else LEAD_NS + ENFORCING_NS
-        timing = _Timing.of(application, timer, cycles, time.monotonic_ns() + lead)
+        timing = timing_of(application, cycles, time.monotonic_ns() + lead)
         offset_before = clock_offset()
-        with _enforced(enforcement, nodes, timing):
+        pids = {node_name(name): child.pid for name, child in nodes.items()}
+        started = StartedNodes(pids, timing.anchor_ns)
+        with nullcontext() if enforcement is None else enforcement(started):
             for child in [*nodes.values(), *meters.values()]:
                 child.tell(**asdict(timing))
             threads, governed = _watch(nodes, meters, timing, progress)
@@ -181,16 +203,9 @@ def origin_timer(application: Application) -> CallbackDescription:
     return next(callback for callback in starts if callback.timer_ns is not None)
 
 
-def completion_ns(application: Application, period_ns: int) -> int:
-    """How long a run goes on behind its last cycle, so that what has begun is completed."""
-    gates = [callback.gate for _, callback in application.callbacks() if callback.gate is not None]
-    held = max((gate.due_cycles for gate in gates), default=0)
-    return max(2 * period_ns, 200_000_000) + held * period_ns
-
-
 @dataclass(frozen=True)
-class _Timing:
-    """The instants of a run (ns of CLOCK_MONOTONIC)."""
+class Timing:
+    """The instants of a run (ns), live or simulated: from the timers' common start to the end."""
 
     start_ns: int
     anchor_ns: int
@@ -199,33 +214,28 @@ class _Timing:
     stop_ns: int
     meter_from_ns: int
 
-    @classmethod
-    def of(
-        cls, application: Application, timer: CallbackDescription, cycles: int, start: int
-    ) -> "_Timing":
-        period = timer.timer_ns or 0
-        first = start + timer.phase_ns + WARM_UP_CYCLES * period
-        end = first + cycles * period
-        gates = [cb.gate for _, cb in application.callbacks() if cb.gate is not None]
-        releases = [opens for gate in gates for opens, _ in gate.slots] or [0]
-        return cls(
-            start_ns=start,
-            anchor_ns=start + timer.phase_ns,
-            # Just before the first recorded expiry: instances are not cut in two.
-            record_from_ns=first - min(1_000_000, period // 10),
-            last_timer_ns=end - min(1_000_000, period // 10),
-            stop_ns=end + completion_ns(application, period),
-            meter_from_ns=start + timer.phase_ns + far_from(releases),
-        )
 
+def timing_of(application: Application, cycles: int, start: int) -> Timing:
+    """The instants of a run that begins at ``start``; what has begun in its last cycle completes.
 
-def _enforced(
-    enforcement: Enforcement | None, nodes: dict[str, Child], timing: _Timing
-) -> AbstractContextManager[object]:
-    if enforcement is None:
-        return nullcontext()
-    pids = {node_name(name): child.pid for name, child in nodes.items()}
-    return enforcement(StartedNodes(pids, timing.anchor_ns))
+    It is recorded from just before the first recorded expiry: instances are not cut in two.
+    """
+    timer = origin_timer(application)
+    period = timer.timer_ns or 0
+    anchor = start + timer.phase_ns
+    first = anchor + WARM_UP_CYCLES * period
+    end, apart = first + cycles * period, min(1_000_000, period // 10)
+    gates = [cb.gate for _, cb in application.callbacks() if cb.gate is not None]
+    releases = [opens for gate in gates for opens, _ in gate.slots] or [0]
+    held = max((gate.due_cycles for gate in gates), default=0)
+    return Timing(
+        start_ns=start,
+        anchor_ns=anchor,
+        record_from_ns=first - apart,
+        last_timer_ns=end - apart,
+        stop_ns=end + max(2 * period, 200_000_000) + held * period,
+        meter_from_ns=anchor + far_from(releases),
+    )
 
 
 def _start_nodes(
@@ -244,7 +254,7 @@ def _start_nodes(
 
 
 def _ros_arguments(name: str) -> tuple[str, ...]:
-    """A node's name as ROS 2 programs get it: whoever looks at its command line knows it."""
+    """A node's name as ROS 2 programs get it: its command line shows it."""
     namespace, _, base = node_name(name).rpartition("/")
     return ("--ros-args", "-r", f"__node:={base}", "-r", f"__ns:={namespace or '/'}")
 
@@ -302,7 +312,7 @@ def _allocate_threads(application: Application, nodes: dict[str, Child], realtim
 def _watch(
     nodes: dict[str, Child],
     meters: dict[int, Child],
-    timing: _Timing,
+    timing: Timing,
     progress: Progress,
 ) -> tuple[tuple[ThreadInfo, ...], tuple[Governed, ...]]:
     """Wait for the end of the run; the threads as they were while it lasted.
@@ -346,6 +356,66 @@ def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[Thread
         )
         for child, node in children
         for thread in list_threads(child.pid)
+    )
+
+
+_MAY_BE_ABSENT = {"gate_release": ("release", "slot")}
+
+
+@dataclass(frozen=True)
+class ProcessLog:
+    """What one process recorded: rows of :mod:`~chainshaper.workload.event_log`, and objects."""
+
+    pid: int
+    core: int | None  # the one its executor was pinned to
+    rows: bytes
+    objects: tuple[dict[str, Any], ...]
+    modes: tuple[str, ...] = ()  # that its gate knows
+
+
+def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataFrame]:
+    """The event tables of all processes, sorted by time.
+
+    Events before ``from_ns`` (the warm-up) are left out, objects are not: they exist throughout.
+    """
+    parts: dict[str, list[pl.DataFrame]] = {}
+    for log in logs:
+        rows = np.frombuffer(log.rows, dtype=np.int64).reshape(-1, WIDTH)
+        rows = rows[rows[:, 1] >= from_ns]
+        for number, (name, fields) in enumerate(LAYOUT):
+            mine = rows[rows[:, 0] == number]
+            if len(mine):
+                columns = {"time": mine[:, 1]}
+                columns |= {field: mine[:, 2 + i] for i, field in enumerate(fields)}
+                parts.setdefault(name, []).append(_typed(name, pl.DataFrame(columns), log))
+        for created in log.objects:
+            name = created["event"]
+            fields_of = {key: [value] for key, value in created.items() if key != "event"}
+            parts.setdefault(name, []).append(_typed(name, pl.DataFrame(fields_of), log))
+    return {
+        name: pl.concat(frames).sort("time", maintain_order=True)
+        for name, frames in sorted(parts.items())
+    }
+
+
+def _typed(name: str, frame: pl.DataFrame, log: ProcessLog) -> pl.DataFrame:
+    frame = frame.with_columns(
+        pl.when(pl.col(field) != ABSENT).then(pl.col(field)).alias(field)
+        for field in _MAY_BE_ABSENT.get(name, ())
+    )
+    frame = frame.with_columns(
+        pl.col(field).replace_strict(dict(enumerate(words)), default=None, return_dtype=pl.String())
+        for field, words in {**WORDS, "mode": log.modes}.items()
+        if field in frame.columns
+    )
+    tid = pl.col("tid") if "tid" in frame.columns else pl.lit(log.pid)  # executors: the main thread
+    types = {**events.FIELDS[name], **events.OPTIONAL_FIELDS.get(name, {})}
+    return frame.select(
+        pl.col("time").cast(pl.Int64),
+        pl.lit(log.pid, dtype=pl.Int32).alias("pid"),
+        tid.cast(pl.Int32).alias("tid"),
+        pl.lit(log.core, dtype=pl.Int32).alias("cpu"),
+        *(pl.col(field).cast(type_) for field, type_ in types.items() if field in frame.columns),
     )
 
 

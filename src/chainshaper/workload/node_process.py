@@ -1,7 +1,7 @@
 """One node of the live workload, in a process of its own: ``python -m …node_process``.
 
 Started by :mod:`chainshaper.workload.live`, with which it talks as
-:mod:`chainshaper.workload.protocol` says. This module imports little on purpose: every page of
+:mod:`chainshaper.workload.event_log` says. This module imports little on purpose: every page of
 it is locked into memory.
 """
 
@@ -22,9 +22,17 @@ from chainshaper.linux.scheduling import (
     signalled_with_parent,
     stop_garbage_collection,
 )
-from chainshaper.workload import dds, protocol
-from chainshaper.workload.computing import Work, computing, load_function, spending
-from chainshaper.workload.event_log import ABSENT, LAYOUT, EventLog, number_of
+from chainshaper.workload import dds
+from chainshaper.workload.event_log import (
+    ABSENT,
+    LAYOUT,
+    EventLog,
+    number_of,
+    receive,
+    send,
+    send_events,
+    wait_for_leave,
+)
 from chainshaper.workload.execution import ExecutionTimes
 from chainshaper.workload.executor import (
     AsynchronousWriter,
@@ -33,11 +41,16 @@ from chainshaper.workload.executor import (
     SubscriptionEntity,
     Synchroniser,
     Timer,
+    Work,
+    computing,
+    load_function,
     noting_sends,
+    spending,
 )
 
 __all__ = ["NodeProcess", "main"]
 
+GATE_FIELDS = ("cycle_ns", "anchor", "overrun", "due_cycles", "messages", "depth")
 FIRST_HANDLE = 0x55D0_0000_0100
 """Handles are like real addresses: unique in this process and reused by the others."""
 
@@ -134,7 +147,7 @@ class NodeProcess:
     def _work(
         self, index: int, callback: dict[str, Any], publishers: list["TracedPublisher"]
     ) -> Work:
-        """What the callback does: compute as a function of somebody's, or spend drawn times."""
+        """What the callback does: call the function that it names, or spend drawn times."""
         if callback["computes"] is not None:
             function = load_function(callback["computes"])
             return computing(callback["computes"], function, len(publishers))
@@ -198,11 +211,8 @@ class NodeProcess:
             topic_name=topic,
             queue_depth=self.spec["topics"][topic]["depth"],
         )
-        self.log.init(
-            "rclcpp_subscription_init",
-            subscription_handle=entity.handle,
-            subscription=rclcpp_handle,
-        )
+        own = {"subscription_handle": entity.handle, "subscription": rclcpp_handle}
+        self.log.init("rclcpp_subscription_init", **own)
         self.log.init(
             "rclcpp_subscription_callback_added", subscription=rclcpp_handle, callback=handle
         )
@@ -313,13 +323,8 @@ class NodeProcess:
         shaper = Shaper(
             Gate(
                 slots=tuple((begin, finish) for begin, finish in gate["slots"]),
-                cycle_ns=gate["cycle_ns"],
-                anchor=gate["anchor"],
-                overrun=gate["overrun"],
-                due_cycles=gate["due_cycles"],
-                messages=gate["messages"],
-                depth=gate["depth"],
                 modes=modes and Modes(modes["bands"], modes["default"], modes["late"]),
+                **{name: gate[name] for name in GATE_FIELDS},
             ),
             gate["spin_ns"],
             get_ready,
@@ -341,8 +346,8 @@ class NodeProcess:
         that threads it outranks can deliver; only then are its events recorded. It does not
         pause when another message has to leave meanwhile.
 
-        What comes while one is held waits at the gate. The executor has it worked off before it
-        takes the next: a message is recorded as taken when it is its turn.
+        What comes while one waits for its release waits behind it. The executor has it worked off
+        before it takes the next: a message is recorded as taken when it is its turn.
 
         Delay that no other thread caused is recorded like the stall meter's own findings. A
         message that is dropped is recorded, and not published.
@@ -453,17 +458,17 @@ class NodeProcess:
 
 def main() -> None:
     """Run one node as the launcher says."""
-    spec = protocol.receive()
+    spec = receive()
     signalled_with_parent(spec["parent"], signal.SIGKILL)
     set_thread_name(spec["node"].strip("/").replace("/", "."))
     node = NodeProcess(spec)
     missing = node.wait_for_counterparts(time.monotonic_ns() + spec["discovery_ns"])
-    protocol.send(missing=missing, memory_locked=lock_memory())
-    times = protocol.receive()
+    send(missing=missing, memory_locked=lock_memory())
+    times = receive()
     node.run(times["start_ns"], times["last_timer_ns"], times["stop_ns"])
-    protocol.send_events(node.log.rows.tobytes(), objects=node.log.objects)
-    protocol.wait_for_leave()
-    os._exit(0)  # DDS teardown of a closed domain is of use to nobody, and not always quick
+    send_events(node.log.rows.tobytes(), objects=node.log.objects)
+    wait_for_leave()
+    os._exit(0)  # DDS teardown of a closed domain is of no use, and not always quick
 
 
 if __name__ == "__main__":

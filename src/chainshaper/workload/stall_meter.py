@@ -5,8 +5,8 @@ at the highest priority that only sleeps and looks at the clock wakes late exact
 figures of a run can only be judged beside what it saw. They run at half their pace as well while
 others keep their hardware busy; then the sleeper's wake-ups, which are the same work each time,
 take it twice as much CPU time. One process per core:
-``python -m chainshaper.workload.stall_meter`` speaks the launcher's protocol. Where nobody knows
-beforehand how long a run takes, :data:`ENOUGH` ends the watch early.
+``python -m chainshaper.workload.stall_meter`` speaks the launcher's protocol. Where it is
+not known beforehand how long a run takes, :data:`ENOUGH` ends the watch early.
 """
 
 import signal
@@ -21,7 +21,7 @@ from chainshaper.linux.scheduling import (
     signalled_with_parent,
     stop_garbage_collection,
 )
-from chainshaper.workload import protocol
+from chainshaper.workload.event_log import receive, send, send_events, wait_for_leave
 
 __all__ = ["ENOUGH", "NO_PACE", "PERIOD_NS", "PRIORITY", "main", "watch"]
 
@@ -79,19 +79,19 @@ def watch(
 
 def main() -> None:
     """Watch the core this process is put on, as the launcher says."""
-    spec = protocol.receive()
+    spec = receive()
     signalled_with_parent(spec["parent"], signal.SIGKILL)
     set_thread_name("stall-meter")
     signals: list[int] = []
     signal.signal(ENOUGH, lambda number, _: signals.append(number))
-    protocol.send(missing=[], memory_locked=lock_memory())
-    times = protocol.receive()
+    send(missing=[], memory_locked=lock_memory())
+    times = receive()
     stop_garbage_collection()
     seen, wakeups, ordinary = watch(
         times["meter_from_ns"], times["stop_ns"], enough=lambda: bool(signals)
     )
-    protocol.send_events(seen.tobytes(), wakeups=wakeups, median_lateness_ns=ordinary)
-    protocol.wait_for_leave()
+    send_events(seen.tobytes(), wakeups=wakeups, median_lateness_ns=ordinary)
+    wait_for_leave()
 
 
 if __name__ == "__main__":

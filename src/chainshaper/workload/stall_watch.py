@@ -7,7 +7,7 @@ else; :func:`stalls_watched` does it beside whatever else runs, and :func:`measu
 
 import os
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -18,15 +18,17 @@ import polars as pl
 from chainshaper.gate.decision import STALL_NS
 from chainshaper.linux.scheduling import Scheduling, apply_scheduling
 from chainshaper.linux.threads import list_threads
+from chainshaper.values import events
 from chainshaper.values.recording import StallMeterInfo
 from chainshaper.workload import stall_meter
-from chainshaper.workload.event_reading import meter_tables
 from chainshaper.workload.launcher import Child, end_all, start_child
+from chainshaper.workload.stall_meter import NO_PACE
 
 __all__ = [
     "StallWatch",
     "far_from",
     "measure_stalls",
+    "meter_tables",
     "promote_meters",
     "read_meters",
     "stalls_watched",
@@ -152,3 +154,30 @@ def measure_stalls(
     assert watch.table is not None  # noqa: S101 - the watch is over
     assert watch.info is not None  # noqa: S101
     return watch.table, watch.info
+
+
+def meter_tables(
+    seen: Sequence[tuple[int, int, bytes]], seen_by_gates: pl.DataFrame | None = None
+) -> dict[str, pl.DataFrame]:
+    """`machine_stall` and `machine_pace` from (pid, core, rows of `stall_meter.watch`) per meter.
+
+    What a gate noticed while it watched the clock is added to the stalls.
+    """
+    rows = [
+        pl.DataFrame(
+            np.frombuffer(block, dtype=np.int64).reshape(-1, 3),
+            schema=["time", "duration", "cpu_time"],
+        ).with_columns(pl.lit(pid, pl.Int32()).alias("pid"), pl.lit(core, pl.Int32()).alias("cpu"))
+        for pid, core, block in seen
+    ]
+    by_meters = pl.concat([events.empty("machine_pace").drop("tid"), *rows], how="diagonal")
+    by_meters = by_meters.with_columns(tid=pl.col("pid"))
+    is_stall = pl.col("cpu_time") == NO_PACE
+    stalls = by_meters.filter(is_stall).select(events.empty("machine_stall").columns)
+    paces = by_meters.filter(~is_stall).select(events.empty("machine_pace").columns)
+    if seen_by_gates is not None:
+        stalls = pl.concat([seen_by_gates, stalls])
+    return {
+        "machine_stall": stalls.sort("time", maintain_order=True),
+        "machine_pace": paces.sort("time", maintain_order=True),
+    }

@@ -7,10 +7,11 @@ import pytest
 from quick_chain import quick_chain
 
 from chainshaper.flow.steps import plan_recording
+from chainshaper.flow.sweep import profile_at
 from chainshaper.planning import PlanRequest
 from chainshaper.simulation import simulate
-from chainshaper.simulation.sweeping.grid import grid_of, points_of
-from chainshaper.simulation.sweeping.points import FIGURES, OTHER_RUN, profile_at, row_at
+from chainshaper.simulation.grid import grid_of, points_of
+from chainshaper.simulation.sweeping import FIGURES, OTHER_RUN, row_at
 from chainshaper.verify.measure import measure_latency
 from chainshaper.workload.description import Application
 

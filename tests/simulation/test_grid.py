@@ -6,7 +6,7 @@ import pytest
 from quick_chain import quick_chain
 
 from chainshaper.planning import Plan, PlanRequest
-from chainshaper.simulation.sweeping.grid import (
+from chainshaper.simulation.grid import (
     application_at,
     grid_of,
     is_duration,
@@ -15,7 +15,7 @@ from chainshaper.simulation.sweeping.grid import (
     points_of,
     request_at,
 )
-from chainshaper.simulation.sweeping.workers import groups_of
+from chainshaper.simulation.sweeping import groups_of
 from chainshaper.values.errors import InputError
 from chainshaper.workload.description import Application
 

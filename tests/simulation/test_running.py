@@ -2,7 +2,6 @@
 
 import fcntl
 import json
-import os
 import signal
 from pathlib import Path
 from typing import Any
@@ -14,8 +13,7 @@ from processes import wait_for
 from quick_chain import quick_chain
 
 from chainshaper import sweep
-from chainshaper.simulation.sweeping import rows_beside
-from chainshaper.simulation.sweeping.points import FIGURES
+from chainshaper.simulation.sweeping import FIGURES, rows_beside
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.workload.description import Application, application_as_written
 
@@ -193,19 +191,3 @@ def test_interrupted_it_says_where_its_rows_are(description: Path, tmp_path: Pat
     assert f"finished points are in {rows_beside(tmp_path / 'out.parquet')}" in finished.err
     assert "Traceback" not in finished.err
     assert not (tmp_path / "out.parquet").exists()
-
-
-def test_a_process_that_is_killed_is_told_of(description: Path, tmp_path: Path) -> None:
-    running = _under_way(description, tmp_path / "out.parquet", "--workers", "2")
-    computing = [
-        pid
-        for pid in running.nodes().values()
-        if b"sweeping.worker" in Path(f"/proc/{pid}/cmdline").read_bytes()
-    ]
-    os.kill(computing[0], signal.SIGKILL)
-    finished = running.end()
-    assert finished.code == 1
-    assert "error: a process that computed points was killed; finished rows are kept" in (
-        finished.err
-    )
-    assert "Traceback" not in finished.err
