@@ -1,6 +1,7 @@
 """What verbs print when all is well: for people on stdout, for scripts as JSON."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -149,6 +150,22 @@ def test_doctor_as_json() -> None:
         assert check["state"] == "good" or check["remedy"], f"{check['name']} has no remedy"
     assert {row["core"] for row in values["stalls"]} >= {DDS_CORE, EXECUTOR_CORE}
     assert values["watched_ns"] == 300_000_000
+
+
+def test_doctor_tries_bpftrace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that is there and does not work is not good, and the warning before is not the reason."""
+    program = tmp_path / "bpftrace"
+    program.write_text(
+        "#!/bin/sh\necho 'WARNING: RLIMIT_MEMLOCK is low' >&2\n"
+        "echo 'ERROR: tracepoint not found: sched:sched_switch' >&2\nexit 1\n"
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    checks = json_of("doctor", "--watch", "100ms")["checks"]
+    (found,) = (check for check in checks if check["name"] == "bpftrace")
+    assert found["state"] == "limited"
+    as_root = "does not work: ERROR: tracepoint not found: sched:sched_switch"
+    assert found["found"] == (as_root if os.geteuid() == 0 else "needs root")
 
 
 def test_demo_keeps_everything_in_one_folder(application_file: Path) -> None:

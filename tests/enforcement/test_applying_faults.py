@@ -52,7 +52,7 @@ pytestmark = [needs_fifo, needs_cgroups]
     ("number", "guardians", "reason"),
     [
         (signal.SIGKILL, None, "dispatcher of core {core} was killed by SIGKILL"),
-        (signal.SIGSTOP, None, "dispatcher of core {core} hung, or somebody stopped it"),
+        (signal.SIGSTOP, None, "dispatcher of core {core} hung, or was stopped"),
         (signal.SIGKILL, signal.SIGKILL, "dispatcher of core {core} was killed by SIGKILL"),
         (signal.SIGKILL, signal.SIGSTOP, "dispatcher of core {core} was killed by SIGKILL"),
     ],

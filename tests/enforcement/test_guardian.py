@@ -206,7 +206,7 @@ def test_an_owner_that_raises_leaves_nothing(node: Governed) -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "reason"), [(KILL, "was killed by SIGKILL"), (STOP, "hung, or somebody stopped it")]
+    ("number", "reason"), [(KILL, "was killed by SIGKILL"), (STOP, "hung, or was stopped")]
 )
 def test_a_lost_dispatcher_is_named(node: Governed, number: signal.Signals, reason: str) -> None:
     with run_on(node) as run:

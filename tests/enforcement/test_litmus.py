@@ -336,7 +336,7 @@ def test_a_plugin_that_somebody_changed_is_a_failure(stand_in: StandIn, journal:
     servers = create(TABLE, journal, stand_in.proc)
     servers.arm(anchor_ns=0)
     subprocess.run([str(stand_in.programs / "setsched"), "GSN-EDF"], check=True)
-    assert servers.failure() == "somebody has changed the scheduler plugin from P-RES to GSN-EDF"
+    assert servers.failure() == "the scheduler plugin was changed from P-RES to GSN-EDF"
     servers.release()
     assert stand_in.plugin == "GSN-EDF", "it is theirs"
 

@@ -92,7 +92,7 @@ def test_what_somebody_else_has_changed_since_is_theirs(tmp_path: Path, journal:
         os.sched_setscheduler(tid, os.SCHED_RR, os.sched_param(5))
         (outcome,) = restore_scheduling(journal)
         assert outcome.fate == "left"
-        assert "somebody else has changed it since: SCHED_RR 5" in outcome.reason
+        assert "another program has changed it since: SCHED_RR 5" in outcome.reason
         now = state_of(tid)
         assert now.scheduling_class.policy == os.SCHED_RR
         assert now.cores == before.cores, "the cores were ours still"

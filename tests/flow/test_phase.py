@@ -26,7 +26,7 @@ from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow import apply as applying
 from chainshaper.flow import phase
 from chainshaper.flow.phase import (
-    NOBODY,
+    NO_NODE,
     DriftWatch,
     Telling,
     find_drift,
@@ -254,7 +254,7 @@ def test_a_beginning_that_moves_is_told_again_once(
     ):
         wait_for(lambda: bool(states) and states[-1].drift_ns is not None, "the first look")
         assert len(told) == 1
-        assert "/shaper could not be told" in states[-1].notes[-1]
+        assert "/shaper did not get the phase" in states[-1].notes[-1]
         assert "(no such service)" in states[-1].notes[-1]
         os.kill(node.pid, signal.SIGUSR1)
         wait_for(lambda: len(told) == 2, "the nodes to be told again")
@@ -299,5 +299,5 @@ def test_a_node_that_never_answers_is_given_up(monkeypatch: pytest.MonkeyPatch) 
     (note,) = waiting.end()
     assert "ROS 2 did not answer within 0 s" in note
     (note,) = Telling(("/shaper",), None, 0.0, "python3 cannot be started").end()
-    assert "/shaper could not be told where cycles begin (python3 cannot be started)" in note
-    assert NOBODY.end() == ()
+    assert "/shaper did not get where cycles begin (python3 cannot be started)" in note
+    assert NO_NODE.end() == ()

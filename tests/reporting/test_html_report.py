@@ -211,7 +211,7 @@ def test_where_nobody_watched_no_cycle_is_called_undisturbed(tmp_path: Path) -> 
     page = _report(measure_latency(known_run(tmp_path / "known", stall_meter=None, plan=None)))
     titles = [row[0] for row in page.rows["figures"] if len(row) == 1]
     assert not [title for title in titles if "undisturbed" in title]
-    assert "known: nobody watched the machine, so its stalls are not known." in page.text
+    assert "known: no meter watched, so its stalls are unknown." in page.text
     assert "known (2 complete cycles)" in page.text
 
 

@@ -230,7 +230,7 @@ def _start_callbacks(graph: ApplicationGraph, spec: str, first: Stage) -> set[in
         if vertices & (set(callback.publishes) - set(callback.passes_on))
     }
     if not starts:
-        writers = ", ".join(graph.publishers.get(first.name, ())) or "nobody in the recording"
+        writers = ", ".join(graph.publishers.get(first.name, ())) or "no node in the recording"
         raise InputError(
             f"chain {spec!r}: no callback was seen to publish {first.name} (its publisher: "
             f"{writers}); begin the chain at a topic that a callback publishes"

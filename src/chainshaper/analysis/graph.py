@@ -126,7 +126,7 @@ def _passed_on(callbacks: pl.DataFrame, writes: dict[int, set[str]]) -> dict[int
 def _of_other_topics(
     row: dict[str, Any], rows: list[dict[str, Any]], outputs: dict[str, dict[int, set[str]]]
 ) -> set[str]:
-    """What subscriptions to other topics publish: nobody synchronises a topic with itself."""
+    """What subscriptions to other topics publish: no callback synchronises a topic with itself."""
     siblings = [other for other in rows if other["topic"] != row["topic"]]
     return set().union(*(outputs["subscription"].get(o["callback_id"], ()) for o in siblings))
 

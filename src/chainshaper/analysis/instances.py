@@ -49,7 +49,7 @@ def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> p
     * ``start``, ``end``: ns of the event clock. An instance's end is the next event of the same
       callback on the same thread if that is a `callback_end`; ``end`` is null when it is not (the
       end was lost) or when there is none (still running as the recording stopped). A
-      `callback_end` without a start belongs to nobody;
+      `callback_end` without a start belongs to no instance;
     * ``execution_ns``: CPU time (paper: e), from the ``thread_time`` columns where the source
       has them, else from `sched_switch` (:func:`cpu_time`), else null, also where a thread seems
       to have used none;

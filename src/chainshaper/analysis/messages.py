@@ -15,7 +15,7 @@ of ROS 2 show different halves of that:
   before a ring buffer's enqueue on the same thread, the take is the dequeue of the same place in
   the same buffer.
 
-Publications and takes under handles that nobody initialised are left out
+Publications and takes under handles that were never initialised are left out
 (:mod:`~chainshaper.analysis.objects`).
 """
 

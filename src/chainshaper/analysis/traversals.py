@@ -72,7 +72,7 @@ class Traversals:
     (time), ``start``, ``publish`` (time), ``end`` (of the instance), ``source_timestamp`` (of the
     message it took), ``communication_ns`` (previous publication to start: transport and waiting),
     ``computation_ns`` (start to publication), and ``via``: ``instance`` when the instance itself
-    published, ``sibling`` when another callback of its node did, null when nobody did. Over a
+    published, ``sibling`` when another callback of its node did, null when none did. Over a
     complete traversal communication and computation add up to the latency.
 
     ``silent`` counts instances of the first callback that published nothing. ``notes`` says what

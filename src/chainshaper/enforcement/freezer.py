@@ -220,7 +220,7 @@ class Freezer:
     def _end_of_dispatcher(self, core: int) -> str:
         """Why a dispatcher has ended: what it said, or what was done to it."""
         if self._page.cores[core].silent:
-            return f"the dispatcher of core {core} hung, or somebody stopped it"
+            return f"the dispatcher of core {core} hung, or was stopped"
         process = self._dispatchers[core]
         stream = process.stderr
         said = stream.read().strip() if stream is not None and not stream.closed else ""
@@ -231,7 +231,7 @@ class Freezer:
         for server in self.table.servers:
             if self._page.servers[server.name].lost:
                 return (
-                    f"somebody removed a cgroup of server {server.name}: the threads that were "
+                    f"a cgroup of server {server.name} was removed: the threads that were "
                     "in it run freely; release, and apply again"
                 )
         inside = {tid for tids in self.members().values() for tid in tids}
@@ -240,7 +240,7 @@ class Freezer:
                 continue
             if not has_ended(tid, born):
                 return (
-                    f"somebody moved thread {tid} out of its server's cgroup: it runs freely; "
+                    f"thread {tid} was moved out of its server's cgroup: it runs freely; "
                     "release, and apply again"
                 )
             del self._born[tid]

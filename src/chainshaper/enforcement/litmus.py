@@ -121,7 +121,7 @@ class Litmus:
     def failure(self) -> str | None:
         if not self._ids or (active := _active_plugin(self._proc)) == PLUGIN:
             return None
-        return f"somebody has changed the scheduler plugin from {PLUGIN} to {active}"
+        return f"the scheduler plugin was changed from {PLUGIN} to {active}"
 
     def release(self) -> None:
         self._ids = {}

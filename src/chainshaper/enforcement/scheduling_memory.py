@@ -305,7 +305,7 @@ def _restore(one: Change) -> Outcome:
         reason = f"the kernel refuses {state_text(one.original)}: {error.strerror}"
         return Outcome(one.tid, one.comm, "failed", reason)
     if ours != different:
-        reason = f"somebody else has changed it since: {state_text(state_of(one.tid))}"
+        reason = f"another program has changed it since: {state_text(state_of(one.tid))}"
         return Outcome(one.tid, one.comm, "left", reason)
     return Outcome(one.tid, one.comm, "restored" if ours else "unchanged")
 

@@ -42,7 +42,7 @@ from chainshaper.enforcement.undoing import (
     undo_run,
 )
 from chainshaper.flow.phase import (
-    NOBODY,
+    NO_NODE,
     DriftWatch,
     Telling,
     measure_phase,
@@ -106,7 +106,7 @@ class _Run:
     guardians: Guardians | None = None
     command: subprocess.Popen[bytes] | None = None
     servers: BackEnd | None = None
-    telling: Telling = NOBODY
+    telling: Telling = NO_NODE
 
     @property
     def folder(self) -> Path:
@@ -253,7 +253,7 @@ def _schedule(run: _Run, found: Allocation) -> None:
 def _initial_state(
     run: _Run, table: ServerTable, command: Sequence[str], plan_path: str
 ) -> RunState:
-    keeper = run.choice.name if gates(run.choice.name) else "nobody: priority only"
+    keeper = run.choice.name if gates(run.choice.name) else "none: priority only"
     kept_by = {server.name: "gate" for server in run.plan.servers}
     kept_by |= {server.name: keeper for server in table.servers}
     return RunState(
@@ -358,7 +358,7 @@ def _keep(
         *(origin.pid, origin.tid, run.plan.cycle_ns, begins, slots),
         cores=set(available_cores()) - {server.core for server in run.plan.servers},
     )
-    told_ns, notes = 0, state.notes
+    sent_ns, notes = 0, state.notes
     latest: tuple[NodeThread, ...] = ()
     unsaved = untaken = ""
     while True:
@@ -382,8 +382,8 @@ def _keep(
         if state.failure is not None or is_over:
             return shown
         moved_ns = drifted_ns or 0
-        if abs(moved_ns - told_ns) > PHASE_BOUND_NS and run.telling is NOBODY:
-            told_ns, run.telling = moved_ns, tell_phase(run.plan, found, begins + moved_ns)
+        if abs(moved_ns - sent_ns) > PHASE_BOUND_NS and run.telling is NO_NODE:
+            sent_ns, run.telling = moved_ns, tell_phase(run.plan, found, begins + moved_ns)
             state = replace(state, notes=(*notes, moved_text(moved_ns)))
         if run.stop.wait(_LOOK_S):
             continue
@@ -436,7 +436,7 @@ def _told(run: _Run) -> tuple[str, ...]:
     """What went wrong with telling the shaping nodes, once that is over."""
     if not run.telling.is_over():
         return ()
-    telling, run.telling = run.telling, NOBODY
+    telling, run.telling = run.telling, NO_NODE
     return telling.end()
 
 

@@ -8,9 +8,12 @@ import os
 import platform
 import resource
 import shutil
+import subprocess
 from collections.abc import Iterator
+from pathlib import Path
 
 from chainshaper.enforcement.back_ends import offered_back_ends
+from chainshaper.linux.own_processes import tool_environment
 from chainshaper.linux.scheduling import available_cores, may_use_fifo, throttle_fraction
 from chainshaper.linux.threads import foreign_realtime_processes
 from chainshaper.values.machine import Check, MachineReport, State
@@ -71,12 +74,38 @@ def _checks(realtime: bool) -> Iterator[Check]:
         found, _, remedy = (offer.missing or "").partition(": ")
         good = "can be used" if offer.missing is None else None
         yield _check(f"back end {offer.name}", offer.strength, good, ("absent", found, remedy))
+    yield _bpftrace()
     for name, purpose, remedy in (
-        ("bpftrace", "recording ROS 2 without LTTng", "apt install bpftrace"),
         ("lttng", "recording ROS 2 with LTTng", "apt install lttng-tools"),
         ("ros2", "shaping ROS 2 applications", "install ROS 2, and source its setup.bash"),
     ):
         yield _check(name, purpose, shutil.which(name), ("absent", "not found", remedy))
+
+
+def _bpftrace() -> Check:
+    """Whether bpftrace is there and works: without tracefs it finds no trace points."""
+    purpose, environment = "recording ROS 2 without LTTng", tool_environment()
+    path = shutil.which("bpftrace", path=environment["PATH"])
+    if path is None:
+        return _check("bpftrace", purpose, None, ("absent", "not found", "apt install bpftrace"))
+    if os.geteuid() != 0:
+        lacking: tuple[State, str, str] = ("limited", "needs root", "run as root, with sudo")
+        return _check("bpftrace", purpose, None, lacking)
+    trial = [path, "-e", "BEGIN { exit(); } tracepoint:sched:sched_switch { }"]
+    try:
+        run = subprocess.run(
+            trial, capture_output=True, text=True, check=False, timeout=30, env=environment
+        )
+        problems = [line for line in run.stderr.splitlines() if "RLIMIT_MEMLOCK" not in line]
+    except subprocess.TimeoutExpired:
+        run, problems = None, ["it did not end within 30 s"]
+    if run is not None and run.returncode == 0:
+        return _check("bpftrace", purpose, path, ("limited", "", ""))
+    remedy = "mount -t tracefs tracefs /sys/kernel/tracing"
+    if Path("/sys/kernel/tracing/events").is_dir():
+        remedy = "see what bpftrace says: a kernel with BTF and uprobes is needed"
+    found = f"does not work: {problems[0] if problems else 'no reason given'}"
+    return _check("bpftrace", purpose, None, ("limited", found, remedy))
 
 
 def _check(name: str, purpose: str, good: str | None, lacking: tuple[State, str, str]) -> Check:

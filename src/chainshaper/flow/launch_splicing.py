@@ -296,7 +296,7 @@ def _subscribers(one: ThrottledInput, graph: "ApplicationGraph | None") -> list[
         nodes = sorted(graph.subscribers.get(one.topic, ()))
         if not nodes:
             raise InputError(
-                f"nobody subscribes to {one.topic} in the recording; what somebody does:"
+                f"no node subscribes to {one.topic} in the recording; to these topics nodes do:"
                 f" {', '.join(sorted(graph.subscribers)) or 'nothing'}"
             )
     if not nodes:

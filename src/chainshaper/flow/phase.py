@@ -265,9 +265,9 @@ def _undisturbed() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Telling:
-    """Nodes that are being told, by a process of ours, since ``begun`` (s of CLOCK_MONOTONIC).
+    """Nodes that a process of ours is sending the phase, since ``begun`` (s of CLOCK_MONOTONIC).
 
-    ``script`` is None where no node is to be told, or it was ``refused``.
+    ``script`` is None where no node is to get it, or it was ``refused``.
     """
 
     nodes: tuple[str, ...]
@@ -290,13 +290,13 @@ class Telling:
         if problem is None:
             return ()
         return (
-            f"{', '.join(self.nodes)} could not be told where cycles begin ({problem}): outputs "
+            f"{', '.join(self.nodes)} did not get where cycles begin ({problem}): outputs "
             "without a stamp of their chain's beginning will not be in time",
         )
 
 
-NOBODY = Telling((), None, 0.0)
-"""No node is being told."""
+NO_NODE = Telling((), None, 0.0)
+"""No node is to get a phase."""
 
 
 def tell_phase(plan: Plan, found: Allocation, phase_ns: int) -> Telling:
@@ -312,7 +312,7 @@ def tell_phase(plan: Plan, found: Allocation, phase_ns: int) -> Telling:
         if node in one.nodes
     }
     if not pids:
-        return NOBODY
+        return NO_NODE
     # Who reads what ROS 2 shows reads recordings as well, which is slow to import.
     from chainshaper.sources.ros import script as ros_script
     from chainshaper.sources.ros.interpreter import start_with_rclpy
@@ -321,7 +321,7 @@ def tell_phase(plan: Plan, found: Allocation, phase_ns: int) -> Telling:
         environments = {node: _environment_for(pid) for node, pid in pids.items()}
         nodes = tuple(node for node, one in environments.items() if _is_ros(one))
         if not nodes:  # they are the live workload's
-            return NOBODY
+            return NO_NODE
         arguments = ("parameter", "phase_ns", str(phase_ns % plan.cycle_ns), *nodes)
         script = start_with_rclpy(environments[nodes[0]], ros_script.__file__, *arguments)
     except OperationError as error:
@@ -347,8 +347,8 @@ def _is_ros(environment: "Environment") -> bool:
 
 
 def moved_text(drift_ns: int) -> str:
-    """What to know when nodes are told again."""
+    """What to say when nodes get the phase again."""
     return (
         f"the chain's beginning has moved by {format_duration(drift_ns)} since the plan was put in "
-        "force; shaping nodes are told, and outputs without a stamp follow from the next cycle"
+        "force; shaping nodes get it, and outputs without a stamp follow from the next cycle"
     )

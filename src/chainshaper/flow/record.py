@@ -1,9 +1,9 @@
-"""Recording an application that somebody else has written: `chainshaper record`.
+"""Recording an application that is not ours: `chainshaper record`.
 
     tracing on ─► application starts ─► threads looked at, now and then ─► tracing off
                                         ─► types and QoS asked for ─► application ends ─► recording
 
-Tracing begins first, because who exists is told only once, when it is created. Types and QoS are
+Tracing begins first, because an object emits its name once, when it is created. Types and QoS are
 asked for when tracing is over: discovery costs every node some time. What the tracer wrote is kept
 with the recording, as `trace/`.
 
@@ -145,7 +145,7 @@ def record_command(
     as the chain of interest, ``plan`` as the plan in force; ``gate_logs`` are where its shaping
     nodes note what they do. ``watch_stalls`` has a sleeper on every core notice when the machine
     stands still, which takes some 2 % of it. What the command prints goes to the file descriptor
-    ``command_stdout``, if that is given. ``progress`` is told the share that is done, as far as
+    ``command_stdout``, if that is given. ``progress`` gets the share that is done, as far as
     that is known, and what is being done.
 
     Raises:

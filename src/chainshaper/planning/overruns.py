@@ -204,7 +204,7 @@ def publication_warnings(plan: Plan) -> list[str]:
     if plan.overrun == "discard" and warnings:
         lifespan, topic = output_lifespan(plan), plan.chain.output or "their topic"
         warnings.append(
-            "outputs that are due in a later cycle than their own cannot be told from overruns by"
+            "outputs that are due in a later cycle than their own look like overruns by"
             " their age: none will be discarded."
             if lifespan is None
             else f"outputs that overran are discarded by DDS if {topic} has a lifespan of"

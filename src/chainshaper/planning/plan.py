@@ -504,7 +504,7 @@ def _check_publisher_threads(plan: Plan) -> None:
         if plan.overrun == "publish" and plan.policy not in ("shaped", "one-long-slot"):
             raise wrong_value(
                 f"under {plan.policy} an output of an asynchronous publisher that comes in its own"
-                " cycle cannot be told from an overrun of the one before: write wait or discard, or"
+                " cycle looks like an overrun of the one before: write wait or discard, or"
                 " plan with --publication synchronous",
                 "overrun",
             )

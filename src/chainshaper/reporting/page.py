@@ -271,7 +271,7 @@ def _overruns(part: _Part) -> str:
 def _stalls(part: _Part) -> str:
     meter = part.measurement.recording.info.stall_meter
     if meter is None:
-        return _paragraph(f"{part.name}: nobody watched the machine, so its stalls are not known.")
+        return _paragraph(f"{part.name}: no meter watched, so its stalls are unknown.")
     stalls = part.timeline.stalls.select(cpu="core", duration=pl.col("end") - pl.col("start"))
     statistics = part.measurement.analysis.statistics
     about = (

@@ -2,7 +2,7 @@
 
 Beside the launch file stand what redirects topics (:mod:`.redirection`) and the nodes that are
 added; the user's launch files stay where they are. A manifest, `splice.json`, names every file with
-its hash, so that the folder can be replaced or removed again as long as nobody has changed it. What
+its hash, so that the folder can be replaced or removed again as long as it is unchanged. What
 running and building leave there does not count as a change: Python's caches, logs of the shaping
 nodes, colcon's folders.
 """

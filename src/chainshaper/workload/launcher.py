@@ -70,7 +70,7 @@ class Child:
             if not select.select([pipe], [], [], within_s)[0]:
                 raise OperationError(
                     f"{self.name} (pid {self.pid}) has not answered for {within_s:g} s: it hangs, "
-                    "or somebody stopped it"
+                    "or was stopped"
                 )
             arrived = os.read(pipe, 1 << 20)
             if not arrived:

@@ -73,7 +73,7 @@ class _Process:
 def callback_functions(callbacks: Iterable[tuple[int, int]]) -> dict[tuple[int, int], str]:
     """(Process, callback) → the type of its function, for callbacks of processes that run.
 
-    Those that cannot be told, or not read, are left out.
+    Those that are not known, or cannot be read, are left out.
     """
     handles: dict[int, list[int]] = {}
     for pid, callback in callbacks:

@@ -99,10 +99,10 @@ def with_found_objects(
 def with_functions(
     tables: events.EventTables, functions: Mapping[tuple[int, int], str], began_ns: int
 ) -> events.EventTables:
-    """Add what `rclcpp_callback_register` would have told: (process, callback) → its function.
+    """Add what `rclcpp_callback_register` would have shown: (process, callback) → its function.
 
     Callbacks were registered when they were added, or before ``began_ns``. What the event itself
-    told, as on Humble, stays.
+    shows, as on Humble, stays.
     """
     named = pl.DataFrame(
         [(*callback, symbol) for callback, symbol in functions.items()],
@@ -168,7 +168,7 @@ def _publishers(tables: events.EventTables, handles: pl.DataFrame) -> pl.DataFra
 
 
 def _unregistered_starts(tables: events.EventTables) -> pl.DataFrame:
-    """Starts of callbacks that nobody registered: ``time, pid, callback, taken``.
+    """Starts of callbacks that were never registered: ``time, pid, callback, taken``.
 
     ``taken`` is the subscription from which the thread had just taken a message, null if it did
     something else before.

@@ -367,7 +367,7 @@ def _family(pids: Iterable[int]) -> set[int]:
 def _wait_until_idle(bpftrace: int) -> None:
     """Wait until bpftrace has printed all that there was: then it sleeps.
 
-    What it has not read when it is told to end, it throws away.
+    What it has not read when it is asked to end, it throws away.
     """
     until = time.monotonic() + _READ_S
     with suppress(OSError):  # it has ended
