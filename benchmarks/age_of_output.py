@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from chainshaper.flow.steps import profile_chains
+from chainshaper.flow.plan import profile_chains
 from chainshaper.gate.decision import OVERRUNS, Gate, release_of
 from chainshaper.planning.margins import EPSILON_NS, OVERRUN_PROBABILITY, covered_latency
 from chainshaper.values.durations import milliseconds

@@ -22,7 +22,7 @@ from results import HERE, MS, PICTURES, Line, Run, Value, lines_of, save
 from table_4 import plans
 
 from chainshaper import load_application
-from chainshaper.flow.steps import plan_recording
+from chainshaper.flow.plan import plan_recording
 from chainshaper.planning import Plan, PlanRequest, publish_slots
 from chainshaper.simulation.samples import with_recorded_times
 from chainshaper.values.errors import ChainshaperError

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
         find_chain,
         load_named_paths,
     )
-    from chainshaper.analysis.description import ApplicationDescription
+    from chainshaper.analysis.graph import ApplicationDescription
     from chainshaper.enforcement.undoing import end_run, find_runs
     from chainshaper.flow.apply import apply_plan
     from chainshaper.flow.doctor import examine_machine
@@ -43,13 +43,13 @@ if TYPE_CHECKING:
         splice_throttlers,
         undo_splice,
     )
-    from chainshaper.flow.profiling import profiling_condition
-    from chainshaper.flow.record import Recorded, record_command
-    from chainshaper.flow.steps import (
+    from chainshaper.flow.plan import (
         plan_recording,
         profile_chains,
         shape_application,
     )
+    from chainshaper.flow.profiling import profiling_condition
+    from chainshaper.flow.record import Recorded, record_command
     from chainshaper.flow.sweep import sweep
     from chainshaper.flow.threads import find_threads, planned_changes
     from chainshaper.planning import (
@@ -77,11 +77,11 @@ if TYPE_CHECKING:
         PlatformError,
     )
     from chainshaper.values.recording import Recording, event_counts, open_recording
-    from chainshaper.verify.breakdown import hop_breakdown
     from chainshaper.verify.measure import (
         Comparison,
         Measurement,
         compare_recordings,
+        hop_breakdown,
         measure_latency,
     )
     from chainshaper.workload.description import Application, load_application
@@ -133,22 +133,22 @@ _HOMES = {
     "chainshaper.flow.record": ("Recorded", "record_command"),
     "chainshaper.values.recording": ("Recording", "event_counts", "open_recording"),
     "chainshaper.verify.measure": (
+        "hop_breakdown",
         "Comparison",
         "Measurement",
         "compare_recordings",
         "measure_latency",
     ),
-    "chainshaper.analysis.description": ("ApplicationDescription",),
+    "chainshaper.analysis.graph": ("ApplicationDescription",),
     "chainshaper.reporting.graph_drawing": ("write_picture",),
     "chainshaper.reporting.figures": ("draw_distribution", "draw_latency"),
-    "chainshaper.verify.breakdown": ("hop_breakdown",),
     "chainshaper.reporting.page": ("write_report",),
     "chainshaper.reporting.perfetto": ("export_perfetto",),
     "chainshaper.simulation": ("simulate", "simulate_latencies"),
     "chainshaper.sources": ("open_source",),
     "chainshaper.sources.gate_log": ("read_gate_log",),
     "chainshaper.splicing.shaping_process": ("write_shaping_process", "write_throttler"),
-    "chainshaper.flow.steps": (
+    "chainshaper.flow.plan": (
         "plan_recording",
         "profile_chains",
         "shape_application",

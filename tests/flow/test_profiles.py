@@ -9,7 +9,7 @@ import pytest
 from reference_traces import DATA
 from story import OFFSET, Callback, Publisher, Story
 
-from chainshaper.flow.steps import plan_recording, profile_chains
+from chainshaper.flow.plan import plan_recording, profile_chains
 from chainshaper.planning import PlanRequest, Profile, plan_chain, plan_warnings
 from chainshaper.planning.plan import revised
 from chainshaper.values import events

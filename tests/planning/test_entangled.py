@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from chainshaper import measure_latency, simulate
-from chainshaper.flow.steps import plan_recording, profile_chains
+from chainshaper.flow.plan import plan_recording, profile_chains
 from chainshaper.planning import Plan, PlanRequest, place_chains, plan_chains, publish_slots
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording

@@ -9,7 +9,7 @@ import pytest
 from story import Story
 
 from chainshaper.analysis import data_flow, graph_of
-from chainshaper.analysis.description import ApplicationDescription, services
+from chainshaper.analysis.graph import ApplicationDescription, services
 from chainshaper.reporting.application_graph import (
     application_json,
     short_symbol,

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from quick_chain import quick_chain
 
-from chainshaper.flow.steps import plan_recording
+from chainshaper.flow.plan import plan_recording
 from chainshaper.flow.sweep import profile_at
 from chainshaper.planning import PlanRequest
 from chainshaper.simulation import simulate

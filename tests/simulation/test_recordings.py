@@ -13,7 +13,7 @@ from schedules import application, simulated
 from small_chain import small_chain
 
 from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
-from chainshaper.flow.steps import plan_recording
+from chainshaper.flow.plan import plan_recording
 from chainshaper.planning import Plan
 from chainshaper.simulation import arrays, simulate, simulate_latencies
 from chainshaper.simulation.samples import measured_costs, with_recorded_times

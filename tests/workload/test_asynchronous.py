@@ -16,7 +16,7 @@ from processes import children_of, wait_for
 from small_chain import PERIOD_NS, small_chain
 
 from chainshaper.analysis import LatencyAnalysis
-from chainshaper.flow.steps import plan_recording
+from chainshaper.flow.plan import plan_recording
 from chainshaper.planning import PlanRequest
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording

@@ -12,24 +12,29 @@ in one callback and published in another of the same node:
   subscription callbacks publish nothing at all, but whose timers do, is taken to store the
   message for the timers.
 
-Both are inferences, so they are kept apart: such topics stand in ``Callback.publishes`` (the
-chain goes on there) and also in ``Callback.passes_on``.
+Both are inferences, so they are marked: such topics stand in ``Callback.publishes`` (the chain
+goes on there) and also in ``Callback.passes_on``.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import polars as pl
 
 from chainshaper.analysis.flow import DataFlow, data_flow
+from chainshaper.analysis.matching import latest_before
+from chainshaper.analysis.objects import named_nodes
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Callback, Node
 
 __all__ = [
     "INTERNAL_TOPICS",
     "MESSAGE_FILTER",
+    "ApplicationDescription",
     "application_graph",
     "goes_on_elsewhere",
     "graph_of",
+    "services",
 ]
 
 MESSAGE_FILTER = "message_filters::"
@@ -159,3 +164,30 @@ def goes_on_elsewhere(graph: ApplicationGraph, callback: Callback, topic: str) -
         return True
     filtered = callback.symbol is None or MESSAGE_FILTER in callback.symbol
     return filtered and any(other.kind == "subscription" for other in siblings)
+
+
+@dataclass(frozen=True)
+class ApplicationDescription:
+    """Everything that a picture of an application shows.
+
+    ``services`` is the frame of :func:`services`; ``lost`` and ``notes`` are what a reader must
+    know about how complete it is.
+    """
+
+    graph: ApplicationGraph
+    services: pl.DataFrame
+    lost: dict[str, int]
+    notes: tuple[str, ...]
+
+
+def services(tables: events.EventTables) -> pl.DataFrame:
+    """All services: ``service, role, node, pid``, one row per server and client."""
+    nodes = named_nodes(tables).rename({"handle": "node_handle", "valid_from": "created"})
+    found = []
+    for role, name in (("server", "rcl_service_init"), ("client", "rcl_client_init")):
+        ends = events.table(tables, name).select(
+            "time", "pid", "node_handle", service="service_name", role=pl.lit(role)
+        )
+        joined = latest_before(ends, nodes, ["pid", "node_handle"], "time", "created")
+        found.append(joined.select("service", "role", "node", "pid"))
+    return pl.concat(found).unique().sort("service", "role", "node", "pid")

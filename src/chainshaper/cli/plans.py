@@ -83,7 +83,7 @@ def plan(
 def _profiles(
     recording: Path | None, latencies: Path | None, period: int | None, chains: Sequence[str | None]
 ) -> "tuple[Profile, ...]":
-    from chainshaper.flow.steps import profile_chains
+    from chainshaper.flow.plan import profile_chains
     from chainshaper.planning import Profile, read_latencies
 
     if recording is not None:
@@ -207,7 +207,7 @@ def sweep(
     from chainshaper.reporting.plans import sweep_table
     from chainshaper.simulation.grid import parse_axis
     from chainshaper.simulation.sweeping import rows_beside
-    from chainshaper.values.whole_file import new_file
+    from chainshaper.values.files import new_file
     from chainshaper.workload.description import load_application
 
     if workers is not None and scheduler is not None:

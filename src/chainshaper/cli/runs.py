@@ -384,7 +384,7 @@ def shape(
 def _shape_described(
     application: Path, plan: Path, output: Path, cycles: int, realtime: bool | None
 ) -> None:
-    from chainshaper.flow.steps import shape_application
+    from chainshaper.flow.plan import shape_application
     from chainshaper.planning import load_plan, plan_warnings
     from chainshaper.verify.overruns import dropped_in, dropped_text, overruns_in, overruns_text
     from chainshaper.workload.description import load_application

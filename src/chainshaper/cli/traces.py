@@ -55,7 +55,7 @@ def graph(
     )
     from chainshaper.reporting.graph_drawing import ENDINGS, write_picture
     from chainshaper.sources import open_source
-    from chainshaper.values.whole_file import new_file
+    from chainshaper.values.files import new_file
 
     if output is not None:
         new_file(output, ENDINGS)
@@ -253,7 +253,7 @@ def report(
     from chainshaper.reporting.latency import comparison_json
     from chainshaper.reporting.page import ENDINGS, write_report
     from chainshaper.sources import open_source
-    from chainshaper.values.whole_file import new_file
+    from chainshaper.values.files import new_file
     from chainshaper.verify.measure import Comparison, measure_latency
 
     new_file(output, ENDINGS)
@@ -291,7 +291,7 @@ def export(
     from chainshaper.flow.exploration import lost_events
     from chainshaper.reporting.perfetto import ENDINGS, export_perfetto
     from chainshaper.sources import open_source
-    from chainshaper.values.whole_file import new_file
+    from chainshaper.values.files import new_file
     from chainshaper.verify.measure import measure_latency
 
     new_file(output, ENDINGS)

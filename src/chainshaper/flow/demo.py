@@ -19,7 +19,7 @@ from pathlib import Path
 import polars as pl
 
 from chainshaper.analysis import callback_statistics, data_flow
-from chainshaper.flow.steps import plan_recording, shape_application
+from chainshaper.flow.plan import plan_recording, shape_application
 from chainshaper.planning import Plan, PlanRequest, save_plan
 from chainshaper.reporting.figures import write_comparison
 from chainshaper.values.errors import OperationError

@@ -16,7 +16,7 @@ from chainshaper.enforcement.back_ends import offered_back_ends
 from chainshaper.linux.own_processes import tool_environment
 from chainshaper.linux.scheduling import available_cores, may_use_fifo, throttle_fraction
 from chainshaper.linux.threads import foreign_realtime_processes
-from chainshaper.values.machine import Check, MachineReport, State
+from chainshaper.values.recording import Check, MachineReport, State
 
 __all__ = ["examine_machine"]
 

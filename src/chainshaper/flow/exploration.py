@@ -16,7 +16,7 @@ from chainshaper.analysis import (
     load_named_paths,
 )
 from chainshaper.analysis.chains import close_names
-from chainshaper.analysis.description import ApplicationDescription, services
+from chainshaper.analysis.graph import ApplicationDescription, services
 from chainshaper.sources import open_source
 from chainshaper.sources.lttng.trace import table_name
 from chainshaper.values.errors import InputError

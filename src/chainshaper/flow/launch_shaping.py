@@ -23,9 +23,9 @@ from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow.apply import START_NS, apply_plan
 from chainshaper.flow.exploration import list_chains
 from chainshaper.flow.launch_splicing import Splicing, splice_launch_files
+from chainshaper.flow.plan import plan_recording
 from chainshaper.flow.profiling import chain_nodes, profiling_condition
 from chainshaper.flow.record import Scheduling, record_command
-from chainshaper.flow.steps import plan_recording
 from chainshaper.linux.processes import Process
 from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.linux.users import run_users

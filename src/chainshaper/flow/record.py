@@ -49,6 +49,7 @@ from chainshaper.values import events
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 from chainshaper.values.events import EventTables
+from chainshaper.values.files import open_to_all
 from chainshaper.values.recording import (
     EndpointInfo,
     InForceInfo,
@@ -56,7 +57,6 @@ from chainshaper.values.recording import (
     refuse_existing,
     write_recording,
 )
-from chainshaper.values.whole_file import open_to_all
 from chainshaper.workload.stall_watch import StallWatch, far_from, stalls_watched
 
 __all__ = ["Recorded", "Scheduling", "record_command"]

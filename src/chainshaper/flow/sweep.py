@@ -12,7 +12,7 @@ from typing import Any
 import polars as pl
 import yaml
 
-from chainshaper.flow.steps import profile_chains
+from chainshaper.flow.plan import profile_chains
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.planning import Plan, Profile
 from chainshaper.simulation import simulate, simulate_latencies
@@ -28,7 +28,7 @@ from chainshaper.simulation.grid import (
 from chainshaper.simulation.sweeping import FIGURES, Row, finished_rows, rows_beside, rows_of
 from chainshaper.values.durations import parse_duration
 from chainshaper.values.errors import ChainshaperError, InputError
-from chainshaper.values.whole_file import new_file, write_whole
+from chainshaper.values.files import new_file, write_whole
 from chainshaper.workload.description import Application, application_as_written
 
 __all__ = ["profile_at", "sweep"]

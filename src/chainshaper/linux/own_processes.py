@@ -27,7 +27,7 @@ from typing import Any
 from chainshaper.linux.scheduling import signalled_with_parent
 from chainshaper.linux.threads import read_proc
 from chainshaper.values.errors import InputError, OperationError
-from chainshaper.values.trusted_files import why_distrusted
+from chainshaper.values.files import why_distrusted
 
 LIBRARIES = ("cyclonedds", "llvmlite", "numba", "numpy", "polars", "pydantic", "scipy", "yaml")
 """What processes import that simulate, or have DDS; all others need Python alone."""

@@ -13,7 +13,7 @@ import yaml
 
 from chainshaper.planning.plan import Plan, band_predictions, publish_slots
 from chainshaper.values.errors import InputError, OperationError
-from chainshaper.values.whole_file import new_file, write_whole
+from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.yaml_file import AS_YAML, read_model
 
 _HEADER = """\

@@ -8,7 +8,7 @@ import re
 from dataclasses import replace
 from typing import Any
 
-from chainshaper.analysis.description import ApplicationDescription
+from chainshaper.analysis.graph import ApplicationDescription
 from chainshaper.reporting.tables import Column, ResultTable, words
 from chainshaper.values.application import INTERNAL_TOPICS, Callback
 from chainshaper.values.durations import format_duration

@@ -17,9 +17,8 @@ from chainshaper.planning import BandChoice, publish_slots
 from chainshaper.reporting.latency import comparison_json
 from chainshaper.reporting.plans import sweep_axes, sweep_value
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.files import new_file, why_distrusted, write_whole
 from chainshaper.values.safe_text import shown
-from chainshaper.values.trusted_files import why_distrusted
-from chainshaper.values.whole_file import new_file, write_whole
 from chainshaper.verify.measure import Comparison, Measurement
 
 if TYPE_CHECKING:

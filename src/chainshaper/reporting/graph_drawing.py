@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from chainshaper.analysis.description import ApplicationDescription
+from chainshaper.analysis.graph import ApplicationDescription
 from chainshaper.reporting.application_graph import (
     application_json,
     callback_text,
@@ -31,9 +31,9 @@ from chainshaper.reporting.application_graph import (
     without_internals,
 )
 from chainshaper.values.application import Callback
+from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.recording import lost_text
 from chainshaper.values.safe_text import escape, shown
-from chainshaper.values.whole_file import new_file, write_whole
 
 __all__ = [
     "ENDINGS",

@@ -24,8 +24,7 @@ from chainshaper.reporting.tables import (
     words,
 )
 from chainshaper.values.durations import milliseconds
-from chainshaper.verify.breakdown import PARTS, hop_breakdown, part_shares
-from chainshaper.verify.measure import Comparison, Measurement
+from chainshaper.verify.measure import PARTS, Comparison, Measurement, hop_breakdown, part_shares
 from chainshaper.verify.predictions import BandHeld, FigureHeld, PredictionHeld
 
 __all__ = [

@@ -41,8 +41,8 @@ from chainshaper.reporting.tables import ResultTable, figures, ms, words
 from chainshaper.reporting.timeline import Timeline, timeline_of
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError
+from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.safe_text import escape, shown
-from chainshaper.values.whole_file import new_file, write_whole
 from chainshaper.verify.measure import Comparison, Measurement
 from chainshaper.verify.overruns import overruns_text
 

@@ -20,8 +20,7 @@ from chainshaper.planning import Plan, publish_slots
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.reporting.tables import ms, slots_ms
 from chainshaper.reporting.timeline import Timeline
-from chainshaper.verify.breakdown import PARTS, hop_breakdown
-from chainshaper.verify.measure import Measurement
+from chainshaper.verify.measure import PARTS, Measurement, hop_breakdown
 
 __all__ = [
     "hop_bars",

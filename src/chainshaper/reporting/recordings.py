@@ -26,9 +26,9 @@ from chainshaper.reporting.tables import (
 )
 from chainshaper.values.application import ApplicationGraph, Chain
 from chainshaper.values.durations import format_duration, milliseconds
-from chainshaper.values.machine import MachineReport
 from chainshaper.values.recording import (
     INFO_FILE,
+    MachineReport,
     Recording,
     StallMeterInfo,
     ThreadInfo,

@@ -25,7 +25,7 @@ from chainshaper.splicing.generated_package import (
     typed_package,
 )
 from chainshaper.values.errors import InputError, OperationError
-from chainshaper.values.whole_file import write_whole
+from chainshaper.values.files import write_whole
 
 NodeKind: TypeAlias = Literal["python", "cpp", "typed"]
 _PACKAGE = Path(__file__).parents[1]

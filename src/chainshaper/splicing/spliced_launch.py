@@ -24,7 +24,7 @@ from chainshaper.splicing import redirection
 from chainshaper.splicing.redirection import Redirect
 from chainshaper.splicing.shaping_process import RESPAWN, ShapingProcess
 from chainshaper.values.errors import InputError, OperationError
-from chainshaper.values.whole_file import open_to_all
+from chainshaper.values.files import open_to_all
 from chainshaper.values.yaml_file import read_text
 
 __all__ = [

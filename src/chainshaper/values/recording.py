@@ -23,15 +23,18 @@ from pydantic import BaseModel, Field
 
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.events import EventTables, as_table, column_problems
-from chainshaper.values.whole_file import free_place, open_to_all
+from chainshaper.values.files import free_place, open_to_all
 from chainshaper.values.yaml_file import wrong_values_refused
 
 __all__ = [
+    "Check",
     "EndpointInfo",
     "InForceInfo",
+    "MachineReport",
     "Recording",
     "RecordingInfo",
     "StallMeterInfo",
+    "State",
     "ThreadInfo",
     "event_counts",
     "lost_text",
@@ -354,3 +357,27 @@ def _write_table(file: Path, frame: pl.DataFrame) -> str:
         stream.flush()
         os.fsync(stream.fileno())
     return _checksum(content.getbuffer())
+
+
+State: TypeAlias = Literal["good", "limited", "absent"]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One ability: ``needed_for`` says what goes without it, ``remedy`` what would bring it."""
+
+    name: str
+    state: State
+    found: str
+    needed_for: str
+    remedy: str = ""
+
+
+@dataclass(frozen=True)
+class MachineReport:
+    """All checks, and the stalls seen while watching every core (`machine_stall` table)."""
+
+    checks: tuple[Check, ...]
+    stalls: pl.DataFrame
+    stall_meter: StallMeterInfo
+    watched_ns: int

@@ -49,7 +49,7 @@ from typing import Any, Generic, TypeAlias, TypeVar
 from chainshaper.gate.decision import origin_of
 from chainshaper.linux.own_processes import named_folders
 from chainshaper.linux.scheduling import set_thread_name
-from chainshaper.values.trusted_files import why_distrusted
+from chainshaper.values.files import why_distrusted
 from chainshaper.workload import dds
 from chainshaper.workload.dds import GuardCondition, Message, Subscription, WaitSet
 from chainshaper.workload.event_log import EventLog, number_of

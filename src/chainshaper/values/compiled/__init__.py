@@ -34,8 +34,7 @@ from typing import Any
 import llvmlite.binding as llvm  # type: ignore[import-untyped]
 
 from chainshaper.values.errors import OperationError
-from chainshaper.values.trusted_files import why_distrusted
-from chainshaper.values.whole_file import write_whole
+from chainshaper.values.files import why_distrusted, write_whole
 
 __all__ = ["kernel"]
 

@@ -1,13 +1,60 @@
-"""A new file, written whole or not at all, and never over another; a place for a new folder."""
+"""Files that may run here, and files that are written whole.
 
+Only files that root and the user of this process alone can change may run, as ssh asks of its keys.
+A folder above may be writable by others where its sticky bit prevents them from replacing what is
+in it, as in /tmp. A new file is written whole or not at all, and never over another.
+"""
+
+import grp
 import os
+import pwd
+import stat
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
 from chainshaper.values.errors import InputError, OperationError
 
-__all__ = ["free_place", "new_file", "open_to_all", "write_whole"]
+__all__ = ["free_place", "new_file", "open_to_all", "why_distrusted", "write_whole"]
+
+
+def why_distrusted(path: str | Path) -> str | None:
+    """Why others may change a file, a folder or what leads there; None if they cannot.
+
+    A name that others wrote is in the reason: it is shown as any other.
+    """
+    place = Path(os.path.realpath(path))
+    for part in (place, *place.parents):
+        try:
+            state = part.lstat()
+        except OSError as error:
+            return f"{part}: {error.strerror}"
+        if state.st_uid not in (0, os.geteuid()):
+            return f"{part} belongs to {_user(state.st_uid)}"
+        if part != place and state.st_mode & stat.S_ISVTX:
+            continue
+        of_group = state.st_mode & stat.S_IWGRP and not _is_own_group(state.st_gid, state.st_uid)
+        if of_group or state.st_mode & stat.S_IWOTH:
+            return f"{part} is writable by others than {_user(state.st_uid)}"
+    return None
+
+
+def _user(uid: int) -> str:
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return f"user {uid}"
+
+
+def _is_own_group(gid: int, uid: int) -> bool:
+    """Whether a group is its user's own and has no other member, as Debian makes one for each."""
+    try:
+        user, group = pwd.getpwuid(uid), grp.getgrgid(gid)
+    except KeyError:
+        return False
+    return (
+        user.pw_gid == gid and group.gr_name == user.pw_name and {*group.gr_mem} <= {user.pw_name}
+    )
 
 
 def free_place(path: Path, taken: bool) -> Path:
