@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from calm_runs import calm_run
 from command_line import called, json_of
 from small_chain import PERIOD_NS, small_chain
 
@@ -30,7 +31,7 @@ from chainshaper.verify.overruns import (
     overruns_in,
     overruns_text,
 )
-from chainshaper.workload.live import StartedNodes
+from chainshaper.workload.live import Enforcement, StartedNodes
 
 MS = 1_000_000
 
@@ -48,8 +49,19 @@ def _too_early() -> Plan:
 
 
 def _shaped(folder: Path, overrun: str) -> Recording:
-    plan = revised(_too_early(), overrun=overrun)
-    return shape_application(small_chain(folder), plan, folder / overrun, cycles=24)
+    return _calm(folder, revised(_too_early(), overrun=overrun))
+
+
+def _calm(folder: Path, plan: Plan, enforcement: Enforcement | None = None) -> Recording:
+    """The small chain shaped for 24 cycles, on a machine that mostly leaves it alone."""
+    application = small_chain(folder)
+
+    def shape(place: Path) -> Recording:
+        return shape_application(
+            application, plan, place / "rec", cycles=24, enforcement=enforcement
+        )
+
+    return calm_run(shape, folder)
 
 
 def test_discarded_outputs_are_not_published_and_not_lost(tmp_path: Path) -> None:
@@ -94,7 +106,7 @@ def test_what_comes_into_an_open_slot_leaves_at_once_and_is_counted(tmp_path: Pa
         for server in early.servers
     )
     plan = revised(early, servers=wide)
-    recording = shape_application(small_chain(tmp_path), plan, tmp_path / "wide", cycles=24)
+    recording = _calm(tmp_path, plan)
     releases = recording.events["gate_release"]
     behind = releases["arrival"] - releases["origin"] - start
     measured = measure_latency(recording)
@@ -248,9 +260,7 @@ def test_a_late_output_is_not_hidden_by_a_stall_after_it_was_due(
     tmp_path: Path, plan: Plan
 ) -> None:
     """A node is stopped; the machine is said to stall while its output waits."""
-    recording = shape_application(
-        small_chain(tmp_path), plan, tmp_path / "rec", cycles=24, enforcement=_stopped_once
-    )
+    recording = _calm(tmp_path, plan, _stopped_once)
     cycles = measure_latency(recording).analysis.traversals
     stopped = cycles.filter("late").row(0, named=True)
     assert stopped["latency_ns"] > PERIOD_NS
