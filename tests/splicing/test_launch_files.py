@@ -290,7 +290,7 @@ def test_two_publishers_of_the_output_are_refused(robot: Path) -> None:
     ("topic", "with_recording", "message"),
     [
         ("/rear", False, "who subscribes to /rear is not known: name a recording"),
-        ("/side", True, "what somebody does: /front, /rear"),
+        ("/side", True, "to these topics nodes do: /front, /rear"),
     ],
 )
 def test_what_cannot_be_throttled_is_named_and_nothing_written(
