@@ -254,7 +254,7 @@ def test_a_beginning_that_moves_is_told_again_once(
     ):
         wait_for(lambda: bool(states) and states[-1].drift_ns is not None, "the first look")
         assert len(told) == 1
-        assert "/shaper did not get the phase" in states[-1].notes[-1]
+        assert "/shaper did not get where cycles begin" in states[-1].notes[-1]
         assert "(no such service)" in states[-1].notes[-1]
         os.kill(node.pid, signal.SIGUSR1)
         wait_for(lambda: len(told) == 2, "the nodes to be told again")
