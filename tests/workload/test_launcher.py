@@ -100,7 +100,9 @@ def test_a_child_killed_from_outside_is_a_casualty(nursery: Nursery) -> None:
 
 def test_a_child_that_keeps_silent_is_not_waited_for_for_ever(nursery: Nursery) -> None:
     child = nursery.start("polite")
-    with pytest.raises(OperationError, match=r"has not answered for 0.2 s: it hangs, or was stopped"):
+    with pytest.raises(
+        OperationError, match=r"has not answered for 0.2 s: it hangs, or was stopped"
+    ):
         child.hear(within_s=0.2)
 
 
