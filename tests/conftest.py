@@ -7,14 +7,13 @@ from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import TypeVar
 
-import numpy as np
 import pytest
 from calm_runs import calm_run
 from hypothesis import settings
-from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain, small_chain_text
+from small_chain import EXECUTOR_CORE, small_chain, small_chain_plan, small_chain_text
 
 from chainshaper import run_application, shape_application
-from chainshaper.planning import Plan, plan_shaping
+from chainshaper.planning import Plan
 from chainshaper.values.recording import Recording
 
 CYCLES = 12
@@ -92,13 +91,9 @@ def application_file(tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def plan() -> Plan:
     """Single-band shaping of the small chain: publish slot [21 ms, 22 ms)."""
-    return plan_shaping(
-        np.array([5_000_000, 20_000_000]),
-        PERIOD_NS,
-        spec="/t1../t3",
-        output="/t3",
-        publisher="/third",
-        nodes=("/first", "/second", "/third"),
+    return small_chain_plan(
+        5_000_000,
+        20_000_000,
         core=EXECUTOR_CORE,
     )
 

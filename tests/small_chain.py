@@ -1,11 +1,23 @@
 """A chain of three short nodes and an actuator, described for the cores of this machine."""
 
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from chainshaper.linux.scheduling import available_cores
+from chainshaper.planning import Plan, plan_shaping
 from chainshaper.workload.description import Application, load_application
 
-__all__ = ["DDS_CORE", "EXECUTOR_CORE", "NODES", "PERIOD_NS", "small_chain", "small_chain_text"]
+__all__ = [
+    "DDS_CORE",
+    "EXECUTOR_CORE",
+    "NODES",
+    "PERIOD_NS",
+    "small_chain",
+    "small_chain_plan",
+    "small_chain_text",
+]
 
 DDS_CORE = available_cores()[0]
 EXECUTOR_CORE = available_cores()[-1]
@@ -49,3 +61,16 @@ def small_chain(folder: Path, *, publication: str = "synchronous") -> Applicatio
     path = folder / "small_chain.yaml"
     path.write_text(small_chain_text(publication=publication))
     return load_application(path)
+
+
+def small_chain_plan(shortest_ns: int, longest_ns: int, **wishes: Any) -> Plan:
+    """A plan for the chain as if its latencies lay between two; ``wishes`` go to the planner."""
+    return plan_shaping(
+        np.array([shortest_ns, longest_ns]),
+        PERIOD_NS,
+        spec="/t1../t3",
+        output="/t3",
+        publisher="/third",
+        nodes=("/first", "/second", "/third"),
+        **wishes,
+    )

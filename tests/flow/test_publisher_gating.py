@@ -2,15 +2,14 @@
 
 from pathlib import Path
 
-import numpy as np
 import polars as pl
 from applied_plans import leftovers, needs_fifo
 from calm_runs import calm_run
 from gated import needs_cgroups
-from small_chain import PERIOD_NS, small_chain
+from small_chain import PERIOD_NS, small_chain, small_chain_plan
 
 from chainshaper import measure_latency, shape_application
-from chainshaper.planning import Plan, plan_shaping
+from chainshaper.planning import Plan
 from chainshaper.planning.plan import publisher_servers
 from chainshaper.workload.description import Application, CallbackDescription
 
@@ -19,13 +18,9 @@ SLOT_NS = 10 * MS
 
 
 def _plan() -> Plan:
-    return plan_shaping(
-        np.array([5, 19]) * MS,
-        PERIOD_NS,
-        spec="/t1../t3",
-        output="/t3",
-        publisher="/third",
-        nodes=("/first", "/second", "/third"),
+    return small_chain_plan(
+        5 * MS,
+        19 * MS,
         publication="asynchronous",
         publish_slot_ns=SLOT_NS,
     )

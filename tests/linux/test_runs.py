@@ -10,11 +10,10 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from applied_plans import needs_fifo
 from gated import needs_cgroups
-from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain_text
+from small_chain import EXECUTOR_CORE, small_chain_plan, small_chain_text
 
 from chainshaper import measure_latency, open_recording, save_plan
 from chainshaper.enforcement.servers import ServerCounters
@@ -38,7 +37,7 @@ from chainshaper.linux.runs import (
     process_of,
     remembered_journal,
 )
-from chainshaper.planning import Plan, plan_shaping
+from chainshaper.planning import Plan
 from chainshaper.values.errors import OperationError, PlatformError
 
 
@@ -304,13 +303,9 @@ def test_applied_and_released_in_the_midst_of_a_recording(tmp_path: Path) -> Non
 
 
 def _asynchronous_plan() -> Plan:
-    return plan_shaping(
-        np.array([4, 24]) * MS,
-        PERIOD_NS,
-        spec="/t1../t3",
-        output="/t3",
-        publisher="/third",
-        nodes=("/first", "/second", "/third"),
+    return small_chain_plan(
+        4 * MS,
+        24 * MS,
         publication="asynchronous",
         publish_slot_ns=10 * MS,
         core=EXECUTOR_CORE,

@@ -15,7 +15,7 @@ import polars as pl
 import pytest
 from calm_runs import calm_run
 from command_line import called, json_of
-from small_chain import PERIOD_NS, small_chain
+from small_chain import PERIOD_NS, small_chain, small_chain_plan
 
 from chainshaper import measure_latency, save_plan, shape_application, simulate
 from chainshaper.gate.decision import sleep_until
@@ -38,13 +38,9 @@ MS = 1_000_000
 
 def _too_early() -> Plan:
     """A publish slot in the midst of the small chain's latencies: every other output overruns."""
-    return plan_shaping(
-        np.array([4, 6]) * MS,
-        PERIOD_NS,
-        spec="/t1../t3",
-        output="/t3",
-        publisher="/third",
-        nodes=("/first", "/second", "/third"),
+    return small_chain_plan(
+        4 * MS,
+        6 * MS,
     )
 
 
