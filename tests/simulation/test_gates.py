@@ -17,7 +17,8 @@ from chainshaper.gate.decision import Gate, Modes, Overrun, missed, release_of
 from chainshaper.planning import PlanRequest
 from chainshaper.simulation import layout as at
 from chainshaper.simulation import simulate_latencies
-from chainshaper.simulation.gate_kernel import decide, missed_slot, switch_mode
+from chainshaper.simulation.callbacks import decide, missed_slot, switch_mode
+from chainshaper.simulation.layout import G, X
 from chainshaper.values import events
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application
@@ -57,15 +58,15 @@ def as_array(gate: Gate) -> at.Int64s:
     memory = np.full(1000, at.NONE, dtype=np.int64)
     slots, bands, changes = 200, 300, 400
     row = memory[PLACE:]
-    row[at.G_SLOTS], row[at.G_SLOTS_END] = slots, slots + 2 * len(gate.slots)
+    row[G.SLOTS], row[G.SLOTS_END] = slots, slots + 2 * len(gate.slots)
     memory[slots : slots + 2 * len(gate.slots)] = np.array(gate.slots).ravel()
-    row[at.G_CYCLE], row[at.G_PHASE] = gate.cycle_ns, gate.phase_ns
-    row[at.G_STAMPED] = gate.anchor == "stamp"
-    row[at.G_OVERRUN] = WORDS["overrun"].index(gate.overrun)
-    row[at.G_DUE], row[at.G_CHANGED], row[at.G_CHANGES] = gate.due_cycles, 0, changes
+    row[G.CYCLE], row[G.PHASE] = gate.cycle_ns, gate.phase_ns
+    row[G.STAMPED] = gate.anchor == "stamp"
+    row[G.OVERRUN] = WORDS["overrun"].index(gate.overrun)
+    row[G.DUE], row[G.CHANGED], row[G.CHANGES] = gate.due_cycles, 0, changes
     if gate.modes is not None:
-        row[at.G_LATE] = WORDS["overrun"].index(gate.modes.late)
-        row[at.G_DEFAULT], row[at.G_BANDS] = NAMES.index(gate.modes.default), bands
+        row[G.LATE] = WORDS["overrun"].index(gate.modes.late)
+        row[G.DEFAULT], row[G.BANDS] = NAMES.index(gate.modes.default), bands
         memory[bands : bands + 3] = [gate.modes.bands.get(name, at.NONE) for name in NAMES]
     return memory
 
@@ -90,7 +91,7 @@ def test_the_compiled_gate_decides_as_the_live_one(
     for time, name in sorted(announced, key=lambda change: change[0]):
         if gate.modes is None:
             continue
-        memory[at.X_NOW] = time
+        memory[X.NOW] = time
         switch_mode(memory, PLACE, NAMES.index(name))
         if name in gate.modes.bands and name != current:
             changes.append((time, name))
@@ -98,14 +99,14 @@ def test_the_compiled_gate_decides_as_the_live_one(
     expected = release_of(gate, arrival, arrival - age, changes)
     decide(memory, PLACE, arrival, arrival - age)
     row = memory[PLACE:]
-    at_ns = None if row[at.G_AT] == at.NONE else int(row[at.G_AT])
-    slot = None if row[at.G_SLOT] == at.NONE else int(row[at.G_SLOT])
-    found = (at_ns, int(row[at.G_ORIGIN]), slot, int(row[at.G_CYCLES]))
+    at_ns = None if row[G.AT] == at.NONE else int(row[G.AT])
+    slot = None if row[G.SLOT] == at.NONE else int(row[G.SLOT])
+    found = (at_ns, int(row[G.ORIGIN]), slot, int(row[G.CYCLES]))
     assert found == (expected.at_ns, expected.origin_ns, expected.slot, expected.cycles_waited)
-    assert word(1 - row[at.G_BY_STAMP], WORDS["anchor"]) == expected.anchor
-    assert word(row[at.G_TREATED], WORDS["overrun"]) == expected.overrun
-    assert word(row[at.G_MODE], NAMES) == expected.mode
-    memory[at.X_NOW] = arrival + late_by
+    assert word(1 - row[G.BY_STAMP], WORDS["anchor"]) == expected.anchor
+    assert word(row[G.TREATED], WORDS["overrun"]) == expected.overrun
+    assert word(row[G.MODE], NAMES) == expected.mode
+    memory[X.NOW] = arrival + late_by
     policy = gate.overrun
     if gate.modes is not None and gate.modes.late != "next-slot":
         policy = gate.modes.late

@@ -17,11 +17,10 @@ from chainshaper.workload.event_log import (
     WORDS,
     EventLog,
     number_of,
-    send_events,
 )
+from chainshaper.workload.launcher import send_events
 from chainshaper.workload.live import ProcessLog, event_tables
-from chainshaper.workload.stall_meter import NO_PACE
-from chainshaper.workload.stall_watch import meter_tables
+from chainshaper.workload.stall_meter import NO_PACE, meter_tables
 
 
 def _process(log: EventLog, pid: int = 100, core: int | None = 1) -> ProcessLog:
@@ -33,7 +32,7 @@ def _types(name: str, fields: tuple[str, ...]) -> dict[str, pl.DataType]:
     return {**events.COMMON_COLUMNS, **{field: known[field] for field in known if field in fields}}
 
 
-@pytest.mark.parametrize(("name", "fields"), LAYOUT)
+@pytest.mark.parametrize(("name", "fields"), LAYOUT.items())
 def test_every_event_is_read_back_as_it_was_recorded(name: str, fields: tuple[str, ...]) -> None:
     log = EventLog()
     values = dict(zip(fields, range(1, len(fields) + 1), strict=True))
@@ -54,7 +53,7 @@ def test_every_event_is_read_back_as_it_was_recorded(name: str, fields: tuple[st
 
 
 def test_the_layout_says_what_the_event_tables_say() -> None:
-    for name, fields in LAYOUT:
+    for name, fields in LAYOUT.items():
         known = {**events.FIELDS[name], **events.OPTIONAL_FIELDS.get(name, {})}
         assert set(events.FIELDS[name]) <= set(fields) <= {*known, *events.COMMON_COLUMNS}, name
         assert 2 + len(fields) <= WIDTH, name

@@ -99,7 +99,7 @@ class Bench:
 
     def recorded(self, event: str) -> list[list[int]]:
         """Rows of one event: time, then its fields."""
-        number = [name for name, _ in LAYOUT].index(event)
+        number = list(LAYOUT).index(event)
         rows = self.log.rows.tolist()
         all_rows = [rows[i : i + WIDTH] for i in range(0, len(rows), WIDTH)]
         return [row[1:] for row in all_rows if row[0] == number]

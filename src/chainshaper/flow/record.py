@@ -57,7 +57,7 @@ from chainshaper.values.recording import (
     refuse_existing,
     write_recording,
 )
-from chainshaper.workload.stall_watch import StallWatch, far_from, stalls_watched
+from chainshaper.workload.stall_meter import StallWatch, far_from, stalls_watched
 
 __all__ = ["Recorded", "Scheduling", "record_command"]
 

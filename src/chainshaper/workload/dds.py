@@ -16,15 +16,9 @@ from typing import Any
 from chainshaper.values.errors import OperationError, PlatformError
 
 try:
+    from cyclonedds import core
     from cyclonedds._clayer import ddspy_take, ddspy_write_ts
-    from cyclonedds.core import (
-        GuardCondition,
-        InstanceState,
-        ReadCondition,
-        SampleState,
-        ViewState,
-        WaitSet,
-    )
+    from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
     from cyclonedds.domain import DomainParticipant
     from cyclonedds.idl import IdlStruct
     from cyclonedds.idl.types import int32, sequence, uint8, uint32, uint64
@@ -38,22 +32,7 @@ except ImportError as error:  # no wheel for this Python or processor
         "it exists for Python 3.10 to 3.13 on x86-64: use one of these"
     ) from error
 
-__all__ = [
-    "GuardCondition",
-    "Message",
-    "Publisher",
-    "Subscription",
-    "WaitSet",
-    "closed_domain_configuration",
-    "data_message",
-    "data_of",
-    "free_domain",
-    "join_domain",
-    "message_template",
-    "number_in",
-    "stamp_message",
-    "text_message",
-]
+GuardCondition, WaitSet = core.GuardCondition, core.WaitSet
 
 _DATA_HEAD = struct.Struct("<4siII4xQI")  # encapsulation, stamp, an empty frame id, number, length
 _LITTLE_ENDIAN = b"\0\1\0\0"
@@ -209,11 +188,8 @@ class Publisher:
         *,
         carries_text: bool = False,
     ) -> None:
-        self._writer = DataWriter(
-            participant,
-            _topic(participant, topic, carries_text),
-            qos=_qos(reliability, depth, lifespan_ns),
-        )
+        own = _topic(participant, topic, carries_text)
+        self._writer = DataWriter(participant, own, qos=_qos(reliability, depth, lifespan_ns))
         self._handle = self._writer._ref
 
     def write(self, payload: bytes, source_timestamp: int) -> None:
@@ -238,11 +214,8 @@ class Subscription:
         *,
         carries_text: bool = False,
     ) -> None:
-        self._reader = DataReader(
-            participant,
-            _topic(participant, topic, carries_text),
-            qos=_qos(reliability, depth),
-        )
+        own = _topic(participant, topic, carries_text)
+        self._reader = DataReader(participant, own, qos=_qos(reliability, depth))
         self.condition = ReadCondition(self._reader, _ANY)
         self._handle = self._reader._ref
 

@@ -40,7 +40,7 @@ from chainshaper.workload.description import (
 )
 from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS
 from chainshaper.workload.launcher import Child, end_all, first_casualty, start_child
-from chainshaper.workload.stall_watch import (
+from chainshaper.workload.stall_meter import (
     far_from,
     meter_tables,
     promote_meters,
@@ -58,6 +58,7 @@ __all__ = [
     "origin_timer",
     "run_application",
     "timing_of",
+    "typed_table",
 ]
 
 Progress = Callable[[float, str], None]
@@ -90,7 +91,6 @@ ANSWER_S = 60.0
 """A process that is silent for longer, discovery included, hangs."""
 SINGLE_THREADED = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 """What a callback computes, it computes on its executor's thread."""
-NODE_MODULE = "chainshaper.workload.node_process"
 
 
 def run_application(
@@ -122,7 +122,6 @@ def run_application(
     if cycles < 1:
         raise InputError(f"{cycles} cycles cannot be recorded: ask for at least 1")
     check_cores(application.cores())
-    timer = origin_timer(application)
     permitted = may_use_fifo()
     if realtime and not permitted:
         raise PlatformError(
@@ -133,11 +132,10 @@ def run_application(
     realtime = permitted if realtime is None else realtime
     nodes: dict[str, Child] = {}
     meters: dict[int, Child] = {}
-    governed: tuple[Governed, ...] = ()
     finished = False
     try:
         progress(0.0, "starting nodes")
-        _start_nodes(application, timer, nodes, realtime)
+        _start_nodes(application, nodes, realtime)
         if realtime:  # what can be pre-empted itself cannot tell a stall from ordinary scheduling
             start_meters(application.cores(), meters)
         memory_locked = _await_ready([*nodes.values(), *meters.values()])
@@ -145,9 +143,9 @@ def run_application(
         promote_meters(meters, realtime)
         lead = LEAD_NS if enforcement is None else LEAD_NS + ENFORCING_NS
         timing = timing_of(application, cycles, time.monotonic_ns() + lead)
-        offset_before = clock_offset()
-        pids = {node_name(name): child.pid for name, child in nodes.items()}
-        started = StartedNodes(pids, timing.anchor_ns)
+        offset = clock_offset()
+        processes = {child.pid: node_name(name) for name, child in nodes.items()}
+        started = StartedNodes({node: pid for pid, node in processes.items()}, timing.anchor_ns)
         with nullcontext() if enforcement is None else enforcement(started):
             for child in [*nodes.values(), *meters.values()]:
                 child.tell(**asdict(timing))
@@ -164,16 +162,15 @@ def run_application(
     in_force = None if plan is None else InForceInfo(since_ns=timing.record_from_ns)
     if plan is None and together is not None:
         in_force = InForceInfo(since_ns=together.since_ns, until_ns=together.until_ns)
-    notes = _notes(None if realtime else reason, memory_locked, clock_offset() - offset_before)
     info = RecordingInfo(
         source="live",
         rmw="cyclonedds",
-        clock_offset_ns=offset_before,
+        clock_offset_ns=offset,
         command=tuple(command),
-        processes={child.pid: node_name(name) for name, child in nodes.items()},
+        processes=processes,
         threads=threads,
         realtime=realtime,
-        notes=notes,
+        notes=_notes(None if realtime else reason, memory_locked, clock_offset() - offset),
         stall_meter=meter_info,
         chain=application.chain,
         application=application_as_written(application),
@@ -227,59 +224,48 @@ def timing_of(application: Application, cycles: int, start: int) -> Timing:
     end, apart = first + cycles * period, min(1_000_000, period // 10)
     gates = [cb.gate for _, cb in application.callbacks() if cb.gate is not None]
     releases = [opens for gate in gates for opens, _ in gate.slots] or [0]
-    held = max((gate.due_cycles for gate in gates), default=0)
+    delayed = max((gate.due_cycles for gate in gates), default=0)
     return Timing(
         start_ns=start,
         anchor_ns=anchor,
         record_from_ns=first - apart,
         last_timer_ns=end - apart,
-        stop_ns=end + max(2 * period, 200_000_000) + held * period,
+        stop_ns=end + max(2 * period, 200_000_000) + delayed * period,
         meter_from_ns=anchor + far_from(releases),
     )
 
 
-def _start_nodes(
-    application: Application, timer: CallbackDescription, nodes: dict[str, Child], realtime: bool
-) -> None:
-    """Start a process per node, into ``nodes``: what fails later can end those started."""
+def _start_nodes(application: Application, nodes: dict[str, Child], realtime: bool) -> None:
+    """Start a process per node, into ``nodes``: what fails later can end those started.
+
+    Each gets its description, durations in ns, and its name in the arguments that ROS 2 has.
+    """
     from chainshaper.workload.dds import closed_domain_configuration, free_domain
 
     domain = free_domain()
     environment = {"CYCLONEDDS_URI": closed_domain_configuration(), **SINGLE_THREADED}
-    for name in application.nodes:
-        nodes[name] = start_child(
-            f"node {name}", NODE_MODULE, environment, _ros_arguments(name), LIBRARIES
+    described = [callback for _, callback in application.callbacks()]
+    writers = Counter(topic for callback in described for topic in callback.publishes)
+    readers = Counter(topic for callback in described for topic in callback.subscriptions)
+    for name, node in application.nodes.items():
+        namespace, _, base = node_name(name).rpartition("/")
+        arguments = ("--ros-args", "-r", f"__node:={base}", "-r", f"__ns:={namespace or '/'}")
+        module = "chainshaper.workload.node_process"
+        nodes[name] = start_child(f"node {name}", module, environment, arguments, LIBRARIES)
+        executor, dds = application.scheduling_of(name), application.dds_scheduling_of(name)
+        nodes[name].tell(
+            node=node_name(name),
+            domain=domain,
+            seed=application.seed,
+            parent=os.getpid(),
+            discovery_ns=DISCOVERY_NS,
+            origin_phase=origin_timer(application).phase_ns,
+            delivery_core=dds.core if realtime and dds.core != executor.core else None,
+            callbacks=[callback.model_dump() for callback in node.callbacks],
+            topics={topic: application.topic(topic).model_dump() for topic in writers},
+            announced=sorted(application.announced()),
+            expected={topic: (writers[topic], readers[topic]) for topic in writers},
         )
-        nodes[name].tell(**_spec(application, name, timer, domain, realtime))
-
-
-def _ros_arguments(name: str) -> tuple[str, ...]:
-    """A node's name as ROS 2 programs get it: its command line shows it."""
-    namespace, _, base = node_name(name).rpartition("/")
-    return ("--ros-args", "-r", f"__node:={base}", "-r", f"__ns:={namespace or '/'}")
-
-
-def _spec(
-    application: Application, name: str, timer: CallbackDescription, domain: int, realtime: bool
-) -> dict[str, Any]:
-    """A node's description as its process gets it: durations are ns here."""
-    callbacks = [callback for _, callback in application.callbacks()]
-    writers = Counter(topic for callback in callbacks for topic in callback.publishes)
-    readers = Counter(topic for callback in callbacks for topic in callback.subscriptions)
-    executor, dds = application.scheduling_of(name), application.dds_scheduling_of(name)
-    return {
-        "node": node_name(name),
-        "domain": domain,
-        "seed": application.seed,
-        "parent": os.getpid(),
-        "discovery_ns": DISCOVERY_NS,
-        "origin_phase": timer.phase_ns,
-        "delivery_core": dds.core if realtime and dds.core != executor.core else None,
-        "callbacks": [cb.model_dump() for cb in application.nodes[name].callbacks],
-        "topics": {topic: application.topic(topic).model_dump() for topic in writers},
-        "announced": sorted(application.announced()),
-        "expected": {topic: (writers[topic], readers[topic]) for topic in writers},
-    }
 
 
 def _await_ready(children: Sequence[Child]) -> bool:
@@ -299,13 +285,12 @@ def _allocate_threads(application: Application, nodes: dict[str, Child], realtim
     for name, child in nodes.items():
         executor, dds = application.scheduling_of(name), application.dds_scheduling_of(name)
         for thread in list_threads(child.pid):
+            core, priority = dds.core, dds.priority
             if thread.role == "executor":
                 core, priority = executor.core, executor.priority
             elif thread.role == "publisher":
                 # Below the executor: it shares the writer's lock with it, and may spin on it.
                 core, priority = executor.core, max(1, executor.priority - 1)
-            else:
-                core, priority = dds.core, dds.priority
             apply_scheduling(thread, Scheduling(priority if realtime else None, cores=(core,)))
 
 
@@ -359,9 +344,6 @@ def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[Thread
     )
 
 
-_MAY_BE_ABSENT = {"gate_release": ("release", "slot")}
-
-
 @dataclass(frozen=True)
 class ProcessLog:
     """What one process recorded: rows of :mod:`~chainshaper.workload.event_log`, and objects."""
@@ -382,40 +364,43 @@ def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataF
     for log in logs:
         rows = np.frombuffer(log.rows, dtype=np.int64).reshape(-1, WIDTH)
         rows = rows[rows[:, 1] >= from_ns]
-        for number, (name, fields) in enumerate(LAYOUT):
+        common = {"pid": log.pid, "tid": log.pid, "cpu": log.core}  # executors: the main thread
+        found: list[tuple[str, pl.DataFrame]] = []
+        for number, (name, fields) in enumerate(LAYOUT.items()):
             mine = rows[rows[:, 0] == number]
             if len(mine):
-                columns = {"time": mine[:, 1]}
-                columns |= {field: mine[:, 2 + i] for i, field in enumerate(fields)}
-                parts.setdefault(name, []).append(_typed(name, pl.DataFrame(columns), log))
+                own = mine[:, 1 : 2 + len(fields)]
+                found.append((name, pl.DataFrame(own, schema=["time", *fields])))
         for created in log.objects:
-            name = created["event"]
-            fields_of = {key: [value] for key, value in created.items() if key != "event"}
-            parts.setdefault(name, []).append(_typed(name, pl.DataFrame(fields_of), log))
+            found.append((created["event"], pl.DataFrame([created])))
+        for name, frame in found:
+            missing = {key: pl.lit(value) for key, value in common.items() if key not in frame}
+            table = typed_table(name, frame.with_columns(**missing), log.modes)
+            parts.setdefault(name, []).append(table)
     return {
         name: pl.concat(frames).sort("time", maintain_order=True)
         for name, frames in sorted(parts.items())
     }
 
 
-def _typed(name: str, frame: pl.DataFrame, log: ProcessLog) -> pl.DataFrame:
-    frame = frame.with_columns(
-        pl.when(pl.col(field) != ABSENT).then(pl.col(field)).alias(field)
-        for field in _MAY_BE_ABSENT.get(name, ())
-    )
-    frame = frame.with_columns(
-        pl.col(field).replace_strict(dict(enumerate(words)), default=None, return_dtype=pl.String())
-        for field, words in {**WORDS, "mode": log.modes}.items()
-        if field in frame.columns
-    )
-    tid = pl.col("tid") if "tid" in frame.columns else pl.lit(log.pid)  # executors: the main thread
-    types = {**events.FIELDS[name], **events.OPTIONAL_FIELDS.get(name, {})}
+def typed_table(name: str, frame: pl.DataFrame, modes: Sequence[str] = ()) -> pl.DataFrame:
+    """An event's table from columns of numbers, which stand for words and nulls as in the log.
+
+    Columns that the event does not have are left out.
+    """
+    columns: dict[str, pl.Expr] = {}
+    for field, words in {**WORDS, "mode": modes}.items():
+        numbered = dict(enumerate(words))
+        columns[field] = pl.col(field).replace_strict(
+            numbered, default=None, return_dtype=pl.String()
+        )
+    for field in ("release", "slot"):
+        columns[field] = pl.when(pl.col(field) != ABSENT).then(pl.col(field)).alias(field)
+    types = {**events.COMMON_COLUMNS, **events.FIELDS[name], **events.OPTIONAL_FIELDS.get(name, {})}
     return frame.select(
-        pl.col("time").cast(pl.Int64),
-        pl.lit(log.pid, dtype=pl.Int32).alias("pid"),
-        tid.cast(pl.Int32).alias("tid"),
-        pl.lit(log.core, dtype=pl.Int32).alias("cpu"),
-        *(pl.col(field).cast(type_) for field, type_ in types.items() if field in frame.columns),
+        columns.get(field, pl.col(field)).cast(type_)
+        for field, type_ in types.items()
+        if field in frame.columns
     )
 
 
