@@ -7,30 +7,14 @@ leads back to a name.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from chainshaper.analysis.chains import find_chain
 from chainshaper.planning.plan import Plan, Server, Thread, shaping_nodes
 from chainshaper.simulation import layout as at
-from chainshaper.simulation.layout import (
-    FOREVER,
-    NONE,
-    A,
-    C,
-    D,
-    E,
-    G,
-    H,
-    I,
-    Int64s,
-    M,
-    P,
-    R,
-    S,
-    T,
-    X,
-)
+from chainshaper.simulation.layout import NONE, A, C, D, E, G, H, I, Int64s, M, P, R, S, T, X
 from chainshaper.values.application import ApplicationGraph, Callback, Chain, Node
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import ThreadInfo
@@ -39,15 +23,11 @@ from chainshaper.workload.event_log import WORDS
 from chainshaper.workload.execution import BLOCK, blocks
 from chainshaper.workload.live import WARM_UP_CYCLES, Timing, node_name
 
-__all__ = ["Machine", "System", "build_machine", "build_system"]
-
 FIRST_PID = 1000
-ORDERS = {
-    "single-threaded": ("timer", "subscription", "service", "client"),
-    "static": ("subscription", "timer", "client", "service"),
-    "events": ("timer", "subscription", "service", "client"),
-}
-"""The order in which executors look at what is ready (rclcpp's Jazzy)."""
+ROLES = ("executor", "publisher", "dds")
+KINDS = ("timer", "subscription", "service", "client")
+STATIC_ORDER = ("subscription", "timer", "client", "service")
+"""The orders in which executors look at what is ready, the static one and others (Jazzy)."""
 
 AHEAD = 16 * BLOCK
 """So many values of every stream are drawn beforehand."""
@@ -60,11 +40,7 @@ POOL = 4096
 """Messages under way, besides those in histories."""
 
 BEST_EFFORT = 1000
-KINDS = ("timer", "subscription", "service", "client")
-COSTS = {"wake_up": T.WAKE, "take": T.TAKE, "publish": T.PUBLISH} | {
-    "receive": T.RECEIVE,
-    "delivery": T.DELIVERY,
-}
+COSTS = ("wake_up", "take", "publish", "receive", "delivery")  # in the order of their columns
 
 
 @dataclass(frozen=True)
@@ -85,8 +61,7 @@ class Entity:
     listens: bool = False
 
 
-@dataclass(frozen=True)
-class Publisher:
+class Publisher(NamedTuple):
     """One callback's publisher of a topic."""
 
     process: int
@@ -94,12 +69,11 @@ class Publisher:
     asynchronous: bool
 
 
-@dataclass(frozen=True)
-class Process:
-    """A node's process."""
+class Process(NamedTuple):
+    """A node's process; ``key`` is the node's name in the description."""
 
     node: str
-    key: str  # the node's name in the description
+    key: str
     pid: int
 
 
@@ -143,7 +117,7 @@ def build_system(
     )
     entities: list[Entity] = []
     publishers: list[Publisher] = []
-    order = ORDERS[application.simulation.executor]
+    order = STATIC_ORDER if application.simulation.executor == "static" else KINDS
     for number, process in enumerate(processes):
         own = list(_entities(application, number, process.key, publishers))
         entities += sorted(own, key=lambda entity: order.index(entity.kind))
@@ -201,20 +175,23 @@ def _threads(
     application: Application, processes: Sequence[Process], publishers: Sequence[Publisher]
 ) -> Iterator[ThreadInfo]:
     for number, process in enumerate(processes):
-        executor = application.scheduling_of(process.key)
-        wanted = [("executor", 0, executor.core, executor.priority)]
+        own, dds = (
+            application.scheduling_of(process.key),
+            application.dds_scheduling_of(process.key),
+        )
+        named = process.node.strip("/").replace("/", ".")[:15]
+        wanted = [("executor", named, own.core, own.priority)]
         if any(p.asynchronous for p in publishers if p.process == number):
-            priority = max(1, executor.priority - 1)  # as the live workload has it
-            wanted.append(("publisher", 1, executor.core, priority))
+            below = max(1, own.priority - 1)  # as the live workload has it
+            wanted.append(("publisher", "dds.publisher", own.core, below))
         if application.simulation.receive is not None:
             dds = application.dds_scheduling_of(process.key)
-            wanted.append(("dds", 2, dds.core, dds.priority))
-        named = process.node.strip("/").replace("/", ".")[:15]
-        for role, place, core, priority in wanted:
+            wanted.append(("dds", "dds.dds", dds.core, dds.priority))
+        for role, comm, core, priority in wanted:
             yield ThreadInfo(
-                tid=process.pid + place,
+                tid=process.pid + ROLES.index(role),
                 pid=process.pid,
-                comm=named if role == "executor" else f"dds.{role}",
+                comm=comm,
                 node=process.node,
                 role=role,
                 policy="SCHED_FIFO",
@@ -457,7 +434,7 @@ def _fill_cores(
         mine = [thread for thread in threads if rows[thread + T.CORE] == place]
         rows[place + C.FIRST], rows[place + C.END] = rows.put(mine)
         rows[place + C.RUNNING], rows[place + C.LAST] = NONE, NONE
-        rows[place + C.UNTIL], rows[place + C.BOUNDARY] = FOREVER, FOREVER
+        rows[place + C.UNTIL], rows[place + C.BOUNDARY] = at.FOREVER, at.FOREVER
         rows[place + C.DIRTY] = 1
         if plan is None or not ranked:
             continue
@@ -493,16 +470,17 @@ def _fill_threads(
     rows: Rows, system: System, threads: range, entities: range, streams: Streams
 ) -> None:
     described = system.application.simulation
-    places = {(info.pid, info.role): place for place, info in zip(threads, system.threads)}  # noqa: B905
+    named = zip(threads, system.threads, strict=True)
+    places = {(info.pid, info.role): place for place, info in named}
     for number, (thread, info) in enumerate(zip(threads, system.threads, strict=True)):
         for column in (T.RUNNABLE, T.LEFT, T.SEQUENCE, T.PREEMPTED, T.USED):
             rows[thread + column] = 0
         rows[thread + T.ROW] = number
-        offset = FIRST_COST + len(COSTS) * ("executor", "publisher", "dds").index(info.role)
-        for place, (name, cost) in enumerate(COSTS.items()):
-            times = getattr(described, name)
-            if times is not None:
-                rows[thread + cost] = streams.add(times, info.node, offset + place)
+        offset = FIRST_COST + len(COSTS) * ROLES.index(info.role)
+        for place, name in enumerate(COSTS):
+            if (times := getattr(described, name)) is not None:
+                stream = streams.add(times, info.node, offset + place)
+                rows[thread + T.WAKE + place] = stream
         if info.role != "executor":
             sends = info.role == "publisher"
             rows[thread + T.KIND] = at.PUBLISHER if sends else at.DDS
@@ -519,18 +497,11 @@ def _fill_threads(
 
 
 def _fill_entities(
-    rows: Rows,
-    system: System,
-    areas: tuple[range, range, range],
-    timing: Timing,
-    streams: Streams,
+    rows: Rows, system: System, areas: tuple[range, ...], timing: Timing, streams: Streams
 ) -> None:
     threads, entities, publishers = areas
-    executors = {
-        info.pid: place
-        for place, info in zip(threads, system.threads, strict=True)
-        if info.role == "executor"
-    }
+    named = zip(threads, system.threads, strict=True)
+    executors = {info.pid: place for place, info in named if info.role == "executor"}
     # What inputs of a synchroniser share, and a gate with its listener: stream, gate or inputs.
     executions: dict[tuple[int, int], int] = {}
     bodies: dict[tuple[int, int], int] = {}

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import polars as pl
 
 from chainshaper.planning.overruns import open_until_done
@@ -194,12 +195,11 @@ def _event_tables(
     yield event_tables(objects, from_ns=0)
     for reason in _runs(machine, progress):
         if reason == at.LOG_FULL:
-            frames = _logged(system, machine, handles)
-            yield {name: frame for name, frame in frames.items() if frame.height}
+            yield _logged(system, machine, handles)
             machine.forget_entries()
 
 
-Handles = dict[str, Int64s]
+Handles = dict[str, npt.NDArray[np.uint64]]
 """By number: ``callback``, ``handle`` and ``rmw_subscription_handle`` of entities,
 ``publisher_handle`` and ``rmw_publisher_handle`` of publishers."""
 
@@ -231,8 +231,8 @@ def _create_objects(system: System) -> tuple[list[ProcessLog], Handles]:
     ]
     names = ("callback", "handle", "rmw_subscription_handle")
     names_of_publishers = ("publisher_handle", "rmw_publisher_handle")
-    by_entity = np.array(entities, dtype=np.int64).reshape(-1, 3).T
-    by_publisher = np.array(publishers, dtype=np.int64).reshape(-1, 2).T
+    by_entity = np.array(entities, dtype=np.uint64).reshape(-1, 3).T.copy()
+    by_publisher = np.array(publishers, dtype=np.uint64).reshape(-1, 2).T.copy()
     handles = dict(zip(names, by_entity, strict=True))
     return created, handles | dict(zip(names_of_publishers, by_publisher, strict=True))
 
@@ -245,7 +245,6 @@ _LOGGED: dict[str, tuple[int, tuple[str, ...]]] = {
     "rmw_publish": (at.L_PUBLISH, ("rmw_publisher_handle", "message")),
     "rmw_take": (at.L_TAKE, LAYOUT["rmw_take"]),
     "rcl_take": (at.L_TAKE, ("", "message", "", "taken")),
-    "rclcpp_take": (at.L_TAKE, ("", "message", "", "taken")),
     "rclcpp_executor_get_next_ready": (at.L_EXECUTE, ("",)),
     "rclcpp_executor_execute": (at.L_EXECUTE, ("handle",)),
     "rclcpp_executor_wait_for_work": (at.L_WAIT, ("timeout",)),
@@ -256,30 +255,46 @@ _LOGGED: dict[str, tuple[int, tuple[str, ...]]] = {
 
 
 def _logged(system: System, machine: Machine, handles: Handles) -> dict[str, pl.DataFrame]:
-    """What is in the log, as event tables."""
-    pids = np.array([info.pid for info in system.threads])
-    tids = np.array([info.tid for info in system.threads])
-    cpus = np.array([info.cores[0] for info in system.threads])
+    """What is in the log, as event tables; only those in which there is something."""
+    of_threads = {
+        "pid": np.array([info.pid for info in system.threads], dtype=np.int32),
+        "tid": np.array([info.tid for info in system.threads], dtype=np.int32),
+        "cpu": np.array([info.cores[0] for info in system.threads], dtype=np.int32),
+    }
+    common: dict[int, list[pl.Series]] = {}
     tables = {"sched_switch": _switches(system, machine)}
     for name, (kind, fields) in _LOGGED.items():
         time, thread, *entries = machine.entries(kind)
-        columns = {"time": time, "pid": pids[thread], "tid": tids[thread], "cpu": cpus[thread]}
+        if not time.size:
+            continue
+        if kind not in common:
+            common[kind] = [pl.Series("time", time)]
+            common[kind] += [pl.Series(key, each[thread]) for key, each in of_threads.items()]
+        columns = {column.name: column for column in common[kind]}
         for field, numbers in zip(fields, entries, strict=True):
-            columns[field] = handles[field][numbers] if field in handles else numbers
+            if field in handles:
+                columns[field] = pl.Series(field, handles[field][numbers])
+            elif field:
+                is_address = field == "message"
+                columns[field] = pl.Series(
+                    field, numbers.view(np.uint64) if is_address else numbers
+                )
         if name == "callback_start":
-            columns["is_intra_process"] = np.zeros_like(time)
+            columns["is_intra_process"] = pl.zeros(time.size, dtype=pl.Int32(), eager=True)
         elif name == "rmw_publish":
-            columns["timestamp"] = time
+            columns["timestamp"] = columns["time"]
         elif name == "asynchronous_send":  # logged when it is over, an event when it began
-            columns["time"] = time - columns["duration"]
+            columns["time"] -= columns["duration"]
         frame = pl.DataFrame(columns)
-        if name in {"rcl_take", "rclcpp_take"}:
+        if name == "rcl_take":
             frame = frame.filter(pl.col("taken") == 1)
         table = typed_table(name, frame, system.modes)
         if kind in {at.L_SEND, at.L_RELEASE}:  # which others were logged before
             table = table.sort("time", maintain_order=True)
         tables[name] = table
-    return tables
+    if "rcl_take" in tables:
+        tables["rclcpp_take"] = tables["rcl_take"]
+    return {name: table for name, table in tables.items() if table.height}
 
 
 def _switches(system: System, machine: Machine) -> pl.DataFrame:

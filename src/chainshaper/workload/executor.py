@@ -52,21 +52,6 @@ from chainshaper.workload.dds import Message, Subscription
 from chainshaper.workload.event_log import EventLog, number_of
 from chainshaper.workload.execution import ExecutionTimes, spend
 
-__all__ = [
-    "AsynchronousWriter",
-    "Executor",
-    "Note",
-    "PublisherThread",
-    "SubscriptionEntity",
-    "Synchroniser",
-    "Timer",
-    "Work",
-    "computing",
-    "load_function",
-    "noting_sends",
-    "spending",
-]
-
 
 @dataclass
 class Timer:
@@ -272,10 +257,7 @@ def spending(times: ExecutionTimes, templates: Sequence[bytearray], announced: l
 
     def work(messages: Sequence[dds.Message], wall_ns: int, cpu_ns: int) -> Sequence[bytes]:
         stamp = (origin_of(messages[0].payload) or 0) if messages else wall_ns
-        made = [
-            next(announcements, None) or dds.stamp_message(template, stamp)
-            for template in templates
-        ]
+        made = [next(announcements, None) or dds.stamp_message(one, stamp) for one in templates]
         spend(times.next(), cpu_ns)
         return made
 
@@ -323,7 +305,8 @@ def load_function(name: str) -> Callable[..., object]:
             + "".join(f"; not {place}: {reason}" for place, reason in places.items() if reason)
         )
     if found is None:
-        sys.exit(f"{name} cannot be loaded: {_file(module)} has no {attribute}")
+        file = getattr(sys.modules[module], "__file__", None) or module
+        sys.exit(f"{name} cannot be loaded: {file} has no {attribute}")
     if not callable(found):
         sys.exit(f"{name} cannot be called: name a function")
     return found  # type: ignore[no-any-return]
@@ -331,7 +314,3 @@ def load_function(name: str) -> Callable[..., object]:
 
 def _in_words(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
-
-
-def _file(module: str) -> str:
-    return getattr(sys.modules[module], "__file__", None) or module

@@ -26,17 +26,6 @@ from typing import IO, Any
 from chainshaper.linux.own_processes import end_in_words, module_command
 from chainshaper.values.errors import OperationError
 
-__all__ = [
-    "Child",
-    "end_all",
-    "first_casualty",
-    "receive",
-    "send",
-    "send_events",
-    "start_child",
-    "wait_for_leave",
-]
-
 
 @dataclass(frozen=True)
 class Child:

@@ -8,7 +8,7 @@ that end with the run, so nothing on the machine is different afterwards.
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -47,19 +47,6 @@ from chainshaper.workload.stall_meter import (
     read_meters,
     start_meters,
 )
-
-__all__ = [
-    "Enforcement",
-    "ProcessLog",
-    "Progress",
-    "StartedNodes",
-    "Timing",
-    "event_tables",
-    "origin_timer",
-    "run_application",
-    "timing_of",
-    "typed_table",
-]
 
 Progress = Callable[[float, str], None]
 """Called with the share done (0 to 1) and what is being done."""
@@ -128,7 +115,6 @@ def run_application(
             "real-time scheduling was asked for, but this process may not use SCHED_FIFO: run as "
             "root, give your user an rtprio limit of 98 in /etc/security/limits.conf, or do without"
         )
-    reason = "the process may not use SCHED_FIFO" if not permitted else "SCHED_FIFO was declined"
     realtime = permitted if realtime is None else realtime
     nodes: dict[str, Child] = {}
     meters: dict[int, Child] = {}
@@ -170,7 +156,7 @@ def run_application(
         processes=processes,
         threads=threads,
         realtime=realtime,
-        notes=_notes(None if realtime else reason, memory_locked, clock_offset() - offset),
+        notes=tuple(_notes(realtime, permitted, memory_locked, clock_offset() - offset)),
         stall_meter=meter_info,
         chain=application.chain,
         application=application_as_written(application),
@@ -414,21 +400,18 @@ def _read_log(name: str, child: Child, application: Application) -> ProcessLog:
 
 
 def _notes(
-    no_realtime_because: str | None, memory_locked: bool, clock_moved_ns: int
-) -> tuple[str, ...]:
-    notes = [f"the first {WARM_UP_CYCLES} cycles warmed up and were not recorded"]
-    if no_realtime_because is not None:
-        notes.append(
-            f"taken without real-time scheduling ({no_realtime_because}), and without watching for "
+    realtime: bool, permitted: bool, memory_locked: bool, clock_moved_ns: int
+) -> Iterator[str]:
+    yield f"the first {WARM_UP_CYCLES} cycles warmed up and were not recorded"
+    if not realtime:
+        reason = "SCHED_FIFO was declined" if permitted else "the process may not use SCHED_FIFO"
+        yield (
+            f"taken without real-time scheduling ({reason}), and without watching for "
             "stalls of the machine"
         )
     if not memory_locked:
-        notes.append("memory was not locked: page faults may have cost time")
+        yield "memory was not locked: page faults may have cost time"
     if abs(clock_moved_ns) > 1_000_000:
-        notes.append(
-            f"the wall clock moved by {format_duration(clock_moved_ns)} against CLOCK_MONOTONIC"
-        )
-    others = foreign_realtime_processes()
-    if others:
-        notes.append(f"other real-time processes were running: {', '.join(others)}")
-    return tuple(notes)
+        yield f"the wall clock moved by {format_duration(clock_moved_ns)} against CLOCK_MONOTONIC"
+    if others := foreign_realtime_processes():
+        yield f"other real-time processes were running: {', '.join(others)}"

@@ -39,8 +39,6 @@ from chainshaper.workload.executor import (
 )
 from chainshaper.workload.launcher import receive, send, send_events, wait_for_leave
 
-__all__ = ["NodeProcess", "main"]
-
 GATE_FIELDS = ("cycle_ns", "anchor", "overrun", "due_cycles", "messages", "depth")
 
 Body: TypeAlias = Callable[[dds.Message], None]
@@ -144,26 +142,15 @@ class NodeProcess:
 
     def _subscription(self, topic: str, depth: int = 0) -> dds.Subscription:
         qos, text = self.spec["topics"][topic], topic in self.spec["announced"]
-        subscription = dds.Subscription(
-            self.participant,
-            topic,
-            qos["reliability"],
-            max(depth, qos["depth"]),
-            carries_text=text,
-        )
+        own = (topic, qos["reliability"], max(depth, qos["depth"]))
+        subscription = dds.Subscription(self.participant, *own, carries_text=text)
         self.subscriptions.append((topic, subscription))
         return subscription
 
     def _publisher(self, topic: str) -> TracedPublisher:
         qos, text = self.spec["topics"][topic], topic in self.spec["announced"]
-        publisher = dds.Publisher(
-            self.participant,
-            topic,
-            qos["reliability"],
-            qos["depth"],
-            qos["lifespan_ns"],
-            carries_text=text,
-        )
+        own = (topic, qos["reliability"], qos["depth"], qos["lifespan_ns"])
+        publisher = dds.Publisher(self.participant, *own, carries_text=text)
         self.publishers[topic] = publisher
         asynchronous, write = qos["publication"] == "asynchronous", publisher.write
         handle, rmw_handle = self.log.publisher(topic, qos["depth"], asynchronous)

@@ -46,19 +46,6 @@ if TYPE_CHECKING:  # a meter is Python alone
 
     from chainshaper.values.recording import StallMeterInfo
 
-__all__ = [
-    "StallWatch",
-    "far_from",
-    "main",
-    "measure_stalls",
-    "meter_tables",
-    "promote_meters",
-    "read_meters",
-    "stalls_watched",
-    "start_meters",
-    "watch",
-]
-
 PERIOD_NS = 1_000_000
 """A wake-up costs some 20 us on a virtual machine: more of them would disturb what they watch."""
 PRIORITY = 98
