@@ -10,7 +10,7 @@ import yaml
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from schedules import application
-from test_servers import MS, plan
+from test_schedules import MS, plan
 
 from chainshaper.analysis import data_flow
 from chainshaper.planning.plan import Server, Thread
