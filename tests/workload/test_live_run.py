@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from calm_runs import calm_run
 from numpy.typing import NDArray
 from processes import children_of, real_time_threads
 from small_chain import DDS_CORE, EXECUTOR_CORE, NODES, PERIOD_NS, small_chain, small_chain_text
@@ -19,7 +18,7 @@ from chainshaper.planning.plan import revised
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import Recording, ThreadInfo
 from chainshaper.workload import live
-from chainshaper.workload.description import Application, load_application
+from chainshaper.workload.description import load_application
 from chainshaper.workload.execution import ExecutionTimes
 
 CYCLES = 12
@@ -38,19 +37,11 @@ def ordinary(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 @pytest.fixture(scope="module")
-def privileged(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+def privileged(unshaped: Recording) -> Recording:
     """A run with real-time scheduling."""
     if not may_use_fifo():
         pytest.skip("SCHED_FIFO is not permitted here")
-    folder = tmp_path_factory.mktemp("privileged")
-    application = small_chain(folder)
-    before = _own_state()
-    recording = calm_run(
-        lambda place: run_application(application, place / "rec", cycles=CYCLES, realtime=True),
-        folder,
-    )
-    assert _own_state() == before, "the caller is not as it was"
-    return recording
+    return unshaped
 
 
 def _own_state() -> tuple[object, ...]:
@@ -101,6 +92,8 @@ def test_every_traversal_is_complete(run: str, request: pytest.FixtureRequest) -
     assert statistics.count == _count_of(recording, "callback_start")["/first"]
     assert statistics.min_ns is not None
     assert statistics.min_ns >= 3_000_000, "three callbacks of 1 ms and more"
+    for pid in {thread.pid for thread in recording.info.threads}:
+        assert not Path(f"/proc/{pid}").exists(), "a process is left"
 
 
 def _threads(recording: Recording, role: str) -> list[ThreadInfo]:
@@ -134,13 +127,6 @@ def test_without_privileges_threads_have_their_cores_and_the_recording_says_so(
     assert {t.cores for t in _threads(ordinary, "dds")} == {(DDS_CORE,)}
     assert ordinary.info.realtime is False
     assert any("without real-time scheduling" in note for note in ordinary.info.notes)
-
-
-@pytest.mark.parametrize("run", ["ordinary", "privileged"])
-def test_no_process_is_left(run: str, request: pytest.FixtureRequest) -> None:
-    recording: Recording = request.getfixturevalue(run)
-    for pid in {thread.pid for thread in recording.info.threads}:
-        assert not Path(f"/proc/{pid}").exists()
 
 
 def test_the_recording_says_what_ran(ordinary: Recording) -> None:
@@ -255,26 +241,19 @@ def test_asynchronous_publication_has_a_thread_of_its_own(tmp_path: Path) -> Non
 
 def test_what_cannot_run_is_refused_before_anything_starts(tmp_path: Path) -> None:
     application = small_chain(tmp_path)
-    started: list[float] = []
+    elsewhere = tmp_path / "elsewhere.yaml"
+    elsewhere.write_text(small_chain_text().replace("  first:\n", "  first:\n    core: 1023\n"))
 
     def report(share: float, what: str) -> None:
-        started.append(share)
+        pytest.fail(f"{what} began")
 
     with pytest.raises(InputError, match="0 cycles cannot be recorded"):
         run_application(application, tmp_path / "rec", cycles=0, progress=report)
     with pytest.raises(InputError, match="exists already"):
         run_application(application, tmp_path, progress=report)
     with pytest.raises(PlatformError, match="core 1023, which node first asks for"):
-        run_application(_elsewhere(tmp_path), tmp_path / "rec", progress=report)
-    assert started == []
+        run_application(load_application(elsewhere), tmp_path / "rec", progress=report)
     assert not (tmp_path / "rec").exists()
-
-
-def _elsewhere(folder: Path) -> Application:
-    path = folder / "elsewhere.yaml"
-    text = small_chain_text().replace("  first:\n", "  first:\n    core: 1023\n")
-    path.write_text(text)
-    return load_application(path)
 
 
 def test_a_caller_that_gives_up_leaves_nothing(tmp_path: Path) -> None:
