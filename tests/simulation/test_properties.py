@@ -9,8 +9,8 @@ import numpy as np
 import yaml
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from schedules import application
-from test_schedules import MS, plan
+from schedules import MS, application
+from test_schedules import plan
 
 from chainshaper.analysis import data_flow
 from chainshaper.planning.plan import Server, Thread

@@ -114,7 +114,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
 
 
 def _send(publisher: dds.Publisher, stamp_ns: int = 1) -> None:
-    publisher.write(dds.stamp_message(dds.message_template(8), stamp_ns), time.time_ns())
+    publisher.write(dds.data_message(bytes(8), stamp_ns), time.time_ns())
 
 
 def test_timers_run_before_subscriptions_each_in_order_of_registration(bench: Bench) -> None:
@@ -196,9 +196,8 @@ def test_an_idle_executor_waits_until_the_end_and_not_less(bench: Bench) -> None
 
 def test_a_slow_reader_keeps_the_last_messages_of_its_depth(bench: Bench) -> None:
     publisher, subscription = bench.topic("/numbers", depth=2)
-    template = dds.message_template(8)
     for number in range(1, 6):
-        publisher.write(dds.stamp_message(template, number), source_timestamp=1000 + number)
+        publisher.write(dds.data_message(bytes(8), number), source_timestamp=1000 + number)
     taken = [subscription.take() for _ in range(3)]
     assert [m and m.source_timestamp for m in taken] == [1004, 1005, None]
     assert not subscription.ready()
@@ -206,7 +205,7 @@ def test_a_slow_reader_keeps_the_last_messages_of_its_depth(bench: Bench) -> Non
 
 def test_takes_are_recorded_with_the_source_timestamp(bench: Bench) -> None:
     publisher = bench.subscribe("one")
-    payload = dds.stamp_message(dds.message_template(8), 5)
+    payload = dds.data_message(bytes(8), 5)
     publisher.write(payload, source_timestamp=123_456_789)
     bench.spin()
     (take,) = bench.recorded("rmw_take")
@@ -218,7 +217,7 @@ def test_takes_are_recorded_with_the_source_timestamp(bench: Bench) -> None:
 
 def test_messages_travel_byte_for_byte(bench: Bench) -> None:
     publisher, subscription = bench.topic("/bytes")
-    payload = dds.stamp_message(dds.message_template(1000), 1_700_000_000_123_456_789)
+    payload = dds.data_message(bytes(1000), 1_700_000_000_123_456_789)
     publisher.write(payload, source_timestamp=7)
     message = subscription.take()
     assert message is not None

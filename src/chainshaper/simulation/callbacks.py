@@ -226,11 +226,10 @@ def publish(m, thread, publisher):
     address = FIRST_ADDRESS + (m[publisher + P.ROW] * ADDRESSES + published % ADDRESSES) * APART
     log(m, at.L_PUBLISH, now, thread, (m[publisher + P.ROW], address))
     message = new_message(m)
-    m[message + M.PUBLISHER], m[message + M.SOURCE] = publisher, now
-    m[message + M.ADDRESS], m[message + M.ORIGIN] = address, m[thread + T.ORIGIN]
-    m[message + M.START] = m[thread + T.START]
-    m[message + M.NUMBER] = m[thread + T.NUMBER]
-    m[message + M.MODE] = NONE
+    for field in range(M.COLUMNS - M.SOURCE):
+        m[message + M.SOURCE + field] = m[thread + T.SOURCE + field]
+    m[message + M.PUBLISHER], m[message + M.ADDRESS] = publisher, address
+    m[message + M.SOURCE], m[message + M.MODE] = now, NONE
     modes = m[publisher + P.MODES_COUNT]
     if modes > 0:
         m[message + M.MODE] = m[m[publisher + P.MODES] + published % modes]
@@ -377,9 +376,8 @@ def _complete(m, thread):
     first, end = m[synchroniser + S.FIRST], m[synchroniser + S.END]
     mine = first + m[entity + E.INPUT] * I.COLUMNS
     message = new_message(m)
-    m[message + M.ORIGIN] = m[thread + T.ORIGIN]
-    m[message + M.START] = m[thread + T.START]
-    m[message + M.NUMBER] = m[thread + T.NUMBER]
+    for field in range(M.COLUMNS - M.SOURCE):
+        m[message + M.SOURCE + field] = m[thread + T.SOURCE + field]
     put_newest(m, mine + I.RING, message)
     for source in range(first, end, I.COLUMNS):
         if m[source + I.WAITING] == 0:
@@ -407,7 +405,7 @@ def _sleep(m, thread, until):
 @compiled()
 def _enter_gate(m, thread):
     gate, now = m[m[thread + T.ENTITY] + E.BODY_ROW], m[X.NOW]
-    decide(m, gate, m[thread + T.CAME], m[thread + T.ORIGIN])
+    decide(m, gate, m[thread + T.ARRIVAL], m[thread + T.ORIGIN])
     m[thread + T.BEGAN] = now
     if m[gate + G.AT] == NONE:
         return _leave_gate(m, thread)

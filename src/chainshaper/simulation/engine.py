@@ -160,13 +160,10 @@ def _take(m, thread):
             callbacks.log(m, at.L_TAKE, now, thread, (m[entity + E.ROW], 0, 0, 0))
             return False
         message = callbacks.take_oldest(m, entity + E.HISTORY)
-        m[thread + T.SOURCE] = m[message + M.SOURCE]
-        m[thread + T.ORIGIN] = m[message + M.ORIGIN]
-        m[thread + T.MODE] = m[message + M.MODE]
-        m[thread + T.NUMBER] = m[message + M.NUMBER]
-        m[thread + T.CAME] = m[message + M.ARRIVAL]
-        if m[entity + E.ON_CHAIN] == 1:
-            m[thread + T.START] = m[message + M.START]
+        for field in range(M.COLUMNS - M.SOURCE):
+            m[thread + T.SOURCE + field] = m[message + M.SOURCE + field]
+        if m[entity + E.ON_CHAIN] == 0:
+            m[thread + T.START] = NONE
         entry = (m[entity + E.ROW], m[message + M.ADDRESS], m[message + M.SOURCE], 1)
         callbacks.log(m, at.L_TAKE, now, thread, entry)
         callbacks.free_message(m, message)

@@ -34,12 +34,12 @@ FOREVER = 2**62
 # send), one message received; DELIVERY is the time until a message is at the subscriber's process.
 # HEAD and TAIL are a queue of messages to send or to receive, or of events to execute. LEFT is the
 # CPU time to the next STEP, SEQUENCE the place among those of its rank; BEGAN is when sending began
-# or the gate woke. SOURCE to MODE and CAME are about the message that it deals with, as in M.
+# or the gate woke. SOURCE to ARRIVAL are those of the message that it deals with, as in M.
 T = IntEnum(
     "T",
     "ROW CORE RANK SERVER KIND FIRST END WAKE TAKE PUBLISH RECEIVE DELIVERY PUBLISHER_THREAD"
     " DDS_THREAD RUNNABLE STEP LEFT SEQUENCE PREEMPTED USED ENTITY PUBLICATION HEAD TAIL SOURCE"
-    " ORIGIN START NUMBER MODE BEGAN CAME COLUMNS",
+    " ORIGIN START NUMBER MODE ARRIVAL BEGAN COLUMNS",
     start=0,
 )
 
@@ -112,7 +112,7 @@ C = IntEnum(
 # ORIGIN the header's stamp, START when the chain that it belongs to started (NONE: it is not on the
 # chain), NUMBER that of the chain's instance.
 M = IntEnum(
-    "M", "NEXT ENTITY PUBLISHER SOURCE ORIGIN START NUMBER ADDRESS MODE ARRIVAL COLUMNS", start=0
+    "M", "NEXT ENTITY PUBLISHER ADDRESS SOURCE ORIGIN START NUMBER MODE ARRIVAL COLUMNS", start=0
 )
 
 D = IntEnum("D", "CONSTANT NEXT LIMIT COLUMNS", start=0)

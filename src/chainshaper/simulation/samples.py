@@ -9,8 +9,6 @@ callback computes before it publishes.
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from chainshaper.analysis import data_flow
@@ -105,8 +103,7 @@ def measured_costs(recording: Recording | str | Path) -> SimulationDescription:
         woken, came = _ordinary(came - DELIVERY_NS), came.clear()
     delivery = _ordinary(came) - round(float(woken.median()))  # type: ignore[arg-type]
     last = flow.publications.group_by("instance").agg(pl.col("sent").max(), pl.len())
-    published = instances.join(last.drop_nulls(), on="instance")
-    published = published.filter(~pl.Series(_stalled(flow, published["sent"], published["end"])))
+    published = _calm(flow, instances.join(last.drop_nulls(), on="instance"), "sent", "end")
     return SimulationDescription(
         wake_up=_samples(woken),
         take=_samples(_ordinary(read["start"] - read["chosen"])),
@@ -154,12 +151,13 @@ def _read(recording: Recording, flow: DataFlow, instances: pl.DataFrame) -> pl.D
             by=by,
             check_sortedness=False,
         )
-    return read.filter(~pl.Series(_stalled(flow, read["sent"], read["start"])))
+    return _calm(flow, read, "sent", "start")
 
 
-def _stalled(flow: DataFlow, start: pl.Series, end: pl.Series) -> npt.NDArray[np.bool_]:
-    """Which of some windows a stall of the machine hit: they say nothing about its costs."""
-    return stalled_after(flow, start.to_numpy(), end.to_numpy())
+def _calm(flow: DataFlow, frame: pl.DataFrame, start: str, end: str) -> pl.DataFrame:
+    """The rows in whose window no stall of the machine was: the others do not show its costs."""
+    hit = stalled_after(flow, frame[start].to_numpy(), frame[end].to_numpy())
+    return frame.filter(~pl.Series(hit))
 
 
 def _share_taken(instances: pl.DataFrame) -> float:

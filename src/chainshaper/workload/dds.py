@@ -115,26 +115,10 @@ def join_domain(domain: int) -> Any:
     return DomainParticipant(domain)
 
 
-def message_template(payload_bytes: int) -> bytearray:
-    """A serialized message with a zero stamp and number, to be filled by :func:`stamp_message`."""
-    message = Stamped(Header(Time(0, 0), ""), 0, [0] * payload_bytes)  # type: ignore[arg-type]
-    serialized = bytes(message.serialize())
-    return bytearray(serialized + b"\0" * (-len(serialized) % 4))
-
-
-def stamp_message(template: bytearray, stamp_ns: int) -> bytes:
-    """A message with the given header stamp (ns of CLOCK_REALTIME); see ``gate.origin_of``."""
-    order = "little" if template[1] & 1 else "big"
-    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-    template[4:8] = seconds.to_bytes(4, order, signed=True)  # type: ignore[arg-type]
-    template[8:12] = nanoseconds.to_bytes(4, order)  # type: ignore[arg-type]
-    return bytes(template)
-
-
 def data_message(data: bytes | memoryview, stamp_ns: int, number: int = 0) -> bytes:
-    """A message that carries a number and ``data`` behind a header.
+    """A message that carries a number and ``data`` behind a header with that stamp.
 
-    ``stamp_ns`` is the header's stamp (ns of CLOCK_REALTIME).
+    ``stamp_ns`` is of CLOCK_REALTIME; see ``gate.origin_of``.
     """
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
     size = memoryview(data).nbytes

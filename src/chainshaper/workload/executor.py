@@ -246,10 +246,10 @@ Work = Callable[[Sequence[dds.Message], int, int], Iterable[bytes]]
 start; gives what is published on each topic, in their order. Nothing: nothing is published."""
 
 
-def spending(times: ExecutionTimes, templates: Sequence[bytearray], announced: list[bytes]) -> Work:
+def spending(times: ExecutionTimes, templates: Sequence[bytes], announced: list[bytes]) -> Work:
     """Spend the next execution time; the first message's stamp is passed on to all topics.
 
-    ``templates`` has a message per topic. What is ``announced`` is published in turn instead.
+    ``templates`` has the data for each topic. What is ``announced`` is published in turn instead.
     All that a callback does before it publishes is part of its execution time, so messages are
     made first.
     """
@@ -257,7 +257,7 @@ def spending(times: ExecutionTimes, templates: Sequence[bytearray], announced: l
 
     def work(messages: Sequence[dds.Message], wall_ns: int, cpu_ns: int) -> Sequence[bytes]:
         stamp = (origin_of(messages[0].payload) or 0) if messages else wall_ns
-        made = [next(announcements, None) or dds.stamp_message(one, stamp) for one in templates]
+        made = [next(announcements, None) or dds.data_message(one, stamp) for one in templates]
         spend(times.next(), cpu_ns)
         return made
 

@@ -49,7 +49,7 @@ class TracedPublisher:
     """A publisher with its trace points, which are recorded apart from sending."""
 
     write: Callable[[bytes, int], None]
-    template: bytearray
+    template: bytes
     handle: int
     rmw_handle: int
     point: dict[str, Callable[..., None]]
@@ -159,8 +159,7 @@ class NodeProcess:
             note = noting_sends(self._point["asynchronous_send"], rmw_handle)
             writer = AsynchronousWriter(write, qos["depth"], qos["lifespan_ns"], note)
             write = partial(self.publisher_thread.publish, writer)
-        template = dds.message_template(qos["payload"])
-        return TracedPublisher(write, template, handle, rmw_handle, self._point)
+        return TracedPublisher(write, bytes(qos["payload"]), handle, rmw_handle, self._point)
 
     def _working_body(
         self,
