@@ -322,14 +322,15 @@ class Machine:
 
     def entries(self, kind: int) -> Int64s:
         """The log's entries of a kind: a row of times, one of threads, and one for each field."""
-        return self.logs[kind][:, : self.array[self._count_of(kind)]]
+        return self.logs[kind][:, : self._counts()[kind]]
 
     def forget_entries(self) -> None:
-        for kind in range(len(self.logs)):
-            self.array[self._count_of(kind)] = 0
+        """The log is empty again."""
+        self._counts()[:] = 0
 
-    def _count_of(self, kind: int) -> int:
-        return int(self.array[X.LOGS] + kind * A.COLUMNS + A.COUNT)
+    def _counts(self) -> Int64s:
+        first = self.array[X.LOGS] + A.COUNT
+        return self.array[first : first + len(self.logs) * A.COLUMNS : A.COLUMNS]
 
 
 def build_machine(

@@ -28,17 +28,9 @@ from chainshaper.values.recording import (
     refuse_existing,
     write_recording,
 )
+from chainshaper.workload import live
 from chainshaper.workload.description import Application, application_as_written
 from chainshaper.workload.event_log import LAYOUT, EventLog
-from chainshaper.workload.live import (
-    WARM_UP_CYCLES,
-    ProcessLog,
-    Timing,
-    event_tables,
-    origin_timer,
-    timing_of,
-    typed_table,
-)
 
 __all__ = ["simulate", "simulate_latencies"]
 
@@ -85,7 +77,7 @@ def simulate(
         processes={process.pid: process.node for process in system.processes},
         threads=system.threads,
         realtime=True,
-        notes=(f"simulated; the first {WARM_UP_CYCLES} cycles were not recorded",),
+        notes=(f"simulated; the first {live.WARM_UP_CYCLES} cycles were not recorded",),
         chain=application.chain,
         application=application_as_written(application),
         plan=None if plan is None else plan.model_dump(mode="json"),
@@ -119,7 +111,7 @@ def simulate_latencies(
 
 def _checked(
     application: Application, plan: Plan | None, cycles: int, seed: int | None
-) -> tuple[Application, Timing]:
+) -> tuple[Application, live.Timing]:
     """The application with the seed and the plan's shaping nodes, and the run's instants."""
     if cycles < 1:
         raise InputError(f"{cycles} cycles cannot be simulated: ask for at least 1")
@@ -133,7 +125,7 @@ def _checked(
     if seed is not None:
         application = application.model_copy(update={"seed": seed})
     if plan is not None:
-        period = origin_timer(application).timer_ns or 0
+        period = live.origin_timer(application).timer_ns or 0
         if plan.chain.period_ns != period:
             raise InputError(
                 f"the plan is for a chain with the period {format_duration(plan.chain.period_ns)},"
@@ -142,7 +134,7 @@ def _checked(
             )
         if plan.shaping_node is not None or any(publisher_servers(plan)):  # not in a baseline
             application = splice_application(application, plan)
-    timing = timing_of(application, cycles, START_NS)
+    timing = live.timing_of(application, cycles, START_NS)
     slowest = max((cb.timer_ns or 0) + cb.phase_ns for _, cb in application.callbacks())
     if timing.stop_ns + slowest > LONGEST_NS:
         raise InputError(
@@ -156,7 +148,7 @@ def _checked(
 def _built(
     application: Application,
     plan: Plan | None,
-    timing: Timing,
+    timing: live.Timing,
     *,
     events: bool = False,
     switches: bool = False,
@@ -192,7 +184,7 @@ def _event_tables(
 ) -> Iterator[dict[str, pl.DataFrame]]:
     """The event tables part by part as the log fills up, the objects' first."""
     objects, handles = _create_objects(system)
-    yield event_tables(objects, from_ns=0)
+    yield live.event_tables(objects, from_ns=0)
     for reason in _runs(machine, progress):
         if reason == at.LOG_FULL:
             yield _logged(system, machine, handles)
@@ -204,7 +196,7 @@ Handles = dict[str, npt.NDArray[np.uint64]]
 ``publisher_handle`` and ``rmw_publisher_handle`` of publishers."""
 
 
-def _create_objects(system: System) -> tuple[list[ProcessLog], Handles]:
+def _create_objects(system: System) -> tuple[list[live.ProcessLog], Handles]:
     """Give every object a handle, unique in its process, and note its creation."""
     logs = [EventLog(clock=lambda: 0) for _ in system.processes]
     for process, log in zip(system.processes, logs, strict=True):
@@ -226,7 +218,7 @@ def _create_objects(system: System) -> tuple[list[ProcessLog], Handles]:
         entities.append((callback, *own))
     core_of = {info.pid: info.cores[0] for info in system.threads if info.role == "executor"}
     created = [
-        ProcessLog(process.pid, core_of[process.pid], b"", tuple(log.objects))
+        live.ProcessLog(process.pid, core_of[process.pid], b"", tuple(log.objects))
         for process, log in zip(system.processes, logs, strict=True)
     ]
     names = ("callback", "handle", "rmw_subscription_handle")
@@ -288,7 +280,7 @@ def _logged(system: System, machine: Machine, handles: Handles) -> dict[str, pl.
         frame = pl.DataFrame(columns)
         if name == "rcl_take":
             frame = frame.filter(pl.col("taken") == 1)
-        table = typed_table(name, frame, system.modes)
+        table = live.typed_table(name, frame, system.modes)
         if kind in {at.L_SEND, at.L_RELEASE}:  # which others were logged before
             table = table.sort("time", maintain_order=True)
         tables[name] = table
@@ -318,4 +310,4 @@ def _switches(system: System, machine: Machine) -> pl.DataFrame:
         "next_tid": tids[following],
         "next_prio": priorities[following],
     }
-    return typed_table("sched_switch", pl.DataFrame(columns))
+    return live.typed_table("sched_switch", pl.DataFrame(columns))

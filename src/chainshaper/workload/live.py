@@ -76,6 +76,8 @@ LOOK_NS = 1_000_000_000
 """How often is looked who governs the nodes: others write it down every second."""
 ANSWER_S = 60.0
 """A process that is silent for longer, discovery included, hangs."""
+SHOWN = ("tid", "pid", "comm", "policy", "priority", "cores")
+"""What the kernel shows of a thread, and a recording has."""
 SINGLE_THREADED = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 """What a callback computes, it computes on its executor's thread."""
 
@@ -316,14 +318,9 @@ def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[Thread
     children += [(child, "") for child in meters.values()]
     return tuple(
         ThreadInfo(
-            tid=thread.tid,
-            pid=thread.pid,
-            comm=thread.comm,
             node=node,
             role=thread.role if node else "stall-meter",
-            policy=thread.policy,
-            priority=thread.priority,
-            cores=thread.cores,
+            **{name: getattr(thread, name) for name in SHOWN},
         )
         for child, node in children
         for thread in list_threads(child.pid)

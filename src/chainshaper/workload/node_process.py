@@ -21,22 +21,9 @@ from chainshaper.linux.scheduling import (
     signalled_with_parent,
     stop_garbage_collection,
 )
-from chainshaper.workload import dds
+from chainshaper.workload import dds, executor
 from chainshaper.workload.event_log import ABSENT, LAYOUT, EventLog, number_of
 from chainshaper.workload.execution import ExecutionTimes
-from chainshaper.workload.executor import (
-    AsynchronousWriter,
-    Executor,
-    PublisherThread,
-    SubscriptionEntity,
-    Synchroniser,
-    Timer,
-    Work,
-    computing,
-    load_function,
-    noting_sends,
-    spending,
-)
 from chainshaper.workload.launcher import receive, send, send_events, wait_for_leave
 
 GATE_FIELDS = ("cycle_ns", "anchor", "overrun", "due_cycles", "messages", "depth")
@@ -79,12 +66,12 @@ class NodeProcess:
         self.spec = spec
         self.log = EventLog()
         self.participant = dds.join_domain(spec["domain"])
-        self.executor = Executor(self.participant, self.log)
+        self.executor = executor.Executor(self.participant, self.log)
         self.publishers: dict[str, dds.Publisher] = {}
         self.subscriptions: list[tuple[str, dds.Subscription]] = []
-        self.publisher_thread: PublisherThread | None = None
+        self.publisher_thread: executor.PublisherThread | None = None
         self.shapers: list[Shaper] = []
-        self.first_due: list[tuple[Timer, int]] = []
+        self.first_due: list[tuple[executor.Timer, int]] = []
         self.execution_times: list[ExecutionTimes] = []
         self._point = {name: self.log.point(name) for name in LAYOUT}
         self.log.node(spec["node"], "live workload")
@@ -105,7 +92,7 @@ class NodeProcess:
         if callback["synchronises"]:
             topics = callback["synchronises"]
             depths = [self.spec["topics"][topic]["depth"] for topic in topics]
-            synchroniser = Synchroniser[dds.Message](depths)
+            synchroniser = executor.Synchroniser[dds.Message](depths)
             for number, topic in enumerate(topics):
                 # As in ROS 2, by which the analysis knows the inputs of one synchroniser.
                 handle = self.log.callback(f"message_filters::{symbol}.{number}")
@@ -119,26 +106,26 @@ class NodeProcess:
             self._subscribe(handle, topic, body)
             return
         period = callback["timer_ns"]
-        timer = Timer(self.log.timer(handle, period), period, body)
+        timer = executor.Timer(self.log.timer(handle, period), period, body)
         self.executor.timers.append(timer)
         self.first_due.append((timer, callback["phase_ns"]))
 
     def _work(
         self, index: int, callback: dict[str, Any], publishers: Sequence[TracedPublisher]
-    ) -> Work:
+    ) -> executor.Work:
         """What the callback does: call the function that it names, or spend drawn times."""
         if callback["computes"] is not None:
-            function = load_function(callback["computes"])
-            return computing(callback["computes"], function, len(publishers))
+            function = executor.load_function(callback["computes"])
+            return executor.computing(callback["computes"], function, len(publishers))
         times = ExecutionTimes(callback["execution"], self.spec["seed"], self.spec["node"], index)
         self.execution_times.append(times)
         announced = [dds.text_message(mode) for mode in callback["announces"]]
-        return spending(times, [publisher.template for publisher in publishers], announced)
+        return executor.spending(times, [publisher.template for publisher in publishers], announced)
 
     def _subscribe(self, handle: int, topic: str, body: Body) -> None:
         subscription, depth = self._subscription(topic), self.spec["topics"][topic]["depth"]
         own = self.log.subscription(handle, topic, depth)
-        self.executor.add_subscription(SubscriptionEntity(*own, subscription, body))
+        self.executor.add_subscription(executor.SubscriptionEntity(*own, subscription, body))
 
     def _subscription(self, topic: str, depth: int = 0) -> dds.Subscription:
         qos, text = self.spec["topics"][topic], topic in self.spec["announced"]
@@ -155,16 +142,16 @@ class NodeProcess:
         asynchronous, write = qos["publication"] == "asynchronous", publisher.write
         handle, rmw_handle = self.log.publisher(topic, qos["depth"], asynchronous)
         if asynchronous:  # the process's publisher thread does the writing
-            self.publisher_thread = self.publisher_thread or PublisherThread()
-            note = noting_sends(self._point["asynchronous_send"], rmw_handle)
-            writer = AsynchronousWriter(write, qos["depth"], qos["lifespan_ns"], note)
+            self.publisher_thread = self.publisher_thread or executor.PublisherThread()
+            note = executor.noting_sends(self._point["asynchronous_send"], rmw_handle)
+            writer = executor.AsynchronousWriter(write, qos["depth"], qos["lifespan_ns"], note)
             write = partial(self.publisher_thread.publish, writer)
         return TracedPublisher(write, bytes(qos["payload"]), handle, rmw_handle, self._point)
 
     def _working_body(
         self,
         handle: int,
-        work: Work,
+        work: executor.Work,
         publishers: Sequence[TracedPublisher],
         complete: Callable[[dds.Message], tuple[dds.Message, ...]] | None = None,
     ) -> Callable[..., None]:
@@ -257,7 +244,7 @@ class NodeProcess:
 
         shaper.look = look
         self.executor.backlogs.append(work_off)
-        entity = SubscriptionEntity(own_handle, rmw_handle, subscription, body)
+        entity = executor.SubscriptionEntity(own_handle, rmw_handle, subscription, body)
         self.executor.add_subscription(entity)
 
     def _shaper(self, gate: dict[str, Any]) -> Shaper:
