@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from chainshaper.workload import dds
 from chainshaper.workload.event_log import LAYOUT, WIDTH, EventLog
-from chainshaper.workload.executor import Executor, SubscriptionEntity, Timer
+from chainshaper.workload.executor import Executor, SubscriptionEntity, Synchroniser, Timer
 
 MS = 1_000_000
 
@@ -195,3 +195,11 @@ def test_takes_are_recorded_with_the_source_timestamp(bench: Bench) -> None:
     assert (take[1], take[3], take[4]) == (handle, 123_456_789, 1)
     (execute,) = bench.recorded("rclcpp_executor_execute")
     assert execute[1] == bench.executor.subscriptions[0].handle
+
+
+def test_a_set_is_the_oldest_message_of_every_input() -> None:
+    synchroniser = Synchroniser[str]([2, 2])
+    assert [synchroniser.add(0, message) for message in ("a1", "a2", "a3")] == [(), (), ()]
+    assert synchroniser.add(1, "b1") == ("a2", "b1")  # the history had no place for a1
+    assert synchroniser.add(1, "b2") == ("a3", "b2")
+    assert synchroniser.add(1, "b3") == ()

@@ -68,7 +68,7 @@ def test_what_comes_in_comes_out_or_is_counted(
     tmp_path: Path, messages: str, depth: int, lost: set[str]
 ) -> None:
     application = application_of(messages, depth)
-    recording = run_application(application, tmp_path / "recording", cycles=200)
+    recording = run_application(application, tmp_path / "recording", cycles=100)
 
     def timestamps(node: str) -> set[int]:
         (pid,) = (pid for pid, name in recording.info.processes.items() if name == node)
