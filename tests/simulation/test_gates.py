@@ -63,10 +63,6 @@ def as_array(gate: Gate) -> tuple[at.Int64s, int]:
     return np.array(rows, dtype=np.int64), place
 
 
-def word(number: int, words: tuple[str, ...]) -> str | None:
-    return None if number == at.NONE else words[number]
-
-
 @given(
     gate=gates(),
     arrival=st.integers(3_000, 6_000),

@@ -55,9 +55,6 @@ def log(m, kind, time, thread, fields):
         m[place + (2 + field) * stride] = fields[field]
 
 
-# Events to come: a heap -----------------------------------------------------------------
-
-
 @compiled()
 def push_event(m, time, kind, row):
     """Something will happen; of what happens at one time, the first pushed comes first."""
@@ -113,9 +110,6 @@ def _earlier(m, one, other):
     if m[one + H.TIME] != m[other + H.TIME]:
         return m[one + H.TIME] < m[other + H.TIME]
     return m[one + H.ORDER] < m[other + H.ORDER]
-
-
-# Messages: the pool, threads' queues, rings ----------------------------------------------
 
 
 @compiled()
@@ -192,8 +186,6 @@ def drop_expired(m, entity):
             return
         free_message(m, take_oldest(m, entity + E.HISTORY))
 
-
-# How messages travel ----------------------------------------------------------------------
 
 ADDRESSES = 64
 """Addresses of messages repeat, as they do in a real process."""
@@ -322,9 +314,6 @@ def mark_event(m, thread, entity):
     event = new_message(m)
     m[event + M.ENTITY] = entity
     append(m, thread, event)
-
-
-# What callbacks do ------------------------------------------------------------------------
 
 
 @compiled()
@@ -478,9 +467,6 @@ def _leave_gate(m, thread):
     return _end(m, thread)
 
 
-# The gate's decisions ---------------------------------------------------------------------
-
-
 @compiled()
 def decide(m, gate, arrival, stamp):
     """When the message whose turn it is may leave, and why, as `Queue.decide`."""
@@ -488,10 +474,8 @@ def decide(m, gate, arrival, stamp):
     _release(m, gate, gate, arrival, stamp, ready)
     if m[gate + G.BY_STAMP] == 1:
         m[gate + G.PHASE] = m[gate + G.ORIGIN] % m[gate + G.CYCLE]
-    if m[gate + G.AT] == NONE:
-        m[gate + G.DROPPED] = at.DISCARDED
-        return
-    if m[gate + G.SLOT] == NONE or m[gate + G.MESSAGES] == at.ALL_IN_ORDER:
+    in_order = m[gate + G.MESSAGES] == at.ALL_IN_ORDER
+    if m[gate + G.AT] == NONE or m[gate + G.SLOT] == NONE or in_order:
         return
     left = m[gate + G.LEFT]
     if left != NONE and _same_cycle(m, gate, _start(m, gate, gate), left):
@@ -501,7 +485,6 @@ def decide(m, gate, arrival, stamp):
         last_end = m[m[gate + G.SLOTS_END] - 1]
         _release(m, gate, gate, arrival, stamp, max(ready, left + last_end))
         if m[gate + G.AT] == NONE:
-            m[gate + G.DROPPED] = at.DISCARDED
             return
         if m[gate + G.SLOT] == NONE:
             m[gate + G.AT] = ready
@@ -561,8 +544,9 @@ def _release(m, gate, row, arrival, stamp, ready):  # noqa: PLR0917 - as `releas
     m[row + G.BY_STAMP], m[row + G.TREATED] = stamped, NONE
     m[row + G.SLOT], m[row + G.CYCLES], m[row + G.DROPPED] = NONE, cycle, NONE
     if overran and policy != at.WAIT:
-        m[row + G.AT] = ready if policy == at.PUBLISH_LATE else NONE
-        m[row + G.TREATED] = policy
+        m[row + G.TREATED], m[row + G.AT] = policy, ready
+        if policy != at.PUBLISH_LATE:
+            m[row + G.AT], m[row + G.DROPPED] = NONE, at.DISCARDED
         return
     if overran:
         m[row + G.TREATED] = at.WAIT

@@ -82,8 +82,7 @@ def measured_costs(recording: Recording | str | Path) -> SimulationDescription:
     from then to the choice the executor woke up; one that found it idle was on its way before that.
     What executors were kept from while they computed, interrupts took.
 
-    Raises:
-        InputError: no message of the recording was taken by such an executor that waited for it.
+    Raises InputError: no message of the recording was taken by such an executor that waited for it.
     """
     recording = recording if isinstance(recording, Recording) else open_source(recording)
     flow = data_flow(recording.events, recording.info.clock_offset_ns)

@@ -92,8 +92,7 @@ def closed_domain_configuration() -> str:
 def free_domain() -> int:
     """A DDS domain id in which no process of this machine takes part.
 
-    Raises:
-        OperationError: all of them are in use.
+    Raises OperationError: all of them are in use.
     """
     candidates = list(range(20, 101))  # 0 to 19 are what people choose by hand
     random.shuffle(candidates)

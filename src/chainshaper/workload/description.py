@@ -60,7 +60,7 @@ class ExecutionTime(Part):
     @model_validator(mode="after")
     def _one_distribution(self) -> "ExecutionTime":
         given = [self.constant_ns, self.uniform_ns, self.normal_ns, self.samples_ns]
-        if sum(value is not None for value in given) != 1:
+        if given.count(None) != 3:
             raise wrong_value("give exactly one of constant, uniform, normal, samples")
         if self.block > 1 and self.samples_ns is None:
             raise wrong_value("a block is a stretch of `samples`: remove it", "block")
@@ -190,8 +190,7 @@ class CallbackDescription(Part):
 
     @model_validator(mode="after")
     def _one_trigger(self) -> "CallbackDescription":
-        triggers = (self.timer_ns, self.subscription, self.synchronises or None)
-        if sum(trigger is not None for trigger in triggers) != 1:
+        if (self.timer_ns, self.subscription, self.synchronises or None).count(None) != 2:
             raise wrong_value(
                 "give either `timer: PERIOD` or `subscription: TOPIC` or `synchronises: [TOPICS]`"
             )
@@ -356,8 +355,7 @@ class Application(Part):
 def load_application(path: str | Path) -> Application:
     """Read an application's YAML file.
 
-    Raises:
-        InputError: with file, line, key, reason and remedy of each wrong value.
+    Raises InputError: with file, line, key, reason and remedy of each wrong value.
     """
     return read_model(path, Application, made_by="like examples/synthetic_chain.yaml")
 

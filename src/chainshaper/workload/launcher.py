@@ -51,8 +51,7 @@ class Child:
     def hear(self, within_s: float | None = None) -> dict[str, Any]:
         """Its next line, waited for as long as it takes or, between its parts, ``within_s``.
 
-        Raises:
-            OperationError: it died instead, or was silent.
+        Raises OperationError: it died instead, or was silent.
         """
         line = self._take(lambda received: received.find(b"\n") + 1, within_s)
         try:

@@ -292,8 +292,7 @@ def _watch(
 
     And the plans that others put in force meanwhile (`chainshaper apply`).
 
-    Raises:
-        OperationError: a process ended before its time.
+    Raises OperationError: a process ended before its time.
     """
     children = [*nodes.values(), *meters.values()]
     threads: tuple[ThreadInfo, ...] = ()

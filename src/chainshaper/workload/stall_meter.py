@@ -199,8 +199,7 @@ class StallWatch:
 def stalls_watched(cores: Iterable[int], realtime: bool) -> Iterator[StallWatch]:
     """Watch cores from when the watch is begun until the context ends.
 
-    Raises:
-        OperationError: a meter died.
+    Raises OperationError: a meter died.
     """
     watch, finished = StallWatch(), False
     meters = watch.meters
@@ -225,8 +224,7 @@ def measure_stalls(
 ) -> "tuple[pl.DataFrame, StallMeterInfo]":
     """Watch cores for a while: the `machine_stall` table, and how it was taken.
 
-    Raises:
-        OperationError: a meter died.
+    Raises OperationError: a meter died.
     """
     with stalls_watched(cores, realtime) as watch:
         watch.begin()
