@@ -20,7 +20,7 @@ from chainshaper.values import events
 from chainshaper.values.recording import Recording
 
 SETTINGS = settings(
-    max_examples=15,
+    max_examples=12,
     deadline=None,
     phases=(Phase.explicit, Phase.generate),  # a failure says enough; shrinking takes minutes
     suppress_health_check=[HealthCheck.too_slow],
