@@ -353,8 +353,9 @@ def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataF
             if len(mine):
                 own = mine[:, 1 : 2 + len(fields)]
                 found.append((name, pl.DataFrame(own, schema=["time", *fields])))
-        for created in log.objects:
-            found.append((created["event"], pl.DataFrame([created])))
+        for name in dict.fromkeys(created["event"] for created in log.objects):
+            own_objects = [created for created in log.objects if created["event"] == name]
+            found.append((name, pl.DataFrame(own_objects)))
         for name, frame in found:
             missing = {key: pl.lit(value) for key, value in common.items() if key not in frame}
             table = typed_table(name, frame.with_columns(**missing), log.modes)
@@ -370,20 +371,18 @@ def typed_table(name: str, frame: pl.DataFrame, modes: Sequence[str] = ()) -> pl
 
     Columns that the event does not have are left out.
     """
-    columns: dict[str, pl.Expr] = {}
-    for field, words in {**WORDS, "mode": modes}.items():
-        numbered = dict(enumerate(words))
-        columns[field] = pl.col(field).replace_strict(
-            numbered, default=None, return_dtype=pl.String()
-        )
-    for field in ("release", "slot"):
-        columns[field] = pl.when(pl.col(field) != ABSENT).then(pl.col(field)).alias(field)
     types = {**events.COMMON_COLUMNS, **events.FIELDS[name], **events.OPTIONAL_FIELDS.get(name, {})}
-    return frame.select(
-        columns.get(field, pl.col(field)).cast(type_)
-        for field, type_ in types.items()
-        if field in frame.columns
-    )
+    words = {**WORDS, "mode": tuple(modes)}
+    columns = []
+    for field in filter(frame.columns.__contains__, types):
+        column = frame[field]
+        if field in words:
+            named = dict(enumerate(words[field]))
+            column = column.replace_strict(named, default=None, return_dtype=pl.String())
+        elif field in {"release", "slot"}:
+            column = column.replace({ABSENT: None})
+        columns.append(column.cast(types[field]))
+    return pl.DataFrame(columns)
 
 
 def _read_log(name: str, child: Child, application: Application) -> ProcessLog:
