@@ -10,7 +10,7 @@ from story import Story
 
 from chainshaper.analysis import data_flow, graph_of
 from chainshaper.analysis.graph import ApplicationDescription, services
-from chainshaper.reporting.application_graph import (
+from chainshaper.reporting.graph_drawing import (
     application_json,
     short_symbol,
     without_internals,

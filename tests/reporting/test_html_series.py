@@ -11,15 +11,8 @@ from hypothesis import strategies as st
 from known_run import LATENCY_NS, MS, PERIOD_NS, known_run
 
 from chainshaper import data_flow, measure_latency
-from chainshaper.reporting.page_data import (
-    BARS,
-    CYCLES,
-    KINDS,
-    latency_histogram,
-    latency_points,
-    timeline_data,
-)
-from chainshaper.reporting.timeline import timeline_of
+from chainshaper.reporting.page import latency_histogram, latency_points
+from chainshaper.reporting.timeline import BARS, CYCLES, KINDS, timeline_data, timeline_of
 from chainshaper.values.recording import Recording
 
 

@@ -11,7 +11,7 @@ from chainshaper import compare_recordings, draw_distribution, draw_latency
 from chainshaper.planning import Plan
 from chainshaper.reporting.figures import draw_comparison
 from chainshaper.reporting.latency import comparison_json, comparison_table
-from chainshaper.reporting.plans import plan_table
+from chainshaper.reporting.overviews import plan_table
 from chainshaper.reporting.tables import ResultTable
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
