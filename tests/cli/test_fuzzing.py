@@ -159,7 +159,10 @@ def facts_of_recordings(chance: random.Random, folder: Path, recording: Recordin
 
 def traces(chance: random.Random, folder: Path, recording: Recording) -> Arguments:
     """Streams and metadata of a CTF trace."""
-    source = write_lttng_trace(folder / "source", recording.events)
+    whole = recording.path.with_name("trace")
+    if not whole.exists():
+        write_lttng_trace(whole, recording.events)
+    source = Path(shutil.copytree(whole, folder / "source"))
     files = [path for path in sorted(source.rglob("*")) if path.is_file()]
     file = chance.choice(files)
     if file.name == "metadata" and chance.random() < 0.7:
