@@ -54,13 +54,14 @@ class Story:
         node = Node(pid, handle or self.handle())
         namespace, _, short = name.rpartition("/")
         handles = {"node_handle": node.handle, "rmw_handle": self.handle()}
-        names = {"node_name": short, "namespace": namespace or "/"}
+        names: dict[str, Any] = {"node_name": short, "namespace": namespace or "/"}
         self.event("rcl_node_init", time, pid, **handles, **names)
         return node
 
     def publisher(self, node: Node, topic: str, time: int = 0) -> Publisher:
         publisher = Publisher(node.pid, self.handle(), self.handle())
-        about = {"node_handle": node.handle, "rmw_publisher_handle": publisher.rmw_handle}
+        about: dict[str, Any] = {"node_handle": node.handle}
+        about |= {"rmw_publisher_handle": publisher.rmw_handle}
         about |= {"topic_name": topic, "queue_depth": 10}
         handle = publisher.handle
         self.event("rcl_publisher_init", time, node.pid, publisher_handle=handle, **about)
@@ -96,8 +97,9 @@ class Story:
         rcl, rmw, rclcpp = self.handle(), self.handle(), self.handle()
         callback = Callback(node.pid, handle or self.handle(), rmw)
         at, it = (time, node.pid), {"subscription_handle": rcl}
-        about = {"node_handle": node.handle, "rmw_subscription_handle": rmw, "topic_name": topic}
-        self.event("rcl_subscription_init", *at, **it, **about, queue_depth=10)
+        about: dict[str, Any] = {"node_handle": node.handle, "rmw_subscription_handle": rmw}
+        about |= {"topic_name": topic, "queue_depth": 10, **it}
+        self.event("rcl_subscription_init", time, node.pid, **about)
         if callbackless:
             return callback
         self.event("rclcpp_subscription_init", *at, **it, subscription=rclcpp)

@@ -77,7 +77,8 @@ def test_a_chain_that_does_not_exist(
 def test_a_mistake_in_the_application(
     command: str, change: str, message: str, folder: Path, words: Words
 ) -> None:
-    (folder / "application.yaml").write_text(small_chain_text().replace(*change.split(" → ")))
+    old, _, new = change.partition(" → ")
+    (folder / "application.yaml").write_text(small_chain_text().replace(old, new))
     assert message in refused(2, *words(command))
     assert not (folder / "recording").exists()
 
@@ -120,10 +121,8 @@ def test_without_the_privilege_it_runs_with_what_it_may(
     options: list[str], application_file: Path
 ) -> None:
     output = application_file.parent / "recording"
-    finished = chainshaper(
-        *("run", application_file, "-o", output, *options),
-        prefix=("setpriv", "--bounding-set=-sys_nice"),
-    )
+    prefix = ("setpriv", "--bounding-set=-sys_nice")
+    finished = chainshaper("run", application_file, "-o", output, *options, prefix=prefix)
     if options != ["--realtime"]:
         assert (finished.code, finished.out) == (0, f"{output}\n"), finished.err
         return

@@ -91,9 +91,11 @@ def test_a_throttler_needs_no_plan(files: Files) -> None:
 
 def test_undo_needs_the_folder_only(files: Files) -> None:
     plan, robot, folder = files
-    for undo, printed in (([], f"{folder} is removed\n"), ([plan, robot, "--json"], None)):
+    removed = f"{folder} is removed\n"
+    words: list[str | Path] = [plan, robot, "--json"]
+    for undo, printed in (([], removed), (words, None)):
         assert called("splice", plan, robot, "-o", folder).code == 0
-        finished = called("splice", "--undo", "-o", folder, *undo)
+        finished = called("splice", "--undo", "-o", folder, *(undo or ()))
         assert finished.out == printed or json.loads(finished.out) == {"removed": str(folder)}
         assert not folder.exists()
     assert "nothing to undo" in refused(2, "splice", "--undo", "-o", folder)
