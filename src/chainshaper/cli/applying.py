@@ -12,6 +12,7 @@ from chainshaper.cli.options import JSON, USERS, argument, option
 from chainshaper.cli.output import (
     Progress,
     notes,
+    present,
     print_json,
     progress,
     say,
@@ -58,11 +59,8 @@ def threads(
         recording = recording or recording_of(place)
     recorded = None if recording is None else cs.open_source(recording)
     found = cs.find_threads(place, recorded, users=user or ())
-    if json:
-        print_json(threads_json(found))
-        return
-    show(threads_table(found))
-    notes(found.notes)
+    if present(json, threads_json(found), threads_table(found)):
+        notes(found.notes)
 
 
 def apply(
@@ -123,10 +121,7 @@ def apply(
             progress=report,
             **how,
         )
-    if json:
-        print_json(asdict(done.state) | {"exit_code": done.exit_code})
-    else:
-        show(servers_table(done.state))
+    present(json, asdict(done.state) | {"exit_code": done.exit_code}, servers_table(done.state))
     notes(done.state.notes)
     if done.exit_code and not stop.is_set():
         raise OperationError(f"the command ended with code {done.exit_code}")
@@ -268,7 +263,4 @@ def doctor(
     with progress("examining this machine") as report:
         report(0.0, "watching for stalls")
         found = cs.examine_machine(watch)
-    if json:
-        print_json(machine_json(found))
-        return
-    show(*machine_tables(found))
+    present(json, machine_json(found), *machine_tables(found))

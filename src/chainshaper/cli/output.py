@@ -48,6 +48,15 @@ def print_json(value: Any) -> None:
         sys.stdout.write(json.dumps(value, indent=2).replace("\x7f", "\\u007f") + "\n")
 
 
+def present(as_json: bool, value: Any, *tables: "RenderableType") -> bool:
+    """A value as JSON, or the same as tables; whether it was the tables."""
+    if as_json:
+        print_json(value)
+    else:
+        show(*tables)
+    return not as_json
+
+
 @contextmanager
 def _written() -> Iterator[None]:
     """What is printed inside is out, or the command fails: a redirection to a full disk."""

@@ -20,7 +20,7 @@ from chainshaper.cli.options import (
     takes_wishes,
     wish,
 )
-from chainshaper.cli.output import notes, print_json, progress, show, show_line
+from chainshaper.cli.output import notes, present, print_json, progress, show_line
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Fallback
 
@@ -110,19 +110,17 @@ def _print_one(
         cs.save_plan(planned, output)
     if curve is not None and choice is not None:
         draw_curve(choice, curve)
-    warnings = plan_warnings(planned)
-    if json:
-        chosen = {} if choice is None else {"choice": choice_json(choice)}
-        print_json({**plan_json(planned), "warnings": warnings, **chosen})
-        return
-    show(plan_table(planned))
+    values: dict[str, Any] = {**plan_json(planned), "warnings": plan_warnings(planned)}
+    tables = [plan_table(planned)]
     if len(publish_slots(planned)) > 1:
-        show(bands_table(planned))
+        tables.append(bands_table(planned))
     if choice is not None:
-        show(choice_table(choice))
-    notes(warnings)
-    for path in filter(None, (curve, output)):
-        show_line(path)
+        values["choice"] = choice_json(choice)
+        tables.append(choice_table(choice))
+    if present(json, values, *tables):
+        notes(values["warnings"])
+        for path in filter(None, (curve, output)):
+            show_line(path)
 
 
 def offsets(
@@ -152,15 +150,12 @@ def _place_and_print(
     placed, remarks = cs.place_chains(plans, time_limit_s=time_limit)
     written = [] if output is None else save_plans(placed, output)
     warnings = [*remarks, *(warning for one in placed for warning in plan_warnings(one))]
-    if json:
-        files = [str(path) for path in written]
-        found = [plan_json(planned) for planned in placed]
-        print_json({"plans": found, "files": files, "warnings": warnings})
-        return
-    show(*map(plan_table, placed))
-    notes(dict.fromkeys(warnings))
-    for path in written:
-        show_line(path)
+    files = [str(path) for path in written]
+    values = {"plans": [plan_json(one) for one in placed], "files": files, "warnings": warnings}
+    if present(json, values, *map(plan_table, placed)):
+        notes(dict.fromkeys(warnings))
+        for path in written:
+            show_line(path)
 
 
 def sweep(
@@ -226,13 +221,10 @@ def sweep(
         raise
     if draw is not None:
         draw_sweep(frame, draw)
-    if json:
-        print_json(frame.to_dicts())
-        return
-    show(sweep_table(frame))
-    notes(frame["error"].drop_nulls().unique(maintain_order=True))
-    for path in filter(None, (draw, output)):
-        show_line(path)
+    if present(json, frame.to_dicts(), sweep_table(frame)):
+        notes(frame["error"].drop_nulls().unique(maintain_order=True))
+        for path in filter(None, (draw, output)):
+            show_line(path)
 
 
 def splice(

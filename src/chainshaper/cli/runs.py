@@ -30,6 +30,7 @@ from chainshaper.cli.output import (
     late_progress,
     lost_events,
     notes,
+    present,
     print_json,
     progress,
     show,
@@ -97,13 +98,11 @@ def demo(
             planned=_warn,
             progress=report,
         )
-    if json:
-        print_json({**comparison_json(result.comparison), "folder": str(folder)})
-        return
-    tables = comparison_tables(result.comparison)[:1]
-    show(callback_table(result.callbacks), plan_table(result.plan), *tables)
-    notes(result.notes)
-    show_line(folder.absolute())
+    tables = [callback_table(result.callbacks), plan_table(result.plan)]
+    tables.append(comparison_tables(result.comparison)[0])
+    if present(json, comparison_json(result.comparison) | {"folder": str(folder)}, *tables):
+        notes(result.notes)
+        show_line(folder.absolute())
 
 
 def _warn(plan: "cs.Plan") -> None:
@@ -404,12 +403,10 @@ def _shape_launched(command: list[str], folder: Path, json: bool, **how: Any) ->
             progress=stage_lines("shape"),
             **how,
         )
-    if json:
-        print_json(comparison_json(shaped.comparison) | {"folder": str(shaped.folder)})
-        return
-    show(*comparison_tables(shaped.comparison))
-    notes(shaped.notes)
-    show_line(shaped.folder)
+    values = comparison_json(shaped.comparison) | {"folder": str(shaped.folder)}
+    if present(json, values, *comparison_tables(shaped.comparison)):
+        notes(shaped.notes)
+        show_line(shaped.folder)
 
 
 def _ask(graph: "ApplicationGraph", found: "ChainEnumeration") -> str:

@@ -19,6 +19,7 @@ from chainshaper.cli.output import (
     lost_events,
     notes,
     opened,
+    present,
     print_json,
     show,
     show_line,
@@ -35,12 +36,9 @@ def info(trace: list[Path] = TRACE, json: bool = JSON) -> None:
 
     with opened("info", trace, overview=True) as (recording, _):
         contents = contents_json(recording)
-    if json:
-        print_json(contents)
-        return
-    show(*contents_table(recording))
-    show_line(lost_events(recording))
-    notes(contents["notes"])
+    if present(json, contents, *contents_table(recording)):
+        show_line(lost_events(recording))
+        notes(contents["notes"])
 
 
 def graph(
@@ -86,14 +84,11 @@ def callbacks(trace: list[Path] = TRACE, json: bool = JSON) -> None:
     with opened("callbacks", trace) as (recording, _):
         flow = cs.data_flow(recording.events, recording.info.clock_offset_ns)
         statistics = cs.callback_statistics(flow)
-    if json:
-        print_json(callback_rows(statistics))
-        if any(recording.info.lost.values()):  # the array has no place for it
-            notes([lost_events(recording)])
-        return
-    show(callback_table(statistics))
-    show_line(lost_events(recording))
-    notes((*recording.info.notes, *flow.notes))
+    if present(json, callback_rows(statistics), callback_table(statistics)):
+        show_line(lost_events(recording))
+        notes((*recording.info.notes, *flow.notes))
+    elif any(recording.info.lost.values()):  # the array has no place for it
+        notes([lost_events(recording)])
 
 
 def chains(
@@ -120,13 +115,10 @@ def chains(
         application = graph_of(flow)
         found = cs.list_chains(flow, start, end, limit)
     remarks = [*recording.info.notes, *flow.notes]
-    if json:
-        lost = {"lost": recording.info.lost, "notes": remarks}
-        print_json({**chains_json(application, found), **lost})
-        return
-    show(chain_table(application, found))
-    show_line(f"{count_text(found)}; {lost_events(recording)}")
-    notes(remarks)
+    values = chains_json(application, found) | {"lost": recording.info.lost, "notes": remarks}
+    if present(json, values, chain_table(application, found)):
+        show_line(f"{count_text(found)}; {lost_events(recording)}")
+        notes(remarks)
 
 
 def latency(
@@ -153,13 +145,12 @@ def latency(
     with opened("latency", trace) as (recording, _):
         measurement = cs.measure_latency(recording, chain)
     analysis = measurement.analysis
-    if json:
-        figures = of_chain.latency_json(measurement, instances=instances)
-        print_json({**figures, **of_chain.breakdown_json(analysis)})
-        return
-    show(of_chain.latency_table(measurement), of_chain.breakdown_table(analysis))
-    show_line(f"{of_chain.doubts_text(measurement)}; {lost_events(recording)}")
-    notes(analysis.notes)
+    values = of_chain.latency_json(measurement, instances=instances)
+    values |= of_chain.breakdown_json(analysis)
+    tables = of_chain.latency_table(measurement), of_chain.breakdown_table(analysis)
+    if present(json, values, *tables):
+        show_line(f"{of_chain.doubts_text(measurement)}; {lost_events(recording)}")
+        notes(analysis.notes)
 
 
 def convert(trace: list[Path] = TRACE, output: Path = RECORDING_OUTPUT) -> None:
@@ -201,10 +192,7 @@ def compare(
         from chainshaper.reporting.figures import draw_comparison
 
         draw_comparison(comparison.measurements, figures)
-    if json:
-        print_json(comparison_json(comparison))
-        return
-    show(*comparison_tables(comparison))
+    present(json, comparison_json(comparison), *comparison_tables(comparison))
 
 
 def report(
