@@ -19,6 +19,7 @@ from chainshaper.cli.output import (
     show,
     show_line,
     stop_on_signals,
+    warn,
 )
 from chainshaper.values.errors import InputError, OperationError
 
@@ -95,7 +96,6 @@ def apply(
 
     Whatever ends it, everything is as it was before.
     """
-    from chainshaper.planning import plan_warnings
     from chainshaper.reporting.overviews import servers_table
 
     planned = cs.load_plan(plan)
@@ -107,7 +107,7 @@ def apply(
     if dry_run:
         _show_changes(planned, backend, json, how)
         return
-    notes(plan_warnings(planned))
+    warn(planned)
     with stop_on_signals() as stop, _watching() as (watch, report):
         done = cs.apply_plan(
             planned,

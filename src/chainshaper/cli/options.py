@@ -155,11 +155,6 @@ _OTHERS: dict[str, tuple[Any, Any]] = {
 }
 
 
-def _parameter(name: str) -> Parameter:
-    kind, default = _OTHERS.get(name) or (get_args(_WISHES[name].type)[0], wish(name))
-    return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=kind)
-
-
 def takes_wishes(*names: str) -> Callable[[Callable[..., None]], Any]:
     """Give a verb, in place of its parameter ``request``, an option for each of these wishes.
 
@@ -174,10 +169,15 @@ def takes_wishes(*names: str) -> Callable[[Callable[..., None]], Any]:
             modes = modes_of(wished.pop("modes", None), wished.pop("late", None))
             verb(**values, request=cs.PlanRequest(**wished, modes=modes))
 
+        options = []
+        for name in names:
+            kind, default = _OTHERS.get(name) or (get_args(_WISHES[name].type)[0], wish(name))
+            more = {"default": default, "annotation": kind}
+            options.append(Parameter(name, Parameter.KEYWORD_ONLY, **more))
         parameters: list[Parameter] = []
         for one in signature(verb).parameters.values():
             own = [one.replace(kind=Parameter.KEYWORD_ONLY)]
-            parameters += map(_parameter, names) if one.name == "request" else own
+            parameters += options if one.name == "request" else own
         called.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
         called.__annotations__ = {one.name: one.annotation for one in parameters}
         return called

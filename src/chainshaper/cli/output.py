@@ -84,6 +84,13 @@ def notes(lines: Iterable[str]) -> None:
         say(f"note: {line}")
 
 
+def warn(plan: "cs.Plan") -> None:
+    """What is doubtful about a plan, before it is used."""
+    from chainshaper.planning import plan_warnings
+
+    notes(plan_warnings(plan))
+
+
 @contextmanager
 def progress(title: str) -> Iterator[Progress]:
     """A progress bar on stderr; without a terminal one line per stage instead."""

@@ -20,7 +20,7 @@ from chainshaper.cli.options import (
     takes_wishes,
     wish,
 )
-from chainshaper.cli.output import notes, present, print_json, progress, show_line
+from chainshaper.cli.output import notes, present, print_json, progress, show_line, warn
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Fallback
 
@@ -61,7 +61,15 @@ def plan(
 
     From a recording, or from bare latencies with their period.
     """
-    from chainshaper.planning import plan_chains
+    from chainshaper.planning import (
+        band_choice,
+        plan_chains,
+        plan_json,
+        plan_warnings,
+        publish_slots,
+    )
+    from chainshaper.reporting.figures import draw_curve
+    from chainshaper.reporting.overviews import bands_table, choice_json, choice_table, plan_table
 
     if (recording is None) == (latencies is None):
         raise InputError("give either a recording or --latencies FILE --period DURATION")
@@ -70,13 +78,28 @@ def plan(
     wanted: list[str | None] = [*chain] if chain else [None]
     profiles = _profiles(recording, latencies, period, [*wanted, *(sink or [])])
     planned, sinks = profiles[: len(wanted)], profiles[len(wanted) :]
-    if len(planned) == 1:
-        made = cs.plan_chain(planned[0], request, sinks)
-        _print_one(made, planned[0], request, output, curve, json)
-    elif sinks or curve is not None:
-        raise InputError("--sink and --curve go with one chain: plan chains one by one")
-    else:
+    if len(planned) > 1:
+        if sinks or curve is not None:
+            raise InputError("--sink and --curve go with one chain: plan chains one by one")
         _place_and_print(plan_chains(planned, request), output, json)
+        return
+    made = cs.plan_chain(planned[0], request, sinks)
+    choice = band_choice(made, planned[0], request) if request.bands == "auto" else None
+    if output is not None:
+        cs.save_plan(made, output)
+    values: dict[str, Any] = {**plan_json(made), "warnings": plan_warnings(made)}
+    tables = [plan_table(made)]
+    if len(publish_slots(made)) > 1:
+        tables.append(bands_table(made))
+    if choice is not None:
+        values["choice"] = choice_json(choice)
+        tables.append(choice_table(choice))
+        if curve is not None:
+            draw_curve(choice, curve)
+    if present(json, values, *tables):
+        notes(values["warnings"])
+        for path in filter(None, (curve, output)):
+            show_line(path)
 
 
 def _profiles(
@@ -91,36 +114,6 @@ def _profiles(
     if len(chains) > 1:
         raise InputError("--latencies are those of one chain: give a recording for several")
     return (cs.Profile(read_latencies(latencies), period, spec=chains[0]),)
-
-
-def _print_one(
-    planned: "cs.Plan",
-    profile: "cs.Profile",
-    request: "cs.PlanRequest",
-    output: Path | None,
-    curve: Path | None,
-    json: bool,
-) -> None:
-    from chainshaper.planning import band_choice, plan_json, plan_warnings, publish_slots
-    from chainshaper.reporting.figures import draw_curve
-    from chainshaper.reporting.overviews import bands_table, choice_json, choice_table, plan_table
-
-    choice = band_choice(planned, profile, request) if request.bands == "auto" else None
-    if output is not None:
-        cs.save_plan(planned, output)
-    if curve is not None and choice is not None:
-        draw_curve(choice, curve)
-    values: dict[str, Any] = {**plan_json(planned), "warnings": plan_warnings(planned)}
-    tables = [plan_table(planned)]
-    if len(publish_slots(planned)) > 1:
-        tables.append(bands_table(planned))
-    if choice is not None:
-        values["choice"] = choice_json(choice)
-        tables.append(choice_table(choice))
-    if present(json, values, *tables):
-        notes(values["warnings"])
-        for path in filter(None, (curve, output)):
-            show_line(path)
 
 
 def offsets(
@@ -298,22 +291,16 @@ def splice(
     elif plan is None or not files:
         raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
     else:
+        planned = cs.load_plan(plan)
+        warn(planned)
         common |= {"message_type": message_type, "fallback": fallback}
-        splicing = _shaped(plan, recording, common)
+        known = _opened(recording or recording_of(planned))
+        splicing = cs.splice_launch_files(planned, recording=known, **common)
     setup = build_package(splicing.folder / NODES) if build and not dry_run else None
     if json:
         print_json(_splicing_json(splicing, setup))
         return
     _show_splicing(splicing, arguments, setup)
-
-
-def _shaped(plan: Path, recording: Path | None, common: dict[str, Any]) -> "cs.Splicing":
-    from chainshaper.planning import plan_warnings
-
-    planned = cs.load_plan(plan)
-    notes(plan_warnings(planned))
-    known = _opened(recording or recording_of(planned))
-    return cs.splice_launch_files(planned, recording=known, **common)
 
 
 def _throttled(inputs: list[str], recording: Path | None, common: dict[str, Any]) -> "cs.Splicing":

@@ -37,6 +37,7 @@ from chainshaper.cli.output import (
     show_line,
     stage_lines,
     stop_on_signals,
+    warn,
 )
 from chainshaper.cli.traces import comparison_tables
 from chainshaper.values.errors import InputError, OperationError
@@ -95,7 +96,7 @@ def demo(
             request=request,
             realtime=realtime,
             command=sys.argv,
-            planned=_warn,
+            planned=warn,
             progress=report,
         )
     tables = [callback_table(result.callbacks), plan_table(result.plan)]
@@ -103,13 +104,6 @@ def demo(
     if present(json, comparison_json(result.comparison) | {"folder": str(folder)}, *tables):
         notes(result.notes)
         show_line(folder.absolute())
-
-
-def _warn(plan: "cs.Plan") -> None:
-    """Say what is doubtful about a plan before it is used."""
-    from chainshaper.planning import plan_warnings
-
-    notes(plan_warnings(plan))
 
 
 def run(
@@ -370,7 +364,7 @@ def _shape_described(
     from chainshaper.verify.overruns import dropped_in, dropped_text, overruns_in, overruns_text
 
     described, planned = cs.load_application(application), cs.load_plan(plan)
-    _warn(planned)
+    warn(planned)
     with progress(f"shaping {described.name}") as report:
         recording = cs.shape_application(
             described,
@@ -399,7 +393,7 @@ def _shape_launched(command: list[str], folder: Path, json: bool, **how: Any) ->
             folder,
             choose=_ask if sys.stdin.isatty() and not json else None,
             stop=stop,
-            planned=_warn,
+            planned=warn,
             progress=stage_lines("shape"),
             **how,
         )

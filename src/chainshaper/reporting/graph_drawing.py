@@ -23,7 +23,7 @@ from dataclasses import dataclass, field, replace
 from graphlib import TopologicalSorter
 from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -350,16 +350,14 @@ def write_picture(
     return write_whole(path, [text.encode()])
 
 
-@dataclass(frozen=True)
-class Box:
+class Box(NamedTuple):
     """Something to place: its size."""
 
     width: float
     height: float
 
 
-@dataclass(frozen=True)
-class Edge:
+class Edge(NamedTuple):
     """An arrow between two boxes (their numbers), leaving and entering at heights inside them."""
 
     source: int
@@ -368,8 +366,7 @@ class Edge:
     enters: float
 
 
-@dataclass(frozen=True)
-class Layout:
+class Layout(NamedTuple):
     """Left upper corners of the boxes, way points of the edges, and the size of it all.
 
     An edge's way points lead from the right side of its source to the left side of its target.
