@@ -92,18 +92,6 @@ def test_people_get_a_table_and_notes(application: Running, tmp_path: Path) -> N
     assert f"note: process {actor.pid} is called /talker after its program" in finished.err
 
 
-def test_two_nodes_of_one_name_are_noted(tmp_path: Path) -> None:
-    arguments = ("--ros-args", "-r", "__node:=twin", "-r", "__ns:=/a")
-    (tmp_path / "other").mkdir()
-    with (
-        acting(tmp_path, *CYCLONE, arguments=arguments) as one,
-        acting(tmp_path / "other", *CYCLONE, arguments=arguments) as other,
-    ):
-        notes = json_of("threads")["notes"]
-    pids = ", ".join(str(pid) for pid in sorted((one.pid, other.pid)))
-    assert any(f"node /a/twin is ambiguous: processes {pids}" in note for note in notes)
-
-
 def test_a_recording_tells_nodes_and_executors(tmp_path: Path) -> None:
     """A container with an executor of several threads, whose names say nothing."""
     with acting(tmp_path, *CYCLONE, "w1", "w2", "w3", program="container") as actor:

@@ -7,7 +7,6 @@ import json
 import random
 import shutil
 from collections.abc import Callable
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -95,20 +94,6 @@ def test_the_binding_constraint_is_named(
     assert message in refused(code, *common, "--grid", "1us", "--publish-slot", "3us", *options)
 
 
-def test_the_solvers_and_their_seeds(common: Words, file: Path) -> None:
-    _triangular(file)
-    common += ["--bands", "3"]
-    exact = json_of(*common)["predicted"]["mean_ns"]
-    drawn = [json_of(*common, "--solver", "random", "--seed", seed) for seed in ("1", "1", "2")]
-    assert drawn[0]["bands_ns"] == drawn[1]["bands_ns"] != drawn[2]["bands_ns"]
-    assert all(values["predicted"]["mean_ns"] >= exact for values in drawn)
-    if find_spec("pyswarms") is None:
-        pytest.skip("pyswarms is not installed")
-    swarm = [json_of(*common, "--solver", "pso", "--seed", "3") for _ in range(2)]
-    assert swarm[0]["bands_ns"] == swarm[1]["bands_ns"]
-    assert swarm[0]["predicted"]["mean_ns"] >= exact
-
-
 def test_each_band_has_its_share_and_jitter(common: Words) -> None:
     bands = json_of(*common, "--bands", "3")["predicted_bands"]
     assert [(band["share"], band["jitter_ns"]) for band in bands] == [
@@ -185,23 +170,6 @@ def test_slots_do_not_depend_on_who_publishes(policy: str, common: Words) -> Non
     assert json_of(*common, "asynchronous") == json_of(*common, "synchronous")
 
 
-def test_a_margin_is_derived_or_refused(common: Words, file: Path) -> None:
-    common += ["--overrun-probability", "1e-5"]
-    generator = random.Random(6)
-    drawn = [f"{60 + sum(generator.random() for _ in range(12)):.6f}ms\n" for _ in range(2000)]
-    file.write_text("".join(drawn))
-    values = json_of(*common)
-    margin = values["margin"]
-    assert (margin["source"], margin["overrun_probability"]) == ("derived", 1e-5)
-    low, high = margin["confidence_interval_ns"]
-    assert low <= margin["epsilon_ns"] <= high
-    assert any("is an estimate" in warning for warning in values["warnings"])
-    file.write_text("".join(drawn[:300]))
-    assert "300 latencies are too few" in refused(1, *common)
-    file.write_text("".join(sorted(drawn)))
-    assert "not stationary" in refused(1, *common)
-
-
 @pytest.mark.parametrize(
     ("policy", "servers"),
     [
@@ -248,22 +216,6 @@ def test_chains_take_turns_where_they_can(saved: Callable[..., Path], tmp_path: 
     assert "exists already and is not overwritten" in again
 
 
-def test_chains_that_overlap_have_their_publish_slots_apart(saved: Callable[..., Path]) -> None:
-    # [61, 62) and [71, 72) of one cycle are apart as they are; two equal chains are not.
-    files = [saved(name, 60) for name in ("a", "b")]
-    values = json_of("offsets", *files)
-    first, second = values["plans"]
-    assert second["offset_ns"] % (100 * MS) in range(MS, 99 * MS + 1)
-    assert [plan["servers"][0]["priority"] for plan in (first, second)] == [2, 3]
-    assert any("only their publish slots are kept apart" in text for text in values["warnings"])
-    assert "only their publish slots" in called("offsets", *files).err
-
-
-def test_impossible_offsets_are_explained(saved: Callable[..., Path]) -> None:
-    files = [saved("a", 6, 20), saved("b", 7, 21)]
-    assert "collide at every offset" in refused(1, "offsets", *files)
-
-
 def test_an_offset_is_refused_where_the_chains_timer_starts_its_cycles(
     application_file: Path, plan: Plan
 ) -> None:
@@ -291,15 +243,6 @@ def test_several_chains_of_a_recording_and_a_further_sink(tmp_path: Path) -> Non
     assert [node["output"] for node in values["further_shaping_nodes"]] == ["/map"]
     twice = refused(2, "plan", recording, "--sink", "/scan../command")
     assert "both publish /command" in twice
-
-
-def test_what_would_be_planned_wrong_is_refused(unshaped: Recording, tmp_path: Path) -> None:
-    folder = tmp_path / "plans"
-    chains = ("--chain", "/t1../t3", "--chain", "/t1../t2")
-    for wanted in (chains, ("--sink", "/t1../t2")):
-        said = refused(2, "plan", unshaped.path, *wanted, "-o", folder, "--publish-slot", "100us")
-        assert "/t1../t3 waits for /t2, which the plan for /t1../t2" in said
-        assert not folder.exists()
 
 
 def test_a_plan_says_that_events_were_lost(unshaped: Recording, tmp_path: Path) -> None:
