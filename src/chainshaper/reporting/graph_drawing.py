@@ -1,6 +1,6 @@
 """The application graph: as plain data, as a table, and as a picture (SVG, or DOT for Graphviz).
 
-Nodes are boxes of callbacks, with topics between them. Arrows run from the callback that publishes
+Nodes are boxes of callbacks, with topics between them; arrows run from the callback that publishes
 a topic to the callbacks that it triggers. A dashed arrow is a message that one callback reads and
 another callback of the node publishes for it (synchronisers, stored messages). An arrow at a node's
 title stands for publications outside its callbacks, or for subscriptions without callback events.
@@ -8,12 +8,10 @@ What every node has for itself (parameter services, /rosout, /parameter_events) 
 tables and pictures unless asked for; in JSON it is marked.
 
 The layout is that of Sugiyama, Tagawa and Toda (1981): edges that close cycles are turned around;
-every box gets a layer (a column), as far left as its predecessors permit; boxes of a column are
-sorted so that few edges cross (barycentres, swept back and forth); heights are chosen so that edges
-run straight, exactly for one column given its neighbours: least squares under the order and the
-gaps between boxes, which is isotonic regression (pool adjacent violators). Edges over several
-columns pass them through places of their own, so that no arrow crosses a box. Parts that are not
-connected are laid out one below the other.
+every box gets a column, as far left as its predecessors permit; columns are sorted so that few
+edges cross (barycentres, swept back and forth); heights are least squares under the order and the
+gaps of a column (isotonic regression), so that edges run straight. Edges over several columns pass
+them through places of their own. Parts that are not connected are laid out one below the other.
 """
 
 import json
