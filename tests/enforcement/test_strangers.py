@@ -19,9 +19,8 @@ from strangers import NOBODY, named, needs_root, open_folder, strange
 from chainshaper import find_threads
 from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow import apply as applying
-from chainshaper.linux.processes import read_process
+from chainshaper.linux.processes import read_process, run_users, user_of
 from chainshaper.linux.threads import has_ended, list_threads, start_of
-from chainshaper.linux.users import run_users, user_of
 from chainshaper.planning import Plan, save_plan
 from chainshaper.sources.ros import interpreter
 from chainshaper.sources.ros.interpreter import environment_of, own_environment, start_with_rclpy

@@ -116,9 +116,9 @@ def test_a_name_with_brackets_and_spaces_does_not_confuse(tmp_path: Path) -> Non
 
 
 def test_in_a_container_a_thread_has_an_id_of_its_own() -> None:
-    assert innermost_id("Name:\tx\nNSpid:\t4711\t12\t3\n") == 3
-    assert innermost_id("Name:\tx\nNSpid:\t4711\n") == 4711
-    assert innermost_id("Name:\tx\n") is None  # a kernel without pid namespaces
+    assert innermost_id(b"Name:\tx\nNSpid:\t4711\t12\t3\n") == 3
+    assert innermost_id(b"Name:\tx\nNSpid:\t4711\n") == 4711
+    assert innermost_id(b"Name:\tx\n") is None  # a kernel without pid namespaces
 
 
 def _thread(tid: int) -> Thread:

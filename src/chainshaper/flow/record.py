@@ -36,11 +36,11 @@ from chainshaper.linux.processes import (
     descendants,
     find_applications,
     list_processes,
+    run_users,
 )
 from chainshaper.linux.runs import Governed, governing, in_force_throughout
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import parents
-from chainshaper.linux.users import run_users
 from chainshaper.planning import Plan
 from chainshaper.sources import Tracer
 from chainshaper.sources.gate_log import releases_so_far, with_gate_logs

@@ -2,10 +2,11 @@
 
 Writing ``1`` to a group's ``cgroup.freeze`` stops every thread in it on its way back to user
 space, and ``0`` lets them go on. A **threaded** group may have some threads of a process while the
-others stay where they are, on one condition: all groups that share a process lie in one *threaded
-domain* (kernel: Documentation/admin-guide/cgroup-v2.rst, "Threads"). So a thread's new group is
-made directly beneath the group in which the thread is now: it keeps every limit, and the way back
-is always up to the parent. Until the child is removed the parent's type reads ``domain threaded``.
+others stay where they are, if all groups that share a process lie in one *threaded domain*. So a
+thread's new group is made directly beneath the group in which the thread is now: it keeps every
+limit, and the way back is always up to the parent, whose type reads ``domain threaded`` meanwhile.
+
+Upstream: Documentation/admin-guide/cgroup-v2.rst of the kernel, "Threads" and "Mounting".
 """
 
 import contextlib
@@ -19,17 +20,16 @@ from chainshaper.values.errors import OperationError, PlatformError
 
 MOUNTS = Path("/proc/mounts")
 QUICK_MOVES = "favordynmods"
-"""A mount option since Linux 6.0 (Documentation/admin-guide/cgroup-v2.rst, "Mounting").
+"""A mount option since Linux 6.0.
 
 Without it whoever moves a process to another group (a service manager, a container engine) waits
-for a grace period of RCU, which is 10 to 30 ms, and holds meanwhile what freezing needs as well:
-a slot opens so much later. Forks and exits become a little slower with it.
+for a grace period of RCU, 10 to 30 ms, and blocks freezing meanwhile: a slot opens so much later.
+Forks and exits become a little slower with it.
 """
 _BEFORE = "trusted.chainshaper.mount"
 """Attribute of the hierarchy's root: its mount options before a run of ours changed them.
 
-A journal says the same, but may be lost, and the option then looks like another program's. The
-attribute is in the kernel's memory, as the option is, so it lasts as long.
+A journal says the same, but may be lost; the attribute is in the kernel's memory, as the option is.
 """
 _REMOUNT = 32
 _MOUNT_FLAGS = {
@@ -61,6 +61,19 @@ def mount_options() -> str:
     return _mount()[1]
 
 
+def _mount() -> tuple[Path, str]:
+    # Beside version 1 hierarchies it usually stands at /sys/fs/cgroup/unified.
+    for line in MOUNTS.read_text().splitlines():
+        _, folder, kind, options, *_ = line.split()
+        if kind == "cgroup2":
+            return Path(folder.encode().decode("unicode_escape")), options
+    raise PlatformError(
+        "no cgroup v2 hierarchy is mounted here, so threads cannot be frozen: "
+        "`mount -t cgroup2 none /sys/fs/cgroup/unified`, or boot with "
+        "systemd.unified_cgroup_hierarchy=1"
+    )
+
+
 def moves_are_quick() -> bool:
     """Whether the hierarchy is mounted with :data:`QUICK_MOVES`."""
     return QUICK_MOVES in mount_options().split(",")
@@ -81,8 +94,11 @@ def options_before_ours() -> str | None:
     Those of now; where a run of ours has set :data:`QUICK_MOVES` and not restored yet, those that
     it found. None: another program has set it, so it stays.
     """
-    options = mount_options()
-    return options if QUICK_MOVES not in options.split(",") else _noted_options()
+    if not moves_are_quick():
+        return mount_options()
+    with contextlib.suppress(OSError):
+        return os.getxattr(mount_point(), _BEFORE).decode()
+    return None
 
 
 def make_moves_quick(before: str) -> None:
@@ -98,25 +114,6 @@ def restore_mount(before: str) -> None:
         remount(before)
     with contextlib.suppress(OSError):  # it is gone already
         os.removexattr(mount_point(), _BEFORE)
-
-
-def _noted_options() -> str | None:
-    with contextlib.suppress(OSError):
-        return os.getxattr(mount_point(), _BEFORE).decode()
-    return None
-
-
-def _mount() -> tuple[Path, str]:
-    # Beside version 1 hierarchies it usually stands at /sys/fs/cgroup/unified.
-    for line in MOUNTS.read_text().splitlines():
-        _, folder, kind, options, *_ = line.split()
-        if kind == "cgroup2":
-            return Path(folder.encode().decode("unicode_escape")), options
-    raise PlatformError(
-        "no cgroup v2 hierarchy is mounted here, so threads cannot be frozen: "
-        "`mount -t cgroup2 none /sys/fs/cgroup/unified`, or boot with "
-        "systemd.unified_cgroup_hierarchy=1"
-    )
 
 
 def cgroup_of(tid: int) -> Path:
@@ -156,34 +153,37 @@ def make_threaded_child(parent: Path, name: str) -> Path:
             "`chainshaper release` removes it"
         ) from None
     except OSError as error:
-        reason = os.strerror(error.errno or 0)
-        raise PlatformError(f"no cgroup can be made in {parent} ({reason}): {_REMEDY}") from error
+        raise PlatformError(
+            f"no cgroup can be made in {parent} ({error.strerror}): {_REMEDY}"
+        ) from error
     try:
         (folder / "cgroup.type").write_text("threaded")
     except OSError as error:
         folder.rmdir()
-        raise PlatformError(_why_not_threaded(parent, error)) from error
+        raise PlatformError(
+            f"threads of the cgroup {parent} cannot be frozen one by one"
+            f"{_obstacle(parent) or f' ({error.strerror}): {_REMEDY}'}"
+        ) from error
     return folder
 
 
-def _why_not_threaded(parent: Path, error: OSError) -> str:
+def _obstacle(parent: Path) -> str | None:
     """What stands in the way of threaded groups: the kernel only says EOPNOTSUPP."""
-    begin = f"threads of the cgroup {parent} cannot be frozen one by one"
     controllers = set(_read(parent / "cgroup.subtree_control").split()) - _THREADED_CONTROLLERS
     if controllers:
-        names = ", ".join(sorted(controllers))
         return (
-            f"{begin}: it hands the controllers {names} down to its children, which rules threaded "
-            f"groups out; run the application in a group that does not (its own scope or unit)"
+            f": it hands the controllers {', '.join(sorted(controllers))} down to its children, "
+            "which rules threaded groups out; run the application in a group that does not (its "
+            "own scope or unit)"
         )
     for child in sorted(parent.iterdir()):
         kind = _read(child / "cgroup.type").strip()
         if kind == "domain" and "populated 1" in _read(child / "cgroup.events"):
             return (
-                f"{begin}: its child {child.name} holds processes of its own; run the application "
-                f"in a group without others beneath it (its own scope or unit)"
+                f": its child {child.name} holds processes of its own; run the application in a "
+                "group without others beneath it (its own scope or unit)"
             )
-    return f"{begin} ({os.strerror(error.errno or 0)}): {_REMEDY}"
+    return None
 
 
 def move_thread(tid: int, folder: Path) -> bool:
@@ -194,17 +194,15 @@ def move_thread(tid: int, folder: Path) -> bool:
     """
     try:
         (folder / "cgroup.threads").write_text(str(tid))
+    except ProcessLookupError:
+        return False
     except OSError as error:
-        if error.errno == errno.ESRCH:
-            return False
-        reason = os.strerror(error.errno or 0)
+        refused = f"thread {tid} cannot be moved to the cgroup {folder} ({error.strerror})"
         if error.errno in {errno.EACCES, errno.EPERM, errno.EROFS}:
-            raise PlatformError(
-                f"thread {tid} cannot be moved to {folder} ({reason}): {_REMEDY}"
-            ) from error
+            raise PlatformError(f"{refused}: {_REMEDY}") from error
         raise OperationError(
-            f"thread {tid} cannot be moved to the cgroup {folder} ({reason}): is it a thread of "
-            "the kernel, or has its process been moved to another group meanwhile?"
+            f"{refused}: is it a thread of the kernel, or has its process been moved to another "
+            "group meanwhile?"
         ) from error
     return True
 

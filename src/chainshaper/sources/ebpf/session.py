@@ -29,7 +29,7 @@ from chainshaper.linux.own_processes import is_installed, tool_environment
 from chainshaper.linux.processes import descendants
 from chainshaper.linux.scheduling import signalled_with_parent
 from chainshaper.linux.threads import parents
-from chainshaper.linux.users import run_users, user_name, user_of
+from chainshaper.linux.processes import run_users, user_name, user_of
 from chainshaper.sources.ebpf.callback_functions import callback_functions
 from chainshaper.sources.ebpf.late_attachment import ADDED, with_found_objects, with_functions
 from chainshaper.sources.ebpf.printing import (

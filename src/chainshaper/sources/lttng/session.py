@@ -33,7 +33,7 @@ import polars as pl
 
 from chainshaper.linux.processes import descendants
 from chainshaper.linux.threads import parents, read_proc
-from chainshaper.linux.users import process_folder, run_users, user_in
+from chainshaper.linux.processes import process_folder, run_users, user_in
 from chainshaper.sources.lttng.daemon import Lttng, connect
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError
