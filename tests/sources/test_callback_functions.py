@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper.sources.ebpf.callback_functions import callback_functions, demangled, type_argument
+from chainshaper.sources.ebpf.functions import callback_functions, demangled, type_argument
 
 SOURCE = Path(__file__).with_name("callbacks.cpp")
 BOUND = "std::_Bind<void (Relay::*(Relay*"

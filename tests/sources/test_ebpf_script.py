@@ -10,23 +10,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from traced_program import build, skip_without_bpftrace
 
-from chainshaper.sources.ebpf.printing import (
+from chainshaper.sources.ebpf.session import lost_events
+from chainshaper.sources.ebpf.trace_points import (
     FIRST_POINT,
+    FUNCTION_PREFIX,
     HEADER,
     NAME_PLACE,
     RMW_PLACE,
     TEXT_BYTES,
     TEXT_CODE,
     TEXT_LINES,
-    bpftrace_script,
-    lost_events,
-    read_printed,
-)
-from chainshaper.sources.ebpf.trace_points import (
-    FUNCTION_PREFIX,
     TracePoint,
     TracingLibrary,
+    bpftrace_script,
     installed_libraries,
+    read_printed,
     trace_points,
 )
 from chainshaper.values import events

@@ -9,8 +9,8 @@ import pytest
 from traced_program import build
 
 from chainshaper.sources.ebpf import trace_points as tracing_libraries
+from chainshaper.sources.ebpf.functions import exported_functions
 from chainshaper.sources.ebpf.trace_points import (
-    exported_functions,
     installed_libraries,
     mapped_libraries,
 )

@@ -35,9 +35,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from chainshaper.linux.processes import process_folder, user_in, user_name
 from chainshaper.linux.scheduling import signalled_with_parent
 from chainshaper.linux.threads import read_proc
-from chainshaper.linux.processes import process_folder, user_in, user_name
 from chainshaper.sources.ros import script as ros_script
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import EndpointInfo
