@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper.sources.ros import script
-from chainshaper.sources.ros.interpreter import Environment, run_with_rclpy
+from chainshaper.sources.ros import Environment, run_with_rclpy, script
 
 RCLPY = '''
 """As much of rclpy (Jazzy) as is used; SERVERS of the node's service are there."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper.sources.ros.interpreter import Environment, ask_graph, environment_of
+from chainshaper.sources.ros import Environment, ask_graph, environment_of
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import EndpointInfo
 

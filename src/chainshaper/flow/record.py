@@ -44,7 +44,7 @@ from chainshaper.linux.threads import parents
 from chainshaper.planning import Plan
 from chainshaper.sources import Tracer
 from chainshaper.sources.gate_log import releases_so_far, with_gate_logs
-from chainshaper.sources.ros.interpreter import Environment, ask_graph, environment_of
+from chainshaper.sources.ros import Environment, ask_graph, environment_of
 from chainshaper.values import events
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
