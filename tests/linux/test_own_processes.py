@@ -271,10 +271,7 @@ def test_a_command_gets_a_sigint_when_we_are_killed(tmp_path: Path) -> None:
         f"start_command(['sh', '-c', {script!r}])\n"
         "time.sleep(60)"
     )
-    owner = subprocess.Popen(
-        [sys.executable, "-c", program],
-        stdout=subprocess.PIPE,
-    )
+    owner = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE)
     assert owner.stdout is not None
     assert owner.stdout.readline() == b"ready\n"
     owner.kill()

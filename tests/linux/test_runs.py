@@ -304,9 +304,5 @@ def test_applied_and_released_in_the_midst_of_a_recording(tmp_path: Path) -> Non
 
 def _asynchronous_plan() -> Plan:
     return small_chain_plan(
-        4 * MS,
-        24 * MS,
-        publication="asynchronous",
-        publish_slot_ns=10 * MS,
-        core=EXECUTOR_CORE,
+        4 * MS, 24 * MS, publication="asynchronous", publish_slot_ns=10 * MS, core=EXECUTOR_CORE
     )

@@ -10,10 +10,7 @@ from traced_program import build
 
 from chainshaper.sources.ebpf import trace_points as tracing_libraries
 from chainshaper.sources.ebpf.functions import exported_functions
-from chainshaper.sources.ebpf.trace_points import (
-    installed_libraries,
-    mapped_libraries,
-)
+from chainshaper.sources.ebpf.trace_points import installed_libraries, mapped_libraries
 
 
 def test_exported_functions_are_those_that_nm_shows(tmp_path: Path) -> None:

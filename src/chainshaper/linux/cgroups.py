@@ -1,10 +1,9 @@
 """Control groups of version 2, as far as stopping single threads needs them.
 
 Writing ``1`` to a group's ``cgroup.freeze`` stops every thread in it on its way back to user
-space, and ``0`` lets them go on. A **threaded** group may have some threads of a process while the
-others stay where they are, if all groups that share a process lie in one *threaded domain*. So a
-thread's new group is made directly beneath the group in which the thread is now: it keeps every
-limit, and the way back is always up to the parent, whose type reads ``domain threaded`` meanwhile.
+space. A **threaded** group may have some threads of a process while the others stay, if all groups
+that share a process lie in one *threaded domain*. So a thread's new group is made directly beneath
+its present one: it keeps every limit, and the way back is always up to the parent.
 
 Upstream: Documentation/admin-guide/cgroup-v2.rst of the kernel, "Threads" and "Mounting".
 """
@@ -91,8 +90,7 @@ def remount(options: str) -> None:
 def options_before_ours() -> str | None:
     """The mount options that a run which begins now has to restore when it ends.
 
-    Those of now; where a run of ours has set :data:`QUICK_MOVES` and not restored yet, those that
-    it found. None: another program has set it, so it stays.
+    Those that a run of ours found, which has not restored them yet. None: another program's stay.
     """
     if not moves_are_quick():
         return mount_options()
@@ -117,10 +115,9 @@ def restore_mount(before: str) -> None:
 
 
 def cgroup_of(tid: int) -> Path:
-    """The folder of the group in which a thread is.
+    """The folder of a thread's group. Raises OperationError: there is no such thread.
 
-    Raises OperationError: there is no such thread. PlatformError: its group cannot be seen from
-    here.
+    PlatformError: its group cannot be seen from here.
     """
     try:
         lines = Path(f"/proc/{tid}/cgroup").read_text().splitlines()
@@ -141,8 +138,7 @@ def cgroup_of(tid: int) -> Path:
 def make_threaded_child(parent: Path, name: str) -> Path:
     """Make an empty threaded group directly beneath the group of the threads it is for.
 
-    Raises OperationError: the name is taken. PlatformError: the machine or the privileges do not
-    allow it; nothing is left behind.
+    Raises OperationError: the name is taken. PlatformError: machine or privileges do not allow it.
     """
     folder = parent / name
     try:
@@ -220,8 +216,7 @@ def has_unseen_threads(folder: Path) -> bool:
 def dissolve(folder: Path, within_s: float = 1.0) -> str | None:
     """Thaw a group, put its threads back into the parent, remove it; harmless when repeated.
 
-    Returns None, or what is left in a sentence: this is called where nothing must be raised,
-    since the next group waits for its turn.
+    Returns None, or what is left in a sentence: nothing is raised.
     """
     with contextlib.suppress(OSError):
         (folder / "cgroup.freeze").write_text("0")
@@ -251,9 +246,7 @@ def dissolve(folder: Path, within_s: float = 1.0) -> str | None:
 def enter_own_group(name: str) -> bool:
     """Put this process into a group of that name, out of reach of what befalls its present one.
 
-    That is directly beneath the root of the hierarchy, or as near to it as we may; not beneath a
-    group with processes, which could have no threaded children then. False where it has to stay
-    where it is, as in a container: what ends the container ends it, too.
+    False where it has to stay, as in a container: what ends the container ends it, too.
     """
     for folder in _own_groups(name):
         for _ in range(_ATTEMPTS):  # the last to leave may just be removing it
@@ -285,7 +278,10 @@ def remove_own_group(name: str) -> None:
 
 
 def _own_groups(name: str) -> list[Path]:
-    """Where a group of ours may be that is not in reach of our present one, the best first."""
+    """Where a group of ours may be that is not in reach of our present one, the best first.
+
+    Not beneath a group with processes, which could have no threaded children then.
+    """
     try:
         root, own = mount_point(), cgroup_of(os.getpid())
     except (OperationError, PlatformError):

@@ -1,12 +1,11 @@
 """Processes that we start, ours and the user's: how they start, how they end.
 
 A process of ours often has more rights than whoever fills the folder that it is started in. So its
-Python is isolated (``-I``). Of what this drops, it gets back by its place, and only if root and we
-alone can change it: our package, and behind all other folders those of the libraries that it needs.
+Python is isolated (``-I``), and gets back, only if root and we alone can change it, our
+package, and behind all other folders those of the libraries that it needs.
 
 The user's command, such as `ros2 launch …`, gets a session of its own: Ctrl-C then reaches us
-alone. It ends by SIGINT to its whole process group, which `ros2 launch` and every node understand
-as the order to shut down; then by SIGTERM, then by SIGKILL.
+alone. It ends by SIGINT to its whole process group, then by SIGTERM, then by SIGKILL.
 """
 
 import contextlib
@@ -47,10 +46,9 @@ _START = (
 
 
 def module_command(module: str, libraries: Sequence[str] = ()) -> list[str]:
-    """How a module runs as a process of ours; its arguments go behind.
+    """How a module runs as a process of ours, with ``libraries`` found where this process does.
 
-    ``libraries`` are found where this process finds them. Raises OperationError: others may change
-    the package, and an isolated Python has no other.
+    Raises OperationError: others may change the package, and an isolated Python has no other.
     """
     own = (*site.getsitepackages(), str(Path(os.__file__).parent))  # where it looks anyway
     package, reason = str(_PACKAGE / "__init__.py"), why_distrusted(_PACKAGE)
@@ -88,10 +86,7 @@ def is_installed(tool: str) -> bool:
 
 
 def check_command(command: Sequence[str]) -> None:
-    """See that a command can be started, before anything is done for it.
-
-    Raises InputError: there is no such program, or it may not be executed.
-    """
+    """See that a command can be started. Raises InputError: no such program, or not executable."""
     if shutil.which(command[0]) is not None:
         return
     if Path(command[0]).is_file() and os.sep in command[0]:
@@ -103,14 +98,12 @@ def check_command(command: Sequence[str]) -> None:
 
 
 def start_command(
-    command: Sequence[str],
-    environment: Mapping[str, str] | None = None,
-    stdout: int | None = None,
+    command: Sequence[str], environment: Mapping[str, str] | None = None, stdout: int | None = None
 ) -> subprocess.Popen[bytes]:
     """Start the command with ``environment`` added to ours, printing to the descriptor ``stdout``.
 
-    Should we be killed, it gets a SIGINT as from its terminal. Raises InputError: see
-    :func:`check_command`. OperationError: the kernel refuses to run it.
+    Should we be killed, it gets a SIGINT. Raises InputError: as :func:`check_command`.
+    OperationError: the kernel refuses to run it.
     """
     check_command(command)
     try:

@@ -2,16 +2,13 @@
 
 A process takes part in DDS when it has a thread that receives or one for timed events, by the names
 of a DDS implementation; where those do not name theirs (Fast DDS before 2.13), a mapped library
-together with further threads has to do. That distinguishes a node from what only carries its
-command line: `ros2 run`, `gdb --args`, or a forked helper.
+together with further threads has to do. What only carries a node's command line has neither.
 
-Every user of the machine can start a process that looks like a node, so a run names users. A
-process is a user's when that user both runs it, by all four of its user ids, and has started its
+A process is a user's when that user both runs it, by all four of its user ids, and has started its
 program: `sudo`, `su` and every other set-user-ID program carry the command line and the environment
 of another user than the one they run as. Root may start programs for all.
 
-Upstream: proc(5), credentials(7), getauxval(3), user_namespaces(7); rcl, `arguments.c` and
-`remap.c`, whose tests say which remap rules are valid.
+Upstream: proc(5), credentials(7), getauxval(3); rcl, `arguments.c` and `remap.c`.
 """
 
 import os
@@ -53,8 +50,7 @@ _LIBRARIES_WITHOUT_NAMED_THREADS = (
 def run_users(named: Collection[str | int] = ()) -> frozenset[int]:
     """The ids of users whose processes a run takes, by their names or numbers.
 
-    By default: who has launched us, also by way of `sudo`, and root. Raises InputError: there is no
-    such user.
+    By default who has launched us, also by `sudo`, and root. Raises InputError: no such user.
     """
     if named:
         return frozenset(_user_id(one) for one in named)
@@ -233,11 +229,7 @@ def named_nodes(command: Sequence[str]) -> tuple[str, ...]:
 
 
 def _rules(command: Sequence[str]) -> Iterator[tuple[str | None, str, str]]:
-    """Valid rules about names: node they are for or None, and its name or (other: empty) namespace.
-
-    What is quoted for a shell is one argument here, so a parameter's value that looks like a rule
-    is not taken for one.
-    """
+    """Valid rules about names: whose (None: all nodes'), and a name, or else a namespace."""
     arguments = iter(command)
     for argument in arguments:
         if argument != "--ros-args":

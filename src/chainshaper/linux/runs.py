@@ -2,11 +2,9 @@
 
 A run has a folder, `/run/chainshaper/RUN` for root, below `$XDG_RUNTIME_DIR` for others, gone when
 the machine boots again, as is all that was changed. In it are `journal.jsonl`, `run.json`, which
-the run writes anew every second for whoever wants to look, and `plan.json`.
-
-Whatever ends us, SIGKILL included, another process must be able to put things back. So each change
-is one line of JSON, which is on the disk (`fsync`) before the change is made. Each kind of change
-is undone by the module that made it; this one writes and reads the lines.
+the run writes anew every second, and `plan.json`. Whatever ends us, SIGKILL included, another
+process must be able to put things back: each change is one line of JSON, on the disk (`fsync`)
+before it is made, and undone by the module that made it.
 """
 
 import contextlib
@@ -50,8 +48,7 @@ class Journal:
     def note_all(self, kind: str, changes: Iterable[Mapping[str, Any]]) -> None:
         """Write down changes that are about to be made: plain data that says how to undo each.
 
-        They are on the disk together (one `fsync`), so that many threads take no longer than one.
-        Raises OperationError: they cannot be written; then no change must be made.
+        One `fsync` for all. Raises OperationError: they cannot be written; make no change then.
         """
         lines = b"".join(json.dumps({"kind": kind, **one}).encode() + b"\n" for one in changes)
         try:
@@ -76,8 +73,7 @@ class Journal:
     def entries(self, kind: str | None = None) -> tuple[Mapping[str, Any], ...]:
         """All that was noted, oldest first; a ``kind`` alone if one is given.
 
-        Left out are a last line that a crash cut off (what it speaks of was never done), and lines
-        that are not a journal's. Raises OperationError: the file cannot be read.
+        What a crash cut off was never done, and is left out. Raises OperationError: unreadable.
         """
         entries = (_entry(line) for line in self._lines())
         return tuple(one for one in entries if one and kind in (None, one["kind"]))
@@ -281,8 +277,7 @@ def boot_id() -> str:
 def locked(folder: Path, waiting: Callable[[float], None]) -> Iterator[None]:
     """Inside, no other process has this folder locked.
 
-    ``waiting`` is called with the seconds waited so far, again and again; it may raise. Raises
-    OSError: there is no such folder, or it may not be opened.
+    ``waiting`` is called with the seconds waited so far, again and again; it may raise.
     """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -312,10 +307,9 @@ def holder_of(folder: Path) -> int | None:
 
 @dataclass(frozen=True)
 class Governed:
-    """A run that governs processes, as it was seen last (ns of CLOCK_MONOTONIC).
+    """A run that governs processes, as it was seen last, at ``seen_ns`` (CLOCK_MONOTONIC).
 
-    In force from ``since_ns`` on, where its first whole cycle starts, and seen so at ``seen_ns``;
-    ``until_ns`` is when it ended (None: it has not been seen to).
+    In force from its first whole cycle on; ``until_ns``: when it ended (None: not seen to).
     """
 
     run: str
@@ -331,10 +325,9 @@ def governing(
     before: Collection[Governed] = (),
     folder: Path | None = None,
 ) -> tuple[Governed, ...]:
-    """The runs that govern threads of these processes, those of an earlier look included.
+    """The runs that govern threads of these processes, those seen ``before`` included.
 
-    To be asked now and then, since a run that is over leaves nothing behind: one that has gone is
-    over since the last look. ``folder`` is where runs have their folders.
+    To be asked now and then: a run that has gone is over since the last look.
     """
     found = {one.run: one for one in before}
     living = set()

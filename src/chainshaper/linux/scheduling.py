@@ -1,9 +1,7 @@
 """How threads are scheduled: what this process may have, and setting and restoring any thread's.
 
-A thread's scheduling has three **aspects**, which the kernel stores and changes apart from each
-other: its class (policy, priority and the flag that children start without it), its nice value,
-and its cores. SCHED_FIFO needs CAP_SYS_NICE or an RLIMIT_RTPRIO, locked memory CAP_IPC_LOCK or an
-RLIMIT_MEMLOCK.
+A thread's scheduling has three **aspects**, which the kernel changes apart from each other: its
+class (policy, priority and the flag that children start without it), its nice value, its cores.
 """
 
 import ctypes
@@ -32,8 +30,7 @@ _THROTTLE = "/proc/sys/kernel/sched_rt_{}_us"
 class Scheduling:
     """What a thread should get; what is None is left alone.
 
-    ``priority`` is that of SCHED_FIFO or, with ``takes_turns``, of SCHED_RR, under which threads
-    of one priority share their time; 0 is an ordinary thread's, of SCHED_OTHER.
+    ``priority`` is that of SCHED_FIFO or, with ``takes_turns``, of SCHED_RR; 0 of SCHED_OTHER.
     """
 
     priority: int | None
@@ -167,10 +164,7 @@ def available_cores() -> tuple[int, ...]:
 
 
 def check_cores(cores: dict[int, str]) -> None:
-    """Refuse cores that this machine or process does not have.
-
-    ``cores`` maps each core to what asked for it. Raises PlatformError: a core is not available.
-    """
+    """Refuse cores (→ what asked for them) that are not available. Raises PlatformError."""
     available = available_cores()
     for core in sorted(cores.keys() - set(available)):
         raise PlatformError(

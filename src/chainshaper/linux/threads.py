@@ -1,11 +1,9 @@
 """Threads as the kernel shows them, and what their names say.
 
-A thread is identified by its id *and* the time at which it started: ids are used again. Cyclone DDS
-has always named its threads, Fast DDS does from 2.13 on (ROS 2 Jazzy); before that they carry the
-name of their process.
+A thread is identified by its id *and* its start: ids are used again. Cyclone DDS has always named
+its threads, Fast DDS does from 2.13 on (ROS 2 Jazzy); others carry the name of their process.
 
-Upstream: proc(5); Cyclone DDS, `check_thread_properties` in `ddsi_init.c`, and the names given to
-`ddsi_create_thread`; Fast DDS documentation, "Concurrency and multithreading".
+Upstream: proc(5); Cyclone DDS, `ddsi_create_thread`; Fast DDS, "Concurrency and multithreading".
 """
 
 import functools
@@ -81,8 +79,7 @@ def dds_kind(comm: str) -> DdsKind | None:
 def role_of(comm: str, is_main: bool) -> ThreadRole:
     """The role of a thread of a node's process, as far as its name shows.
 
-    Executors spin on the main thread unless a program arranges it otherwise, and no program
-    renames its main thread to a DDS thread's name.
+    Executors spin on the main thread, unless a program arranges it otherwise.
     """
     if is_main:
         return "executor"
@@ -181,10 +178,7 @@ def parents() -> dict[int, int]:
 
 
 def read_proc(path: str, folder: int | None = None) -> bytes:
-    """A whole file of /proc; ``folder`` is an open one that ``path`` begins in.
-
-    Raises OSError: what it is about has ended, or belongs to another user.
-    """
+    """A whole file of /proc, or of an open ``folder`` in it. Raises OSError: gone, or forbidden."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC, dir_fd=folder)
     with os.fdopen(descriptor, "rb", buffering=0) as file:
         return file.readall()
@@ -241,10 +235,9 @@ def open_process(pid: int, started: int) -> int | None:
 
 
 def foreign_realtime_processes() -> tuple[str, ...]:
-    """Real-time threads of other user processes, as ``comm (pid)``: they spoil measurements.
+    """Other processes with real-time threads, as ``comm (pid)``: they spoil measurements.
 
-    Kernel threads (which have no command line), our own children and what enforces a plan are not
-    among them.
+    Our own children and what enforces a plan are not among them.
     """
     found = []
     for pid, parent in parents().items():

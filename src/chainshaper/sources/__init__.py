@@ -17,16 +17,12 @@ __all__ = ["Tracer", "open_source"]
 
 
 def open_source(
-    *paths: str | Path,
-    progress: Callable[[float, str], None] | None = None,
-    overview: bool = False,
+    *paths: str | Path, progress: Callable[[float, str], None] | None = None, overview: bool = False
 ) -> Recording:
     """Open a recording folder, or an LTTng trace (CTF 1.8): one folder, or several of one trace.
 
-    ``overview`` is for who wants to know what is in it only: a trace's callbacks and messages are
-    then not decoded before they are used. ``progress`` gets the share that is done, from 0 to 1,
-    and what is being done.
-
+    ``overview``: a trace's callbacks and messages are not decoded before they are used.
+    ``progress`` gets the share that is done, from 0 to 1, and what is being done.
     Raises InputError: there is nothing that can be read.
     """
     if not paths:
@@ -59,24 +55,19 @@ class Tracer(Protocol):
     def start(self) -> Mapping[str, str]:
         """Begin; tracing is on when this returns. What to add to the application's environment.
 
-        Raises PlatformError: the machine lacks the tracer or a privilege. OperationError: it does
-        not start.
+        Raises PlatformError: the machine lacks the tracer or a privilege. OperationError: else.
         """
         ...
 
     def failure(self) -> str | None:
         """Why nothing is traced any more, as half a sentence; None while all is well.
 
-        Asked every few seconds, so also the place to look after losses. A failure ends the run;
-        what was traced until then is recorded with it as a note.
+        Asked every few seconds, so also the place to look after losses. A failure ends the run.
         """
         ...
 
     def stop(self) -> None:
-        """End tracing; everything is on disk when this returns.
-
-        Raises OperationError: it cannot be ended in order; `remove` is still called.
-        """
+        """End tracing; everything is on disk when this returns. Raises OperationError."""
         ...
 
     def remove(self) -> None:
@@ -84,9 +75,5 @@ class Tracer(Protocol):
         ...
 
     def recording(self) -> tuple[EventTables, RecordingInfo]:
-        """The events, and what they tell, from the folder; called after `stop` and `remove`.
-
-        Command, threads, endpoints and scheduling are added to that by whoever started the run.
-        Raises OperationError: what was traced cannot be read.
-        """
+        """The events, and what they tell, after `stop` and `remove`. Raises OperationError."""
         ...

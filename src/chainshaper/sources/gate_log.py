@@ -26,12 +26,10 @@ _TYPES = {
 
 
 def read_gate_log(path: str | Path) -> pl.DataFrame:
-    """The event table ``gate_release`` of a shaping node's log, sorted by time.
+    """The event table ``gate_release`` of a shaping node's log, and of ``….1``, sorted by time.
 
-    The file before it, ``….1``, is a part of it. ``callback`` is null: a node does not know its
-    callback's handle. A last line that is not whole is left out.
-
-    Raises InputError: no such file, or it is no shaping node's log.
+    ``callback`` is null: a node does not know its callback's handle. A last line that is not whole
+    is left out. Raises InputError: no such file, or it is no shaping node's log.
     """
     path = Path(path)
     before = path.with_name(f"{path.name}.1")
@@ -83,13 +81,10 @@ def releases_so_far(logs: Iterable[Path]) -> npt.NDArray[np.int64]:
 def with_gate_logs(
     tables: events.EventTables, logs: Sequence[Path], since_ns: int, until_ns: int
 ) -> tuple[events.EventTables, tuple[str, ...]]:
-    """Event tables with `gate_release` from the logs of shaping nodes, and which are not there.
+    """Event tables with `gate_release` and stalls from the logs of shaping nodes; and notes.
 
-    A node writes its log for as long as it runs. Of that, the cycles count that began at
-    ``since_ns`` or later, and whose message was let go before ``until_ns``: those are in the other
-    tables too (both CLOCK_MONOTONIC). The stalls that gates saw go to `machine_stall`.
-
-    Raises InputError: a file is no shaping node's log.
+    Of what a node has written, the cycles count that began at ``since_ns`` or later, and whose
+    message was let go before ``until_ns`` (CLOCK_MONOTONIC). Raises InputError: no such log.
     """
     there = [log for log in logs if log.is_file()]
     notes = tuple(

@@ -30,11 +30,10 @@ _THREADS = {
 def distribution_of(tables: EventTables, fields: Mapping[str, Mapping[str, int]]) -> str | None:
     """The ROS 2 distribution as `ROS_DISTRO` has it (``jazzy``), None if nothing tells.
 
-    ``tables`` are those of the objects' creation; ``fields`` the declared events' fields, with
-    the length of those that are arrays (0: no array). CARET's `caret_init` says it, or `rcl_init`
-    by the version of tracetools. Else declared fields prove it: `rmw_publish` has a source
-    timestamp since Jazzy, a gid 16 bytes instead of 24 since Kilted, intra-process events came
-    with Iron. What a session did not enable proves nothing.
+    ``fields`` are the declared events' fields, with the length of arrays. CARET's `caret_init`
+    says it, or `rcl_init` by the version of tracetools. Else declared fields prove it:
+    `rmw_publish` has a source timestamp since Jazzy, a gid 16 bytes instead of 24 since Kilted,
+    intra-process events came with Iron.
     """
     said = _first(tables, "caret_init", "distribution")
     if said is not None:

@@ -1,18 +1,14 @@
 """Functions: those that a library exports, and those that a process's callbacks are.
 
 With LTTng `rclcpp_callback_register` says which function a callback is, with uprobes no event does.
-But a callback's handle is an address, and what stands around it tells (on 64-bit machines, for
-objects made by GCC's library):
+But a callback's handle is an address, and what stands around it tells (64 bits, GCC's library):
 
-* that of a timer is a member of `rclcpp::WallTimer<F, …>` or `GenericTimer<F, …>`. The object
-  begins with the address of its class's table, which leads to the class's name, stripped or not;
+* that of a timer is a member of `rclcpp::WallTimer<F, …>` or `GenericTimer<F, …>`, which begins
+  with the address of its class's table, which leads to the class's name, stripped or not;
 * that of a subscription or service begins with a `std::function`, which has the address of
   `std::_Function_handler<…, F>::_M_invoke`. Files name it unless they were stripped.
 
-In both, F is the type whose name `rclcpp_callback_register` has.
-
-Upstream: elf(5); Itanium C++ ABI, 2.5.2 and 2.9.5; libstdc++, `bits/std_function.h`; rclcpp,
-`timer.hpp`, `any_subscription_callback.hpp`.
+Upstream: elf(5); Itanium C++ ABI, 2.5.2 and 2.9.5; libstdc++, `bits/std_function.h`.
 """
 
 import ctypes
@@ -47,10 +43,7 @@ _SHORTEST_NAME, _LONGEST_NAME = 3, 16_384
 
 
 def open_regular(path: Path) -> int:
-    """Open a file at a path that a process of the application has named.
-
-    Raises OSError: it is no ordinary file (but a pipe, a device), or cannot be read.
-    """
+    """Open a file that a process of the application has named. Raises OSError: no ordinary one."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
@@ -59,7 +52,7 @@ def open_regular(path: Path) -> int:
 
 
 def read_regular(path: Path, longest: int = _LONGEST_FILE) -> bytes:
-    """The content of such a file. Raises OSError: see :func:`open_regular`, or it is longer."""
+    """The content of such a file. Raises OSError: also if it is longer."""
     with os.fdopen(open_regular(path), "rb") as file:
         content = file.read(longest + 1)
     if len(content) > longest:
@@ -193,10 +186,7 @@ class _Process:
 
 
 def callback_functions(callbacks: Iterable[tuple[int, int]]) -> dict[tuple[int, int], str]:
-    """(Process, callback) → the type of its function, for callbacks of processes that run.
-
-    Those that are not known, or cannot be read, are left out.
-    """
+    """(Process, callback) → the type of its function, where it is known and the process runs."""
     handles: dict[int, list[int]] = {}
     for pid, callback in callbacks:
         handles.setdefault(pid, []).append(callback)

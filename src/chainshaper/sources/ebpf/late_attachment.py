@@ -1,23 +1,20 @@
 """Who exists in an application that ran before tracing began, as far as it can be found out.
 
 Objects say who they are when they are created. For those created before, the same tables are filled
-with what is known otherwise, so that the analysis does with it what it always does:
+with what is known otherwise:
 
 * **Topics**: what a tracer read from the objects behind the handles of `rmw_publish`, `rmw_take`
   and `rcl_publish`. This is certain.
 * **Subscriptions' callbacks**: an executor takes a message and at once starts the callback that it
   is for, on the same thread. A callback that nearly always starts like that is its subscription's.
-* **Timers**: callbacks that start without a message, at regular distances. Services' callbacks
-  stay unknown, like everything that gets its messages within its process.
-* **Nodes**: DDS discovery shows which nodes publish and subscribe which topics: a topic that one
-  node only publishes tells whose publisher it is, and which node lives in that process. The command
-  line of a process names nodes. Where several nodes have a topic (`/rosout`), it is the one that is
-  known to live in that process. A timer belongs to its process's only node, or to that of the
-  publisher it uses. What is not certain is left open.
+* **Timers**: callbacks that start without a message, at regular distances.
+* **Nodes**: DDS discovery shows which nodes publish and subscribe which topics, the command line of
+  a process names nodes. Where several nodes have a topic (`/rosout`), it is the one that is known
+  to live in that process. A timer belongs to its process's only node, or to that of the publisher
+  it uses. What is not certain is left open.
 
 Handles are the real ones where events carry them, and addresses of other things of the same object
-where not; nodes are numbered from 1, where no object's address can be. This is about rclcpp: rclpy
-emits no callback events, its endpoints are found all the same.
+where not; nodes are numbered from 1, where no object's address can be.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -52,10 +49,9 @@ _KINDS = ("publisher", "subscription")
 def with_found_objects(
     tables: events.EventTables, handles: pl.DataFrame, began_ns: int
 ) -> tuple[events.EventTables, tuple[str, ...]]:
-    """Add publishers, subscriptions and callbacks that were there at ``began_ns``.
+    """Add publishers, subscriptions and callbacks that were there at ``began_ns``; and a note.
 
-    ``handles`` has the columns ``pid, event, handle, topic``. Returns the tables, and in words what
-    was found and how.
+    ``handles`` has the columns ``pid, event, handle, topic``.
     """
     handles = handles.filter(pl.col("topic").str.starts_with("/"))  # others are the RMW's own
     publishers = _publishers(tables, handles)
@@ -94,8 +90,7 @@ def with_functions(
 ) -> events.EventTables:
     """Add what `rclcpp_callback_register` would have shown: (process, callback) → its function.
 
-    Callbacks were registered when they were added, or before ``began_ns``. What the event itself
-    shows, as on Humble, stays.
+    What the event itself shows, as on Humble, stays.
     """
     named = pl.DataFrame(
         [(*callback, symbol) for callback, symbol in functions.items()],
@@ -112,10 +107,7 @@ def with_functions(
 def added_rows(
     tables: events.EventTables, rows: Mapping[str, pl.DataFrame], began_ns: int
 ) -> dict[str, pl.DataFrame]:
-    """The tables with new rows, as events of ``began_ns`` where no ``time`` says otherwise.
-
-    Tables that get none are left out.
-    """
+    """The tables that get new rows, as events of ``began_ns`` where no ``time`` says otherwise."""
     added = {}
     for name, found in rows.items():
         if found.height:
@@ -166,8 +158,7 @@ def _publishers(tables: events.EventTables, handles: pl.DataFrame) -> pl.DataFra
 def _unregistered_starts(tables: events.EventTables) -> pl.DataFrame:
     """Starts of callbacks that were never registered: ``time, pid, callback, taken``.
 
-    ``taken`` is the subscription from which the thread had just taken a message, null if it did
-    something else before.
+    ``taken``: the subscription from which the thread had just taken a message, null if none.
     """
     takes = events.table(tables, "rmw_take", ["taken"]).filter(pl.col("taken").fill_null(1) != 0)
     starts = events.table(tables, "callback_start", ["is_intra_process"])
@@ -218,10 +209,9 @@ def with_found_nodes(
     endpoints: Sequence[EndpointInfo],
     processes: Iterable[Process],
 ) -> tuple[events.EventTables, RecordingInfo]:
-    """Give publishers, subscriptions and timers without a node theirs, as far as it is certain.
+    """Give publishers, subscriptions and timers without a node theirs, where it is certain.
 
-    ``endpoints`` are those of DDS discovery. Names of processes change with the tables, and what
-    stays unknown becomes a note. Nothing changes where every endpoint has its node.
+    ``endpoints`` are those of DDS discovery. What stays unknown becomes a note.
     """
     created = {kind: events.table(tables, f"rcl_{kind}_init") for kind in _KINDS}
     nameless = pl.concat(
@@ -251,10 +241,7 @@ def with_found_nodes(
     nodes = pl.DataFrame(parts, schema=types, orient="row").with_columns(
         pl.col("namespace").replace("", "/")
     )
-    new = {
-        "rcl_node_init": nodes,
-        "rclcpp_timer_link_node": _timer_links(changed, nodes),
-    }
+    new = {"rcl_node_init": nodes, "rclcpp_timer_link_node": _timer_links(changed, nodes)}
     changed |= added_rows(changed, new, nameless["time"].min())
     names = processes_of(changed, info.processes)
     notes = info.notes
@@ -295,10 +282,7 @@ def _owners(
 
 
 def _timer_links(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
-    """``pid, timer_handle, node_handle`` of timers that no event links to a node.
-
-    ``nodes`` are all ``pid, node_handle`` that were found.
-    """
+    """``pid, timer_handle, node_handle`` of timers that no event links to one of the ``nodes``."""
     timers = events.table(tables, "rclcpp_timer_callback_added").join(
         events.table(tables, "rclcpp_timer_link_node"), on=["pid", "timer_handle"], how="anti"
     )

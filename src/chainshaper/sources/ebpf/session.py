@@ -1,10 +1,8 @@
 """Tracing with eBPF: uprobes on the library that every ROS 2 node has, set by bpftrace.
 
 Uprobes belong to a file, so they are there before the first process maps it, and they reach
-processes that run already. What they cost a thread, and what cannot be seen by them, is in
-`docs/record_ebpf.md`. bpftrace writes into a file, and we read it when all is over. Probes are set,
-and removed, one after the other: what comes before the last one was set or after the first one was
-removed is left out, because instances and messages would be incomplete there.
+processes that run already (`docs/record_ebpf.md`). Probes are set, and removed, one after the
+other: what comes before the last one was set or after the first one was removed is left out.
 
 Upstream: bpftrace(8); `src/bpftrace.cpp` of bpftrace 0.17 to 0.26.
 """
@@ -322,8 +320,7 @@ def lost_events(*paths: Path) -> int:
 def _in_the_background(parent_pid: int) -> None:
     """Have a new process end with its parent, and disturb the threads little that it watches.
 
-    Every event wakes it. If it pre-empted the thread then, as ordinary processes do, these were two
-    switches, thus two events, and so on: ten times as many events as there were to be recorded.
+    Every event wakes it: if it pre-empted the thread then, these were two more events, and so on.
     """
     signalled_with_parent(parent_pid, signal.SIGINT)
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
@@ -343,10 +340,7 @@ def _family(pids: Iterable[int]) -> set[int]:
 
 
 def _wait_until_idle(bpftrace: int) -> None:
-    """Wait until bpftrace has printed all that there was: then it sleeps.
-
-    What it has not read when it is asked to end, it throws away.
-    """
+    """Wait until bpftrace sleeps: what it has not read when it is to end, it throws away."""
     until = time.monotonic() + _READ_S
     with suppress(OSError):  # it has ended
         while time.monotonic() < until:
@@ -371,8 +365,7 @@ def _check_privileges() -> None:
 def _boot_time_ahead() -> int:
     """CLOCK_BOOTTIME minus CLOCK_MONOTONIC in ns: how long the machine has been suspended.
 
-    The narrowest of several brackets counts, because we may be pre-empted within one. Suspensions
-    are longer than a millisecond; without one the two are the same clock.
+    The narrowest of several brackets counts; without a suspension the clocks are the same.
     """
     brackets = []
     for _ in range(10):

@@ -1,13 +1,10 @@
 """The trace points of `libtracetools.so`: where they are, the script that prints them, the tables.
 
-Every ROS 2 build with tracing compiled in calls `ros_trace_<event>(arguments…)` of that library,
-whether or not LTTng is there. The arguments are the fields of the event's table
-(:mod:`chainshaper.values.events`) in the same order; :func:`_columns` has the exceptions. Which of
-them a library exports is read from its symbol table. `rclcpp_callback_register` is not called from
-Iron on, except under an LTTng session.
+Every ROS 2 build with tracing compiled in calls `ros_trace_<event>(arguments…)` of that library.
+The arguments are the fields of the event's table in the same order, with exceptions
+(:attr:`TracePoint.arguments`). `rclcpp_callback_register` is not called from Iron on.
 
-The bpftrace script sets uprobes on these functions, and `sched_switch`. Every line that it prints
-is numbers separated by tabs, which costs the traced thread little and is read at the speed of CSV:
+bpftrace sets uprobes there, and prints lines of numbers, separated by tabs and in no order:
 
     code  time  pid  tid  cpu  value 0 … value 9  [prev_comm  next_comm]
 
@@ -16,26 +13,21 @@ is numbers separated by tabs, which costs the traced thread little and is read a
 * A text is printed as the eight-byte words it lies in, in lines of its own (:data:`TEXT_CODE`) with
   the time and thread of the event: 16 × the argument's place + the line's number, how many bytes
   before the text the first word begins, and eight words. So a name may be of any length and
-  contain anything; bpftrace's `str()` cuts at 64 bytes or less than 200. Aligned words never reach
-  into a page where the text is not.
+  contain anything, unlike with `str()`. Aligned words never reach into a page without the text.
 * `sched_switch` (:data:`SWITCH_CODE`) is printed where a thread that has emitted events goes or
   comes. The first of these events shows a thread at work that came unseen, so a line like that
   stands before it, which says nothing of the thread that went.
 
-Other lines are bpftrace's own. Every core has a buffer of its own, so lines of different cores are
-in no order. Times are of CLOCK_BOOTTIME.
-
-Topics of publishers and subscriptions that were created before tracing began are read where they
-are used first: the handles of `rmw_publish` and `rmw_take` are the addresses of a `rmw_publisher_t`
-and a `rmw_subscription_t`, which begin with the addresses of the RMW's name, of its data and of the
-topic's name. Before tracetools 8 the former is found from `rcl_publish`'s `rcl_publisher_t`.
+Topics of publishers and subscriptions that were created before are read where they are used first:
+the handles of `rmw_publish` and `rmw_take` are the addresses of structures that begin with the
+addresses of the RMW's name, of its data and of the topic's name. Before tracetools 8 the former is
+found from `rcl_publish`'s `rcl_publisher_t`.
 
 bpftrace runs the script as root, so nothing stands in it that a stranger may have written:
-events, which we know, numbers, and paths of plain characters only. Who traces a file of another
-name gives it open, as `/proc/PID/fd/N`.
+events, which we know, numbers, and paths of plain characters only.
 
-Upstream: ros2_tracing, `tracetools/tracetools.h`, tags 4.1.1 to 8.10.1; bpftrace 0.17 to 0.26; rmw,
-`rmw/types.h`; rcl, `publisher_impl.h` (Humble, Iron).
+Upstream: `tracetools/tracetools.h` of ros2_tracing, tags 4.1.1 to 8.10.1; bpftrace 0.17 to 0.26;
+rmw, `rmw/types.h`; rcl, `publisher_impl.h` (Humble, Iron).
 """
 
 import re
@@ -181,9 +173,9 @@ def trace_points(libraries: Sequence[TracingLibrary]) -> tuple[TracePoint, ...]:
 
 
 def installed_libraries(environment: Mapping[str, str]) -> tuple[TracingLibrary, ...]:
-    """The libraries that a command started with this environment can find.
+    """The libraries that a command with this environment can find, all below `/opt/ros` included:
 
-    All below `/opt/ros` are among them: the command may be a script that sets up its ROS 2 itself.
+    it may be a script that sets up its ROS 2 itself.
     """
     prefixes = environment.get("AMENT_PREFIX_PATH", "").split(":")
     folders = [Path(prefix) / "lib" for prefix in prefixes if prefix]
@@ -243,10 +235,8 @@ def bpftrace_script(
 ) -> str:
     """The script for some trace points.
 
-    ``traced`` are the processes to which, with all that they start, events are limited; without
-    them ``users`` are the user ids to whose processes they are, empty: to none. ``attached`` is
-    whether names of handles are read that were created before.
-
+    Events are limited to the ``traced`` processes and all that they start, else to those of
+    ``users``; empty: to none. ``attached``: names of handles that were created before are read.
     Raises InputError: a file's path is not of plain characters.
     """
     limits = [f"@traced[{pid}] = 1;" for pid in traced]
@@ -322,11 +312,8 @@ def _text(address: str, place: int) -> Iterator[str]:
 class Printed:
     """The output of one run; times are ns of CLOCK_MONOTONIC.
 
-    * ``tables``: the events.
-    * ``handles``: ``pid, event, handle, topic``, the names of handles that were in use when
-      tracing began; the event is the one that the handle was read from.
-    * ``rmw``: the RMW's name from such a handle.
-    * ``cut_names``: how many names were longer than what is printed of one.
+    ``handles`` are the names of handles that were in use when tracing began, ``pid, event, handle,
+    topic``; ``rmw`` is from such a one. ``cut_names``: how many were longer than what is printed.
     """
 
     tables: dict[str, pl.DataFrame]
@@ -336,7 +323,7 @@ class Printed:
 
 
 def read_printed(path: Path, points: Sequence[TracePoint], ahead_ns: int) -> Printed:
-    """Read the file that the script of these trace points printed into, behind :data:`HEADER`.
+    """Read what the script of these trace points printed, behind :data:`HEADER`.
 
     ``ahead_ns`` is CLOCK_BOOTTIME, which bpftrace reads, minus CLOCK_MONOTONIC.
     """

@@ -1,32 +1,22 @@
 """Tracing with LTTng: a recording session of our own, and the session daemon that it needs.
 
 Events go through ring buffers in shared memory, one per core and user, from which a consumer
-daemon writes them to disk. When a buffer is full, events are discarded and counted. `ros2 trace`
-has 64 KiB a core; here it is 4 MiB where there is that much shared memory: 70,000 events that the
-consumer, an ordinary thread beside real-time ones, may be late with. When events are lost all the
-same, tracing moves to a session with buffers four times as large while the application runs on:
-LTTng cannot add buffers to a session that has been started.
+daemon writes them to disk. When a buffer is full, events are discarded and counted; tracing then
+moves to a session with buffers four times as large while the application runs on.
 
-Which session daemon traces an application depends on who runs it:
+A root daemon that runs already, which we may use as root or in the group `tracing`, traces
+everybody's processes, and the kernel: we add a session to it, and leave out of the tables what
+other applications did. Otherwise we start a daemon and end it afterwards. It listens in a home
+directory of our own, which the command gets as its `LTTNG_HOME`, so it traces the command alone.
+Root's run directory is /var/run/lttng whatever its environment says, so root's daemon and clients
+have one of ours mounted there, in mount namespaces that they alone see. Where root may not mount
+(most containers), there can be one recording at a time.
 
-* A root daemon runs already, and we are root or in the group `tracing`: it traces everybody's
-  processes, and the kernel. We add a session to it, and leave it as it was. What other applications
-  did is left out of the tables: a second run of the same nodes would make two of every chain.
-* Otherwise we start one and end it afterwards: a root daemon if we are root, else one of our
-  user's. It listens for applications in a home directory of our own, which the command gets as its
-  `LTTNG_HOME`. So it traces the command and nothing else.
+We may be killed. The kernel then ends a daemon of ours; a shell that waits for our end
+destroys our sessions in another's daemon and removes the home directory.
 
-A daemon of ours shares nothing with others: its run directory is in our home directory. Root's is
-/var/run/lttng whatever its environment says, so root's daemon and clients have that directory
-mounted there, in mount namespaces that they alone see. Where root may not mount (most containers),
-there can be one recording at a time.
-
-We may be killed at any moment. The kernel then ends a daemon of ours; everything else is left to a
-shell that waits for our end, destroys our sessions in another's daemon and removes the home
-directory.
-
-Upstream: lttng(1), lttng-sessiond(8), lttng-enable-channel(1); lttng-tools, `utils_get_rundir` and
-`set_session_daemon_path`; lttng-ust, `setup_local_apps`; `tracetools_trace` of ros2_tracing.
+Upstream: lttng(1), lttng-sessiond(8), lttng-enable-channel(1); lttng-tools, `utils_get_rundir`;
+lttng-ust, `setup_local_apps`; `tracetools_trace` of ros2_tracing.
 """
 
 import os
@@ -93,8 +83,7 @@ rm -rf "$LTTNG_HOME"
 class Lttng:
     """A connection to a session daemon, by the client that every installation has.
 
-    ``home`` is a directory of our own, whose unique name sessions are called after; in it the
-    client never learns which session is the user's "current" one. ``afterwards`` is the shell that
+    ``home`` is a directory of our own, whose unique name sessions are called after; ``afterwards``
     clears up when we are gone. ``daemon`` is the daemon's process where we have started it, and
     ``inside`` what commands begin with that shall see its run directory.
     """
@@ -156,7 +145,7 @@ def connect() -> Lttng:
     """Find the session daemon that traces our applications, or start one.
 
     Raises PlatformError: LTTng is not installed, or cannot make two recordings at a time here.
-    OperationError: the daemon does not start; in its own words.
+    OperationError: the daemon does not start.
     """
     if not is_installed("lttng"):
         raise PlatformError(f"the command `lttng` is not there: {_PACKAGES}")
@@ -201,10 +190,7 @@ def _hears_one_command_only() -> bool:
 
 
 def _run_directory_apart(home: Path) -> tuple[str, ...]:
-    """What root's commands begin with that see a run directory of our own; empty if not permitted.
-
-    All other users' is in the home directory anyway.
-    """
+    """What root's commands begin with that see a run directory of our own, if permitted."""
     if os.getuid() == 0:
         folder = home / "run"
         folder.mkdir()
@@ -255,9 +241,7 @@ def _environment(home: Path) -> dict[str, str]:
 class LttngSession:
     """Records with LTTng: a :class:`~chainshaper.sources.Tracer`.
 
-    ``buffer`` is the size of the ring buffer of each core in bytes; by default what is enough for
-    most applications and fits into the machine's shared memory. `sched_switch`, for execution
-    times, comes from the kernel tracer where there is one and we may use it.
+    ``buffer`` is the size of the ring buffer of each core in bytes (:func:`buffer_size`).
     """
 
     def __init__(
@@ -362,9 +346,8 @@ class LttngSession:
     def _look_for_strangers(self, lttng: Lttng) -> None:
         """Note who else runs, if the daemon is not ours and so hears every application.
 
-        A process is the command's if it descends from us, or has a mark of ours in its environment:
-        a daemon process, whose parent is gone, still has that, and what `sudo` starts, which has
-        lost it, descends.
+        What descends from us is the command's, and what has our mark in its environment: a process
+        whose parent is gone still has that; what `sudo` starts has lost it.
         """
         if lttng.daemon is None:
             parent_of, mark = parents(), f"{MARK}={self._sessions[0]}"
@@ -424,8 +407,7 @@ def buffer_size(
 ) -> int:
     """The ring buffer of each core in bytes, a power of two: what is wanted, as far as possible.
 
-    The buffers of all cores get half of the ``free`` bytes of /dev/shm at most; with more, LTTng
-    could not make them, and would record nothing.
+    The buffers of all cores get half of the ``free`` bytes of /dev/shm at most.
     """
     cores = cores or os.sysconf("SC_NPROCESSORS_CONF")
     if free is None:

@@ -1,19 +1,15 @@
 """LTTng traces as recordings: the folders that `ros2 trace` writes.
 
 Events lose their provider (``ros2:callback_start`` → ``callback_start``) and get the columns and
-types of :mod:`chainshaper.values.events`; events that no table is for are left out. A trace may
-declare other types (a narrower integer), and fewer fields: older distributions do, and so does
-damaged metadata. Integers are widened; a field that is absent, or of a kind that no cast brings
-right, becomes a column of nulls, which the analysis takes for "not known", and a note says so
-unless that is how a distribution is.
+types of :mod:`chainshaper.values.events`; events that no table is for are left out. Integers are
+widened; a field that a trace does not declare, or of a kind that no cast brings right, becomes a
+column of nulls, and a note says so unless that is how a distribution is.
 
 Tables are decoded in groups that are used together, because one pass over a trace costs nearly the
-same for one table as for twenty. Times stay ns of CLOCK_MONOTONIC; process numbers stay too, except
-that containers number theirs independently of each other: folders of several hosts are read host by
-host, and where two of them use the same number, the later host's are moved (:data:`NEXT_HOST`).
-
-CARET keeps the events of an application's start and emits them again when tracing begins; those
-carry ``init_timestamp``, the time at which they really happened, and are put there.
+same for one table as for twenty. Containers number their processes independently of each other:
+folders of several hosts are read host by host, and where two of them use the same number, the later
+host's are moved (:data:`NEXT_HOST`). CARET emits the events of an application's start again when
+tracing begins; those carry ``init_timestamp``, when they really happened, and are put there.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -65,9 +61,7 @@ def open_lttng_trace(
 ) -> Recording:
     """Open the LTTng trace in ``paths``: folders of one recording, searched recursively.
 
-    Kernel and user space, users (per-uid) and processes (per-pid) have a folder each; all are
-    merged by time. ``overview`` leaves callbacks and messages undecoded until their first use;
-    ``progress`` hears about this, and about decoding later on.
+    ``overview`` leaves callbacks and messages undecoded until their first use.
 
     Raises InputError: no trace there, metadata that cannot be understood, or traces taken by
     different clocks (other machines, other boots), whose times cannot be compared.
@@ -120,10 +114,9 @@ def _fact(environment: Mapping[str, object], name: str) -> str:
 
 
 class TraceTables(Mapping[str, pl.DataFrame]):
-    """The event tables of an open trace, decoded at first use.
+    """The event tables of an open trace that happened, decoded at first use.
 
-    ``counts`` are the events per full name, provider included. Only events that happened are in
-    the mapping.
+    ``counts`` are the events per full name, provider included.
     """
 
     def __init__(self, trace: CtfTrace, progress: Progress, overview: bool) -> None:
@@ -279,8 +272,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
 def _by_host(trace: CtfTrace) -> dict[str, CtfTrace]:
     """The trace in parts, one per host whose processes were traced.
 
-    The kernel's folder goes with its own host, or with the first one: containers run on its
-    kernel, but their threads have other numbers there.
+    The kernel's folder goes with its own host, or with the first one.
     """
     hosts = [_fact(folder.declared.env, "hostname") for folder in trace.folders]
     kernel = [folder.declared.env.get("domain") == "kernel" for folder in trace.folders]
@@ -310,8 +302,7 @@ def _process_names(frames: Mapping[str, pl.DataFrame]) -> dict[int, str]:
 def table_name(event: str) -> str | None:
     """The table that an event belongs to: ``ros2:callback_start`` → ``callback_start``.
 
-    None for events that no table is for, and for another provider's event of the same name. The
-    kernel's events have no provider.
+    None for others, and another provider's event of the same name; the kernel's have no provider.
     """
     provider, _, name = event.rpartition(":")
     of_kernel = name == "sched_switch"

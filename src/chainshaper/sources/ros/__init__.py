@@ -2,16 +2,14 @@
 
 The Python that has `rclpy` is seldom ours, and domain and RMW are those of the application's nodes.
 An environment says which programs and libraries are loaded: who wrote it chooses what runs. So this
-is the one place where something is run that was found through another process, and it runs with
-that process's user's rights or not at all:
+is the one place where something is run that was found through another process, even the
+interpreter, and it runs with that process's user's rights or not at all:
 
-* as that user, with the groups of the user database, without capabilities, and with no way to get
-  any (`no_new_privs`);
+* as that user, with the groups of the user database, without capabilities or a way to get any;
 * in that environment and no other, in a session of its own, with no files of ours but the script,
-  and what it may print into: 8 MiB;
-* for a limited time, and no longer than we run ourselves.
+  and what it may print into, 8 MiB; for a limited time, and no longer than we run ourselves.
 
-Even the search for the interpreter is that process's. What a script prints is a stranger's word.
+What a script prints is a stranger's word.
 """
 
 import ctypes
@@ -81,9 +79,9 @@ class Script:
         return self.process.poll() is not None
 
     def end(self, within_s: float = 0.0) -> tuple[str, str | None]:
-        """Wait for its end, and end it with all of its session's group when that takes longer.
+        """Wait for its end, once, and end all of its session's group when that takes longer.
 
-        To be called once. Returns what it printed, and why it failed, if it did.
+        Returns what it printed, and why it failed, if it did.
         """
         problem = None
         try:
@@ -102,8 +100,7 @@ class Script:
 def environment_of(pid: int) -> Environment:
     """The environment of a process, as it has it now.
 
-    Raises OperationError: it has ended, may not be read, is no single user's (`sudo` carries the
-    environment of whoever called it), or in a container, whose paths lead elsewhere here.
+    Raises OperationError: it has ended, may not be read, is no single user's, or in a container.
     """
     try:
         with process_folder(pid) as folder:
@@ -145,10 +142,7 @@ def own_environment() -> Environment:
 def run_with_rclpy(
     environment: Environment, script: str, *arguments: str, within_s: float
 ) -> tuple[str, str | None]:
-    """Run a script file in a node's environment to its end: :func:`start_with_rclpy`, then `end`.
-
-    Returns what it printed, and why it failed, if it did.
-    """
+    """Run a script file in an environment; what it printed, and why it failed, if it did."""
     try:
         return start_with_rclpy(environment, script, *arguments).end(within_s)
     except OperationError as error:
@@ -232,14 +226,11 @@ def _content(descriptor: int) -> str:
 
 
 def ask_graph(environment: Environment) -> tuple[tuple[EndpointInfo, ...], str | None]:
-    """All endpoints of the ROS graph that a node with this environment belongs to.
+    """All endpoints of the ROS graph of a node with this environment, and why there are none.
 
-    Types and QoS travel in DDS discovery only. One participant for a few seconds learns those of
-    all topics; `ros2 topic info -v` would be one per topic, and leave a daemon behind. Whoever is
-    in the graph says what it likes, and DDS without its security plug-ins does not prove who is:
-    the answer is bounded and checked in its form, and believed in names, types and QoS only.
-
-    Returns the endpoints, and why there are none, if so.
+    Types and QoS travel in DDS discovery only, which one participant learns in a few seconds. DDS
+    without its security plug-ins does not prove who is in the graph: the answer is bounded and
+    checked in its form, and believed in names, types and QoS only.
     """
     asked = (ros_script.__file__, "graph", str(_PATIENCE_S))
     said, problem = run_with_rclpy(environment, *asked, within_s=_PATIENCE_S + _START_S)
