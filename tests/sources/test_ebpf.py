@@ -15,7 +15,7 @@ import pytest
 from command_line import called, json_of
 from processes import children_of, wait_for
 from strangers import NOBODY, named, open_folder, strange
-from traced_program import Program, build, skip_without_bpftrace, traced
+from traced_program import Program, build, built, skip_without_bpftrace, traced
 
 from chainshaper.analysis.flow import DataFlow, data_flow
 from chainshaper.flow.record import record_command
@@ -31,17 +31,16 @@ CYCLES, PERIOD_NS = 20, 50_000_000
 TOPICS = ("/ebpf1", "/ebpf2")
 
 
-@pytest.fixture(scope="module")
-def program(tmp_path_factory: pytest.TempPathFactory) -> Program:
-    """Jazzy's trace points, in a folder whose name has spaces."""
+@pytest.fixture
+def program() -> Program:
     skip_without_bpftrace()
-    return build(tmp_path_factory.mktemp("a prefix of ours") / "jazzy")
+    return built()
 
 
-@pytest.fixture(scope="module")
-def humble(tmp_path_factory: pytest.TempPathFactory) -> Program:
+@pytest.fixture
+def humble() -> Program:
     skip_without_bpftrace()
-    return build(tmp_path_factory.mktemp("other") / "humble", "-DHUMBLE", version="4.1.1")
+    return built("-DHUMBLE", version="4.1.1")
 
 
 @pytest.fixture(autouse=True)
