@@ -206,15 +206,21 @@ def test_of_strangers_nothing_is_recorded_or_run_unless_they_are_named(
         processes.extend(program.waiting("chain", "3", "wait", user=one) for one in (None, NOBODY))
         return [process.pid for process in processes]
 
-    def run(_: float = 0, what: str = "recording") -> list[list[str]]:
-        while processes and "recording" in what:
+    def run() -> list[list[str]]:
+        while processes:
             processes.pop().communicate("go\n", timeout=60)
         return []
+
+    def progress(_: float, what: str) -> None:
+        if "recording" in what:
+            run()
 
     ours, _ = start()
     with strange(named("listener"), {"PATH": f"{open_folder}:/bin:/usr/bin"}) as listener:
         second = 1_000_000_000
-        made = record_command(tmp_path / "rec", source="ebpf", duration_ns=second, progress=run)
+        made = record_command(
+            tmp_path / "rec", source="ebpf", duration_ns=second, progress=progress
+        )
     assert not ran.exists()
     assert f"/listener (process {listener.pid} of nobody)" in " ".join(made.recording.info.notes)
     assert set(made.recording.events["callback_start"]["pid"]) == {ours}

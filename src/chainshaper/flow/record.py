@@ -272,7 +272,7 @@ def _look(run: _Run) -> None:
     """Which processes and threads there are, and a node's environment."""
     if run.pids:
         parent_of = parents()
-        family = {pid for one in run.pids for pid in descendants(parent_of, one)} & parent_of.keys()
+        family = descendants(parent_of, *run.pids) & parent_of.keys()
         processes = list_processes(family)
     else:
         everybody = find_applications(list_processes())

@@ -209,7 +209,7 @@ def threads_in(folder: Path) -> tuple[int, ...]:
 
 
 def has_unseen_threads(folder: Path) -> bool:
-    """Whether there are some that cannot be seen from our process namespace."""
+    """Whether there are others."""
     return "0" in _read(folder / "cgroup.threads").split()
 
 

@@ -52,25 +52,21 @@ def run_users(named: Collection[str | int] = ()) -> frozenset[int]:
 
     By default who has launched us, also by `sudo`, and root. Raises InputError: no such user.
     """
-    if named:
-        return frozenset(_user_id(one) for one in named)
+    users = {int(one) for one in named if isinstance(one, int) or one.isdecimal()}
+    for name in named:
+        try:
+            if isinstance(name, str) and not name.isdecimal():
+                users.add(pwd.getpwnam(name).pw_uid)
+        except KeyError:
+            raise InputError(
+                f"no user is named {name!r} on this machine: give a name of `getent passwd`, or a "
+                "number"
+            ) from None
     launched = {os.getuid(), os.geteuid(), 0}
     behind_sudo = os.environ.get("SUDO_UID", "")
     if os.geteuid() == 0 and behind_sudo.isdecimal():
         launched.add(int(behind_sudo))
-    return frozenset(launched)
-
-
-def _user_id(named: str | int) -> int:
-    if isinstance(named, int) or named.isdecimal():
-        return int(named)
-    try:
-        return pwd.getpwnam(named).pw_uid
-    except KeyError:
-        raise InputError(
-            f"no user is named {named!r} on this machine: give a name of `getent passwd`, or a "
-            "number"
-        ) from None
+    return frozenset(users or launched)
 
 
 def user_name(user: int | None) -> str:
@@ -168,13 +164,12 @@ def read_process(pid: int) -> Process | None:
     )
 
 
-def descendants(parent_of: Mapping[int, int], pid: int) -> frozenset[int]:
-    """A process and all its children, theirs and so on; ``parent_of`` maps each to its parent."""
-    family, grown = {pid}, True
-    while grown:
-        more = {child for child, parent in parent_of.items() if parent in family} - family
-        family |= more
-        grown = bool(more)
+def descendants(parent_of: Mapping[int, int], *pids: int) -> frozenset[int]:
+    """Processes and all their children, theirs and so on; ``parent_of`` maps each to its parent."""
+    family, born = set(pids), set(pids)
+    while born:
+        born = {child for child, parent in parent_of.items() if parent in born} - family
+        family |= born
     return frozenset(family)
 
 

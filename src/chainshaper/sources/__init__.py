@@ -57,23 +57,18 @@ class Tracer(Protocol):
 
         Raises PlatformError: the machine lacks the tracer or a privilege. OperationError: else.
         """
-        ...
 
     def failure(self) -> str | None:
         """Why nothing is traced any more, as half a sentence; None while all is well.
 
         Asked every few seconds, so also the place to look after losses. A failure ends the run.
         """
-        ...
 
     def stop(self) -> None:
         """End tracing; everything is on disk when this returns. Raises OperationError."""
-        ...
 
     def remove(self) -> None:
         """Leave nothing of ours behind, however the run ended; perhaps called twice."""
-        ...
 
     def recording(self) -> tuple[EventTables, RecordingInfo]:
         """The events, and what they tell, after `stop` and `remove`. Raises OperationError."""
-        ...

@@ -65,7 +65,8 @@ def rows_missing(releases: pl.DataFrame) -> tuple[int, int]:
     first, last = pl.min("row"), pl.max("row")
     spans = releases.drop_nulls("row").group_by("pid")
     counts = spans.agg(removed=first - 1, unwritten=last - first + 1 - pl.len().cast(pl.Int64))
-    return counts["removed"].sum(), counts["unwritten"].sum()
+    removed, unwritten = counts.select("removed", "unwritten").sum().row(0)
+    return removed, unwritten
 
 
 def releases_so_far(logs: Iterable[Path]) -> npt.NDArray[np.int64]:

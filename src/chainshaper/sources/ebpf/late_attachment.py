@@ -242,7 +242,7 @@ def with_found_nodes(
         pl.col("namespace").replace("", "/")
     )
     new = {"rcl_node_init": nodes, "rclcpp_timer_link_node": _timer_links(changed, nodes)}
-    changed |= added_rows(changed, new, nameless["time"].min())
+    changed |= added_rows(changed, new, min(nameless["time"]))
     names = processes_of(changed, info.processes)
     notes = info.notes
     if unknown := sorted({key[2] for key in wanted if key not in owners} - INTERNAL_TOPICS):

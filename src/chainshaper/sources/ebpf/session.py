@@ -13,7 +13,7 @@ import re
 import signal
 import subprocess
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -149,7 +149,12 @@ class EbpfTracer:
                 "the machine was suspended during the recording: times after that are too late by "
                 "as long as it slept."
             )
-        _wait_until_idle(self._bpftrace.pid)
+        bpftrace, until = f"/proc/{self._bpftrace.pid}", time.monotonic() + _READ_S
+        with suppress(OSError):  # it has ended
+            time.sleep(_LOOK_S)
+            # It sleeps when it has read all: the rest it would throw away.
+            while read_stat(bpftrace)[1][0] == b"R" and time.monotonic() < until:
+                time.sleep(_LOOK_S)
         self._bpftrace.send_signal(signal.SIGINT)
         try:
             self._bpftrace.wait(_STOP_S)
@@ -192,6 +197,11 @@ class EbpfTracer:
             tables, found = with_found_objects(tables, printed.handles, self._began_ns)
             notes += found
         tables = with_functions(tables, self._functions, self._began_ns)
+        # Process → the name of its main thread as `sched_switch` has it.
+        switches = events.table(tables, "sched_switch").select("next_tid", "next_comm")
+        names = dict(switches.unique("next_tid", keep="last").iter_rows())
+        emitting = (table["pid"] for name, table in tables.items() if name != "sched_switch")
+        commands = {pid: names.get(pid) or "" for pids in emitting for pid in pids.unique()}
         # What `rcl_init` would say of the library's version, whether or not it was traced.
         versions = [point.library.version for point in self._points[:1]]
         info = RecordingInfo(
@@ -199,7 +209,7 @@ class EbpfTracer:
             distribution=distribution_of({"rcl_init": pl.DataFrame({"version": versions})}, {}),
             rmw=printed.rmw or rmw_of_gids(tables),
             clock_offset_ns=self._clock_offset_ns,
-            processes=processes_of(tables, _commands(tables)),
+            processes=processes_of(tables, commands),
             lost={"lost_events": lost},
             notes=tuple(notes),
         )
@@ -224,11 +234,12 @@ class EbpfTracer:
 
     def _mapped(self) -> tuple[TracingLibrary, ...]:
         """The libraries that the processes to attach to have mapped; at least one."""
-        family = _family(self._pids)
+        parent_of = parents()
+        family = descendants(parent_of, *self._pids)
         mapped = mapped_libraries(
-            pid for pid in parents() if pid in family or user_of(pid) in self._users
+            pid for pid in parent_of if pid in family or user_of(pid) in self._users
         )
-        unsuited = [pid for pid in self._pids if not _family((pid,)) & mapped.keys()]
+        unsuited = [pid for pid in self._pids if not descendants(parent_of, pid) & mapped.keys()]
         if unsuited:
             raise InputError(
                 f"process {', '.join(map(str, unsuited))} neither uses {LIBRARY}, as every "
@@ -257,7 +268,7 @@ class EbpfTracer:
             )
             return ()
         # What we start is ours: the application, which does not run yet.
-        return tuple(sorted(_family(self._pids or (os.getpid(),))))
+        return tuple(sorted(descendants(parents(), *(self._pids or (os.getpid(),)))))
 
     def _wait_until_attached(self, bpftrace: "subprocess.Popen[bytes]") -> None:
         until = time.monotonic() + _START_S
@@ -333,22 +344,6 @@ def _callbacks(tables: EventTables) -> Iterator[tuple[int, int]]:
         yield from events.table(tables, name).select("pid", "callback").unique().iter_rows()
 
 
-def _family(pids: Iterable[int]) -> set[int]:
-    """These processes, and all that they have started."""
-    parent_of = parents()
-    return set().union(*(descendants(parent_of, pid) for pid in pids))
-
-
-def _wait_until_idle(bpftrace: int) -> None:
-    """Wait until bpftrace sleeps: what it has not read when it is to end, it throws away."""
-    until = time.monotonic() + _READ_S
-    with suppress(OSError):  # it has ended
-        while time.monotonic() < until:
-            time.sleep(_LOOK_S)
-            if read_stat(f"/proc/{bpftrace}")[1][0] != b"R":
-                return
-
-
 def _check_privileges() -> None:
     """bpftrace would say it as well, but not what else can be done."""
     (own,) = status_field(read_proc("/proc/self/status"), "CapEff", base=16)
@@ -375,11 +370,3 @@ def _boot_time_ahead() -> int:
         brackets.append((after - before, boot_time - (before + after) // 2))
     _, ahead = min(brackets)
     return ahead if ahead > _SHORTEST_SUSPENSION_NS else 0
-
-
-def _commands(tables: EventTables) -> dict[int, str]:
-    """Process → the name of its main thread as `sched_switch` has it, empty if unknown."""
-    switches = events.table(tables, "sched_switch").select("next_tid", "next_comm")
-    names = dict(switches.unique("next_tid", keep="last").iter_rows())
-    emitting = (table["pid"] for name, table in tables.items() if name != "sched_switch")
-    return {pid: names.get(pid) or "" for pid in sorted({pid for pids in emitting for pid in pids})}
