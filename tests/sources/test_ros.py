@@ -1,4 +1,4 @@
-"""Asking an application's ROS 2 with its interpreter and in its environment; rclpy is a stand-in."""
+"""Asking an application's ROS 2, with its Python and in its environment; rclpy is a stand-in."""
 
 import os
 import subprocess

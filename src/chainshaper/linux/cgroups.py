@@ -1,9 +1,8 @@
 """Control groups of version 2, as far as stopping single threads needs them.
 
-Writing ``1`` to a group's ``cgroup.freeze`` stops every thread in it on its way back to user
-space. A **threaded** group may have some threads of a process while the others stay, if all groups
-that share a process lie in one *threaded domain*. So a thread's new group is made directly beneath
-its present one: it keeps every limit, and the way back is always up to the parent.
+``cgroup.freeze`` stops every thread in a group on its way back to user space. A **threaded** group
+may have some threads of a process while the others stay, if all groups that share a process lie in
+one *threaded domain*: so it is made directly beneath their present one, and keeps every limit.
 
 Upstream: Documentation/admin-guide/cgroup-v2.rst of the kernel, "Threads" and "Mounting".
 """

@@ -1,17 +1,7 @@
 """Who exists in an application that ran before tracing began, as far as it can be found out.
 
 Objects say who they are when they are created. For those created before, the same tables are filled
-with what is known otherwise:
-
-* **Topics**: what a tracer read from the objects behind the handles of `rmw_publish`, `rmw_take`
-  and `rcl_publish`. This is certain.
-* **Subscriptions' callbacks**: an executor takes a message and at once starts the callback that it
-  is for, on the same thread. A callback that nearly always starts like that is its subscription's.
-* **Timers**: callbacks that start without a message, at regular distances.
-* **Nodes**: DDS discovery shows which nodes publish and subscribe which topics, the command line of
-  a process names nodes. Where several nodes have a topic (`/rosout`), it is the one that is known
-  to live in that process. A timer belongs to its process's only node, or to that of the publisher
-  it uses. What is not certain is left open.
+with what is known otherwise; `docs/record_ebpf.md` says how. What is not certain is left open.
 
 Handles are the real ones where events carry them, and addresses of other things of the same object
 where not; nodes are numbered from 1, where no object's address can be.
@@ -211,7 +201,8 @@ def with_found_nodes(
 ) -> tuple[events.EventTables, RecordingInfo]:
     """Give publishers, subscriptions and timers without a node theirs, where it is certain.
 
-    ``endpoints`` are those of DDS discovery. What stays unknown becomes a note.
+    ``endpoints`` are those of DDS discovery: a topic that one node only publishes says whose
+    publisher it is, and which node lives in that process. What stays unknown becomes a note.
     """
     created = {kind: events.table(tables, f"rcl_{kind}_init") for kind in _KINDS}
     nameless = pl.concat(

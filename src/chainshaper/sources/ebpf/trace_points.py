@@ -1,30 +1,24 @@
 """The trace points of `libtracetools.so`: where they are, the script that prints them, the tables.
 
-Every ROS 2 build with tracing compiled in calls `ros_trace_<event>(arguments…)` of that library.
-The arguments are the fields of the event's table in the same order, with exceptions
-(:attr:`TracePoint.arguments`). `rclcpp_callback_register` is not called from Iron on.
-
-bpftrace sets uprobes there, and prints lines of numbers, separated by tabs and in no order:
+Every ROS 2 build with tracing compiled in calls `ros_trace_<event>(arguments…)` of that library;
+:attr:`TracePoint.arguments` says with what. bpftrace sets uprobes there, and prints lines of
+numbers, separated by tabs and in no order:
 
     code  time  pid  tid  cpu  value 0 … value 9  [prev_comm  next_comm]
 
 * The code says which of the trace points it is, :data:`FIRST_POINT` being the first one.
 * A number or a flag is one value, a gid two: its first 16 bytes, those that mean anything.
-* A text is printed as the eight-byte words it lies in, in lines of its own (:data:`TEXT_CODE`) with
-  the time and thread of the event: 16 × the argument's place + the line's number, how many bytes
-  before the text the first word begins, and eight words. So a name may be of any length and
-  contain anything, unlike with `str()`. Aligned words never reach into a page without the text.
+* A text is printed as the eight-byte words it lies in, in lines of its own (:data:`TEXT_CODE`):
+  16 × the argument's place + the line's number, how many bytes before the text the first word
+  begins, and eight words. So a name may be of any length and contain anything, unlike with `str()`.
+  Aligned words never reach into a page without the text.
 * `sched_switch` (:data:`SWITCH_CODE`) is printed where a thread that has emitted events goes or
-  comes. The first of these events shows a thread at work that came unseen, so a line like that
-  stands before it, which says nothing of the thread that went.
+  comes; it came unseen before the first one, so a line stands there that says nothing of who went.
 
-Topics of publishers and subscriptions that were created before are read where they are used first:
-the handles of `rmw_publish` and `rmw_take` are the addresses of structures that begin with the
+The handles of `rmw_publish` and `rmw_take` are the addresses of structures that begin with the
 addresses of the RMW's name, of its data and of the topic's name. Before tracetools 8 the former is
-found from `rcl_publish`'s `rcl_publisher_t`.
-
-bpftrace runs the script as root, so nothing stands in it that a stranger may have written:
-events, which we know, numbers, and paths of plain characters only.
+found from `rcl_publish`'s `rcl_publisher_t`. bpftrace runs as root, so nothing stands in its script
+that a stranger may have written: events, which we know, numbers, and paths of plain characters.
 
 Upstream: `tracetools/tracetools.h` of ros2_tracing, tags 4.1.1 to 8.10.1; bpftrace 0.17 to 0.26;
 rmw, `rmw/types.h`; rcl, `publisher_impl.h` (Humble, Iron).
@@ -78,13 +72,8 @@ _SWITCH = {  # column of `sched_switch` → the kernel's name, in the order of p
     "next_tid": "next_pid",
     "next_prio": "next_prio",
 }
-_KINDS: dict[object, Literal["text", "gid", "flag"]] = {
-    pl.String: "text",
-    pl.List: "gid",
-    pl.Int32: "flag",
-}
-_Texts: TypeAlias = dict[tuple[int, int, int], str]
-"""(time, tid, place) → text."""
+_Kind: TypeAlias = Literal["number", "flag", "text", "gid"]
+_KINDS: Mapping[object, _Kind] = {pl.String: "text", pl.List: "gid", pl.Int32: "flag"}
 
 
 @dataclass(frozen=True)
@@ -112,7 +101,7 @@ class Argument:
 
     column: str
     place: int
-    kind: Literal["number", "flag", "text", "gid"]
+    kind: _Kind
 
     @property
     def values(self) -> tuple[str, ...]:
@@ -173,10 +162,7 @@ def trace_points(libraries: Sequence[TracingLibrary]) -> tuple[TracePoint, ...]:
 
 
 def installed_libraries(environment: Mapping[str, str]) -> tuple[TracingLibrary, ...]:
-    """The libraries that a command with this environment can find, all below `/opt/ros` included:
-
-    it may be a script that sets up its ROS 2 itself.
-    """
+    """The libraries that a command with this environment can find, and all below `/opt/ros`."""
     prefixes = environment.get("AMENT_PREFIX_PATH", "").split(":")
     folders = [Path(prefix) / "lib" for prefix in prefixes if prefix]
     folders += [Path(entry) for entry in environment.get("LD_LIBRARY_PATH", "").split(":") if entry]
@@ -341,8 +327,8 @@ def read_printed(path: Path, points: Sequence[TracePoint], ahead_ns: int) -> Pri
         if stream.read() != b"\n":  # bpftrace was killed while it wrote
             lines = lines.head(-1)
     lines = lines.drop_nulls(CODE)  # bpftrace's own have no number in front
-    lines = lines.with_columns(pl.col("time") - ahead_ns).sort("time", maintain_order=True)
-    texts, cut_names = _texts(lines.filter(code=TEXT_CODE))
+    lines = lines.with_columns(pl.col("time") - ahead_ns)
+    texts = _texts(lines.filter(code=TEXT_CODE))
     parts: dict[str, list[pl.DataFrame]] = {}
     for code, point in enumerate(points, FIRST_POINT):
         rows = lines.filter(code=code)
@@ -350,51 +336,65 @@ def read_printed(path: Path, points: Sequence[TracePoint], ahead_ns: int) -> Pri
             parts.setdefault(point.event, []).append(_table(rows, point, texts))
     switches = lines.filter(code=SWITCH_CODE)
     if switches.height:
-        named = dict(zip(VALUES, _SWITCH, strict=False))
-        parts["sched_switch"] = [_typed(switches.rename(named), "sched_switch")]
+        columns = dict(zip(VALUES, _SWITCH, strict=False))
+        parts["sched_switch"] = [_typed(switches.rename(columns), "sched_switch")]
     tables = {
         event: pl.concat(tables, how="diagonal").sort("time", maintain_order=True)
         for event, tables in parts.items()
     }
-    rmw = next((text for (_, _, place), text in texts.items() if place == RMW_PLACE), None)
-    return Printed(tables, _handles(lines, points, texts), rmw, cut_names)
+    event_of = {code: point.event for code, point in enumerate(points, FIRST_POINT)}
+    named = texts.filter(place=NAME_PLACE).select("time", "tid", topic="text")
+    handles = lines.filter(pl.col("code").is_in(list(event_of))).join(named, on=["time", "tid"])
+    event = pl.col("code").replace_strict(event_of, return_dtype=pl.String)
+    handle = pl.col(VALUES[0]).cast(pl.UInt64)
+    handles = handles.with_columns(pl.col("pid").cast(pl.Int32), event=event, handle=handle)
+    rmw = texts.filter(place=RMW_PLACE)["text"]
+    return Printed(
+        tables,
+        handles.select("pid", "event", "handle", "topic").unique(maintain_order=True),
+        rmw[0] if len(rmw) else None,
+        int(texts["cut"].sum()),
+    )
 
 
-def _texts(lines: pl.DataFrame) -> tuple[_Texts, int]:
-    """The texts, put together from their words, and how many of them are cut."""
+def _texts(lines: pl.DataFrame) -> pl.DataFrame:
+    """``time, tid, place, text, cut``: the texts, put together from their words."""
     key = ["time", "tid", "place", "line"]
     lines = lines.with_columns(place=pl.col(VALUES[0]) // 16, line=pl.col(VALUES[0]) % 16)
     lines = lines.sort(key)
     words = lines.select(VALUES[2:]).fill_null(0).to_numpy().astype("<i8")
-    parts: dict[tuple[int, int, int], bytes] = {}
-    for row, (time, tid, place, line, skipped) in enumerate(
-        lines.select(*key, VALUES[1]).iter_rows()
-    ):
-        before = parts.get((time, tid, place), b"")
-        here = line * words[row].nbytes - (skipped if line else 0)
+    parts: dict[tuple[int, ...], bytes] = {}
+    rows = lines.select(*key, VALUES[1]).iter_rows()
+    for part, (*where, line, skipped) in zip(words, rows, strict=True):
+        thread = tuple(where)
+        before = parts.get(thread, b"")
+        here = line * part.nbytes - (skipped if line else 0)
         if b"\0" not in before and here == len(before):  # else it has ended, or a line was lost
-            part = words[row].tobytes()
-            parts[time, tid, place] = before + (part if line else part[skipped:])
-    ended = {key: part.partition(b"\0") for key, part in parts.items()}
-    texts = {key: text.decode(errors="replace") for key, (text, _, _) in ended.items()}
-    return texts, sum(not end for _, end, _ in ended.values())
+            parts[thread] = before + part.tobytes()[0 if line else skipped :]
+    texts = ((thread, *part.partition(b"\0")) for thread, part in parts.items())
+    return pl.DataFrame(
+        [(*thread, text.decode(errors="replace"), not end) for thread, text, end, _ in texts],
+        schema={**dict.fromkeys(key[:3], pl.Int64), "text": pl.String, "cut": pl.Boolean},
+        orient="row",
+    )
 
 
-def _table(rows: pl.DataFrame, point: TracePoint, texts: _Texts) -> pl.DataFrame:
+def _table(rows: pl.DataFrame, point: TracePoint, texts: pl.DataFrame) -> pl.DataFrame:
     """The table of one trace point's rows."""
     values = iter(VALUES)
     for argument in point.arguments:
-        column: pl.Series
+        column = argument.column
         if argument.kind == "text":
-            keys = rows.select("time", "tid").iter_rows()
-            names = [texts.get((time, tid, argument.place)) for time, tid in keys]
-            column = pl.Series(names, dtype=pl.String)
+            own = texts.filter(place=argument.place).select(
+                "time", "tid", pl.col("text").alias(column)
+            )
+            rows = rows.join(own, on=["time", "tid"], how="left")
         elif argument.kind == "gid":
             words = rows.select(next(values), next(values)).to_numpy().astype("<i8")
-            column = pl.Series([list(one.tobytes()) for one in words], dtype=pl.List(pl.UInt8))
+            gids = [list(one.tobytes()) for one in words]
+            rows = rows.with_columns(pl.Series(column, gids, dtype=pl.List(pl.UInt8)))
         else:
-            column = rows[next(values)]
-        rows = rows.with_columns(column.alias(argument.column))
+            rows = rows.with_columns(pl.col(next(values)).alias(column))
     if point.event == "rcl_init":
         rows = rows.with_columns(version=pl.lit(point.library.version, dtype=pl.String))
     return _typed(rows, point.event)
@@ -405,24 +405,3 @@ def _typed(rows: pl.DataFrame, event: str) -> pl.DataFrame:
     types = {**events.COMMON_COLUMNS, **events.FIELDS[event]}
     known = {column: kind for column, kind in types.items() if column in rows.columns}
     return rows.select(pl.col(column).cast(kind) for column, kind in known.items())
-
-
-def _handles(lines: pl.DataFrame, points: Sequence[TracePoint], texts: _Texts) -> pl.DataFrame:
-    """Whose names were read at which event: ``pid, event, handle, topic``."""
-    named = pl.DataFrame(
-        [(time, tid, name) for (time, tid, place), name in texts.items() if place == NAME_PLACE],
-        schema={"time": pl.Int64, "tid": pl.Int64, "topic": pl.String},
-        orient="row",
-    )
-    event_of = {code: point.event for code, point in enumerate(points, FIRST_POINT)}
-    return (
-        lines.filter(pl.col("code").is_in(list(event_of)))
-        .join(named, on=["time", "tid"])
-        .select(
-            pl.col("pid").cast(pl.Int32),
-            pl.col("code").replace_strict(event_of, return_dtype=pl.String).alias("event"),
-            pl.col(VALUES[0]).cast(pl.UInt64).alias("handle"),
-            "topic",
-        )
-        .unique(maintain_order=True)
-    )

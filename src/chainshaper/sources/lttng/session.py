@@ -1,9 +1,5 @@
 """Tracing with LTTng: a recording session of our own, and the session daemon that it needs.
 
-Events go through ring buffers in shared memory, one per core and user, from which a consumer
-daemon writes them to disk. When a buffer is full, events are discarded and counted; tracing then
-moves to a session with buffers four times as large while the application runs on.
-
 A root daemon that runs already, which we may use as root or in the group `tracing`, traces
 everybody's processes, and the kernel: we add a session to it, and leave out of the tables what
 other applications did. Otherwise we start a daemon and end it afterwards. It listens in a home
@@ -12,8 +8,8 @@ Root's run directory is /var/run/lttng whatever its environment says, so root's 
 have one of ours mounted there, in mount namespaces that they alone see. Where root may not mount
 (most containers), there can be one recording at a time.
 
-We may be killed. The kernel then ends a daemon of ours; a shell that waits for our end
-destroys our sessions in another's daemon and removes the home directory.
+We may be killed. The kernel then ends a daemon of ours; a shell that waits for our end destroys our
+sessions in another's daemon and removes the home directory.
 
 Upstream: lttng(1), lttng-sessiond(8), lttng-enable-channel(1); lttng-tools, `utils_get_rundir`;
 lttng-ust, `setup_local_apps`; `tracetools_trace` of ros2_tracing.
@@ -381,10 +377,7 @@ class LttngSession:
         return name
 
     def _enlarge(self, lttng: Lttng) -> None:
-        """Go on in a session with larger buffers, if there is room for it.
-
-        What was lost until then stays lost and is counted.
-        """
+        """Go on in a session with larger buffers, if there is room: one that runs gets none."""
         before, larger = self._buffer, buffer_size(wanted=self._buffer * _ENLARGED_BY)
         if larger <= before:
             return

@@ -3,13 +3,9 @@
 The Python that has `rclpy` is seldom ours, and domain and RMW are those of the application's nodes.
 An environment says which programs and libraries are loaded: who wrote it chooses what runs. So this
 is the one place where something is run that was found through another process, even the
-interpreter, and it runs with that process's user's rights or not at all:
-
-* as that user, with the groups of the user database, without capabilities or a way to get any;
-* in that environment and no other, in a session of its own, with no files of ours but the script,
-  and what it may print into, 8 MiB; for a limited time, and no longer than we run ourselves.
-
-What a script prints is a stranger's word.
+interpreter, and it runs with that process's user's rights, without capabilities or a way to get
+any, in that environment and a session of its own, with no files of ours but the script and what it
+may print into, for a limited time, or not at all. What it prints is a stranger's word.
 """
 
 import ctypes
