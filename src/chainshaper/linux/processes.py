@@ -52,11 +52,11 @@ def run_users(named: Collection[str | int] = ()) -> frozenset[int]:
 
     By default who has launched us, also by `sudo`, and root. Raises InputError: no such user.
     """
-    users = {int(one) for one in named if isinstance(one, int) or one.isdecimal()}
+    users = set()
     for name in named:
+        number = isinstance(name, int) or name.isdecimal()
         try:
-            if isinstance(name, str) and not name.isdecimal():
-                users.add(pwd.getpwnam(name).pw_uid)
+            users.add(int(name) if number else pwd.getpwnam(str(name)).pw_uid)
         except KeyError:
             raise InputError(
                 f"no user is named {name!r} on this machine: give a name of `getent passwd`, or a "

@@ -48,8 +48,13 @@ def with_found_objects(
     known = events.table(tables, "rcl_subscription_init")
     subscriptions = _of(handles, "rmw_take", "rmw_subscription_handle", known)
     starts = _unregistered_starts(tables)
-    readers = _readers(starts).join(
-        subscriptions, on=["pid", "rmw_subscription_handle"], how="semi"
+    usual = pl.col("taken").drop_nulls().mode().first().alias("rmw_subscription_handle")
+    share = (pl.col("taken") == usual).fill_null(False).mean()
+    readers = (
+        starts.group_by(_CALLBACK)
+        .agg(usual, share=share)
+        .filter(pl.col("share") >= _NEARLY_ALWAYS)
+        .join(subscriptions, on=["pid", "rmw_subscription_handle"], how="semi")
     )
     timers = _timers(starts.join(readers, on=_CALLBACK, how="anti"))
     handle = pl.col("rmw_subscription_handle").alias("subscription_handle")
@@ -164,14 +169,6 @@ def _unregistered_starts(tables: events.EventTables) -> pl.DataFrame:
         .join(pl.concat(registered), on=_CALLBACK, how="anti")
         .select("time", *_CALLBACK, "taken")
     )
-
-
-def _readers(starts: pl.DataFrame) -> pl.DataFrame:
-    """``pid, callback, rmw_subscription_handle`` of callbacks that start with what was taken."""
-    usual = pl.col("taken").drop_nulls().mode().first()
-    share = (pl.col("taken") == usual).fill_null(False).mean()
-    found = starts.group_by(_CALLBACK).agg(usual.alias("rmw_subscription_handle"), share=share)
-    return found.filter(pl.col("share") >= _NEARLY_ALWAYS).drop("share")
 
 
 def _timers(starts: pl.DataFrame) -> pl.DataFrame:

@@ -193,7 +193,13 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         """What a reader of the tables must know: damage, absent fields, numbers that were moved."""
         yield from self.warnings
         for name in sorted(set(self) & self._fields.keys()):
-            if missing := _missing_fields(name, self._fields[name]):
+            missing = [
+                field
+                for field, kind in events.FIELDS[name].items()
+                if field not in events.VERSION_FIELDS.get(name, ())
+                and not _castable(_decoded_type(self._fields[name].get(field)), kind)
+            ]
+            if missing:
                 yield (
                     f"the trace's {name} has no usable field {', '.join(missing)}: what depends on "
                     "it cannot be known."
@@ -236,7 +242,11 @@ class TraceTables(Mapping[str, pl.DataFrame]):
                         table = table.with_columns(pl.col("pid", "tid") + moved)
                     parts.setdefault(name, []).append(table)
         for name, tables in parts.items():
-            self._read[name] = tables[0] if len(tables) == 1 else _merged(tables)
+            table = tables[0]
+            if len(tables) > 1:  # several providers'; CARET's copy of an event is not another
+                table = pl.concat(tables, how="diagonal_relaxed").sort("time", maintain_order=True)
+                table = table.unique(maintain_order=True) if table.height else table
+            self._read[name] = table
 
     def _report(self, place: int, share: float) -> None:
         self._progress((place + share) / len(self._hosts), "decoding events")
@@ -324,17 +334,7 @@ def _declared_fields(trace: CtfTrace) -> dict[str, dict[str, Type]]:
     return declared
 
 
-def _missing_fields(name: str, fields: Mapping[str, Type]) -> list[str]:
-    """Which fields of an event are absent, or of a kind without use."""
-    return [
-        field
-        for field, wanted in events.FIELDS[name].items()
-        if field not in events.VERSION_FIELDS.get(name, ())
-        and not (field in fields and _castable(_decoded_type(fields[field]), wanted))
-    ]
-
-
-def _decoded_type(declared: Type) -> pl.DataType | None:
+def _decoded_type(declared: Type | None) -> pl.DataType | None:
     """What the values of a declared field become, of the kinds that a table has."""
     match declared:
         case IntegerType() | EnumType():
@@ -374,9 +374,3 @@ def _event_table(frame: pl.DataFrame, name: str, clock_offset_ns: int) -> pl.Dat
     # `sched_switch` names its threads itself.
     nameless = name != "sched_switch" and (table["pid"].null_count() or table["tid"].null_count())
     return table.drop_nulls(["pid", "tid"]) if nameless else table
-
-
-def _merged(parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
-    """Several providers' events of one name, by time; CARET's copy of an event is not another."""
-    together = pl.concat(parts, how="diagonal_relaxed").sort("time", maintain_order=True)
-    return together.unique(maintain_order=True) if together.height else together
