@@ -43,10 +43,17 @@ def humble() -> Program:
     return built("-DHUMBLE", version="4.1.1")
 
 
+@pytest.fixture
+def few() -> Program:
+    """Its trace points are those of callbacks alone, whose probes are set sooner."""
+    skip_without_bpftrace()
+    return built("-DFEW")
+
+
 @pytest.fixture(autouse=True)
 def set_up(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
     """The environment is as after sourcing the programs' set-up files."""
-    found = [name for name in ("program", "humble") if name in request.fixturenames]
+    found = [name for name in ("program", "humble", "few") if name in request.fixturenames]
     prefixes = [str(request.getfixturevalue(name).prefix) for name in found]
     monkeypatch.setenv("AMENT_PREFIX_PATH", ":".join(prefixes))
     monkeypatch.delenv("LD_LIBRARY_PATH", raising=False)
@@ -194,7 +201,7 @@ def test_of_strangers_nothing_is_recorded_or_run_unless_they_are_named(
 ) -> None:
     """Uprobes belong to a file, which both use; QoS is asked for in the last node's environment."""
     skip_without_bpftrace()
-    program = build(open_folder / "jazzy")
+    program = build(open_folder / "jazzy", "-DFEW")
     ran = open_folder / "ran"
     (open_folder / "evil").write_text(f"#!/bin/sh\nid -u > {ran}\n")
     (open_folder / "ros2").write_text(f"#!{open_folder}/evil\n")
@@ -231,17 +238,17 @@ def test_of_strangers_nothing_is_recorded_or_run_unless_they_are_named(
 
 
 def test_events_that_bpftrace_lost_are_counted(
-    program: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    few: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its buffers fill while it is stopped."""
     monkeypatch.setenv("BPFTRACE_PERF_RB_PAGES", "4")
     count = 5_000
-    tracer = EbpfTracer(tmp_path, program.command("flood"), ())
+    tracer = EbpfTracer(tmp_path, few.command("flood"), ())
 
     def flood() -> list[list[str]]:
         bpftrace = bpftrace_of(os.getpid())
         os.kill(bpftrace, signal.SIGSTOP)
-        process = program.waiting("flood", str(count))
+        process = few.waiting("flood", str(count))
         os.kill(bpftrace, signal.SIGCONT)
         time.sleep(0.5)
         process.communicate("go\n", timeout=60)
@@ -277,12 +284,12 @@ def test_a_recording_is_made_and_its_latency_computed_by_the_command_line(
 
 
 def test_the_end_of_bpftrace_is_noticed_and_what_it_wrote_is_read(
-    program: Program, tmp_path: Path
+    few: Program, tmp_path: Path
 ) -> None:
-    tracer = EbpfTracer(tmp_path, program.command("chain"), ())
+    tracer = EbpfTracer(tmp_path, few.command("chain"), ())
     try:
         tracer.start()
-        program.run("chain", "3")
+        few.run("chain", "3")
         os.kill(bpftrace_of(os.getpid()), signal.SIGKILL)
         wait_for(lambda: tracer.failure() is not None, "the tracer to notice")
         assert "bpftrace ended" in str(tracer.failure())
@@ -303,7 +310,7 @@ def bpftrace_of(parent: int) -> int:
     return found
 
 
-def test_bpftrace_ends_when_the_tracer_is_killed(program: Program, tmp_path: Path) -> None:
+def test_bpftrace_ends_when_the_tracer_is_killed(few: Program, tmp_path: Path) -> None:
     code = (
         "import sys, time, pathlib\n"
         "from chainshaper.sources.ebpf.session import EbpfTracer\n"
@@ -361,8 +368,8 @@ def test_what_the_machine_lacks_is_named_with_the_remedy(
 
 
 def test_bpftraces_own_words_are_in_the_error_when_it_cannot_trace(
-    program: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    few: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("BPFTRACE_MAX_PROBES", "1")
     with pytest.raises(PlatformError, match=r"bpftrace cannot trace here: .*probes"):
-        traced(EbpfTracer(tmp_path, program.command("every"), ()))
+        traced(EbpfTracer(tmp_path, few.command("every"), ()))
