@@ -230,17 +230,13 @@ def test_a_trace_without_ros_events_cannot_be_converted(tmp_path: Path) -> None:
     assert not (tmp_path / "recording").exists()
 
 
-def test_nothing_is_overwritten(tmp_path: Path) -> None:
-    trace = written(tmp_path / "trace", chain_story())
-    for name, verb in (("rec", "convert"), ("graph.svg", "graph")):
-        (tmp_path / name).write_text("mine")
-        said = refused(2, verb, trace, "-o", tmp_path / name)
-        assert f"{name} exists already and is not overwritten" in said
-        assert (tmp_path / name).read_text() == "mine"
-    assert "ends in .svg or .dot or .json" in refused(
-        2, "graph", trace, "-o", tmp_path / "graph.png"
-    )
-    assert "no such folder" in refused(2, "graph", trace, "-o", tmp_path / "no" / "graph.svg")
+def test_a_graph_is_written_where_it_can_be(tmp_path: Path) -> None:
+    trace, picture = written(tmp_path / "trace", chain_story()), tmp_path / "graph.svg"
+    picture.write_text("mine")
+    assert "exists already and is not overwritten" in refused(2, "graph", trace, "-o", picture)
+    other = refused(2, "graph", trace, "-o", picture.with_suffix(".png"))
+    assert "ends in .svg or .dot or .json" in other
+    assert picture.read_text() == "mine"
 
 
 def one_event(folder: Path, name: str, kinds: dict[str, str], payload: dict[str, Any]) -> None:

@@ -18,6 +18,8 @@ import struct
 from bisect import bisect
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
+from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,6 +30,7 @@ __all__ = [
     "demangled",
     "exported_functions",
     "function_offsets",
+    "mapped_regions",
     "read_regular",
     "type_argument",
 ]
@@ -106,7 +109,7 @@ def _functions(content: bytes, tables: tuple[int, ...]) -> Iterator[tuple[int, s
                 yield address, content[begin : content.index(b"\0", begin)].decode()
 
 
-class _Region(NamedTuple):
+class Region(NamedTuple):
     """Memory that a file is mapped to; ``offset`` is where in the file it begins."""
 
     start: int
@@ -114,6 +117,15 @@ class _Region(NamedTuple):
     offset: int
     executable: bool
     path: str
+
+
+def mapped_regions(pid: int) -> Iterator[Region]:
+    """The regions of a process's memory, by address. Raises OSError: gone, or another user's."""
+    for line in read_proc(f"/proc/{pid}/maps").decode(errors="replace").splitlines():
+        span, rights, offset, _, _, *path = line.split(maxsplit=5)
+        if path and path[0].startswith("/"):
+            start, end = (int(bound, 16) for bound in span.split("-"))
+            yield Region(start, end, int(offset, 16), "x" in rights, path[0])
 
 
 class _Process:
@@ -124,19 +136,14 @@ class _Process:
 
     def __init__(self, pid: int, memory: int, invokers: dict[str, dict[int, str]]) -> None:
         self.pid, self.memory, self.invokers = pid, memory, invokers
-        self.regions = []
-        for line in read_proc(f"/proc/{pid}/maps").decode(errors="replace").splitlines():
-            span, rights, offset, _, _, *path = line.split(maxsplit=5)
-            if path and path[0].startswith("/"):
-                start, end = (int(bound, 16) for bound in span.split("-"))
-                self.regions.append(_Region(start, end, int(offset, 16), "x" in rights, path[0]))
+        self.regions = list(mapped_regions(pid))
 
     def words(self, address: int, count: int) -> tuple[int, ...]:
         """Eight-byte words; raises OSError where nothing is mapped."""
         data = os.pread(self.memory, 8 * count, address)
         return struct.unpack_from(f"={len(data) // 8}Q", data)
 
-    def region(self, address: int) -> _Region | None:
+    def region(self, address: int) -> Region | None:
         number = bisect(self.regions, address, key=lambda one: one.start) - 1
         found = self.regions[number] if number >= 0 else None
         return found if found is not None and address < found.end else None
@@ -187,15 +194,12 @@ class _Process:
 
 def callback_functions(callbacks: Iterable[tuple[int, int]]) -> dict[tuple[int, int], str]:
     """(Process, callback) → the type of its function, where it is known and the process runs."""
-    handles: dict[int, list[int]] = {}
-    for pid, callback in callbacks:
-        handles.setdefault(pid, []).append(callback)
     invokers: dict[str, dict[int, str]] = {}
     found: dict[tuple[int, int], str] = {}
-    for pid, addresses in handles.items():
+    for pid, handles in groupby(sorted(set(callbacks)), key=itemgetter(0)):
         with suppress(OSError), Path(f"/proc/{pid}/mem").open("rb") as memory:
             process = _Process(pid, memory.fileno(), invokers)
-            for address in addresses:
+            for _, address in handles:
                 name = process.timer(address)
                 if name is None or name.startswith("std::function<"):
                     name = process.function(address)

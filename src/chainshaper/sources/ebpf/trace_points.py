@@ -33,8 +33,7 @@ from typing import Literal, TypeAlias
 
 import polars as pl
 
-from chainshaper.linux.threads import read_proc
-from chainshaper.sources.ebpf.functions import exported_functions, read_regular
+from chainshaper.sources.ebpf.functions import exported_functions, mapped_regions, read_regular
 from chainshaper.values import events
 from chainshaper.values.errors import InputError
 
@@ -181,9 +180,9 @@ def mapped_libraries(pids: Iterable[int]) -> dict[int, tuple[TracingLibrary, ...
 def _mapped(pid: int) -> Iterator[Path]:
     """Files of that name which a process has mapped, by paths that lead there from here."""
     with suppress(OSError):  # it is gone, or another user's
-        maps = read_proc(f"/proc/{pid}/maps").decode(errors="replace")
-        paths = {line.split(maxsplit=5)[5] for line in maps.splitlines() if f"/{LIBRARY}" in line}
-        for mapped in sorted(paths):
+        for mapped in sorted(
+            {one.path for one in mapped_regions(pid) if f"/{LIBRARY}" in one.path}
+        ):
             inside = Path(f"/proc/{pid}/root{mapped}")  # as a container has it
             if inside.is_file():  # else replaced since: its new contents are not what runs
                 outside = Path(mapped)
