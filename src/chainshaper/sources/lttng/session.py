@@ -24,7 +24,6 @@ import tempfile
 import time
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
@@ -40,7 +39,7 @@ from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import RecordingInfo
 
-__all__ = ["Lttng", "LttngSession", "buffer_size", "connect"]
+__all__ = ["LttngSession", "buffer_size"]
 
 EVENTS = ("ros2:*", "ros2_caret:*", "dds:*")
 """Everything that `tracetools` of any distribution, CARET, and a traced Cyclone DDS emit."""
@@ -75,19 +74,39 @@ rm -rf "$LTTNG_HOME"
 """
 
 
-@dataclass(frozen=True)
 class Lttng:
-    """A connection to a session daemon, by the client that every installation has.
+    """A connection to the session daemon that traces our applications, or to one of our own.
 
-    ``home`` is a directory of our own, whose unique name sessions are called after; ``afterwards``
-    clears up when we are gone. ``daemon`` is the daemon's process where we have started it, and
-    ``inside`` what commands begin with that shall see its run directory.
+    ``home`` is a directory of our own, whose unique name sessions are called after. ``daemon`` is
+    the daemon's process where we have started it.
+
+    Raises PlatformError: LTTng is not installed, or cannot make two recordings at a time here.
+    OperationError: the daemon does not start.
     """
 
-    home: Path
-    afterwards: "subprocess.Popen[bytes]"
-    daemon: "subprocess.Popen[bytes] | None" = None
-    inside: tuple[str, ...] = ()
+    def __init__(self) -> None:
+        if not is_installed("lttng"):
+            raise PlatformError(f"the command `lttng` is not there: {_PACKAGES}")
+        # Sockets lie in it, whose paths may have 108 characters only: not beside the recording.
+        self.home = Path(tempfile.mkdtemp(prefix="chainshaper-lttng-"))
+        self.daemon: subprocess.Popen[bytes] | None = None
+        self._environment = {**tool_environment(), "LTTNG_HOME": str(self.home)}
+        self._inside: tuple[str, ...] = ()  # what commands begin with that see its run directory
+        self._afterwards = subprocess.Popen(  # clears up when we are gone
+            ["sh", "-c", _AFTERWARDS, self.home.name],
+            env=self._environment,
+            stdin=subprocess.PIPE,  # ends with us, however that happens
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        try:
+            found = self._answers()
+            if not found or _hears_one_command_only():
+                self._start_daemon(found)
+        except BaseException:
+            self.close()
+            raise
 
     @property
     def environment(self) -> dict[str, str]:
@@ -99,8 +118,8 @@ class Lttng:
         what = f"`{shlex.join(('lttng', *arguments))}`"
         try:
             run = subprocess.run(
-                [*self.inside, "lttng", "--no-sessiond", "--mi", "xml", *arguments],
-                env=_environment(self.home),
+                [*self._inside, "lttng", "--no-sessiond", "--mi", "xml", *arguments],
+                env=self._environment,
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
                 text=True,
@@ -118,12 +137,54 @@ class Lttng:
         said = _last_line(run.stderr).removeprefix("Error: ")
         raise OperationError(f"{what} failed: {said or f'exit code {run.returncode}'}")
 
-    def answers(self) -> bool:
+    def _answers(self) -> bool:
         """Whether a session daemon does."""
         with suppress(OperationError):
             self.ask("list")
             return True
         return False
+
+    def _start_daemon(self, another: bool) -> None:
+        """Start a daemon of ours, with a run directory of its own if there is ``another``."""
+        if os.getuid() == 0:  # all other users' is in the home directory anyway
+            (self.home / "run").mkdir()
+            inside = (*_APART, str(self.home / "run"))
+            with suppress(OSError):  # no `unshare` here
+                trial, environment = [*inside, "true"], self._environment
+                run = subprocess.run(trial, env=environment, capture_output=True, check=False)
+                self._inside = inside if run.returncode == 0 else ()
+        if another and not self._inside:
+            raise PlatformError(
+                "another recording runs, and LTTng can make one at a time here, because root may "
+                "not mount: wait for its end, or record where mounting is permitted (Docker: "
+                "`--privileged`)"
+            )
+        if not is_installed("lttng-sessiond"):
+            raise PlatformError(
+                f"no LTTng session daemon runs, and `lttng-sessiond` is not there: {_PACKAGES}"
+            )
+        said, folder = self.home / "daemon.log", self.home / ".lttng"
+        folder.mkdir()
+        for version in range(5, 20):  # applications look for one with their ABI's version
+            (folder / f"lttng-ust-sock-{version}").symlink_to("applications")
+        sockets = f"--apps-sock={folder / 'applications'}"
+        with said.open("wb") as log:
+            self.daemon = subprocess.Popen(
+                [*self._inside, "lttng-sessiond", "--quiet", sockets],
+                env=self._environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                # It ends in order, with its consumers, should we be killed.
+                preexec_fn=partial(signalled_with_parent, os.getpid(), signal.SIGINT),  # noqa: PLW1509 - one call
+            )
+        deadline = time.monotonic() + _START_S
+        while not self._answers():
+            if self.daemon.poll() is not None or time.monotonic() > deadline:
+                reason = _last_line(said.read_text(errors="replace")) or "it says nothing"
+                raise OperationError(f"the LTTng session daemon does not start: {reason}")
+            time.sleep(0.05)
 
     def close(self) -> None:
         """End the daemon if it is ours, and remove the home directory; harmless when repeated."""
@@ -134,47 +195,7 @@ class Lttng:
             except subprocess.TimeoutExpired:
                 self.daemon.kill()
                 self.daemon.wait()
-        self.afterwards.communicate()
-
-
-def connect() -> Lttng:
-    """Find the session daemon that traces our applications, or start one.
-
-    Raises PlatformError: LTTng is not installed, or cannot make two recordings at a time here.
-    OperationError: the daemon does not start.
-    """
-    if not is_installed("lttng"):
-        raise PlatformError(f"the command `lttng` is not there: {_PACKAGES}")
-    # Sockets lie in it, whose paths may have 108 characters only: not beside the recording.
-    home = Path(tempfile.mkdtemp(prefix="chainshaper-lttng-"))
-    afterwards = subprocess.Popen(
-        ["sh", "-c", _AFTERWARDS, home.name],
-        env=_environment(home),
-        stdin=subprocess.PIPE,  # ends with us, however that happens
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
-    lttng = Lttng(home, afterwards)
-    try:
-        found = lttng.answers()
-        if found and not _hears_one_command_only():
-            return lttng
-        lttng = replace(lttng, inside=_run_directory_apart(home))
-        if found and not lttng.inside:
-            raise PlatformError(
-                "another recording runs, and LTTng can make one at a time here, because root may "
-                "not mount: wait for its end, or record where mounting is permitted (Docker: "
-                "`--privileged`)"
-            )
-        if not is_installed("lttng-sessiond"):
-            raise PlatformError(
-                f"no LTTng session daemon runs, and `lttng-sessiond` is not there: {_PACKAGES}"
-            )
-        return _with_daemon(lttng)
-    except BaseException:
-        lttng.close()
-        raise
+        self._afterwards.communicate()
 
 
 def _hears_one_command_only() -> bool:
@@ -185,53 +206,8 @@ def _hears_one_command_only() -> bool:
     return False
 
 
-def _run_directory_apart(home: Path) -> tuple[str, ...]:
-    """What root's commands begin with that see a run directory of our own, if permitted."""
-    if os.getuid() == 0:
-        folder = home / "run"
-        folder.mkdir()
-        inside = (*_APART, str(folder))
-        trial, environment = [*inside, "true"], _environment(home)
-        with suppress(OSError):  # no `unshare` here
-            run = subprocess.run(trial, env=environment, capture_output=True, check=False)
-            return inside if run.returncode == 0 else ()
-    return ()
-
-
-def _with_daemon(lttng: Lttng) -> Lttng:
-    said = lttng.home / "daemon.log"
-    folder = lttng.home / ".lttng"
-    folder.mkdir()
-    for version in range(5, 20):  # the name under which applications look has their ABI's version
-        (folder / f"lttng-ust-sock-{version}").symlink_to("applications")
-    with said.open("wb") as log:
-        daemon = subprocess.Popen(
-            [*lttng.inside, "lttng-sessiond", "--quiet", f"--apps-sock={folder / 'applications'}"],
-            env=_environment(lttng.home),
-            stdin=subprocess.DEVNULL,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
-            # It ends in order, with its consumers, should we be killed.
-            preexec_fn=partial(signalled_with_parent, os.getpid(), signal.SIGINT),  # noqa: PLW1509 - one call
-        )
-    started = replace(lttng, daemon=daemon)
-    deadline = time.monotonic() + _START_S
-    while not started.answers():
-        if daemon.poll() is not None or time.monotonic() > deadline:
-            reason = _last_line(said.read_text(errors="replace")) or "it says nothing"
-            started.close()
-            raise OperationError(f"the LTTng session daemon does not start: {reason}")
-        time.sleep(0.05)
-    return started
-
-
 def _last_line(text: str) -> str:
     return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")
-
-
-def _environment(home: Path) -> dict[str, str]:
-    return {**tool_environment(), "LTTNG_HOME": str(home)}
 
 
 class LttngSession:
@@ -264,7 +240,7 @@ class LttngSession:
 
     def start(self) -> Mapping[str, str]:
         """Have a session daemon, and a session that is on."""
-        self._lttng = lttng = connect()
+        self._lttng = lttng = Lttng()
         try:
             lttng.ask("list", "--kernel")
             self._kernel = True
