@@ -222,7 +222,7 @@ def test_of_strangers_nothing_is_recorded_or_run_unless_they_are_named(
         if "recording" in what:
             run()
 
-    ours, _ = start()
+    ours, strangers = start()
     with strange(named("listener"), {"PATH": f"{open_folder}:/bin:/usr/bin"}) as listener:
         second = 1_000_000_000
         made = record_command(
@@ -230,11 +230,13 @@ def test_of_strangers_nothing_is_recorded_or_run_unless_they_are_named(
         )
     assert not ran.exists()
     assert f"/listener (process {listener.pid} of nobody)" in " ".join(made.recording.info.notes)
-    assert set(made.recording.events["callback_start"]["pid"]) == {ours}
+    seen = set(made.recording.events["callback_start"]["pid"])
+    assert ours in seen
+    assert strangers not in seen
     pids = start()
     (tmp_path / "trace").mkdir()
     named_too = traced(EbpfTracer(tmp_path / "trace", (), (), {0, NOBODY}), run)
-    assert set(named_too.tables["callback_start"]["pid"]) == set(pids)
+    assert set(named_too.tables["callback_start"]["pid"]) >= set(pids)
 
 
 def test_events_that_bpftrace_lost_are_counted(

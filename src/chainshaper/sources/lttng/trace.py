@@ -22,16 +22,7 @@ from typing import TypeAlias
 import polars as pl
 
 from chainshaper.sources.ctf import CtfTrace, Events, count_events, open_trace, read_events
-from chainshaper.sources.ctf.types import (
-    ArrayType,
-    EnumType,
-    IntegerType,
-    SequenceType,
-    StringType,
-    StructType,
-    Type,
-    field_name,
-)
+from chainshaper.sources.ctf import types as ctf
 from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids, rmw_of_threads
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
@@ -165,7 +156,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
     def field_lengths(self) -> dict[str, dict[str, int]]:
         """Event → its declared fields, with the length of those that are arrays (0: no array)."""
         return {
-            name: {f: t.length if isinstance(t, ArrayType) else 0 for f, t in fields.items()}
+            name: {f: t.length if isinstance(t, ctf.ArrayType) else 0 for f, t in fields.items()}
             for name, fields in self._fields.items()
         }
 
@@ -320,28 +311,31 @@ def table_name(event: str) -> str | None:
     return name if known and provider in (("",) if of_kernel else ("ros2", "ros2_caret")) else None
 
 
-def _declared_fields(trace: CtfTrace) -> dict[str, dict[str, Type]]:
+def _declared_fields(trace: CtfTrace) -> dict[str, dict[str, ctf.Type]]:
     """Table → the fields that the trace declares for its event."""
-    declared: dict[str, dict[str, Type]] = {}
+    declared: dict[str, dict[str, ctf.Type]] = {}
     for folder in trace.folders:
         for stream in folder.declared.streams.values():
             for event in stream.events.values():
                 name = table_name(event.name)
                 if name is not None:
-                    kind = event.fields or StructType()
-                    fields = {field_name(f.name): f.type for f in kind.fields}
+                    kind = event.fields or ctf.StructType()
+                    fields = {ctf.field_name(f.name): f.type for f in kind.fields}
                     declared.setdefault(name, {}).update(fields)
     return declared
 
 
-def _decoded_type(declared: Type | None) -> pl.DataType | None:
+def _decoded_type(declared: ctf.Type | None) -> pl.DataType | None:
     """What the values of a declared field become, of the kinds that a table has."""
     match declared:
-        case IntegerType() | EnumType():
+        case ctf.IntegerType() | ctf.EnumType():
             return pl.Int64()
-        case StringType():
+        case ctf.StringType():
             return pl.String()
-        case ArrayType(element=IntegerType() as one) | SequenceType(element=IntegerType() as one):
+        case (
+            ctf.ArrayType(element=ctf.IntegerType() as one)
+            | ctf.SequenceType(element=ctf.IntegerType() as one)
+        ):
             text = one.encoding != "none" and one.size == one.align == 8
             return pl.String() if text else pl.List(pl.Int64())
     return None
