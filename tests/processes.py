@@ -10,7 +10,7 @@ __all__ = ["children_of", "marked_processes", "real_time_threads", "wait_for"]
 
 
 def children_of(pid: int) -> list[int]:
-    """Processes whose parent is ``pid``, dead ones that nobody has waited for included."""
+    """Processes whose parent is ``pid``, zombies included."""
     return [child for child, parent in parents().items() if parent == pid]
 
 
@@ -24,7 +24,7 @@ def marked_processes(marker: str) -> dict[int, str]:
         try:
             if marker.encode() in Path(f"/proc/{pid}/environ").read_bytes():
                 found[pid] = Path(f"/proc/{pid}/comm").read_text().strip()
-        except OSError:  # it ended meanwhile, or belongs to somebody else
+        except OSError:  # it ended meanwhile, or is another user's
             continue
     return found
 

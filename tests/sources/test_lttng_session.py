@@ -41,7 +41,7 @@ UNPRIVILEGED = ("setpriv", "--bounding-set=-sys_admin")
 
 @contextmanager
 def users_daemon(home: Path) -> Iterator[dict[str, str]]:
-    """Have one, started unless it is there; the environment of somebody who uses it."""
+    """Have one, started unless it is there; the environment of who uses it."""
     if os.geteuid() != 0:
         pytest.skip("only root can start the session daemon that traces everybody")
     environment = {**os.environ, "LTTNG_HOME": str(home)}
@@ -64,8 +64,8 @@ def lttng(environment: dict[str, str], *arguments: str) -> "subprocess.Completed
 
 def sessions(environment: dict[str, str]) -> list[str]:
     """The names of all sessions."""
-    told = lttng(environment, "--mi=xml", "list").stdout
-    return sorted(re.findall(r"<session>\s*<name>(.*?)</name>", told))
+    said = lttng(environment, "--mi=xml", "list").stdout
+    return sorted(re.findall(r"<session>\s*<name>(.*?)</name>", said))
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +76,7 @@ def node() -> Path:
 @pytest.fixture
 def daemon_of_our_own(node: Path) -> None:
     if lttng(dict(os.environ), "list").returncode == 0:
-        pytest.skip("a session daemon of somebody else runs here, so none of ours would")
+        pytest.skip("a session daemon of another program runs here, so none of ours would")
 
 
 @contextmanager
@@ -146,7 +146,7 @@ def test_in_a_users_daemon_all_stays_as_it_is_and_others_applications_are_left_o
     with users_daemon(tmp_path / "user") as users:
         current = Path(users["LTTNG_HOME"]) / ".lttngrc"
         assert lttng(users, "create", "mine", f"--output={tmp_path / 'mine'}").returncode == 0
-        # Its parent ends at once, so it descends from nobody of ours.
+        # Its parent ends at once, so it does not descend from us.
         orphaned = ["sh", "-c", f"{node} flood 100000 1000 > /dev/null 2>&1 & echo $!"]
         started = subprocess.run(orphaned, capture_output=True, text=True, check=True)
         stranger = int(started.stdout)
@@ -196,7 +196,7 @@ def test_a_daemon_that_dies_is_a_failure_in_words(node: Path, tmp_path: Path) ->
         assert session.failure() is None
         daemon = session._lttng.daemon if session._lttng else None
         if daemon is None:
-            pytest.skip("a session daemon of somebody else runs here, which is not ours to kill")
+            pytest.skip("a session daemon of another program runs here, which is not ours to kill")
         daemon.send_signal(signal.SIGKILL)
         daemon.wait()
         assert session.failure() == "the LTTng session daemon ended with code -9"
@@ -259,7 +259,7 @@ def callbacks(session: LttngSession) -> dict[int, int]:
 
 @dataclass(frozen=True)
 class Another:
-    """A process that records at the same time until it is told to end."""
+    """A process that records at the same time until it has to end."""
 
     process: "subprocess.Popen[str]"
     mark: str
