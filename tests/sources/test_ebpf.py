@@ -15,7 +15,7 @@ import pytest
 from command_line import called, json_of
 from processes import children_of, wait_for
 from strangers import NOBODY, named, open_folder, strange
-from traced_program import Program, build, built, skip_without_bpftrace, traced
+from traced_program import Program, Traced, build, built, skip_without_bpftrace, traced
 
 from chainshaper.analysis.flow import DataFlow, data_flow
 from chainshaper.flow.record import record_command
@@ -23,6 +23,7 @@ from chainshaper.sources.ebpf.late_attachment import with_found_nodes
 from chainshaper.sources.ebpf.session import EbpfTracer
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.events import EventTables
 from chainshaper.values.recording import EndpointInfo, open_recording
 
 __all__ = ["open_folder"]
@@ -90,30 +91,54 @@ def assert_same(tables: Mapping[str, pl.DataFrame], printed: list[list[str]], ve
         assert event == "sched_switch" or next(rows[event], None) is None, event
 
 
-def test_every_argument_arrives_as_it_was_passed_and_execution_times_are_cpu_times(
-    program: Program, humble: Program, tmp_path: Path
-) -> None:
-    """Both versions' libraries are there, as on a machine with two distributions."""
-    printed: dict[str, list[list[str]]] = {}
+@pytest.fixture(scope="module")
+def everything(tmp_path_factory: pytest.TempPathFactory) -> tuple[Traced, dict[str, Any]]:
+    """`every` of two versions, as on a machine with two distributions, and a chain: one recording.
+
+    And what the former printed, by version.
+    """
+    skip_without_bpftrace()
+    program, humble = built(), built("-DHUMBLE", version="4.1.1")
+    printed = {}
 
     def run_all() -> list[list[str]]:
         for version, one in (("8.2.3", program), ("4.1.1", humble)):
             printed[version] = one.run("every")
         return program.run("chain", str(CYCLES))
 
-    run = traced(EbpfTracer(tmp_path, program.command("every"), ()), run_all)
+    tracer = EbpfTracer(tmp_path_factory.mktemp("trace"), program.command("every"), ())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AMENT_PREFIX_PATH", f"{program.prefix}:{humble.prefix}")
+        return traced(tracer, run_all), printed
+
+
+def of_process(tables: EventTables, pid: int) -> dict[str, pl.DataFrame]:
+    own = {name: table.filter(pid=pid) for name, table in tables.items()}
+    return {name: table for name, table in own.items() if table.height}
+
+
+def test_every_argument_of_every_function_arrives_as_it_was_passed(
+    everything: tuple[Traced, dict[str, Any]],
+) -> None:
+    run, printed = everything
     assert run.info.lost == {"lost_events": 0}
     assert run.info.distribution == "jazzy"
-    every = {version: int(rows[0][1]) for version, rows in printed.items()}
-    for version, pid in every.items():
-        own = {name: table.filter(pid=pid) for name, table in run.tables.items()}
-        own = {name: table for name, table in own.items() if table.height}
-        assert_same(own, printed[version], version)
+    for version, rows in printed.items():
+        pid = int(rows[0][1])
+        own = of_process(run.tables, pid)
+        assert_same(own, rows, version)
         assert own["rcl_take"].item(0, "tid") != pid
-    (chain,) = set(run.tables["callback_start"]["pid"]) - set(every.values())
+
+
+def test_execution_times_are_the_threads_own_cpu_time(
+    everything: tuple[Traced, dict[str, Any]],
+) -> None:
+    run, printed = everything
+    every = {int(rows[0][1]) for rows in printed.values()}
+    (chain,) = set(run.tables["callback_start"]["pid"]) - every
     switches = run.tables["sched_switch"]
-    tables = {name: t.filter(pid=chain) for name, t in run.tables.items()}
-    instances = data_flow({**tables, "sched_switch": switches}).instances.drop_nulls("end")
+    tables = {**of_process(run.tables, chain), "sched_switch": switches}
+    instances = data_flow(tables).instances.drop_nulls("end")
     spent = [int(fields[4]) for fields in run.printed if fields[0] == "instance"]
     assert instances.height == len(spent) == 2 * CYCLES
     # Reading its own clocks costs the thread a little outside the callback, being traced inside.
@@ -173,10 +198,10 @@ def assert_attached(program: Program, folder: Path, distribution: str) -> None:
     assert info.processes == {wanted.pid: "/first, /second"}
 
 
-def test_the_chain_of_an_application_that_runs_is_found_and_its_folders_name_is_no_script(
+def test_an_application_that_runs_already_is_attached_to_and_its_chain_is_found(
     open_folder: Path, tmp_path: Path
 ) -> None:
-    """The name ends the quotes, and has root's bpftrace print a file that root alone may read."""
+    """Its folder's name ends the quotes, and has bpftrace print a file that root alone may read."""
     skip_without_bpftrace()
     secret = open_folder / "secret"
     secret.touch(0o600)
