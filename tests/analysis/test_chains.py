@@ -72,11 +72,7 @@ DIAMOND = graph(
 
 @pytest.mark.parametrize(
     ("text", "waypoints"),
-    [
-        ("/t1../t5", ("/t1", "/t5")),
-        (" /a .. /b/c..d ", ("/a", "/b/c", "d")),
-        ("/t1", ("/t1",)),
-    ],
+    [("/t1../t5", ("/t1", "/t5")), (" /a .. /b/c..d ", ("/a", "/b/c", "d")), ("/t1", ("/t1",))],
 )
 def test_way_points_are_separated_by_two_dots(text: str, waypoints: tuple[str, ...]) -> None:
     assert parse_chain(text) == waypoints
@@ -162,11 +158,7 @@ def test_a_chain_that_would_have_to_pass_a_topic_twice_is_cyclic() -> None:
 
 
 def test_a_cycle_beside_the_chain_does_no_harm() -> None:
-    loop = graph(
-        source=[(None, ("/a",))],
-        one=[("/a", ("/b",))],
-        two=[("/b", ("/out", "/a"))],
-    )
+    loop = graph(source=[(None, ("/a",))], one=[("/a", ("/b",))], two=[("/b", ("/out", "/a"))])
     assert find_chain(loop, "/a../out").callbacks == (0, 1, 2)
 
 

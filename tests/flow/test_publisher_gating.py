@@ -18,12 +18,7 @@ SLOT_NS = 10 * MS
 
 
 def _plan() -> Plan:
-    return small_chain_plan(
-        5 * MS,
-        19 * MS,
-        publication="asynchronous",
-        publish_slot_ns=SLOT_NS,
-    )
+    return small_chain_plan(5 * MS, 19 * MS, publication="asynchronous", publish_slot_ns=SLOT_NS)
 
 
 def _burning_meanwhile(application: Application) -> Application:

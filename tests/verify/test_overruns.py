@@ -38,10 +38,7 @@ MS = 1_000_000
 
 def _too_early() -> Plan:
     """A publish slot in the midst of the small chain's latencies: every other output overruns."""
-    return small_chain_plan(
-        4 * MS,
-        6 * MS,
-    )
+    return small_chain_plan(4 * MS, 6 * MS)
 
 
 def _shaped(folder: Path, overrun: str) -> Recording:

@@ -14,14 +14,7 @@ from small_chain import small_chain
 
 from chainshaper import compare_recordings, measure_latency, plan_recording, shape_application
 from chainshaper.analysis import LatencyAnalysis, latency_statistics
-from chainshaper.planning import (
-    Modes,
-    Plan,
-    PlanRequest,
-    Profile,
-    plan_chain,
-    publish_slots,
-)
+from chainshaper.planning import Modes, Plan, PlanRequest, Profile, plan_chain, publish_slots
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.plan import revised
 from chainshaper.reporting.latency import late_text, prediction_json, prediction_table

@@ -98,11 +98,7 @@ def nearest(
 
 
 def _rows(
-    left: tuple[pl.Series, "Keys"],
-    right: tuple[pl.Series, "Keys"],
-    step: int,
-    *,
-    strictly: bool,
+    left: tuple[pl.Series, "Keys"], right: tuple[pl.Series, "Keys"], step: int, *, strictly: bool
 ) -> pl.Series:
     """For every row of ``left`` that of ``right`` which matches it, or null; both in order."""
     (at, left_keys), (times, right_keys) = left, right

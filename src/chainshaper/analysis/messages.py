@@ -21,13 +21,7 @@ Publications and takes under handles that were never initialised are left out
 
 import polars as pl
 
-from chainshaper.analysis.matching import (
-    by_number,
-    first_after,
-    grows,
-    in_order,
-    latest_before,
-)
+from chainshaper.analysis.matching import by_number, first_after, grows, in_order, latest_before
 from chainshaper.analysis.objects import Objects
 from chainshaper.values import events
 
@@ -224,10 +218,7 @@ def _dequeued(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
 
 
 def link_takes(
-    tables: events.EventTables,
-    taken: pl.DataFrame,
-    published: pl.DataFrame,
-    clock_offset_ns: int,
+    tables: events.EventTables, taken: pl.DataFrame, published: pl.DataFrame, clock_offset_ns: int
 ) -> pl.DataFrame:
     """``taken`` with a column ``publication``: which publication each take read (null: unknown).
 

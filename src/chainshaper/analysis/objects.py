@@ -22,13 +22,7 @@ import polars as pl
 from chainshaper.analysis.matching import first_after, latest_before, nearest
 from chainshaper.values import events
 
-__all__ = [
-    "CALLBACK_SCHEMA",
-    "Objects",
-    "named_nodes",
-    "numbered",
-    "resolve_objects",
-]
+__all__ = ["CALLBACK_SCHEMA", "Objects", "named_nodes", "numbered", "resolve_objects"]
 
 CALLBACK_SCHEMA: dict[str, pl.DataType] = {
     "callback_id": pl.UInt32(),

@@ -27,11 +27,7 @@ from chainshaper.enforcement import threads as allocation
 from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, make_back_end
 from chainshaper.enforcement.guardian import Guardians, run_claimed, start_guardians
 from chainshaper.enforcement.scheduling_memory import change_all, look_alikes, note_descendants
-from chainshaper.enforcement.servers import (
-    BackEnd,
-    ServerCounters,
-    ServerTable,
-)
+from chainshaper.enforcement.servers import BackEnd, ServerCounters, ServerTable
 from chainshaper.enforcement.threads import Allocation, NodeThread, RecordedProcess, server_members
 from chainshaper.enforcement.undoing import (
     RunState,
@@ -55,11 +51,7 @@ from chainshaper.linux.runs import PLAN_FILE, Journal
 from chainshaper.linux.scheduling import available_cores, check_cores
 from chainshaper.linux.threads import list_threads
 from chainshaper.linux.users import run_users
-from chainshaper.planning.overruns import (
-    open_until_done,
-    publication_warnings,
-    refuse_offset,
-)
+from chainshaper.planning.overruns import open_until_done, publication_warnings, refuse_offset
 from chainshaper.planning.plan import Plan, publisher_servers, shaping_nodes
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
@@ -393,11 +385,7 @@ def _keep(
 
 
 def _look_again(
-    run: _Run,
-    servers: BackEnd,
-    before: Allocation,
-    state: RunState,
-    latest: tuple[NodeThread, ...],
+    run: _Run, servers: BackEnd, before: Allocation, state: RunState, latest: tuple[NodeThread, ...]
 ) -> tuple[Allocation, RunState, tuple[NodeThread, ...], str]:
     """Threads that have appeared get what the plan says; ``latest`` had when it was looked before.
 

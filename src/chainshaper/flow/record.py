@@ -31,12 +31,7 @@ from chainshaper.flow.recorded_threads import (
     scheduled_in_real_time,
 )
 from chainshaper.linux.own_processes import check_command, end_command, end_in_words, start_command
-from chainshaper.linux.processes import (
-    Process,
-    descendants,
-    find_applications,
-    list_processes,
-)
+from chainshaper.linux.processes import Process, descendants, find_applications, list_processes
 from chainshaper.linux.runs import Governed, governing, in_force_throughout
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import parents

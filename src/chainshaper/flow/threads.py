@@ -15,12 +15,7 @@ from chainshaper.enforcement.litmus import litmus_commands
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.enforcement.threads import Allocation, RecordedProcess, WantedScheduling, allocate
 from chainshaper.flow.phase import measure_phase
-from chainshaper.linux.processes import (
-    Process,
-    descendants,
-    find_applications,
-    list_processes,
-)
+from chainshaper.linux.processes import Process, descendants, find_applications, list_processes
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.linux.threads import Thread
 from chainshaper.linux.users import run_users
