@@ -6,7 +6,7 @@ import random
 import polars as pl
 import pytest
 
-from chainshaper.analysis.instances import ends_of_starts
+from chainshaper.analysis.matching import ends_of_starts
 
 
 def by_definition(

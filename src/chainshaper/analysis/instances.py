@@ -17,14 +17,12 @@ Some work has no callback event, but its messages prove it. Such instances are a
 
 from dataclasses import replace
 
-import numpy as np
 import polars as pl
 
-from chainshaper.analysis.matching import Keys, key_table, latest_before
+from chainshaper.analysis.matching import ends_of_starts, latest_before
 from chainshaper.analysis.objects import CALLBACK_SCHEMA, Objects
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS
-from chainshaper.values.compiled import kernel
 
 __all__ = [
     "callback_instances",
@@ -33,11 +31,6 @@ __all__ = [
     "with_assumed_readers",
     "with_assumed_writers",
 ]
-
-_walk_pairs = kernel("chainshaper.analysis.matching", "walk_pairs")
-_NONE = 0xFFFFFFFF
-_THREAD = ["pid", "tid", "callback"]
-
 
 def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFrame:
     """All instances of all callbacks, one row each, sorted by start.
@@ -78,29 +71,6 @@ def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> p
     if frame["execution_ns"].null_count() == frame.height and "sched_switch" in tables:
         frame = _plausible(frame.with_columns(cpu_time(tables, frame).alias("execution_ns")))
     return frame.with_row_index("instance")
-
-
-def ends_of_starts(starts: pl.DataFrame, ends: pl.DataFrame) -> pl.Series:
-    """For every row of `callback_start` the row of its `callback_end`, null for none.
-
-    Both are sorted by time. An end is the next event of its process, thread and callback.
-    """
-    keys = Keys.of(starts, _THREAD), Keys.of(ends, _THREAD)
-    if keys[0] is None or keys[1] is None:
-        raise TypeError("pid, tid and callback are integers")
-    began, ended = (frame["time"].rechunk().to_numpy() for frame in (starts, ends))
-    slots, status = 1024, -1
-    while status < 0:
-        found = np.full(len(began), _NONE, np.uint32)
-        table, states = key_table(slots), np.zeros((slots, 4), np.int64)
-        status = _walk_pairs(
-            keys[0].table.ctypes.data, began.ctypes.data, len(began),
-            keys[1].table.ctypes.data, ended.ctypes.data, len(ended),
-            found.ctypes.data, table.ctypes.data, states.ctypes.data, slots,
-        )  # fmt: skip
-        slots *= 8
-    row = pl.Series(found)
-    return row.set(row == _NONE, None) if (found == _NONE).any() else row
 
 
 def _used(starts: pl.DataFrame, ends: pl.DataFrame, row: pl.Series) -> pl.Expr:
