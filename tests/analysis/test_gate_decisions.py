@@ -4,7 +4,7 @@ import polars as pl
 
 from chainshaper import analyse_latency
 from chainshaper.analysis import data_flow
-from chainshaper.analysis.departures import gate_decisions
+from chainshaper.analysis.messages import gate_decisions
 from chainshaper.values.recording import Recording
 
 

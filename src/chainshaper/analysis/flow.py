@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from chainshaper.analysis.departures import with_departures
+from chainshaper.analysis.messages import with_departures
 from chainshaper.analysis.instances import (
     callback_instances,
     with_assumed_readers,
@@ -34,7 +34,7 @@ class DataFlow:
       its row.
     * ``publications``: see :func:`~chainshaper.analysis.messages.publications`, with the
       ``instance`` in which each was published and its ``callback_id`` (null: outside callbacks),
-      and when it was ``sent`` (:mod:`~chainshaper.analysis.departures`).
+      and when it was ``sent`` (:mod:`~chainshaper.analysis.messages`).
     * ``takes``: see :func:`~chainshaper.analysis.messages.takes`, with the ``publication`` that
       was read and the ``instance`` that got the message (null: none did).
     * ``events``: the tables all this came from.

@@ -32,6 +32,7 @@ __all__ = [
     "with_assumed_writers",
 ]
 
+
 def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFrame:
     """All instances of all callbacks, one row each, sorted by start.
 

@@ -126,7 +126,7 @@ class LatencyAnalysis:
     :func:`~chainshaper.analysis.punctuality.with_punctuality`), ``disturbed``, ``received``,
     ``reception_ns`` (latency to the subscriber's `callback_start`) and ``reception_disturbed``
     (also by a stall between the two) added, ``hops`` its frame of hops, ``releases`` what gates
-    decided about them (:func:`~chainshaper.analysis.departures.gated_hops`). ``statistics`` are
+    decided about them (:func:`~chainshaper.analysis.messages.gated_hops`). ``statistics`` are
     over all complete traversals, ``undisturbed`` over those that the machine did not disturb;
     ``subscriber`` and ``subscriber_undisturbed`` are the same of ``reception_ns`` (None: no node
     subscribes to the output in this recording). ``incomplete`` counts traversals without an end by

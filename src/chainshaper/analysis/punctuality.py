@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import polars as pl
 
-from chainshaper.analysis.departures import gated_hops
+from chainshaper.analysis.messages import gated_hops
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.traversals import Traversals
 
@@ -57,7 +57,7 @@ def with_punctuality(
     * ``origin``: from when the gate counted (null: no gate decided); ``computed_at``: when the
       chain was done, at the gate's door or with the publication.
 
-    The decisions are those of :func:`~chainshaper.analysis.departures.gated_hops`.
+    The decisions are those of :func:`~chainshaper.analysis.messages.gated_hops`.
     """
     releases = gated_hops(
         flow.events, flow.objects, traversals.hops, 0 if due is None else due.cycles

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from chainshaper.analysis.departures import discarded_instances, why_not_sent
+from chainshaper.analysis.messages import discarded_instances, why_not_sent
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.graph import MESSAGE_FILTER, goes_on_elsewhere, graph_of
 from chainshaper.analysis.matching import by_number, first_after, in_order

@@ -11,7 +11,7 @@ later cycle than due as having waited.
 import polars as pl
 
 from chainshaper.analysis import LatencyAnalysis
-from chainshaper.analysis.departures import with_overrun
+from chainshaper.analysis.messages import with_overrun
 from chainshaper.gate.decision import DROPPED
 from chainshaper.planning import Plan
 from chainshaper.planning.overruns import cycles_until_output
