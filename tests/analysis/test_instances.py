@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from story import Callback, Story
 
 from chainshaper.analysis import callback_instances, data_flow, resolve_objects
-from chainshaper.analysis.instances import cpu_time
+from chainshaper.analysis.flow import cpu_time
 
 
 def instances(story: Story) -> pl.DataFrame:

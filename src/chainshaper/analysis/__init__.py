@@ -17,9 +17,8 @@ from chainshaper.analysis.chains import (
     parse_chain,
 )
 from chainshaper.analysis.disturbance import disturbed
-from chainshaper.analysis.flow import DataFlow, data_flow
+from chainshaper.analysis.flow import DataFlow, callback_instances, data_flow
 from chainshaper.analysis.graph import application_graph, graph_of
-from chainshaper.analysis.instances import callback_instances
 from chainshaper.analysis.latency import (
     LatencyAnalysis,
     LatencyStatistics,

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 
 import polars as pl
 
-from chainshaper.analysis.messages import gated_hops
 from chainshaper.analysis.flow import DataFlow
+from chainshaper.analysis.messages import gated_hops
 from chainshaper.analysis.traversals import Traversals
 
 __all__ = ["Due", "lateness_in_cycle", "with_punctuality"]

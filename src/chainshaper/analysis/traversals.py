@@ -29,11 +29,10 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from chainshaper.analysis.messages import discarded_instances, why_not_sent
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.graph import MESSAGE_FILTER, goes_on_elsewhere, graph_of
 from chainshaper.analysis.matching import by_number, first_after, in_order
-from chainshaper.analysis.messages import overwritten_in
+from chainshaper.analysis.messages import discarded_instances, overwritten_in, why_not_sent
 from chainshaper.values.application import ApplicationGraph, Callback, Chain
 
 __all__ = ["REASONS", "Traversals", "reception", "traverse"]
