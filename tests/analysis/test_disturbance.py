@@ -8,7 +8,7 @@ from story import OFFSET, Story
 
 from chainshaper.analysis import data_flow, disturbed, find_chain, graph_of, traverse
 from chainshaper.analysis.disturbance import overlapping, stalled_within
-from chainshaper.analysis.punctuality import Due, with_punctuality
+from chainshaper.analysis.disturbance import Due, with_punctuality
 
 
 def one_traversal(

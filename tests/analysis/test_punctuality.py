@@ -6,7 +6,7 @@ import pytest
 from story import OFFSET, Story
 
 from chainshaper.analysis import LatencyAnalysis, analyse_latency
-from chainshaper.analysis.punctuality import Due
+from chainshaper.analysis.disturbance import Due
 
 PERIOD = 1_000
 

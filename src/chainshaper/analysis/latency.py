@@ -11,10 +11,9 @@ import numpy.typing as npt
 import polars as pl
 
 from chainshaper.analysis.chains import find_chain
-from chainshaper.analysis.disturbance import disturbed, stalled_after
+from chainshaper.analysis.disturbance import Due, disturbed, stalled_after, with_punctuality
 from chainshaper.analysis.flow import DataFlow, data_flow
 from chainshaper.analysis.graph import graph_of
-from chainshaper.analysis.punctuality import Due, with_punctuality
 from chainshaper.analysis.traversals import reception, traverse
 from chainshaper.values import events
 from chainshaper.values.application import ApplicationGraph, Chain
@@ -123,7 +122,7 @@ class LatencyAnalysis:
 
     ``traversals`` is the frame of :class:`~chainshaper.analysis.traversals.Traversals` with the
     columns ``place_ns``, ``due_at``, ``late`` (see
-    :func:`~chainshaper.analysis.punctuality.with_punctuality`), ``disturbed``, ``received``,
+    :func:`~chainshaper.analysis.disturbance.with_punctuality`), ``disturbed``, ``received``,
     ``reception_ns`` (latency to the subscriber's `callback_start`) and ``reception_disturbed``
     (also by a stall between the two) added, ``hops`` its frame of hops, ``releases`` what gates
     decided about them (:func:`~chainshaper.analysis.messages.gated_hops`). ``statistics`` are

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from chainshaper.analysis import DataFlow, LatencyAnalysis
-from chainshaper.analysis.punctuality import lateness_in_cycle
+from chainshaper.analysis.disturbance import lateness_in_cycle
 from chainshaper.planning import Plan
 from chainshaper.values import events
 from chainshaper.values.recording import Recording
@@ -129,7 +129,7 @@ def _origins(
     """The gate says from when it counted; else the chain's stamp, or where cycles seem to start.
 
     Cycles of which the recording says nothing are taken to start as
-    :mod:`chainshaper.analysis.punctuality` takes them.
+    :mod:`chainshaper.analysis.disturbance` takes them.
     """
     if analysis is None or plan is None:
         return pl.DataFrame(

@@ -25,7 +25,7 @@ from typing import Literal
 import polars as pl
 
 from chainshaper.analysis import LatencyAnalysis, LatencyStatistics, latency_statistics
-from chainshaper.analysis.punctuality import Due
+from chainshaper.analysis.disturbance import Due
 from chainshaper.planning import Plan, publish_slots
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.plan import publisher_servers, server_of
