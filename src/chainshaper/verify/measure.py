@@ -26,19 +26,6 @@ from chainshaper.values.recording import Recording
 from chainshaper.verify.overruns import dropped_in, into_open_slots, overruns_in
 from chainshaper.verify.predictions import PredictionHeld, due_of, hold_prediction
 
-__all__ = [
-    "PARTS",
-    "Comparison",
-    "LeftOut",
-    "Measurement",
-    "chain_of",
-    "compare_recordings",
-    "hop_breakdown",
-    "longest_stall",
-    "measure_latency",
-    "part_shares",
-]
-
 
 @dataclass(frozen=True)
 class LeftOut:
