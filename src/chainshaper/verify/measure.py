@@ -17,6 +17,7 @@ from pathlib import Path
 import polars as pl
 
 from chainshaper.analysis import LatencyAnalysis, analyse_latency
+from chainshaper.analysis.latency import summary
 from chainshaper.planning import Plan
 from chainshaper.sources import open_source
 from chainshaper.values import events
@@ -182,36 +183,34 @@ def hop_breakdown(analysis: LatencyAnalysis) -> pl.DataFrame:
     without traversals, and for the first hop's communication), and ``…_share`` of the mean latency.
     """
     callbacks = {callback.id: callback for callback in analysis.graph.callbacks}
+    path = [callbacks[number] for number in analysis.chain.callbacks]
     complete = analysis.traversals.filter("complete")
-    hops = analysis.hops.join(complete.select("traversal"), on="traversal", how="semi")
-    latency = complete["latency_ns"].mean()
+    latency = pl.lit(complete["latency_ns"].mean(), dtype=pl.Float64)
+    hops = analysis.hops.join(complete, on="traversal", how="semi")
     found = hops.group_by("hop").agg(
-        pl.len().alias("count"),
-        (pl.col("via") == "sibling").sum().alias("by_sibling"),
-        *(_summary(part) for part in PARTS),
+        *(summary(f"{part}_ns", pl.col(f"{part}_ns")) for part in PARTS),
+        count=pl.len(),
+        by_sibling=(pl.col("via") == "sibling").sum(),
     )
     rows = pl.DataFrame(
         {
-            "hop": range(len(analysis.chain.callbacks)),
+            "hop": range(len(path)),
             "callback_id": analysis.chain.callbacks,
-            "node": [callbacks[number].node for number in analysis.chain.callbacks],
-            "callback": [callbacks[number].label for number in analysis.chain.callbacks],
+            "node": [callback.node for callback in path],
+            "callback": [callback.label for callback in path],
             "topic": analysis.chain.topics,
         },
         schema_overrides={"hop": pl.UInt8, "callback_id": pl.UInt32},
     )
-    joined = rows.join(found, on="hop", how="left", maintain_order="left")
-    means = [pl.col(f"{part}_ns").struct.field("mean").alias(f"{part}_share") for part in PARTS]
-    return joined.with_columns(
+    return rows.join(found, on="hop", how="left", maintain_order="left").select(
+        *rows.columns,
         pl.col("count", "by_sibling").fill_null(0),
-        *(mean / pl.lit(latency, dtype=pl.Float64) for mean in means),
+        *(f"{part}_ns" for part in PARTS),
+        *(
+            (pl.col(f"{part}_ns").struct.field("mean") / latency).alias(f"{part}_share")
+            for part in PARTS
+        ),
     )
-
-
-def _summary(part: str) -> pl.Expr:
-    values = pl.col(f"{part}_ns")
-    summary = pl.struct(min=values.min(), mean=values.mean(), max=values.max())
-    return pl.when(values.count() > 0).then(summary).alias(f"{part}_ns")
 
 
 def part_shares(frame: pl.DataFrame) -> dict[str, float | None]:
