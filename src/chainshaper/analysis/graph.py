@@ -45,10 +45,13 @@ def graph_of(flow: DataFlow) -> ApplicationGraph:
     writes = defaultdict[int, set[str]](set)
     for callback_id, topic in pairs.collect().iter_rows():
         writes[callback_id].add(topic)
-    known = flow.objects.callbacks.unique("callback_id", maintain_order=True).sort("callback_id")
-    columns = ("kind", "node", "pid", "handle", "topic", "period_ns", "symbol")
-    rows = known.select("callback_id", *columns).iter_rows()
-    callbacks = [Callback(*row, publishes=tuple(sorted(writes[row[0]]))) for row in rows]
+    known = flow.objects.callbacks.unique("callback_id", keep="first", maintain_order=True)
+    known = known.sort("callback_id").rename({"callback_id": "id"})
+    known = known.select("kind", "node", "pid", "handle", "topic", "period_ns", "symbol", "id")
+    callbacks = [
+        Callback(**row, publishes=tuple(sorted(writes[row["id"]])))
+        for row in known.iter_rows(named=True)
+    ]
     of_node = defaultdict[tuple[int, str], list[Callback]](list)
     for callback in callbacks:
         if callback.kind != "unknown":

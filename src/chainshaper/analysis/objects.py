@@ -219,9 +219,9 @@ def _unregistered(tables: events.EventTables, registered: pl.DataFrame) -> pl.Da
     """Callbacks that ran before (or without) a registration: tracing started after them."""
     key = ["pid", "handle"]
     known = registered.group_by(key).agg(valid_to=pl.col("valid_from").min())
-    started = events.table(tables, "callback_start").lazy()
-    started = started.select("pid", "time", handle="callback").group_by(key)
-    first = started.agg(valid_from=pl.col("time").min()).collect().join(known, on=key, how="left")
+    started = events.table(tables, "callback_start").lazy().select("pid", "time", handle="callback")
+    first = started.group_by(key).agg(valid_from=pl.col("time").min()).collect()
+    first = first.join(known, on=key, how="left")
     early = pl.col("valid_to").is_null() | (pl.col("valid_from") < pl.col("valid_to"))
     return (
         first.filter(early)

@@ -2,10 +2,9 @@
 
 Servers' cycles must be anchored to the chain (DESIGN section 6): the slot of its server has to open
 just after its timer. The timer wakes the executor of the chain's first node, which the kernel
-counts: the third number of `/proc/PID/task/TID/schedstat` is how often a thread was put on a core
-(sched-stats.rst), the second for how long it was ready before that. The wake-ups that come once in
-every cycle at the same place are the timer's; of several such places the one after the longest rest
-is where the chain begins.
+counts: the third number of `/proc/PID/task/TID/schedstat` is how often a thread was put on a core,
+the second for how long it was ready before that. The wake-ups that come once in every cycle at the
+same place are the timer's; of several such places the one after the longest rest is the beginning.
 
 Outputs without a stamp (a `geometry_msgs/Twist`, say) are released by the cycle, whose beginning no
 message carries: shaping nodes in ROS 2 get it as a parameter. That takes ROS 2 a second or two, in
@@ -142,8 +141,6 @@ def find_phase(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> P
 
     None when there is no place that has some in four of five cycles.
     """
-    if not len(wake_ups):
-        return None
     width = max(1, cycle_ns // 50)
     places = np.sort(wake_ups % cycle_ns)
     # A circle has no first place: the first two turns of it have every neighbour.
@@ -151,8 +148,7 @@ def find_phase(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> P
     best: Phase | None = None
     longest_rest = -1
     for number, place in enumerate(places):
-        last = int(np.searchsorted(turned, place + width, side="right"))
-        here = turned[number:last]
+        here = turned[number : int(np.searchsorted(turned, place + width, side="right"))]
         inside = (wake_ups - place) % cycle_ns <= width
         seen = len(np.unique((wake_ups[inside] - place) // cycle_ns))
         before = turned[number - 1 + len(places)] - cycle_ns
@@ -160,10 +156,8 @@ def find_phase(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> P
         if seen >= SEEN_IN * cycles and rest > longest_rest:
             longest_rest = rest
             # The first of each cycle: what follows it is the same thread going on.
-            firsts = here[: max(1, seen)]
-            at = int(np.median(firsts)) % cycle_ns
-            spread = int(np.percentile(firsts, 90) - np.percentile(firsts, 10))
-            best = Phase(at, spread, len(here), cycles)
+            low, at, high = np.percentile(here[: max(1, seen)], (10, 50, 90))
+            best = Phase(int(at) % cycle_ns, int(high - low), len(here), cycles)
     return best
 
 
@@ -185,11 +179,8 @@ def find_drift(
     if slots:
         places = (wake_ups - expected_ns) % cycle_ns
         wake_ups = wake_ups[np.any([(s <= places) & (places < e) for s, e in slots], axis=0)]
-    phase = find_phase(wake_ups, cycle_ns, cycles)
-    if phase is None:
-        return None
-    half = cycle_ns // 2
-    return (phase.at_ns - expected_ns + half) % cycle_ns - half
+    phase, half = find_phase(wake_ups, cycle_ns, cycles), cycle_ns // 2
+    return None if phase is None else (phase.at_ns - expected_ns + half) % cycle_ns - half
 
 
 class DriftWatch:
@@ -197,10 +188,9 @@ class DriftWatch:
 
     ``latest_ns`` is how far that is from ``expected_ns`` (None: not seen yet). Held back by a
     server, a thread begins with its slot; once its timer expires inside the slot, it begins so
-    much later, and that is the drift. Where nothing holds it, its beginning is seen to move.
-    Looking takes a tenth of a core: it is done on ``cores``, if there are any, since it would delay
-    what runs in slots, and only ``NEAR`` where the thread began last, since it would also delay
-    what is delivered. A thread that is not seen there any more is looked for in the whole cycle.
+    much later, and that is the drift. Looking takes a tenth of a core: it is done on ``cores``, if
+    there are any, and only ``NEAR`` where the thread began last, since it would also delay what is
+    delivered. A thread that is not seen there any more is looked for in the whole cycle.
     """
 
     EVERY_S = 10.0
@@ -232,8 +222,7 @@ class DriftWatch:
                 time.sleep(self.EVERY_S)
                 drift = self._look(near_ns)
                 near_ns = None if drift is None else self._expected_ns + drift
-                if drift is not None:
-                    self.latest_ns = drift
+                self.latest_ns = self.latest_ns if drift is None else drift
 
     def _look(self, near_ns: int | None) -> int | None:
         """The drift, if the thread was seen; near where it was expected, None: anywhere."""
@@ -243,13 +232,11 @@ class DriftWatch:
             place = (now_ns - (near_ns or 0) + near) % cycle_ns
             return 0 if near_ns is None or place < 2 * near else cycle_ns - place
 
+        least_ns, cycles = TO_STOP_NS if self._slots else 0, self.CYCLES
         seen = watch_wake_ups(
-            *self._thread,
-            self.CYCLES * cycle_ns,
-            least_ns=TO_STOP_NS if self._slots else 0,
-            rest_ns=until_near,
+            *self._thread, cycles * cycle_ns, least_ns=least_ns, rest_ns=until_near
         )
-        return find_drift(seen, cycle_ns, self.CYCLES, self._expected_ns, self._slots)
+        return find_drift(seen, cycle_ns, cycles, self._expected_ns, self._slots)
 
 
 @contextlib.contextmanager
@@ -305,12 +292,8 @@ def tell_phase(plan: Plan, found: Allocation, phase_ns: int) -> Telling:
     ``phase_ns`` is where the chain begins in every cycle, on CLOCK_MONOTONIC. The nodes of a chain
     are in one domain: any of them has the environment in which all are found.
     """
-    pids = {
-        node: one.thread.pid
-        for node in (one.thread.node for one in shaping_nodes(plan))
-        for one in found.threads
-        if node in one.nodes
-    }
+    names = [node.thread.node for node in shaping_nodes(plan)]
+    pids = {node: one.thread.pid for node in names for one in found.threads if node in one.nodes}
     if not pids:
         return NO_NODE
     # Who reads what ROS 2 shows reads recordings as well, which is slow to import.
