@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from story import OFFSET, Story
 
 from chainshaper.analysis import data_flow, disturbed, find_chain, graph_of, traverse
-from chainshaper.analysis.disturbance import overlapping, stalled_within
-from chainshaper.analysis.disturbance import Due, with_punctuality
+from chainshaper.analysis.disturbance import Due, overlapping, stalled_within, with_punctuality
 
 
 def one_traversal(

@@ -1,20 +1,15 @@
 """Computation chains: finding the one that a person means, and listing those there are.
 
-A chain is written ``FIRST..LAST``, with more way points where several paths match. Way points
-are topics or nodes. A chain that begins with a topic starts at the callback that publishes it,
-and every chain ends with the publication of its last topic (paper, section 2.3); a chain that
-ends with a node ends with what that node publishes, or, if it publishes nothing, with the topic
-that it subscribes to. CARET's ``named_paths`` are read as well (tier4/caret_analyze,
-`architecture.yaml`).
+A chain is written ``FIRST..LAST``, with more way points (topics or nodes) where several paths
+match. One that begins with a topic starts at the callback that publishes it, and every chain ends
+with the publication of its last topic (paper, section 2.3): of a last node that is the topic it
+publishes, or, if it publishes nothing, the one it subscribes to.
 
-Real applications have cycles and wide fan-in: the number of simple paths grows exponentially, and
-counting them is #P-hard. Three things make the search answer quickly:
-
-* without cycles every step forward leads to an end, so listing needs no search;
-* with cycles the shortest paths are listed first; if they are few, a search backwards from the
-  ends at every step avoids dead ends. Both have a budget;
-* counting and the heaviest path come from dynamic programming over the edges that lead forwards
-  in one order of the vertices: exact without cycles, else a lower bound.
+The number of simple paths grows exponentially with cycles and fan-in, and counting them is #P-hard.
+Without cycles every step forward leads to an end, so listing needs no search. With cycles the
+shortest paths are listed first; if they are few, a search backwards from the ends at every step
+avoids dead ends; both have a budget. Counting and the heaviest path come from dynamic programming
+over the edges that lead forwards in one order of the vertices: exact without cycles, else a bound.
 """
 
 import heapq

@@ -2,22 +2,18 @@
 
 Where a gate decided, its row (`gate_release`) says from which instant the slots count, and what
 became of an output that overran. Where no gate decided, an output is due in the cycle that the
-plan says, and without a plan within a period of the chain's start. ``late`` is what a consumer
-sees: it does not depend on who caused it. With the anchor `cycle` a gate takes an output for one of
-the cycle that it arrives in. The traversal knows better: a chain that began in an earlier cycle is
-late by whole cycles.
+plan says, and without a plan within a period of the chain's start. With the anchor `cycle` a gate
+takes an output for one of the cycle that it arrives in; the traversal knows better: a chain that
+began in an earlier cycle is late by whole cycles.
 
-Virtual machines and firmware stop all threads of a core now and then, for up to several ms. A
-sleeper at the highest priority, run beside the application, sees it: a row of `machine_stall`
-says that on core ``cpu`` no thread ran from ``time`` for ``duration``. A cycle is disturbed by
-stalls **before the moment at which its output was due**, and by no other: what happens to an output
-that is late already is no excuse for it.
+A sleeper at the highest priority sees the machine stop: a row of `machine_stall` says that on core
+``cpu`` no thread ran from ``time`` for ``duration``. A cycle is disturbed by stalls **before the
+moment at which its output was due**, and by no other:
 
 * **At two instants** any stall disturbs what a gate lets go: where the origin is taken (between the
   traversal's start and the anchor's origin), and around the moment at which the output was due.
 * **In between** stalls add up, on one core, within [start, due]. Without a gate they disturb from
-  ``COMPUTING_THRESHOLD_NS`` in all. A gate absorbs what the plan's margin ε has room for, whatever
-  the cycle's own latency: only more than that disturbs.
+  ``COMPUTING_THRESHOLD_NS`` in all; a gate absorbs what the plan's margin ε has room for.
 * A traversal that began before its disturbed predecessor was computed may have queued behind it,
   and counts as disturbed with it, unless the plan has them overlap (logical execution time).
 """

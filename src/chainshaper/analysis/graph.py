@@ -1,19 +1,16 @@
 """The application graph of a recording: callbacks connected by topics (paper, section 2.1).
 
-A callback is connected to a topic that its instances publish. Some messages, however, are read
-in one callback and published in another of the same node:
+A callback is connected to a topic that its instances publish. Some messages are read in one
+callback and published in another of the same node:
 
 * **Synchronising callbacks** (message_filters) read in one instance and publish in that of the
-  input which completes the set. The library emits no events of its own. A subscription callback
-  is taken to be such an input of topic X when another subscription callback of its node publishes
-  X, subscribes to another topic, and it either is registered by message_filters (its symbol says
-  so) or publishes nothing itself.
-* **Stored messages**: a subscription callback that publishes nothing, in a node whose
-  subscription callbacks publish nothing at all, but whose timers do, is taken to store the
-  message for the timers.
+  input which completes the set; no event says so. A subscription callback is taken to be such an
+  input of topic X when another subscription callback of its node publishes X, subscribes to another
+  topic, and it either is registered by message_filters (its symbol says so) or publishes nothing.
+* **Stored messages**: a subscription callback in a node whose subscription callbacks publish
+  nothing at all, but whose timers do, is taken to store the message for the timers.
 
-Both are inferences, so they are marked: such topics stand in ``Callback.publishes`` (the chain
-goes on there) and also in ``Callback.passes_on``.
+Both are inferences: such topics stand in ``Callback.publishes`` and also in ``passes_on``.
 """
 
 from collections import defaultdict

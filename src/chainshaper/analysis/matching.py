@@ -1,14 +1,13 @@
 """Matching events to events by time: the joins that the rest of the analysis is built from.
 
 An event rarely names what it belongs to. It carries an address, which means whatever was last
-created there, or it belongs to whatever its thread was doing at that moment. Both questions are
-"the latest row before this one with the same key" (or the next after it): an asof join.
+created there, or it belongs to whatever its thread was doing then: "the latest row before this one
+with the same key" (or the next after it), an asof join. Events come sorted by time, so one compiled
+walk over both tables that remembers the latest row of each key is enough: some ten ns a row.
 
-Events come sorted by time, so one compiled walk over both tables that remembers the latest row of
-each key is enough: some ten nanoseconds a row. Columns are read where they lie. A key is a table of
-three rows (address, bytes per value); unused ones have 0 bytes. The table of keys has ``slots``
-rows, a power of two, of (three numbers, whether it is taken, the latest row), and one more whose
-first number counts them. The same walk pairs `callback_end` with `callback_start`.
+Columns are read where they lie. A key is a table of three rows (address, bytes per value); unused
+ones have 0 bytes. The table of keys has ``slots`` rows, a power of two, of (three numbers, whether
+it is taken, the latest row), and one more whose first number counts them.
 """
 
 from collections.abc import Callable

@@ -2,15 +2,9 @@
 
 Events name objects by handles: addresses that are unique only within one process, and only until
 they are freed. So a handle is looked up as (process, handle, time): the object created there last,
-at or before the event. A subscription that is destroyed and created again gets another address,
-one with intra-process communication has two at once: in a graph and in statistics each is one
-callback, with one ``callback_id`` (:func:`numbered`).
-
-Handles that were never initialised belong to no object: `ros_discovery_info` is published and
-taken under such (Cyclone DDS), as is everything that existed before tracing began.
-
-Upstream: ros2_tracing, `tracetools/include/tracetools/tracetools.h`; the order of the events is
-that of rclcpp's constructors.
+at or before the event. Handles that were never initialised belong to no object:
+`ros_discovery_info` is published and taken under such (Cyclone DDS), as is everything that existed
+before tracing began. The order of the events is that of rclcpp's constructors (ros2_tracing).
 """
 
 from dataclasses import dataclass

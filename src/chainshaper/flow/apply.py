@@ -3,13 +3,10 @@
     find the threads ─► priorities and cores ─► servers ─► anchor ─► arm ─► watch ─► all as before
 
 Nothing of the application is changed but where and when its threads run, and every change stands in
-a journal first (:mod:`chainshaper.linux.runs`): whatever ends the run, this function, a signal or a
-crash, puts it back. Servers are armed only when all nodes run, and released before a command of
-ours is to end, since a stopped thread cannot.
-
-A thread that appears later gets what the plan says, at the next look; until then it has the class,
-cores and cgroup of the thread that started it. The shaping node is its own server: its thread gets
-a priority and a core, and no slots from a back end.
+a journal first (:mod:`chainshaper.linux.runs`): whatever ends the run, a signal or a crash, puts it
+back. Servers are armed only when all nodes run, and released before a command of ours is to end,
+since a stopped thread cannot. A thread that appears later gets what the plan says at the next look.
+The shaping node is its own server: its thread gets a priority and a core, and no slots.
 """
 
 import contextlib
@@ -24,41 +21,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from chainshaper.enforcement import threads as allocation
+from chainshaper.enforcement import undoing
 from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, make_back_end
 from chainshaper.enforcement.guardian import Guardians, run_claimed, start_guardians
 from chainshaper.enforcement.scheduling_memory import change_all, look_alikes, note_descendants
 from chainshaper.enforcement.servers import BackEnd, ServerCounters, ServerTable
-from chainshaper.enforcement.threads import (
-    Allocation,
-    NodeThread,
-    RecordedProcess,
-    new_and_ended,
-    server_members,
-)
-from chainshaper.enforcement.undoing import (
-    RunState,
-    ServerState,
-    claim_run,
-    save_run_state,
-    strange_lines,
-    undo_run,
-)
-from chainshaper.flow.phase import (
-    NO_NODE,
-    DriftWatch,
-    Telling,
-    measure_phase,
-    moved_text,
-    tell_phase,
-)
-from chainshaper.flow.threads import (
-    LEAD_NS,
-    find_threads,
-    first_thread,
-    recorded_processes,
-    server_table,
-    table_of,
-)
+from chainshaper.enforcement.threads import Allocation, NodeThread, RecordedProcess
+from chainshaper.enforcement.undoing import RunState, ServerState
+from chainshaper.flow import threads
+from chainshaper.flow.phase import NO_NODE, DriftWatch, Telling, measure_phase, tell_phase
+from chainshaper.flow.threads import LEAD_NS
 from chainshaper.linux.own_processes import end_command, start_command
 from chainshaper.linux.runs import PLAN_FILE, Journal
 from chainshaper.linux.scheduling import available_cores, check_cores
@@ -134,17 +106,17 @@ def apply_plan(
     """
     refuse_offset(plan)
     given, plan = plan, open_until_done(plan)
-    table, taken = server_table(plan), run_users(users)
+    table, taken = threads.server_table(plan), run_users(users)
     check_cores({server.core: f"server {server.name}" for server in plan.servers})
     choice = choose_back_end(back_end)
     nodes = {thread.node for server in plan.servers for thread in server.threads}
     nodes.update(receiver for node in shaping_nodes(plan) for receiver in node.receivers)
     recorded: tuple[RecordedProcess, ...] = ()
     if recording is not None:  # looked up once: that takes longer than looking at processes
-        recorded, _ = recorded_processes(recording)
+        recorded, _ = threads.recorded_processes(recording)
     stop = stop or threading.Event()
     cores = {server.core for server in plan.servers}
-    journal = claim_run(cores, nodes, folder, lambda: _go_on(stop))
+    journal = undoing.claim_run(cores, nodes, folder, lambda: _go_on(stop))
     run = _Run(given, plan, choice, journal, recorded, taken, stop)
     try:
         run.guardians = start_guardians(journal)
@@ -206,7 +178,7 @@ class _Run:
         self.state = replace(self.state, notes=(*self.state.notes, *notes))
 
     def find(self) -> Allocation:
-        return find_threads(self.plan, recorded=self.recorded, users=self.users)
+        return threads.find_threads(self.plan, recorded=self.recorded, users=self.users)
 
     def await_nodes(self, wait_ns: int, progress: Callable[[float, str], None]) -> None:
         """Look until all nodes of the plan run; where there is time, a little for late threads."""
@@ -216,7 +188,7 @@ class _Run:
             self.found = self.find()
             waited = time.monotonic_ns() - begun
             try:
-                server_members(self.plan, self.found)
+                allocation.server_members(self.plan, self.found)
                 looks += 1
             except OperationError:
                 looks = 0
@@ -227,7 +199,7 @@ class _Run:
                     ) from None
                 if waited >= wait_ns:
                     raise
-            quiet = before is not None and not any(new_and_ended(before, self.found))
+            quiet = before is not None and not any(allocation.new_and_ended(before, self.found))
             if looks and (quiet or looks > _SETTLING_LOOKS or waited >= wait_ns):
                 return
             before = self.found
@@ -278,7 +250,7 @@ class _Run:
         """Measure where the chain begins, put its threads into the servers, and close these."""
         spread, cycle_ns = None, self.plan.cycle_ns
         if phase_ns is None:
-            origin = first_thread(self.plan, self.found)
+            origin = threads.first_thread(self.plan, self.found)
 
             def measured(share: float) -> None:
                 self.go_on()
@@ -314,7 +286,7 @@ class _Run:
         """Put the threads that are not in their servers yet there."""
         themselves = {node.thread.node for node in shaping_nodes(self.plan)}
         already = {one.name: one.threads for one in self.state.servers}
-        members = server_members(self.plan, self.found)
+        members = allocation.server_members(self.plan, self.found)
         for name, group in members.items():
             for member in group:
                 self.go_on()
@@ -323,13 +295,13 @@ class _Run:
                     servers.assign(tid, name)
         self.set_threads({n: tuple(m.thread.tid for m in group) for n, group in members.items()})
 
-    def set_threads(self, threads: dict[str, tuple[int, ...]]) -> None:
-        known = tuple(replace(one, threads=threads[one.name]) for one in self.state.servers)
+    def set_threads(self, tids: dict[str, tuple[int, ...]]) -> None:
+        known = tuple(replace(one, threads=tids[one.name]) for one in self.state.servers)
         self.state = replace(self.state, servers=known)
 
     def watch_over(self, servers: BackEnd, watch: Callable[[RunState], None]) -> None:
         """Watch over the run until it is to end; the state is then as it was last."""
-        origin, gated = first_thread(self.plan, self.found), gates(self.choice.name)
+        origin, gated = threads.first_thread(self.plan, self.found), gates(self.choice.name)
         begins = (self.state.anchor_ns or 0) - (0 if gated else LEAD_NS)
         own = (s.slots for s in self.state.servers if gated and origin.tid in s.threads)
         drift = DriftWatch(
@@ -350,7 +322,7 @@ class _Run:
             shown = replace(self.state, notes=(*self.state.notes, *trouble))  # while it lasts
             unsaved = ""
             try:
-                save_run_state(self.folder, shown)
+                undoing.save_run_state(self.folder, shown)
             except OSError as error:  # the plan is in force all the same
                 unsaved = (
                     f"{self.folder}: `status` cannot show how this run is doing ({error.strerror})"
@@ -362,7 +334,7 @@ class _Run:
             if abs((moved_ns or 0) - sent_ns) > PHASE_BOUND_NS and self.telling is NO_NODE:
                 sent_ns = moved_ns or 0
                 self.telling = tell_phase(self.plan, self.found, begins + sent_ns)
-                self.state = replace(self.state, notes=(*notes, moved_text(sent_ns)))
+                self.state = replace(self.state, notes=(*notes, _moved_text(sent_ns)))
             if self.stop.wait(_LOOK_S):
                 continue
             if self.guardians is not None:
@@ -392,7 +364,7 @@ class _Run:
         perhaps.
         """
         before, now = self.found, self.find()
-        new, ended = new_and_ended(before, now)
+        new, ended = allocation.new_and_ended(before, now)
         self.name_fleeting(latest, ended)
         self.name_strangers(now)
         there = {one.thread.tid for one in now.threads}
@@ -449,8 +421,8 @@ class _Run:
         self.telling.end()
         if self.command is not None:
             end_command(self.command)
-        problems += undo_run(self.journal, by_owner=True)
-        problems += strange_lines(self.journal)
+        problems += undoing.undo_run(self.journal, by_owner=True)
+        problems += undoing.strange_lines(self.journal)
         if self.guardians is not None:
             self.guardians.end()
         if problems:
@@ -458,6 +430,13 @@ class _Run:
                 f"not everything could be put back: {'; '.join(problems)}; {self.journal.path} "
                 "says what was there, `chainshaper release` tries again"
             )
+
+
+def _moved_text(drift_ns: int) -> str:
+    return (
+        f"the chain's beginning has moved by {format_duration(drift_ns)} since the plan was put in "
+        "force; shaping nodes get it, and outputs without a stamp follow from the next cycle"
+    )
 
 
 @contextlib.contextmanager
@@ -475,7 +454,7 @@ def publishers_gated(plan: Plan, nodes: "StartedNodes") -> Iterator[None]:
     """
     choice = choose_back_end("freezer")  # the others want threads of the fair class
     planned = [(server, names) for _, server, names in publisher_servers(open_until_done(plan))]
-    table = table_of(plan.cycle_ns, (server for server, _ in planned))
+    table = threads.table_of(plan.cycle_ns, (server for server, _ in planned))
     cores = {server.core for server, _ in planned}
     with run_claimed(cores, {name for _, names in planned for name in names}) as journal:
         servers = make_back_end(choice.name, table, journal)

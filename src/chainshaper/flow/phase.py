@@ -6,11 +6,9 @@ counts: the third number of `/proc/PID/task/TID/schedstat` is how often a thread
 the second for how long it was ready before that. The wake-ups that come once in every cycle at the
 same place are the timer's; of several such places the one after the longest rest is the beginning.
 
-Outputs without a stamp (a `geometry_msgs/Twist`, say) are released by the cycle, whose beginning no
-message carries: shaping nodes in ROS 2 get it as a parameter. That takes ROS 2 a second or two, in
-a process of its own, as the user of the nodes' processes and in one's environment; as whom we may
-not run, in ours. Which participant answers under a node's name, DDS does not prove without its
-security plug-ins; two that do are noticed.
+Outputs without a stamp are released by the cycle, whose beginning no message carries: shaping nodes
+in ROS 2 get it as a parameter. That takes ROS 2 a second or two, in a process of its own, as the
+user of the nodes' processes and in one's environment; as whom we may not run, in ours.
 """
 
 import contextlib
@@ -327,11 +325,3 @@ def _environment_for(pid: int) -> "Environment":
 
 def _is_ros(environment: "Environment") -> bool:
     return "AMENT_PREFIX_PATH" in environment.variables
-
-
-def moved_text(drift_ns: int) -> str:
-    """What to say when nodes get the phase again."""
-    return (
-        f"the chain's beginning has moved by {format_duration(drift_ns)} since the plan was put in "
-        "force; shaping nodes get it, and outputs without a stamp follow from the next cycle"
-    )

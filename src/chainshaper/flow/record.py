@@ -4,11 +4,9 @@
                                         ─► types and QoS asked for ─► application ends ─► recording
 
 Tracing begins first, because an object emits its name once, when it is created. Types and QoS are
-asked for when tracing is over: discovery costs every node some time. What the tracer wrote is kept
-with the recording, as `trace/`.
-
-Whatever ends the run, the application, a duration or Ctrl-C, its recording is whole; nothing is
-left running, nor changed.
+asked for when tracing is over: discovery costs every node some time. What the tracer wrote stays
+with the recording, as `trace/`. Whatever ends the run, its recording is whole; nothing is left
+running, nor changed.
 """
 
 import platform

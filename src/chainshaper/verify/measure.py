@@ -1,13 +1,10 @@
 """Measuring a chain in a recording, and comparing the same chain in several recordings.
 
-A measurement joins the latency analysis with what the recording says of the machine, of the gates,
-and of the plan in force, whose prediction stands beside it.
-
 :func:`hop_breakdown` says where the latency goes. A hop is a callback of the chain. Its
 *communication* is the time from the publication before it to its own start: transport, and waiting
 for its executor. Its *computation* is the time from its start to its publication: execution,
-pre-emption, and, where another callback of the node publishes for it (a synchroniser), waiting for
-that one. Over a complete traversal the two add up to the latency, so mean shares add up to one.
+pre-emption, and waiting for another callback of the node that publishes for it (a synchroniser).
+Over a complete traversal the two add up to the latency, so mean shares add up to one.
 """
 
 from collections.abc import Sequence
