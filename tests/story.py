@@ -208,7 +208,7 @@ class Story:
             self.end(callback, end, tid)
 
     def gate(
-        self, callback: Callback, sent: int, arrival: int, release: int | None, **fields: Any
+        self, callback: Callback, /, sent: int, arrival: int, release: int | None, **fields: Any
     ) -> None:
         """A gate's decision about the message sent at ``sent``; ``fields`` differ from usual."""
         usual = {"slot": 0, "cycles_waited": 0, "anchor": "stamp", "overrun": None}
