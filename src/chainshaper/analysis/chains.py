@@ -22,33 +22,20 @@ from itertools import islice
 from pathlib import Path
 from typing import TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
-from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Callback, Chain
+from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Chain
 from chainshaper.values.errors import InputError
 from chainshaper.values.yaml_file import PlainData, compose, read_text
 
-HANDFUL = 5
-"""So many names or paths a message lists."""
+HANDFUL = 5  # so many names or paths a message lists
+STEPS = 100_000  # for short paths where there are cycles, about 1 µs each
+SEARCHES = 100  # backwards, for all paths then, about 1 ms each
+CLOSE = 0.6  # likeness (0 to 1) from which a name is worth mentioning
+WORSE = 0.15  # how much less alike than the best one a name may be
 
-STEPS = 100_000
-"""Steps that looking for short paths may take where there are cycles, about 1 µs each."""
-
-SEARCHES = 100
-"""Backward searches that looking for all paths may take then, about 1 ms each."""
-
-CLOSE = 0.6
-"""Likeness (0 to 1) from which a name is worth mentioning."""
-
-WORSE = 0.15
-"""How much less alike than the best one a name may be."""
-
-Vertex: TypeAlias = int | str
-"""A callback's id, or a topic's name."""
-
-State: TypeAlias = tuple[Vertex, int]
-"""A vertex, and how many way points have been met with it."""
-
+Vertex: TypeAlias = int | str  # a callback's id, or a topic's name
+State: TypeAlias = tuple[Vertex, int]  # a vertex, and how many way points have been met with it
 GraphPath: TypeAlias = tuple[Vertex, ...]
 
 
@@ -96,9 +83,8 @@ class ChainEnumeration:
     """The chains between two places of a graph.
 
     ``chains`` are all of them if ``complete``, else the first ones found. ``count`` says how many
-    there are; where the graph between the two places has cycles, it is only a lower bound (not
-    ``exact``). ``heaviest`` has the largest sum of mean response times (``heaviest_ns``) among the
-    counted and the listed chains; None without response times.
+    there are (not ``exact``: at least). ``heaviest`` has the largest sum of mean response times
+    (``heaviest_ns``) among the counted and the listed chains; None without response times.
     """
 
     chains: tuple[Chain, ...]
@@ -279,7 +265,11 @@ class _Search:
     def _starts(self, name: str, vertices: frozenset[Vertex]) -> set[int]:
         if not any(isinstance(vertex, str) for vertex in vertices):
             return {vertex for vertex in vertices if isinstance(vertex, int)}
-        starts = {c.id for c in self.graph.callbacks if vertices & _written(c)}
+        starts = {
+            one.id
+            for one in self.graph.callbacks
+            if vertices & (set(one.publishes) - set(one.passes_on))
+        }
         if not starts:
             writers = ", ".join(self.graph.publishers.get(name, ())) or "no node in the recording"
             raise InputError(
@@ -340,7 +330,8 @@ class _Search:
         met = self.furthest
         from_name = self.stages[max(met - 1, 0)][0]
         topics = sorted(vertex for vertex in self.reached if isinstance(vertex, str))
-        stops = [topic for topic in topics if topic not in self._passed_on()] or topics
+        heard = {c.topic for c in self.graph.callbacks if c.kind == "subscription" and c.publishes}
+        stops = [topic for topic in topics if topic not in heard] or topics
         if not met or not stops:
             return f"chain {self.spec!r}: no callback of {from_name} publishes anything"
         goal = self.stages[min(met, len(self.stages) - 1)][0]
@@ -348,10 +339,6 @@ class _Search:
             f"chain {self.spec!r}: no path leads from {from_name} to {goal}; from there the data "
             f"gets as far as {_some(stops)}"
         )
-
-    def _passed_on(self) -> set[str | None]:
-        subscriptions = (c for c in self.graph.callbacks if c.kind == "subscription")
-        return {callback.topic for callback in subscriptions if callback.publishes}
 
     def listed(self, limit: int) -> tuple[tuple[GraphPath, ...], bool, int]:
         """Up to ``limit`` paths, whether they are all, and how many were met on the way.
@@ -449,8 +436,7 @@ class _Search:
     def counted(self, weights: Mapping[int, float]) -> tuple[int, GraphPath, float]:
         """Number of paths, the heaviest of them, and its weight (the sum over its callbacks).
 
-        All paths are counted unless ``cyclic``. Else those are that never step back in one order
-        of the vertices: the depth-first one, or the greedy one if more paths agree with it.
+        If ``cyclic``, of those that never step back in the depth-first or the greedy order.
         """
         orders = [self.order] + ([self._greedy()] if self.cyclic else [])
         results = [self._counted_in(order, weights) for order in orders]
@@ -486,8 +472,7 @@ class _Search:
     def _greedy(self) -> dict[Vertex, int]:
         """The greedy order of topics, every callback just after the topic it subscribes to.
 
-        Callbacks have one edge in and thus no choice: ordered by themselves they would all come
-        before their topics. Roots are first, no path comes back to them.
+        Callbacks have one edge in and thus no choice. Roots are first, no path comes back to them.
         """
         roots = [vertex for vertex, _ in self.roots]
         between: dict[str, list[str]] = {}
@@ -504,10 +489,6 @@ class _Search:
         for vertex in self.edges:
             rank.setdefault(vertex, last - 1)  # topics that only a root publishes, and that end
         return rank | dict.fromkeys(roots, max(rank.values(), default=0) + 1)
-
-
-def _written(callback: Callback) -> set[str]:
-    return set(callback.publishes) - set(callback.passes_on)
 
 
 def _distances(successors: Mapping[State, tuple[State, ...]], ends: set[State]) -> dict[State, int]:
@@ -588,21 +569,17 @@ def _greedy_order(edges: Mapping[str, Sequence[str]]) -> dict[str, int]:
     return {vertex: len(order) - place for place, vertex in enumerate(order)}
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(frozen=True)
-
-
-class _PathNode(_Model):
+class _PathNode(BaseModel):
     node_name: str
     publish_topic_name: str | None = None
 
 
-class _NamedPath(_Model):
+class _NamedPath(BaseModel):
     path_name: str
     node_chain: tuple[_PathNode, ...] = Field(min_length=1)
 
 
-class _Architecture(_Model):
+class _Architecture(BaseModel):
     named_paths: tuple[_NamedPath, ...]
 
 
@@ -625,14 +602,13 @@ def load_named_paths(file: str | Path) -> dict[str, str]:
             f"{plain.problems(error, _Architecture)}; chains are read from the `named_paths` of a"
             " CARET architecture file, each with its `path_name` and `node_chain`"
         ) from error
-    return {path.path_name: _way_points(path.node_chain) for path in architecture.named_paths}
-
-
-def _way_points(nodes: Sequence[_PathNode]) -> str:
-    waypoints: list[str] = []
-    for place, node in enumerate(nodes):
-        if node.publish_topic_name not in (None, "UNDEFINED"):
-            waypoints += [node.node_name, node.publish_topic_name]
-        elif place < len(nodes) - 1:
-            waypoints.append(node.node_name)
-    return "..".join(waypoints)
+    chains = {}
+    for named in architecture.named_paths:
+        points: list[str | None] = []
+        for node in named.node_chain:
+            topic = node.publish_topic_name
+            points += [node.node_name, None if topic == "UNDEFINED" else topic]
+        if points[-1] is None:
+            points.pop(-2)
+        chains[named.path_name] = "..".join(point for point in points if point is not None)
+    return chains

@@ -33,12 +33,8 @@ from chainshaper.values import events
 
 WAKE_UP_NS = 250_000
 
-WAKING_NS = 200_000
-"""A gate wakes up and publishes within this time of a release: a stall this shortly before or
-behind the release moves the output."""
-
-COMPUTING_THRESHOLD_NS = 1_000_000
-"""A chain that computes for tens of milliseconds is hardly changed by less than this."""
+WAKING_NS = 200_000  # a gate wakes up and publishes within this time of a release
+COMPUTING_THRESHOLD_NS = 1_000_000  # less hardly changes a chain that computes for tens of ms
 
 Times = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
@@ -113,8 +109,8 @@ def with_punctuality(
 def lateness_in_cycle(starts: pl.Series, cycle_ns: int) -> pl.Series:
     """How long after the start of the cycle each chain began (ns).
 
-    When cycles started is not recorded. The earliest beginning stands for it, which is the one
-    behind the widest part of the cycle that has none, and came a wake-up after the start.
+    When cycles started is not recorded. The beginning behind the widest part of the cycle that has
+    none stands for it, which came a wake-up after the start.
     """
     places = (starts % cycle_ns).sort()
     if not len(places):
@@ -236,8 +232,7 @@ def stalled_within(start: Times, end: Times, began: Times, ended: Times, core: T
 def overlapping(start: Times, end: Times, began: Times, ended: Times) -> Mask:
     """Whether each closed window [start, end] meets any of the intervals [began, ended).
 
-    Of all intervals those that begin in time for the window, minus those that are over before
-    it: both are counted in sorted arrays, so the cost is (windows + intervals) · log.
+    Of all intervals those that begin in time for the window, minus those that are over before it.
     """
     begun_by_end = np.searchsorted(np.sort(began), end, side="right")
     over_by_start = np.searchsorted(np.sort(ended), start, side="right")

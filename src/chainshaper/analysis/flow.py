@@ -56,8 +56,7 @@ class DataFlow:
 def data_flow(tables: events.EventTables, clock_offset_ns: int = 0) -> DataFlow:
     """Resolve a recording's events.
 
-    ``clock_offset_ns`` is what to add to event times for CLOCK_REALTIME; recordings carry it. It
-    matters only for traces from before Jazzy (:mod:`~chainshaper.analysis.messages`).
+    ``clock_offset_ns``, to add to event times for CLOCK_REALTIME, matters only before Jazzy.
     """
     objects = resolve_objects(tables)
     with ThreadPoolExecutor(max_workers=1) as beside:  # instances and messages meet only below
@@ -93,13 +92,10 @@ def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> p
     ``callbacks`` is the frame of :class:`~chainshaper.analysis.objects.Objects`. The result has
 
     * ``instance``: numbered from 0 in order of start; ``callback_id``; ``pid``, ``tid``;
-    * ``start``, ``end``: ns of the event clock. ``end`` is null when the end was lost or the
-      instance was still running as the recording stopped
-      (:func:`~chainshaper.analysis.matching.ends_of_starts`). A `callback_end` without a start
-      belongs to no instance;
+    * ``start``, ``end``: ns of the event clock; ``end`` is null when it was lost, or the instance
+      was still running (:func:`~chainshaper.analysis.matching.ends_of_starts`);
     * ``execution_ns``: CPU time (paper: e), from the ``thread_time`` columns where the source
-      has them, else from `sched_switch` (:func:`cpu_time`), else null, also where a thread seems
-      to have used none;
+      has them, else from `sched_switch` (:func:`cpu_time`), else null;
     * ``intra_process``: whether its message came through a ring buffer;
     * ``assumed``: always false here.
     """
@@ -133,10 +129,9 @@ def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> p
 def cpu_time(tables: events.EventTables, spans: pl.DataFrame) -> pl.Series:
     """CPU time of thread ``tid`` between ``start`` and ``end`` of every row, from `sched_switch`.
 
-    Exact: the thread's running time at an instant is what it had accumulated at its last switch
-    plus, if that switched it in, the time since. A thread whose first switch takes it off its
-    core is taken to have run since the recording began. Null without an end, and for threads
-    that never appear in `sched_switch`.
+    Exact: what the thread had accumulated at its last switch plus, if that switched it in, the time
+    since. A thread whose first switch takes it off its core is taken to have run since the
+    recording began. Null without an end, and for threads that never appear in `sched_switch`.
     """
     curve = _running_time(tables)
     rows = spans.select("tid", "start", "end").with_row_index("row")
@@ -227,10 +222,9 @@ def _published_in(
     """Add ``instance`` and ``callback_id``: the innermost instance running on the thread then.
 
     An instance without an end is taken to run until the thread's next instance. A publication in
-    the very nanosecond in which one instance ends and the next begins, as simulators have it, is
-    the first one's. Where a callback runs others inside itself (it spins an executor), what it
-    publishes after them is its own: the search is repeated among the instances that contain
-    others, once per level of nesting.
+    the nanosecond in which one instance ends and the next begins is the first one's. Where a
+    callback runs others inside itself (it spins an executor), what it publishes after them is its
+    own: the search is repeated among the instances that contain others, per level of nesting.
     """
     nodes = objects.callbacks.unique("callback_id", maintain_order=True)
     nodes = nodes.select("callback_id", owner=pl.col("node").cast(published.schema["node"]))

@@ -58,19 +58,10 @@ def latency_statistics(
         return LatencyStatistics(0, incomplete, hit, None, None, None, None, None, {}, late)
     values = np.percentile(sample, PERCENTILES)
     percentiles = {f"{p:g}": round(float(v)) for p, v in zip(PERCENTILES, values, strict=True)}
-    low, high = int(sample.min()), int(sample.max())
-    return LatencyStatistics(
-        count=len(sample),
-        incomplete=incomplete,
-        disturbed=hit,
-        min_ns=low,
-        mean_ns=round(int(sample.sum()) / len(sample)),
-        max_ns=high,
-        jitter_ns=high - low,
-        spread_ns=percentiles["99.5"] - percentiles["0.5"],
-        percentiles_ns=percentiles,
-        late=late,
-    )
+    low, high, mean = int(sample.min()), int(sample.max()), round(int(sample.sum()) / len(sample))
+    spread = percentiles["99.5"] - percentiles["0.5"]
+    figures = (low, mean, high, high - low, spread, percentiles)
+    return LatencyStatistics(len(sample), incomplete, hit, *figures, late)
 
 
 def summary(column: str, values: pl.Expr) -> pl.Expr:
@@ -112,16 +103,15 @@ def callback_statistics(flow: DataFlow) -> pl.DataFrame:
 class LatencyAnalysis:
     """The end-to-end latency of one chain in one recording.
 
-    ``traversals`` is the frame of :class:`~chainshaper.analysis.traversals.Traversals` with the
-    columns ``place_ns``, ``due_at``, ``late`` (see
-    :func:`~chainshaper.analysis.disturbance.with_punctuality`), ``disturbed``, ``received``,
-    ``reception_ns`` (latency to the subscriber's `callback_start`) and ``reception_disturbed``
-    (also by a stall between the two) added, ``hops`` its frame of hops, ``releases`` what gates
-    decided about them (:func:`~chainshaper.analysis.messages.gated_hops`). ``statistics`` are
+    ``traversals`` is the frame of :class:`~chainshaper.analysis.traversals.Traversals` with
+    ``place_ns``, ``due_at``, ``late`` (:func:`~.disturbance.with_punctuality`), ``disturbed``,
+    ``received``, ``reception_ns`` (latency to the subscriber's `callback_start`) and
+    ``reception_disturbed`` (also by a stall between the two), ``hops`` its frame of hops,
+    ``releases`` what gates decided about them (:func:`~.messages.gated_hops`). ``statistics`` are
     over all complete traversals, ``undisturbed`` over those that the machine did not disturb;
     ``subscriber`` and ``subscriber_undisturbed`` are the same of ``reception_ns`` (None: no node
-    subscribes to the output in this recording). ``incomplete`` counts traversals without an end by
-    reason, ``silent`` instances of the first callback that began none.
+    subscribes to the output). ``incomplete`` counts traversals without an end by reason, ``silent``
+    instances of the first callback that began none.
     """
 
     chain: Chain
@@ -149,15 +139,13 @@ def analyse_latency(
 ) -> LatencyAnalysis:
     """Every traversal of ``chain`` in a recording, with statistics.
 
-    ``source`` is a recording, its event tables, or its data flow where several chains are
-    analysed. ``clock_offset_ns`` (event clock to CLOCK_REALTIME) is taken from a recording and
-    needed for tables from before Jazzy. ``subscriber`` names the node whose reception is
-    reported. ``due`` is when a plan has outputs leave; those of other chains are passed over.
-    ``between`` leaves out traversals that did not begin, and end, between two instants (ns).
+    ``clock_offset_ns`` (event clock to CLOCK_REALTIME) is taken from a recording and needed for
+    tables from before Jazzy. ``subscriber`` names the node whose reception is reported. ``due`` is
+    when a plan has outputs leave; those of other chains are passed over. ``between`` leaves out
+    traversals that did not begin, and end, between two instants (ns).
 
     Raises:
-        InputError: the chain is not in the recording, see
-            :func:`~chainshaper.analysis.chains.find_chain`.
+        InputError: the chain is not in the recording, see :func:`~.chains.find_chain`.
     """
     notes: tuple[str, ...] = ()
     if isinstance(source, Recording):

@@ -94,9 +94,8 @@ def ends_of_starts(starts: pl.DataFrame, ends: pl.DataFrame) -> pl.Series:
     """For every row of `callback_start` the row of its `callback_end`, null for none.
 
     Both are sorted by time. An instance ends with the next event of the same callback on the same
-    thread, if that is an end. Clocks tick coarsely and simulators exactly, so an instance may begin
-    in the nanosecond in which the one before ended (end first), or last no time at all (start
-    first): it is the former when one was open before that nanosecond.
+    thread, if that is an end. It may begin in the nanosecond in which the one before ended (end
+    first), or last no time at all (start first): the former when one was open before.
     """
     (keys, _own), (others, _its) = (_keys(t, ["pid", "tid", "callback"]) for t in (starts, ends))
     began, ended = _as_array(starts["time"]), _as_array(ends["time"])
@@ -152,10 +151,7 @@ def _sorted(frame: pl.DataFrame, time: str) -> pl.DataFrame:
 
 
 def in_order(frame: pl.DataFrame, time: str, *ties: str, nulls_last: bool = False) -> pl.DataFrame:
-    """``frame`` sorted by ``time`` and, where times are equal, by ``ties``; else as it was.
-
-    Looking whether all times grow costs a fraction of what sorting by several columns does.
-    """
+    """``frame`` sorted by ``time`` and ``ties``, if not all times grow: looking is cheap."""
     if grows(frame[time]):
         return frame
     return frame.sort(time, *ties, nulls_last=nulls_last, maintain_order=True)
@@ -169,8 +165,7 @@ def grows(times: pl.Series) -> bool:
 def by_number(rows: pl.DataFrame, number: str, column: str, height: int) -> pl.Series:
     """``column`` of ``rows`` laid out by their ``number``: a series of ``height``, null elsewhere.
 
-    What a left join on a frame's own row numbers gives, without copying the frame. Of several rows
-    with one number the last counts.
+    A left join on a frame's own row numbers. Of several rows with one number the last counts.
     """
     values = pl.repeat(None, height, dtype=rows.schema[column], eager=True).alias(column)
     return values.scatter(rows[number], rows[column])
@@ -237,10 +232,8 @@ def place_of(table, slots, columns, row, add):
 def walk(left, at, count, right, times, others, step, strictly, found, table, slots):
     """Fill ``found`` (uint32) with the row of ``right`` that matches each row of ``left``.
 
-    That is the last one at or before it (``step`` 1), or the first one at or after it (``step``
-    −1: the walk begins at the end). ``at`` and ``times`` (int64, ns) ascend, ``left`` and ``right``
-    are their keys. Returns how many rows have none, which NONE stands for, or FULL where ``slots``
-    are too few for all keys.
+    ``step`` −1 walks from the end. ``at`` and ``times`` (int64, ns) ascend, ``left`` and ``right``
+    are their keys. Returns how many rows have none (NONE), or FULL: ``slots`` are too few.
     """
     row, other = (0, 0) if step > 0 else (count - 1, others - 1)
     missing = 0
@@ -267,7 +260,7 @@ def walk_pairs(starts, began, start_count, ends, ended, end_count, found, table,
     """For every start write the row of its end to ``found`` (uint32; other rows are left alone).
 
     ``starts`` and ``ends`` are keys, ``began`` and ``ended`` their ascending times; ``states`` has
-    four zeros for each of the ``slots``. Returns 0, or FULL where those are too few for all keys.
+    four zeros for each of the ``slots``. Returns 0, or FULL: they are too few.
     """
     i = j = moment = np.int64(0)
     while i < start_count or j < end_count:

@@ -40,10 +40,9 @@ class Objects:
       type ``Enum``: millions of rows carry them as numbers.
     * ``callbacks``: :data:`CALLBACK_SCHEMA`, one row per *registration*, the address
       (``pid, handle``) under which a callback ran from ``valid_from`` until that address was
-      registered again (``valid_to``, null: never). ``callback_id`` numbers callbacks from 0.
-      ``kind`` is timer, subscription, service, client or unknown, ``topic`` the topic or the
-      service's name. ``observed`` is false for what emits no callback events: subscriptions of
-      rclpy, whose instances are assumed from what they take and publish, and all clients.
+      registered again (``valid_to``, null: never). ``callback_id`` numbers callbacks from 0
+      (:func:`numbered`). ``topic`` is the topic or the service's name. ``observed`` is false for
+      what emits no callback events: subscriptions of rclpy, and all clients.
     * ``buffers``: ``pid, buffer, valid_from, callback_id``: intra-process ring buffers.
     * ``notes``: what cannot be known from this recording, in plain words.
     """

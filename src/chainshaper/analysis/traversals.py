@@ -59,15 +59,14 @@ class Traversals:
     topic where an incomplete one stopped) and ``reason`` (a key of :data:`REASONS`).
 
     ``hops`` has one row per traversal and callback reached, sorted by hop: ``traversal``,
-    ``hop`` (from 0), ``callback_id``, ``topic`` (that it publishes), ``instance``, ``take``
-    (time), ``start``, ``publish`` (time), ``end`` (of the instance), ``source_timestamp`` (of the
+    ``hop`` (from 0), ``callback_id``, ``topic`` (that it publishes), ``instance``, the times
+    ``take``, ``start``, ``publish`` and ``end`` (of the instance), ``source_timestamp`` (of the
     message it took), ``communication_ns`` (previous publication to start: transport and waiting),
     ``computation_ns`` (start to publication), and ``via``: ``instance`` when the instance itself
-    published, ``sibling`` when another callback of its node did, null when none did. Over a
-    complete traversal communication and computation add up to the latency.
+    published, ``sibling`` when another callback of its node did. Over a complete traversal the two
+    parts add up to the latency.
 
-    ``silent`` counts instances of the first callback that published nothing. ``notes`` says what
-    the events leave open.
+    ``silent`` counts instances of the first callback that published nothing.
     """
 
     chain: Chain
@@ -298,10 +297,9 @@ def reception(
 ) -> pl.DataFrame:
     """When a callback of the output's subscriber started with each traversal's message.
 
-    One row per traversal, in order: ``traversal``, ``received`` (start of the callback instance
-    that took the output, null if there is none) and ``reception_ns`` (from the traversal's
-    start). The subscriber is that of ``node``, by default the first subscription callback of the
-    last topic that received anything at all.
+    One row per traversal, in order: ``traversal``, ``received`` (null: never) and ``reception_ns``
+    (from the traversal's start). The subscriber is that of ``node``, by default the first
+    subscription callback of the last topic that received anything at all.
     """
     candidates = [
         callback.id

@@ -46,18 +46,11 @@ if TYPE_CHECKING:
     from chainshaper.workload.live import StartedNodes
 
 
-START_NS = 30_000_000_000
-"""A command has this long to start all nodes of the plan."""
-
-PHASE_BOUND_NS = 250_000
-"""Shaping nodes get the beginning of cycles again when it has moved by more. Watching a thread from
-outside shows nothing finer (:data:`.phase.POLL_NS`)."""
-
+START_NS = 30_000_000_000  # for a command to start all nodes of the plan
+PHASE_BOUND_NS = 250_000  # nodes get the beginning of cycles again when it has moved by more
 _LOOK_S = 1.0
-_SETTLING_LOOKS = 3
-"""Nodes that have just started go on to start threads for a while; some never stop."""
-_FLEETING = 3
-"""So many threads of a process that a look finds, and the next does not, are worth a note."""
+_SETTLING_LOOKS = 3  # nodes that have just started go on to start threads for a while
+_FLEETING = 3  # so many threads that a look finds, and the next does not, are worth a note
 _NOTHING = ServerCounters()
 
 
@@ -87,22 +80,19 @@ def apply_plan(
 ) -> Applied:
     """Put a plan in force until ``stop`` is set, the command or the application ends, or it fails.
 
-    ``command`` is started first, with ``command_stdout`` as its output if that is not ours;
-    without one, the application runs already. Its nodes have ``wait_ns`` to appear (default: 30 s
-    with a command, else none). ``phase_ns`` is where in a cycle the chain's first timer expires, on
-    CLOCK_MONOTONIC; it is measured where it is not given. ``recording`` is one of the very
-    processes, if there is one. Only processes of ``users`` (names or numbers; default: who launched
-    us, and root) are taken for nodes of the plan, now and later. ``watch`` gets the state every
-    second; ``folder`` is where runs keep what they need (default: `/run/chainshaper`).
+    ``command`` is started first (its output goes to ``command_stdout``); without one, the
+    application runs already. Its nodes have ``wait_ns`` to appear (default: 30 s with a command,
+    else none). ``phase_ns`` is where in a cycle the chain's first timer expires, on CLOCK_MONOTONIC
+    (None: it is measured). ``recording`` is one of the very processes. Only processes of ``users``
+    (names or numbers; default: who launched us, and root) are nodes of the plan. ``watch`` gets the
+    state every second; ``folder`` is where runs stand (default: `/run/chainshaper`).
 
     Raises:
-        InputError: the plan names no threads, its table is not one, or it has an offset; or there
-            is no such user.
+        InputError: the plan names no threads, or has an offset; or there is no such user.
         PlatformError: the machine lacks a core or the back end, or we a privilege.
-        OperationError: another run governs one of the cores or nodes, a node does not appear or
-            is ambiguous, the chain has no regular beginning, the kernel refuses something, the
-            servers failed while in force, or the application, not being our command, has ended;
-            or ``stop`` was set before the plan was in force.
+        OperationError: another run governs a core or node, a node does not appear or is ambiguous,
+            the chain has no regular beginning, the kernel refuses something, the servers failed,
+            the application ended by itself, or ``stop`` was set before the plan was in force.
     """
     refuse_offset(plan)
     given, plan = plan, open_until_done(plan)
@@ -360,8 +350,7 @@ class _Run:
     ) -> tuple[tuple[NodeThread, ...], str]:
         """Threads that have appeared get what the plan says; ``latest`` had before this look.
 
-        Returns the new ones, and why they were not taken in, if so: a node is on its way up,
-        perhaps.
+        Returns the new ones, and why they were not taken in, if so.
         """
         before, now = self.found, self.find()
         new, ended = allocation.new_and_ended(before, now)
@@ -383,10 +372,7 @@ class _Run:
         return new, ""
 
     def name_strangers(self, found: Allocation) -> None:
-        """One line about strangers who say they are nodes, the latest, if there is any.
-
-        It replaces the one before, so that they cannot make it long by coming and going.
-        """
+        """One line about strangers who say they are nodes: the latest replaces the one before."""
         if found.strangers is not None:
             notes = self.state.notes
             others = (note for note in notes if not note.startswith(allocation.LEFT_ALONE))
@@ -443,9 +429,8 @@ def _moved_text(drift_ns: int) -> str:
 def publishers_gated(plan: Plan, nodes: "StartedNodes") -> Iterator[None]:
     """Inside, the publisher threads that a plan names run in the slots of their servers only.
 
-    For the live workload (paper, section 3.2.1, design 1): its nodes are ours, so which process
-    each is, and when cycles start, needs not be found or measured. Executors and DDS threads of
-    the same processes run on.
+    For the live workload (paper, section 3.2.1, design 1): which process each node is, and when
+    cycles start, is known. Executors and DDS threads of the same processes run on.
 
     Raises:
         PlatformError: threads cannot be frozen here.

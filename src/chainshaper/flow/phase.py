@@ -36,14 +36,9 @@ if TYPE_CHECKING:
 
 POLL_NS = 250_000
 WATCHER_PRIORITY = 95
-TO_STOP_NS = 20_000
-"""Stopping and continuing a thread that waits for something wakes it for 5 to 7 us of its time; an
-executor that finds its timer expired needs tens."""
-
-SEEN_IN = 0.8
-"""A place counts when wake-ups come there in this share of the cycles."""
-_PATIENCE_S = 20
-"""ROS 2 has started and found the nodes by then, however busy the machine is, or never will."""
+TO_STOP_NS = 20_000  # stopping and continuing a thread takes 5 to 7 us of its time, a timer tens
+SEEN_IN = 0.8  # a place counts when wake-ups come there in this share of the cycles
+_PATIENCE_S = 20  # ROS 2 has found the nodes by then, however busy the machine is, or never will
 
 
 @dataclass(frozen=True)
@@ -94,10 +89,9 @@ def watch_wake_ups(
 ) -> npt.NDArray[np.int64]:
     """When a thread became ready to run, each time it did (ns of CLOCK_MONOTONIC).
 
-    A wake-up is known to lie between two looks, and the later of them is taken, minus the time that
-    the thread had to wait for its core. Those after which it ran for less than ``least_ns`` are
-    left out. ``rest_ns`` says at any time for how long not to look. Raises OperationError: the
-    thread has ended.
+    That is the later of two looks, minus the time that the thread waited for its core. Wake-ups
+    after which it ran for less than ``least_ns`` are left out. ``rest_ns`` says at any time for how
+    long not to look. Raises OperationError: the thread has ended.
     """
     # When it woke up (0: a rest begins, or the end), and how long it had run by then.
     found: list[tuple[int, int]] = []
@@ -184,11 +178,9 @@ def find_drift(
 class DriftWatch:
     """Looks every ten seconds, in a thread of its own, where a thread begins its cycles now.
 
-    ``latest_ns`` is how far that is from ``expected_ns`` (None: not seen yet). Held back by a
-    server, a thread begins with its slot; once its timer expires inside the slot, it begins so
-    much later, and that is the drift. Looking takes a tenth of a core: it is done on ``cores``, if
-    there are any, and only ``NEAR`` where the thread began last, since it would also delay what is
-    delivered. A thread that is not seen there any more is looked for in the whole cycle.
+    ``latest_ns`` is how far that is from ``expected_ns`` (None: not seen yet). Looking takes a
+    tenth of a core: it is done on ``cores``, if there are any, and only ``NEAR`` where the thread
+    began last. A thread that is not seen there any more is looked for in the whole cycle.
     """
 
     EVERY_S = 10.0
@@ -250,7 +242,7 @@ def _undisturbed() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Telling:
-    """Nodes that a process of ours is sending the phase, since ``begun`` (s of CLOCK_MONOTONIC).
+    """Nodes that get the phase by a script, since ``begun`` (s of CLOCK_MONOTONIC).
 
     ``script`` is None where no node is to get it, or it was ``refused``.
     """
@@ -285,10 +277,9 @@ NO_NODE = Telling((), None, 0.0)
 
 
 def tell_phase(plan: Plan, found: Allocation, phase_ns: int) -> Telling:
-    """Begin to set ``phase_ns`` of a plan's shaping nodes, as far as they are ROS 2's.
+    """Begin to give a plan's shaping nodes in ROS 2 where the chain begins in every cycle.
 
-    ``phase_ns`` is where the chain begins in every cycle, on CLOCK_MONOTONIC. The nodes of a chain
-    are in one domain: any of them has the environment in which all are found.
+    The nodes of a chain are in one domain: any of them has the environment in which all are found.
     """
     names = [node.thread.node for node in shaping_nodes(plan)]
     pids = {node: one.thread.pid for node in names for one in found.threads if node in one.nodes}

@@ -57,13 +57,10 @@ is as it shall be; events from before that are left out of the tables.
 """
 
 TRACE_FOLDER = "trace"
-SPARE_DISK = 64 << 20
-"""A run ends when its disk has no more than that (bytes): there is more to be written."""
-
+SPARE_DISK = 64 << 20  # a run ends when its disk has no more (bytes): there is more to be written
 _STEP_S = 0.1
 _FIRST_LOOK_NS = 500_000_000
-_LONGEST_PAUSE_NS = 5_000_000_000
-"""Looking costs the machine some milliseconds: the longer a run lasts, the rarer it is."""
+_LONGEST_PAUSE_NS = 5_000_000_000  # looking takes some ms: the longer a run lasts, the rarer it is
 
 
 @dataclass(frozen=True)
@@ -76,7 +73,7 @@ class Recorded:
 
 @dataclass
 class _Run:
-    """What there is to keep together while an application is recorded, and what was seen of it.
+    """An application that is recorded, and what was seen of it.
 
     ``environment`` is a node's. ``in_force_ns`` is when the scheduling that was asked for was,
     ``governed`` are plans that others put in force meanwhile (`chainshaper apply`).
@@ -127,14 +124,13 @@ def record_command(
 ) -> Recorded:
     """Record an application until it ends, ``duration_ns`` are over, or ``stop`` is set.
 
-    ``command`` is started, and ended with the recording. Without one, eBPF attaches to ``pids``
-    and their descendants, or to all that ``users`` run (names or numbers; default: who launched
-    us, and root). ``buffer`` is the size of LTTng's buffer of a core in bytes. ``chain`` is noted
-    as the chain of interest, ``plan`` as the plan in force; ``gate_logs`` are where its shaping
-    nodes note what they do. ``watch_stalls`` has a sleeper on every core notice when the machine
-    stands still, which takes some 2 % of it. What the command prints goes to the file descriptor
-    ``command_stdout``, if that is given. ``progress`` gets the share that is done, as far as
-    that is known, and what is being done.
+    ``command`` is started, and ended with the recording; it prints to ``command_stdout``. Without
+    one, eBPF attaches to ``pids`` and their descendants, or to all that ``users`` run (names or
+    numbers; default: who launched us, and root). ``buffer`` is the size of LTTng's buffer of a core
+    in bytes. ``chain`` is noted as the chain of interest, ``plan`` as the plan in force;
+    ``gate_logs`` are where its shaping nodes note what they do. ``watch_stalls`` has a sleeper on
+    every core notice when the machine stands still (2 % of it). ``progress`` gets the share that is
+    done, as far as that is known, and what is being done.
 
     Raises:
         InputError: ``output`` exists, there is no such command or process, or no such source.
@@ -331,9 +327,8 @@ def _written(
 def _recorded_threads(processes: Sequence[Process], recording: Recording) -> tuple[ThreadInfo, ...]:
     """The threads of the nodes among ``processes``, numbered as in the recording.
 
-    Nodes are the processes that the recording saw one in; where it saw none (tracing began later),
-    those that take part in DDS. A thread that works for several nodes (a component container's) is
-    given to none.
+    Nodes are the processes that the recording saw one in; where it saw none, those that take part
+    in DDS. A thread that works for several nodes (a component container's) is given to none.
     """
     recorded, _ = recorded_processes(recording)
     pids = {seen.pid for seen in recorded}
@@ -360,8 +355,7 @@ def _known_endpoints(
 ) -> tuple[EndpointInfo, ...]:
     """The graph's endpoints with their depths from the trace, then those that only it saw.
 
-    Several of one node, topic and kind are taken in the order in which they were created. Not
-    every RMW shows to others how deep queues are.
+    Several of one node, topic and kind are taken in the order in which they were created.
     """
     objects = resolve_objects(tables)
     traced: list[EndpointInfo] = []

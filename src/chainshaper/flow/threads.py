@@ -54,9 +54,9 @@ def find_threads(
 
     ``where`` is a process, which stands for its descendants too; a plan, for the nodes of its
     servers; or None for all that looks like an application of ROS 2 or DDS. ``recording`` is one
-    of the processes that still run, if there is one; who looks often gives what it says about them,
-    ``recorded``, instead. Only processes of ``users`` (names or numbers; default: who launched us,
-    and root) are nodes; a process that is asked for is, whoever runs it.
+    of the processes that still run; who looks often gives what it says, ``recorded``, instead. Only
+    processes of ``users`` (names or numbers; default: who launched us, and root) are nodes; a
+    process that is asked for is, whoever runs it.
 
     Raises:
         InputError: there is no such process, or no such user.

@@ -50,14 +50,12 @@ class LeftOut:
 class Measurement:
     """A recording with its chain's latency analysis.
 
-    ``longest_stall_ns`` is the machine's own during the recording (None: it was not watched),
-    ``overruns`` counts outputs that came too late for their publish slot, per policy that was
-    applied to them: ``wait``, ``discard``, ``publish`` (None: nothing was gated);
-    ``into_open_slots`` those that came in time, but too late to wait until their slot's start
-    (None: no gate decided), and ``dropped`` messages that were lost at a gate, per reason. ``plan``
-    is the plan in force, and ``held`` its prediction beside this measurement. All of it is about
-    the time in which the plan was in force, where the recording says when that was: ``left_out``
-    names the rest.
+    ``longest_stall_ns`` is the machine's own (None: it was not watched), ``overruns`` counts
+    outputs that came too late for their publish slot, per policy (None: nothing was gated),
+    ``into_open_slots`` those that came in time, but too late to wait until their slot's start,
+    ``dropped`` messages that were lost at a gate, per reason (None: no gate decided). ``plan`` is
+    the plan in force, ``held`` its prediction beside this measurement. All of it is about the time
+    in which the plan was in force; ``left_out`` names the rest.
     """
 
     recording: Recording
