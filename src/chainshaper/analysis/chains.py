@@ -12,7 +12,6 @@ avoids dead ends; both have a budget. Counting and the heaviest path come from d
 over the edges that lead forwards in one order of the vertices: exact without cycles, else a bound.
 """
 
-import heapq
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -436,16 +435,9 @@ class _Search:
     def counted(self, weights: Mapping[int, float]) -> tuple[int, GraphPath, float]:
         """Number of paths, the heaviest of them, and its weight (the sum over its callbacks).
 
-        If ``cyclic``, of those that never step back in the depth-first or the greedy order.
+        If ``cyclic``, of those that never step back in the order of a depth-first search.
         """
-        orders = [self.order] + ([self._greedy()] if self.cyclic else [])
-        results = [self._counted_in(order, weights) for order in orders]
-        heaviest = max(results, key=lambda result: result[2])
-        return max(result[0] for result in results), heaviest[1], heaviest[2]
-
-    def _counted_in(
-        self, order: Mapping[Vertex, int], weights: Mapping[int, float]
-    ) -> tuple[int, GraphPath, float]:
+        order = self.order
         best: dict[State, tuple[int, float, State | None]] = {}
         for state in sorted(self.successors, key=lambda s: (order[s[0]], -s[1])):
             vertex = state[0]
@@ -468,27 +460,6 @@ class _Search:
             heaviest.append(at[0])
             at = best[at][2]
         return sum(best[root][0] for root in roots), tuple(heaviest), best[first][1]
-
-    def _greedy(self) -> dict[Vertex, int]:
-        """The greedy order of topics, every callback just after the topic it subscribes to.
-
-        Callbacks have one edge in and thus no choice. Roots are first, no path comes back to them.
-        """
-        roots = [vertex for vertex, _ in self.roots]
-        between: dict[str, list[str]] = {}
-        for vertex, onward in self.edges.items():
-            topic = self.callbacks[vertex].topic if isinstance(vertex, int) else None
-            if topic is not None and vertex not in roots:
-                between.setdefault(topic, []).extend(str(after) for after in onward)
-        rank: dict[Vertex, int] = {}
-        for topic, place in _greedy_order(between).items():
-            rank[topic] = 2 * place
-            for callback in self.subscribers.get(topic, ()):
-                rank[callback] = 2 * place - 1
-        last = min(rank.values(), default=0)
-        for vertex in self.edges:
-            rank.setdefault(vertex, last - 1)  # topics that only a root publishes, and that end
-        return rank | dict.fromkeys(roots, max(rank.values(), default=0) + 1)
 
 
 def _distances(successors: Mapping[State, tuple[State, ...]], ends: set[State]) -> dict[State, int]:
@@ -526,47 +497,6 @@ def _depth_first_order(
             if vertex is not None:
                 rank[vertex] = len(rank)
     return rank
-
-
-def _greedy_order(edges: Mapping[str, Sequence[str]]) -> dict[str, int]:
-    """An order with few backward edges: the heuristic of Eades, Lin and Smyth (1993).
-
-    Sinks go to the back, sources to the front, and when there are neither the vertex with the
-    greatest surplus of outgoing edges goes to the front. Cost is edges · log.
-    """
-    after = {vertex: set(following) for vertex, following in edges.items()}
-    before: dict[str, set[str]] = {vertex: set() for vertex in after}
-    for vertex, onward in edges.items():
-        for following in onward:
-            after.setdefault(following, set())
-            before.setdefault(following, set()).add(vertex)
-    number = {vertex: index for index, vertex in enumerate(after)}
-
-    def urgency(vertex: str) -> tuple[int, int]:
-        """0 for sinks, 1 for sources, then by surplus."""
-        if not after[vertex]:
-            return 0, 0
-        return (1, 0) if not before[vertex] else (2, len(before[vertex]) - len(after[vertex]))
-
-    heap = [(urgency(vertex), number[vertex], vertex) for vertex in after]
-    heapq.heapify(heap)
-    front: list[str] = []
-    back: list[str] = []
-    placed: set[str] = set()
-    while heap:
-        noted, _, vertex = heapq.heappop(heap)
-        if vertex in placed or noted != urgency(vertex):
-            continue  # an entry from before its neighbours went
-        placed.add(vertex)
-        (front if after[vertex] else back).append(vertex)
-        for neighbour in before[vertex]:
-            after[neighbour].discard(vertex)
-        for neighbour in after[vertex]:
-            before[neighbour].discard(vertex)
-        for neighbour in (*before[vertex], *after[vertex]):
-            heapq.heappush(heap, (urgency(neighbour), number[neighbour], neighbour))
-    order = [*front, *reversed(back)]
-    return {vertex: len(order) - place for place, vertex in enumerate(order)}
 
 
 class _PathNode(BaseModel):
