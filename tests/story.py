@@ -211,8 +211,8 @@ class Story:
         self, callback: Callback, /, sent: int, arrival: int, release: int | None, **fields: Any
     ) -> None:
         """A gate's decision about the message sent at ``sent``; ``fields`` differ from usual."""
-        usual = {"slot": 0, "cycles_waited": 0, "anchor": "stamp", "overrun": None}
-        known = {"callback": callback.handle, "source_timestamp": sent + OFFSET}
+        usual: dict[str, Any] = {"slot": 0, "cycles_waited": 0, "anchor": "stamp", "overrun": None}
+        known: dict[str, Any] = {"callback": callback.handle, "source_timestamp": sent + OFFSET}
         known |= {"arrival": arrival, "release": release, **usual, **fields}
         self.event("gate_release", release or arrival, callback.pid, **known)
 

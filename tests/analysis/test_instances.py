@@ -2,6 +2,7 @@
 
 import itertools
 from collections import Counter
+from typing import Any
 
 import polars as pl
 import pytest
@@ -87,7 +88,7 @@ def paired(starts: Happenings, ends: Happenings) -> list[int]:
         pl.DataFrame(rows, types, orient="row").with_columns(pid=pl.lit(7, pl.Int32))
         for rows in (starts, ends)
     )
-    return ends_of_starts(*tables).cast(pl.Int64).fill_null(-1).to_list()
+    return list(ends_of_starts(*tables).cast(pl.Int64).fill_null(-1))
 
 
 HAPPENINGS = st.lists(
@@ -118,7 +119,13 @@ def test_execution_time_from_thread_time() -> None:
 
 
 def switch(story: Story, time: int, prev: int, following: int) -> None:
-    unused = {"prev_comm": "", "prev_prio": 0, "prev_state": 0, "next_comm": "", "next_prio": 0}
+    unused: Any = {
+        "prev_comm": "",
+        "prev_prio": 0,
+        "prev_state": 0,
+        "next_comm": "",
+        "next_prio": 0,
+    }
     story.event("sched_switch", time, 0, prev_tid=prev, next_tid=following, **unused)
 
 

@@ -1,5 +1,6 @@
 """When outputs were due, and which came late: stories whose every instant is known by hand."""
 
+from dataclasses import replace
 from typing import Any
 
 import polars as pl
@@ -40,82 +41,68 @@ def _analysed(story: Story, due: Due | None = None) -> LatencyAnalysis:
     return found
 
 
-def _late(story: Story, due: Due | None = None) -> list[bool | None]:
-    return _analysed(story, due).traversals["late"].to_list()
-
-
 SLOT = Due(PERIOD, slots=((300, 310),))
 OUTPUTS = [(1_000, 1_300), (2_000, 2_315), (3_000, 4_300)]
+CYCLE = replace(SLOT, from_cycle=True)
+LET = Due(PERIOD, cycles=1, slots=((0, 10),))
+MODES = Due(PERIOD, slots=((200, 210), (300, 310)), last_slot={"fast": 0, "slow": 1})
+# In its slot; in it but published behind it; a period later; at once, behind the slot.
+BEHIND: list[dict[str, Any]] = [
+    {},
+    {"release": 2_300},
+    {"overrun": "wait", "cycles_waited": 1, "arrival": 3_350},
+    {"overrun": "publish", "arrival": 5_400, "slot": None},
+]
+# The gate takes the third for an output of the cycle that it arrives in, and in time.
+BY_CYCLE: list[dict[str, Any]] = [
+    {"anchor": "cycle", "origin": 980},
+    {"anchor": "cycle", "origin": 2_010, "release": 2_310},
+    {"anchor": "cycle", "origin": 4_000, "arrival": 4_020},
+]
+OF_MODES: list[dict[str, Any]] = [
+    {"mode": "slow", "slot": 1},
+    {"mode": "fast", "overrun": "publish", "slot": None},
+]
+A_CYCLE_LATER: list[dict[str, Any]] = [
+    {"cycles_waited": 1},
+    {"cycles_waited": 2, "overrun": "wait"},
+]
 
 
-def test_what_a_gate_let_go_behind_its_slot_is_late() -> None:
-    """In its slot; in it but published behind it; a period later; at once, behind the slot."""
-    outputs = [*OUTPUTS, (5_000, 5_400)]
-    gated: list[dict[str, Any]] = [
-        {},
-        {"release": 2_300},
-        {"overrun": "wait", "cycles_waited": 1, "arrival": 3_350},
-        {"overrun": "publish", "arrival": 5_400, "slot": None},
-    ]
-    found = _analysed(_chain(outputs, gated), SLOT)
-    assert found.traversals["late"].to_list() == [False, True, True, True]
-    assert found.traversals["place_ns"].to_list() == [300, 315, 1_300, 400]
-    assert found.traversals["due_at"].to_list() == [1_300, 2_300, 3_300, 5_300]
-    assert (found.statistics.late, found.undisturbed.late) == (3, 3)
-    # Without the plan the gate's own word remains, and when others were due.
-    found = _analysed(_chain(outputs, gated))
-    assert found.traversals["late"].to_list() == [False, False, True, True]
-    assert found.traversals["due_at"].to_list() == [1_300, 2_300, 3_300, 5_300]
-
-
-def test_with_the_anchor_cycle_the_cycle_counts_in_which_the_chain_began() -> None:
-    """The gate takes the third for an output of the cycle that it arrives in, and in time."""
-    cycle = Due(PERIOD, slots=((300, 310),), from_cycle=True)
-    gated = [
-        {"anchor": "cycle", "origin": 980},
-        {"anchor": "cycle", "origin": 2_010, "release": 2_310},
-        {"anchor": "cycle", "origin": 4_000, "arrival": 4_020},
-    ]
-    outputs = [(1_000, 1_280), (2_000, 2_312), (3_000, 4_300)]
-    found = _analysed(_chain(outputs, gated), cycle)
-    assert found.traversals["place_ns"].to_list() == [300, 302, 1_300]
-    assert found.traversals["late"].to_list() == [False, False, True]
-    assert found.traversals["due_at"].to_list() == [1_280, 2_310, 3_300]
-
-
-def test_under_let_an_output_is_due_a_cycle_later() -> None:
-    let = Due(PERIOD, cycles=1, slots=((0, 10),))
-    gated: list[dict[str, Any]] = [{"cycles_waited": 1}, {"cycles_waited": 2, "overrun": "wait"}]
-    assert _late(_chain([(1_000, 2_000), (2_000, 4_000)], gated), let) == [False, True]
-    assert _late(_chain([(1_000, 2_000), (2_000, 4_000)]), let) == [False, True], "without a gate"
-
-
-def test_a_mode_has_a_slot_of_its_own() -> None:
-    modes = Due(PERIOD, slots=((200, 210), (300, 310)), last_slot={"fast": 0, "slow": 1})
-    outputs = [(1_000, 1_300), (2_000, 2_300)]
-    gated: list[dict[str, Any]] = [
-        {"mode": "slow", "slot": 1},
-        {"mode": "fast", "overrun": "publish", "slot": None},
-    ]
-    found = _analysed(_chain(outputs, gated), modes)
-    assert found.traversals["late"].to_list() == [False, True]
-    assert found.traversals["due_at"].to_list() == [1_300, 2_200]
+FIVE = [*OUTPUTS, (5_000, 5_400)]
+TWO = [(1_000, 2_000), (2_000, 4_000)]
 
 
 @pytest.mark.parametrize(
-    ("due", "late"),
+    ("told", "due", "late", "places", "due_at"),
     [
-        (None, [False, False, True]),  # a period behind the chain's start
-        (Due(2 * PERIOD), [False, False, False]),
-        (Due(PERIOD, slots=((300, 310),)), [False, False, True]),  # the cycle, where no gate spoke
+        ((FIVE, BEHIND), SLOT, "-LLL", [300, 315, 1_300, 400], [1_300, 2_300, 3_300, 5_300]),
+        # Without the plan the gate's own word remains, and when others were due.
+        ((FIVE, BEHIND), None, "--LL", None, [1_300, 2_300, 3_300, 5_300]),
+        (
+            ([(1_000, 1_280), (2_000, 2_312), (3_000, 4_300)], BY_CYCLE),
+            *(CYCLE, "--L", [300, 302, 1_300], [1_280, 2_310, 3_300]),
+        ),
+        ((TWO, A_CYCLE_LATER), LET, "-L", None, None),
+        ((TWO,), LET, "-L", None, None),
+        (([(1_000, 1_300), (2_000, 2_300)], OF_MODES), MODES, "-L", None, [1_300, 2_200]),
+        ((OUTPUTS,), None, "--L", None, None),  # a period behind the chain's start
+        ((OUTPUTS,), Due(2 * PERIOD), "---", None, None),
+        ((OUTPUTS,), SLOT, "--L", None, None),  # the cycle, where no gate spoke
     ],
 )
-def test_without_a_gate_an_output_is_due_within_its_cycle(
-    due: Due | None, late: list[bool]
+def test_an_output_is_late_behind_its_slot_or_cycle(
+    told: tuple[Any, ...],
+    due: Due | None,
+    late: str,
+    places: list[int] | None,
+    due_at: list[int] | None,
 ) -> None:
-    story = _chain(OUTPUTS)
-    assert _late(story, due) == late
-    assert _analysed(story, due).statistics.late == sum(late)
+    found = _analysed(_chain(*told), due)
+    assert found.traversals["late"].to_list() == [one == "L" for one in late]
+    assert places in (None, found.traversals["place_ns"].to_list())
+    assert due_at in (None, found.traversals["due_at"].to_list())
+    assert found.statistics.late == found.undisturbed.late == late.count("L")
 
 
 def test_nothing_says_when_an_output_was_due_where_no_timer_starts_the_chain() -> None:

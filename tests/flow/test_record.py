@@ -203,7 +203,7 @@ def test_what_is_wrong_is_said_before_anything_starts(
         (("-o", path, *ebpf, "--buffer", "8", *program), "--buffer is about LTTng's buffers"),
         (("-o", tmp_path / "mine", *program), "exists already and is not overwritten"),
     ):
-        assert words in refused(2, "record", *arguments)  # type: ignore[arg-type]
+        assert words in refused(2, "record", *arguments)
     (tmp_path / "true").symlink_to("/bin/true")
     monkeypatch.setenv("PATH", str(tmp_path))
     said = refused(3, "record", "-o", path, *program)
