@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -35,18 +36,25 @@ from chainshaper.workload.live import StartedNodes
 MS = 1_000_000
 
 
-def _too_early() -> Plan:
-    """A publish slot in the midst of the small chain's latencies: every other output overruns."""
-    return small_chain_plan(4 * MS, 6 * MS)
+def _too_early(overrun: str = "wait", until_ns: int | None = None, **changes: Any) -> Plan:
+    """A publish slot in the midst of the small chain's latencies; the chain itself may run on.
+
+    Until ``until_ns``: 1 ms later.
+    """
+    plan = small_chain_plan(4 * MS, 6 * MS)
+    chain, output = plan.servers
+    ((start, end),) = output.slots
+    slots = ((0, PERIOD_NS),), ((start, until_ns or end),)
+    servers = [
+        one.model_copy(update={"slots": own})
+        for one, own in zip((chain, output), slots, strict=True)
+    ]
+    return revised(plan, servers=tuple(servers), overrun=overrun, **changes)
 
 
 def test_discarded_outputs_are_not_published_and_not_lost(tmp_path: Path) -> None:
-    application, plan = small_chain(tmp_path), revised(_too_early(), overrun="discard")
-
-    def shape(place: Path) -> Recording:
-        return shape_application(application, plan, place / "rec", cycles=24)
-
-    recording = calm_run(shape, tmp_path)
+    plan = _too_early("discard")
+    recording = simulate(small_chain(tmp_path), tmp_path / "rec", plan, cycles=24)
     measured = measure_latency(recording)
     releases = recording.events["gate_release"]
     discarded = releases.filter(pl.col("overrun") == "discard")
@@ -77,7 +85,7 @@ def test_discarded_outputs_are_not_published_and_not_lost(tmp_path: Path) -> Non
 
 
 def test_outputs_published_at_once_wait_for_nothing(tmp_path: Path) -> None:
-    plan = revised(_too_early(), overrun="publish")
+    plan = _too_early("publish")
     recording = simulate(small_chain(tmp_path), tmp_path / "rec", plan, cycles=24)
     measured = measure_latency(recording)
     late = recording.events["gate_release"].filter(pl.col("overrun").is_not_null())
@@ -91,13 +99,8 @@ def test_outputs_published_at_once_wait_for_nothing(tmp_path: Path) -> None:
 
 
 def test_what_comes_into_an_open_slot_leaves_at_once_and_is_counted(tmp_path: Path) -> None:
-    early = _too_early()
-    ((start, _),) = publish_slots(early)
-    wide = tuple(
-        server.model_copy(update={"slots": ((server.slots[0][0], PERIOD_NS),)})
-        for server in early.servers
-    )
-    plan = revised(early, servers=wide)
+    plan = _too_early(until_ns=PERIOD_NS)
+    ((start, _),) = publish_slots(plan)
     recording = simulate(small_chain(tmp_path), tmp_path / "rec", plan, cycles=24)
     releases = recording.events["gate_release"]
     behind = releases["arrival"] - releases["origin"] - start
@@ -117,7 +120,7 @@ def test_the_plan_says_what_is_done_about_overruns_and_the_live_run_reports_it(
     latencies.write_text("4ms\n6ms\n")
     made = json_of("plan", "--latencies", latencies, "--period", "50ms", "--overrun", "discard")
     assert made["overrun"] == "discard"
-    save_plan(revised(_too_early(), overrun="discard"), plan_file)
+    save_plan(_too_early("discard"), plan_file)
     small_chain(tmp_path)
     output, described = tmp_path / "rec", tmp_path / "small_chain.yaml"
     shaped = called("shape", described, plan_file, "-o", output, "--cycles", "12")
@@ -129,7 +132,7 @@ def test_what_a_gate_lost_is_shown_wherever_recordings_are_compared(tmp_path: Pa
     """An overrun that waits meets the output of the next cycle, which takes its place."""
     application = small_chain(tmp_path)
     profile = simulate(application, tmp_path / "profile", cycles=24)
-    plan = revised(_too_early(), overrun="wait", messages="newest")
+    plan = _too_early(messages="newest")
     shaped = simulate(application, tmp_path / "shaped", plan, cycles=24)
     count = (dropped_in(shaped) or {})["replaced"]
     assert dropped_in(shaped) == {"replaced": count}
