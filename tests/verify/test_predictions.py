@@ -1,4 +1,4 @@
-"""Prediction beside measurement: known answers, and a live run with three bands."""
+"""Prediction beside measurement: known answers, and a chain with three bands."""
 
 import io
 from dataclasses import replace
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 from small_chain import small_chain
 
-from chainshaper import compare_recordings, measure_latency, plan_recording, shape_application
+from chainshaper import compare_recordings, measure_latency, plan_recording, simulate
 from chainshaper.analysis import LatencyAnalysis, latency_statistics
 from chainshaper.planning import Modes, Plan, PlanRequest, Profile, plan_chain, publish_slots
 from chainshaper.planning.overruns import cycles_until_output
@@ -135,17 +135,18 @@ def test_each_mode_is_held_by_its_own_band(like: LatencyAnalysis) -> None:
         assert "fast, 1 late" in text.getvalue()
 
 
-def test_three_bands_live(tmp_path: Path, unshaped: Recording) -> None:
-    pytest.importorskip("numba")
-    plan = plan_recording(
-        unshaped, request=PlanRequest(bands=3, publish_slot_ns=100_000, epsilon_ns=3 * MS)
-    )
-    after = shape_application(small_chain(tmp_path), plan, tmp_path / "after", cycles=12)
-    held = compare_recordings([unshaped, after]).measurements[1].held
+def test_three_bands_of_a_simulated_chain(tmp_path: Path) -> None:
+    application = small_chain(tmp_path)
+    before = simulate(application, tmp_path / "before", cycles=100)
+    request = PlanRequest(bands=3, publish_slot_ns=100_000, epsilon_ns=3 * MS)
+    plan = plan_recording(before, request=request)
+    after = simulate(application, tmp_path / "after", plan, cycles=100)
+    held = compare_recordings([before, after]).measurements[1].held
     assert held is not None
     assert [(band.slot_start_ns, band.slot_end_ns) for band in held.bands] == [*publish_slots(plan)]
     undisturbed = measure_latency(after).analysis.undisturbed
     assert sum(band.count for band in held.bands) + held.late == undisturbed.count
+    assert sum(band.count > 0 for band in held.bands) > 1
     for band in held.bands:
         assert band.min_ns is None or band.min_ns >= band.slot_start_ns, "before its slot"
 
