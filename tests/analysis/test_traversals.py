@@ -1,5 +1,6 @@
 """Traversals of chains: hand-made runs with answers worked out by hand."""
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -356,78 +357,65 @@ class Fusion:
             self.inputs[side], start, end, reads=sent, writes=writes if published else ()
         )
 
-
-def test_a_synchronised_message_leaves_with_the_input_that_completes_the_set() -> None:
-    # Left always comes first, right completes the set and publishes for both.
-    run = Fusion()
-    for cycle in (0, 100):
-        run.read("left", cycle + 10, cycle + 20)
-        run.read("right", cycle + 30, cycle + 40, published=cycle + 45)
-    found = traversals(run.story, LEFT)
-    assert spans(found) == [(9, 45), (109, 145)]
-    assert found.hops.filter(hop=1)["via"].to_list() == ["sibling", "sibling"]
-    assert found.notes == ()
-    assert spans(traversals(run.story, RIGHT)) == [(29, 45), (129, 145)]
+    def tell(self, told: str) -> Story:
+        """``left 10-20>25``: sent at 10, read at 20, both inputs' set published at 25."""
+        for one in told.split(", "):
+            side, sent, start, published = re.findall(r"(\w+) (\d+)(?:-(\d+))?(?:>(\d+))?", one)[0]
+            if side == "anew":
+                self.create(int(sent))
+            else:
+                self.read(side, int(sent), int(start), int(published) if published else None)
+        return self.story
 
 
-def test_either_input_may_complete_the_set() -> None:
-    # Left completes the second set; message_filters registered both callbacks.
-    run = Fusion(MESSAGE_FILTER)
-    run.read("left", 10, 20)
-    run.read("right", 30, 40, published=45)
-    run.read("right", 110, 120)
-    run.read("left", 130, 140, published=145)
-    assert spans(traversals(run.story, LEFT)) == [(9, 45), (129, 145)]
-    assert spans(traversals(run.story, RIGHT)) == [(29, 45), (109, 145)]
+RIGHT_LAST = "left 10-20, right 30-40>45, left 110-120, right 130-140>145"
+EITHER_LAST = "left 10-20, right 30-40>45, right 110-120, left 130-140>145"
+OWN = "Fusion::on_points(Cloud)"
 
 
-def test_two_inputs_may_go_into_one_output_and_the_last_into_none() -> None:
-    # Two left messages wait for one right message; the third waits for ever.
-    run = Fusion()
-    run.read("left", 10, 20)
-    run.read("left", 22, 25)
-    run.read("right", 30, 40, published=45)
-    run.read("left", 110, 120)
-    found = traversals(run.story, LEFT)
-    assert spans(found) == [(9, 45), (21, 45), (109, None)]
-    assert reasons(found)[2] == (109, "/fused", "not published")
+@pytest.mark.parametrize(
+    ("symbol", "told", "spec", "expected"),
+    [
+        (None, RIGHT_LAST, LEFT, [(9, 45), (109, 145)]),
+        (None, RIGHT_LAST, RIGHT, [(29, 45), (129, 145)]),
+        # Left completes the second set; message_filters registered both callbacks.
+        (MESSAGE_FILTER, EITHER_LAST, LEFT, [(9, 45), (129, 145)]),
+        (MESSAGE_FILTER, EITHER_LAST, RIGHT, [(29, 45), (109, 145)]),
+        # Two left messages wait for one right message; the third waits for ever.
+        (
+            *(None, "left 10-20, left 22-25, right 30-40>45, left 110-120", LEFT),
+            [(9, 45), (21, 45), (109, None)],
+        ),
+        # Both are the application's own functions and publish each for itself: the left message of
+        # 110 is dropped on purpose, the right one's answer at 145 is not its own.
+        (
+            *(OWN, "left 10-20>25, right 30-40>45, left 110-120, right 130-140>145", LEFT),
+            [(9, 25), (109, None)],
+        ),
+        # Left waits at 120 for a right message. The node is destroyed, created again at 200 in the
+        # same process, and publishes a set of its own.
+        (
+            None,
+            "left 10-20, right 30-40>45, left 110-120, anew 200, left 310-320, right 330-340>345",
+            *(LEFT, [(9, 45), (109, None), (309, 345)]),
+        ),
+    ],
+)
+def test_a_synchronised_message_leaves_with_the_input_that_completes_the_set(
+    symbol: str | None, told: str, spec: str, expected: list[tuple[int, int | None]]
+) -> None:
+    found = traversals(Fusion(symbol).tell(told), spec)
+    assert spans(found) == expected
+    for start, *why in reasons(found):
+        assert why == ([None, None] if dict(expected)[start] else ["/fused", "not published"])
+    if (told, spec) == (RIGHT_LAST, LEFT):
+        assert found.hops.filter(hop=1)["via"].to_list() == ["sibling", "sibling"]
+        assert found.notes == ()
 
 
 def test_outputs_without_a_new_input_give_a_holding_synchroniser_away() -> None:
     # Right publishes at 45 and 65 without a left message between: one of the two earlier left
     # messages was held back, which one the events do not show.
-    run = Fusion(MESSAGE_FILTER)
-    run.read("left", 10, 20)
-    run.read("left", 22, 25)
-    run.read("right", 30, 40, published=45)
-    run.read("right", 50, 60, published=65)
-    run.read("left", 110, 120)
-    run.read("right", 130, 140, published=145)
-    (note,) = traversals(run.story, LEFT).notes
+    told = "left 10-20, left 22-25, right 30-40>45, right 50-60>65, left 110-120, right 130-140>145"
+    (note,) = traversals(Fusion(MESSAGE_FILTER).tell(told), LEFT).notes
     assert note.startswith("1 of 3 publications on /fused came without a new message")
-
-
-def test_independent_publishers_of_one_topic_do_not_answer_for_each_other() -> None:
-    # Both are the application's own functions and publish each for itself: the left message of
-    # 110 is dropped on purpose, the right one's answer at 145 is not its own.
-    run = Fusion("Fusion::on_points(Cloud)")
-    run.read("left", 10, 20, published=25)
-    run.read("right", 30, 40, published=45)
-    run.read("left", 110, 120)
-    run.read("right", 130, 140, published=145)
-    assert spans(traversals(run.story, LEFT)) == [(9, 25), (109, None)]
-
-
-def test_a_node_created_anew_knows_no_message_of_the_one_before() -> None:
-    # Left waits at 120 for a right message. The node is destroyed, created again at 200 in the
-    # same process, and publishes a set of its own.
-    run = Fusion()
-    run.read("left", 10, 20)
-    run.read("right", 30, 40, published=45)
-    run.read("left", 110, 120)
-    run.create(200)
-    run.read("left", 310, 320)
-    run.read("right", 330, 340, published=345)
-    found = traversals(run.story, LEFT)
-    assert spans(found) == [(9, 45), (109, None), (309, 345)]
-    assert reasons(found)[1] == (109, "/fused", "not published")
