@@ -145,9 +145,10 @@ def _last_slot(frame: pl.DataFrame, due: Due | None) -> tuple[pl.Expr, pl.Expr]:
     last = pl.lit(len(due.slots) - 1)
     for mode, slot in due.last_slot.items():
         last = pl.when(pl.col("mode") == mode).then(slot).otherwise(last)
-    opens, closes = zip(*due.slots, strict=True)
-    sides = [pl.lit(pl.Series(side, dtype=pl.Int64)).gather(last) for side in (opens, closes)]
-    return sides[0] + due.cycles * due.cycle_ns, sides[1] + due.cycles * due.cycle_ns
+    delay = due.cycles * due.cycle_ns
+    sides = (pl.Series([s + delay for s in side]) for side in zip(*due.slots, strict=True))
+    opens, closes = (pl.lit(side).gather(last) for side in sides)
+    return opens, closes
 
 
 def disturbed(
@@ -164,8 +165,6 @@ def disturbed(
     ``frame`` is that of :func:`with_punctuality`, ``margin_ns`` the margin of the plan in force.
     """
     began, ended, core = _stalls(flow, threshold_ns)
-    if not len(began):
-        return np.zeros(frame.height, dtype=np.bool_)
     complete, gated = frame["complete"].to_numpy(), frame["origin"].is_not_null().to_numpy()
     start, due, origin, computed = (
         frame[name].fill_null(frame["start"]).to_numpy()
@@ -177,7 +176,7 @@ def disturbed(
     most = np.where(gated, max(computing_threshold_ns, margin_ns + 1), computing_threshold_ns)
     hit = complete & ((gated & at_instants) | (lost >= most))
     # A predecessor that was to be out later than the next began is not waited for.
-    following = np.append(start[1:], np.iinfo(np.int64).max) if len(start) else start
+    following = np.append(start[1:], np.iinfo(np.int64).max)[: len(start)]
     busy_until = np.where(gated & (due > following), start, computed)
     return complete & (hit | _queued_behind(hit, start, busy_until, complete))
 
@@ -198,8 +197,6 @@ def _stalls(flow: DataFlow, threshold_ns: int) -> tuple[Times, Times, Times]:
 
 def _queued_behind(hit: Mask, start: Times, busy_until: Times, may_queue: Mask) -> Mask:
     """Traversals, in order of start, linked to a disturbed one by predecessors still computed."""
-    if not len(start):
-        return hit
     linked = np.zeros(len(start), dtype=np.bool_)
     linked[1:] = may_queue[1:] & (start[1:] < np.maximum.accumulate(busy_until)[:-1])
     position = np.arange(len(start))

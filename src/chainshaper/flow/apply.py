@@ -324,7 +324,12 @@ class _Run:
             if abs((moved_ns or 0) - sent_ns) > PHASE_BOUND_NS and self.telling is NO_NODE:
                 sent_ns = moved_ns or 0
                 self.telling = tell_phase(self.plan, self.found, begins + sent_ns)
-                self.state = replace(self.state, notes=(*notes, _moved_text(sent_ns)))
+                moved = (
+                    f"the chain's beginning has moved by {format_duration(sent_ns)} since the plan "
+                    "was put in force; shaping nodes get it, and outputs without a stamp follow "
+                    "from the next cycle"
+                )
+                self.state = replace(self.state, notes=(*notes, moved))
             if self.stop.wait(_LOOK_S):
                 continue
             if self.guardians is not None:
@@ -416,13 +421,6 @@ class _Run:
                 f"not everything could be put back: {'; '.join(problems)}; {self.journal.path} "
                 "says what was there, `chainshaper release` tries again"
             )
-
-
-def _moved_text(drift_ns: int) -> str:
-    return (
-        f"the chain's beginning has moved by {format_duration(drift_ns)} since the plan was put in "
-        "force; shaping nodes get it, and outputs without a stamp follow from the next cycle"
-    )
 
 
 @contextlib.contextmanager

@@ -54,9 +54,8 @@ class FigureHeld:
 class BandHeld:
     """One latency band, over undisturbed cycles whose output came in the cycle it was due.
 
-    ``inside`` counts outputs that left while the slot was open. Of a plan with modes it is the band
-    of ``mode``: ``late`` counts the mode's outputs that came behind its slot, and the shares are
-    those of its outputs that did not.
+    ``inside`` counts outputs that left while the slot was open. With modes it is that of ``mode``:
+    ``late`` counts the mode's outputs behind its slot, the shares are those of its others.
     """
 
     slot_start_ns: int
@@ -79,8 +78,7 @@ class PredictionHeld:
 
     The figures are latencies, or with ``counted_from`` the cycle places in it. ``late`` counts
     outputs that missed their last slot; they are in the figures, not in the bands. ``late_of_all``
-    counts those of ``cycles``, in which no cycle is left out (None: not known). ``bands`` is empty
-    for policies without publish slots.
+    counts those of all ``cycles`` (None: not known). Policies without slots have no ``bands``.
     """
 
     mean: FigureHeld
@@ -110,8 +108,8 @@ def due_of(plan: Plan) -> tuple[Due, ...]:
     for node in plan.further_shaping_nodes:
         server, cycles = server_of(plan, node.thread), cycles_until_output(plan, node)
         if server is not None:
-            changes = {"cycles": cycles, "slots": server.slots, "last_slot": {}}
-            sinks.append(replace(own, **changes, output=node.output))  # type: ignore[arg-type]
+            sink = replace(own, cycles=cycles, slots=server.slots, last_slot={}, output=node.output)
+            sinks.append(sink)
     return own, *sinks
 
 
@@ -185,27 +183,23 @@ def _figures(
         lowest_max = longest
     samples = 1 / plan.evidence.samples + 1 / measured.count if measured.count else 0.0
     room = round(STANDARD_ERRORS * (variance * samples) ** 0.5)
-    figures = (
-        (mean, predicted.mean_ns, measured.mean_ns, mean - room, room),
-        (longest, predicted.max_ns, measured.max_ns, lowest_max, 0),
-        (jitter, predicted.jitter_ns, measured.jitter_ns, lowest_jitter, 0),
+
+    def figure(at_start: int, name: str, lowest: int, above: int = 0) -> FigureHeld:
+        at_end, found = getattr(predicted, name), getattr(measured, name)
+        low, high, holds = min(lowest, at_start), at_end + above, None
+        if plan.modes is None and found is not None:  # as they are printed
+            holds = _printed(low) <= _printed(found) <= _printed(high)
+        return FigureHeld(at_start, at_end, low, high, found, holds)
+
+    return (
+        figure(mean, "mean_ns", mean - room, room),
+        figure(longest, "max_ns", lowest_max),
+        figure(jitter, "jitter_ns", lowest_jitter),
     )
-    first, second, third = (_figure(*one, judged=plan.modes is None) for one in figures)
-    return first, second, third
 
 
 def _weighted(shares: Sequence[float], values: Sequence[float]) -> float:
     return sum(share * value for share, value in zip(shares, values, strict=True))
-
-
-def _figure(
-    at_start: int, at_end: int, measured: int | None, lowest: int, above: int, *, judged: bool
-) -> FigureHeld:
-    low, high = min(lowest, at_start), at_end + above
-    holds = None
-    if judged and measured is not None:
-        holds = _printed(low) <= _printed(measured) <= _printed(high)
-    return FigureHeld(at_start, at_end, low, high, measured, holds)
 
 
 def _printed(nanoseconds: int) -> float:
