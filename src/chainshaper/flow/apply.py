@@ -32,10 +32,10 @@ from chainshaper.flow import threads
 from chainshaper.flow.phase import NO_NODE, DriftWatch, Telling, measure_phase, tell_phase
 from chainshaper.flow.threads import LEAD_NS
 from chainshaper.linux.own_processes import end_command, start_command
+from chainshaper.linux.processes import run_users
 from chainshaper.linux.runs import PLAN_FILE, Journal
 from chainshaper.linux.scheduling import available_cores, check_cores
 from chainshaper.linux.threads import list_threads
-from chainshaper.linux.users import run_users
 from chainshaper.planning.overruns import open_until_done, publication_warnings, refuse_offset
 from chainshaper.planning.plan import Plan, publisher_servers, shaping_nodes
 from chainshaper.values.durations import format_duration

@@ -26,15 +26,20 @@ from chainshaper.enforcement.threads import allocate, strangers_text
 from chainshaper.flow.exploration import with_trace_events
 from chainshaper.flow.threads import recorded_processes
 from chainshaper.linux.own_processes import check_command, end_command, end_in_words, start_command
-from chainshaper.linux.processes import Process, descendants, find_applications, list_processes
+from chainshaper.linux.processes import (
+    Process,
+    descendants,
+    find_applications,
+    list_processes,
+    run_users,
+)
 from chainshaper.linux.runs import Governed, governing, in_force_throughout
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import parents
-from chainshaper.linux.users import run_users
 from chainshaper.planning import Plan
 from chainshaper.sources import Tracer
 from chainshaper.sources.gate_log import releases_so_far, with_gate_logs
-from chainshaper.sources.ros.interpreter import Environment, ask_graph, environment_of
+from chainshaper.sources.ros import Environment, ask_graph, environment_of
 from chainshaper.values import events
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
@@ -254,7 +259,7 @@ def _look(run: _Run) -> None:
     """Which processes and threads there are, and a node's environment."""
     if run.pids:
         parent_of = parents()
-        family = {pid for one in run.pids for pid in descendants(parent_of, one)} & parent_of.keys()
+        family = descendants(parent_of, *run.pids) & parent_of.keys()
         processes = list_processes(family)
     else:
         everybody = find_applications(list_processes())
