@@ -14,11 +14,9 @@ import pytest
 from chainshaper.planning.bands import (
     BandProblem,
     Placement,
-    band_problem,
     broken_constraint,
     choose_bands,
     counts_and_mean,
-    enough_bands,
     place_bands,
     place_by_swarm,
     place_randomly,
@@ -86,7 +84,7 @@ def random_problem(random: random.Random) -> tuple[BandProblem, int]:
     max_share = None
     if random.random() < 0.4:
         max_share = random.choice([0.2, 0.25, 1 / 3, 0.5, 0.6, 0.75, random.uniform(0.1, 1)])
-    problem = band_problem(
+    problem = BandProblem(
         np.array(sample),
         last,
         publish_slot_ns=slot,
@@ -168,25 +166,25 @@ def test_a_placement_worked_out_by_hand() -> None:
     # Half of the executions take 10 ms, half 50 ms. With Δ = 1 ms the first slot is best right
     # behind the shorter ones: it must begin after 10 ms, so it ends 1 µs after 11 ms.
     latencies = np.array([10, 10, 50, 50]) * MS
-    placement = place_bands(band_problem(latencies, 52 * MS), 2)
+    placement = place_bands(BandProblem(latencies, 52 * MS), 2)
     assert placement.slot_ends_ns == (11_001_000, 52 * MS)
     assert placement.mean_ns == (11_001_000 + 52 * MS) / 2
     # With neighbours at most 30 ms apart the first moves to 22 ms, far from any sample; a third
     # one lies between them, as early as the gap of the last allows.
-    close = band_problem(latencies, 52 * MS, max_gap_ns=30 * MS)
+    close = BandProblem(latencies, 52 * MS, max_gap_ns=30 * MS)
     assert place_bands(close, 2).slot_ends_ns == (22 * MS, 52 * MS)
     assert place_bands(close, 3).slot_ends_ns[0] == 11_001_000
 
 
 def test_a_cap_on_the_share_moves_bands_together() -> None:
     latencies = np.arange(1, 101) * MS
-    placement = place_bands(band_problem(latencies, 101 * MS, grid_ns=MS, max_share=0.4), 3)
+    placement = place_bands(BandProblem(latencies, 101 * MS, grid_ns=MS, max_share=0.4), 3)
     shares = np.diff(np.searchsorted(latencies, placement.slot_ends_ns, side="right"), prepend=0)
     assert max(shares) <= 40
 
 
 def test_equal_latencies_leave_no_earlier_slot() -> None:
-    problem = band_problem(np.array([50, 50]) * MS, 52 * MS)
+    problem = BandProblem(np.array([50, 50]) * MS, 52 * MS)
     assert place_bands(problem, 1).slot_ends_ns == (52 * MS,)
     with pytest.raises(InputError, match="room for 1 publish slots of 1ms"):
         place_bands(problem, 3)
@@ -204,13 +202,13 @@ def test_equal_latencies_leave_no_earlier_slot() -> None:
 )
 def test_the_binding_constraint_is_named(limits: dict[str, Any], bands: int, words: str) -> None:
     latencies = np.linspace(10 * MS, 50 * MS, 100).astype(np.int64)
-    problem = replace(band_problem(latencies, 52 * MS), **limits)
+    problem = replace(BandProblem(latencies, 52 * MS), **limits)
     with pytest.raises(OperationError, match=words):
         place_bands(problem, bands)
 
 
 def test_an_average_out_of_reach_is_said() -> None:
-    problem = band_problem(np.array([10, 20, 30]) * MS, 32 * MS, grid_ns=MS)
+    problem = BandProblem(np.array([10, 20, 30]) * MS, 32 * MS, grid_ns=MS)
     goals: list[Goal] = ["mean", "jitter", "gap"]
     for goal in goals:
         with pytest.raises(OperationError, match="the best is 24ms"):
@@ -232,11 +230,11 @@ def test_an_average_out_of_reach_is_said() -> None:
 def test_senseless_problems_are_refused(wrong: dict[str, Any], words: str) -> None:
     values = {"last_end_ns": 32 * MS, **wrong}
     with pytest.raises(InputError, match=words):
-        band_problem(np.array([10, 20, 30]) * MS, **values)
+        BandProblem(np.array([10, 20, 30]) * MS, **values)
 
 
 def test_senseless_requests_are_refused() -> None:
-    problem = band_problem(np.array([10, 20, 30]) * MS, 32 * MS)
+    problem = BandProblem(np.array([10, 20, 30]) * MS, 32 * MS)
     with pytest.raises(InputError, match="one band at least"):
         place_bands(problem, 0)
     for more_than_fit in (22, 10**9):  # 22 ms for slots of 1 ms that are more than 1 ms apart
@@ -250,15 +248,17 @@ def test_senseless_requests_are_refused() -> None:
 
 def test_bands_are_enough_when_another_gains_little() -> None:
     latencies = np.linspace(30 * MS, 60 * MS, 301).astype(np.int64)
-    curve = placement_curve(band_problem(latencies, 62 * MS), 12)
-    means = [placement.mean_ns for placement in curve]
+    choice = choose_bands(plan_shaping(latencies, 100 * MS), latencies, least_gain=0.02)
+    means = [placement.mean_ns for placement in choice.curve]
     assert means == sorted(means, reverse=True)
-    chosen = enough_bands(curve, least_gain=0.02)
-    bands = len(chosen.slot_ends_ns)
+    bands = len(choice.chosen.slot_ends_ns)
     gains = [(before - after) / before for before, after in itertools.pairwise(means)]
     assert all(gain >= 0.02 for gain in gains[: bands - 1])
     assert gains[bands - 1] < 0.02
-    assert enough_bands(curve, least_gain=0) == curve[-1]
+    assert f"stopped at {bands}: another band would lower" in choice.reason
+    all_of_them = choose_bands(plan_shaping(latencies, 100 * MS), latencies, least_gain=1e-9)
+    assert all_of_them.chosen == all_of_them.curve[-1]
+    assert all_of_them.reason == "stopped at 12: more bands are not tried"
 
 
 def _plan() -> Plan:
@@ -342,7 +342,7 @@ def test_a_plan_without_publish_slot_has_no_bands() -> None:
 def _problem(seed: int, **limits: float) -> BandProblem:
     latencies = np.random.default_rng(seed).normal(67 * MS, 9 * MS, 400)
     latencies = latencies.clip(33 * MS, 85 * MS).astype(np.int64)
-    return band_problem(latencies, 87 * MS, **limits)  # type: ignore[arg-type]
+    return BandProblem(latencies, 87 * MS, **limits)  # type: ignore[arg-type]
 
 
 def _swarm(problem: BandProblem, bands: int, seed: int = 1) -> Placement:
@@ -382,7 +382,7 @@ def test_the_exact_placement_is_never_worse_than_the_swarm() -> None:
 
 
 def test_random_placements_keep_the_constraints_and_reach_everywhere() -> None:
-    problem = band_problem(np.array([0, 10]), 12, publish_slot_ns=1, grid_ns=1)
+    problem = BandProblem(np.array([0, 10]), 12, publish_slot_ns=1, grid_ns=1)
     seen = {place_randomly(problem, 3, seed).slot_ends_ns for seed in range(500)}
     allowed = {
         (first, second, 12)
@@ -403,7 +403,7 @@ def test_what_cannot_be_placed_is_said() -> None:
         place_randomly(replace(_problem(1), grid_ns=20 * MS), 10)
     with pytest.raises(OperationError, match="use the exact solver"):
         _swarm(_problem(1), 40)
-    equal = band_problem(np.array([50, 50]) * MS, 51 * MS)
+    equal = BandProblem(np.array([50, 50]) * MS, 51 * MS)
     for place in (place_by_swarm, place_randomly):
         with pytest.raises(InputError, match="room for 1 publish slots"):
             place(equal, 2)
