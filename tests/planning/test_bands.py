@@ -24,9 +24,8 @@ from chainshaper.planning.bands import (
     with_bands,
     with_long_slot,
 )
-from chainshaper.planning.baselines import server_per_chain
 from chainshaper.planning.plan import Plan, publish_slots
-from chainshaper.planning.shaping import plan_shaping
+from chainshaper.planning.shaping import plan_shaping, server_per_chain
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import Goal, Solver
 

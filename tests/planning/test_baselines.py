@@ -5,17 +5,26 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from chainshaper.planning.baselines import (
+from chainshaper.planning.plan import (
+    Plan,
+    Thread,
+    dump_plan,
+    publish_slots,
+    publishing_servers,
+    server_of,
+)
+from chainshaper.planning.shaping import (
     CallbackTimes,
     let_per_callback,
     let_per_callback_asynchronous,
     let_per_chain,
+    over_cores,
+    plan_shaping,
     server_per_callback,
     server_per_chain,
+    with_first_node_apart,
+    with_sink,
 )
-from chainshaper.planning.plan import Plan, Thread, publish_slots, publishing_servers, server_of
-from chainshaper.planning.plan_file import dump_plan
-from chainshaper.planning.shaping import over_cores, plan_shaping, with_first_node_apart, with_sink
 from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000

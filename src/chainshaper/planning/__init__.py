@@ -11,14 +11,6 @@ from chainshaper.planning.bands import (
     with_bands,
     with_long_slot,
 )
-from chainshaper.planning.baselines import (
-    CallbackTimes,
-    let_per_callback,
-    let_per_callback_asynchronous,
-    let_per_chain,
-    server_per_callback,
-    server_per_chain,
-)
 from chainshaper.planning.margins import check_latencies, read_latencies
 from chainshaper.planning.offsets import place_chains
 from chainshaper.planning.overruns import plan_warnings
@@ -34,12 +26,27 @@ from chainshaper.planning.plan import (
     Slot,
     Thread,
     band_predictions,
+    dump_plan,
+    load_plan,
+    plan_json,
     publish_slots,
+    save_plan,
+    save_plans,
     server_of,
 )
-from chainshaper.planning.plan_file import dump_plan, load_plan, plan_json, save_plan, save_plans
 from chainshaper.planning.request import PlanRequest, Profile, band_choice, plan_chain, plan_chains
-from chainshaper.planning.shaping import over_cores, plan_shaping, with_first_node_apart, with_sink
+from chainshaper.planning.shaping import (
+    CallbackTimes,
+    let_per_callback,
+    let_per_callback_asynchronous,
+    let_per_chain,
+    over_cores,
+    plan_shaping,
+    server_per_callback,
+    server_per_chain,
+    with_first_node_apart,
+    with_sink,
+)
 
 __all__ = [
     "BandChoice",

@@ -22,14 +22,6 @@ from numpy.typing import NDArray
 
 from chainshaper.gate.decision import Overrun
 from chainshaper.planning.bands import BandChoice, choose_bands, with_bands, with_long_slot
-from chainshaper.planning.baselines import (
-    CallbackTimes,
-    let_per_callback,
-    let_per_callback_asynchronous,
-    let_per_chain,
-    server_per_callback,
-    server_per_chain,
-)
 from chainshaper.planning.margins import (
     EPSILON_NS,
     MOST_PROBABLE,
@@ -43,9 +35,15 @@ from chainshaper.planning.margins import (
 from chainshaper.planning.offsets import same_nodes, same_output
 from chainshaper.planning.plan import PER_CALLBACK, Evidence, Margin, Modes, Plan, revised
 from chainshaper.planning.shaping import (
+    CallbackTimes,
     evidence_of,
+    let_per_callback,
+    let_per_callback_asynchronous,
+    let_per_chain,
     over_cores,
     plan_shaping,
+    server_per_callback,
+    server_per_chain,
     with_first_node_apart,
     with_sink,
 )
@@ -71,7 +69,7 @@ class Profile:
     output waits for: on the chain, on those branches, and before the chain begins. ``receivers``
     are the nodes that subscribe to the chain's output and are none of these. ``callbacks`` are
     those of the chain and its branches, see
-    :func:`~chainshaper.planning.baselines.server_per_callback`. ``output_depth`` is the history of
+    :func:`~chainshaper.planning.shaping.server_per_callback`. ``output_depth`` is the history of
     the output's writer. The rest is :class:`~chainshaper.planning.plan.Evidence`.
     """
 
