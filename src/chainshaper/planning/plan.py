@@ -79,11 +79,11 @@ class ChainOfPlan(Part):
 class Evidence(Part):
     """The measurements that the plan rests on: end-to-end latencies under high SCHED_FIFO.
 
-    The latencies are those of undisturbed cycles (of all, where the machine disturbed all but one);
-    ``max_of_all_ns`` is the longest of all. ``incomplete`` counts traversals without an end,
-    ``disturbed`` those that a stall of the machine hit; ``utilisation`` is the share of its core
-    that the chain's execution takes, ``longest_send_ns`` is of the output's asynchronous publisher.
-    ``None`` is: not known.
+    The latencies are those of undisturbed cycles; where the machine disturbed all but one of them,
+    which ``all_disturbed`` says, of all. ``max_of_all_ns`` is the longest of all. ``incomplete``
+    counts traversals without an end, ``disturbed`` those that a stall of the machine hit;
+    ``utilisation`` is the share of its core that the chain's execution takes, ``longest_send_ns``
+    is of the output's asynchronous publisher. ``None`` is: not known.
     """
 
     recording: str | None = None
@@ -99,6 +99,7 @@ class Evidence(Part):
     utilisation: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
     longest_send_ns: Duration | None = None
     lost_events: FromOne | None = None
+    all_disturbed: Literal[True] | None = None
 
     @model_validator(mode="after")
     def _ordered(self) -> "Evidence":
