@@ -16,8 +16,8 @@ from processes import wait_for
 from quick_chain import quick_chain
 
 from chainshaper import sweep
-from chainshaper.simulation import sweeping
-from chainshaper.simulation.sweeping import rows_beside
+from chainshaper.flow import sweep as sweeping
+from chainshaper.flow.sweep import rows_beside
 from chainshaper.values.errors import InputError, OperationError
 
 pytest.importorskip("distributed", reason="Dask's `distributed` is not installed")

@@ -5,17 +5,17 @@ from typing import Any
 import pytest
 from quick_chain import quick_chain
 
-from chainshaper.planning import Plan, PlanRequest
-from chainshaper.simulation.grid import (
+from chainshaper.flow.sweep import (
     application_at,
     grid_of,
+    groups_of,
     is_duration,
     parse_axis,
     plan_at,
     points_of,
     request_at,
 )
-from chainshaper.simulation.sweeping import groups_of
+from chainshaper.planning import Plan, PlanRequest
 from chainshaper.values.errors import InputError
 from chainshaper.workload.description import Application
 

@@ -7,11 +7,9 @@ import pytest
 from quick_chain import quick_chain
 
 from chainshaper.flow.plan import plan_recording
-from chainshaper.flow.sweep import profile_at
+from chainshaper.flow.sweep import FIGURES, OTHER_RUN, grid_of, points_of, profile_at, row_at
 from chainshaper.planning import PlanRequest
 from chainshaper.simulation import simulate
-from chainshaper.simulation.grid import grid_of, points_of
-from chainshaper.simulation.sweeping import FIGURES, OTHER_RUN, row_at
 from chainshaper.verify.measure import measure_latency
 from chainshaper.workload.description import Application
 

@@ -13,7 +13,7 @@ from processes import wait_for
 from quick_chain import quick_chain
 
 from chainshaper import sweep
-from chainshaper.simulation.sweeping import FIGURES, rows_beside
+from chainshaper.flow.sweep import FIGURES, rows_beside
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.workload.description import Application, application_as_written
 

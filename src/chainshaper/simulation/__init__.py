@@ -10,8 +10,6 @@ everything downstream cannot tell a simulated recording from a live one, but for
     gate_kernel  the gate's decision                            /
     tables       the engine's log as event tables
     samples      execution times and costs as a recording has them
-    grid         a sweep's axes, and what a combination of their values means
-    sweeping     a sweep's points: computed by threads, or by a Dask cluster
 """
 
 from chainshaper.simulation.simulating import simulate, simulate_latencies
