@@ -10,7 +10,7 @@ from reference_traces import DATA
 from story import OFFSET, Callback, Publisher, Story
 
 from chainshaper.flow.plan import plan_recording, profile_chains
-from chainshaper.planning import PlanRequest, Profile, plan_chain, plan_warnings
+from chainshaper.planning import PlanRequest, Profile, band_choice, plan_chain, plan_warnings
 from chainshaper.planning.plan import revised
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
@@ -203,26 +203,41 @@ def test_a_chain_that_no_timer_starts_needs_its_period() -> None:
         profile_chains(_recorded(), [CHAIN], period_ns=50 * MS)
 
 
-def test_stalled_cycles_are_left_out() -> None:
+def _stalled(*times_ms: int) -> Recording:
     recording = _recorded()
-    stall = pl.DataFrame(
-        [{"time": 1050 * MS, "cpu": 1, "duration": 5 * MS}],
+    stalls = pl.DataFrame(
+        [{"time": time * MS, "cpu": 1, "duration": 5 * MS} for time in times_ms],
         schema_overrides={**events.COMMON_COLUMNS, **events.FIELDS["machine_stall"]},
     )
-    stalled = Recording(
-        recording.path, recording.info, {**recording.events, "machine_stall": stall}
-    )
-    (profile,) = profile_chains(stalled, [CHAIN])
+    return Recording(recording.path, recording.info, {**recording.events, "machine_stall": stalls})
+
+
+def test_stalled_cycles_are_left_out() -> None:
+    (profile,) = profile_chains(_stalled(1050), [CHAIN])
     assert profile.disturbed == 1
     assert profile.latencies_ns.max() == 95 * MS - 1
     assert profile.callbacks[-1].max_response_ns == 50 * MS
-    for stalls, left in ((2, "1 is complete and undisturbed"), (3, "none is complete")):
-        often = pl.concat(
-            stall.with_columns(time=pl.lit((1050 + 100 * n) * MS)) for n in range(stalls)
-        )
-        events_then = {**recording.events, "machine_stall": often}
-        with pytest.raises(OperationError, match=f"of 3 traversals of .* {left}.* {stalls} dist"):
-            profile_chains(Recording(recording.path, recording.info, events_then), [CHAIN])
+
+
+@pytest.mark.parametrize("stalls", [2, 3])
+def test_where_no_cycle_is_undisturbed_all_of_them_are_planned_from(stalls: int) -> None:
+    recording = _stalled(*(1050 + 100 * number for number in range(stalls)))
+    plan = plan_recording(recording, CHAIN)
+    assert plan.evidence.all_disturbed
+    assert (plan.evidence.samples, plan.evidence.disturbed) == (3, stalls)
+    assert plan.servers[0].slots == ((0, 97 * MS - 1),), "1 ms behind the longest of all"
+    assert any("disturbed every cycle" in warning for warning in plan_warnings(plan))
+    with pytest.raises(OperationError, match="leave out --ideal-machine, or record again"):
+        plan_recording(recording, CHAIN, PlanRequest(ideal_machine=True))
+
+
+def test_a_stall_longer_than_the_cycle_is_not_covered_where_all_cycles_are_disturbed() -> None:
+    latencies = np.array([*range(20_000, 20_299), 160_000]) * 1000
+    profile = Profile(latencies, 100 * MS, disturbed=300, all_disturbed=True)
+    plan = plan_chain(profile, PlanRequest(bands="auto"))
+    assert plan.evidence.max_latency_ns == 20_298_000
+    assert plan.evidence.max_of_all_ns == 160 * MS
+    assert band_choice(plan, profile, PlanRequest(bands="auto")).chosen.mean_ns > 0
 
 
 def test_executions_that_span_cycles_can_be_planned_callback_by_callback() -> None:

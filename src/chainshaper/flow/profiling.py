@@ -1,9 +1,8 @@
 """The paper's profiling condition: a chain alone with its interference (sections 2.5 and 4.2).
 
-L̄ and L̲, from which slots are computed, are measured with the executors of the chain's nodes under
-SCHED_FIFO at a high priority on one core, and their DDS threads above them on the others. What else
-runs cannot disturb the chain; interference that remains is what no schedule avoids (section 2.3).
-Threads are changed as `apply` changes them; those that appear later get theirs at the next look.
+The executors of the chain's nodes run under SCHED_FIFO at a high priority on one core, their DDS
+threads above them on the others, so that nothing else disturbs the chain. Threads are changed as
+`apply` changes them; those that appear later get theirs at the next look.
 """
 
 import time
@@ -31,8 +30,7 @@ from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError, PlatformError
 from chainshaper.values.recording import Recording
 
-START_NS = 30_000_000_000
-"""The nodes have this long to appear."""
+START_NS = 30_000_000_000  # so long the nodes have to appear
 
 
 @contextmanager
@@ -45,10 +43,9 @@ def profiling_condition(
     """Have the threads of ``nodes`` (default: of all) run as the paper profiles a chain.
 
     It gives what :func:`chainshaper.flow.record.record_command` wants for its ``scheduling``.
-    ``core`` is where the executors run; by default the last that we may use. ``folder`` is where
-    runs keep their journals (default: `/run/chainshaper`). ``like`` is an earlier recording of the
-    application: it tells what a container's components are, and which executors have several
-    threads.
+    ``core`` is where the executors run (default: the last that we may use), ``folder`` where
+    journals are (default: `/run/chainshaper`). An earlier recording of the application that this
+    one is ``like`` says which components a container has, and which executors several threads.
 
     Raises:
         PlatformError: no such core, or SCHED_FIFO is not permitted.
@@ -104,9 +101,10 @@ class _Condition:
         members = executors_of(found, self.nodes, processes, self.recorded)
         if not members or not self.nodes <= there:
             if time.monotonic_ns() - self.begun_ns > START_NS:
+                missing, running = (", ".join(sorted(n)) for n in (self.nodes - there, there))
                 raise OperationError(
-                    f"{_missing(self.nodes - there)} has not appeared within "
-                    f"{format_duration(START_NS)}; running: {', '.join(sorted(there)) or 'no node'}"
+                    f"{f'node {missing}' if missing else 'a node'} has not appeared within"
+                    f" {format_duration(START_NS)}; running: {running or 'no node'}"
                 )
             return False
         server = ReservationServer("the chain", self.core, 1, ())
@@ -134,26 +132,20 @@ def executors_of(
     owners = {one.thread.pid for one in found.threads if one.nodes}
     launchers = {one.parent for one in processes if one.pid in owners}
     names = {one.pid: one.threads[0].comm for one in processes if one.threads}
-    several = {
-        node
-        for seen in recorded
-        if sum(thread.role == "executor" for thread in seen.threads) > 1
-        for node in seen.nodes
-    }
-    return [
-        one
-        for one in found.threads
-        if (
-            one.thread.role in ("executor", "publisher")
-            or (
-                one.thread.role == "unknown"
-                and one.thread.comm == names[one.thread.pid]
-                and not several.isdisjoint(one.nodes)
-            )
-        )
-        and (nodes & set(one.nodes) if nodes else one.nodes and one.thread.pid not in launchers)
-    ]
+    several: set[str] = set()
+    for seen in recorded:
+        if sum(thread.role == "executor" for thread in seen.threads) > 1:
+            several.update(seen.nodes)
 
+    def executes(one: NodeThread) -> bool:
+        if one.thread.role == "unknown":
+            unnamed = one.thread.comm == names[one.thread.pid]
+            return unnamed and not several.isdisjoint(one.nodes)
+        return one.thread.role in ("executor", "publisher")
 
-def _missing(nodes: Collection[str]) -> str:
-    return f"node {', '.join(sorted(nodes))}" if nodes else "a node"
+    def is_meant(one: NodeThread) -> bool:
+        if nodes:
+            return not nodes.isdisjoint(one.nodes)
+        return bool(one.nodes) and one.thread.pid not in launchers
+
+    return [one for one in found.threads if executes(one) and is_meant(one)]

@@ -219,8 +219,8 @@ def _about_late_outputs(plan: Plan) -> Iterator[str]:
     what = "" if stall is None else f", longest stall {milliseconds(stall)} ms"
     if evidence.all_disturbed:
         yield (
-            f"the machine disturbed every cycle{what}: its stalls are in all latencies that the"
-            " plan rests on. Record again on a calmer machine."
+            f"the machine disturbed every cycle, but one at most{what}: the plan rests on latencies"
+            " with its stalls in them. Record again on a calmer machine."
         )
     elif evidence.disturbed:
         yield f"the machine disturbed {evidence.disturbed} of {cycles} cycles{what}."

@@ -203,12 +203,13 @@ def _covered(profile: Profile, request: PlanRequest) -> Profile:
     if request.ideal_machine:
         raise OperationError(
             f"{profile.recording or profile.name}: the machine disturbed every cycle of"
-            f" {profile.name}, which leaves none to plan an ideal machine from: leave out"
+            f" {profile.name}, but one at most, too few to plan an ideal machine from: leave out"
             " --ideal-machine, or record again on a calmer one"
         )
     share = request.overrun_probability or OVERRUN_PROBABILITY
-    covered = covered_latency(profile.every, share, _latest(profile, request))
-    return replace(profile, latencies_ns=profile.every[profile.every <= covered])
+    every = profile.every
+    covered = covered_latency(every, share, _latest(profile, request))
+    return replace(profile, latencies_ns=every[every <= covered], every_latency_ns=every)
 
 
 def _latest(profile: Profile, request: PlanRequest) -> int:
