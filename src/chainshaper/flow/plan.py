@@ -52,9 +52,8 @@ def profile_chains(
     machine is not part of the chain's latency, but its output is late nevertheless. Only where
     fewer than two were undisturbed, they are over all.
 
-    Raises:
-        InputError: no such chain, or a chain's period is not known, or known and given as well.
-        OperationError: a chain with fewer than two complete traversals.
+    Raises InputError: no such chain, or a chain's period is not known, or known and given as well.
+    OperationError: a chain with fewer than two complete traversals.
     """
     if not isinstance(recording, Recording):
         recording = open_source(recording)
@@ -382,10 +381,9 @@ def shape_application(
     the thread of an asynchronous publisher is gated unless ``enforcement`` does so
     (:func:`chainshaper.flow.apply.publishers_gated`).
 
-    Raises:
-        InputError: the plan does not fit the application, or has an offset; and what
-            :func:`~chainshaper.workload.live.run_application` raises.
-        PlatformError: the plan gates a publisher's thread, and threads cannot be frozen here.
+    Raises InputError: the plan does not fit the application, or has an offset; and what
+    :func:`~chainshaper.workload.live.run_application` raises. PlatformError: the plan gates a
+    publisher's thread, and threads cannot be frozen here.
     """
     refuse_offset(plan)
     if any(publisher_servers(plan)) and enforcement is None:

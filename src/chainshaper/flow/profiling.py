@@ -47,10 +47,9 @@ def profiling_condition(
     journals are (default: `/run/chainshaper`). An earlier recording of the application that this
     one is ``like`` says which components a container has, and which executors several threads.
 
-    Raises:
-        PlatformError: no such core, or SCHED_FIFO is not permitted.
-        OperationError: `apply` governs one of the nodes, or the core; not all could be put back.
-            And where it is called: a node does not appear, or the kernel refuses something.
+    Raises PlatformError: no such core, or SCHED_FIFO is not permitted. OperationError: `apply`
+    governs one of the nodes, or the core; not all could be put back. And where it is called: a node
+    does not appear, or the kernel refuses something.
     """
     core = check_profiling(core)
     recorded = recorded_processes(like)[0] if like is not None else ()

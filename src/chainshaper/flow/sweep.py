@@ -157,11 +157,9 @@ def sweep(
     cannot be has an ``error``. The same frame is in ``output``, a Parquet file. Until it is whole,
     finished rows stand beside it, and the same call goes on with what is missing.
 
-    Raises:
-        InputError: unknown axes or impossible values; ``output`` exists, or rows beside it are of
-            another sweep.
-        OperationError: the cluster failed, or the disk is full.
-        PlatformError: `distributed` is not installed.
+    Raises InputError: unknown axes or impossible values; ``output`` exists, or rows beside it are
+    of another sweep. OperationError: the cluster failed, or the disk is full. PlatformError:
+    `distributed` is not installed.
     """
     output = new_file(output, (".parquet",))
     grid = grid_of(application, vary, plan, cycles=cycles, seed=seed)
@@ -228,8 +226,7 @@ def _axis(name: str, values: Sequence[Any], points: Sequence[Values]) -> pl.Seri
 def parse_axis(text: str) -> tuple[str, tuple[Any, ...]]:
     """An axis as it is written: ``bands=1..5``, ``epsilon=0,1ms``, ``policy=none,shaped``.
 
-    Raises:
-        InputError: it is not of this form.
+    Raises InputError: it is not of this form.
     """
     name, _, values = text.partition("=")
     try:
@@ -269,8 +266,7 @@ def grid_of(
 ) -> Grid:
     """A grid, once it is sure that each value of each axis means something.
 
-    Raises:
-        InputError: an axis that is unknown or empty, or a value that it cannot have.
+    Raises InputError: an axis that is unknown or empty, or a value that it cannot have.
     """
     if seed is not None:
         application = application.model_copy(update={"seed": seed})
@@ -346,8 +342,7 @@ def is_duration(name: str, values: Sequence[Any]) -> bool:
 def application_at(grid: Grid, values: Values) -> Application:
     """The application of a point.
 
-    Raises:
-        InputError: it cannot be; the values and the reason are named.
+    Raises InputError: it cannot be; the values and the reason are named.
     """
     changes = {name: value for name, value in values.items() if _changes_application(name)}
     if not changes:
@@ -365,8 +360,7 @@ def application_at(grid: Grid, values: Values) -> Application:
 def plan_at(grid: Grid, values: Values) -> Plan | None:
     """The given plan with the point's values in it; None without one.
 
-    Raises:
-        InputError: that is no plan.
+    Raises InputError: that is no plan.
     """
     changes = {name: value for name, value in values.items() if name.startswith(PLAN)}
     if grid.plan is None or not changes:
@@ -380,8 +374,7 @@ def plan_at(grid: Grid, values: Values) -> Plan | None:
 def request_at(grid: Grid, values: Values) -> PlanRequest | None:
     """What is wished of a point's plan; None where none is made.
 
-    Raises:
-        InputError: a value that no such wish can have.
+    Raises InputError: a value that no such wish can have.
     """
     if grid.plan is not None or values.get("policy") == UNPLANNED:
         return None
@@ -462,8 +455,8 @@ def profile_at(grid: Grid, values: Values, progress: Progress | None = None) -> 
     except ChainshaperError as error:
         return str(error)
     complete = latencies[latencies >= 0]
-    measured = {"latencies_ns": complete, "incomplete": int(latencies.size - complete.size)}
-    return dataclasses.replace(profile, **measured, recording=None)
+    lost = int(latencies.size - complete.size)
+    return dataclasses.replace(profile, latencies_ns=complete, incomplete=lost, recording=None)
 
 
 def _urgent(application: Application) -> Application:
@@ -605,11 +598,9 @@ def rows_of(
     not depend on who computes it. Points that differ in nothing measured share a profile; those
     whose profile is there come first, so that few profiles are in memory at a time.
 
-    Raises:
-        InputError: that is no address.
-        PlatformError: `distributed` is not installed.
-        OperationError: no scheduler is there, or it is gone; there are no workers, or one has
-            other versions of what rows depend on; or a point killed one worker after another.
+    Raises InputError: that is no address. PlatformError: `distributed` is not installed.
+    OperationError: no scheduler is there, or it is gone; there are no workers, or one has other
+    versions of what rows depend on; or a point killed one worker after another.
     """
     coming = iter(groups_of(grid, points))
     ready: deque[tuple[int, Values, Any]] = deque()
@@ -743,9 +734,8 @@ def finished_rows(
     rows of anything else are not mixed with it. Each is on disk before the next; a crash leaves
     half a line at most, which is removed. A file without rows is removed.
 
-    Raises:
-        InputError: the file is of another sweep; the message names what differs.
-        OperationError: another process works on it, or it cannot be read or written.
+    Raises InputError: the file is of another sweep; the message names what differs. OperationError:
+    another process works on it, or it cannot be read or written.
     """
     about = json.loads(json.dumps(about))
     try:

@@ -76,8 +76,7 @@ def predict_bands(
     The latest output is at x_ν, the earliest at x_1 − Δ: a jitter of 25 ms for the paper's slots
     [62, 63], [77, 78], [86, 87] ms.
 
-    Raises:
-        InputError: slot ends that do not ascend, or the last is before the longest latency.
+    Raises InputError: slot ends that do not ascend, or the last is before the longest latency.
     """
     ends = [int(end) for end in slot_ends_ns]
     if not ends or any(after <= before for before, after in pairwise(ends)):
@@ -108,8 +107,7 @@ class BandProblem:
     multiples of ``grid_ns``. Neighbouring slot ends are at most ``max_gap_ns`` apart (LV), a band
     has at most ``max_share`` of the executions.
 
-    Raises:
-        InputError: values that make no sense for any number of bands.
+    Raises InputError: values that make no sense for any number of bands.
     """
 
     latencies_ns: NDArray[np.int64]
@@ -184,9 +182,8 @@ def with_bands(
     ``minimise`` and ``mean_at_most_ns`` see :func:`place_bands`; ``pso`` and ``random`` take a
     ``seed``. ``limits`` are ``grid_ns``, ``max_gap_ns`` and ``max_share`` of :class:`BandProblem`.
 
-    Raises:
-        InputError: a plan without a publish slot, or values that make no sense together.
-        OperationError: no such placement exists; the message names the binding constraint.
+    Raises InputError: a plan without a publish slot, or values that make no sense together.
+    OperationError: no such placement exists; the message names the binding constraint.
     """
     problem = _problem(plan, latencies_ns, limits)
     other_goal = minimise != "mean" or mean_at_most_ns is not None
@@ -221,9 +218,8 @@ def choose_bands(
     """What :func:`with_bands` takes for ``auto``: the first number of bands behind which another
     one gains less than ``least_gain`` of the average.
 
-    Raises:
-        InputError: a plan without a publish slot, or a least gain that is no share.
-        OperationError: no number of bands can be placed.
+    Raises InputError: a plan without a publish slot, or a least gain that is no share.
+    OperationError: no number of bands can be placed.
     """
     if not 0 < least_gain < 1:
         raise InputError(
@@ -248,8 +244,7 @@ def with_long_slot(plan: Plan, latencies_ns: NDArray[np.int64], slot_start_ns: i
     An execution that is done earlier waits for the slot, any other publishes at once: the average
     falls and the jitter grows as the start moves towards the shortest latency (end of section 4.1).
 
-    Raises:
-        InputError: a start that is negative, or behind that of the plan's own publish slot.
+    Raises InputError: a start that is negative, or behind that of the plan's own publish slot.
     """
     start, end = _last_publish_slot(plan)
     if not 0 <= slot_start_ns <= start:
@@ -296,9 +291,8 @@ def place_bands(
     average stays at or below ``mean_at_most_ns``, the overall jitter x_ν − (x_1 − Δ), or the
     largest gap between neighbouring bands.
 
-    Raises:
-        InputError: a goal that makes no sense, or as :func:`refuse_more_than_fit`.
-        OperationError: no placement exists; the message names the constraint that prevents it.
+    Raises InputError: a goal that makes no sense, or as :func:`refuse_more_than_fit`.
+    OperationError: no placement exists; the message names the constraint that prevents it.
     """
     refuse_more_than_fit(problem, bands)
     if minimise == "jitter" and mean_at_most_ns is None:
@@ -324,8 +318,7 @@ def place_bands(
 def placement_curve(problem: BandProblem, most_bands: int) -> list[Placement]:
     """The best placement for each number of bands from one upwards, as far as they fit (figure 7).
 
-    Raises:
-        OperationError: no number of bands up to ``most_bands`` can be placed.
+    Raises OperationError: no number of bands up to ``most_bands`` can be placed.
     """
     most = min(most_bands, problem.room)
     tables = _solve(problem, most)
@@ -511,10 +504,8 @@ def place_by_swarm(problem: BandProblem, bands: int, seed: int | None = None) ->
     Particles are the ends of all slots but the last, on the grid. A particle that breaks a
     constraint costs more than any that does not, in proportion to how far it is off.
 
-    Raises:
-        InputError: as :func:`refuse_more_than_fit`.
-        OperationError: the swarm ended at a placement that breaks a constraint.
-        PlatformError: PySwarms is not installed.
+    Raises InputError: as :func:`refuse_more_than_fit`. OperationError: the swarm ended at a
+    placement that breaks a constraint. PlatformError: PySwarms is not installed.
     """
     refuse_more_than_fit(problem, bands)
     last, slot, grid = problem.last_end_ns, problem.publish_slot_ns, problem.grid_ns
@@ -544,9 +535,8 @@ def place_by_swarm(problem: BandProblem, bands: int, seed: int | None = None) ->
 def place_randomly(problem: BandProblem, bands: int, seed: int | None = None) -> Placement:
     """Place bands at random, every allowed placement on the grid being equally likely.
 
-    Raises:
-        InputError: as :func:`refuse_more_than_fit`.
-        OperationError: the grid is too coarse for so many, or no draw of many respects the limits.
+    Raises InputError: as :func:`refuse_more_than_fit`. OperationError: the grid is too coarse for
+    so many, or no draw of many respects the limits.
     """
     refuse_more_than_fit(problem, bands)
     if bands == 1:

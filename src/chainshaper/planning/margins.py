@@ -65,9 +65,8 @@ def read_latencies(path: str | Path) -> _Latencies:
     One duration a line with its unit (``59.3ms``; blank lines and lines that begin with ``#`` are
     skipped), or a ``.npy`` file of nanoseconds.
 
-    Raises:
-        InputError: no such file, a line that is no duration (named with its number), an array
-            that does not hold whole nanoseconds, fewer than two latencies, or none above zero.
+    Raises InputError: no such file, a line that is no duration (named with its number), an array
+    that does not hold whole nanoseconds, fewer than two latencies, or none above zero.
     """
     path = Path(path)
     try:
@@ -109,8 +108,7 @@ def _read_lines(path: Path) -> _Latencies:
 def check_latencies(latencies: object) -> _Latencies:
     """A sample that can be planned with: at least two latencies, whole nanoseconds, none negative.
 
-    Raises:
-        InputError: anything else, with the first wrong element named by its place from 0.
+    Raises InputError: anything else, with the first wrong element named by its place from 0.
     """
     array = np.asarray(latencies)
     if array.ndim != 1 or array.dtype.kind not in "iuf":
@@ -227,10 +225,9 @@ def fit_tail(latencies_ns: _Latencies, probability: float, seed: int = 0) -> Tai
 
     The threshold is the lowest of a few that leaves a tail of good fit.
 
-    Raises:
-        InputError: latencies that cannot be planned with, or a probability outside the tail.
-        OperationError: the data do not allow an answer: too few, not stationary, not
-            independent, no generalised Pareto tail, or an answer too vague to plan with.
+    Raises InputError: latencies that cannot be planned with, or a probability outside the tail.
+    OperationError: the data do not allow an answer: too few, not stationary, not independent, no
+    generalised Pareto tail, or an answer too vague to plan with.
     """
     latencies = check_latencies(latencies_ns)
     if not 0 < probability < MOST_PROBABLE:

@@ -81,11 +81,10 @@ def with_offsets(
     The first chain, and any that shares no core with another, has the offset 0. ``time_limit_s``
     bounds the search among chains that can collide with each other.
 
-    Raises:
-        InputError: no plans, or plans that govern the same threads or the same output.
-        OperationError: there are no such offsets, with the reason where a single pair of chains or
-            the load of a core already excludes them; or the time was up before an answer.
-        PlatformError: more than a few chains collide and OR-tools is not installed.
+    Raises InputError: no plans, or plans that govern the same threads or the same output.
+    OperationError: there are no such offsets, with the reason where a single pair of chains or the
+    load of a core already excludes them; or the time was up before an answer. PlatformError: more
+    than a few chains collide and OR-tools is not installed.
     """
     if not plans:
         raise InputError("no plans to find offsets for: give one per chain")

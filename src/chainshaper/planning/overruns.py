@@ -71,8 +71,7 @@ def output_lifespan(plan: Plan) -> int | None:
 def refuse_offset(plan: Plan) -> None:
     """Refuse an offset where the phase of the chain's own timer says when its cycles start.
 
-    Raises:
-        InputError: the plan has one; the message says how to carry it out.
+    Raises InputError: the plan has one; the message says how to carry it out.
     """
     if plan.offset_ns:
         raise InputError(
@@ -124,9 +123,8 @@ def check_publication(plan: Plan, writers: Sequence[Writer]) -> list[str]:
 
     Returns what a person must know, one sentence each.
 
-    Raises:
-        InputError: the output is published by another node, or synchronously, or its history is
-            too shallow for what is handed over while the thread may not run.
+    Raises InputError: the output is published by another node, or synchronously, or its history is
+    too shallow for what is handed over while the thread may not run.
     """
     warnings: list[str] = []
     output = plan.chain.output

@@ -285,7 +285,7 @@ class Plan(Part):
         rules = (_cycle, _servers, _overlaps, _shaping_nodes, _modes, _publisher_threads)
         for rule in rules:
             for reason, *where in rule(self):
-                raise wrong_value(reason, *where)
+                raise wrong_value(str(reason), *where)
         return self
 
 
@@ -361,8 +361,7 @@ def until(server: Server, end_ns: int) -> tuple[Slot, ...]:
 def revised(plan: Plan, **changes: object) -> Plan:
     """A copy of a plan with some fields replaced, checked like any other plan.
 
-    Raises:
-        InputError: the fields make no plan together.
+    Raises InputError: the fields make no plan together.
     """
     values = {name: getattr(plan, name) for name in Plan.model_fields}
     with wrong_values_refused(Plan):
@@ -604,9 +603,8 @@ _SECTION_COMMENTS = {
 def load_plan(path: str | Path) -> Plan:
     """Read a plan, however a person has laid it out.
 
-    Raises:
-        InputError: no such file, not YAML, or wrong values; each is named with its line, key,
-            reason and remedy.
+    Raises InputError: no such file, not YAML, or wrong values; each is named with its line, key,
+    reason and remedy.
     """
     return read_model(path, Plan, made_by="written by `chainshaper plan`")
 
@@ -652,9 +650,8 @@ _Dumper.add_representer(
 def save_plan(plan: Plan, path: str | Path, *, overwrite: bool = False) -> None:
     """Write a plan, whole or not at all.
 
-    Raises:
-        InputError: ``path`` exists (and ``overwrite`` is not set), or its folder does not.
-        OperationError: it cannot be written; nothing is left behind, an existing file stays.
+    Raises InputError: ``path`` exists (and ``overwrite`` is not set), or its folder does not.
+    OperationError: it cannot be written; nothing is left behind, an existing file stays.
     """
     path = Path(path)
     if not (overwrite and path.is_file()):
@@ -665,9 +662,8 @@ def save_plan(plan: Plan, path: str | Path, *, overwrite: bool = False) -> None:
 def save_plans(plans: Sequence[Plan], folder: str | Path) -> list[Path]:
     """Write the plans of several chains into a new folder, each named after its output.
 
-    Raises:
-        InputError: ``folder`` exists, or what it stands in does not.
-        OperationError: they cannot be written; nothing is left behind.
+    Raises InputError: ``folder`` exists, or what it stands in does not. OperationError: they cannot
+    be written; nothing is left behind.
     """
     folder = new_file(folder)
     try:

@@ -131,11 +131,9 @@ def plan_chain(
 
     ``sinks`` are profiles of further outputs of the same graph, each of which is shaped too.
 
-    Raises:
-        InputError: wishes that exclude each other, or a policy that needs more than the profile
-            has.
-        OperationError: no such plan exists; the message names what prevents it.
-        PlatformError: a library that only this request needs is not installed.
+    Raises InputError: wishes that exclude each other, or a policy that needs more than the profile
+    has. OperationError: no such plan exists; the message names what prevents it. PlatformError: a
+    library that only this request needs is not installed.
     """
     _refuse_contradictions(request, bool(sinks))
     _refuse_entangled((profile, *sinks), request.policy, sinks=True)

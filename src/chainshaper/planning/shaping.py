@@ -80,9 +80,8 @@ def plan_shaping(
             :class:`~chainshaper.values.plan_choices.Wishes`, and how the latencies were taken:
             fields of :class:`~chainshaper.planning.plan.Evidence`.
 
-    Raises:
-        InputError: latencies or values that no plan may have.
-        OperationError: L̄ + ε + Δ does not fit into the period.
+    Raises InputError: latencies or values that no plan may have. OperationError: L̄ + ε + Δ does
+    not fit into the period.
     """
     latencies = check_latencies(latencies_ns)
     of_chain = {n: values.pop(n) for n in ChainOfPlan.model_fields.keys() & values.keys()}
@@ -202,8 +201,7 @@ def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
     ``core_of`` names the core of every node whose executor takes part, also of nodes that the plan
     does not know yet: branches that the chain waits for.
 
-    Raises:
-        InputError: a node of the plan is missing.
+    Raises InputError: a node of the plan is missing.
     """
     chain, others = _chain_and_others(plan)
     if missing := [thread.node for thread in chain.threads if thread.node not in core_of]:
@@ -230,8 +228,7 @@ def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int) -> Plan:
     execution at the beginning of a cycle as if it were one (table 4, rows 2 to 5: [0, 2] and [2,
     86] ms).
 
-    Raises:
-        InputError: the chain's server has no thread of that node, or is shorter than the slot.
+    Raises InputError: the chain's server has no thread of that node, or is shorter than the slot.
     """
     chain, others = _chain_and_others(plan)
     (start, end), thread = chain.slots[0], Thread(node=node)
@@ -274,10 +271,9 @@ def with_sink(
     chain's servers stay open as long as the slowest sink needs. The prediction stays that of the
     first output.
 
-    Raises:
-        InputError: a plan that shapes nothing or publishes in the other way, a sink that it shapes
-            already, latencies or a topic that no plan may have.
-        OperationError: the slot does not fit into the cycle.
+    Raises InputError: a plan that shapes nothing or publishes in the other way, a sink that it
+    shapes already, latencies or a topic that no plan may have. OperationError: the slot does not
+    fit into the cycle.
     """
     node, publishing = plan.shaping_node, output_server(plan)
     if publishing is None or not publishing.threads:
@@ -372,9 +368,8 @@ def server_per_callback(
     Callbacks of one node share its thread, hence a server with several slots. Each of ``callbacks``
     comes after those it waits for; the chain's last stands last, the first starts the cycle.
 
-    Raises:
-        InputError: no callbacks, or one that waits for itself or a later one.
-        OperationError: the slots do not fit into the cycle.
+    Raises InputError: no callbacks, or one that waits for itself or a later one. OperationError:
+    the slots do not fit into the cycle.
     """
     slots = _slots_in_sequence(callbacks, margin_ns, boundary_ns)
     end = max(slot[1] for slot in slots)
@@ -444,9 +439,8 @@ def let_per_chain(plan: Plan) -> Plan:
     The output is published in a slot at the beginning of the following cycle, so the latency is one
     period (section 5.3, table 5).
 
-    Raises:
-        InputError: a plan without a publish slot, or a chain so fast that it could publish in the
-            cycle it began in.
+    Raises InputError: a plan without a publish slot, or a chain so fast that it could publish in
+    the cycle it began in.
     """
     publishing, length = _one_slot(plan)
     if plan.evidence.min_latency_ns <= length:
@@ -469,10 +463,8 @@ def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str
     ``publishers`` their nodes, where known. Behind each topic a shaping node republishes at the
     beginning of the next cycle: as many periods as there are callbacks (section 5.3, table 5).
 
-    Raises:
-        InputError: a plan without a shaping node, topics that do not end with the chain's output,
-            or repeat one.
-        OperationError: the slots do not fit into the cycle.
+    Raises InputError: a plan without a shaping node, topics that do not end with the chain's
+    output, or repeat one. OperationError: the slots do not fit into the cycle.
     """
     last = plan.shaping_node
     if last is None or not topics or topics[-1] != last.output:
@@ -495,10 +487,8 @@ def let_per_callback_asynchronous(plan: Plan, publishers: Sequence[str]) -> Plan
     The publisher threads of ``publishers``, the nodes of the chain's callbacks in order, run in the
     slots.
 
-    Raises:
-        InputError: a plan that does not gate the publisher's thread, or nodes that do not end with
-            it, or repeat one.
-        OperationError: the slots do not fit into the cycle.
+    Raises InputError: a plan that does not gate the publisher's thread, or nodes that do not end
+    with it, or repeat one. OperationError: the slots do not fit into the cycle.
     """
     if plan.shaping_node is not None or not publishers or publishers[-1] != plan.chain.publisher:
         raise InputError(
