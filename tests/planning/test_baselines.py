@@ -16,7 +16,6 @@ from chainshaper.planning.plan import (
 from chainshaper.planning.shaping import (
     CallbackTimes,
     let_per_callback,
-    let_per_callback_asynchronous,
     let_per_chain,
     over_cores,
     plan_shaping,
@@ -191,7 +190,7 @@ def test_let_per_callback_of_asynchronous_publishers_adds_no_nodes() -> None:
         publication="asynchronous",
         overrun="wait",
     )
-    plan = let_per_callback_asynchronous(shaped, ["/n1", "/n2"])
+    plan = let_per_callback(shaped, ["/t1", "/t5"], ["/n1", "/n2"])
     assert plan.shaping_node is None
     assert plan.further_shaping_nodes == ()
     publishers = [Thread(node=name, role="publisher") for name in ("/n1", "/n2")]
@@ -201,9 +200,7 @@ def test_let_per_callback_of_asynchronous_publishers_adds_no_nodes() -> None:
     assert plan.predicted.max_ns == 201 * MS
     for wrong in ([], ["/n2", "/n1"]):
         with pytest.raises(InputError, match="publishes its output last"):
-            let_per_callback_asynchronous(shaped, wrong)
-    with pytest.raises(InputError, match="plan for asynchronous publication"):
-        let_per_callback_asynchronous(_avp(), ["/localizer"])
+            let_per_callback(shaped, ["/t1", "/t5"], wrong)
 
 
 def test_a_first_node_apart_has_no_place_in_let() -> None:

@@ -14,7 +14,7 @@ from chainshaper.planning import (
     Plan,
     PlanRequest,
     Profile,
-    let_per_callback_asynchronous,
+    let_per_callback,
     let_per_chain,
     load_plan,
     plan_chain,
@@ -112,7 +112,7 @@ def test_bands_and_long_slots_put_the_publisher_below_its_executor() -> None:
 
 def test_logical_execution_time_goes_with_asynchronous_publication() -> None:
     assert publish_slots(let_per_chain(asynchronous())) == ((0, MS),)
-    assert publish_slots(let_per_callback_asynchronous(asynchronous(), ["/n1", "/n5"])) == (
+    assert publish_slots(let_per_callback(asynchronous(), ["/t1", "/t5"], ["/n1", "/n5"])) == (
         (0, MS),
     )
 

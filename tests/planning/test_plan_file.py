@@ -7,8 +7,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chainshaper.planning import (
-    ChainOfPlan,
-    Evidence,
     Margin,
     Modes,
     Plan,
@@ -23,6 +21,7 @@ from chainshaper.planning import (
     save_plan,
     server_of,
 )
+from chainshaper.planning.plan import ChainOfPlan, Evidence
 from chainshaper.values.errors import InputError, OperationError
 
 GOOD = """\

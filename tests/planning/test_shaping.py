@@ -15,11 +15,11 @@ from chainshaper.planning import (
     plan_json,
     plan_shaping,
     plan_warnings,
-    predict_bands,
     publish_slots,
     server_per_chain,
     with_bands,
 )
+from chainshaper.planning.bands import predict_bands
 from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000

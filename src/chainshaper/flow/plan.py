@@ -46,11 +46,10 @@ def profile_chains(
 ) -> tuple[Profile, ...]:
     """What the planner needs of recorded chains: see :func:`chainshaper.planning.plan_chain`.
 
-    Period, cores and priorities are those of the recording; ``period_ns`` is for chains that no
-    timer starts. None stands for the chain that the recording names. Latencies and all other times
-    but ``every_latency_ns`` are over cycles that the machine did not disturb: a stall of the
-    machine is not part of the chain's latency, but its output is late nevertheless. Only where
-    fewer than two were undisturbed, they are over all.
+    ``period_ns`` is for chains that no timer starts; None stands for the chain that the recording
+    names. Latencies and all other times but ``every_latency_ns`` are over cycles that the machine
+    did not disturb: a stall is not part of the chain's latency, but its output is late
+    nevertheless. Only where fewer than two were undisturbed, they are over all.
 
     Raises InputError: no such chain, or a chain's period is not known, or known and given as well.
     OperationError: a chain with fewer than two complete traversals.
@@ -377,8 +376,8 @@ def shape_application(
 ) -> Recording:
     """Splice the plan's shaping node into an application, run it and record it.
 
-    ``enforcement`` puts the plan's servers in force while it runs. A shaping node does without;
-    the thread of an asynchronous publisher is gated unless ``enforcement`` does so
+    ``enforcement`` puts the plan's servers in force while it runs. A shaping node does without; the
+    thread of an asynchronous publisher is gated unless ``enforcement`` does so
     (:func:`chainshaper.flow.apply.publishers_gated`).
 
     Raises InputError: the plan does not fit the application, or has an offset; and what

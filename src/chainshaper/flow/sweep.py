@@ -121,10 +121,8 @@ where there are no slots). ``per_band`` has the bands, with the outputs that lef
 
 @dataclass(frozen=True)
 class Grid:
-    """Every combination of the axes' values, for one application.
-
-    ``plan`` is in force in all of them; without one each point is planned. Each point is
-    simulated for ``cycles`` periods of the chain.
+    """Every combination of the axes' values for one application, each simulated for ``cycles``
+    periods of the chain. ``plan`` is in force in all of them; without one each point is planned.
     """
 
     application: Application
@@ -150,11 +148,11 @@ def sweep(
     ``vary`` has the values of each axis, durations as texts. With a ``plan``, this one is in force
     everywhere. Each point is a run of ``cycles`` periods to plan from, and another one with the
     plan in force; ``seed`` replaces the description's. ``workers`` threads compute (default: one
-    per core that we may use), or a Dask cluster, whose ``scheduler`` is at that address.
+    per core that we may use), or the Dask cluster whose ``scheduler`` is at that address.
 
-    The frame has a row for each point, in the order of the axes: a column for each axis (durations
-    in ns, with ``_ns`` behind the name), ``cycles``, ``seed``, and :data:`FIGURES`. A point that
-    cannot be has an ``error``. The same frame is in ``output``, a Parquet file. Until it is whole,
+    The frame, also written to ``output`` (Parquet), has a row for each point, in the order of the
+    axes: a column for each axis (durations in ns, with ``_ns`` behind the name), ``cycles``,
+    ``seed``, and :data:`FIGURES`. A point that cannot be has an ``error``. Until it is whole,
     finished rows stand beside it, and the same call goes on with what is missing.
 
     Raises InputError: unknown axes or impossible values; ``output`` exists, or rows beside it are
@@ -440,8 +438,8 @@ def _nanoseconds(name: str, value: Any) -> Any:
 def profile_at(grid: Grid, values: Values, progress: Progress | None = None) -> Profile | str:
     """The measurements that a point is planned from, or why there are none.
 
-    They depend on the application, and on whether callbacks are planned one by one: then response
-    times of as many cycles are needed, 100,000 at most, which takes events.
+    Where callbacks are planned one by one, response times of as many cycles are needed, 100,000 at
+    most, which takes events.
     """
     try:
         application = _urgent(application_at(grid, values))
@@ -593,10 +591,9 @@ def rows_of(
 ) -> Generator[tuple[int, Row], None, None]:
     """Rows by the numbers of their points, as they are finished.
 
-    ``workers`` threads compute, or the Dask cluster whose ``scheduler`` is at that address, where
-    points of a worker that dies are computed by others. A row is a function of its point: it does
-    not depend on who computes it. Points that differ in nothing measured share a profile; those
-    whose profile is there come first, so that few profiles are in memory at a time.
+    ``workers`` threads compute, or a Dask cluster, where points of a worker that dies are computed
+    by others; a row does not depend on who computes it. Points that differ in nothing measured
+    share a profile; those whose profile is there come first, so that few are in memory at a time.
 
     Raises InputError: that is no address. PlatformError: `distributed` is not installed.
     OperationError: no scheduler is there, or it is gone; there are no workers, or one has other
@@ -652,9 +649,8 @@ def _threads(workers: int) -> Iterator[_Engine]:
 
 @contextmanager
 def _cluster(address: str) -> Iterator[_Engine]:
-    """Dask has many errors of its own for what happens to its parts: lost, killed, unable to load.
-
-    All of them leave the sweep where it is, and the user with the same things to look at.
+    """A Dask cluster. All of Dask's many errors leave the sweep where it is, and the user with the
+    same things to look at.
     """
     distributed, here = extra_library("distributed", "a sweep on a Dask cluster"), _versions()
     if not _ADDRESS.fullmatch(address):
@@ -730,9 +726,9 @@ def finished_rows(
 ) -> Iterator[tuple[dict[int, Row], Callable[[int, Row], None]]]:
     """The rows that are finished, by the number of their point, and how to add one.
 
-    One line of JSON a row, behind a first line that says what is swept (``about``, plain data):
-    rows of anything else are not mixed with it. Each is on disk before the next; a crash leaves
-    half a line at most, which is removed. A file without rows is removed.
+    One line of JSON a row, behind a first line that says what is swept (``about``, plain data).
+    Each is on disk before the next; a crash leaves half a line at most, which is removed. A file
+    without rows is removed.
 
     Raises InputError: the file is of another sweep; the message names what differs. OperationError:
     another process works on it, or it cannot be read or written.

@@ -7,16 +7,13 @@ Everything starts with :func:`plan_shaping`; each further step takes a plan and 
 from chainshaper.planning.bands import (
     BandChoice,
     choose_bands,
-    predict_bands,
     with_bands,
     with_long_slot,
 )
-from chainshaper.planning.margins import check_latencies, read_latencies
+from chainshaper.planning.margins import read_latencies
 from chainshaper.planning.offsets import place_chains
 from chainshaper.planning.overruns import plan_warnings
 from chainshaper.planning.plan import (
-    ChainOfPlan,
-    Evidence,
     Margin,
     Modes,
     Plan,
@@ -38,7 +35,6 @@ from chainshaper.planning.request import PlanRequest, Profile, band_choice, plan
 from chainshaper.planning.shaping import (
     CallbackTimes,
     let_per_callback,
-    let_per_callback_asynchronous,
     let_per_chain,
     over_cores,
     plan_shaping,
@@ -51,8 +47,6 @@ from chainshaper.planning.shaping import (
 __all__ = [
     "BandChoice",
     "CallbackTimes",
-    "ChainOfPlan",
-    "Evidence",
     "Margin",
     "Modes",
     "Plan",
@@ -65,11 +59,9 @@ __all__ = [
     "Thread",
     "band_choice",
     "band_predictions",
-    "check_latencies",
     "choose_bands",
     "dump_plan",
     "let_per_callback",
-    "let_per_callback_asynchronous",
     "let_per_chain",
     "load_plan",
     "over_cores",
@@ -79,7 +71,6 @@ __all__ = [
     "plan_json",
     "plan_shaping",
     "plan_warnings",
-    "predict_bands",
     "publish_slots",
     "read_latencies",
     "save_plan",

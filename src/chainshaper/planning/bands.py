@@ -178,9 +178,9 @@ def with_bands(
 ) -> Plan:
     """A shaped plan with ``bands`` publish slots of the plan's length (Δ); the last one stays.
 
-    ``auto`` takes as many bands as each lower the average by ``least_gain`` of it at least. For
-    ``minimise`` and ``mean_at_most_ns`` see :func:`place_bands`; ``pso`` and ``random`` take a
-    ``seed``. ``limits`` are ``grid_ns``, ``max_gap_ns`` and ``max_share`` of :class:`BandProblem`.
+    ``auto`` takes as many as each lower the average by ``least_gain`` of it at least. For
+    ``minimise`` and ``mean_at_most_ns`` see :func:`place_bands`; ``limits`` are ``grid_ns``,
+    ``max_gap_ns`` and ``max_share`` of :class:`BandProblem`.
 
     Raises InputError: a plan without a publish slot, or values that make no sense together.
     OperationError: no such placement exists; the message names the binding constraint.
@@ -241,8 +241,8 @@ def choose_bands(
 def with_long_slot(plan: Plan, latencies_ns: NDArray[np.int64], slot_start_ns: int) -> Plan:
     """A shaped plan with one long publish slot, from ``slot_start_ns`` to where it ended before.
 
-    An execution that is done earlier waits for the slot, any other publishes at once: the average
-    falls and the jitter grows as the start moves towards the shortest latency (end of section 4.1).
+    An execution that is done earlier waits for it, any other publishes at once: the average falls
+    and the jitter grows as the start moves towards the shortest latency (end of section 4.1).
 
     Raises InputError: a start that is negative, or behind that of the plan's own publish slot.
     """
@@ -442,22 +442,15 @@ def _smallest_gap(problem: BandProblem, found: Placement, mean_at_most_ns: int |
 
 def _why_none(problem: BandProblem, bands: int) -> str:
     """Which constraint leaves no placement: the one without which there is one."""
-    limits = {}
-    if problem.max_share is not None:
-        limits["max_share"] = (
-            f"no placement keeps every band at {problem.max_share:.1%} of the executions; allow a"
-            " larger share or more bands"
-        )
-    if problem.max_gap_ns is not None:
-        limits["max_gap_ns"] = (
-            f"no placement keeps neighbours within {format_duration(problem.max_gap_ns)}; allow a"
-            " larger gap"
-        )
-    tried: list[tuple[list[str], str]] = [([name], reason) for name, reason in limits.items()]
-    if len(limits) == 2:
-        both = "the largest gap and the largest share exclude each other; relax one"
-        tried.append((list(limits), both))
-    for names, reason in tried:
+    reasons = {
+        ("max_share",): f"no placement keeps every band at {problem.max_share or 1:.1%} of the"
+        " executions; allow a larger share or more bands",
+        ("max_gap_ns",): "no placement keeps neighbours within"
+        f" {format_duration(problem.max_gap_ns or 0)}; allow a larger gap",
+        ("max_share", "max_gap_ns"): "the largest gap and the largest share exclude each other;"
+        " relax one",
+    }
+    for names, reason in reasons.items():
         changes: dict[str, Any] = dict.fromkeys(names)
         if _solve(replace(problem, **changes), bands).best(bands) is not None:
             return f"{bands} bands cannot be placed: {reason}"
@@ -501,8 +494,8 @@ def _broken(
 def place_by_swarm(problem: BandProblem, bands: int, seed: int | None = None) -> Placement:
     """Place bands with PySwarms and the paper's parameters; the same ``seed``, the same result.
 
-    Particles are the ends of all slots but the last, on the grid. A particle that breaks a
-    constraint costs more than any that does not, in proportion to how far it is off.
+    Particles are the ends of all slots but the last. One that breaks a constraint costs more than
+    any that does not, in proportion to how far it is off.
 
     Raises InputError: as :func:`refuse_more_than_fit`. OperationError: the swarm ended at a
     placement that breaks a constraint. PlatformError: PySwarms is not installed.
@@ -568,10 +561,8 @@ def _checked(problem: BandProblem, ends: list[int], what: str) -> Placement:
 
 @contextmanager
 def _quiet_and_seeded(seed: int | None) -> Iterator[None]:
-    """PySwarms draws from NumPy's global generator and sets up logging into the current folder.
-
-    The generator's state comes back; a logging configuration that changes nothing (named by
-    PySwarms' own environment variable) makes it write no files.
+    """PySwarms draws from NumPy's global generator, whose state comes back, and sets up logging
+    into the current folder: a configuration that changes nothing makes it write no files.
     """
     state, configured = np.random.get_state(), os.environ.get("LOG_CFG")
     with tempfile.TemporaryDirectory(prefix="chainshaper-") as folder:

@@ -60,10 +60,8 @@ _Floats = NDArray[np.float64]
 
 
 def read_latencies(path: str | Path) -> _Latencies:
-    """End-to-end latencies of a file, in nanoseconds, in the file's order.
-
-    One duration a line with its unit (``59.3ms``; blank lines and lines that begin with ``#`` are
-    skipped), or a ``.npy`` file of nanoseconds.
+    """End-to-end latencies of a file, in nanoseconds, in the file's order: one duration a line with
+    its unit (``59.3ms``; ``#`` begins a comment), or a ``.npy`` file of nanoseconds.
 
     Raises InputError: no such file, a line that is no duration (named with its number), an array
     that does not hold whole nanoseconds, fewer than two latencies, or none above zero.
@@ -134,10 +132,8 @@ def check_latencies(latencies: object) -> _Latencies:
 
 @dataclass(frozen=True)
 class TailFit:
-    """A generalised Pareto tail and the latency that it says is exceeded with ``probability``.
-
-    ``interval_ns`` is the 95 % confidence interval of ``latency_ns``; ``goodness`` the p-value of
-    the Anderson–Darling test of the fit.
+    """A generalised Pareto tail, the latency exceeded with ``probability``, its 95 % confidence
+    interval, and the p-value of the Anderson–Darling test of the fit.
     """
 
     probability: float
@@ -160,9 +156,8 @@ def cycles_needed(overrun_probability: float) -> int:
 
 
 def late_share(every_latency_ns: _Latencies, latency_ns: int) -> float:
-    """The share of cycles that take longer than ``latency_ns``, at most, with 95 % confidence.
-
-    From how many of the measured ones do (Clopper and Pearson's upper bound).
+    """The share of cycles that take longer than ``latency_ns``, at most, with 95 % confidence
+    (Clopper and Pearson's upper bound).
     """
     from scipy.special import betaincinv
 
@@ -202,10 +197,10 @@ def derive_margin(
     *,
     longest_ns: int | None = None,
 ) -> Margin:
-    """The margin ε with which an execution overruns its slot with the given probability.
+    """The margin ε, with its confidence interval, beyond ``longest_ns`` (default: the longest of
+    them) with which an execution overruns its slot with the given probability.
 
-    ``latencies_ns`` are in the order in which they were measured; ε counts from ``longest_ns``,
-    their longest unless given. The result has its confidence interval.
+    ``latencies_ns`` are in the order in which they were measured.
 
     Raises: as :func:`fit_tail`.
     """

@@ -50,9 +50,7 @@ def place_chains(
 
     The chains take turns where they can (:func:`with_offsets`). Where they cannot, they run at the
     same time, the chain with the shorter period at the better priority, and only their publish
-    slots, which make the latency constant, stay apart.
-
-    Raises: as :func:`with_offsets`.
+    slots stay apart. Raises as :func:`with_offsets`.
     """
     try:
         return with_offsets(plans, time_limit_s=time_limit_s), []

@@ -37,9 +37,8 @@ ROOMY_SLOT_NS = 10_000_000  # suffices for many sends where the machine stalls f
 def cycles_until_output(plan: Plan, node: ShapingNode | None = None) -> int:
     """How many cycles after its own an output is due, and leaves at the earliest: 0 but under LET.
 
-    It is the chain's output, or what ``node`` republishes: under LET per callback, each topic
-    inside the chain is due a cycle after the one before it. Without slots for outputs: as
-    predicted.
+    It is the chain's output, or what ``node`` republishes: under LET per callback, each topic is
+    due a cycle after the one before it. Without slots for outputs: as predicted.
     """
     if plan.policy == "let-per-chain":
         return 1
@@ -86,9 +85,9 @@ def open_until_done(plan: Plan) -> Plan:
 
     Where an output that missed its slot is to leave at once, the servers that run the chain to its
     end stay open until the cycle's end (section 6), and so does the last publish slot of an
-    asynchronous publisher's thread: a server that stopped either of them would delay the output by
-    a whole cycle. The plan itself states what is reserved (eq. 1) and shared out among chains;
-    where another server of the same priority has a slot there, the servers stay as planned.
+    asynchronous publisher: stopping either would delay the output by a whole cycle. The plan itself
+    states what is reserved (eq. 1); where another server of the same priority has a slot there, it
+    stays as planned.
     """
     shaped = plan.policy in ("shaped", "one-long-slot") and output_server(plan) is not None
     if plan.overrun != "publish" or not shaped:
@@ -119,9 +118,8 @@ class Writer:
 
 
 def check_publication(plan: Plan, writers: Sequence[Writer]) -> list[str]:
-    """Check a plan that gates publishers' threads against the writers of the application.
-
-    Returns what a person must know, one sentence each.
+    """Check a plan that gates publishers' threads against the writers of the application; returns
+    what a person must know, one sentence each.
 
     Raises InputError: the output is published by another node, or synchronously, or its history is
     too shallow for what is handed over while the thread may not run.

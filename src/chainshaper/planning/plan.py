@@ -63,9 +63,9 @@ Slot: TypeAlias = tuple[Duration, Duration]
 
 
 class ChainOfPlan(Part):
-    """The chain that is planned for, as far as it is known.
+    """The chain that is planned for, as far as it is known: a plan from bare latencies knows only
+    the period, and can be studied but not carried out.
 
-    A plan from bare latencies knows only the period; it can be studied but not carried out.
     ``publisher`` is the node that publishes ``output``, ``output_depth`` its writer's history.
     """
 
@@ -79,11 +79,11 @@ class ChainOfPlan(Part):
 class Evidence(Part):
     """The measurements that the plan rests on: end-to-end latencies under high SCHED_FIFO.
 
-    The latencies are those of undisturbed cycles; where the machine disturbed all but one of them,
-    which ``all_disturbed`` says, of all. ``max_of_all_ns`` is the longest of all. ``incomplete``
-    counts traversals without an end, ``disturbed`` those that a stall of the machine hit;
-    ``utilisation`` is the share of its core that the chain's execution takes, ``longest_send_ns``
-    is of the output's asynchronous publisher. ``None`` is: not known.
+    They are of undisturbed cycles; where the machine disturbed all but one at most
+    (``all_disturbed``), of all. ``max_of_all_ns`` is the longest of all, ``incomplete`` counts
+    traversals without an end, ``disturbed`` those hit by a stall of the machine; ``utilisation`` is
+    the share of its core that the chain takes, ``longest_send_ns`` is of the output's asynchronous
+    publisher. ``None`` is: not known.
     """
 
     recording: str | None = None
@@ -111,10 +111,9 @@ class Evidence(Part):
 class Margin(Part):
     """How far the chain's slot reaches beyond the longest undisturbed latency (ε of eq. 1).
 
-    ``given`` by a person; ``measured``: it covers all cycles but a share, also those that the
-    machine disturbed, for which ``stalls_ns`` of it are needed; ``derived`` from the tail of the
-    latencies, with its confidence interval. ``overrun_probability`` is the share of late outputs,
-    at most, with 95 % confidence.
+    ``given``; ``measured``: it covers all cycles but a share, for which ``stalls_ns`` of it are
+    needed; ``derived`` from the tail of the latencies, with its confidence interval.
+    ``overrun_probability`` is the share of late outputs, at most, with 95 % confidence.
     """
 
     epsilon_ns: Duration
@@ -125,9 +124,8 @@ class Margin(Part):
 
 
 class Thread(Part):
-    """A thread of a node that runs inside a server: its executor, or its asynchronous publisher.
-
-    Other DDS threads are never gated (section 3.1), so they have no role.
+    """A thread of a node that runs inside a server; other DDS threads are never gated (section
+    3.1).
     """
 
     node: FullName
@@ -135,9 +133,8 @@ class Thread(Part):
 
 
 class Server(Part):
-    """A table-driven reservation server (section 2.2.1): its threads run in its slots only.
-
-    A smaller ``priority`` is better, which is LITMUS^RT's order.
+    """A table-driven reservation server (section 2.2.1): its threads run in its slots only. A
+    smaller ``priority`` is better, as in LITMUS^RT.
     """
 
     name: Annotated[str, Field(min_length=1)]
@@ -161,14 +158,14 @@ class Server(Part):
 
 
 class ShapingNode(Part):
-    """The node that takes the chain's output from ``input`` and republishes it on ``output``.
+    """The node that takes the chain's output from ``input`` and republishes it on ``output``, in
+    the slots of the server that has its thread.
 
-    It publishes in the slots of the server that has its thread. It sleeps until ``spin_ns`` before
-    the slot and spins from there, and pauses for ``pause_ns`` after a publication so that delivery
-    is not delayed by it. ``publisher`` is the node whose output it takes, where that is not
-    `chain.publisher`. While the plan is in force the executors of ``receivers``, which subscribe to
-    the output, run under SCHED_FIFO below all servers. ``depth`` is how many messages may wait in
-    it; None: as many as the history of the output's publisher has room for, and 10 at least.
+    It sleeps until ``spin_ns`` before the slot and spins from there; it pauses for ``pause_ns``
+    after a publication so that it does not delay delivery. ``publisher`` is the node whose output
+    it takes, where that is not `chain.publisher`. The executors of ``receivers``, which subscribe
+    to the output, run under SCHED_FIFO below all servers. ``depth`` is how many messages may wait
+    in it; None: as many as the history of the output's publisher has room for, and 10 at least.
     """
 
     name: Annotated[str, _plain_name("node")]
@@ -199,11 +196,10 @@ class ShapingNode(Part):
 
 
 class Modes(Part):
-    """Which latency band the chain's output has in each mode of the system (sections 3.3, 6).
+    """Which latency band, 1 for the first slot, the output has in each mode (sections 3.3, 6).
 
-    The active mode's name is read from ``topic``, a ``std_msgs/msg/String``; until one is read it
-    is ``default``. ``bands`` has the number of each mode's band, 1 for the first slot. An early
-    output waits for its mode's slot. A late one waits for the same slot of the next cycle
+    The active mode is read from ``topic``, a ``std_msgs/msg/String``; until then it is ``default``.
+    An early output waits for its mode's slot. A late one waits for the same slot of the next cycle
     (``wait``), is discarded, leaves at once (``publish``), or takes the ``next-slot`` of the cycle.
     """
 
@@ -253,14 +249,13 @@ def slot_text(slot: Slot) -> str:
 class Plan(Part):
     """Servers and shaping nodes for one chain, with the evidence and the prediction.
 
-    ``cycle_ns`` is the servers' cycle time: the chain's period, or a whole multiple of it. This
-    chain's cycles start ``offset_ns`` after the instant from which those of all chains count.
-    ``anchor`` says what starts a cycle for the shaping node: the stamp that each message carries
-    from the chain's first callback, or the servers' own cycle. ``overrun`` says what becomes of an
-    output that missed its last slot, ``messages`` which of several outputs of one cycle leave,
+    ``cycle_ns`` is a whole multiple of the chain's period. Its cycles start ``offset_ns`` after the
+    instant from which those of all chains count; ``anchor``: by the stamp that each message carries
+    from the chain's first callback, or by the servers' own cycle. ``overrun`` says what becomes of
+    an output that missed its last slot, ``messages`` which of several outputs of one cycle leave,
     ``fallback`` what becomes of outputs while their shaping node is not there. ``shaping_node``
-    serves the chain's output; it is absent when the publisher's own thread is gated or nothing is.
-    ``further_shaping_nodes`` serve other sinks, or topics inside a chain (LET per callback).
+    serves the chain's output, unless the publisher's own thread is gated; ``further_shaping_nodes``
+    serve other sinks, or topics inside a chain (LET per callback).
     """
 
     format: Literal[1] = 1
@@ -302,8 +297,8 @@ def shaping_nodes(plan: Plan) -> list[ShapingNode]:
 def output_server(plan: Plan) -> Server | None:
     """The server in whose slots the chain's output is published; None without shaping.
 
-    It has the thread of the shaping node or of the asynchronous publisher. A plan from bare
-    latencies names no threads; its server ``output`` is the one meant.
+    It has the thread of the shaping node or of the asynchronous publisher; a plan from bare
+    latencies names no threads, and its server ``output`` is meant.
     """
     server = None
     if plan.shaping_node is not None:
@@ -567,9 +562,8 @@ def publisher_servers(plan: Plan) -> Iterator[tuple[int, Server, list[str]]]:
 
 
 def messages_waiting(plan: Plan, server: Server) -> int:
-    """How many messages may be handed over while a server is closed, in one stretch.
-
-    One per period of the chain, and one more for where the stretch begins.
+    """How many messages may be handed over while a server is closed, in one stretch: one per period
+    of the chain, and one more for where the stretch begins.
     """
     (first, _), (_, last) = server.slots[0], server.slots[-1]
     closed = [after[0] - before[1] for before, after in pairwise(server.slots)]
@@ -685,10 +679,8 @@ def save_plans(plans: Sequence[Plan], folder: str | Path) -> list[Path]:
 
 
 def plan_json(plan: Plan) -> dict[str, Any]:
-    """The plan as plain data for ``--json``: integer nanoseconds, keys ending in ``_ns``.
-
-    ``bands_ns`` are the ends of the publish slots, ascending; ``predicted_bands`` are those of
-    :func:`band_predictions`.
+    """The plan as plain data for ``--json``: integer nanoseconds, keys ending in ``_ns``, with the
+    ends of the publish slots (``bands_ns``) and :func:`band_predictions`.
     """
     return {
         **plan.model_dump(mode="json"),

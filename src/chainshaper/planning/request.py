@@ -35,7 +35,6 @@ from chainshaper.planning.shaping import (
     CallbackTimes,
     evidence_of,
     let_per_callback,
-    let_per_callback_asynchronous,
     let_per_chain,
     over_cores,
     plan_shaping,
@@ -299,8 +298,6 @@ def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
         )
     if request.policy == "server-per-callback":
         return server_per_callback(plan, profile.callbacks, margin_ns=plan.margin.epsilon_ns)
-    if request.publication == "asynchronous":
-        return let_per_callback_asynchronous(plan, profile.nodes)
     return let_per_callback(plan, profile.topics, profile.nodes)
 
 

@@ -67,18 +67,13 @@ def plan_shaping(
     With L̄ the longest latency, ε the margin, Δ the length of the publish slot and CT the period,
     the chain's server R_m gets the slot [0, L̄ + ε) (eq. 1) and the output's server R_m° gets [L̄ +
     ε, L̄ + ε + Δ) (eq. 4 with a shaping node, eq. 2 with an asynchronous publisher thread), in the
-    same cycle (eq. 3). R_m° gets the better priority and, unless ``output_core`` says otherwise,
-    the same core.
+    same cycle (eq. 3), at the better priority, on ``output_core`` (default: the same core).
 
-    Args:
-        latencies_ns: every end-to-end latency to be covered.
-        wishes, margin: ε is the margin's or, without one, 1 ms unless the wishes say otherwise.
-        nodes: those whose executors run the chain's callbacks.
-        fifo_priority, receivers: for the shaping node.
-        values: fields of :class:`~chainshaper.planning.plan.ChainOfPlan` (without ``output`` the
-            plan can be studied, not carried out), single
-            :class:`~chainshaper.values.plan_choices.Wishes`, and how the latencies were taken:
-            fields of :class:`~chainshaper.planning.plan.Evidence`.
+    ε is the margin's or, without one, 1 ms unless the wishes say otherwise. ``nodes`` are those
+    whose executors run the chain. ``fifo_priority`` and ``receivers`` are for the shaping node.
+    ``values`` are fields of :class:`~chainshaper.planning.plan.ChainOfPlan` (without ``output`` the
+    plan can be studied, not carried out) and of :class:`~chainshaper.planning.plan.Evidence`, and
+    single :class:`~chainshaper.values.plan_choices.Wishes`.
 
     Raises InputError: latencies or values that no plan may have. OperationError: L̄ + ε + Δ does
     not fit into the period.
@@ -198,8 +193,8 @@ def _refuse_too_long(longest: int, epsilon: int, publish_slot: int, period: int)
 def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
     """One server per core for the chain's threads, each with the chain's slot (section 5.4).
 
-    ``core_of`` names the core of every node whose executor takes part, also of nodes that the plan
-    does not know yet: branches that the chain waits for.
+    ``core_of`` names the core of every node that takes part, also on branches that the chain waits
+    for and that the plan does not know yet.
 
     Raises InputError: a node of the plan is missing.
     """
@@ -224,9 +219,8 @@ def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
 def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int) -> Plan:
     """The chain's first node in a server of its own, [0, ``slot_end_ns``), the rest behind it.
 
-    For a chain whose first callback is not a timer: stopped until its slot, it starts every
-    execution at the beginning of a cycle as if it were one (table 4, rows 2 to 5: [0, 2] and [2,
-    86] ms).
+    Stopped until its slot, a first callback that is no timer starts every execution at the
+    beginning of a cycle (table 4, rows 2 to 5: [0, 2] and [2, 86] ms).
 
     Raises InputError: the chain's server has no thread of that node, or is shorter than the slot.
     """
@@ -320,10 +314,8 @@ def with_sink(
 
 @dataclass(frozen=True)
 class CallbackTimes:
-    """Measured response times of one callback, and what it waits for.
-
-    ``after`` are the places, in the sequence that this stands in, of the callbacks whose data it
-    needs: one for a link of a chain, several for a synchronising callback.
+    """Measured response times of one callback; ``after`` are the places, in the sequence that this
+    stands in, of the callbacks whose data it needs.
     """
 
     node: str
@@ -335,16 +327,13 @@ class CallbackTimes:
 
 
 def server_per_chain(plan: Plan) -> Plan:
-    """One server for the whole chain, nothing shaped (section 3.1; table 4 row 2).
-
-    The chain is isolated from best-effort work and its latency is what was measured.
+    """One server for the whole chain, nothing shaped (section 3.1; table 4 row 2): its latency is
+    what was measured.
     """
     publishing, evidence = output_server(plan), plan.evidence
-    predicted = Prediction(
-        mean_ns=evidence.mean_latency_ns,
-        max_ns=evidence.max_latency_ns,
-        jitter_ns=evidence.max_latency_ns - evidence.min_latency_ns,
-    )
+    shortest, longest = evidence.min_latency_ns, evidence.max_latency_ns
+    mean = evidence.mean_latency_ns
+    predicted = Prediction(mean_ns=mean, max_ns=longest, jitter_ns=longest - shortest)
     servers = tuple(server for server in plan.servers if server is not publishing)
     return _unshaped(plan, policy="server-per-chain", servers=servers, predicted=predicted)
 
@@ -362,11 +351,10 @@ def server_per_callback(
 ) -> Plan:
     """Time-triggered scheduling: each callback runs in a slot of its own, as long as its longest.
 
-    A slot starts when the slots of all callbacks that this one waits for have ended, the
-    synchronisation points of a graph (table 4 row 1), and the slot before it on its core. It is the
-    longest response time plus ``margin_ns`` long, rounded up to a multiple of ``boundary_ns``.
-    Callbacks of one node share its thread, hence a server with several slots. Each of ``callbacks``
-    comes after those it waits for; the chain's last stands last, the first starts the cycle.
+    A slot starts when the slots of all callbacks that this one waits for have ended (table 4 row
+    1), and the slot before it on its core. It is the longest response time plus ``margin_ns`` long,
+    rounded up to a multiple of ``boundary_ns``. Callbacks of one node share a server with several
+    slots. Each of ``callbacks`` comes after those it waits for; the chain's last stands last.
 
     Raises InputError: no callbacks, or one that waits for itself or a later one. OperationError:
     the slots do not fit into the cycle.
@@ -434,10 +422,8 @@ def _server_of_node(node: str, own: list[tuple[int, Slot]]) -> Server:
 
 
 def let_per_chain(plan: Plan) -> Plan:
-    """Logical execution time for the chain as one task: output at the next cycle's start.
-
-    The output is published in a slot at the beginning of the following cycle, so the latency is one
-    period (section 5.3, table 5).
+    """Logical execution time for the chain as one task: its output leaves in a slot at the start of
+    the next cycle, so the latency is one period (section 5.3, table 5).
 
     Raises InputError: a plan without a publish slot, or a chain so fast that it could publish in
     the cycle it began in.
@@ -461,64 +447,49 @@ def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str
 
     ``topics`` are the outputs of the chain's callbacks in order, the chain's own last;
     ``publishers`` their nodes, where known. Behind each topic a shaping node republishes at the
-    beginning of the next cycle: as many periods as there are callbacks (section 5.3, table 5).
+    beginning of the next cycle, or the publishers' threads run then, where the plan gates one: as
+    many periods as there are callbacks (section 5.3, table 5).
 
-    Raises InputError: a plan without a shaping node, topics that do not end with the chain's
-    output, or repeat one. OperationError: the slots do not fit into the cycle.
-    """
-    last = plan.shaping_node
-    if last is None or not topics or topics[-1] != last.output:
-        raise InputError(
-            "LET per callback needs a plan with a shaping node and all topics of the chain, its"
-            " output last"
-        )
-    with wrong_values_refused(Plan):
-        inside = tuple(
-            _node_like(last, topic, publisher)
-            for topic, publisher in zip_longest(topics[:-1], publishers[: len(topics) - 1])
-        )
-        threads = [node.thread for node in (*inside, last)]
-        return revised(_let_per_thread(plan, threads), further_shaping_nodes=inside)
-
-
-def let_per_callback_asynchronous(plan: Plan, publishers: Sequence[str]) -> Plan:
-    """:func:`let_per_callback` for callbacks that publish asynchronously: no nodes are added.
-
-    The publisher threads of ``publishers``, the nodes of the chain's callbacks in order, run in the
-    slots.
-
-    Raises InputError: a plan that does not gate the publisher's thread, or nodes that do not end
-    with it, or repeat one. OperationError: the slots do not fit into the cycle.
-    """
-    if plan.shaping_node is not None or not publishers or publishers[-1] != plan.chain.publisher:
-        raise InputError(
-            "asynchronous LET per callback needs a plan for asynchronous publication and the"
-            " nodes of the chain, the one that publishes its output last"
-        )
-    with wrong_values_refused(Plan):
-        return _let_per_thread(plan, [Thread(node=name, role="publisher") for name in publishers])
-
-
-def _let_per_thread(plan: Plan, threads: list[Thread]) -> Plan:
-    """Publishing threads in slots at the beginning of the cycle, in reverse order of the chain.
-
-    Whatever a fast callback makes of the data of one slot, the slot of its own output is over.
+    Raises InputError: a plan that shapes nothing, topics (or gated publishers) that do not end with
+    the chain's, or repeat one. OperationError: the slots do not fit into the cycle.
     """
     publishing, length = _one_slot(plan)
-    if length * len(threads) > plan.cycle_ns:
+    last = plan.shaping_node
+    end, given = (plan.chain.publisher, publishers) if last is None else (last.output, topics)
+    if end is None or list(given[-1:]) != [end]:
+        raise InputError(
+            "LET per callback needs a plan with a shaping node and all topics of the chain, its"
+            " output last; or one for asynchronous publication and the nodes of the chain, the one"
+            " that publishes its output last"
+        )
+    if length * len(given) > plan.cycle_ns:
         raise OperationError(
-            f"{len(threads)} publish slots of {format_duration(length)} do not fit into the cycle"
+            f"{len(given)} publish slots of {format_duration(length)} do not fit into the cycle"
             f" {format_duration(plan.cycle_ns)}: use shorter slots"
         )
-    gates = []
-    for number, thread in enumerate(reversed(threads)):
-        name = f"output_{thread.node.strip('/')}" if number else "output"
-        slot = (number * length, (number + 1) * length)
-        gates.append(_publishing(name, publishing.core, slot, (thread,)))
     others = [server for server in plan.servers if server is not publishing]
     chain = with_slots(others, {server.name: ((0, plan.cycle_ns),) for server in others})
-    predicted = _after_periods(plan, len(threads), length)
-    return revised(plan, policy="let-per-callback", servers=(*chain, *gates), predicted=predicted)
+    with wrong_values_refused(Plan):
+        inside: tuple[ShapingNode, ...] = ()
+        threads = [Thread(node=name, role="publisher") for name in publishers]
+        if last is not None:
+            known = zip_longest(topics[:-1], publishers[: len(topics) - 1])
+            inside = tuple(_node_like(last, topic, publisher) for topic, publisher in known)
+            threads = [node.thread for node in (*inside, last)]
+        gates = []
+        # Backwards: whatever a fast callback makes of the data of one slot, that of its own
+        # output is over.
+        for number, thread in enumerate(reversed(threads)):
+            name = f"output_{thread.node.strip('/')}" if number else "output"
+            slot = (number * length, (number + 1) * length)
+            gates.append(_publishing(name, publishing.core, slot, (thread,)))
+        return revised(
+            plan,
+            policy="let-per-callback",
+            servers=(*chain, *gates),
+            further_shaping_nodes=inside,
+            predicted=_after_periods(plan, len(threads), length),
+        )
 
 
 def _one_slot(plan: Plan) -> tuple[Server, int]:
