@@ -1,7 +1,9 @@
 """What the planner is told of a recorded chain: the story of a graph that synchronises."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -10,8 +12,14 @@ from reference_traces import DATA
 from story import OFFSET, Callback, Publisher, Story
 
 from chainshaper.flow.plan import plan_recording, profile_chains
-from chainshaper.planning import PlanRequest, Profile, band_choice, plan_chain, plan_warnings
-from chainshaper.planning.plan import revised
+from chainshaper.planning import (
+    Plan,
+    PlanRequest,
+    Profile,
+    band_choice,
+    plan_chain,
+    plan_warnings,
+)
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording, RecordingInfo, ThreadInfo
@@ -48,7 +56,8 @@ def _graph(story: Story) -> tuple[dict[str, Callback], dict[str, Publisher]]:
     return callbacks, publishers
 
 
-def _recorded(cycles: int = 3) -> Recording:
+@cache
+def _recorded() -> Recording:
     """Response times in ms: 1, 1, 20, 31, 1 and 3 (fusion), 9, 51 minus the cycle's number."""
     story = Story()
     callbacks, publishers = _graph(story)
@@ -59,7 +68,7 @@ def _recorded(cycles: int = 3) -> Recording:
         story.runs(callbacks[name], int(start * MS), int(end * MS), reads=reads, writes=writes)
         return sent
 
-    for cycle in range(cycles):
+    for cycle in range(3):
         t = 1000 + 100 * cycle
         rear = run("throttle_rear", "throttle_rear", t, t + 1, None)
         front = run("throttle_front", "throttle_front", t + 1, t + 2, None)
@@ -69,27 +78,23 @@ def _recorded(cycles: int = 3) -> Recording:
         fused = run("fuse_front", "fusion", t + 33, t + 36, front)
         small = run("voxel", "voxel", t + 36, t + 45, fused)
         run("ndt", "ndt", t + 45, t + 96 - cycle, small)
-    cores = {1: 1, 2: 1, 3: 0, 4: 1, 5: 1, 6: 1}
+    thread: dict[str, Any] = {"comm": "node", "node": "", "role": "executor"}
+    thread |= {"policy": "SCHED_FIFO", "priority": 70}
     threads = tuple(
-        ThreadInfo(
-            tid=pid,
-            pid=pid,
-            comm="node",
-            node="",
-            role="executor",
-            policy="SCHED_FIFO",
-            priority=70,
-            cores=(core,),
-        )
-        for pid, core in cores.items()
+        ThreadInfo(tid=pid, pid=pid, cores=(0 if pid == 3 else 1,), **thread) for pid in range(1, 7)
     )
     info = RecordingInfo(source="simulated", clock_offset_ns=OFFSET, threads=threads)
     return Recording(Path("parking"), info, story.tables())
 
 
+@cache
 def _profile() -> Profile:
     (profile,) = profile_chains(_recorded(), [CHAIN])
     return profile
+
+
+def _slots_ms(plan: Plan) -> dict[str, list[tuple[int, int]]]:
+    return {server.name: [(a // MS, b // MS) for a, b in server.slots] for server in plan.servers}
 
 
 def test_branches_that_the_chain_waits_for_are_found() -> None:
@@ -123,8 +128,7 @@ def test_what_feeds_the_first_node_of_a_chain_that_no_timer_starts_is_left_out()
 
 def test_a_server_per_callback_is_the_papers_table_4_row_1() -> None:
     plan = plan_chain(_profile(), PlanRequest(policy="server-per-callback", epsilon_ns=0))
-    slots = {server.name: [(a // MS, b // MS) for a, b in server.slots] for server in plan.servers}
-    assert slots == {
+    assert _slots_ms(plan) == {
         "throttler": [(0, 2)],
         "rear_filter": [(2, 22)],
         "front_filter": [(2, 33)],
@@ -138,9 +142,8 @@ def test_a_server_per_callback_is_the_papers_table_4_row_1() -> None:
 def test_the_margin_is_every_callbacks() -> None:
     slower = replace(_profile(), period_ns=200 * MS)
     plan = plan_chain(slower, PlanRequest(policy="server-per-callback", epsilon_ns=MS // 2))
-    slots = {server.name: [(a // MS, b // MS) for a, b in server.slots] for server in plan.servers}
-    assert slots["throttler"] == [(0, 4)], "two callbacks, each rounded up to whole ms"
-    assert slots["rear_filter"] == [(4, 25)]
+    assert _slots_ms(plan)["throttler"] == [(0, 4)], "two callbacks, each rounded up to whole ms"
+    assert _slots_ms(plan)["rear_filter"] == [(4, 25)]
     with pytest.raises(OperationError, match=r"takes \d+ms, .* plan with a smaller margin"):
         plan_chain(_profile(), PlanRequest(policy="server-per-callback", epsilon_ns=2 * MS))
 
@@ -154,7 +157,7 @@ def test_shaping_opens_a_server_on_each_core_of_the_graph() -> None:
     ]
     assert [thread.node for thread in plan.servers[0].threads] == ["/front_filter"]
     apart = plan_recording(_recorded(), CHAIN, PlanRequest(epsilon_ns=2 * MS, first_slot_ns=2 * MS))
-    assert ("first", ((0, 2 * MS),)) in [(server.name, server.slots) for server in apart.servers]
+    assert _slots_ms(apart)["first"] == [(0, 2)]
 
 
 def test_a_sink_that_the_chain_waits_for_is_refused() -> None:
@@ -167,30 +170,23 @@ def test_a_sink_that_the_chain_waits_for_is_refused() -> None:
 
 
 def test_who_subscribes_to_the_output_and_is_not_in_the_chain_receives_it() -> None:
-    recording = _recorded()
-    plan = plan_recording(recording, "/rear_raw../fused")
-    assert plan.shaping_node is not None
-    assert plan.shaping_node.receivers == ("/voxel",)
-    left = plan_recording(recording, "/rear_raw../fused", PlanRequest(with_receivers=False))
-    assert left == revised(
-        plan, shaping_node=plan.shaping_node.model_copy(update={"receivers": ()})
-    )
-    whole = plan_recording(recording, CHAIN)
-    assert whole.shaping_node is not None
-    assert whole.shaping_node.receivers == (), "no node takes /pose"
+    for chain, request, receivers in (
+        ("/rear_raw../fused", PlanRequest(), ("/voxel",)),
+        ("/rear_raw../fused", PlanRequest(with_receivers=False), ()),
+        (CHAIN, PlanRequest(), ()),  # no node takes /pose
+    ):
+        node = plan_recording(_recorded(), chain, request).shaping_node
+        assert node is not None
+        assert node.receivers == receivers
 
 
 def test_asynchronous_publication_gates_the_last_nodes_thread() -> None:
-    request = PlanRequest(publication="asynchronous")
-    plan = plan_recording(_recorded(), CHAIN, request)
+    plan = plan_recording(_recorded(), CHAIN, PlanRequest(publication="asynchronous"))
     assert plan.shaping_node is None
     (thread,) = plan.servers[-1].threads
     assert (thread.node, thread.role) == ("/ndt", "publisher")
-
-
-def test_let_per_callback_has_a_node_per_topic() -> None:
     plan = plan_recording(_recorded(), CHAIN, PlanRequest(policy="let-per-callback"))
-    assert len(plan.further_shaping_nodes) == 4
+    assert len(plan.further_shaping_nodes) == 4, "a node per topic"
     assert plan.predicted.max_ns == 501 * MS
 
 
