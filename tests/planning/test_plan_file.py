@@ -293,7 +293,10 @@ def plans(draw: st.DrawFn) -> Plan:
     slots = tuple(zip(bounds[::2], bounds[1::2], strict=False))
     output, times = draw(NAMES), st.integers(0, 10**12)
     node = ShapingNode(
-        **{"name": "gate", "input": output + "_tmp", "output": output, "core": 0},
+        name="gate",
+        input=output + "_tmp",
+        output=output,
+        core=0,
         fifo_priority=draw(st.integers(1, 98)),
         spin_ns=draw(times),
         pause_ns=draw(times),

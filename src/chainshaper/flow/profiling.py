@@ -8,7 +8,7 @@ threads above them on the others, so that nothing else disturbs the chain. Threa
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 from chainshaper.analysis import data_flow, find_chain, graph_of
@@ -24,7 +24,6 @@ from chainshaper.enforcement.threads import (
 )
 from chainshaper.flow.recorded_threads import recorded_processes
 from chainshaper.linux.processes import Process
-from chainshaper.linux.runs import Journal
 from chainshaper.linux.scheduling import available_cores, check_cores, may_use_fifo
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError, PlatformError
@@ -51,10 +50,34 @@ def profiling_condition(
     governs one of the nodes, or the core; not all could be put back. And where it is called: a node
     does not appear, or the kernel refuses something.
     """
-    core = check_profiling(core)
+    core, wanted = check_profiling(core), frozenset(nodes)
     recorded = recorded_processes(like)[0] if like is not None else ()
+    begun_ns, done = time.monotonic_ns(), set[tuple[int, int]]()
+
+    def see_to_it(processes: Sequence[Process]) -> bool:
+        """Give new threads what they shall have; whether all nodes have it, and nothing was new."""
+        found = allocate(processes, recorded)
+        there = {node for one in found.threads for node in one.nodes}
+        members = executors_of(found, wanted, processes, recorded)
+        if not members or not wanted <= there:
+            if time.monotonic_ns() - begun_ns > START_NS:
+                missing, running = (", ".join(sorted(n)) for n in (wanted - there, there))
+                raise OperationError(
+                    f"{f'node {missing}' if missing else 'a node'} has not appeared within"
+                    f" {format_duration(START_NS)}; running: {running or 'no node'}"
+                )
+            return False
+        server = ReservationServer("the chain", core, 1, ())
+        around = scheduling_around({server.name: members}, [server], found, available_cores())
+        new = [one for one in around if one.thread.thread.identity not in done]
+        # One after the other, as under SCHED_FIFO in the paper: no turns.
+        changes = [(one.thread.thread, replace(one.wanted, takes_turns=False)) for one in new]
+        change_all(journal, changes)
+        done.update(thread.identity for thread, _ in changes)
+        return not new
+
     with run_claimed({core}, nodes, folder) as journal:
-        yield _Condition(frozenset(nodes), core, journal, recorded).see_to_it
+        yield see_to_it
 
 
 def check_profiling(core: int | None = None) -> int:
@@ -80,40 +103,6 @@ def chain_nodes(recording: Recording, chain: str) -> tuple[str, ...]:
     graph = graph_of(data_flow(recording.events, recording.info.clock_offset_ns))
     found = find_chain(graph, chain)
     return tuple(dict.fromkeys(graph.callbacks[number].node for number in found.callbacks))
-
-
-@dataclass
-class _Condition:
-    """What is wished for, and which threads have it already. No ``nodes``: all of them."""
-
-    nodes: frozenset[str]
-    core: int
-    journal: Journal
-    recorded: Sequence[RecordedProcess]
-    begun_ns: int = field(default_factory=time.monotonic_ns)
-    done: set[tuple[int, int]] = field(default_factory=set)
-
-    def see_to_it(self, processes: Sequence[Process]) -> bool:
-        """Give new threads what they shall have; whether all nodes have it, and nothing was new."""
-        found = allocate(processes, self.recorded)
-        there = {node for one in found.threads for node in one.nodes}
-        members = executors_of(found, self.nodes, processes, self.recorded)
-        if not members or not self.nodes <= there:
-            if time.monotonic_ns() - self.begun_ns > START_NS:
-                missing, running = (", ".join(sorted(n)) for n in (self.nodes - there, there))
-                raise OperationError(
-                    f"{f'node {missing}' if missing else 'a node'} has not appeared within"
-                    f" {format_duration(START_NS)}; running: {running or 'no node'}"
-                )
-            return False
-        server = ReservationServer("the chain", self.core, 1, ())
-        wanted = scheduling_around({server.name: members}, [server], found, available_cores())
-        new = [one for one in wanted if one.thread.thread.identity not in self.done]
-        # One after the other, as under SCHED_FIFO in the paper: no turns.
-        changes = [(one.thread.thread, replace(one.wanted, takes_turns=False)) for one in new]
-        change_all(self.journal, changes)
-        self.done.update(thread.identity for thread, _ in changes)
-        return not new
 
 
 def executors_of(

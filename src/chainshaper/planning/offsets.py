@@ -86,8 +86,11 @@ def with_offsets(
     """
     if not plans:
         raise InputError("no plans to find offsets for: give one per chain")
-    _refuse_shared_parts(plans)
     allowed: _Allowed = {}
+    for one, two in combinations(plans, 2):
+        threads = [{t for server in plan.servers for t in server.threads} for plan in (one, two)]
+        shared = {thread.node for thread in threads[0]} & {thread.node for thread in threads[1]}
+        refuse_common((_name(one), _name(two)), (one.chain.output, two.chain.output), shared)
     for j, k in combinations(range(len(plans)), 2):
         common, forbidden = _collisions(plans[j], plans[k])
         if forbidden:
@@ -328,28 +331,19 @@ def _name(plan: Plan) -> str:
     return plan.chain.spec or plan.chain.output or "a chain without a name"
 
 
-def _refuse_shared_parts(plans: Sequence[Plan]) -> None:
-    """Plans that were made one by one may not govern the same threads, or the same output."""
-    for one, two in combinations(plans, 2):
-        if one.chain.output is not None and one.chain.output == two.chain.output:
-            raise InputError(same_output(_name(one), _name(two), one.chain.output))
-        nodes = [{t.node for server in plan.servers for t in server.threads} for plan in (one, two)]
-        if shared := nodes[0] & nodes[1]:
-            raise InputError(same_nodes(_name(one), _name(two), shared))
-
-
-def same_output(one: str, two: str, topic: str) -> str:
-    """Why two chains with one output have no plan together."""
-    return (
-        f"{one} and {two} both publish {topic}, and one shaping node can hold it at one place"
-        " only: name each output once, with the chain that takes longest"
-    )
-
-
-def same_nodes(one: str, two: str, nodes: Iterable[str]) -> str:
-    """Why two chains with common nodes have no plan together."""
-    return (
-        f"{one} and {two} share {', '.join(sorted(nodes))}: a thread runs in the servers of one"
-        " plan. Plan one of the two alone or, where both begin at the same callback, the other as"
-        " its --sink"
-    )
+def refuse_common(
+    names: tuple[str, str], outputs: tuple[str | None, str | None], nodes: Iterable[str] = ()
+) -> None:
+    """Refuse to plan two chains one by one whose plans would have one output, or these nodes."""
+    one, two = names
+    if outputs[0] is not None and outputs[0] == outputs[1]:
+        raise InputError(
+            f"{one} and {two} both publish {outputs[0]}, and one shaping node can hold it at one"
+            " place only: name each output once, with the chain that takes longest"
+        )
+    if shared := sorted(nodes):
+        raise InputError(
+            f"{one} and {two} share {', '.join(shared)}: a thread runs in the servers of one plan."
+            " Plan one of the two alone or, where both begin at the same callback, the other as"
+            " its --sink"
+        )

@@ -29,7 +29,7 @@ from chainshaper.planning.margins import (
     derive_margin,
     late_share,
 )
-from chainshaper.planning.offsets import same_nodes, same_output
+from chainshaper.planning.offsets import refuse_common
 from chainshaper.planning.plan import PER_CALLBACK, Evidence, Margin, Modes, Plan, revised
 from chainshaper.planning.shaping import (
     CallbackTimes,
@@ -325,8 +325,8 @@ def _refuse_contradictions(request: PlanRequest, sinks: bool) -> None:
 def _refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: bool = False) -> None:
     """With ``sinks`` all are planned as one: the first chain, and further outputs of its graph."""
     for one, two in combinations(profiles, 2):
-        if one.topics and one.topics[-1:] == two.topics[-1:]:
-            raise InputError(same_output(one.name, two.name, one.topics[-1]))
+        outputs = [profile.topics[-1] if profile.topics else None for profile in (one, two)]
+        refuse_common((one.name, two.name), (outputs[0], outputs[1]))
     for shaped, waiting in permutations(profiles, 2):
         # The topics that come later under the plan than they were measured:
         delayed = shaped.topics if policy == "let-per-callback" else shaped.topics[-1:]
@@ -340,8 +340,8 @@ def _refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: boo
             )
     for one, two in combinations(profiles, 2):
         if not sinks:
-            if shared := set(one.core_of) & set(two.core_of):
-                raise InputError(same_nodes(one.name, two.name, shared))
+            shared = one.core_of.keys() & two.core_of.keys()
+            refuse_common((one.name, two.name), (None, None), shared)
         elif one.begins is not None and two.begins is not None and one.begins != two.begins:
             raise InputError(
                 f"{two.name} begins at {two.begins[1]}, {one.name} at another callback,"
