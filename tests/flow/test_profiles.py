@@ -1,4 +1,4 @@
-"""What the planner is told of a recorded chain: the story of a graph that synchronises."""
+"""What the planner gets of a recorded chain: the story of a graph that synchronises."""
 
 from dataclasses import replace
 from functools import cache
@@ -12,14 +12,7 @@ from reference_traces import DATA
 from story import OFFSET, Callback, Publisher, Story
 
 from chainshaper.flow.plan import plan_recording, profile_chains
-from chainshaper.planning import (
-    Plan,
-    PlanRequest,
-    Profile,
-    band_choice,
-    plan_chain,
-    plan_warnings,
-)
+from chainshaper.planning import Plan, PlanRequest, Profile, band_choice, plan_chain, plan_warnings
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording, RecordingInfo, ThreadInfo

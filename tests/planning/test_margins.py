@@ -129,13 +129,13 @@ def test_the_share_of_late_cycles_is_stated_with_the_confidence_that_it_has() ->
     latencies = random.triangular(40, 52, 65, (500, 5_600)) + (
         random.exponential(8, (500, 5_600)) * (random.random((500, 5_600)) < 0.05)
     )
-    held = 0
+    right = 0
     for run in (latencies * MS).astype(np.int64):
         before, after = run[:600], run[600:]
         covered = covered_latency(before, 0.01)
         assert late_share(before, covered) < 0.01
-        held += np.mean(after > covered) <= 0.01
-    assert 0.95 <= held / 500 < 1
+        right += np.mean(after > covered) <= 0.01
+    assert 0.95 <= right / 500 < 1
 
 
 @pytest.mark.parametrize(

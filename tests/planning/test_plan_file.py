@@ -335,10 +335,7 @@ def plans(draw: st.DrawFn) -> Plan:
         anchor=draw(st.sampled_from(["stamp", "cycle"])),
         overrun=draw(st.sampled_from(["wait", "discard", "publish"])),
         fallback=draw(st.sampled_from(["bypass", "silence"])),
-        servers=(
-            chain,
-            Server(name=name, core=0, priority=1, slots=slots, threads=(node.thread,)),
-        ),
+        servers=(chain, Server(name=name, core=0, priority=1, slots=slots, threads=(node.thread,))),
         shaping_node=node,
         modes=draw(optional(modes(len(slots)))),
         predicted=Prediction(mean_ns=1, max_ns=high, jitter_ns=0, shares=draw(SHARES)),

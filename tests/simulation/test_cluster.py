@@ -131,7 +131,7 @@ def test_where_no_scheduler_answers_the_address_is_named(
 ) -> None:
     monkeypatch.setattr(sweeping, "CONNECT_S", 1)
     with socket.socket() as reserved:
-        reserved.bind(("127.0.0.1", 0))  # nobody listens there
+        reserved.bind(("127.0.0.1", 0))  # nothing listens there
         address = f"tcp://127.0.0.1:{reserved.getsockname()[1]}"
         with pytest.raises(OperationError, match=f"no Dask scheduler answers at {address}"):
             swept(tmp_path / "out.parquet", scheduler=address)

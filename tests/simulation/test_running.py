@@ -91,7 +91,7 @@ def test_a_sweep_that_was_ended_goes_on_with_what_is_missing(tmp_path: Path) -> 
     first = json.loads(rows.read_text().splitlines()[1])
     assert first["number"] == 0
     marked = rows.read_text().replace(f'"mean_ns": {first["row"]["mean_ns"]}', '"mean_ns": 1', 1)
-    rows.write_text(marked)  # nobody computes this one again
+    rows.write_text(marked)  # so it was not computed again
     shares: list[float] = []
     frame = swept(output, progress=lambda share, _: shares.append(share))
     assert shares == [0.5, 0.75, 1.0]
@@ -114,11 +114,11 @@ def test_rows_of_another_sweep_are_not_mixed_in(
 ) -> None:
     output = tmp_path / "out.parquet"
     rows = _first_rows(output, 1)
-    kept = rows.read_bytes()
+    before = rows.read_bytes()
     with pytest.raises(InputError, match=said) as refused:
         swept(output, **wishes)
     assert "has 1 finished rows of another sweep" in str(refused.value)
-    assert rows.read_bytes() == kept
+    assert rows.read_bytes() == before
     assert not output.exists()
 
 
@@ -146,7 +146,7 @@ def test_nothing_is_overwritten_and_nothing_begun_that_cannot_be_written(tmp_pat
 
 
 def test_a_full_disk_is_named(full_disk: Path) -> None:
-    with pytest.raises(OperationError, match="finished rows cannot be kept"):
+    with pytest.raises(OperationError, match="finished rows cannot be written"):
         swept(full_disk / "out.parquet")
 
 

@@ -31,10 +31,7 @@ def lost_events(info: RecordingInfo) -> str:
 
 
 def list_chains(
-    source: Recording | DataFlow,
-    start: str | None = None,
-    end: str | None = None,
-    limit: int = 100,
+    source: Recording | DataFlow, start: str | None = None, end: str | None = None, limit: int = 100
 ) -> ChainEnumeration:
     """The chains of a recording, the heaviest by mean response times among them, as
     :func:`~chainshaper.analysis.chains.enumerate_chains` gives them.
@@ -79,7 +76,7 @@ def convert_recording(recording: Recording | str | Path, output: str | Path) -> 
 
 
 def with_trace_events(recording: Recording) -> RecordingInfo:
-    """A trace's description with the events it had, and a note about those that are not kept."""
+    """A trace's description with the events it had, and a note about those that are left out."""
     info = recording.info
     if info.source != "lttng" or info.trace_events:
         return info

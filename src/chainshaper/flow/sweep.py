@@ -408,7 +408,7 @@ def _interfered(described: dict[str, Any], period_ns: int, longest_ns: int) -> d
     """The description with a load beside the chain, as in section 2.5.
 
     Once a period, for between half the time and all of it, at the lowest priority on the
-    executors' core. A node of that name that is described keeps everything else that it has.
+    executors' core. A node of that name that is described has everything else as described.
     """
     own = described["nodes"].get(INTERFERENCE, {})
     first, *others = own.get("callbacks", [{"timer": format_duration(period_ns)}])
@@ -689,7 +689,7 @@ def _cluster(address: str) -> Iterator[_Engine]:
         except Exception as error:
             raise OperationError(
                 f"the Dask cluster at {address} failed ({type(error).__name__}: {error}); finished"
-                " rows are kept. See that its workers run, that chainshaper is installed on each,"
+                " rows stay. See that its workers run, that chainshaper is installed on each,"
                 " and that they have memory; then the same command goes on"
             ) from error
 
@@ -759,7 +759,7 @@ def finished_rows(
                     path.unlink()
     except OSError as error:
         raise OperationError(
-            f"{path}: finished rows cannot be kept ({error.strerror or error}); what is in it"
+            f"{path}: finished rows cannot be written ({error.strerror or error}); what is in it"
             " stays, and the same command goes on from there"
         ) from error
 

@@ -4,12 +4,7 @@ Everything starts with :func:`plan_shaping`; each further step takes a plan and 
 :func:`plan_chain` takes all of them that a :class:`PlanRequest` asks for.
 """
 
-from chainshaper.planning.bands import (
-    BandChoice,
-    choose_bands,
-    with_bands,
-    with_long_slot,
-)
+from chainshaper.planning.bands import BandChoice, choose_bands, with_bands, with_long_slot
 from chainshaper.planning.margins import read_latencies
 from chainshaper.planning.offsets import place_chains
 from chainshaper.planning.overruns import plan_warnings

@@ -443,9 +443,9 @@ def _smallest_gap(problem: BandProblem, found: Placement, mean_at_most_ns: int |
 def _why_none(problem: BandProblem, bands: int) -> str:
     """Which constraint leaves no placement: the one without which there is one."""
     reasons = {
-        ("max_share",): f"no placement keeps every band at {problem.max_share or 1:.1%} of the"
+        ("max_share",): f"no placement has every band at {problem.max_share or 1:.1%} of the"
         " executions; allow a larger share or more bands",
-        ("max_gap_ns",): "no placement keeps neighbours within"
+        ("max_gap_ns",): "no placement has neighbours within"
         f" {format_duration(problem.max_gap_ns or 0)}; allow a larger gap",
         ("max_share", "max_gap_ns"): "the largest gap and the largest share exclude each other;"
         " relax one",

@@ -275,7 +275,7 @@ def _about_evidence(plan: Plan) -> Iterator[str]:
         )
     if NEARLY_FULL * cycle < longest < cycle:
         yield (
-            "a cycle as long as the longest measured keeps its core busy for more than"
+            "a cycle as long as the longest measured has its core busy for more than"
             f" {NEARLY_FULL:.0%}, where the kernel throttles real-time threads"
             " (/proc/sys/kernel/sched_rt_runtime_us)."
         )
