@@ -49,6 +49,14 @@ def test_a_point_is_what_simulate_plan_simulate_give(tmp_path: Path) -> None:
         assert ours["jitter_ns"] == held.jitter_ns
 
 
+def test_a_share_of_late_cycles_is_judged_by_all_cycles_of_the_profile() -> None:
+    """Not by the hundred that are recorded for the application's structure."""
+    axes = {"overrun_probability": (0.01,), "policy": ("shaped",)}
+    few, many = (_rows(quick_chain(VARYING), axes, cycles=cycles)[0] for cycles in (200, 300))
+    assert "200 cycles are too few for an overrun probability of 0.01" in few["error"]
+    assert many["error"] is None
+
+
 def test_constant_times_by_hand() -> None:
     """2 ms and 2 ms: L̄ = 4 ms; with ε = 1 ms the slot is [5 ms, 6 ms), left at its start."""
     (row,) = _rows(quick_chain(), {"epsilon": ("1ms",)})

@@ -454,7 +454,8 @@ def profile_at(grid: Grid, values: Values, progress: Progress | None = None) -> 
         return str(error)
     complete = latencies[latencies >= 0]
     lost = int(latencies.size - complete.size)
-    return dataclasses.replace(profile, latencies_ns=complete, incomplete=lost, recording=None)
+    profile = dataclasses.replace(profile, latencies_ns=complete, every_latency_ns=complete)
+    return dataclasses.replace(profile, incomplete=lost, recording=None)
 
 
 def _urgent(application: Application) -> Application:
