@@ -109,14 +109,20 @@ def test_branches_that_the_chain_waits_for_are_found() -> None:
     assert profile.latencies_ns.tolist() == [(96 - cycle) * MS - 1 for cycle in range(3)]
 
 
-def test_what_feeds_the_first_node_of_a_chain_that_no_timer_starts_is_left_out() -> None:
+def test_a_chain_that_no_timer_starts_needs_its_period_and_leaves_out_what_feeds_it() -> None:
     """The throttler feeds the rear filter, and the front filter's branch is followed so far."""
-    (profile,) = profile_chains(_recorded(), ["/rear_filtered../fused../pose"], period_ns=100 * MS)
+    chain = "/rear_filtered../fused../pose"
+    with pytest.raises(InputError, match=r"starts are 100ms apart, mostly\): add --period"):
+        profile_chains(_recorded(), [chain])
+    (profile,) = profile_chains(_recorded(), [chain], period_ns=100 * MS)
+    assert profile.period_ns == 100 * MS
     assert [callback.node for callback in profile.callbacks] == [
         *("/rear_filter", "/front_filter", "/fusion", "/voxel", "/ndt")
     ]
     assert [callback.after for callback in profile.callbacks] == [(), (), (0, 1), (2,), (3,)]
     assert "/throttler" not in profile.core_of
+    with pytest.raises(InputError, match="--period goes with --latencies, or with a chain"):
+        profile_chains(_recorded(), [CHAIN], period_ns=50 * MS)
 
 
 def test_a_server_per_callback_is_the_papers_table_4_row_1() -> None:
@@ -130,9 +136,7 @@ def test_a_server_per_callback_is_the_papers_table_4_row_1() -> None:
         "ndt": [(46, 97)],
     }
     assert {server.name: server.core for server in plan.servers}["front_filter"] == 0
-
-
-def test_the_margin_is_every_callbacks() -> None:
+    # The margin is every callback's.
     slower = replace(_profile(), period_ns=200 * MS)
     plan = plan_chain(slower, PlanRequest(policy="server-per-callback", epsilon_ns=MS // 2))
     assert _slots_ms(plan)["throttler"] == [(0, 4)], "two callbacks, each rounded up to whole ms"
@@ -183,15 +187,6 @@ def test_asynchronous_publication_gates_the_last_nodes_thread() -> None:
     assert plan.predicted.max_ns == 501 * MS
 
 
-def test_a_chain_that_no_timer_starts_needs_its_period() -> None:
-    with pytest.raises(InputError, match=r"starts are 100ms apart, mostly\): add --period"):
-        profile_chains(_recorded(), ["/rear_filtered../fused../pose"])
-    given = profile_chains(_recorded(), ["/rear_filtered../fused../pose"], period_ns=100 * MS)
-    assert given[0].period_ns == 100 * MS
-    with pytest.raises(InputError, match="--period goes with --latencies, or with a chain"):
-        profile_chains(_recorded(), [CHAIN], period_ns=50 * MS)
-
-
 def _stalled(*times_ms: int) -> Recording:
     recording = _recorded()
     stalls = pl.DataFrame(
@@ -227,6 +222,12 @@ def test_a_stall_longer_than_the_cycle_is_not_covered_where_all_cycles_are_distu
     assert plan.evidence.max_latency_ns == 20_298_000
     assert plan.evidence.max_of_all_ns == 160 * MS
     assert band_choice(plan, profile, PlanRequest(bands="auto")).chosen.mean_ns > 0
+    # Where a policy has slots of its own, a latency may exceed the cycle; else it is refused.
+    own = replace(profile, callbacks=_profile().callbacks, topics=("/t",))
+    per_callback = plan_chain(own, PlanRequest(policy="server-per-callback", epsilon_ns=0))
+    assert per_callback.evidence.max_latency_ns == 160 * MS
+    with pytest.raises(OperationError, match="do not fit into the cycle"):
+        plan_chain(replace(profile, latencies_ns=latencies * 10), PlanRequest())
 
 
 def test_executions_that_span_cycles_can_be_planned_callback_by_callback() -> None:

@@ -204,9 +204,11 @@ def _covered(profile: Profile, request: PlanRequest) -> Profile:
             " --ideal-machine, or record again on a calmer one"
         )
     share = request.overrun_probability or OVERRUN_PROBABILITY
+    latest = None if request.policy in OWN_SLOTS else _latest(profile, request)
     every = profile.every
-    covered = covered_latency(every, share, _latest(profile, request))
-    return replace(profile, latencies_ns=every[every <= covered], every_latency_ns=every)
+    covered = every[every <= covered_latency(every, share, latest)]
+    latencies = covered if covered.size > 1 else every  # none fits, which the planner refuses
+    return replace(profile, latencies_ns=latencies, every_latency_ns=every)
 
 
 def _latest(profile: Profile, request: PlanRequest) -> int:
