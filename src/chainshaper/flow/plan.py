@@ -147,54 +147,50 @@ _Key = tuple[tuple[int, ...], str]
 def _stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
     """The chain and the branches it waits for, along the graph; the chain's last stands last."""
     outside = _feeding(graph, chain)
-    planned = [callback for callback in graph.callbacks if callback.node not in outside]
-    needs: dict[_Key, set[_Key]] = {}
+    along: list[_Key] = []
+    before: dict[int, list[_Key]] = {}  # of the chain's callbacks
     of_chain: dict[int, _Key] = {}
+    for number, topic in zip(chain.callbacks, chain.topics, strict=True):
+        members = _inputs(graph, graph.callbacks[number], topic) if along else (number,)
+        before[number] = along[-1:]
+        along.append((members, topic))
+        of_chain.update(dict.fromkeys(members, along[-1]))
+    needs: dict[_Key, set[_Key]] = {}
 
-    def writers_of(number: int, above: set[_Key]) -> set[_Key]:
-        """The stages that publish what a callback reads; new ones are added to ``needs``."""
-        topic, found = graph.callbacks[number].topic, set()
-        for writer in planned:
-            if topic is None or topic not in writer.publishes:
-                continue
-            key = of_chain.get(writer.id) or (_inputs(graph, writer, topic), topic)
-            if key in above:  # a loop in the graph: what feeds back comes from a cycle before
-                continue
-            found.add(key)
-            if key not in needs:
-                needs[key] = set()
-                for member in key[0]:
-                    needs[key] |= writers_of(member, above | {key})
-        return found
+    def writers_of(topic: str | None) -> list[_Key]:
+        return [
+            of_chain.get(writer.id) or (_inputs(graph, writer, topic), topic)
+            for writer in graph.callbacks
+            if topic is not None and topic in writer.publishes and writer.node not in outside
+        ]
 
-    previous: _Key | None = None
-    for place, (number, topic) in enumerate(zip(chain.callbacks, chain.topics, strict=True)):
-        key = (_inputs(graph, graph.callbacks[number], topic) if place else (number,), topic)
-        needs[key] = set() if previous is None else {previous}
-        of_chain.update(dict.fromkeys(key[0], key))
-        previous = key
-    along = list(needs)
-    for place, key in enumerate(along):
+    def follow(key: _Key, above: set[_Key]) -> None:
+        needs[key] = set()
         for number in key[0]:
-            if number not in chain.callbacks:
-                # What comes from further down the chain feeds back, from a cycle before.
-                needs[key] |= writers_of(number, {*along[place:]})
+            on_chain = key in along and number in before
+            read = graph.callbacks[number].topic
+            for one in before[number] if on_chain else writers_of(read):
+                if one not in above:  # what feeds back comes from a cycle before
+                    needs[key].add(one)
+                    if one not in needs:
+                        follow(one, above | {one})
+
+    follow(along[-1], {along[-1]})
     level: dict[_Key, int] = {}
 
     def level_of(key: _Key) -> int:
         if key not in level:
             level[key] = 0  # ends a loop
-            level[key] = 1 + max((level_of(before) for before in needs[key]), default=-1)
+            level[key] = 1 + max((level_of(one) for one in needs[key]), default=-1)
         return level[key]
 
-    in_chain = set(of_chain.values())
-    order = sorted(needs, key=lambda key: (level_of(key), key not in in_chain))
+    order = sorted(needs, key=lambda key: (level_of(key), key not in along, key))
     return [
         _Stage(
             node=graph.callbacks[members[0]].node,
             topic=topic,
             members=members,
-            after=tuple(sorted(order.index(before) for before in needs[members, topic])),
+            after=tuple(sorted(order.index(one) for one in needs[members, topic])),
         )
         for members, topic in order
     ]
