@@ -20,14 +20,8 @@ from chainshaper.values.recording import (
     Recording,
     RecordingInfo,
     event_counts,
-    lost_text,
     write_recording,
 )
-
-
-def lost_events(info: RecordingInfo) -> str:
-    """What was lost while recording, in words for below a table; "nothing" is said as well."""
-    return lost_text(info.lost)
 
 
 def list_chains(
