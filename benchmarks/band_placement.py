@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from chainshaper.planning.bands import (
     BandProblem,
     Placement,
-    band_problem,
     place_bands,
     place_by_swarm,
 )
@@ -51,7 +50,7 @@ def _latencies(size: int, seed: int) -> NDArray[np.int64]:
 
 
 def _problem(size: int, seed: int) -> BandProblem:
-    return band_problem(_latencies(size, seed), 87 * MS)
+    return BandProblem(_latencies(size, seed), 87 * MS)
 
 
 def _fastest(place: Callable[[], Placement]) -> tuple[float, Placement]:
@@ -80,7 +79,7 @@ def _race(instances: int) -> None:
     exact_total = swarm_total = 0.0
     excess = []
     for seed in range(instances):
-        problem = band_problem(
+        problem = BandProblem(
             _latencies(generator.choice([20, 100, 500]), seed),
             87 * MS,
             publish_slot_ns=generator.choice([MS // 4, MS, 3 * MS]),

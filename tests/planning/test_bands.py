@@ -3,10 +3,9 @@
 import itertools
 import math
 import random
-from dataclasses import dataclass, replace
-from importlib.util import find_spec
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -14,11 +13,9 @@ import pytest
 from chainshaper.planning.bands import (
     BandProblem,
     Placement,
-    band_problem,
     broken_constraint,
     choose_bands,
     counts_and_mean,
-    enough_bands,
     place_bands,
     place_by_swarm,
     place_randomly,
@@ -26,18 +23,16 @@ from chainshaper.planning.bands import (
     with_bands,
     with_long_slot,
 )
-from chainshaper.planning.baselines import server_per_chain
 from chainshaper.planning.plan import Plan, publish_slots
-from chainshaper.planning.shaping import plan_shaping
+from chainshaper.planning.shaping import plan_shaping, server_per_chain
 from chainshaper.values.errors import InputError, OperationError
-from chainshaper.values.plan_choices import Goal, Solver
+from chainshaper.values.plan_choices import Goal
 
 MS = 1_000_000
 LATENCIES = (np.random.default_rng(3).triangular(33, 68, 85, 2000) * MS).astype(np.int64)
 
 
-@dataclass(frozen=True)
-class Tried:
+class Tried(NamedTuple):
     """One placement that keeps every constraint, judged without the code under test."""
 
     ends: tuple[int, ...]
@@ -49,15 +44,12 @@ class Tried:
 def every_placement(problem: BandProblem, bands: int) -> list[Tried]:
     """All placements on the grid, straight from the text of sections 3.3 and 4.1."""
     sample = problem.latencies_ns.tolist()
-    grid, slot, last = problem.grid_ns, problem.publish_slot_ns, problem.last_end_ns
-    instants = range(0, last, grid)
+    slot, last = problem.publish_slot_ns, problem.last_end_ns
     found = []
-    for first_ends in itertools.combinations(instants, bands - 1):
+    for first_ends in itertools.combinations(range(0, last, problem.grid_ns), bands - 1):
         ends = (*first_ends, last)
-        if bands > 1 and not ends[0] - slot > min(sample):
-            continue
         gaps = [after - before for before, after in itertools.pairwise(ends)]
-        if any(not gap > slot for gap in gaps):
+        if any(not gap > slot for gap in gaps) or (bands > 1 and not ends[0] - slot > min(sample)):
             continue
         if problem.max_gap_ns is not None and any(gap > problem.max_gap_ns for gap in gaps):
             continue
@@ -72,36 +64,26 @@ def every_placement(problem: BandProblem, bands: int) -> list[Tried]:
 
 def random_problem(random: random.Random) -> tuple[BandProblem, int]:
     """A small problem; slots, gaps and caps are tight as often as not."""
-    span = random.randint(2, 18)
-    low = random.randint(0, 6)
-    size = random.randint(2, 10)
+    span, low, size = random.randint(2, 18), random.randint(0, 6), random.randint(2, 10)
     sample = [low + random.randint(0, span) for _ in range(size)]
     if random.random() < 0.3:  # few distinct values: plateaus and jumps of the distribution
         sample = [low + random.choice([0, span // 2, span]) for _ in range(size)]
     slot = random.choice([1, 1, 2, 3, random.randint(1, 8)])
-    last = max(sample) + random.randint(0, 3) + slot
-    max_gap = None
+    limits: dict[str, Any] = {}
     if random.random() < 0.6:
-        max_gap = slot + random.choice([1, 1, 2, 3, random.randint(1, 12)])
-    max_share = None
+        limits["max_gap_ns"] = slot + random.choice([1, 1, 2, 3, random.randint(1, 12)])
     if random.random() < 0.4:
-        max_share = random.choice([0.2, 0.25, 1 / 3, 0.5, 0.6, 0.75, random.uniform(0.1, 1)])
-    problem = band_problem(
-        np.array(sample),
-        last,
-        publish_slot_ns=slot,
-        grid_ns=random.choice([1, 1, 1, 2, 3]),
-        max_gap_ns=max_gap,
-        max_share=max_share,
-    )
-    return problem, random.randint(1, 5)
+        shares = [0.2, 0.25, 1 / 3, 0.5, 0.6, 0.75, random.uniform(0.1, 1)]
+        limits["max_share"] = random.choice(shares)
+    last, grid = max(sample) + random.randint(0, 3) + slot, random.choice([1, 1, 1, 2, 3])
+    return BandProblem(np.array(sample), last, slot, grid, **limits), random.randint(1, 5)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_optimum_is_that_of_trying_everything(seed: int) -> None:
     generator = random.Random(seed)
     feasible = tight = 0
-    for _ in range(1000):
+    for _ in range(900):
         problem, bands = random_problem(generator)
         tried = every_placement(problem, bands)
         size = problem.latencies_ns.size
@@ -111,44 +93,28 @@ def test_the_optimum_is_that_of_trying_everything(seed: int) -> None:
             continue
         feasible += 1
         tight += len(tried) < 4
+        by_ends = {one.ends: one for one in tried}
         placement = place_bands(problem, bands)
         least = min(one.total for one in tried)
         assert placement.mean_ns == least / size
-        assert placement.slot_ends_ns in {one.ends for one in tried}
         assert broken_constraint(problem, placement.slot_ends_ns) is None
         assert counts_and_mean(problem.latencies_ns, placement.slot_ends_ns)[1] == placement.mean_ns
         best_jitter = min(one.jitter for one in tried if one.total == least)
-        found = next(one for one in tried if one.ends == placement.slot_ends_ns)
-        assert found.jitter == best_jitter
-    assert feasible > 350
-    assert tight > 50
+        assert by_ends[placement.slot_ends_ns].jitter == best_jitter
 
-
-@pytest.mark.parametrize("seed", range(2))
-def test_other_goals_are_reached_as_well_as_by_trying_everything(seed: int) -> None:
-    generator = random.Random(100 + seed)
-    compared = 0
-    while compared < 300:
-        problem, bands = random_problem(generator)
-        tried = every_placement(problem, bands)
-        if not tried:
-            continue
-        size = problem.latencies_ns.size
-        least = math.ceil(min(one.total for one in tried) / size)
-        mean = least + generator.choice([0, 1, 1, 2, 5])
-        allowed = [one for one in tried if one.total <= mean * size]
-        placement = place_bands(problem, bands, minimise="jitter", mean_at_most_ns=mean)
-        found = next(one for one in allowed if one.ends == placement.slot_ends_ns)
-        assert found.jitter == min(one.jitter for one in allowed)
-        placement = place_bands(problem, bands, minimise="gap", mean_at_most_ns=mean)
-        found = next(one for one in allowed if one.ends == placement.slot_ends_ns)
-        assert found.gap == min(one.gap for one in allowed)
-        compared += 1
+        mean = math.ceil(least / size) + generator.choice([0, 1, 1, 2, 5])
+        allowed = {one.ends: one for one in tried if one.total <= mean * size}
+        calm = place_bands(problem, bands, minimise="jitter", mean_at_most_ns=mean)
+        assert allowed[calm.slot_ends_ns].jitter == min(one.jitter for one in allowed.values())
+        close = place_bands(problem, bands, minimise="gap", mean_at_most_ns=mean)
+        assert allowed[close.slot_ends_ns].gap == min(one.gap for one in allowed.values())
+    assert feasible > 320
+    assert tight > 45
 
 
 def test_the_curve_is_every_number_of_bands_at_once() -> None:
     generator = random.Random(7)
-    for _ in range(200):
+    for _ in range(150):
         problem, _ = random_problem(generator)
         alone = []
         for bands in range(1, 6):
@@ -168,28 +134,18 @@ def test_a_placement_worked_out_by_hand() -> None:
     # Half of the executions take 10 ms, half 50 ms. With Δ = 1 ms the first slot is best right
     # behind the shorter ones: it must begin after 10 ms, so it ends 1 µs after 11 ms.
     latencies = np.array([10, 10, 50, 50]) * MS
-    placement = place_bands(band_problem(latencies, 52 * MS), 2)
-    assert placement.slot_ends_ns == (11_001_000, 52 * MS)
-    assert placement.mean_ns == (11_001_000 + 52 * MS) / 2
+    placement = place_bands(BandProblem(latencies, 52 * MS), 2)
+    assert placement == Placement((11_001_000, 52 * MS), (11_001_000 + 52 * MS) / 2)
     # With neighbours at most 30 ms apart the first moves to 22 ms, far from any sample; a third
     # one lies between them, as early as the gap of the last allows.
-    close = band_problem(latencies, 52 * MS, max_gap_ns=30 * MS)
+    close = BandProblem(latencies, 52 * MS, max_gap_ns=30 * MS)
     assert place_bands(close, 2).slot_ends_ns == (22 * MS, 52 * MS)
     assert place_bands(close, 3).slot_ends_ns[0] == 11_001_000
+    equal = BandProblem(np.array([50, 50]) * MS, 52 * MS)
+    assert place_bands(equal, 1).slot_ends_ns == (52 * MS,)
 
 
-def test_a_cap_on_the_share_moves_bands_together() -> None:
-    latencies = np.arange(1, 101) * MS
-    placement = place_bands(band_problem(latencies, 101 * MS, grid_ns=MS, max_share=0.4), 3)
-    shares = np.diff(np.searchsorted(latencies, placement.slot_ends_ns, side="right"), prepend=0)
-    assert max(shares) <= 40
-
-
-def test_equal_latencies_leave_no_earlier_slot() -> None:
-    problem = band_problem(np.array([50, 50]) * MS, 52 * MS)
-    assert place_bands(problem, 1).slot_ends_ns == (52 * MS,)
-    with pytest.raises(InputError, match="room for 1 publish slots of 1ms"):
-        place_bands(problem, 3)
+EVEN = np.linspace(10 * MS, 50 * MS, 100).astype(np.int64)
 
 
 @pytest.mark.parametrize(
@@ -203,18 +159,19 @@ def test_equal_latencies_leave_no_earlier_slot() -> None:
     ],
 )
 def test_the_binding_constraint_is_named(limits: dict[str, Any], bands: int, words: str) -> None:
-    latencies = np.linspace(10 * MS, 50 * MS, 100).astype(np.int64)
-    problem = replace(band_problem(latencies, 52 * MS), **limits)
     with pytest.raises(OperationError, match=words):
-        place_bands(problem, bands)
+        place_bands(BandProblem(EVEN, 52 * MS, **limits), bands)
 
 
-def test_an_average_out_of_reach_is_said() -> None:
-    problem = band_problem(np.array([10, 20, 30]) * MS, 32 * MS, grid_ns=MS)
-    goals: list[Goal] = ["mean", "jitter", "gap"]
-    for goal in goals:
-        with pytest.raises(OperationError, match="the best is 24ms"):
-            place_bands(problem, 2, minimise=goal, mean_at_most_ns=20 * MS)
+THREE = np.array([10, 20, 30]) * MS
+
+
+@pytest.mark.parametrize("goal", ["mean", "jitter", "gap"])
+def test_an_average_out_of_reach_is_said(goal: Goal) -> None:
+    with pytest.raises(OperationError, match="the best is 24ms"):
+        place_bands(
+            BandProblem(THREE, 32 * MS, grid_ns=MS), 2, minimise=goal, mean_at_most_ns=20 * MS
+        )
 
 
 @pytest.mark.parametrize(
@@ -230,88 +187,69 @@ def test_an_average_out_of_reach_is_said() -> None:
     ],
 )
 def test_senseless_problems_are_refused(wrong: dict[str, Any], words: str) -> None:
-    values = {"last_end_ns": 32 * MS, **wrong}
     with pytest.raises(InputError, match=words):
-        band_problem(np.array([10, 20, 30]) * MS, **values)
+        BandProblem(THREE, **{"last_end_ns": 32 * MS, **wrong})
 
 
 def test_senseless_requests_are_refused() -> None:
-    problem = band_problem(np.array([10, 20, 30]) * MS, 32 * MS)
-    with pytest.raises(InputError, match="one band at least"):
-        place_bands(problem, 0)
-    for more_than_fit in (22, 10**9):  # 22 ms for slots of 1 ms that are more than 1 ms apart
-        with pytest.raises(InputError, match="room for 21 publish slots"):
-            place_bands(problem, more_than_fit)
+    problem = BandProblem(THREE, 32 * MS)
+    for place in (place_bands, place_by_swarm, place_randomly):
+        with pytest.raises(InputError, match="one band at least"):
+            place(problem, 0)
+        for more_than_fit in (22, 10**9):  # 22 ms for slots of 1 ms that are more than 1 ms apart
+            with pytest.raises(InputError, match="room for 21 publish slots"):
+                place(problem, more_than_fit)
+        assert place(problem, 1).slot_ends_ns == (32 * MS,)
     with pytest.raises(InputError, match="which average"):
         place_bands(problem, 2, minimise="jitter")
     with pytest.raises(InputError, match="coarser than 1ns"):
         place_bands(replace(problem, grid_ns=1, last_end_ns=2000 * MS), 2)
 
 
-def test_bands_are_enough_when_another_gains_little() -> None:
-    latencies = np.linspace(30 * MS, 60 * MS, 301).astype(np.int64)
-    curve = placement_curve(band_problem(latencies, 62 * MS), 12)
-    means = [placement.mean_ns for placement in curve]
-    assert means == sorted(means, reverse=True)
-    chosen = enough_bands(curve, least_gain=0.02)
-    bands = len(chosen.slot_ends_ns)
-    gains = [(before - after) / before for before, after in itertools.pairwise(means)]
-    assert all(gain >= 0.02 for gain in gains[: bands - 1])
-    assert gains[bands - 1] < 0.02
-    assert enough_bands(curve, least_gain=0) == curve[-1]
-
-
 def _plan() -> Plan:
     return plan_shaping(LATENCIES, 100 * MS, output="/t5", publisher="/n5", nodes=["/n5"])
+
+
+def test_bands_are_enough_when_another_gains_little() -> None:
+    choice = choose_bands(_plan(), LATENCIES)
+    means = [placement.mean_ns for placement in choice.curve]
+    bands = len(choice.chosen.slot_ends_ns)
+    gains = [(before - after) / before for before, after in itertools.pairwise(means)]
+    assert all(gain >= 0.02 for gain in gains[: bands - 1])
+    assert 0 <= gains[bands - 1] < 0.02
+    assert f"stopped at {bands}: another band would lower" in choice.reason
+    assert len(publish_slots(with_bands(_plan(), LATENCIES, "auto"))) == bands
+    every = choose_bands(_plan(), LATENCIES, least_gain=1e-9)
+    assert (every.chosen, every.reason) == (
+        every.curve[-1],
+        "stopped at 12: more bands are not tried",
+    )
 
 
 def test_bands_replace_the_publish_slot_and_nothing_else() -> None:
     plan = _plan()
     banded = with_bands(plan, LATENCIES, 3)
-    assert len(publish_slots(banded)) == 3
-    assert publish_slots(banded)[-1] == publish_slots(plan)[-1]
+    slots = publish_slots(banded)
+    assert len(slots) == 3
+    assert slots[-1:] == publish_slots(plan)
     assert banded.servers[0] == plan.servers[0]
     assert banded.predicted.max_ns == plan.predicted.max_ns
     assert banded.predicted.mean_ns < plan.predicted.mean_ns
     assert sum(banded.predicted.shares) == pytest.approx(1)
-    first, last = publish_slots(banded)[0], publish_slots(banded)[-1]
-    assert banded.predicted.jitter_ns == last[1] - first[0]
+    assert banded.predicted.jitter_ns == slots[-1][1] - slots[0][0]
     unchanged = {"servers", "predicted"}
     assert banded.model_dump(exclude=unchanged) == plan.model_dump(exclude=unchanged)
-
-
-def test_solvers_agree_in_order() -> None:
-    if find_spec("pyswarms") is None:
-        pytest.skip("pyswarms is not installed")
-    solvers: list[Solver] = ["exact", "pso", "random"]
-    exact, swarm, drawn = (
-        with_bands(_plan(), LATENCIES, 4, solver=solver, seed=1).predicted.mean_ns
-        for solver in solvers
-    )
-    assert exact <= swarm <= drawn
-
-
-def test_auto_takes_a_number_of_bands_from_the_curve() -> None:
-    curve = choose_bands(_plan(), LATENCIES).curve
-    auto = with_bands(_plan(), LATENCIES, "auto")
-    bands = len(publish_slots(auto))
-    assert 2 <= bands <= 6
-    assert auto.predicted.mean_ns == round(curve[bands - 1].mean_ns)
 
 
 def test_goals_and_limits_reach_the_placement() -> None:
     ends = [end for _, end in publish_slots(with_bands(_plan(), LATENCIES, 4, max_gap_ns=5 * MS))]
     assert max(np.diff(ends)) <= 5 * MS
-    shared = with_bands(_plan(), LATENCIES, 4, max_share=0.3)
-    assert max(shared.predicted.shares) <= 0.3
+    assert max(with_bands(_plan(), LATENCIES, 4, max_share=0.3).predicted.shares) <= 0.3
     least = with_bands(_plan(), LATENCIES, 3).predicted
-    calm = with_bands(
-        _plan(), LATENCIES, 3, minimise="jitter", mean_at_most_ns=least.mean_ns + 2 * MS
-    ).predicted
+    goal: dict[str, Any] = {"minimise": "jitter", "mean_at_most_ns": least.mean_ns + 2 * MS}
+    calm = with_bands(_plan(), LATENCIES, 3, **goal).predicted
     assert calm.jitter_ns < least.jitter_ns
     assert calm.mean_ns <= least.mean_ns + 2 * MS
-    with pytest.raises(OperationError, match=r"30\.0% of the executions"):
-        with_bands(_plan(), LATENCIES, 3, max_share=0.3)
     with pytest.raises(InputError, match="needs the exact solver"):
         with_bands(_plan(), LATENCIES, 3, solver="pso", mean_at_most_ns=80 * MS)
     with pytest.raises(InputError, match="only the exact solver"):
@@ -329,84 +267,55 @@ def test_one_long_slot_trades_jitter_for_the_average() -> None:
     for start in (-1, 86 * MS + 1):
         with pytest.raises(InputError, match="may start from 0ms to 86ms"):
             with_long_slot(plan, latencies, start)
-
-
-def test_a_plan_without_publish_slot_has_no_bands() -> None:
-    bare = server_per_chain(_plan())
     with pytest.raises(InputError, match="server-per-chain has no publish slot"):
-        with_bands(bare, LATENCIES, 2)
-    with pytest.raises(InputError, match="no publish slot"):
-        with_long_slot(bare, LATENCIES, 0)
+        with_bands(server_per_chain(plan), latencies, 2)
 
 
-def _problem(seed: int, **limits: float) -> BandProblem:
+def _problem(seed: int, **limits: Any) -> BandProblem:
     latencies = np.random.default_rng(seed).normal(67 * MS, 9 * MS, 400)
-    latencies = latencies.clip(33 * MS, 85 * MS).astype(np.int64)
-    return band_problem(latencies, 87 * MS, **limits)  # type: ignore[arg-type]
-
-
-def _swarm(problem: BandProblem, bands: int, seed: int = 1) -> Placement:
-    if find_spec("pyswarms") is None:
-        pytest.skip("pyswarms is not installed")
-    return place_by_swarm(problem, bands, seed)
+    return BandProblem(latencies.clip(33 * MS, 85 * MS).astype(np.int64), 87 * MS, **limits)
 
 
 def test_the_swarm_is_repeatable_and_leaves_no_traces(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    pytest.importorskip("pyswarms")
     monkeypatch.chdir(tmp_path)
     np.random.seed(5)
     expected = np.random.random()
     np.random.seed(5)
-    assert _swarm(_problem(1), 3) == _swarm(_problem(1), 3)
+    assert place_by_swarm(_problem(1), 3, 1) == place_by_swarm(_problem(1), 3, 1)
     assert np.random.random() == expected
     assert not list(tmp_path.iterdir())
+    with pytest.raises(OperationError, match="use the exact solver"):
+        place_by_swarm(_problem(1), 40, 1)
 
 
-def test_the_exact_placement_is_never_worse_than_the_swarm() -> None:
+def test_the_exact_placement_is_never_worse_than_swarm_or_chance() -> None:
+    pytest.importorskip("pyswarms")
     generator = random.Random(11)
-    infeasible = 0
-    for seed in range(25):
-        bands = generator.randint(2, 8)
-        max_gap = generator.choice([None, 20 * MS, 2 * MS])
-        problem = _problem(seed, max_gap_ns=max_gap)  # type: ignore[arg-type]
+    compared = 0
+    for seed in range(12):
+        bands, max_gap = generator.randint(2, 8), generator.choice([None, 20 * MS, 2 * MS])
+        problem = _problem(seed, max_gap_ns=max_gap)
         exact = place_bands(problem, bands)
-        try:
-            swarm = _swarm(problem, bands, seed)
-        except OperationError:
-            infeasible += 1
-            continue
-        assert broken_constraint(problem, swarm.slot_ends_ns) is None
-        assert exact.mean_ns <= swarm.mean_ns
-    assert infeasible < 25
+        for place in [place_by_swarm] if max_gap else [place_by_swarm, place_randomly]:
+            try:
+                other = place(problem, bands, seed)
+            except OperationError:
+                continue
+            assert broken_constraint(problem, other.slot_ends_ns) is None
+            assert exact.mean_ns <= other.mean_ns
+            compared += 1
+    assert compared > 8
 
 
 def test_random_placements_keep_the_constraints_and_reach_everywhere() -> None:
-    problem = band_problem(np.array([0, 10]), 12, publish_slot_ns=1, grid_ns=1)
-    seen = {place_randomly(problem, 3, seed).slot_ends_ns for seed in range(500)}
-    allowed = {
-        (first, second, 12)
-        for first in range(2, 11)
-        for second in range(first + 2, 11)
-        if first - 1 > 0
-    }
-    assert seen == allowed
+    problem = BandProblem(np.array([0, 10]), 12, publish_slot_ns=1, grid_ns=1)
+    seen = {place_randomly(problem, 3, seed).slot_ends_ns for seed in range(300)}
+    assert seen == {(one, two, 12) for one in range(2, 11) for two in range(one + 2, 11)}
     assert place_randomly(_problem(1), 3, 8) == place_randomly(_problem(1), 3, 8)
-    tight = _problem(1, max_gap_ns=25 * MS)
-    assert broken_constraint(tight, place_randomly(tight, 3, 2).slot_ends_ns) is None
-
-
-def test_what_cannot_be_placed_is_said() -> None:
     with pytest.raises(OperationError, match="last random draw ended"):
         place_randomly(_problem(1, max_gap_ns=1_001_000), 3)
     with pytest.raises(OperationError, match="grid of 20ms is too coarse"):
         place_randomly(replace(_problem(1), grid_ns=20 * MS), 10)
-    with pytest.raises(OperationError, match="use the exact solver"):
-        _swarm(_problem(1), 40)
-    equal = band_problem(np.array([50, 50]) * MS, 51 * MS)
-    for place in (place_by_swarm, place_randomly):
-        with pytest.raises(InputError, match="room for 1 publish slots"):
-            place(equal, 2)
-        assert place(equal, 1).slot_ends_ns == (51 * MS,)
-        with pytest.raises(InputError, match="one band at least"):
-            place(equal, 0)

@@ -1,14 +1,14 @@
 """The plan file: what is written is read back equal, and what would not run is refused."""
 
+import tempfile
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chainshaper.planning import (
-    ChainOfPlan,
-    Evidence,
     Margin,
     Modes,
     Plan,
@@ -23,6 +23,7 @@ from chainshaper.planning import (
     save_plan,
     server_of,
 )
+from chainshaper.planning.plan import ChainOfPlan, Evidence
 from chainshaper.values.errors import InputError, OperationError
 
 GOOD = """\
@@ -56,6 +57,7 @@ format: 1
 
 
 def test_a_hand_edited_plan_is_read(tmp_path: Path) -> None:
+    """And its JSON form has integer nanoseconds."""
     plan = _load(tmp_path, GOOD)
     assert plan.cycle_ns == 100_000_000
     assert plan.evidence.mean_latency_ns == 48_123_456
@@ -64,29 +66,20 @@ def test_a_hand_edited_plan_is_read(tmp_path: Path) -> None:
     assert publish_slots(plan) == ((64_000_000, 65_000_000),)
     assert server_of(plan, Thread(node="/n1")) == plan.servers[0]
     assert server_of(plan, Thread(node="/n9")) is None
-
-
-def test_the_json_form_has_integer_nanoseconds(tmp_path: Path) -> None:
-    values = plan_json(_load(tmp_path, GOOD))
+    values = plan_json(plan)
     assert values["bands_ns"] == [65_000_000]
     assert values["predicted"] == {
-        "mean_ns": 65_000_000,
-        "max_ns": 65_000_000,
-        "jitter_ns": 1_000_000,
-        "shares": [1.0],
+        **{"mean_ns": 65_000_000, "max_ns": 65_000_000, "jitter_ns": 1_000_000, "shares": [1.0]}
     }
     assert values["servers"][0]["slots"] == [[0, 64_000_000]]
-    assert values["cycle_ns"] == 100_000_000
     assert values["chain"]["period_ns"] == 100_000_000
 
 
 WRONG_VALUES = [
     # what to replace, by what, line, key, and words of the reason
     ("cycle: 100ms", "cycle: 100", 11, "cycle", "unit"),
-    ("cycle: 100ms", "cycle: .nan", 11, "cycle", "unit"),
     ("cycle: 100ms", "cycle: -1ms", 11, "cycle", "negative"),
     ("cycle: 100ms", "cycle: 0", 11, "cycle", "zero"),
-    ("cycle: 100ms", "cycle: [100ms]", 11, "cycle", "unit"),
     ("cycle: 100ms", "cycle: 1000000000000s", 11, "cycle", "292 years"),
     ("cycle: 100ms", "cycle: 150ms", 11, "cycle", "multiple"),
     ("cycle: 100ms", "cycel: 100ms", 11, "cycel", "did you mean 'cycle'"),
@@ -96,23 +89,17 @@ WRONG_VALUES = [
     ("cycle: 100ms", "cycle: 100ms\ncolour: red", 12, "colour", "unknown key: remove it"),
     ("max_latency: 63ms", "max_latency: 100ms", 11, "cycle", "not longer than"),
     ("max_latency: 63ms", "max_latency: 40ms", 18, "evidence.mean_latency", "ascend"),
-    ("samples: 320", "samples: 0", 16, "evidence.samples", "greater than or equal to 1"),
     ("samples: 320", "samples: many", 16, "evidence.samples", "'many' is not a whole number"),
     ("realtime: yes", "realtime: 1", 20, "evidence.realtime", "not true or false"),
     ("[[0, 64ms]]", "[[0, 64]]", 3, "servers[0].slots[0][1]", "unit"),
-    ("[[0, 64ms]]", "[[-1ms, 64ms]]", 3, "servers[0].slots[0][0]", "negative"),
-    ("[[0, 64ms]]", "[[64ms, 64ms]]", 3, "servers[0].slots[0]", "empty"),
     ("[[0, 64ms]]", "[[64ms, 3ms]]", 3, "servers[0].slots[0]", "empty"),
     ("[[0, 64ms]]", "[[0, 64ms], [99ms, 101ms]]", 3, "servers[0].slots[1]", "after the cycle"),
     ("[[0, 64ms]]", "[[5ms, 9ms], [0ms, 4ms]]", 3, "servers[0].slots[1]", "ascending"),
     ("[[0, 64ms]]", "[[5ms, 9ms], [8ms, 12ms]]", 3, "servers[0].slots[1]", "overlap"),
     ("[[0, 64ms]]", "[[0ms]]", 3, "servers[0].slots[0][1]", "missing"),
-    ("[[0, 64ms]]", "64ms", 3, "servers[0].slots", "not a list"),
     ("[[0, 64ms]]", "[]", 3, "servers[0].slots", "too short"),
     ("name: output ", "name: chain ", 4, "servers[1].name", "two servers"),
     ("priority: 1", "priority: 0", 5, "servers[1].priority", "greater than or equal to 1"),
-    ("priority: 1", "priority: 1.5", 5, "servers[1].priority", "not a whole number"),
-    ("core: 0\n", "core: -1\n", 6, "servers[1].core", "greater than or equal to 0"),
     ("core: 0\n", "core: 3\n", 23, "shaping_node.core", "make them the same"),
     ("{node: /n1, role: executor}", "/n1", 3, "servers[0].threads[0]", "not a mapping"),
     ("{node: /n1, role: executor}", "{node: n1}", 3, "servers[0].threads[0].node", "full ROS"),
@@ -120,23 +107,17 @@ WRONG_VALUES = [
     ("{node: /n1", "{node: /chainshaper_t5", 10, "servers[1].threads[0]", "already in"),
     ("{node: /chainshaper_t5}", "{node: /other}", 23, "shaping_node.name", "no server holds"),
     ("input: /t5_tmp", "input: /t5", 23, "shaping_node.input", "feed itself"),
-    ("input: /t5_tmp", "input: t5_tmp", 23, "shaping_node.input", "full ROS"),
     ("input: /t5_tmp", "input: /t5//tmp", 23, "shaping_node.input", "full ROS"),
-    ("input: /t5_tmp", "input: /5", 23, "shaping_node.input", "full ROS"),
     ("output: /t5, core", "output: /t6, core", 23, "shaping_node.output", "make them the same"),
     ("fifo_priority: 84", "fifo_priority: 99", 23, "shaping_node.fifo_priority", "equal to 98"),
-    ("fifo_priority: 84", "fifo_priority: 0", 23, "shaping_node.fifo_priority", "equal to 1"),
     ("{name: chainshaper_t5,", "{name: /x,", 23, "shaping_node.name", "not a node's name"),
     ("spin: 300us", "spin: 0.1ns", 24, "shaping_node.spin", "finer"),
     ("shares: [1]", "shares: [.nan]", 25, "predicted.shares[0]", "finite"),
-    ("shares: [1]", "shares: [1.5]", 25, "predicted.shares[0]", "equal to 1"),
     ("shares: [1]", "shares: 1", 25, "predicted.shares", "not a list"),
     ("policy: shaped", "policy: fast", 12, "policy", "'shaped'"),
     ("anchor: stamp", "anchor: sea", 22, "anchor", "'stamp' or 'cycle'"),
-    ("anchor: stamp", "fallback: sea", 22, "fallback", "'bypass' or 'silence'"),
     ("format: 1", "format: 2", 26, "format", "should be 1"),
     ('spec: "/t1../t5"', "spec: 7", 13, "chain.spec", "7 is not a text"),
-    ("samples: 320", "samples: 2001-99-99", 16, "evidence.samples", "whole number"),
 ]
 
 MODES = """\
@@ -146,67 +127,46 @@ modes:
   bands: {city: 2, highway: 1}
   late: next-slot
 """
+WITH_MODES = GOOD.replace("- [64000us, 0.065s]", "- [40ms, 41ms]\n      - [64ms, 65ms]") + MODES
 WRONG_MODES = [  # what is replaced, by what, the line in the modes, the key, and some words
     ("default: city", "default: sea", 3, "modes.default", "write one of city, highway"),
     ("default: city", "default: 1st", 3, "modes.default", "not a mode's name"),
-    ("default: city", "default: on", 3, "modes.default", "not a text"),
     ("highway: 1", "highway: 3", 4, "modes.bands.highway", "from 1 to 2"),
-    ("highway: 1", "highway: 0", 4, "modes.bands.highway", "greater than or equal to 1"),
     ("{city: 2, highway: 1}", "{}", 4, "modes.bands", "too short"),
     ("{city: 2, highway: 1}", "[2, 1]", 4, "modes.bands", "dictionary"),
-    ("topic: /mode", "topic: mode", 2, "modes.topic", "full ROS"),
     ("topic: /mode", "topic: /t5_tmp", 2, "modes.topic", "carries the chain's output"),
     ("late: next-slot", "late: never", 5, "modes.late", "'next-slot'"),
     ("late: next-slot", "early: wait", 5, "modes.early", "unknown key"),
 ]
 
 
-@pytest.mark.parametrize("case", WRONG_VALUES, ids=lambda case: case[1].strip())
+@pytest.mark.parametrize("case", [*WRONG_VALUES, *WRONG_MODES], ids=lambda case: case[1].strip())
 def test_a_wrong_value_is_named(tmp_path: Path, case: tuple[str, str, int, str, str]) -> None:
     old, new, line, key, words = case
-    assert GOOD.count(old) >= 1
+    text = GOOD
+    if case in WRONG_MODES:
+        text, line = WITH_MODES, line + WITH_MODES[: WITH_MODES.index("modes:")].count("\n")
+    assert old in text
     with pytest.raises(InputError) as caught:
-        _load(tmp_path, GOOD.replace(old, new, 1))
+        _load(tmp_path, text.replace(old, new, 1))
     problem = str(caught.value).splitlines()[-1]
     assert problem.startswith(f"{tmp_path / 'plan.yaml'}:{line}: {key}: ")
     assert words in problem
 
 
 def test_a_mode_publishes_in_a_slot_of_its_own(tmp_path: Path) -> None:
-    modes = _load(tmp_path, _with_modes(MODES)).modes
-    assert modes is not None
-    assert (modes.bands, modes.default, modes.late) == (
-        {"city": 2, "highway": 1},
-        "city",
-        "next-slot",
-    )
-    shorter = _load(tmp_path, _with_modes(MODES.replace("  late: next-slot\n", ""))).modes
+    modes = _load(tmp_path, WITH_MODES).modes
+    bands = {"city": 2, "highway": 1}
+    assert modes == Modes(topic="/mode", default="city", bands=bands, late="next-slot")
+    shorter = _load(tmp_path, WITH_MODES.replace("  late: next-slot\n", "")).modes
     assert shorter is not None
     assert shorter.late == "wait"
 
 
-@pytest.mark.parametrize("case", WRONG_MODES, ids=lambda case: case[1])
-def test_a_wrong_mode_is_named(tmp_path: Path, case: tuple[str, str, int, str, str]) -> None:
-    old, new, line, key, words = case
-    good = _with_modes(MODES)
-    line += good[: good.index("modes:")].count("\n")
-    with pytest.raises(InputError) as caught:
-        _load(tmp_path, _with_modes(MODES.replace(old, new)))
-    problem = str(caught.value).splitlines()[-1]
-    assert problem.startswith(f"{tmp_path / 'plan.yaml'}:{line}: {key}: ")
-    assert words in problem
-
-
 def test_modes_need_a_shaping_node(tmp_path: Path) -> None:
-    text = _with_modes(MODES)
-    start, end = text.index("shaping_node:"), text.index("predicted:")
+    start, end = WITH_MODES.index("shaping_node:"), WITH_MODES.index("predicted:")
     with pytest.raises(InputError, match="modes: only a shaping node knows the mode"):
-        _load(tmp_path, text[:start] + text[end:])
-
-
-def _with_modes(modes: str) -> str:
-    two_slots = GOOD.replace("- [64000us, 0.065s]", "- [40ms, 41ms]\n      - [64ms, 65ms]")
-    return two_slots + modes
+        _load(tmp_path, WITH_MODES[:start] + WITH_MODES[end:])
 
 
 def test_every_wrong_value_is_named_once(tmp_path: Path) -> None:
@@ -320,6 +280,10 @@ def modes(slots: int) -> st.SearchStrategy[Modes]:
     )
 
 
+def optional(strategy: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
+    return st.none() | strategy
+
+
 @st.composite
 def plans(draw: st.DrawFn) -> Plan:
     """Any plan the rules allow: times anywhere in 64 bits, names as ROS 2 permits them."""
@@ -327,80 +291,60 @@ def plans(draw: st.DrawFn) -> Plan:
     low, mean, high = sorted(draw(st.lists(st.integers(1, period - 1), min_size=3, max_size=3)))
     bounds = sorted(draw(st.sets(st.integers(0, period), min_size=4, max_size=8)))
     slots = tuple(zip(bounds[::2], bounds[1::2], strict=False))
-    output = draw(NAMES)
+    output, times = draw(NAMES), st.integers(0, 10**12)
     node = ShapingNode(
         name="gate",
         input=output + "_tmp",
         output=output,
         core=0,
         fifo_priority=draw(st.integers(1, 98)),
-        spin_ns=draw(st.integers(0, 10**9)),
-        pause_ns=draw(st.integers(0, 10**9)),
+        spin_ns=draw(times),
+        pause_ns=draw(times),
     )
-    others = draw(st.sets(NAMES.filter(lambda name: name != "/gate"), max_size=3))
+    threads = [Thread(node=name) for name in sorted(draw(st.sets(NAMES, max_size=3)))]
+    name = draw(st.text(min_size=1).filter(lambda name: name != "chain"))
+    interval = (3, 123_456_789)
+    derived = Margin(epsilon_ns=7, source="derived", confidence_interval_ns=interval)
+    threads = [thread for thread in threads if thread != node.thread]
+    whole = ((0, period),)
+    chain = Server(name="chain", core=1, priority=2, slots=whole, threads=tuple(threads))
     return Plan(
         chain=ChainOfPlan(
-            spec=draw(st.none() | st.text()),
+            spec=draw(optional(st.text())),
             output=output,
-            publisher=draw(st.none() | NAMES),
-            output_depth=draw(st.none() | st.integers(1, 100)),
+            publisher=draw(optional(NAMES)),
+            output_depth=draw(optional(st.integers(1, 100))),
             period_ns=period,
         ),
         evidence=Evidence(
-            recording=draw(st.none() | st.text()),
+            recording=draw(optional(st.text())),
             samples=draw(st.integers(1, 10**12)),
             min_latency_ns=low,
             mean_latency_ns=mean,
             max_latency_ns=high,
-            realtime=draw(st.none() | st.booleans()),
-            longest_stall_ns=draw(st.none() | st.integers(0, 10**12)),
-            utilisation=draw(st.none() | st.floats(0, 2)),
-            longest_send_ns=draw(st.none() | st.integers(0, 10**12)),
+            realtime=draw(optional(st.booleans())),
+            longest_stall_ns=draw(optional(times)),
+            utilisation=draw(optional(st.floats(0, 2))),
+            longest_send_ns=draw(optional(times)),
+            all_disturbed=draw(st.sampled_from([None, True])),
         ),
-        margin=draw(
-            st.integers(0, 10**9).map(lambda margin: Margin(epsilon_ns=margin))
-            | st.just(
-                Margin(
-                    epsilon_ns=7,
-                    source="derived",
-                    overrun_probability=1e-6,
-                    confidence_interval_ns=(3, 123_456_789),
-                )
-            )
-        ),
+        margin=draw(st.sampled_from([derived, Margin(epsilon_ns=draw(times))])),
         policy="shaped",
         cycle_ns=period,
         offset_ns=draw(st.integers(0, 3)),
         anchor=draw(st.sampled_from(["stamp", "cycle"])),
         overrun=draw(st.sampled_from(["wait", "discard", "publish"])),
         fallback=draw(st.sampled_from(["bypass", "silence"])),
-        servers=(
-            Server(
-                name="chain",
-                core=1,
-                priority=2,
-                slots=((0, period),),
-                threads=tuple(Thread(node=name) for name in sorted(others)),
-            ),
-            Server(
-                name=draw(st.text(min_size=1).filter(lambda name: name != "chain")),
-                core=0,
-                priority=1,
-                slots=slots,
-                threads=(node.thread,),
-            ),
-        ),
+        servers=(chain, Server(name=name, core=0, priority=1, slots=slots, threads=(node.thread,))),
         shaping_node=node,
-        modes=draw(st.none() | modes(len(slots))),
+        modes=draw(optional(modes(len(slots)))),
         predicted=Prediction(mean_ns=1, max_ns=high, jitter_ns=0, shares=draw(SHARES)),
     )
 
 
-@settings(deadline=None)  # it writes files, on whatever machine
+@settings(deadline=None, max_examples=40)  # it writes files, on whatever machine
 @given(plans())
 def test_what_is_dumped_is_loaded_equal(plan: Plan) -> None:
-    import tempfile
-
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "plan.yaml"
         save_plan(plan, file)

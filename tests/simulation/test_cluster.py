@@ -16,28 +16,32 @@ from processes import wait_for
 from quick_chain import quick_chain
 
 from chainshaper import sweep
-from chainshaper.simulation import sweeping
-from chainshaper.simulation.sweeping import rows_beside
+from chainshaper.flow import sweep as sweeping
+from chainshaper.flow.sweep import rows_beside
 from chainshaper.values.errors import InputError, OperationError
 
-pytest.importorskip("distributed", reason="Dask's `distributed` is not installed")
+distributed = pytest.importorskip("distributed", reason="Dask's `distributed` is not installed")
 
 AXES: dict[str, list[Any]] = {"bands": [1, 2, 3], "seed": [1, 2]}
 Start = Callable[..., "subprocess.Popen[bytes]"]
 
 
-@pytest.fixture
-def start(tmp_path: Path) -> Iterator[Start]:
-    """Start a part of a cluster; all of them end with the test."""
+@pytest.fixture(scope="module")
+def start(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Start]:
+    """Start a part of a cluster; all of them end with the tests."""
     parts: list[subprocess.Popen[bytes]] = []
+    folder = tmp_path_factory.mktemp("cluster")
 
     def start_one(part: str, *arguments: str, path: Path | None = None) -> Any:
         command = [sys.executable, "-m", f"distributed.cli.dask_{part}", *arguments]
         environment = {**os.environ, **({} if path is None else {"PYTHONPATH": str(path)})}
-        with (tmp_path / f"{part}_{len(parts)}.log").open("wb") as log:
-            process = subprocess.Popen(
-                [*command, "--no-dashboard"], stdout=log, stderr=log, cwd=tmp_path, env=environment
-            )
+        process = subprocess.Popen(
+            [*command, "--no-dashboard"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            cwd=folder,
+            env=environment,
+        )
         parts.append(process)
         return process
 
@@ -47,10 +51,10 @@ def start(tmp_path: Path) -> Iterator[Start]:
         process.wait()
 
 
-@pytest.fixture
-def scheduler(start: Start, tmp_path: Path) -> str:
+@pytest.fixture(scope="module")
+def scheduler(start: Start, tmp_path_factory: pytest.TempPathFactory) -> str:
     """The address of a scheduler without workers."""
-    file = tmp_path / "scheduler.json"
+    file = tmp_path_factory.mktemp("scheduler") / "scheduler.json"
     start("scheduler", "--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file))
     wait_for(lambda: file.exists() and file.stat().st_size > 0, "the scheduler")
     return str(json.loads(file.read_text())["address"])
@@ -74,9 +78,18 @@ def test_the_rows_are_the_same_although_a_worker_is_killed(
         if share:
             both[0].send_signal(signal.SIGKILL)
 
-    on_cluster = swept(tmp_path / "cluster.parquet", scheduler=scheduler, progress=kill_one)
-    assert both[0].wait() == -signal.SIGKILL
+    try:
+        on_cluster = swept(tmp_path / "cluster.parquet", scheduler=scheduler, progress=kill_one)
+        assert both[0].wait() == -signal.SIGKILL
+    finally:
+        _end(*both)
     assert on_cluster.equals(swept(tmp_path / "here.parquet", workers=1))
+
+
+def _end(*processes: "subprocess.Popen[bytes]") -> None:
+    for process in processes:
+        process.kill()
+        process.wait()
 
 
 def test_a_worker_with_another_version_is_named(
@@ -87,9 +100,10 @@ def test_a_worker_with_another_version_is_named(
     (information / "METADATA").write_text(
         "Metadata-Version: 2.1\nName: chainshaper\nVersion: 9.9\n"
     )
-    worker(start, scheduler, path=tmp_path / "other")
+    other = worker(start, scheduler, path=tmp_path / "other")
     with pytest.raises(OperationError) as refused:
         swept(tmp_path / "out.parquet", scheduler=scheduler)
+    _end(other)
     assert "the Dask worker at tcp://127.0.0.1:" in str(refused.value)
     assert "has chainshaper 9.9, not " in str(refused.value)
     assert "numpy" not in str(refused.value)
@@ -104,12 +118,12 @@ def test_without_any_worker_that_can_compute_it_does_not_wait_for_ever(
     (tmp_path / "other" / "chainshaper").mkdir(parents=True)
     (tmp_path / "other" / "chainshaper" / "__init__.py").touch()
     ended = worker(start, scheduler, path=tmp_path / "other")
-    # It may take its time to come, too.
-    wait_for(lambda: "Register worker" in (tmp_path / "scheduler_0.log").read_text(), "a worker")
+    with distributed.Client(scheduler, set_as_default=False) as client:
+        client.wait_for_workers(1, timeout=60)
     with pytest.raises(OperationError, match="it has had no workers for 1 s") as refused:
         swept(tmp_path / "out.parquet", scheduler=scheduler)
+    assert ended.wait(timeout=60) is not None
     assert f"the Dask cluster at {scheduler} failed" in str(refused.value)
-    assert ended.wait() is not None
 
 
 def test_where_no_scheduler_answers_the_address_is_named(
@@ -117,7 +131,7 @@ def test_where_no_scheduler_answers_the_address_is_named(
 ) -> None:
     monkeypatch.setattr(sweeping, "CONNECT_S", 1)
     with socket.socket() as reserved:
-        reserved.bind(("127.0.0.1", 0))  # nobody listens there
+        reserved.bind(("127.0.0.1", 0))  # nothing listens there
         address = f"tcp://127.0.0.1:{reserved.getsockname()[1]}"
         with pytest.raises(OperationError, match=f"no Dask scheduler answers at {address}"):
             swept(tmp_path / "out.parquet", scheduler=address)

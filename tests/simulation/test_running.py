@@ -13,7 +13,7 @@ from processes import wait_for
 from quick_chain import quick_chain
 
 from chainshaper import sweep
-from chainshaper.simulation.sweeping import FIGURES, rows_beside
+from chainshaper.flow.sweep import FIGURES, rows_beside
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.workload.description import Application, application_as_written
 
@@ -57,19 +57,15 @@ def test_rows_do_not_depend_on_the_order_of_axes_or_on_who_computes_them(tmp_pat
     assert compared(swept(tmp_path / "two.parquet", workers=2)).equals(reference)
 
 
-def test_seeds_draw_other_execution_times(tmp_path: Path) -> None:
+def test_seeds_draw_other_execution_times_and_what_cannot_be_does_not_end_the_others(
+    tmp_path: Path,
+) -> None:
     frame = swept(tmp_path / "out.parquet", {"seed": [1, 2], "policy": ["none"]})
     assert frame["seed"].to_list() == [1, 2]
     assert frame["mean_ns"].n_unique() == 2
-    again = swept(tmp_path / "again.parquet", {"policy": ["none"]}, seed=2)
-    assert again["mean_ns"][0] == frame["mean_ns"][1]
-
-
-def test_a_point_that_cannot_be_does_not_end_the_others(tmp_path: Path) -> None:
     axes = {"nodes.first.callbacks.0.execution": [{"constant": "60ms"}, {"constant": "1ms"}]}
-    frame = swept(tmp_path / "out.parquet", axes)
+    frame = swept(tmp_path / "impossible.parquet", axes)
     assert "do not fit into the cycle" in frame["error"][0]
-    assert frame["mean_ns"][0] is None
     assert frame["error"][1] is None
     assert frame["nodes.first.callbacks.0.execution"][0] == "{constant: 60ms}"
 
@@ -95,7 +91,7 @@ def test_a_sweep_that_was_ended_goes_on_with_what_is_missing(tmp_path: Path) -> 
     first = json.loads(rows.read_text().splitlines()[1])
     assert first["number"] == 0
     marked = rows.read_text().replace(f'"mean_ns": {first["row"]["mean_ns"]}', '"mean_ns": 1', 1)
-    rows.write_text(marked)  # nobody computes this one again
+    rows.write_text(marked)  # so it was not computed again
     shares: list[float] = []
     frame = swept(output, progress=lambda share, _: shares.append(share))
     assert shares == [0.5, 0.75, 1.0]
@@ -118,22 +114,19 @@ def test_rows_of_another_sweep_are_not_mixed_in(
 ) -> None:
     output = tmp_path / "out.parquet"
     rows = _first_rows(output, 1)
-    kept = rows.read_bytes()
+    before = rows.read_bytes()
     with pytest.raises(InputError, match=said) as refused:
         swept(output, **wishes)
     assert "has 1 finished rows of another sweep" in str(refused.value)
-    assert rows.read_bytes() == kept
+    assert rows.read_bytes() == before
     assert not output.exists()
 
 
-def test_a_file_of_something_else_is_left_alone(tmp_path: Path) -> None:
-    rows_beside(tmp_path / "out.parquet").write_text("my notes\n")
+def test_rows_that_are_in_use_or_something_else_are_left_alone(tmp_path: Path) -> None:
+    rows_beside(tmp_path / "mine.parquet").write_text("my notes\n")
     with pytest.raises(InputError, match="these are no rows of a sweep"):
-        swept(tmp_path / "out.parquet")
-    assert rows_beside(tmp_path / "out.parquet").read_text() == "my notes\n"
-
-
-def test_two_do_not_work_on_one_sweep(tmp_path: Path) -> None:
+        swept(tmp_path / "mine.parquet")
+    assert rows_beside(tmp_path / "mine.parquet").read_text() == "my notes\n"
     rows = _first_rows(tmp_path / "out.parquet", 1)
     with rows.open() as other:
         fcntl.flock(other, fcntl.LOCK_EX)
@@ -153,7 +146,7 @@ def test_nothing_is_overwritten_and_nothing_begun_that_cannot_be_written(tmp_pat
 
 
 def test_a_full_disk_is_named(full_disk: Path) -> None:
-    with pytest.raises(OperationError, match="finished rows cannot be kept"):
+    with pytest.raises(OperationError, match="finished rows cannot be written"):
         swept(full_disk / "out.parquet")
 
 
@@ -173,21 +166,18 @@ def _under_way(description: Path, output: Path, *options: str) -> Running:
     return running
 
 
-def test_killed_it_leaves_its_rows_and_no_processes(description: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_ended_it_leaves_its_rows_and_no_processes(
+    number: signal.Signals, description: Path, tmp_path: Path
+) -> None:
     running = _under_way(description, tmp_path / "out.parquet", "--workers", "2")
-    running.process.kill()
-    running.process.wait()
-    wait_for(lambda: not running.nodes(), f"the end of {running.nodes()}")
-    kept = rows_beside(tmp_path / "out.parquet").read_bytes().count(b"\n") - 1
-    assert 1 <= kept < 40
-    assert not (tmp_path / "out.parquet").exists()
-
-
-def test_interrupted_it_says_where_its_rows_are(description: Path, tmp_path: Path) -> None:
-    running = _under_way(description, tmp_path / "out.parquet", "--workers", "2")
-    running.process.send_signal(signal.SIGINT)
+    running.process.send_signal(number)
     finished = running.end()
-    assert finished.code not in (0, -signal.SIGINT)
-    assert f"finished points are in {rows_beside(tmp_path / 'out.parquet')}" in finished.err
-    assert "Traceback" not in finished.err
+    wait_for(lambda: not running.nodes(), f"the end of {running.nodes()}")
+    rows = rows_beside(tmp_path / "out.parquet")
+    assert 1 <= rows.read_bytes().count(b"\n") - 1 < 40
     assert not (tmp_path / "out.parquet").exists()
+    if number == signal.SIGINT:
+        assert finished.code not in (0, -signal.SIGINT)
+        assert f"finished points are in {rows}" in finished.err
+        assert "Traceback" not in finished.err

@@ -181,10 +181,9 @@ def sweep(
     Ended before it is whole, it keeps the finished points beside the file that it writes; the same
     command goes on with the others.
     """
+    from chainshaper.flow.sweep import parse_axis, rows_beside
     from chainshaper.reporting.figures import draw_sweep
     from chainshaper.reporting.overviews import sweep_table
-    from chainshaper.simulation.grid import parse_axis
-    from chainshaper.simulation.sweeping import rows_beside
     from chainshaper.values.files import new_file
 
     if workers is not None and scheduler is not None:

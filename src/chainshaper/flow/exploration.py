@@ -1,8 +1,4 @@
-"""Looking into a recording or a trace: what is in it, which services, which chains.
-
-The functions behind `chainshaper info`, `graph`, `chains` and `convert`. All of them take whatever
-:func:`chainshaper.sources.open_source` opened.
-"""
+"""Looking into a recording or a trace, for `chainshaper info`, `graph`, `chains` and `convert`."""
 
 from pathlib import Path
 
@@ -24,34 +20,15 @@ from chainshaper.values.recording import (
     Recording,
     RecordingInfo,
     event_counts,
-    lost_text,
     write_recording,
 )
 
-__all__ = [
-    "convert_recording",
-    "describe_application",
-    "list_chains",
-    "lost_events",
-    "named_chain",
-    "with_trace_events",
-]
-
-
-def lost_events(info: RecordingInfo) -> str:
-    """What was lost while recording, in words for below a table; "nothing" is said as well."""
-    return lost_text(info.lost)
-
 
 def list_chains(
-    source: Recording | DataFlow,
-    start: str | None = None,
-    end: str | None = None,
-    limit: int = 100,
+    source: Recording | DataFlow, start: str | None = None, end: str | None = None, limit: int = 100
 ) -> ChainEnumeration:
-    """The computation chains of a recording, the heaviest by mean response times among them.
-
-    See :func:`~chainshaper.analysis.chains.enumerate_chains`.
+    """The chains of a recording, the heaviest by mean response times among them, as
+    :func:`~chainshaper.analysis.chains.enumerate_chains` gives them.
     """
     if isinstance(source, Recording):
         source = data_flow(source.events, source.info.clock_offset_ns)
@@ -64,30 +41,26 @@ def list_chains(
 def named_chain(file: str | Path, name: str | None = None) -> str:
     """The chain that a CARET architecture file calls ``name``, as we write it.
 
-    Raises:
-        InputError: no such path in the file, or several and no ``name``.
+    Raises InputError: no such path in the file, or several and no ``name``.
     """
     paths = load_named_paths(file)
     if name is None and len(paths) == 1:
         return next(iter(paths.values()))
+    if name in paths:
+        return paths[name]
     known = ", ".join(paths) or "none"
     if name is None:
         raise InputError(f"{file}: choose one of its named_paths with --chain: {known}")
-    if name not in paths:
-        close = close_names(name, paths)
-        hint = f"did you mean {' or '.join(close)}?" if close else f"its named_paths: {known}"
-        raise InputError(f"{file}: no path is named {name!r}; {hint}")
-    return paths[name]
+    close = close_names(name, paths)
+    hint = f"did you mean {' or '.join(close)}?" if close else f"its named_paths: {known}"
+    raise InputError(f"{file}: no path is named {name!r}; {hint}")
 
 
 def convert_recording(recording: Recording | str | Path, output: str | Path) -> Recording:
-    """Write an open trace as a recording of ours: Parquet tables that are read in no time.
+    """Write a trace as a recording of ours, with all events that the analysis knows: every figure
+    stays the same to the nanosecond. A note names the other events.
 
-    All events that the analysis knows are kept, so every figure stays the same to the nanosecond;
-    a note names the others.
-
-    Raises:
-        InputError: ``output`` exists already.
+    Raises InputError: ``output`` exists already, or no event is known.
     """
     if not isinstance(recording, Recording):
         recording = open_source(recording)
@@ -97,7 +70,7 @@ def convert_recording(recording: Recording | str | Path, output: str | Path) -> 
 
 
 def with_trace_events(recording: Recording) -> RecordingInfo:
-    """A trace's description with the events it had, and a note about those that are not kept."""
+    """A trace's description with the events it had, and a note about those that are left out."""
     info = recording.info
     if info.source != "lttng" or info.trace_events:
         return info
@@ -106,8 +79,8 @@ def with_trace_events(recording: Recording) -> RecordingInfo:
     notes = info.notes
     if left:
         count = sum(counts[name] for name in left)
-        notes += (f"{count} events of kinds that chainshaper makes no use of were not kept: "
-                  f"{', '.join(left)}.",)  # fmt: skip
+        note = f"{count} events of kinds that chainshaper makes no use of were not kept: "
+        notes += (f"{note}{', '.join(left)}.",)
     return info.model_copy(update={"trace_events": counts, "notes": notes})
 
 

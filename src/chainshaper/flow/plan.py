@@ -1,10 +1,9 @@
 """From recordings to a plan, and a run of a described application that the plan shapes.
 
-The planner needs latencies, callbacks, cores and conditions of a recorded chain. A chain in a graph
-waits at synchronising callbacks for branches that are not part of it (paper, section 2.3). Whoever
-plans slots for its callbacks has to plan for those branches too, so they are followed backwards
-here, from every input of a synchronising callback to what starts it, or to the node with which the
-chain begins: what feeds a subscription there is not planned for.
+A chain in a graph waits at synchronising callbacks for branches that are not part of it (paper,
+section 2.3). Whoever plans slots for its callbacks has to plan for those branches too, so they are
+followed backwards here, from every input of a synchronising callback to what starts it, or to the
+node with which the chain begins: what feeds a subscription there is not planned for.
 """
 
 from collections.abc import Collection, Sequence
@@ -33,48 +32,58 @@ from chainshaper.verify.measure import chain_of, longest_stall
 from chainshaper.workload.description import Application
 from chainshaper.workload.live import Enforcement, Progress, origin_timer, run_application
 
-__all__ = ["plan_recording", "profile_chains", "profile_of", "shape_application"]
+__all__ = ["plan_recording", "profile_chains", "shape_application"]
 
 DEFAULT_PRIORITY = 80
+_STANDARD = PlanRequest()
 
 
-def profile_of(
-    recording: Recording,
-    flow: DataFlow,
-    analysis: LatencyAnalysis,
+def profile_chains(
+    recording: Recording | str | Path,
+    chains: Sequence[str | None] = (None,),
     *,
     period_ns: int | None = None,
-    longest_stall_ns: int | None = None,
-) -> Profile:
-    """The profile of one analysed chain.
+) -> tuple[Profile, ...]:
+    """What the planner needs of recorded chains: see :func:`chainshaper.planning.plan_chain`.
 
-    L̄ and all other times but ``every_latency_ns`` are over cycles that the machine did not disturb:
-    a stall of the machine is not part of the chain's latency, but its output is late nevertheless.
-    ``period_ns`` is for chains that no timer starts.
+    ``period_ns`` is for chains that no timer starts; None stands for the chain that the recording
+    names. Latencies and all other times but ``every_latency_ns`` are over cycles that the machine
+    did not disturb: a stall is not part of the chain's latency, but its output is late
+    nevertheless. Only where fewer than two were undisturbed, they are over all.
 
-    Raises:
-        InputError: the chain's period is not known, or known and given as well.
-        OperationError: fewer than two complete undisturbed traversals.
+    Raises InputError: no such chain, or a chain's period is not known, or known and given as well.
+    OperationError: a chain with fewer than two complete traversals.
     """
+    if not isinstance(recording, Recording):
+        recording = open_source(recording)
+    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    analyses = [analyse_latency(flow, chain_of(recording, chain)) for chain in chains]
+    return tuple(_profile_of(recording, flow, analysis, period_ns) for analysis in analyses)
+
+
+def _profile_of(
+    recording: Recording, flow: DataFlow, analysis: LatencyAnalysis, period_ns: int | None
+) -> Profile:
+    graph, chain, statistics = analysis.graph, analysis.chain, analysis.statistics
     every = analysis.traversals.filter("complete")
-    complete = every.filter(~pl.col("disturbed"))
-    if complete.height < 2:
+    if every.height < 2:
         raise OperationError(
-            f"{recording.path}: of {analysis.traversals.height} traversals of {analysis.chain.spec}"
-            f" {complete.height or 'none'} is complete and undisturbed by the machine"
-            f" ({analysis.statistics.incomplete} incomplete, {analysis.statistics.disturbed}"
-            " disturbed), too few to plan from: see `chainshaper latency`, and record again, longer"
-            " or on a calmer machine"
+            f"{recording.path}: of {analysis.traversals.height} traversals of {chain.spec}"
+            f" {every.height or 'none'} is complete, too few to plan from: see `chainshaper"
+            " latency`, and record again, longer"
         )
-    graph, chain = analysis.graph, analysis.chain
+    calm = every.filter(~pl.col("disturbed"))
+    all_disturbed = calm.height < 2
+    disturbed = every.clear() if all_disturbed else every.filter("disturbed")
     period = _period(analysis, period_ns)
     stages = _stages(graph, chain)
     cores, priority = _executors(recording, graph)
     nodes = dict.fromkeys(stage.node for stage in stages)
     core_of = {node: cores.get(node, DEFAULT_CORE) for node in nodes}
-    calm = _undisturbed_instances(flow, analysis.traversals)
+    instances = _instances_apart_from(flow, disturbed)
+    measured = every if all_disturbed else calm
     return Profile(
-        latencies_ns=complete["latency_ns"].to_numpy().astype(np.int64),
+        latencies_ns=measured["latency_ns"].to_numpy().astype(np.int64),
         every_latency_ns=every["latency_ns"].to_numpy().astype(np.int64),
         period_ns=period,
         spec=chain.spec,
@@ -84,31 +93,31 @@ def profile_of(
         upstream=_upstream(graph, chain, stages),
         core_of=core_of,
         receivers=_receivers(graph, chain, nodes),
-        callbacks=tuple(_times(flow, calm, stage, core_of[stage.node]) for stage in stages),
+        callbacks=tuple(_times(flow, instances, stage, core_of[stage.node]) for stage in stages),
         fifo_priority=min(97, priority.get(stages[-1].node, DEFAULT_PRIORITY) + 5),
         recording=str(recording.path),
-        incomplete=analysis.statistics.incomplete,
-        disturbed=analysis.statistics.disturbed,
+        incomplete=statistics.incomplete,
+        disturbed=statistics.disturbed,
         realtime=recording.info.realtime,
-        longest_stall_ns=longest_stall_ns,
+        longest_stall_ns=longest_stall(recording),
         utilisation=_utilisation(flow, graph, core_of),
         longest_send_ns=_longest_send(flow),
         lost_events=sum(recording.info.lost.values()) or None,
         output_depth=_output_depth(flow, stages[-1].node, chain.topics[-1]),
+        all_disturbed=all_disturbed or None,
     )
 
 
 def _period(analysis: LatencyAnalysis, given: int | None) -> int:
     first = analysis.graph.callbacks[analysis.chain.callbacks[0]]
-    if first.period_ns is not None:
-        if given not in (None, first.period_ns):
-            raise InputError(
-                "--period goes with --latencies, or with a chain that no timer starts:"
-                f" {first.label} has its own period, leave it out"
-            )
-        return first.period_ns
-    if given is not None:
-        return given
+    if first.period_ns is not None and given not in (None, first.period_ns):
+        raise InputError(
+            "--period goes with --latencies, or with a chain that no timer starts:"
+            f" {first.label} has its own period, leave it out"
+        )
+    period = given if first.period_ns is None else first.period_ns
+    if period is not None:
+        return period
     starts = analysis.traversals["start"].unique().sort().to_numpy()
     seen = f" (starts are {format_duration(int(np.median(np.diff(starts))))} apart, mostly)"
     raise InputError(
@@ -138,49 +147,50 @@ _Key = tuple[tuple[int, ...], str]
 def _stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
     """The chain and the branches it waits for, along the graph; the chain's last stands last."""
     outside = _feeding(graph, chain)
-    planned = [callback for callback in graph.callbacks if callback.node not in outside]
-    needs: dict[_Key, set[_Key]] = {}
+    along: list[_Key] = []
+    before: dict[int, list[_Key]] = {}  # of the chain's callbacks
     of_chain: dict[int, _Key] = {}
+    for number, topic in zip(chain.callbacks, chain.topics, strict=True):
+        members = _inputs(graph, graph.callbacks[number], topic) if along else (number,)
+        before[number] = along[-1:]
+        along.append((members, topic))
+        of_chain.update(dict.fromkeys(members, along[-1]))
+    needs: dict[_Key, set[_Key]] = {}
 
-    def writers_of(number: int, above: set[_Key]) -> set[_Key]:
-        """The stages that publish what a callback reads; new ones are added to ``needs``."""
-        topic, found = graph.callbacks[number].topic, set()
-        for writer in planned:
-            if topic is None or topic not in writer.publishes:
-                continue
-            key = of_chain.get(writer.id) or (_inputs(graph, writer, topic), topic)
-            if key in above:  # a loop in the graph: what feeds back comes from a cycle before
-                continue
-            found.add(key)
-            if key not in needs:
-                needs[key] = set()
-                for member in key[0]:
-                    needs[key] |= writers_of(member, above | {key})
-        return found
+    def writers_of(topic: str | None) -> list[_Key]:
+        return [
+            of_chain.get(writer.id) or (_inputs(graph, writer, topic), topic)
+            for writer in graph.callbacks
+            if topic is not None and topic in writer.publishes and writer.node not in outside
+        ]
 
-    previous: _Key | None = None
-    for place, (number, topic) in enumerate(zip(chain.callbacks, chain.topics, strict=True)):
-        key = (_inputs(graph, graph.callbacks[number], topic) if place else (number,), topic)
-        needs[key] = set() if previous is None else {previous}
-        of_chain.update(dict.fromkeys(key[0], key))
-        previous = key
-    along = list(needs)
-    for place, key in enumerate(along):
+    def follow(key: _Key, above: set[_Key]) -> None:
+        needs[key] = set()
         for number in key[0]:
-            if number not in chain.callbacks:
-                # What comes from further down the chain feeds back, from a cycle before.
-                needs[key] |= writers_of(number, {*along[place:]})
+            on_chain = key in along and number in before
+            read = graph.callbacks[number].topic
+            for one in before[number] if on_chain else writers_of(read):
+                if one not in above:  # what feeds back comes from a cycle before
+                    needs[key].add(one)
+                    if one not in needs:
+                        follow(one, above | {one})
+
+    follow(along[-1], {along[-1]})
     level: dict[_Key, int] = {}
-    for key in needs:
-        _level(key, needs, level)
-    in_chain = set(of_chain.values())
-    order = sorted(needs, key=lambda key: (level[key], key not in in_chain))
+
+    def level_of(key: _Key) -> int:
+        if key not in level:
+            level[key] = 0  # ends a loop
+            level[key] = 1 + max((level_of(one) for one in needs[key]), default=-1)
+        return level[key]
+
+    order = sorted(needs, key=lambda key: (level_of(key), key not in along, key))
     return [
         _Stage(
             node=graph.callbacks[members[0]].node,
             topic=topic,
             members=members,
-            after=tuple(sorted(order.index(before) for before in needs[members, topic])),
+            after=tuple(sorted(order.index(one) for one in needs[members, topic])),
         )
         for members, topic in order
     ]
@@ -229,32 +239,22 @@ def _inputs(graph: ApplicationGraph, callback: Callback, topic: str) -> tuple[in
     )
 
 
-def _level(key: _Key, needs: dict[_Key, set[_Key]], level: dict[_Key, int]) -> int:
-    if key not in level:
-        level[key] = 0  # ends a loop
-        level[key] = 1 + max((_level(before, needs, level) for before in needs[key]), default=-1)
-    return level[key]
-
-
-def _times(flow: DataFlow, calm: pl.DataFrame, stage: _Stage, core: int) -> CallbackTimes:
+def _times(flow: DataFlow, instances: pl.DataFrame, stage: _Stage, core: int) -> CallbackTimes:
     """Response times of a stage: those of the instances that publish.
 
     At a synchronising callback the other inputs' instances come before, in the same slot.
     """
     published = flow.publications.filter(pl.col("topic") == stage.topic)["instance"].drop_nulls()
-    own = calm.filter(pl.col("callback_id").is_in(stage.members))
-    publishing = own.filter(pl.col("instance").is_in(published.implode()))
-    chosen = publishing if publishing.height else own
-    if not chosen.height:
+    publishes = pl.col("instance").is_in(published.implode())
+    own = instances.filter(pl.col("callback_id").is_in(stage.members))
+    response = (publishing if (publishing := own.filter(publishes)).height else own)["response"]
+    if response.is_empty():
         raise OperationError(
             f"no execution of {stage.node} that publishes {stage.topic} was recorded undisturbed:"
             " record again"
         )
-    response = chosen["response"]
-    waiting = 0
-    if len(stage.members) > 1:
-        others = own.filter(~pl.col("instance").is_in(published.implode()))
-        waiting = sum(others.group_by("callback_id").agg(pl.col("response").max())["response"])
+    others = own.filter(~publishes) if len(stage.members) > 1 else own.clear()
+    waiting = others.group_by("callback_id").agg(pl.col("response").max())["response"].sum()
     return CallbackTimes(
         node=stage.node,
         core=core,
@@ -265,16 +265,14 @@ def _times(flow: DataFlow, calm: pl.DataFrame, stage: _Stage, core: int) -> Call
     )
 
 
-def _undisturbed_instances(flow: DataFlow, traversals: pl.DataFrame) -> pl.DataFrame:
-    """Finished instances, with their response time, that began in no disturbed traversal."""
+def _instances_apart_from(flow: DataFlow, disturbed: pl.DataFrame) -> pl.DataFrame:
+    """Finished instances, with their response time, that began in none of these traversals."""
     seen = flow.instances.filter(pl.col("end").is_not_null() & ~pl.col("assumed"))
-    disturbed = traversals.filter(pl.col("disturbed") & pl.col("complete"))
     began = seen["start"].to_numpy()
     # An instance that begins just as a traversal ends is hit by it as well.
     hit = overlapping(began, began, disturbed["start"].to_numpy(), disturbed["end"].to_numpy() + 1)
-    return seen.filter(~pl.Series(hit)).select(
-        "instance", "callback_id", response=pl.col("end") - pl.col("start")
-    )
+    response = pl.col("end") - pl.col("start")
+    return seen.filter(~pl.Series(hit)).select("instance", "callback_id", response=response)
 
 
 def _receivers(graph: ApplicationGraph, chain: Chain, nodes: Collection[str]) -> tuple[str, ...]:
@@ -310,14 +308,11 @@ def _longest_send(flow: DataFlow) -> int | None:
     if not sends.height:
         return None
     stalls = events.table(flow.events, "machine_stall")
-    began = sends["time"].to_numpy()
-    stalled = overlapping(
-        began,
-        began + sends["duration"].to_numpy(),
-        stalls["time"].to_numpy(),
-        (stalls["time"] + stalls["duration"]).to_numpy(),
+    (began, ended), (stalled, over) = (
+        (one["time"].to_numpy(), (one["time"] + one["duration"]).to_numpy())
+        for one in (sends, stalls)
     )
-    calm = sends.filter(~pl.Series(stalled))
+    calm = sends.filter(~pl.Series(overlapping(began, ended, stalled, over)))
     return int((calm if calm.height else sends)["duration"].max())  # type: ignore[arg-type]
 
 
@@ -334,55 +329,16 @@ def _output_depth(flow: DataFlow, node: str, topic: str) -> int | None:
 
 def _utilisation(flow: DataFlow, graph: ApplicationGraph, core_of: dict[str, int]) -> float | None:
     """The largest share of a core that the executors of the chain's nodes take."""
-    core = {
-        callback.id: core_of[callback.node]
-        for callback in graph.callbacks
-        if callback.node in core_of
-    }
+    core = {one.id: core_of[one.node] for one in graph.callbacks if one.node in core_of}
     ran = flow.instances.filter(
         pl.col("callback_id").is_in(list(core)) & pl.col("execution_ns").is_not_null()
     )
     if not ran.height:
         return None
     lasted = int(ran["end"].max()) - int(ran["start"].min())  # type: ignore[arg-type]
-    busy = ran.group_by(pl.col("callback_id").replace_strict(core)).agg(
-        pl.col("execution_ns").sum()
-    )
-    return float(busy["execution_ns"].max()) / max(1, lasted)  # type: ignore[arg-type]
-
-
-_STANDARD = PlanRequest()
-
-
-def profile_chains(
-    recording: Recording | str | Path,
-    chains: Sequence[str | None] = (None,),
-    *,
-    period_ns: int | None = None,
-) -> tuple[Profile, ...]:
-    """What the planner needs of recorded chains: see :func:`chainshaper.planning.plan_chain`.
-
-    Period, cores and priorities are those of the recording; ``period_ns`` is for chains that no
-    timer starts. None stands for the chain that the recording names.
-
-    Raises:
-        InputError: no such chain, or no period.
-        OperationError: a chain with fewer than two complete undisturbed traversals.
-    """
-    if not isinstance(recording, Recording):
-        recording = open_source(recording)
-    flow = data_flow(recording.events, recording.info.clock_offset_ns)
-    stall = longest_stall(recording)
-    return tuple(
-        profile_of(
-            recording,
-            flow,
-            analyse_latency(flow, chain_of(recording, chain)),
-            period_ns=period_ns,
-            longest_stall_ns=stall,
-        )
-        for chain in chains
-    )
+    of_core = ran.group_by(pl.col("callback_id").replace_strict(core))
+    busy = of_core.agg(pl.col("execution_ns").sum())["execution_ns"].max()
+    return float(busy) / max(1, lasted)  # type: ignore[arg-type]
 
 
 def plan_recording(
@@ -395,8 +351,7 @@ def plan_recording(
 ) -> Plan:
     """Plan a recorded chain: single-band shaping (eq. 1, 4) unless ``request`` says otherwise.
 
-    L̄ is the maximum over the cycles that the machine did not disturb: a stall of the machine is
-    not part of the chain's latency. ``sinks`` are chains to further outputs of the same graph.
+    ``sinks`` are chains to further outputs of the same graph.
 
     Raises: as :func:`profile_chains` and :func:`chainshaper.planning.plan_chain`.
     """
@@ -417,14 +372,13 @@ def shape_application(
 ) -> Recording:
     """Splice the plan's shaping node into an application, run it and record it.
 
-    ``enforcement`` puts the plan's servers in force while it runs. A shaping node does without;
-    the thread of an asynchronous publisher is gated unless ``enforcement`` does so
+    ``enforcement`` puts the plan's servers in force while it runs. A shaping node does without; the
+    thread of an asynchronous publisher is gated unless ``enforcement`` does so
     (:func:`chainshaper.flow.apply.publishers_gated`).
 
-    Raises:
-        InputError: the plan does not fit the application, or has an offset; and what
-            :func:`~chainshaper.workload.live.run_application` raises.
-        PlatformError: the plan gates a publisher's thread, and threads cannot be frozen here.
+    Raises InputError: the plan does not fit the application, or has an offset; and what
+    :func:`~chainshaper.workload.live.run_application` raises. PlatformError: the plan gates a
+    publisher's thread, and threads cannot be frozen here.
     """
     refuse_offset(plan)
     if any(publisher_servers(plan)) and enforcement is None:

@@ -1,15 +1,14 @@
 """The paper's profiling condition: a chain alone with its interference (sections 2.5 and 4.2).
 
-L̄ and L̲, from which slots are computed, are measured with the executors of the chain's nodes under
-SCHED_FIFO at a high priority on one core, and their DDS threads above them on the others. What else
-runs cannot disturb the chain; interference that remains is what no schedule avoids (section 2.3).
-Threads are changed as `apply` changes them; those that appear later get theirs at the next look.
+The executors of the chain's nodes run under SCHED_FIFO at a high priority on one core, their DDS
+threads above them on the others, so that nothing else disturbs the chain. Threads are changed as
+`apply` changes them; those that appear later get theirs at the next look.
 """
 
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 from chainshaper.analysis import data_flow, find_chain, graph_of
@@ -25,14 +24,12 @@ from chainshaper.enforcement.threads import (
 )
 from chainshaper.flow.threads import recorded_processes
 from chainshaper.linux.processes import Process
-from chainshaper.linux.runs import Journal
 from chainshaper.linux.scheduling import available_cores, check_cores, may_use_fifo
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError, PlatformError
 from chainshaper.values.recording import Recording
 
-START_NS = 30_000_000_000
-"""The nodes have this long to appear."""
+START_NS = 30_000_000_000  # so long the nodes have to appear
 
 
 @contextmanager
@@ -45,20 +42,42 @@ def profiling_condition(
     """Have the threads of ``nodes`` (default: of all) run as the paper profiles a chain.
 
     It gives what :func:`chainshaper.flow.record.record_command` wants for its ``scheduling``.
-    ``core`` is where the executors run; by default the last that we may use. ``folder`` is where
-    runs keep their journals (default: `/run/chainshaper`). ``like`` is an earlier recording of the
-    application: it tells what a container's components are, and which executors have several
-    threads.
+    ``core`` is where the executors run (default: the last that we may use), ``folder`` where
+    journals are (default: `/run/chainshaper`). An earlier recording of the application that this
+    one is ``like`` says which components a container has, and which executors several threads.
 
-    Raises:
-        PlatformError: no such core, or SCHED_FIFO is not permitted.
-        OperationError: `apply` governs one of the nodes, or the core; not all could be put back.
-            And where it is called: a node does not appear, or the kernel refuses something.
+    Raises PlatformError: no such core, or SCHED_FIFO is not permitted. OperationError: `apply`
+    governs one of the nodes, or the core; not all could be put back. And where it is called: a node
+    does not appear, or the kernel refuses something.
     """
-    core = check_profiling(core)
+    core, wanted = check_profiling(core), frozenset(nodes)
     recorded = recorded_processes(like)[0] if like is not None else ()
+    begun_ns, done = time.monotonic_ns(), set[tuple[int, int]]()
+
+    def see_to_it(processes: Sequence[Process]) -> bool:
+        """Give new threads what they shall have; whether all nodes have it, and nothing was new."""
+        found = allocate(processes, recorded)
+        there = {node for one in found.threads for node in one.nodes}
+        members = executors_of(found, wanted, processes, recorded)
+        if not members or not wanted <= there:
+            if time.monotonic_ns() - begun_ns > START_NS:
+                missing, running = (", ".join(sorted(n)) for n in (wanted - there, there))
+                raise OperationError(
+                    f"{f'node {missing}' if missing else 'a node'} has not appeared within"
+                    f" {format_duration(START_NS)}; running: {running or 'no node'}"
+                )
+            return False
+        server = ReservationServer("the chain", core, 1, ())
+        around = scheduling_around({server.name: members}, [server], found, available_cores())
+        new = [one for one in around if one.thread.thread.identity not in done]
+        # One after the other, as under SCHED_FIFO in the paper: no turns.
+        changes = [(one.thread.thread, replace(one.wanted, takes_turns=False)) for one in new]
+        change_all(journal, changes)
+        done.update(thread.identity for thread, _ in changes)
+        return not new
+
     with run_claimed({core}, nodes, folder) as journal:
-        yield _Condition(frozenset(nodes), core, journal, recorded).see_to_it
+        yield see_to_it
 
 
 def check_profiling(core: int | None = None) -> int:
@@ -86,39 +105,6 @@ def chain_nodes(recording: Recording, chain: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(graph.callbacks[number].node for number in found.callbacks))
 
 
-@dataclass
-class _Condition:
-    """What is wished for, and which threads have it already. No ``nodes``: all of them."""
-
-    nodes: frozenset[str]
-    core: int
-    journal: Journal
-    recorded: Sequence[RecordedProcess]
-    begun_ns: int = field(default_factory=time.monotonic_ns)
-    done: set[tuple[int, int]] = field(default_factory=set)
-
-    def see_to_it(self, processes: Sequence[Process]) -> bool:
-        """Give new threads what they shall have; whether all nodes have it, and nothing was new."""
-        found = allocate(processes, self.recorded)
-        there = {node for one in found.threads for node in one.nodes}
-        members = executors_of(found, self.nodes, processes, self.recorded)
-        if not members or not self.nodes <= there:
-            if time.monotonic_ns() - self.begun_ns > START_NS:
-                raise OperationError(
-                    f"{_missing(self.nodes - there)} has not appeared within "
-                    f"{format_duration(START_NS)}; running: {', '.join(sorted(there)) or 'no node'}"
-                )
-            return False
-        server = ReservationServer("the chain", self.core, 1, ())
-        wanted = scheduling_around({server.name: members}, [server], found, available_cores())
-        new = [one for one in wanted if one.thread.thread.identity not in self.done]
-        # One after the other, as under SCHED_FIFO in the paper: no turns.
-        changes = [(one.thread.thread, replace(one.wanted, takes_turns=False)) for one in new]
-        change_all(self.journal, changes)
-        self.done.update(thread.identity for thread, _ in changes)
-        return not new
-
-
 def executors_of(
     found: Allocation,
     nodes: frozenset[str],
@@ -134,26 +120,20 @@ def executors_of(
     owners = {one.thread.pid for one in found.threads if one.nodes}
     launchers = {one.parent for one in processes if one.pid in owners}
     names = {one.pid: one.threads[0].comm for one in processes if one.threads}
-    several = {
-        node
-        for seen in recorded
-        if sum(thread.role == "executor" for thread in seen.threads) > 1
-        for node in seen.nodes
-    }
-    return [
-        one
-        for one in found.threads
-        if (
-            one.thread.role in ("executor", "publisher")
-            or (
-                one.thread.role == "unknown"
-                and one.thread.comm == names[one.thread.pid]
-                and not several.isdisjoint(one.nodes)
-            )
-        )
-        and (nodes & set(one.nodes) if nodes else one.nodes and one.thread.pid not in launchers)
-    ]
+    several: set[str] = set()
+    for seen in recorded:
+        if sum(thread.role == "executor" for thread in seen.threads) > 1:
+            several.update(seen.nodes)
 
+    def executes(one: NodeThread) -> bool:
+        if one.thread.role == "unknown":
+            unnamed = one.thread.comm == names[one.thread.pid]
+            return unnamed and not several.isdisjoint(one.nodes)
+        return one.thread.role in ("executor", "publisher")
 
-def _missing(nodes: Collection[str]) -> str:
-    return f"node {', '.join(sorted(nodes))}" if nodes else "a node"
+    def is_meant(one: NodeThread) -> bool:
+        if nodes:
+            return not nodes.isdisjoint(one.nodes)
+        return bool(one.nodes) and one.thread.pid not in launchers
+
+    return [one for one in found.threads if executes(one) and is_meant(one)]

@@ -1,45 +1,134 @@
-"""`sweep` as a function: one application in many variants, each profiled, planned and judged."""
+"""`sweep` as a function: one application in many variants, each profiled, planned and judged.
 
+An axis is a name with the values that it takes. What the name says is found out in this order:
+
+    bands, epsilon, publish-slot, policy, …     a wish for the plan: a field of PlanRequest
+    interference                                the load of section 2.5 beside the chain
+    plan.servers.0.slots.0.1, plan.overrun, …   a value of the plan's file
+    nodes.node3.core, seed, …                   a value of the application's description
+
+Paths lead through mappings by key and through lists by number, from 0. Values are those of YAML,
+so a whole part of a description may be one: ``{uniform: [5ms, 10ms]}``.
+
+A point is what a careful person would do by hand: simulate the application with its chain in front
+of all others (the profile), plan, splice, simulate again. The run that is planned from and the run
+that is judged draw their execution times with different seeds, so a margin is tried against
+latencies that the plan has not seen, and all points of one seed are judged by the same ones.
+
+Threads suffice to compute, because the compiled engine runs without the interpreter's lock; and
+they open no port and start no process that other users of the machine could reach.
+"""
+
+import asyncio
+import dataclasses
+import difflib
+import fcntl
 import importlib.metadata
 import io
+import json
+import os
+import re
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
-from dataclasses import replace
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from itertools import product
+from math import prod
 from pathlib import Path
-from typing import Any
+from queue import SimpleQueue
+from threading import Event
+from typing import IO, Any, TypeAlias, TypeVar
 
+import numpy as np
 import polars as pl
 import yaml
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from chainshaper.analysis import latency_statistics
+from chainshaper.analysis.latency import PERCENTILES
 from chainshaper.flow.plan import profile_chains
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.planning import Plan, Profile
+from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain, publish_slots
+from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.simulation import simulate, simulate_latencies
 from chainshaper.simulation.arrays import build_system
-from chainshaper.simulation.grid import (
-    Grid,
-    Values,
-    application_at,
-    grid_of,
-    is_duration,
-    points_of,
-)
-from chainshaper.simulation.sweeping import FIGURES, Row, finished_rows, rows_beside, rows_of
-from chainshaper.values.durations import parse_duration
-from chainshaper.values.errors import ChainshaperError, InputError
+from chainshaper.values.durations import format_duration, parse_duration
+from chainshaper.values.errors import ChainshaperError, InputError, OperationError, extra_library
 from chainshaper.values.files import new_file, write_whole
+from chainshaper.values.yaml_file import AS_YAML, PlainData, compose, wrong_values_refused
 from chainshaper.workload.description import Application, application_as_written
+from chainshaper.workload.live import origin_timer
 
-__all__ = ["profile_at", "sweep"]
+__all__ = ["parse_axis", "rows_beside", "sweep"]
 
-STRUCTURE_CYCLES = 100
-"""Enough of a recording to see who publishes what where."""
+Values: TypeAlias = Mapping[str, Any]
+"""One value for every axis: a point."""
+Row: TypeAlias = Mapping[str, Any]
+Progress: TypeAlias = Callable[[float, str], None]
+_Model = TypeVar("_Model", bound=BaseModel)
+
+INTERFERENCE = "interference"
+PLAN = "plan."
+UNPLANNED = "none"
+"""The policy of a point whose application runs as it is described."""
+MOST_POINTS = 1_000_000
+STRUCTURE_CYCLES = 100  # enough of a recording to see who publishes what where
 MOST_RECORDED = 100_000
 URGENT = 90
 """A chain is profiled at this priority where it is not more urgent than all others anyway."""
+OTHER_RUN = 1 << 32
+"""Added to a seed for the run that is judged; seeds that people count up never meet it."""
 
-Progress = Callable[[float, str], None]
+_REQUEST = TypeAdapter(PlanRequest)
+_WISHES = {
+    field.name.removesuffix("_ns"): field.name
+    for field in dataclasses.fields(PlanRequest)
+    if field.name != "seed"  # that of the application is meant
+}
+_RANGE = re.compile(r"(-?\d{1,18})\.\.(-?\d{1,18})")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)e[+-]?\d+", re.IGNORECASE)
+_BAND = {
+    **{"start_ns": pl.Int64, "end_ns": pl.Int64},
+    **{"predicted_share": pl.Float64, "share": pl.Float64, "jitter_ns": pl.Int64},
+}
+_OF_PLAN = (
+    *("profile_min_ns", "profile_mean_ns", "profile_max_ns"),
+    *("predicted_mean_ns", "predicted_max_ns", "predicted_jitter_ns"),
+)
+_OF_RUN = ("min_ns", "mean_ns", "max_ns", "jitter_ns", "spread_ns")
+
+FIGURES: dict[str, Any] = {
+    **dict.fromkeys((*_OF_PLAN, "count", "incomplete", "late", *_OF_RUN), pl.Int64),
+    **{f"p{percentile:g}_ns": pl.Int64 for percentile in PERCENTILES},
+    "band_jitter_ns": pl.Int64,
+    "per_band": pl.List(pl.Struct(_BAND)),
+    "error": pl.String,
+    "seconds": pl.Float64,
+}
+"""The columns of a row behind those of the axes.
+
+``profile_…`` are L̲, the average and L̄ that the plan rests on, ``predicted_…`` the plan's own
+(eq. 5). All others are of the judged run, in which ``incomplete`` instances of the chain gave no
+output, and ``late`` ones gave it behind the last slot it was due in (or later than the plan says,
+where there are no slots). ``per_band`` has the bands, with the outputs that left in their slots;
+``band_jitter_ns`` is the widest of their jitters. ``error`` says why there is nothing else.
+``seconds`` is the computing time, without that of the profile, which points share.
+"""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Every combination of the axes' values for one application, each simulated for ``cycles``
+    periods of the chain. ``plan`` is in force in all of them; without one each point is planned.
+    """
+
+    application: Application
+    plan: Plan | None
+    axes: Mapping[str, tuple[Any, ...]]
+    cycles: int
 
 
 def sweep(
@@ -56,23 +145,19 @@ def sweep(
 ) -> pl.DataFrame:
     """Simulate an application at every combination of some values, planned and shaped for each.
 
-    ``vary`` has the values of each axis (:mod:`chainshaper.simulation.grid`), durations as texts.
-    With a ``plan``, this one is in force everywhere. Each point is a run of ``cycles`` periods to
-    plan from, and another one with the plan in force; ``seed`` replaces the description's.
-    ``workers`` threads compute (default: one per core that we may use), or a Dask cluster, whose
-    ``scheduler`` is at that address.
+    ``vary`` has the values of each axis, durations as texts. With a ``plan``, this one is in force
+    everywhere. Each point is a run of ``cycles`` periods to plan from, and another one with the
+    plan in force; ``seed`` replaces the description's. ``workers`` threads compute (default: one
+    per core that we may use), or the Dask cluster whose ``scheduler`` is at that address.
 
-    The frame has a row for each point, in the order of the axes: a column for each axis (durations
-    in ns, with ``_ns`` behind the name), ``cycles``, ``seed``, and the figures of
-    :data:`chainshaper.simulation.sweeping.FIGURES`. A point that cannot be has an ``error``. The
-    same frame is in ``output``, a Parquet file. Until it is whole, finished rows stand beside it,
-    and the same call goes on with what is missing.
+    The frame, also written to ``output`` (Parquet), has a row for each point, in the order of the
+    axes: a column for each axis (durations in ns, with ``_ns`` behind the name), ``cycles``,
+    ``seed``, and :data:`FIGURES`. A point that cannot be has an ``error``. Until it is whole,
+    finished rows stand beside it, and the same call goes on with what is missing.
 
-    Raises:
-        InputError: unknown axes or impossible values; ``output`` exists, or rows beside it are of
-            another sweep.
-        OperationError: the cluster failed, or the disk is full.
-        PlatformError: `distributed` is not installed.
+    Raises InputError: unknown axes or impossible values; ``output`` exists, or rows beside it are
+    of another sweep. OperationError: the cluster failed, or the disk is full. PlatformError:
+    `distributed` is not installed.
     """
     output = new_file(output, (".parquet",))
     grid = grid_of(application, vary, plan, cycles=cycles, seed=seed)
@@ -80,12 +165,19 @@ def sweep(
         raise InputError(f"{workers} workers compute nothing: ask for at least 1")
     points = points_of(grid)
     rows_file = rows_beside(output)
-    with finished_rows(rows_file, _about(grid)) as (rows, add):
+    about = {  # what rows depend on, under the names that are said when it changed
+        "the version of chainshaper": importlib.metadata.version("chainshaper"),
+        "the application or the seed": application_as_written(grid.application),
+        "the plan": None if grid.plan is None else grid.plan.model_dump(mode="json"),
+        "the axes": {name: list(values) for name, values in grid.axes.items()},
+        "the number of cycles": grid.cycles,
+    }
+    with finished_rows(rows_file, about) as (rows, add):
         missing = [(number, values) for number, values in enumerate(points) if number not in rows]
         most = min(workers or len(available_cores()), max(1, len(missing)))
         if missing and progress is not None:
             progress(len(rows) / len(points), f"{len(points)} points")
-        with closing(rows_of(grid, missing, profile_at, most, scheduler)) as coming:
+        with closing(rows_of(grid, missing, most, scheduler)) as coming:
             for number, row in coming if missing else ():
                 add(number, row)
                 if progress is not None:
@@ -98,63 +190,11 @@ def sweep(
     return frame
 
 
-def profile_at(grid: Grid, values: Values, progress: Progress | None = None) -> Profile | str:
-    """The measurements that a point is planned from, or why there are none.
-
-    They depend on the application, and on whether callbacks are planned one by one: then response
-    times of as many cycles are needed, 100,000 at most, which takes events.
-    """
-    try:
-        application = _urgent(application_at(grid, values))
-        per_callback = values.get("policy") == "server-per-callback"
-        recorded = min(grid.cycles, MOST_RECORDED if per_callback else STRUCTURE_CYCLES)
-        with tempfile.TemporaryDirectory(prefix="chainshaper-sweep-") as folder:
-            place = Path(folder) / "profile"
-            recording = simulate(application, place, cycles=recorded, progress=progress)
-            (profile,) = profile_chains(recording)
-        latencies = simulate_latencies(application, cycles=grid.cycles, progress=progress)
-    except ChainshaperError as error:
-        return str(error)
-    complete = latencies[latencies >= 0]
-    incomplete = int(latencies.size - complete.size)
-    return replace(profile, latencies_ns=complete, incomplete=incomplete, recording=None)
-
-
-def _urgent(application: Application) -> Application:
-    """The profiling condition (section 3.1): the chain's executors before all others."""
-    system = build_system(application, follow_chain=True)
-    places = [system.entities[callback].process for callback in system.chain.callbacks]
-    chain = {system.processes[place].key for place in places}
-    priority = {name: application.scheduling_of(name).priority for name in application.nodes}
-    others = [priority[name] for name in application.nodes if name not in chain]
-    if min(priority[name] for name in chain) > max(others, default=0):
-        return application
-    nodes = {
-        name: node.model_copy(
-            update={"priority": URGENT if name in chain else min(priority[name], URGENT - 1)}
-        )
-        for name, node in application.nodes.items()
-    }
-    return application.model_copy(update={"nodes": nodes})
-
-
-def _about(grid: Grid) -> dict[str, Any]:
-    """What rows depend on, under the names that are said when it changed."""
-    return {
-        "the version of chainshaper": importlib.metadata.version("chainshaper"),
-        "the application or the seed": application_as_written(grid.application),
-        "the plan": None if grid.plan is None else grid.plan.model_dump(mode="json"),
-        "the axes": {name: list(values) for name, values in grid.axes.items()},
-        "the number of cycles": grid.cycles,
-    }
-
-
 def _frame(grid: Grid, points: Sequence[Values], rows: Sequence[Row]) -> pl.DataFrame:
     axes = [_axis(name, values, points) for name, values in grid.axes.items()]
-    seeds = [values.get("seed", grid.application.seed) for values in points]
     own = [pl.Series("cycles", [grid.cycles] * len(points), dtype=pl.Int64)]
     if "seed" not in grid.axes:
-        own.append(pl.Series("seed", seeds, dtype=pl.Int64))
+        own.append(pl.Series("seed", [grid.application.seed] * len(points), dtype=pl.Int64))
     figures = pl.DataFrame([dict(row) for row in rows], schema=FIGURES)
     return pl.DataFrame([*axes, *own]).hstack(figures)
 
@@ -169,10 +209,588 @@ def _axis(name: str, values: Sequence[Any], points: Sequence[Values]) -> pl.Seri
     for dtype, those in ((pl.Boolean, {bool}), (pl.Int64, {int}), (pl.Float64, {int, float})):
         if kinds and kinds <= those:
             return pl.Series(name, column, dtype=dtype)
-    return pl.Series(name, [_text(value) for value in column], dtype=pl.String)
+    texts = [
+        value
+        if value is None or isinstance(value, str)
+        else yaml.safe_dump(value, default_flow_style=True, width=1000).split("\n")[0]
+        for value in column
+    ]
+    return pl.Series(name, texts, dtype=pl.String)
 
 
-def _text(value: Any) -> str | None:
-    if value is None or isinstance(value, str):
+# Axes and points -------------------------------------------------------------------------------
+
+
+def parse_axis(text: str) -> tuple[str, tuple[Any, ...]]:
+    """An axis as it is written: ``bands=1..5``, ``epsilon=0,1ms``, ``policy=none,shaped``.
+
+    Raises InputError: it is not of this form.
+    """
+    name, _, values = text.partition("=")
+    try:
+        root = compose(f"[{values}]", "value")
+        listed = None if root is None else PlainData("value").of(root)
+        if not name.strip() or not isinstance(listed, tuple) or not listed:
+            raise InputError("it has no name, or no values")
+    except InputError as error:
+        raise InputError(
+            f"--vary {text!r} is no axis: write NAME=VALUE,VALUE…, such as epsilon=0ms,1ms,2ms or"
+            f" bands=1..5 ({error})"
+        ) from error
+    plain = json.loads(json.dumps(listed))  # lists where YAML's reader has tuples
+    return name.strip(), tuple(value for one in plain for value in _expanded(one))
+
+
+def _expanded(written: Any) -> Iterator[Any]:
+    """A range as its numbers, and numbers that YAML 1.1 takes for texts (1e-6)."""
+    if isinstance(written, str) and (ends := _RANGE.fullmatch(written)):
+        numbers = range(int(ends[1]), int(ends[2]) + 1)
+        if numbers[MOST_POINTS:]:
+            raise InputError(f"{written}: more than {MOST_POINTS} values: write a shorter range")
+        yield from numbers
+    elif isinstance(written, str) and _NUMBER.fullmatch(written):
+        yield float(written)
+    else:
+        yield written
+
+
+def grid_of(
+    application: Application,
+    axes: Mapping[str, Sequence[Any]],
+    plan: Plan | None = None,
+    *,
+    cycles: int,
+    seed: int | None = None,
+) -> Grid:
+    """A grid, once it is sure that each value of each axis means something.
+
+    Raises InputError: an axis that is unknown or empty, or a value that it cannot have.
+    """
+    if seed is not None:
+        application = application.model_copy(update={"seed": seed})
+    if cycles < 1:
+        raise InputError(f"{cycles} cycles cannot be simulated: ask for at least 1")
+    # Wishes are called as the command line calls them, or as Python does.
+    python = {name: name.replace("-", "_").removesuffix("_ns") for name in axes}
+    named = {
+        python[name] if python[name] in _WISHES else name: tuple(values)
+        for name, values in axes.items()
+    }
+    if len(named) < len(axes):
+        raise InputError(f"an axis is given twice, of {', '.join(axes)}: give all values at once")
+    grid = Grid(application, plan, named, cycles)
+    for name, values in named.items():
+        _refuse_unknown(name, plan)
+        texts = [json.dumps(value) for value in values]
+        if not values or len(set(texts)) < len(texts):
+            raise InputError(f"axis {name}: give at least one value, and none of them twice")
+    if (points := prod(map(len, named.values()))) > MOST_POINTS:
+        raise InputError(f"{points} points: give fewer values, for {MOST_POINTS} points at most")
+    first = {name: values[0] for name, values in named.items()}
+    for name, values in named.items():
+        for value in values:
+            point = {**first, name: value}
+            application_at(grid, point)
+            plan_at(grid, point)
+            request_at(grid, point)
+    return grid
+
+
+def points_of(grid: Grid) -> list[Values]:
+    """All points, in the order of the axes: the last one changes fastest."""
+    return [dict(zip(grid.axes, values, strict=True)) for values in product(*grid.axes.values())]
+
+
+def _changes_application(name: str) -> bool:
+    return name not in _WISHES and not name.startswith(PLAN)
+
+
+def _refuse_unknown(name: str, plan: Plan | None) -> None:
+    if plan is not None and name in _WISHES:
+        raise InputError(
+            f"axis {name} is a wish for a plan, but a plan is given: leave it out, or vary a value"
+            " of its file, such as plan.overrun"
+        )
+    if plan is None and name.startswith(PLAN):
+        raise InputError(f"axis {name} is a value of a plan's file: give the plan, too")
+    keys = [field.removesuffix("_ns") for field in Application.model_fields]
+    first = name.partition(".")[0]
+    if _changes_application(name) and first not in (*keys, INTERFERENCE):
+        near = difflib.get_close_matches(first, [*_WISHES, *keys, INTERFERENCE], n=1)
+        raise InputError(
+            f"axis {name}: no such thing{f', did you mean {near[0]}?' if near else ''} There are"
+            f" {', '.join([*_WISHES, INTERFERENCE])}, plan.PATH with a plan, and values of the"
+            f" description, by paths that begin with {', '.join(keys)}"
+        )
+
+
+def is_duration(name: str, values: Sequence[Any]) -> bool:
+    """Whether an axis has durations only: all with units, but for zeros."""
+    if _WISHES.get(name, "").endswith("_ns"):
+        return True
+    texts = [value for value in values if value not in (0, None)]
+    try:
+        for text in texts:
+            parse_duration(text if isinstance(text, str) else "")
+    except InputError:
+        return False
+    return bool(texts)
+
+
+def application_at(grid: Grid, values: Values) -> Application:
+    """The application of a point.
+
+    Raises InputError: it cannot be; the values and the reason are named.
+    """
+    changes = {name: value for name, value in values.items() if _changes_application(name)}
+    if not changes:
+        return grid.application
+    described: Any = application_as_written(grid.application)
+    if (load := changes.get(INTERFERENCE)) is not None:
+        timer = origin_timer(grid.application)
+        described = _interfered(described, timer.timer_ns or 0, _nanoseconds(INTERFERENCE, load))
+    for name, value in changes.items():
+        if name != INTERFERENCE:
+            described = _replaced(described, name.split("."), value)
+    return _validated(Application, described, changes)
+
+
+def plan_at(grid: Grid, values: Values) -> Plan | None:
+    """The given plan with the point's values in it; None without one.
+
+    Raises InputError: that is no plan.
+    """
+    changes = {name: value for name, value in values.items() if name.startswith(PLAN)}
+    if grid.plan is None or not changes:
+        return grid.plan
+    written: Any = grid.plan.model_dump(mode="json", by_alias=True, context=AS_YAML)
+    for name, value in changes.items():
+        written = _replaced(written, name.removeprefix(PLAN).split("."), value)
+    return _validated(Plan, written, changes)
+
+
+def request_at(grid: Grid, values: Values) -> PlanRequest | None:
+    """What is wished of a point's plan; None where none is made.
+
+    Raises InputError: a value that no such wish can have.
+    """
+    if grid.plan is not None or values.get("policy") == UNPLANNED:
+        return None
+    wishes: dict[str, Any] = {"seed": values.get("seed", grid.application.seed)}
+    for name, value in values.items():
+        field = _WISHES.get(name)
+        if field is not None:
+            wishes[field] = _nanoseconds(name, value) if field.endswith("_ns") else value
+    try:
+        return _REQUEST.validate_json(json.dumps(wishes), strict=True)
+    except ValidationError as error:
+        wrong = error.errors()[0]
+        name = str(wrong["loc"][0])
+        raise InputError(
+            f"axis {name.removesuffix('_ns')}: {wishes.get(name)!r} is no value of it:"
+            f" {wrong['msg']}"
+        ) from error
+
+
+def _replaced(data: Any, path: list[str], value: Any) -> Any:
+    """Plain data with one value in it replaced; mappings on the way to it are made."""
+    if not path:
         return value
-    return yaml.safe_dump(value, default_flow_style=True, width=1000).split("\n")[0]
+    key, *rest = path
+    if isinstance(data, list) and key.isdecimal() and int(key) < len(data):
+        number = int(key)
+        return [*data[:number], _replaced(data[number], rest, value), *data[number + 1 :]]
+    mapping = data if isinstance(data, dict) else {}
+    return {**mapping, key: _replaced(mapping.get(key), rest, value)}
+
+
+def _interfered(described: dict[str, Any], period_ns: int, longest_ns: int) -> dict[str, Any]:
+    """The description with a load beside the chain, as in section 2.5.
+
+    Once a period, for between half the time and all of it, at the lowest priority on the
+    executors' core. A node of that name that is described has everything else as described.
+    """
+    own = described["nodes"].get(INTERFERENCE, {})
+    first, *others = own.get("callbacks", [{"timer": format_duration(period_ns)}])
+    times = [format_duration(longest_ns // 2), format_duration(longest_ns)]
+    callbacks = [{**first, "execution": {"uniform": times}}, *others]
+    node = {"priority": 1, "dds_priority": 1, **own, "callbacks": callbacks}
+    return {**described, "nodes": {**described["nodes"], INTERFERENCE: node}}
+
+
+def _validated(model: type[_Model], data: Any, changes: Values) -> _Model:
+    said = ", ".join(f"{name}={value}" for name, value in changes.items())
+    with wrong_values_refused(model, f"{said}: "):
+        return model.model_validate_json(json.dumps(data), context=AS_YAML)
+
+
+def _nanoseconds(name: str, value: Any) -> Any:
+    if value is None or value == 0:
+        return value
+    if not isinstance(value, str):
+        raise InputError(f"axis {name}: {value!r} has no unit: write a duration, such as 1ms")
+    return parse_duration(value)
+
+
+# One point -------------------------------------------------------------------------------------
+
+
+def profile_at(grid: Grid, values: Values, progress: Progress | None = None) -> Profile | str:
+    """The measurements that a point is planned from, or why there are none.
+
+    Where callbacks are planned one by one, response times of as many cycles are needed, 100,000 at
+    most, which takes events.
+    """
+    try:
+        application = _urgent(application_at(grid, values))
+        per_callback = values.get("policy") == "server-per-callback"
+        recorded = min(grid.cycles, MOST_RECORDED if per_callback else STRUCTURE_CYCLES)
+        with tempfile.TemporaryDirectory(prefix="chainshaper-sweep-") as folder:
+            place = Path(folder) / "profile"
+            recording = simulate(application, place, cycles=recorded, progress=progress)
+            (profile,) = profile_chains(recording)
+        latencies = simulate_latencies(application, cycles=grid.cycles, progress=progress)
+    except ChainshaperError as error:
+        return str(error)
+    complete = latencies[latencies >= 0]
+    lost = int(latencies.size - complete.size)
+    profile = dataclasses.replace(profile, latencies_ns=complete, every_latency_ns=complete)
+    return dataclasses.replace(profile, incomplete=lost, recording=None)
+
+
+def _urgent(application: Application) -> Application:
+    """The profiling condition (section 3.1): the chain's executors before all others."""
+    system = build_system(application, follow_chain=True)
+    places = [system.entities[callback].process for callback in system.chain.callbacks]
+    chain = {system.processes[place].key for place in places}
+    priority = {name: application.scheduling_of(name).priority for name in application.nodes}
+    others = [priority[name] for name in application.nodes if name not in chain]
+    if min(priority[name] for name in chain) > max(others, default=0):
+        return application
+    urgent = {n: URGENT if n in chain else min(priority[n], URGENT - 1) for n in application.nodes}
+    nodes = {
+        name: node.model_copy(update={"priority": urgent[name]})
+        for name, node in application.nodes.items()
+    }
+    return application.model_copy(update={"nodes": nodes})
+
+
+def row_at(
+    grid: Grid, values: Values, profile: Profile | str | None, progress: Progress | None = None
+) -> dict[str, Any]:
+    """The figures of one point, under the names of :data:`FIGURES`.
+
+    ``profile`` None: no plan is made. An impossible point raises nothing, its row has the reason.
+    """
+    began = time.perf_counter()
+    figures: dict[str, Any] = dict.fromkeys(FIGURES)
+    try:
+        if isinstance(profile, str):
+            raise InputError(profile)
+        figures |= _judged(grid, values, profile, progress)
+    except ChainshaperError as error:
+        figures["error"] = str(error)
+    return {**figures, "seconds": round(time.perf_counter() - began, 6)}
+
+
+def _judged(
+    grid: Grid, values: Values, profile: Profile | None, progress: Progress | None
+) -> dict[str, Any]:
+    application, plan = application_at(grid, values), plan_at(grid, values)
+    request = request_at(grid, values)
+    if profile is not None and request is not None:
+        plan = plan_chain(profile, request)
+    seed = application.seed + OTHER_RUN
+    latencies = simulate_latencies(
+        application, plan, cycles=grid.cycles, seed=seed, progress=progress
+    )
+    complete = latencies[latencies >= 0]
+    measured = latency_statistics(complete, incomplete=latencies.size - complete.size)
+    figures = {name: getattr(measured, name) for name in ("count", "incomplete", *_OF_RUN)}
+    figures |= {f"p{name}_ns": value for name, value in measured.percentiles_ns.items()}
+    return figures if plan is None else {**figures, **_beside(plan, complete)}
+
+
+def _beside(plan: Plan, latencies: Any) -> dict[str, Any]:
+    """What the plan says, and what became of its bands."""
+    delay = cycles_until_output(plan) * plan.cycle_ns
+    slots = [(start + delay, end + delay) for start, end in publish_slots(plan)]
+    shares = plan.predicted.shares
+    bands = []
+    for number, (start, end) in enumerate(slots):
+        # An output belongs to the last slot that had started when it left, if it is not late.
+        until = slots[number + 1][0] if slots[number + 1 :] else end
+        inside = latencies[(latencies >= start) & (latencies < until)]
+        band = {
+            "start_ns": start,
+            "end_ns": end,
+            "predicted_share": shares[number] if len(shares) == len(slots) else None,
+            "share": inside.size / latencies.size if latencies.size else None,
+            "jitter_ns": int(inside.max() - inside.min()) if inside.size else None,
+        }
+        bands.append(band)
+    latest = slots[-1][1] - 1 if slots else plan.predicted.max_ns
+    jitters = [band["jitter_ns"] for band in bands if band["jitter_ns"] is not None]
+    evidence, predicted = plan.evidence, plan.predicted
+    return {
+        "profile_min_ns": evidence.min_latency_ns,
+        "profile_mean_ns": evidence.mean_latency_ns,
+        "profile_max_ns": evidence.max_latency_ns,
+        "predicted_mean_ns": predicted.mean_ns,
+        "predicted_max_ns": predicted.max_ns,
+        "predicted_jitter_ns": predicted.jitter_ns,
+        "late": int(np.count_nonzero(latencies > latest)),
+        "band_jitter_ns": max(jitters, default=None),
+        "per_band": bands,
+    }
+
+
+# Who computes ----------------------------------------------------------------------------------
+
+CONNECT_S = 10
+WITHOUT_WORKERS_S = 60
+LOOK_S = 0.5
+ASKED_OF_CLUSTER = 10_000
+"""So many points at a time are with a cluster: more than its workers compute at once."""
+SAME = ("chainshaper", "numpy", "distributed")
+"""Packages whose versions rows depend on: NumPy's generators may draw differently."""
+_ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?[^/]+:\d+")
+
+
+@dataclass(frozen=True)
+class Group:
+    """Points, by their numbers, that share a profile; ``profiled``: or need none."""
+
+    profiled: bool
+    points: tuple[tuple[int, Values], ...]
+
+
+@dataclass(frozen=True)
+class _Engine:
+    """Who computes: ``submit`` (a function and its arguments, futures among them), the next future
+    that is ``finished``, and how many may be ``under_way``."""
+
+    submit: Callable[..., Any]
+    finished: Callable[[], Any]
+    under_way: int
+
+
+def groups_of(grid: Grid, points: Iterable[tuple[int, Values]]) -> list[Group]:
+    """Points in groups of one profile each, in their order."""
+    groups: dict[str, list[tuple[int, Values]]] = {}
+    for number, values in points:
+        profiled = request_at(grid, values) is not None
+        application = {name: value for name, value in values.items() if _changes_application(name)}
+        per_callback = values.get("policy") == "server-per-callback"
+        key = json.dumps([profiled, profiled and per_callback, application])
+        groups.setdefault(key, []).append((number, values))
+    return [Group(json.loads(key)[0], tuple(points)) for key, points in groups.items()]
+
+
+def rows_of(
+    grid: Grid, points: Iterable[tuple[int, Values]], workers: int, scheduler: str | None = None
+) -> Generator[tuple[int, Row], None, None]:
+    """Rows by the numbers of their points, as they are finished.
+
+    ``workers`` threads compute, or a Dask cluster, where points of a worker that dies are computed
+    by others; a row does not depend on who computes it. Points that differ in nothing measured
+    share a profile; those whose profile is there come first, so that few are in memory at a time.
+
+    Raises InputError: that is no address. PlatformError: `distributed` is not installed.
+    OperationError: no scheduler is there, or it is gone; there are no workers, or one has other
+    versions of what rows depend on; or a point killed one worker after another.
+    """
+    coming = iter(groups_of(grid, points))
+    ready: deque[tuple[int, Values, Any]] = deque()
+    pending: dict[Any, Group | int] = {}
+    with _threads(workers) if scheduler is None else _cluster(scheduler) as engine:
+        while True:
+            while len(pending) < engine.under_way:
+                if ready:
+                    number, values, profile = ready.popleft()
+                    pending[engine.submit(row_at, grid, values, profile)] = number
+                elif (group := next(coming, None)) is None:
+                    break
+                elif group.profiled:
+                    pending[engine.submit(profile_at, grid, group.points[0][1])] = group
+                else:
+                    ready.extend((number, values, None) for number, values in group.points)
+            if not pending:
+                return
+            future = engine.finished()
+            result, of = future.result(), pending.pop(future)
+            if isinstance(of, Group):
+                ready.extend((number, values, future) for number, values in of.points)
+            else:
+                yield of, result
+
+
+@contextmanager
+def _threads(workers: int) -> Iterator[_Engine]:
+    """Threads of this process, which leave their points unfinished when the sweep ends early."""
+    ending, done = Event(), SimpleQueue["Future[Any]"]()
+
+    def go_on(*_: object) -> None:
+        if ending.is_set():
+            raise CancelledError
+
+    def submit(function: Callable[..., Any], *arguments: Any) -> "Future[Any]":
+        known = [one.result() if isinstance(one, Future) else one for one in arguments]
+        future = pool.submit(function, *known, progress=go_on)
+        future.add_done_callback(done.put)
+        return future
+
+    pool = ThreadPoolExecutor(workers, "sweep")
+    try:
+        yield _Engine(submit, done.get, 2 * workers)
+    finally:
+        ending.set()
+        pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _cluster(address: str) -> Iterator[_Engine]:
+    """A Dask cluster. All of Dask's many errors leave the sweep where it is, and the user with the
+    same things to look at.
+    """
+    distributed, here = extra_library("distributed", "a sweep on a Dask cluster"), _versions()
+    if not _ADDRESS.fullmatch(address):
+        raise InputError(f"{address!r} is no scheduler's address: write one like tcp://HOST:8786")
+    try:
+        connected = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, asyncio.TimeoutError) as error:  # from Python 3.11 on they are one
+        raise OperationError(
+            f"no Dask scheduler answers at {address} ({error}): start one with `dask scheduler`,"
+            " and give the address that it prints, such as --scheduler tcp://HOST:8786"
+        ) from error
+    with connected as client:
+        completed = distributed.as_completed(loop=client.loop)
+
+        def submit(function: Callable[..., Any], *arguments: Any) -> Any:
+            future = client.submit(_same_versions, here, function, *arguments, pure=False)
+            completed.add(future)
+            return future
+
+        def finished() -> Any:
+            """The next result. Workers may come and go, but one has to be there now and then."""
+            seen = looked = time.monotonic()
+            while not completed.has_ready():
+                time.sleep(0.02)
+                if time.monotonic() - looked > LOOK_S:
+                    looked = time.monotonic()
+                    seen = looked if client.nthreads() else seen
+                    if looked - seen > WITHOUT_WORKERS_S:
+                        raise TimeoutError(f"it has had no workers for {WITHOUT_WORKERS_S} s")
+            return next(completed)
+
+        try:
+            yield _Engine(submit, finished, ASKED_OF_CLUSTER)
+        except ChainshaperError:
+            raise
+        except Exception as error:
+            raise OperationError(
+                f"the Dask cluster at {address} failed ({type(error).__name__}: {error}); finished"
+                " rows stay. See that its workers run, that chainshaper is installed on each,"
+                " and that they have memory; then the same command goes on"
+            ) from error
+
+
+def _versions() -> dict[str, str]:
+    return {name: importlib.metadata.version(name) for name in SAME}
+
+
+def _same_versions(client: dict[str, str], function: Callable[..., Any], *arguments: Any) -> Any:
+    """On a worker, which may have come later than the rest: rows must not depend on who it is."""
+    own = _versions()
+    different = [f"{n} {own[n]}, not {client[n]}" for n in SAME if own[n] != client[n]]
+    if different:
+        worker = importlib.import_module("distributed").get_worker().address
+        raise OperationError(
+            f"the Dask worker at {worker} has {' and '.join(different)}: install the same versions"
+            " there as here"
+        )
+    return function(*arguments)
+
+
+# Where finished rows stand ---------------------------------------------------------------------
+
+
+def rows_beside(output: str | Path) -> Path:
+    """Where the finished rows of a sweep stand until it is whole."""
+    output = Path(output)
+    return output.with_name(output.name + ".rows")
+
+
+@contextmanager
+def finished_rows(
+    path: Path, about: Mapping[str, Any]
+) -> Iterator[tuple[dict[int, Row], Callable[[int, Row], None]]]:
+    """The rows that are finished, by the number of their point, and how to add one.
+
+    One line of JSON a row, behind a first line that says what is swept (``about``, plain data).
+    Each is on disk before the next; a crash leaves half a line at most, which is removed. A file
+    without rows is removed.
+
+    Raises InputError: the file is of another sweep; the message names what differs. OperationError:
+    another process works on it, or it cannot be read or written.
+    """
+    about = json.loads(json.dumps(about))
+    try:
+        with path.open("a+", encoding="utf-8") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise OperationError(
+                    f"{path}: another process works on this sweep: wait for it, or name another"
+                    " output"
+                ) from error
+            finished = _read(file, path, about)
+            if finished is None:
+                _append(file, about)
+            rows = dict(finished or {})
+
+            def add(number: int, row: Row) -> None:
+                rows[number] = row  # first: an interruption must not take it for an empty file
+                _append(file, {"number": number, "row": row})
+
+            try:
+                yield rows, add
+            finally:
+                if not rows:
+                    path.unlink()
+    except OSError as error:
+        raise OperationError(
+            f"{path}: finished rows cannot be written ({error.strerror or error}); what is in it"
+            " stays, and the same command goes on from there"
+        ) from error
+
+
+def _read(file: IO[str], path: Path, about: Mapping[str, Any]) -> dict[int, Row] | None:
+    """The rows of whole lines; what is behind them is cut off. None: the file is new."""
+    file.seek(0)
+    text = file.read()
+    whole = text[: text.rfind("\n") + 1]
+    if len(whole) < len(text):
+        os.truncate(file.fileno(), len(whole.encode()))
+    if not whole:
+        return None
+    try:
+        first, *rows = map(json.loads, whole.splitlines())
+        finished = {row["number"]: row["row"] for row in rows}
+        changed = [name for name in about if first[name] != about[name]]
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            f"{path}: these are no rows of a sweep: move the file away, or name another output"
+        ) from error
+    if changed:
+        raise InputError(
+            f"{path} has {len(finished)} finished rows of another sweep: {' and '.join(changed)}"
+            " changed since. Undo that to go on with them, name another output, or remove the file"
+        )
+    return finished
+
+
+def _append(file: IO[str], value: Mapping[str, Any]) -> None:
+    file.write(json.dumps(value) + "\n")
+    file.flush()
+    os.fsync(file.fileno())

@@ -19,12 +19,11 @@ from chainshaper.values.compiled.memory import compiled, store_word, table_at
 def fill_costs(grid, windows, costs, successors, work, positions, layers):
     """For every position, the cost of 2, 3, … ``layers`` bands behind it, and the next of them.
 
-    ``grid`` are two rows, counts and ends. ``windows`` are two rows that ascend: a band at i may
-    be followed by one at j from the first (at most ``positions``) to the second. Row 0 of
-    ``costs`` is given: when only the last band is behind position i, ``UNREACHABLE`` where it
-    cannot be. Row m becomes the smallest ``(counts[j] − counts[i])·ends[j]`` plus row m − 1 at j,
-    and that of ``successors`` (int32) this j; both stay as they are where there is none. ``work``
-    has 12 rows of ``positions`` + 1. Returns 0.
+    ``grid`` are two rows, counts and ends; ``windows`` two rows that ascend: a band at i may be
+    followed by one at j from the first (at most ``positions``) to the second. Row 0 of ``costs`` is
+    given: only the last band is behind position i. Row m becomes the smallest ``(counts[j] −
+    counts[i])·ends[j]`` plus row m − 1 at j, that of ``successors`` (int32) this j; both stay as
+    they are where there is none. ``work`` has 12 rows of ``positions`` + 1. Returns 0.
     """
     row = 8 * (positions + 1)
     column_of, row_of, best = table_at(work), table_at(work + 3 * row), table_at(work + 9 * row)

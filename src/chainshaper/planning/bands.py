@@ -1,30 +1,24 @@
 """Where to put the publish slots of several latency bands, exactly (sections 3.3 and 4.1).
 
-With ν bands an execution publishes in the first slot that ends after it is done, so most of them
-come earlier than the longest latency. The average is eq. 5,
+With ν bands an execution publishes in the first slot that ends after it is done. With x_α the end
+of slot α and φ the measured distribution, the average is eq. 5,
 
     Σ_α (φ(x_α) − φ(x_{α−1}))·x_α,
 
-x_α the end of slot α and φ the measured distribution; the last slot stays where single-band shaping
-has it. The optimum is found on a grid of instants by dynamic programming from the last slot
-backwards: B_m(i), the least cost of the m bands behind a band that ends at x_i, is
+and the last slot stays where single-band shaping has it. The optimum on a grid of instants is found
+by dynamic programming from the last slot backwards. With c_j of n latencies ≤ x_j, the least cost
+of the m bands behind one that ends at x_i is
 
-    B_m(i) = min over j of (c_j − c_i)·x_j + B_{m−1}(j),    B_1(i) = (n − c_i)·x_ν,
+    B_m(i) = min over j of (c_j − c_i)·x_j + B_{m−1}(j),    B_1(i) = (n − c_i)·x_ν.
 
-c_i being the number of latencies ≤ x_i among n.
+**Why this is exact, also under tight constraints.** For row i, column j costs the value at c_i of a
+line with intercept c_j·x_j + B_{m−1}(j) and slope −x_j. Every constraint (Δ, LV, the cap on a
+band's share) says that j lies in a window whose ends ascend with i, and so do the c_i. The kernel
+keeps the lower envelope of the lines, in an order of rows in which windows only grow, so that it
+loses no line that a later row needs. Each layer is linear in the number of grid points.
 
-**Why this is exact, also under tight constraints.** For row i, column j costs the value of the line
-with intercept c_j·x_j + B_{m−1}(j) and slope −x_j at c_i. Every constraint on neighbouring bands
-says that j lies in a window whose both ends ascend with i: Δ and LV bound x_j − x_i, the cap on a
-band's share bounds c_j − c_i, and x and c ascend. So B_m(i) is the least of the lines of a moving
-window at c_i, and all the c_i ascend too. The kernel keeps the lower envelope of the lines, in an
-order of rows in which windows only grow, so that no line is lost that a later row may need, and
-positions from which no placement leads on are left out. Each layer is linear in the number of grid
-points. (The cost is Monge as well, w(i, j) + w(i', j') ≤ w(i, j') + w(i', j) for i < i', j < j',
-which is why the average gains less with every further band.)
-
-Placement by particle swarm, as the paper does it, and at random (section 5.1.5, the rows "PSO" and
-"Random" of tables 3 and 4) are for comparison: neither better nor faster.
+Placement by particle swarm, as the paper does it, and at random (section 5.1.5, tables 3 and 4) are
+for comparison: neither better nor faster.
 """
 
 import os
@@ -57,13 +51,9 @@ from chainshaper.values.plan_choices import Goal, Solver
 UNREACHABLE = 2**63 - 1  # the cost of what cannot be placed
 MOST_CELLS = 120_000_000  # grid points × bands: more than a gigabyte
 MOST_BANDS = 12  # as far as `auto` looks; figure 7 is flat from the fourth on
-
-# Section 5.1.5.
-PARTICLES = 100
-ITERATIONS = 150
-OPTIONS = {"c1": 0.5, "c2": 0.3, "w": 0.9}
-
 RANDOM_TRIES = 10_000
+# Section 5.1.5:
+PARTICLES, ITERATIONS, OPTIONS = 100, 150, {"c1": 0.5, "c2": 0.3, "w": 0.9}
 
 
 def counts_and_mean(
@@ -71,8 +61,7 @@ def counts_and_mean(
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """How many of ascending latencies publish in each slot, and the average of eq. 5.
 
-    An execution whose latency is in (x_{α−1}, x_α] publishes in slot α: φ(x_α) − φ(x_{α−1}) times
-    the sample. ``ends_ns`` ascend along the last axis, none before the longest latency behind.
+    ``ends_ns`` ascend along the last axis; the last is not before the longest latency.
     """
     ends = np.asarray(ends_ns)
     counts = np.diff(np.searchsorted(ordered_ns, ends, side="right"), prepend=0, axis=-1)
@@ -82,14 +71,12 @@ def counts_and_mean(
 def predict_bands(
     latencies_ns: NDArray[np.int64], slot_ends_ns: Sequence[int], publish_slot_ns: int
 ) -> Prediction:
-    """What publication in given slots makes of measured latencies.
+    """What publication in slots with these ends, Δ long, makes of measured latencies.
 
-    A band is represented by the end of its slot, x_α. The latest output is at x_ν, the earliest at
-    the start of the first slot, so the jitter is x_ν − (x_1 − Δ): 25 ms for the paper's slots [62,
-    63], [77, 78], [86, 87] ms. ``slot_ends_ns`` ascend; Δ is ``publish_slot_ns``.
+    The latest output is at x_ν, the earliest at x_1 − Δ: a jitter of 25 ms for the paper's slots
+    [62, 63], [77, 78], [86, 87] ms.
 
-    Raises:
-        InputError: slot ends that do not ascend, or the last is before the longest latency.
+    Raises InputError: slot ends that do not ascend, or the last is before the longest latency.
     """
     ends = [int(end) for end in slot_ends_ns]
     if not ends or any(after <= before for before, after in pairwise(ends)):
@@ -114,25 +101,59 @@ def _refuse_before_longest(last_end_ns: int, longest_ns: int) -> None:
 
 @dataclass(frozen=True)
 class BandProblem:
-    """What a placement must respect; made by :func:`band_problem`.
+    """What a placement must respect, checked; ``latencies_ns`` ascend afterwards.
 
-    ``latencies_ns`` ascend. Slots are ``publish_slot_ns`` long (Δ), the last ends at
-    ``last_end_ns``, the others at multiples of ``grid_ns``. Neighbouring slot ends are at most
-    ``max_gap_ns`` apart (LV), a band has at most ``max_share`` of the executions.
+    Slots are ``publish_slot_ns`` long (Δ), the last ends at ``last_end_ns``, the others at
+    multiples of ``grid_ns``. Neighbouring slot ends are at most ``max_gap_ns`` apart (LV), a band
+    has at most ``max_share`` of the executions.
+
+    Raises InputError: values that make no sense for any number of bands.
     """
 
     latencies_ns: NDArray[np.int64]
     last_end_ns: int
-    publish_slot_ns: int
-    grid_ns: int
+    publish_slot_ns: int = 1_000_000
+    grid_ns: int = 1_000
     max_gap_ns: int | None = None
     max_share: float | None = None
+
+    def __post_init__(self) -> None:
+        slot, gap, share = self.publish_slot_ns, self.max_gap_ns, self.max_share
+        latencies = np.sort(check_latencies(self.latencies_ns))
+        object.__setattr__(self, "latencies_ns", latencies)
+        if slot <= 0 or self.grid_ns <= 0:
+            raise InputError("the publish slot and the grid must be longer than 0ms")
+        _refuse_before_longest(self.last_end_ns, int(latencies[-1]))
+        if gap is not None and gap <= slot:
+            raise InputError(
+                f"a largest gap of {format_duration(gap)} is not longer than the publish slot"
+                f" {format_duration(slot)}, so no two slots could follow each other: allow a"
+                " longer gap or use a shorter slot"
+            )
+        if share is not None and not 0 < share <= 1:
+            raise InputError(f"the largest share per band must be above 0, at most 1: not {share}")
+        if latencies.size * self.last_end_ns >= 2**62:
+            raise InputError(
+                "latencies this long and this many overflow the planner: plan with fewer"
+            )
 
     @property
     def most_per_band(self) -> int:
         """How many of the sample's latencies one band may hold."""
         size = self.latencies_ns.size
         return size if self.max_share is None else int(self.max_share * size + 1e-9)
+
+    @property
+    def room(self) -> int:
+        """How many publish slots fit: x_1 ≥ L̲ + Δ + 1 ns, then steps of Δ + 1 ns at least."""
+        behind = self.last_end_ns - int(self.latencies_ns[0])
+        return max(1, behind // (self.publish_slot_ns + 1))
+
+    @property
+    def positions(self) -> tuple[int, int]:
+        """The first multiple of the grid above L̲ + Δ (x_1 − Δ > L̲), how many below x_ν − Δ."""
+        first = (int(self.latencies_ns[0]) + self.publish_slot_ns) // self.grid_ns + 1
+        return first, -(-(self.last_end_ns - self.publish_slot_ns) // self.grid_ns) - first
 
 
 @dataclass(frozen=True)
@@ -141,37 +162,6 @@ class Placement:
 
     slot_ends_ns: tuple[int, ...]
     mean_ns: float
-
-
-def band_problem(
-    latencies_ns: NDArray[np.int64],
-    last_end_ns: int,
-    *,
-    publish_slot_ns: int = 1_000_000,
-    grid_ns: int = 1_000,
-    max_gap_ns: int | None = None,
-    max_share: float | None = None,
-) -> BandProblem:
-    """Check and sort what a placement needs.
-
-    Raises:
-        InputError: values that make no sense for any number of bands; the message names them.
-    """
-    latencies = np.sort(check_latencies(latencies_ns))
-    if publish_slot_ns <= 0 or grid_ns <= 0:
-        raise InputError("the publish slot and the grid must be longer than 0ms")
-    _refuse_before_longest(last_end_ns, int(latencies[-1]))
-    if max_gap_ns is not None and max_gap_ns <= publish_slot_ns:
-        raise InputError(
-            f"a largest gap of {format_duration(max_gap_ns)} is not longer than the publish slot"
-            f" {format_duration(publish_slot_ns)}, so no two slots could follow each other: allow"
-            " a longer gap or use a shorter slot"
-        )
-    if max_share is not None and not 0 < max_share <= 1:
-        raise InputError(f"the largest share per band must be above 0, at most 1: not {max_share}")
-    if latencies.size * last_end_ns >= 2**62:
-        raise InputError("latencies this long and this many overflow the planner: plan with fewer")
-    return BandProblem(latencies, last_end_ns, publish_slot_ns, grid_ns, max_gap_ns, max_share)
 
 
 def with_bands(
@@ -186,37 +176,31 @@ def with_bands(
     seed: int | None = None,
     **limits: Any,
 ) -> Plan:
-    """A shaped plan with ``bands`` publish slots; the last stays where the plan has it.
+    """A shaped plan with ``bands`` publish slots of the plan's length (Δ); the last one stays.
 
-    The slots are as long as the plan's own (Δ). ``exact`` finds the best placement on the grid;
-    ``pso`` and ``random`` take a ``seed``. ``auto`` takes as many bands as each lower the average
-    by ``least_gain`` of it at least. With ``mean_at_most_ns`` the exact solver can ``minimise`` the
-    ``jitter`` or the largest ``gap`` instead of the average. ``limits`` are ``grid_ns``,
-    ``max_gap_ns`` (LV) and ``max_share``, as in :func:`band_problem`.
+    ``auto`` takes as many as each lower the average by ``least_gain`` of it at least. For
+    ``minimise`` and ``mean_at_most_ns`` see :func:`place_bands`; ``limits`` are ``grid_ns``,
+    ``max_gap_ns`` and ``max_share`` of :class:`BandProblem`.
 
-    Raises:
-        InputError: a plan without a publish slot, or values that make no sense together.
-        OperationError: no such placement exists; the message names the binding constraint.
+    Raises InputError: a plan without a publish slot, or values that make no sense together.
+    OperationError: no such placement exists; the message names the binding constraint.
     """
     problem = _problem(plan, latencies_ns, limits)
-    length = problem.publish_slot_ns
-    if (bands == "auto" or solver != "exact") and (
-        minimise != "mean" or mean_at_most_ns is not None
-    ):
+    other_goal = minimise != "mean" or mean_at_most_ns is not None
+    if other_goal and (bands == "auto" or solver != "exact"):
         raise InputError("another goal than the average needs the exact solver and fixed bands")
     if bands == "auto":
         if solver != "exact":
             raise InputError("only the exact solver chooses the number of bands by itself")
         placement = choose_bands(plan, latencies_ns, least_gain=least_gain, **limits).chosen
-    elif solver == "pso":
-        placement = place_by_swarm(problem, bands, seed)
-    elif solver == "random":
-        placement = place_randomly(problem, bands, seed)
-    else:
+    elif solver == "exact":
         placement = place_bands(problem, bands, minimise=minimise, mean_at_most_ns=mean_at_most_ns)
+    else:
+        placement = (place_by_swarm if solver == "pso" else place_randomly)(problem, bands, seed)
+    length = problem.publish_slot_ns
     slots = tuple((end - length, end) for end in placement.slot_ends_ns)
     predicted = predict_bands(problem.latencies_ns, placement.slot_ends_ns, length)
-    return _with_publish_slots(plan, slots, predicted)
+    return _with_publish_slots(plan, slots, predicted=predicted)
 
 
 @dataclass(frozen=True)
@@ -231,40 +215,36 @@ class BandChoice:
 def choose_bands(
     plan: Plan, latencies_ns: NDArray[np.int64], *, least_gain: float = 0.02, **limits: Any
 ) -> BandChoice:
-    """What :func:`with_bands` takes for ``auto``, with its grounds.
+    """What :func:`with_bands` takes for ``auto``: the first number of bands behind which another
+    one gains less than ``least_gain`` of the average.
 
-    Raises:
-        InputError: a plan without a publish slot, or a least gain that is no share.
-        OperationError: no number of bands can be placed.
+    Raises InputError: a plan without a publish slot, or a least gain that is no share.
+    OperationError: no number of bands can be placed.
     """
     if not 0 < least_gain < 1:
         raise InputError(
             f"the least gain is a share of the average, such as 0.02: not {least_gain}"
         )
     curve = placement_curve(_problem(plan, latencies_ns, limits), MOST_BANDS)
-    chosen = enough_bands(curve, least_gain)
-    bands, longest = len(chosen.slot_ends_ns), len(curve[-1].slot_ends_ns)
-    if chosen is not curve[-1]:
-        gain = 1 - curve[curve.index(chosen) + 1].mean_ns / chosen.mean_ns
-        reason = (
-            f"stopped at {bands}: another band would lower the average by {gain:.2%}, less than"
-            f" {least_gain:.2%}"
-        )
-    elif longest < MOST_BANDS:
-        reason = f"stopped at {bands}: no more bands can be placed"
-    else:
-        reason = f"stopped at {bands}: more bands are not tried"
-    return BandChoice(tuple(curve), chosen, reason)
+    for number, (placement, following) in enumerate(pairwise(curve), start=1):
+        gain = 1 - following.mean_ns / placement.mean_ns
+        if gain < least_gain:
+            reason = (
+                f"stopped at {number}: another band would lower the average by {gain:.2%}, less"
+                f" than {least_gain:.2%}"
+            )
+            return BandChoice(tuple(curve), placement, reason)
+    why = "no more bands can be placed" if len(curve) < MOST_BANDS else "more bands are not tried"
+    return BandChoice(tuple(curve), curve[-1], f"stopped at {len(curve)}: {why}")
 
 
 def with_long_slot(plan: Plan, latencies_ns: NDArray[np.int64], slot_start_ns: int) -> Plan:
     """A shaped plan with one long publish slot, from ``slot_start_ns`` to where it ended before.
 
-    An execution that is done earlier waits for the slot, any other publishes at once: the average
-    falls and the jitter grows as the start moves towards the shortest latency (end of section 4.1).
+    An execution that is done earlier waits for it, any other publishes at once: the average falls
+    and the jitter grows as the start moves towards the shortest latency (end of section 4.1).
 
-    Raises:
-        InputError: a start that is not before the plan's own publish slot, or negative.
+    Raises InputError: a start that is negative, or behind that of the plan's own publish slot.
     """
     start, end = _last_publish_slot(plan)
     if not 0 <= slot_start_ns <= start:
@@ -281,12 +261,12 @@ def with_long_slot(plan: Plan, latencies_ns: NDArray[np.int64], slot_start_ns: i
         shares=(1.0,),
     )
     slots = ((slot_start_ns, end),)
-    return revised(_with_publish_slots(plan, slots, predicted), policy="one-long-slot")
+    return _with_publish_slots(plan, slots, predicted=predicted, policy="one-long-slot")
 
 
 def _problem(plan: Plan, latencies_ns: NDArray[np.int64], limits: dict[str, Any]) -> BandProblem:
     start, end = _last_publish_slot(plan)
-    return band_problem(latencies_ns, end, publish_slot_ns=end - start, **limits)
+    return BandProblem(latencies_ns, end, publish_slot_ns=end - start, **limits)
 
 
 def _last_publish_slot(plan: Plan) -> Slot:
@@ -296,10 +276,10 @@ def _last_publish_slot(plan: Plan) -> Slot:
     return slots[-1]
 
 
-def _with_publish_slots(plan: Plan, slots: tuple[Slot, ...], predicted: Prediction) -> Plan:
+def _with_publish_slots(plan: Plan, slots: tuple[Slot, ...], **changes: object) -> Plan:
     publishing = output_server(plan)
     servers = with_slots(plan.servers, {} if publishing is None else {publishing.name: slots})
-    return revised(plan, servers=below_executors(servers), predicted=predicted)
+    return revised(plan, servers=below_executors(servers), **changes)
 
 
 def place_bands(
@@ -311,37 +291,40 @@ def place_bands(
     average stays at or below ``mean_at_most_ns``, the overall jitter x_ν − (x_1 − Δ), or the
     largest gap between neighbouring bands.
 
-    Raises:
-        InputError: a goal that makes no sense, or as :func:`refuse_more_than_fit`.
-        OperationError: no placement exists; the message names the constraint that prevents it.
+    Raises InputError: a goal that makes no sense, or as :func:`refuse_more_than_fit`.
+    OperationError: no placement exists; the message names the constraint that prevents it.
     """
     refuse_more_than_fit(problem, bands)
     if minimise == "jitter" and mean_at_most_ns is None:
         raise InputError("the smallest jitter is that of one band: say which average it may cost")
-    if minimise == "gap":
-        return _smallest_gap(problem, bands, mean_at_most_ns)
     tables = _solve(problem, bands)
-    best = _best(tables, bands)
+    best = tables.best(bands)
     if best is None:
         raise OperationError(_why_none(problem, bands))
-    _refuse_slower(best, mean_at_most_ns)
+    if mean_at_most_ns is not None and best.mean_ns > mean_at_most_ns:
+        raise OperationError(
+            f"no placement of {bands} bands has an average of {format_duration(mean_at_most_ns)}"
+            f" or less; the best is {format_duration(round(best.mean_ns))}: allow that, or more"
+            " bands"
+        )
+    if minimise == "gap":
+        return _smallest_gap(problem, best, mean_at_most_ns)
     if minimise == "jitter" and bands > 1 and mean_at_most_ns is not None:
-        allowed = mean_at_most_ns * problem.latencies_ns.size
-        return _read(tables, bands, int(np.flatnonzero(tables.totals(bands) <= allowed)[-1]))
+        allowed = tables.totals(bands) <= mean_at_most_ns * problem.latencies_ns.size
+        return tables.read(bands, int(np.flatnonzero(allowed)[-1]))
     return best
 
 
 def placement_curve(problem: BandProblem, most_bands: int) -> list[Placement]:
     """The best placement for each number of bands from one upwards, as far as they fit (figure 7).
 
-    Raises:
-        OperationError: no number of bands up to ``most_bands`` can be placed.
+    Raises OperationError: no number of bands up to ``most_bands`` can be placed.
     """
-    most = min(most_bands, _room(problem))
+    most = min(most_bands, problem.room)
     tables = _solve(problem, most)
     curve: list[Placement] = []
     for bands in range(1, most + 1):
-        best = _best(tables, bands)
+        best = tables.best(bands)
         if best is not None:
             curve.append(best)
         elif curve:
@@ -355,38 +338,14 @@ def refuse_more_than_fit(problem: BandProblem, bands: int) -> None:
     """Refuse no bands, or more than publish slots fit behind the shortest latency."""
     if bands < 1:
         raise InputError(f"{bands} bands: plan with one band at least")
-    most = _room(problem)
-    if bands > most:
+    if bands > problem.room:
         raise InputError(
             f"{bands} bands cannot be placed: between the shortest latency"
             f" {format_duration(int(problem.latencies_ns[0]))} and the last slot's end"
-            f" {format_duration(problem.last_end_ns)} there is room for {most} publish slots of"
-            f" {format_duration(problem.publish_slot_ns)}; use fewer bands or a shorter slot"
+            f" {format_duration(problem.last_end_ns)} there is room for {problem.room} publish"
+            f" slots of {format_duration(problem.publish_slot_ns)}; use fewer bands or a shorter"
+            " slot"
         )
-
-
-def enough_bands(curve: list[Placement], least_gain: float = 0.02) -> Placement:
-    """The first placement of a curve behind which another band gains less than ``least_gain``."""
-    for placement, following in pairwise(curve):
-        if placement.mean_ns - following.mean_ns < least_gain * placement.mean_ns:
-            return placement
-    return curve[-1]
-
-
-def broken_constraint(problem: BandProblem, slot_ends_ns: tuple[int, ...]) -> str | None:
-    """The first constraint that given slot ends break, in words; the grid is not among them."""
-    ends = np.array(slot_ends_ns)
-    slot, shortest = problem.publish_slot_ns, int(problem.latencies_ns[0])
-    if ends.size > 1 and ends[0] - slot <= shortest:
-        return f"the first slot must begin after the shortest latency {format_duration(shortest)}"
-    if (np.diff(ends) <= slot).any():
-        return f"slot ends must be more than the publish slot {format_duration(slot)} apart"
-    if problem.max_gap_ns is not None and (np.diff(ends) > problem.max_gap_ns).any():
-        return f"slot ends must be at most {format_duration(problem.max_gap_ns)} apart"
-    counts, _ = counts_and_mean(problem.latencies_ns, ends)
-    if (counts > problem.most_per_band).any():
-        return f"a band must hold at most {problem.max_share:.1%} of the executions"
-    return None
 
 
 @dataclass(frozen=True)
@@ -405,12 +364,34 @@ class _Tables:
         allowed = (behind != UNREACHABLE) & (self.counts <= self.problem.most_per_band)
         return np.where(allowed, behind + self.counts * self.ends * allowed, UNREACHABLE)
 
+    def best(self, bands: int) -> Placement | None:
+        """Of equally good placements the one that begins last, which has the smallest jitter."""
+        if bands == 1:
+            fits = self.problem.latencies_ns.size <= self.problem.most_per_band
+            last = self.problem.last_end_ns
+            return Placement((last,), float(last)) if fits else None
+        if bands - 1 > self.ends.size:
+            return None
+        totals = self.totals(bands)
+        least = totals.min()
+        place = int(np.flatnonzero(totals == least)[-1])
+        return None if least == UNREACHABLE else self.read(bands, place)
+
+    def read(self, bands: int, position: int) -> Placement:
+        """The placement whose first band is at a position."""
+        total = int(self.totals(bands)[position])
+        ends = [int(self.ends[position])]
+        for behind in range(bands - 2, 0, -1):
+            position = int(self.successors[behind, position])
+            ends.append(int(self.ends[position]))
+        ends.append(self.problem.last_end_ns)
+        return Placement(tuple(ends), total / self.problem.latencies_ns.size)
+
 
 def _solve(problem: BandProblem, bands: int) -> _Tables:
     slot, grid, last = problem.publish_slot_ns, problem.grid_ns, problem.last_end_ns
-    # Positions: multiples of the grid above L̲ + Δ (x_1 − Δ > L̲) and below x_ν − Δ.
-    first = (int(problem.latencies_ns[0]) + slot) // grid + 1
-    size = max(0, -(-(last - slot) // grid) - first) if bands > 1 else 0
+    first, fitting = problem.positions
+    size = max(0, fitting) if bands > 1 else 0
     layers = min(bands, size + 1)
     if size * layers > MOST_CELLS:
         raise InputError(
@@ -437,196 +418,153 @@ def _solve(problem: BandProblem, bands: int) -> _Tables:
         # What loads machine code takes a moment to import, and two bands do without it.
         from chainshaper.values.compiled import kernel
 
-        fill_costs = kernel("chainshaper.planning.band_kernel", "fill_costs")
         grid_rows, windows = np.stack([counts, ends]), np.stack([nearest, farthest])
         work = np.empty((12, size + 1), dtype=np.int64)
-        fill_costs(
-            grid_rows.ctypes.data, windows.ctypes.data, costs.ctypes.data,
-            successors.ctypes.data, work.ctypes.data, size, layers - 1,
-        )  # fmt: skip
+        tables = [array.ctypes.data for array in (grid_rows, windows, costs, successors, work)]
+        kernel("chainshaper.planning.band_kernel", "fill_costs")(*tables, size, layers - 1)
     return _Tables(problem, ends, counts, costs, successors)
 
 
-def _best(tables: _Tables, bands: int) -> Placement | None:
-    problem = tables.problem
-    if bands == 1:
-        fits = problem.latencies_ns.size <= problem.most_per_band
-        return Placement((problem.last_end_ns,), float(problem.last_end_ns)) if fits else None
-    if bands - 1 > tables.ends.size:
-        return None
-    totals = tables.totals(bands)
-    if totals.min() == UNREACHABLE:
-        return None
-    # Of equally good placements the one that begins last: the smallest jitter.
-    return _read(tables, bands, int(np.flatnonzero(totals == totals.min())[-1]))
-
-
-def _read(tables: _Tables, bands: int, position: int) -> Placement:
-    total = int(tables.totals(bands)[position])
-    ends = [int(tables.ends[position])]
-    for behind in range(bands - 2, 0, -1):
-        position = int(tables.successors[behind, position])
-        ends.append(int(tables.ends[position]))
-    ends.append(tables.problem.last_end_ns)
-    return Placement(tuple(ends), total / tables.problem.latencies_ns.size)
-
-
-def _smallest_gap(problem: BandProblem, bands: int, mean_at_most_ns: int | None) -> Placement:
+def _smallest_gap(problem: BandProblem, found: Placement, mean_at_most_ns: int | None) -> Placement:
     # A larger gap only ever allows more: the smallest one that is enough is found by halving.
-    found = place_bands(problem, bands, mean_at_most_ns=mean_at_most_ns)
     low = problem.publish_slot_ns
     high = max(np.diff(found.slot_ends_ns), default=low + 1)
     while high - low > 1:
         middle = int(low + high) // 2
+        closer = replace(problem, max_gap_ns=middle)
         try:
-            found = place_bands(
-                replace(problem, max_gap_ns=middle), bands, mean_at_most_ns=mean_at_most_ns
-            )
+            found = place_bands(closer, len(found.slot_ends_ns), mean_at_most_ns=mean_at_most_ns)
             high = max(np.diff(found.slot_ends_ns))
         except OperationError:
             low = middle
     return found
 
 
-def _room(problem: BandProblem) -> int:
-    """How many publish slots fit: x_1 ≥ L̲ + Δ + 1 ns, then steps of Δ + 1 ns at least."""
-    behind = problem.last_end_ns - int(problem.latencies_ns[0])
-    return max(1, behind // (problem.publish_slot_ns + 1))
-
-
-def _refuse_slower(best: Placement, mean_at_most_ns: int | None) -> None:
-    if mean_at_most_ns is not None and best.mean_ns > mean_at_most_ns:
-        raise OperationError(
-            f"no placement of {len(best.slot_ends_ns)} bands has an average of"
-            f" {format_duration(mean_at_most_ns)} or less; the best is"
-            f" {format_duration(round(best.mean_ns))}: allow that, or more bands"
-        )
-
-
 def _why_none(problem: BandProblem, bands: int) -> str:
     """Which constraint leaves no placement: the one without which there is one."""
-    said = f"{bands} bands cannot be placed: "
-    limits = []
-    if problem.max_share is not None:
-        without = replace(problem, max_share=None)
-        reason = f"no placement keeps every band at {problem.max_share:.1%} of the executions"
-        limits.append((without, f"{reason}; allow a larger share or more bands"))
-    if problem.max_gap_ns is not None:
-        without = replace(problem, max_gap_ns=None)
-        reason = f"no placement keeps neighbours within {format_duration(problem.max_gap_ns)}"
-        limits.append((without, f"{reason}; allow a larger gap"))
-    for without, reason in limits:
-        if _best(_solve(without, bands), bands) is not None:
-            return said + reason
-    if len(limits) == 2 and _best(
-        _solve(replace(problem, max_share=None, max_gap_ns=None), bands), bands
-    ):
-        return f"{said}the largest gap and the largest share exclude each other; relax one"
+    reasons = {
+        ("max_share",): f"no placement has every band at {problem.max_share or 1:.1%} of the"
+        " executions; allow a larger share or more bands",
+        ("max_gap_ns",): "no placement has neighbours within"
+        f" {format_duration(problem.max_gap_ns or 0)}; allow a larger gap",
+        ("max_share", "max_gap_ns"): "the largest gap and the largest share exclude each other;"
+        " relax one",
+    }
+    for names, reason in reasons.items():
+        changes: dict[str, Any] = dict.fromkeys(names)
+        if _solve(replace(problem, **changes), bands).best(bands) is not None:
+            return f"{bands} bands cannot be placed: {reason}"
+    return _too_coarse(problem, bands)
+
+
+def _too_coarse(problem: BandProblem, bands: int) -> str:
     return (
-        f"{said}the grid of {format_duration(problem.grid_ns)} is too coarse for slots of"
-        f" {format_duration(problem.publish_slot_ns)}; use a finer one"
+        f"{bands} bands cannot be placed: the grid of {format_duration(problem.grid_ns)} is too"
+        f" coarse for slots of {format_duration(problem.publish_slot_ns)}; use a finer one"
     )
+
+
+def broken_constraint(problem: BandProblem, slot_ends_ns: Sequence[int]) -> str | None:
+    """The first constraint that given slot ends break, in words; the grid is not among them."""
+    broken = _broken(problem, np.array(slot_ends_ns))
+    return next((words for words, off in broken if off > 0), None)
+
+
+def _broken(
+    problem: BandProblem, ends: NDArray[np.int64]
+) -> Iterator[tuple[str, NDArray[np.float64]]]:
+    """Each constraint in words, and by how much (ns) each row of slot ends breaks it."""
+    slot, shortest = problem.publish_slot_ns, int(problem.latencies_ns[0])
+    gaps = np.diff(ends, axis=-1)
+    if ends.shape[-1] > 1:
+        words = f"the first slot must begin after the shortest latency {format_duration(shortest)}"
+        yield words, np.clip(shortest + slot + 1 - ends[..., 0], 0, None)
+    words = f"slot ends must be more than the publish slot {format_duration(slot)} apart"
+    yield words, np.clip(slot + 1 - gaps, 0, None).sum(axis=-1)
+    if problem.max_gap_ns is not None:
+        words = f"slot ends must be at most {format_duration(problem.max_gap_ns)} apart"
+        yield words, np.clip(gaps - problem.max_gap_ns, 0, None).sum(axis=-1)
+    if problem.max_share is not None:
+        counts, _ = counts_and_mean(problem.latencies_ns, ends)
+        too_many = np.clip(counts - problem.most_per_band, 0, None).sum(axis=-1)
+        words = f"a band must hold at most {problem.max_share:.1%} of the executions"
+        yield words, too_many * problem.last_end_ns / problem.latencies_ns.size
 
 
 def place_by_swarm(problem: BandProblem, bands: int, seed: int | None = None) -> Placement:
     """Place bands with PySwarms and the paper's parameters; the same ``seed``, the same result.
 
-    Particles are the ends of all slots but the last, on the grid. A particle that breaks a
-    constraint costs more than any that does not, in proportion to how far it is off.
+    Particles are the ends of all slots but the last. One that breaks a constraint costs more than
+    any that does not, in proportion to how far it is off.
 
-    Raises:
-        InputError: as :func:`refuse_more_than_fit`.
-        OperationError: the swarm ended at a placement that breaks a constraint.
-        PlatformError: PySwarms is not installed.
+    Raises InputError: as :func:`refuse_more_than_fit`. OperationError: the swarm ended at a
+    placement that breaks a constraint. PlatformError: PySwarms is not installed.
     """
     refuse_more_than_fit(problem, bands)
+    last, slot, grid = problem.last_end_ns, problem.publish_slot_ns, problem.grid_ns
     if bands == 1:
-        return _checked(problem, (problem.last_end_ns,), "the single band")
-    lowest = float(problem.latencies_ns[0] + problem.publish_slot_ns)
-    highest = float(problem.last_end_ns - problem.publish_slot_ns)
-    bounds = (np.full(bands - 1, lowest), np.full(bands - 1, highest))
+        return _checked(problem, [last], "the single band")
+
+    def slot_ends(particles: NDArray[np.float64]) -> NDArray[np.int64]:
+        ends = np.ceil(np.sort(particles, axis=1) / grid).astype(np.int64) * grid
+        return np.hstack([ends, np.full((len(ends), 1), last)])
+
+    def cost(particles: NDArray[np.float64]) -> NDArray[np.float64]:
+        ends = slot_ends(particles)
+        _, means = counts_and_mean(problem.latencies_ns, ends)
+        off = sum(off for _, off in _broken(problem, ends))
+        return np.where(off > 0, last + off, means)
+
+    lowest = np.full(bands - 1, float(problem.latencies_ns[0] + slot))
+    bounds = (lowest, np.full(bands - 1, float(last - slot)))
     with _quiet_and_seeded(seed):
         swarm = extra_library("pyswarms", "placement by particle swarm").single.GlobalBestPSO(
             n_particles=PARTICLES, dimensions=bands - 1, options=OPTIONS, bounds=bounds
         )
-        _, best = swarm.optimize(
-            lambda particles: _costs(problem, particles), iters=ITERATIONS, verbose=False
-        )
-    ends = _slot_ends(problem, best[np.newaxis, :])[0]
-    return _checked(problem, tuple(int(end) for end in ends), "the swarm")
+        _, best = swarm.optimize(cost, iters=ITERATIONS, verbose=False)
+    return _checked(problem, slot_ends(best[np.newaxis, :])[0].tolist(), "the swarm")
 
 
 def place_randomly(problem: BandProblem, bands: int, seed: int | None = None) -> Placement:
     """Place bands at random, every allowed placement on the grid being equally likely.
 
-    Raises:
-        InputError: as :func:`refuse_more_than_fit`.
-        OperationError: the grid is too coarse for so many, or no draw of many respects the limits.
+    Raises InputError: as :func:`refuse_more_than_fit`. OperationError: the grid is too coarse for
+    so many, or no draw of many respects the limits.
     """
     refuse_more_than_fit(problem, bands)
     if bands == 1:
-        return _checked(problem, (problem.last_end_ns,), "the single band")
-    grid, slot = problem.grid_ns, problem.publish_slot_ns
-    first = (int(problem.latencies_ns[0]) + slot) // grid + 1
-    size = -(-(problem.last_end_ns - slot) // grid) - first
+        return _checked(problem, [problem.last_end_ns], "the single band")
+    first, size = problem.positions
     # Draw from the positions that remain when each gap's minimum beyond one step is taken out.
-    spare = slot // grid
+    spare = problem.publish_slot_ns // problem.grid_ns
     remaining = size - spare * (bands - 2)
     if remaining < bands - 1:
-        raise OperationError(
-            f"{bands} bands cannot be placed: the grid of {format_duration(grid)} is too coarse for"
-            f" slots of {format_duration(slot)}; use a finer one"
-        )
+        raise OperationError(_too_coarse(problem, bands))
     random = np.random.default_rng(seed)
     for _ in range(RANDOM_TRIES):
         drawn = np.sort(random.choice(remaining, size=bands - 1, replace=False))
-        ends = (first + drawn + spare * np.arange(bands - 1)) * grid
-        placed = (*(int(end) for end in ends), problem.last_end_ns)
+        ends = (first + drawn + spare * np.arange(bands - 1)) * problem.grid_ns
+        placed = [*ends.tolist(), problem.last_end_ns]
         if broken_constraint(problem, placed) is None:
             break
     return _checked(problem, placed, "the last random draw")
 
 
-def _checked(problem: BandProblem, ends: tuple[int, ...], what: str) -> Placement:
+def _checked(problem: BandProblem, ends: list[int], what: str) -> Placement:
     broken = broken_constraint(problem, ends)
     if broken is not None:
         raise OperationError(
             f"{what} ended at a placement that is not allowed ({broken}); use the exact solver"
         )
-    _, mean = counts_and_mean(problem.latencies_ns, ends)
-    return Placement(ends, float(mean))
-
-
-def _slot_ends(problem: BandProblem, particles: NDArray[np.float64]) -> NDArray[np.int64]:
-    grid = problem.grid_ns
-    ends = np.ceil(np.sort(particles, axis=1) / grid).astype(np.int64) * grid
-    last = np.full((len(ends), 1), problem.last_end_ns)
-    return np.hstack([ends, last])
-
-
-def _costs(problem: BandProblem, particles: NDArray[np.float64]) -> NDArray[np.float64]:
-    ends = _slot_ends(problem, particles)
-    gaps = np.diff(ends, axis=1)
-    counts, means = counts_and_mean(problem.latencies_ns, ends)
-    slot = problem.publish_slot_ns
-    off = np.clip(problem.latencies_ns[0] + slot + 1 - ends[:, 0], 0, None)
-    off = off + np.clip(slot + 1 - gaps, 0, None).sum(axis=1)
-    if problem.max_gap_ns is not None:
-        off = off + np.clip(gaps - problem.max_gap_ns, 0, None).sum(axis=1)
-    too_many = np.clip(counts - problem.most_per_band, 0, None).sum(axis=1)
-    off = off + too_many * problem.last_end_ns / problem.latencies_ns.size
-    return np.where(off > 0, problem.last_end_ns + off, means)
+    return Placement(tuple(ends), float(counts_and_mean(problem.latencies_ns, ends)[1]))
 
 
 @contextmanager
 def _quiet_and_seeded(seed: int | None) -> Iterator[None]:
-    """PySwarms draws from NumPy's global generator and sets up logging into the current folder.
-
-    The generator's state comes back; a logging configuration that changes nothing (named by
-    PySwarms' own environment variable) makes it write no files.
+    """PySwarms draws from NumPy's global generator, whose state comes back, and sets up logging
+    into the current folder: a configuration that changes nothing makes it write no files.
     """
-    state = np.random.get_state()
-    configured = os.environ.get("LOG_CFG")
+    state, configured = np.random.get_state(), os.environ.get("LOG_CFG")
     with tempfile.TemporaryDirectory(prefix="chainshaper-") as folder:
         configuration = Path(folder) / "logging.yaml"
         configuration.write_text("version: 1\nincremental: true\n")
@@ -636,7 +574,6 @@ def _quiet_and_seeded(seed: int | None) -> Iterator[None]:
             yield
         finally:
             np.random.set_state(state)
-            if configured is None:
-                del os.environ["LOG_CFG"]
-            else:
+            del os.environ["LOG_CFG"]
+            if configured is not None:
                 os.environ["LOG_CFG"] = configured

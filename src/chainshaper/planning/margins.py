@@ -1,20 +1,14 @@
 """Measured latencies, and how far beyond the longest undisturbed one a slot must reach.
 
-Planning needs nothing else of a chain than its end-to-end latencies, so a sample from any tool can
-be planned with (:func:`read_latencies`).
-
 **By default** (:func:`covered_latency`) so far that a stated share of *all* cycles is in time, also
 of those that the machine disturbed: an actuator does not care who caused a delay. How many of n
-measured cycles may lie beyond follows from the binomial distribution alone, whatever that of the
-latencies (Wilks, *Determination of sample sizes for setting tolerance limits*, Annals of
-Mathematical Statistics 12, 1941): nothing has to be assumed about stalls but that the cycles to
-come are like those measured. The longest of 299 latencies covers 99 % with 95 % confidence.
+measured cycles may lie beyond follows from the binomial distribution alone (Wilks, Annals of
+Mathematical Statistics 12, 1941): nothing is assumed but that the cycles to come are like those
+measured. The longest of 299 latencies covers 99 % with 95 % confidence.
 
-**Beyond the sample** (:func:`derive_margin`) extreme value theory says how often the longest of n
-latencies is exceeded: whatever the distribution, its excesses over a high threshold u follow, in
-the limit, a generalised Pareto distribution (Pickands–Balkema–de Haan), which can be fitted and
-read beyond the data. With ζ the share of latencies above u, ξ the shape and σ the scale, the
-latency that is exceeded with probability p is
+**Beyond the sample** (:func:`derive_margin`) the excesses of latencies over a high threshold u
+follow, in the limit, a generalised Pareto distribution (Pickands–Balkema–de Haan). With ζ the share
+of latencies above u, ξ the shape and σ the scale, the latency exceeded with probability p is
 
     x_p = u + σ/ξ · ((ζ/p)^ξ − 1),
 
@@ -22,15 +16,13 @@ and the margin is ε = x_p − L̄, if that is positive. This holds for independ
 unchanging system and a tail that does look generalised Pareto. Each of the three is tested, and
 where one fails there is no number.
 
-The parameters are estimated by L-moments (Hosking and Wallis, *Parameter and quantile estimation
-for the generalized Pareto distribution*, Technometrics 29, 1987), which for a few hundred excesses
-err less than maximum likelihood does. They may put the end of a bounded tail before the longest
-latency measured, which is then made the end (Dupuis and Tsao, *A hybrid estimator for generalized
-Pareto and extreme-value distributions*, Communications in Statistics 27, 1998). The goodness of fit
-(Anderson–Darling) and the confidence interval come from one parametric bootstrap, because tables
-for known parameters do not hold for estimated ones. In simulations with normal, exponential,
-triangular and uniform-sum latencies the 95 % interval for a probability of 1e-5 had the true value
-in 97 to 100 of 100 samples of 5,000 and in 93 to 98 of 100 samples of 1,500; where it missed it was
+The parameters are estimated by L-moments (Hosking and Wallis, Technometrics 29, 1987), which for a
+few hundred excesses err less than maximum likelihood does. They may put the end of a bounded tail
+before the longest latency measured, which is then made the end (Dupuis and Tsao, Communications in
+Statistics 27, 1998). The goodness of fit (Anderson–Darling) and the confidence interval come from
+one parametric bootstrap, because tables for known parameters do not hold for estimated ones. In
+simulations with four distributions the 95 % interval for a probability of 1e-5 had the true value
+in 97 to 100 of 100 samples of 5,000, in 93 to 98 of 100 samples of 1,500; where it missed it was
 too low. Where the density does not vanish at the end of the distribution, it errs on the high side.
 """
 
@@ -46,109 +38,57 @@ from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import InputError, OperationError
 
 LONGEST_NS = 24 * 3_600 * 1_000_000_000  # beyond a day it is a wrong unit, not a latency
-
 EPSILON_NS = 1_000_000
 """What a margin adds to latencies seen: the way to the shaping node is not in them."""
-
 OVERRUN_PROBABILITY = 0.01
 """The share of all cycles that may be late by default, at most, with 95 % confidence."""
 
 # A tail is the n^(2/3) longest of n latencies, or these parts of it: the more there are, the
 # further out it begins. A fixed share would leave large samples with a systematic error.
 TAILS = (1.0, 0.85, 0.7, 0.6, 0.5)
-FEWEST_EXCESSES = 50
-MOST_EXCESSES = 2_000
+FEWEST_EXCESSES, MOST_EXCESSES = 50, 2_000
 MOST_PROBABLE = 0.001
 SIGNIFICANCE = 0.01  # below it, independence or an unchanging system is given up
 GOODNESS = 0.10  # the fit's own test must not come near rejection
 CONFIDENCE = 0.95
 BOOTSTRAPS = 999
 WIDEST_INTERVAL = 0.5  # of the latency itself; wider, the sample does not tell
-
 LEAST_LOG = np.log(1e-12)  # of a probability: a fitted end may stand at the longest excess itself
 
+_Latencies = NDArray[np.int64]
 _Floats = NDArray[np.float64]
 
 
-def read_latencies(path: str | Path) -> NDArray[np.int64]:
-    """End-to-end latencies of a file, in nanoseconds, in the file's order.
+def read_latencies(path: str | Path) -> _Latencies:
+    """End-to-end latencies of a file, in nanoseconds, in the file's order: one duration a line with
+    its unit (``59.3ms``; ``#`` begins a comment), or a ``.npy`` file of nanoseconds.
 
-    One duration a line with its unit (``59.3ms``; blank lines and lines that begin with ``#`` are
-    skipped), or a ``.npy`` file of nanoseconds.
-
-    Raises:
-        InputError: no such file, a line that is no duration (named with its number), an array
-            that does not hold whole nanoseconds, fewer than two latencies, or none above zero.
+    Raises InputError: no such file, a line that is no duration (named with its number), an array
+    that does not hold whole nanoseconds, fewer than two latencies, or none above zero.
     """
     path = Path(path)
     try:
-        found = _read_array(path) if path.suffix == ".npy" else _read_lines(path)
+        found = np.load(path, allow_pickle=False) if path.suffix == ".npy" else _read_lines(path)
         latencies = check_latencies(found)
-        if not latencies.any():
-            raise InputError("every latency is 0ms: check the unit, and what was measured")
-        return latencies
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except (ValueError, EOFError) as error:
+        content = "whole nanoseconds in one row, by numpy.save"
+        content = content if path.suffix == ".npy" else "a text of one duration a line"
+        raise InputError(f"{path}: cannot be read ({error}): write {content}") from error
     except InputError as error:
         # Lines are named already; what concerns the whole sample gets the file's name here.
-        raise InputError(
-            str(error) if str(error).startswith(str(path)) else f"{path}: {error}"
-        ) from error
+        named = str(error).startswith(str(path))
+        raise InputError(str(error) if named else f"{path}: {error}") from error
+    if not latencies.any():
+        raise InputError(f"{path}: every latency is 0ms: check the unit, and what was measured")
+    return latencies
 
 
-def check_latencies(latencies: object) -> NDArray[np.int64]:
-    """A sample that can be planned with: at least two latencies, whole nanoseconds, none negative.
-
-    Raises:
-        InputError: anything else, with the first wrong element named by its place from 0.
-    """
-    array = np.asarray(latencies)
-    if array.ndim != 1 or array.dtype.kind not in "iuf":
-        raise InputError(
-            f"latencies must be one row of numbers in nanoseconds, not {array.ndim}-dimensional"
-            f" {array.dtype}"
-        )
-    if array.size < 2:
-        raise InputError(
-            f"{array.size} latencies are too few to plan with: measure more cycles (100 at least)"
-        )
-    if array.dtype.kind == "f":
-        _refuse_first(array, ~np.isfinite(array), "is not a number: remove it")
-        _refuse_first(
-            array, array != np.floor(array), "is not a whole number of nanoseconds: convert it"
-        )
-    _refuse_first(array, array < 0, "is negative: a latency is not; check the clocks")
-    _refuse_first(
-        array, array > LONGEST_NS, f"is longer than {format_duration(LONGEST_NS)}: check the unit"
-    )
-    return array.astype(np.int64)
-
-
-def _refuse_first(array: NDArray[np.generic], wrong: NDArray[np.bool_], reason: str) -> None:
-    if wrong.any():
-        place = int(np.argmax(wrong))
-        raise InputError(f"latency number {place} ({array[place]}) {reason}")
-
-
-def _read_array(path: Path) -> object:
-    try:
-        return np.load(path, allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise InputError(
-            f"{path}: not a NumPy file of numbers: write it with numpy.save, whole nanoseconds in"
-            " one row"
-        ) from error
-
-
-def _read_lines(path: Path) -> NDArray[np.int64]:
-    try:
-        text = path.read_text(encoding="utf-8-sig")  # spreadsheets begin with a byte-order mark
-    except UnicodeDecodeError as error:
-        raise InputError(
-            f"{path}: not a text of one duration a line ({error}); arrays end in .npy"
-        ) from error
+def _read_lines(path: Path) -> _Latencies:
     found = []
-    for number, line in enumerate(text.splitlines(), start=1):
+    # Spreadsheets begin a file with a byte-order mark.
+    for number, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), start=1):
         content = line.partition("#")[0].strip()
         if not content:
             continue
@@ -163,12 +103,37 @@ def _read_lines(path: Path) -> NDArray[np.int64]:
     return np.array(found, dtype=np.int64)
 
 
+def check_latencies(latencies: object) -> _Latencies:
+    """A sample that can be planned with: at least two latencies, whole nanoseconds, none negative.
+
+    Raises InputError: anything else, with the first wrong element named by its place from 0.
+    """
+    array = np.asarray(latencies)
+    if array.ndim != 1 or array.dtype.kind not in "iuf":
+        raise InputError(
+            f"latencies must be one row of numbers in nanoseconds, not {array.ndim}-dimensional"
+            f" {array.dtype}"
+        )
+    if array.size < 2:
+        raise InputError(
+            f"{array.size} latencies are too few to plan with: measure more cycles (100 at least)"
+        )
+    for wrong, reason in (
+        (~np.isfinite(array), "is not a number: remove it"),
+        (array != np.floor(array), "is not a whole number of nanoseconds: convert it"),
+        (array < 0, "is negative: a latency is not; check the clocks"),
+        (array > LONGEST_NS, f"is longer than {format_duration(LONGEST_NS)}: check the unit"),
+    ):
+        if wrong.any():
+            place = int(np.argmax(wrong))
+            raise InputError(f"latency number {place} ({array[place]}) {reason}")
+    return array.astype(np.int64)
+
+
 @dataclass(frozen=True)
 class TailFit:
-    """A generalised Pareto tail and the latency that it says is exceeded with ``probability``.
-
-    ``interval_ns`` is the 95 % confidence interval of ``latency_ns``; ``goodness`` the p-value of
-    the Anderson–Darling test of the fit.
+    """A generalised Pareto tail, the latency exceeded with ``probability``, its 95 % confidence
+    interval, and the p-value of the Anderson–Darling test of the fit.
     """
 
     probability: float
@@ -190,10 +155,9 @@ def cycles_needed(overrun_probability: float) -> int:
     return math.ceil(math.log(1 - CONFIDENCE) / math.log(1 - overrun_probability))
 
 
-def late_share(every_latency_ns: NDArray[np.int64], latency_ns: int) -> float:
-    """The share of cycles that take longer than ``latency_ns``, at most, with 95 % confidence.
-
-    From how many of the measured ones do (Clopper and Pearson's upper bound).
+def late_share(every_latency_ns: _Latencies, latency_ns: int) -> float:
+    """The share of cycles that take longer than ``latency_ns``, at most, with 95 % confidence
+    (Clopper and Pearson's upper bound).
     """
     from scipy.special import betaincinv
 
@@ -204,7 +168,7 @@ def late_share(every_latency_ns: NDArray[np.int64], latency_ns: int) -> float:
 
 
 def covered_latency(
-    latencies_ns: NDArray[np.int64], overrun_probability: float, latest_ns: int | None = None
+    latencies_ns: _Latencies, overrun_probability: float, latest_ns: int | None = None
 ) -> int:
     """The shortest measured latency that covers all cycles but a share, with 95 % confidence (ns).
 
@@ -227,16 +191,16 @@ def covered_latency(
 
 
 def derive_margin(
-    latencies_ns: NDArray[np.int64],
+    latencies_ns: _Latencies,
     overrun_probability: float,
     seed: int = 0,
     *,
     longest_ns: int | None = None,
 ) -> Margin:
-    """The margin ε with which an execution overruns its slot with the given probability.
+    """The margin ε, with its confidence interval, beyond ``longest_ns`` (default: the longest of
+    them) with which an execution overruns its slot with the given probability.
 
-    ``latencies_ns`` are in the order in which they were measured; ε counts from ``longest_ns``,
-    their longest unless given. The result has its confidence interval.
+    ``latencies_ns`` are in the order in which they were measured.
 
     Raises: as :func:`fit_tail`.
     """
@@ -251,15 +215,14 @@ def derive_margin(
     )
 
 
-def fit_tail(latencies_ns: NDArray[np.int64], probability: float, seed: int = 0) -> TailFit:
+def fit_tail(latencies_ns: _Latencies, probability: float, seed: int = 0) -> TailFit:
     """Fit the tail of a sample and read the latency that is exceeded with a small probability.
 
     The threshold is the lowest of a few that leaves a tail of good fit.
 
-    Raises:
-        InputError: latencies that cannot be planned with, or a probability outside the tail.
-        OperationError: the data do not allow an answer: too few, not stationary, not
-            independent, no generalised Pareto tail, or an answer too vague to plan with.
+    Raises InputError: latencies that cannot be planned with, or a probability outside the tail.
+    OperationError: the data do not allow an answer: too few, not stationary, not independent, no
+    generalised Pareto tail, or an answer too vague to plan with.
     """
     latencies = check_latencies(latencies_ns)
     if not 0 < probability < MOST_PROBABLE:
@@ -274,54 +237,49 @@ def fit_tail(latencies_ns: NDArray[np.int64], probability: float, seed: int = 0)
             f" more than {fewest} cycles, better thousands, or give the margin yourself"
         )
     _refuse_not_stationary(latencies)
-    random = np.random.default_rng(seed)
-    tried = []
-    thresholds = _thresholds(latencies)
-    for threshold in thresholds[:1]:
-        _refuse_clusters(latencies, threshold)
-    for threshold in thresholds:
+    ordered = np.sort(latencies)
+    longest = min(ordered.size ** (2 / 3), MOST_EXCESSES)
+    thresholds = [int(ordered[-round(share * longest) - 1]) for share in TAILS]
+    # Equal latencies may leave too few beyond.
+    thresholds = [u for u in thresholds if np.count_nonzero(latencies > u) >= FEWEST_EXCESSES]
+    random, best = np.random.default_rng(seed), 0.0
+    for number, threshold in enumerate(thresholds):
+        if number == 0:
+            _refuse_clusters(latencies, threshold)
         fit = _fit_above(latencies, threshold, probability, random)
-        tried.append(fit.goodness)
+        best = max(best, fit.goodness)
         if fit.goodness >= GOODNESS:
-            _refuse_vague(fit, latencies.size)
-            return fit
+            low, high = fit.interval_ns
+            if high - low <= WIDEST_INTERVAL * fit.latency_ns:
+                return fit
+            raise OperationError(
+                f"{latencies.size} latencies are too few for an overrun probability of"
+                f" {probability:g}: the latency it asks for lies between {format_duration(low)}"
+                f" and {format_duration(high)}. Measure more cycles, or ask for less"
+            )
     raise OperationError(
         "the longest latencies do not follow a generalised Pareto distribution above any of"
-        f" {len(tried)} thresholds (best p-value {max(tried, default=0):.3f}), so rarer ones cannot"
-        " be extrapolated: look for two modes of the application in one recording, or give the"
+        f" {len(thresholds)} thresholds (best p-value {best:.3f}), so rarer ones cannot be"
+        " extrapolated: look for two modes of the application in one recording, or give the"
         " margin yourself"
     )
 
 
-def _thresholds(latencies: NDArray[np.int64]) -> list[int]:
-    """Where a tail may begin, ascending; none where equal latencies leave too few beyond."""
-    ordered = np.sort(latencies)
-    longest = min(ordered.size ** (2 / 3), MOST_EXCESSES)
-    thresholds = [int(ordered[-round(share * longest) - 1]) for share in TAILS]
-    return [
-        threshold
-        for threshold in thresholds
-        if np.count_nonzero(latencies > threshold) >= FEWEST_EXCESSES
-    ]
-
-
 def _fit_above(
-    latencies: NDArray[np.int64], threshold: int, probability: float, random: np.random.Generator
+    latencies: _Latencies, threshold: int, probability: float, random: np.random.Generator
 ) -> TailFit:
     from scipy.stats import genpareto  # SciPy takes a moment to import
 
     excesses = np.sort(latencies[latencies > threshold] - threshold).astype(float)[np.newaxis, :]
     shape, scale = _l_moment_fit(excesses)
-    goodness_of_fit = _anderson_darling(excesses, shape, scale)[0]
+    distance = _anderson_darling(excesses, shape, scale)[0]
     share = excesses.size / latencies.size
-    quantile = float(_quantile(shape, scale, share, probability)[0])
 
-    drawn = genpareto.rvs(
-        shape[0], scale=scale[0], size=(BOOTSTRAPS, excesses.size), random_state=random
-    )
+    size = (BOOTSTRAPS, excesses.size)
+    drawn = genpareto.rvs(shape[0], scale=scale[0], size=size, random_state=random)
     drawn.sort(axis=1)
     shapes, scales = _l_moment_fit(drawn)
-    statistics = _anderson_darling(drawn, shapes, scales)
+    distances = _anderson_darling(drawn, shapes, scales)
     shares = random.binomial(latencies.size, share, BOOTSTRAPS) / latencies.size
     quantiles = _quantile(shapes, scales, shares, probability)
     low, high = np.quantile(quantiles, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
@@ -331,8 +289,8 @@ def _fit_above(
         excesses=excesses.size,
         shape=float(shape[0]),
         scale_ns=float(scale[0]),
-        goodness=float((1 + np.sum(statistics >= goodness_of_fit)) / (1 + BOOTSTRAPS)),
-        latency_ns=threshold + round(quantile),
+        goodness=float((1 + np.sum(distances >= distance)) / (1 + BOOTSTRAPS)),
+        latency_ns=threshold + round(float(_quantile(shape, scale, share, probability)[0])),
         interval_ns=(threshold + round(low), threshold + round(high)),
     )
 
@@ -345,8 +303,7 @@ def _l_moment_fit(ordered: _Floats) -> tuple[_Floats, _Floats]:
     """
     size = ordered.shape[1]
     first = ordered.mean(axis=1)
-    weights = (2 * np.arange(size) - (size - 1)) / (size * (size - 1))
-    second = ordered @ weights
+    second = ordered @ ((2 * np.arange(size) - (size - 1)) / (size * (size - 1)))
     shape = 2 - first / second
     scale = first * (1 - shape)
     return np.maximum(shape, -scale / ordered[:, -1]), scale
@@ -376,7 +333,7 @@ def _anderson_darling(ordered: _Floats, shape: _Floats, scale: _Floats) -> _Floa
     return result
 
 
-def _refuse_not_stationary(latencies: NDArray[np.int64]) -> None:
+def _refuse_not_stationary(latencies: _Latencies) -> None:
     from scipy import stats
 
     half = latencies.size // 2
@@ -391,26 +348,16 @@ def _refuse_not_stationary(latencies: NDArray[np.int64]) -> None:
         )
 
 
-def _refuse_clusters(latencies: NDArray[np.int64], threshold: int) -> None:
+def _refuse_clusters(latencies: _Latencies, threshold: int) -> None:
     from scipy import stats
 
     above = latencies > threshold
-    share = float(above.mean())
     long, followed = int(above[:-1].sum()), int(np.count_nonzero(above[:-1] & above[1:]))
+    share = float(above.mean())
     chance = stats.binomtest(followed, long, share, alternative="greater").pvalue
     if chance < SIGNIFICANCE:
         raise OperationError(
             f"long latencies come in clusters ({followed} of {long} are followed by another,"
-            f" p = {chance:.2g}): executions are not independent, as when one delays the"
-            " next. Remove the cause, or give the margin yourself"
-        )
-
-
-def _refuse_vague(fit: TailFit, samples: int) -> None:
-    low, high = fit.interval_ns
-    if not high - low <= WIDEST_INTERVAL * fit.latency_ns:
-        raise OperationError(
-            f"{samples} latencies are too few for an overrun probability of {fit.probability:g}:"
-            f" the latency it asks for lies between {format_duration(low)} and"
-            f" {format_duration(high)}. Measure more cycles, or ask for less"
+            f" p = {chance:.2g}): executions are not independent, as when one delays the next."
+            " Remove the cause, or give the margin yourself"
         )

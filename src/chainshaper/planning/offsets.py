@@ -1,9 +1,8 @@
 """Several chains on shared cores: when each one's cycles start, so that no slots collide.
 
-Plans made one by one may want the same instants of the same core. Within the hyper-period of their
-cycles, chains are moved against each other until every two slots of one core and one priority are
-disjoint in all cycles (the rule that holds inside a plan, across plans; servers of different
-priority may overlap, as there). The paper leaves this open (section 3.1).
+Within the hyper-period of their cycles, chains are moved against each other until every two slots
+of one core and one priority are disjoint in all cycles (the rule that holds inside a plan, across
+plans). The paper leaves this open (section 3.1).
 
 Two slots [a, a + d) and [b, b + e) that repeat every T and U collide in some cycle unless the
 distance of their starts, modulo g = gcd(T, U), is in [d, g − e]: the distances that occur are all
@@ -13,11 +12,10 @@ nothing else matters.
 **Few chains are searched exhaustively.** From any solution, take the chains that are not linked to
 the first by a chain of tight pairs (pairs whose difference is at an end of an allowed interval),
 and start all of them earlier until some pair becomes tight. Repeated, that links every chain to the
-first without breaking a constraint: if there is a solution, there is one in which the tight pairs
-form a tree, and it is enough to try the ends of allowed intervals. Many chains are first fitted in
-one after the other, pushing each other out where there is no room, which is quick and mostly
-enough; where it is not, the CP-SAT solver of OR-tools decides, which is exact as well but may run
-out of time.
+first without breaking a constraint: it is enough to try the ends of allowed intervals. Many chains
+are first fitted in one after the other, pushing each other out where there is no room, which is
+quick and mostly enough; where it is not, the CP-SAT solver of OR-tools decides, which is exact as
+well but may run out of time.
 """
 
 import math
@@ -30,7 +28,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.planning.plan import Plan, publishing_servers, revised
+from chainshaper.planning.plan import Plan, Slot, publishing_servers, revised
 from chainshaper.planning.shaping import OUTPUT_PRIORITY
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError, extra_library
@@ -40,9 +38,9 @@ TIME_LIMIT_SECONDS = 60.0
 MOST_CYCLES = 2_000  # of all chains in a hyper-period that is played out for the solver
 MOST_FITTINGS = 10_000  # of one chain, before the solver is asked; some seconds for 30 chains
 
-_Intervals: TypeAlias = list[tuple[int, int]]  # closed, ascending
+_Intervals: TypeAlias = list[tuple[int, int]]  # closed; the first end is behind the last: around 0
 _Allowed: TypeAlias = dict[tuple[int, int], tuple[int, _Intervals]]
-"""For chains j < k whose slots can collide: g, and what (offset k − offset j) mod g may be."""
+"""For chains j, k whose slots can collide: g, and what (offset k − offset j) mod g may be."""
 
 
 def place_chains(
@@ -52,15 +50,18 @@ def place_chains(
 
     The chains take turns where they can (:func:`with_offsets`). Where they cannot, they run at the
     same time, the chain with the shorter period at the better priority, and only their publish
-    slots, which make the latency constant, stay apart.
-
-    Raises: as :func:`with_offsets`.
+    slots stay apart. Raises as :func:`with_offsets`.
     """
     try:
         return with_offsets(plans, time_limit_s=time_limit_s), []
     except OperationError as error:
-        ranked = _with_own_priorities(plans)
-        if [plan.servers for plan in ranked] == [plan.servers for plan in plans]:
+        ranked = list(plans)
+        for rank, k in enumerate(sorted(range(len(plans)), key=lambda k: (plans[k].cycle_ns, k))):
+            own = {"priority": OUTPUT_PRIORITY + 1 + rank}
+            publishing = publishing_servers(plans[k])
+            servers = [s if s in publishing else s.model_copy(update=own) for s in plans[k].servers]
+            ranked[k] = revised(plans[k], servers=tuple(servers))
+        if ranked == list(plans):
             raise
         remark = (
             f"{error} Instead, the chains run at the same time at priorities of their own, and"
@@ -68,23 +69,6 @@ def place_chains(
             " while all of them ran like this."
         )
         return with_offsets(ranked, time_limit_s=time_limit_s), [remark]
-
-
-def _with_own_priorities(plans: Sequence[Plan]) -> list[Plan]:
-    """Servers that do not publish get priorities behind those that do, by period."""
-    order = sorted(range(len(plans)), key=lambda k: (plans[k].cycle_ns, k))
-    rank = {k: place for place, k in enumerate(order)}
-    ranked = []
-    for k, plan in enumerate(plans):
-        publishing = publishing_servers(plan)
-        servers = tuple(
-            server
-            if server in publishing
-            else server.model_copy(update={"priority": OUTPUT_PRIORITY + 1 + rank[k]})
-            for server in plan.servers
-        )
-        ranked.append(revised(plan, servers=servers))
-    return ranked
 
 
 def with_offsets(
@@ -95,24 +79,33 @@ def with_offsets(
     The first chain, and any that shares no core with another, has the offset 0. ``time_limit_s``
     bounds the search among chains that can collide with each other.
 
-    Raises:
-        InputError: no plans, or plans that govern the same threads or the same output.
-        OperationError: there are no such offsets, with the reason where a single pair of chains or
-            the load of a core already excludes them; or the time was up before an answer.
-        PlatformError: more than a few chains collide and OR-tools is not installed.
+    Raises InputError: no plans, or plans that govern the same threads or the same output.
+    OperationError: there are no such offsets, with the reason where a single pair of chains or the
+    load of a core already excludes them; or the time was up before an answer. PlatformError: more
+    than a few chains collide and OR-tools is not installed.
     """
     if not plans:
         raise InputError("no plans to find offsets for: give one per chain")
-    _refuse_shared_parts(plans)
     allowed: _Allowed = {}
+    for one, two in combinations(plans, 2):
+        threads = [{t for server in plan.servers for t in server.threads} for plan in (one, two)]
+        shared = {thread.node for thread in threads[0]} & {thread.node for thread in threads[1]}
+        refuse_common((_name(one), _name(two)), (one.chain.output, two.chain.output), shared)
     for j, k in combinations(range(len(plans)), 2):
-        found = _allowed_differences(plans[j], plans[k])
-        if found is not None:
-            allowed[j, k] = found
-            if not found[1]:
-                raise OperationError(_pair_too_long(plans[j], plans[k], found[0]))
-    _refuse_overload(plans)
-    offsets = [0] * len(plans)
+        common, forbidden = _collisions(plans[j], plans[k])
+        if forbidden:
+            intervals = _between(forbidden, common)
+            if not intervals:
+                raise OperationError(_pair_too_long(plans[j], plans[k], common))
+            allowed[j, k] = common, intervals
+            allowed[k, j] = common, [(-end % common, -start % common) for start, end in intervals]
+    for (core, priority), load in _loads(plans).items():
+        if load > 1 + 1e-9:
+            raise OperationError(
+                f"the slots of all chains on core {core} at priority {priority} fill {load:.1%} of"
+                " its time: move a chain to another core, or give servers different priorities"
+            )
+    offsets = dict.fromkeys(range(len(plans)), 0)
     for group in _groups(len(plans), allowed):
         if len(group) <= MOST_SEARCHED:
             solution = _search(plans, allowed, group, {group[0]: 0})
@@ -127,64 +120,50 @@ def with_offsets(
                 " their slots apart, although any two of them could: move one to another core,"
                 " give servers different priorities, or shorten slots"
             )
-        for k, offset in solution.items():
-            offsets[k] = offset
-    return tuple(
-        revised(plan, offset_ns=offset) for plan, offset in zip(plans, offsets, strict=True)
-    )
+        offsets.update(solution)
+    return tuple(revised(plan, offset_ns=offsets[k]) for k, plan in enumerate(plans))
 
 
-def _allowed_differences(one: Plan, two: Plan) -> tuple[int, _Intervals] | None:
+def _slots(plan: Plan) -> dict[tuple[int, int], list[Slot]]:
+    """All slots by core and priority."""
+    found: dict[tuple[int, int], list[Slot]] = {}
+    for server in plan.servers:
+        found.setdefault((server.core, server.priority), []).extend(server.slots)
+    return found
+
+
+def _collisions(one: Plan, two: Plan) -> tuple[int, _Intervals]:
+    """g, and the differences of offsets modulo g at which slots collide."""
     common = math.gcd(one.cycle_ns, two.cycle_ns)
     forbidden: _Intervals = []
-    for place in _places(one) & _places(two):
-        for start_one, end_one in _slots(one, place):
-            for start_two, end_two in _slots(two, place):
+    for place, slots in _slots(one).items():
+        for start, end in slots:
+            for other_start, other_end in _slots(two).get(place, []):
                 # They collide if `two` starts later by more than this and less than that.
-                first, last = start_one - end_two + 1, end_one - start_two - 1
+                first, last = start - other_end + 1, end - other_start - 1
                 if last - first + 1 >= common:
-                    return common, []
+                    return common, [(0, common - 1)]
                 first, last = first % common, last % common
                 forbidden += [(first, last)] if first <= last else [(0, last), (first, common - 1)]
-    if not forbidden:
-        return None
+    return common, forbidden
+
+
+def _between(forbidden: _Intervals, common: int) -> _Intervals:
     allowed, free = [], 0
-    for first, last in sorted(forbidden):
+    for first, last in sorted([*forbidden, (common, common)]):
         if first > free:
             allowed.append((free, first - 1))
         free = max(free, last + 1)
-    if free < common:
-        allowed.append((free, common - 1))
-    return common, allowed
-
-
-def _places(plan: Plan) -> set[tuple[int, int]]:
-    return {(server.core, server.priority) for server in plan.servers}
-
-
-def _slots(plan: Plan, place: tuple[int, int]) -> Iterator[tuple[int, int]]:
-    for server in plan.servers:
-        if (server.core, server.priority) == place:
-            yield from server.slots
+    return allowed
 
 
 def _groups(count: int, allowed: _Allowed) -> list[list[int]]:
     """Chains that can collide with each other, directly or through others."""
     groups = [{k} for k in range(count)]
-    for j, k in allowed:
-        merged = set().union(*(group for group in groups if j in group or k in group))
+    for pair in allowed:
+        merged = set().union(*(group for group in groups if group.intersection(pair)))
         groups = [group for group in groups if not group & merged] + [merged]
     return [sorted(group) for group in groups if len(group) > 1]
-
-
-def _differences(allowed: _Allowed, j: int, k: int) -> tuple[int, _Intervals] | None:
-    """What (offset k − offset j) mod g may be, whichever of the two comes first."""
-    if (j, k) in allowed:
-        return allowed[j, k]
-    if (k, j) in allowed:
-        common, intervals = allowed[k, j]
-        return common, [(-last % common, -first % common) for first, last in intervals]
-    return None
 
 
 def _search(
@@ -192,18 +171,15 @@ def _search(
 ) -> dict[int, int] | None:
     if len(placed) == len(group):
         return placed
-    tried = set()
     for k in (k for k in group if k not in placed):
         candidates = _candidates(plans, allowed, k, placed)
         fitting = np.ones(candidates.size, dtype=bool)
         for j, base in placed.items():
             fitting &= _apart(allowed, j, k, candidates - base)
         for offset in candidates[fitting].tolist():
-            if (k, offset) not in tried:
-                tried.add((k, offset))
-                found = _search(plans, allowed, group, {**placed, k: offset})
-                if found is not None:
-                    return found
+            found = _search(plans, allowed, group, {**placed, k: offset})
+            if found is not None:
+                return found
     return None
 
 
@@ -211,15 +187,27 @@ def _candidates(
     plans: Sequence[Plan], allowed: _Allowed, k: int, placed: dict[int, int]
 ) -> NDArray[np.int64]:
     """Offsets of chain k, ascending, at which it is tight with one of the placed chains; or 0."""
-    cycle, found = plans[k].cycle_ns, [np.zeros(1, dtype=np.int64)]
+    found = [np.zeros(1, dtype=np.int64)]
     for j, base in placed.items():
-        difference = _differences(allowed, j, k)
-        if difference is not None:
-            common, intervals = difference
+        if (j, k) in allowed:
+            common, intervals = allowed[j, k]
             ends = np.array(intervals, dtype=np.int64).ravel()
-            repeats = np.arange(0, cycle, common, dtype=np.int64)
+            repeats = np.arange(0, plans[k].cycle_ns, common, dtype=np.int64)
             found.append(np.add.outer((base + ends) % common, repeats).ravel())
     return np.unique(np.concatenate(found))
+
+
+def _apart(allowed: _Allowed, j: int, k: int, distances: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which distances from an offset of chain j to one of chain k keep their slots apart."""
+    if (j, k) not in allowed:
+        return np.ones(distances.size, dtype=bool)
+    common, intervals = allowed[j, k]
+    distances = distances % common
+    apart = np.zeros(distances.size, dtype=bool)
+    for first, last in intervals:
+        behind, before = distances >= first, distances <= last
+        apart |= behind & before if first <= last else behind | before
+    return apart
 
 
 def _fitted(
@@ -232,7 +220,8 @@ def _fitted(
     hard ones come to stay and the others move around them (guided ejection: Nagata and Bräysy,
     Operations Research Letters 37, 2009).
     """
-    waiting = sorted(group, key=lambda k: (-plans[k].cycle_ns, _busy(plans[k])))
+    busy = [sum(end - start for s in plan.servers for start, end in s.slots) for plan in plans]
+    waiting = sorted(group, key=lambda k: (-plans[k].cycle_ns, busy[k]))
     weight = dict.fromkeys(group, 1)
     placed: dict[int, int] = {}
     generator = random.Random(0)  # noqa: S311 - no secrets here; the same plans, the same offsets
@@ -259,24 +248,6 @@ def _fitted(
     return None
 
 
-def _apart(allowed: _Allowed, j: int, k: int, distances: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which distances from an offset of chain j to one of chain k keep their slots apart."""
-    difference = _differences(allowed, j, k)
-    if difference is None:
-        return np.ones(distances.size, dtype=bool)
-    common, intervals = difference
-    distances = distances % common
-    apart = np.zeros(distances.size, dtype=bool)
-    for first, last in intervals:
-        inside = (distances >= first) & (distances <= last)
-        apart |= inside if first <= last else (distances >= first) | (distances <= last)
-    return apart
-
-
-def _busy(plan: Plan) -> int:
-    return sum(end - start for server in plan.servers for start, end in server.slots)
-
-
 def _solve(
     plans: Sequence[Plan], allowed: _Allowed, group: list[int], time_limit_s: float
 ) -> dict[int, int] | None:
@@ -284,15 +255,14 @@ def _solve(
     model = cp_model.CpModel()
     offsets = {k: model.new_int_var(0, plans[k].cycle_ns - 1, f"offset{k}") for k in group}
     model.add(offsets[group[0]] == 0)
-    for (j, k), (common, intervals) in allowed.items():
-        if j in offsets and k in offsets:
-            cycles = model.new_int_var(
-                -(plans[j].cycle_ns // common) - 1, plans[k].cycle_ns // common + 1, f"n{j}_{k}"
-            )
-            model.add_linear_expression_in_domain(
-                offsets[k] - offsets[j] - common * cycles,
-                cp_model.Domain.from_intervals([list(interval) for interval in intervals]),
-            )
+    for j, k in combinations(group, 2):
+        if (j, k) in allowed:
+            common, intervals = allowed[j, k]
+            least, most = -(plans[j].cycle_ns // common) - 1, plans[k].cycle_ns // common + 1
+            cycles = model.new_int_var(least, most, f"n{j}_{k}")
+            domain = cp_model.Domain.from_intervals([list(interval) for interval in intervals])
+            difference = offsets[k] - offsets[j] - common * cycles
+            model.add_linear_expression_in_domain(difference, domain)
     for slots in _played_out(plans, group):
         model.add_no_overlap(
             [
@@ -306,14 +276,16 @@ def _solve(
     status = solver.solve(model)
     if status == cp_model.INFEASIBLE:
         return None
-    if status not in (cp_model.OPTIMAL, cp_model.FEASIBLE):
-        raise OperationError(
-            f"undecided: in the time allowed neither offsets for {len(group)} chains that share"
-            f" cores were found nor a proof that there are none. {_fullest(plans, group)} Put"
-            " fewer chains on it, shorten slots, use periods with a large common divisor, or allow"
-            " more time"
-        )
-    return {k: int(solver.value(offset)) for k, offset in offsets.items()}
+    if status in (cp_model.OPTIMAL, cp_model.FEASIBLE):
+        return {k: int(solver.value(offset)) for k, offset in offsets.items()}
+    loads = _loads([plans[k] for k in group])
+    core, priority = max(loads, key=lambda place: (loads[place], place))
+    raise OperationError(
+        f"undecided: in the time allowed neither offsets for {len(group)} chains that share cores"
+        f" were found nor a proof that there are none. Their slots fill"
+        f" {loads[core, priority]:.1%} of core {core} at priority {priority}. Put fewer chains on"
+        " it, shorten slots, use periods with a large common divisor, or allow more time"
+    )
 
 
 def _played_out(plans: Sequence[Plan], group: list[int]) -> Iterator[list[tuple[int, int, int]]]:
@@ -325,40 +297,24 @@ def _played_out(plans: Sequence[Plan], group: list[int]) -> Iterator[list[tuple[
     hyper_period = math.lcm(*(plans[k].cycle_ns for k in group))
     if sum(hyper_period // plans[k].cycle_ns for k in group) > MOST_CYCLES:
         return
-    for place in sorted(set().union(*(_places(plans[k]) for k in group))):
+    slots = {k: _slots(plans[k]) for k in group}
+    for place in sorted(set().union(*slots.values())):
         yield [
             (k, start + cycle, end + cycle)
             for k in group
-            for start, end in _slots(plans[k], place)
+            for start, end in slots[k].get(place, [])
             for cycle in range(-plans[k].cycle_ns, hyper_period, plans[k].cycle_ns)
         ]
 
 
 def _loads(plans: Sequence[Plan]) -> dict[tuple[int, int], float]:
     """The share of time that slots take, per core and priority."""
-    return {
-        place: sum(
-            (end - start) / plan.cycle_ns for plan in plans for start, end in _slots(plan, place)
-        )
-        for place in sorted(set().union(*(_places(plan) for plan in plans)))
-    }
-
-
-def _fullest(plans: Sequence[Plan], group: list[int]) -> str:
-    load, (core, priority) = max(
-        (load, place) for place, load in _loads([plans[k] for k in group]).items()
-    )
-    return f"Their slots fill {load:.1%} of core {core} at priority {priority}."
-
-
-def _refuse_overload(plans: Sequence[Plan]) -> None:
-    for place, load in _loads(plans).items():
-        if load > 1 + 1e-9:
-            raise OperationError(
-                f"the slots of all chains on core {place[0]} at priority {place[1]} fill"
-                f" {load:.1%} of its time: move a chain to another core, or give servers different"
-                " priorities"
-            )
+    loads: dict[tuple[int, int], float] = {}
+    for plan in plans:
+        for place, slots in _slots(plan).items():
+            busy = sum((end - start) / plan.cycle_ns for start, end in slots)
+            loads[place] = loads.get(place, 0.0) + busy
+    return dict(sorted(loads.items()))
 
 
 def _pair_too_long(one: Plan, two: Plan, common: int) -> str:
@@ -375,28 +331,19 @@ def _name(plan: Plan) -> str:
     return plan.chain.spec or plan.chain.output or "a chain without a name"
 
 
-def _refuse_shared_parts(plans: Sequence[Plan]) -> None:
-    """Plans that were made one by one may not govern the same threads, or the same output."""
-    for one, two in combinations(plans, 2):
-        if one.chain.output is not None and one.chain.output == two.chain.output:
-            raise InputError(same_output(_name(one), _name(two), one.chain.output))
-        nodes = [{t.node for server in plan.servers for t in server.threads} for plan in (one, two)]
-        if shared := nodes[0] & nodes[1]:
-            raise InputError(same_nodes(_name(one), _name(two), shared))
-
-
-def same_output(one: str, two: str, topic: str) -> str:
-    """Why two chains with one output have no plan together."""
-    return (
-        f"{one} and {two} both publish {topic}, and one shaping node can hold it at one place"
-        " only: name each output once, with the chain that takes longest"
-    )
-
-
-def same_nodes(one: str, two: str, nodes: Iterable[str]) -> str:
-    """Why two chains with common nodes have no plan together."""
-    return (
-        f"{one} and {two} share {', '.join(sorted(nodes))}: a thread runs in the servers of one"
-        " plan. Plan one of the two alone or, where both begin at the same callback, the other as"
-        " its --sink"
-    )
+def refuse_common(
+    names: tuple[str, str], outputs: tuple[str | None, str | None], nodes: Iterable[str] = ()
+) -> None:
+    """Refuse to plan two chains one by one whose plans would have one output, or these nodes."""
+    one, two = names
+    if outputs[0] is not None and outputs[0] == outputs[1]:
+        raise InputError(
+            f"{one} and {two} both publish {outputs[0]}, and one shaping node can hold it at one"
+            " place only: name each output once, with the chain that takes longest"
+        )
+    if shared := sorted(nodes):
+        raise InputError(
+            f"{one} and {two} share {', '.join(shared)}: a thread runs in the servers of one plan."
+            " Plan one of the two alone or, where both begin at the same callback, the other as"
+            " its --sink"
+        )

@@ -2,16 +2,11 @@
 
 An **overrun** is an output that comes behind the last slot it was due in (section 6). A shaping
 node sees them and treats them as the plan says (:mod:`chainshaper.gate.decision`). The thread of an
-asynchronous publisher cannot tell an overrun from an output that came early, but DDS can, by its
-age: with a **lifespan** on the topic, what waited for the slot of a later cycle has expired when
-the thread may run again.
-
-A plan for asynchronous publication (section 3.2.1) gates the thread that publishes the chain's
-output. Its own values are checked wherever a plan is made or read
-(:mod:`chainshaper.planning.plan`); who publishes what, and how, only the application can tell.
+asynchronous publisher cannot, but DDS can, by an output's age: with a **lifespan** on the topic,
+what waited for the slot of a later cycle has expired when the thread may run again.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -36,17 +31,14 @@ from chainshaper.values.durations import format_duration, milliseconds
 from chainshaper.values.errors import InputError
 
 NEARLY_FULL = 0.95  # of the cycle; also the kernel's default share for real-time threads
-
-ROOMY_SLOT_NS = 10_000_000
-"""What is left of such a slot suffices for many sends where the machine stalls for 1 to 8 ms."""
+ROOMY_SLOT_NS = 10_000_000  # suffices for many sends where the machine stalls for 1 to 8 ms
 
 
 def cycles_until_output(plan: Plan, node: ShapingNode | None = None) -> int:
     """How many cycles after its own an output is due, and leaves at the earliest: 0 but under LET.
 
-    It is the chain's output, or what ``node`` republishes: under LET per callback, each topic
-    inside the chain is due a cycle after the one before it. Without slots for outputs: as
-    predicted.
+    It is the chain's output, or what ``node`` republishes: under LET per callback, each topic is
+    due a cycle after the one before it. Without slots for outputs: as predicted.
     """
     if plan.policy == "let-per-chain":
         return 1
@@ -60,12 +52,11 @@ def cycles_until_output(plan: Plan, node: ShapingNode | None = None) -> int:
 def output_lifespan(plan: Plan) -> int | None:
     """The lifespan (ns) by which DDS discards what overruns; None where it is not needed.
 
-    It is as short as it may be: an output that comes in time waits no longer than until the end of
-    the first slot when it was handed over at the very start of the cycle, or of the next slot when
-    it just missed one. An overrun waits from when it is handed over, at latency l, to the first
-    slot of the next cycle, CT + (x_1 − Δ) − l. So overruns are discarded up to a latency of CT − Δ
-    with one slot; one that took longer still is taken for an early output of the next cycle. Under
-    LET, where every output waits for the next cycle, age tells nothing.
+    It is as short as it may be: an output in time waits at most until the end of the first slot,
+    or of the next slot when it just missed one. An overrun with latency l waits for the first slot
+    of the next cycle, CT + (x_1 − Δ) − l. So overruns are discarded up to a latency of CT − Δ with
+    one slot; one that took longer still is taken for an early output of the next cycle. Under LET,
+    where every output waits for the next cycle, age tells nothing.
     """
     publisher = plan.chain.publisher
     if plan.overrun != "discard" or publisher is None or cycles_until_output(plan):
@@ -73,15 +64,13 @@ def output_lifespan(plan: Plan) -> int | None:
     if server_of(plan, Thread(node=publisher, role="publisher")) is None:
         return None
     slots = publish_slots(plan)
-    waits = [after[1] - before[1] for before, after in pairwise(slots)]
-    return max([slots[0][1], *waits])
+    return max([slots[0][1], *(after[1] - before[1] for before, after in pairwise(slots))])
 
 
 def refuse_offset(plan: Plan) -> None:
     """Refuse an offset where the phase of the chain's own timer says when its cycles start.
 
-    Raises:
-        InputError: the plan has one; the message says how to carry it out.
+    Raises InputError: the plan has one; the message says how to carry it out.
     """
     if plan.offset_ns:
         raise InputError(
@@ -96,9 +85,9 @@ def open_until_done(plan: Plan) -> Plan:
 
     Where an output that missed its slot is to leave at once, the servers that run the chain to its
     end stay open until the cycle's end (section 6), and so does the last publish slot of an
-    asynchronous publisher's thread: a server that stopped either of them would delay the output by
-    a whole cycle. The plan itself states what is reserved (eq. 1) and shared out among chains;
-    where another server of the same priority has a slot there, the servers stay as planned.
+    asynchronous publisher: stopping either would delay the output by a whole cycle. The plan itself
+    states what is reserved (eq. 1); where another server of the same priority has a slot there, it
+    stays as planned.
     """
     shaped = plan.policy in ("shaped", "one-long-slot") and output_server(plan) is not None
     if plan.overrun != "publish" or not shaped:
@@ -129,25 +118,20 @@ class Writer:
 
 
 def check_publication(plan: Plan, writers: Sequence[Writer]) -> list[str]:
-    """Check a plan that gates publishers' threads against the writers of the application.
+    """Check a plan that gates publishers' threads against the writers of the application; returns
+    what a person must know, one sentence each.
 
-    Returns what a person must know, one sentence each.
-
-    Raises:
-        InputError: the output is published by another node, or synchronously, or its history is
-            too shallow for what is handed over while the thread may not run.
+    Raises InputError: the output is published by another node, or synchronously, or its history is
+    too shallow for what is handed over while the thread may not run.
     """
     warnings: list[str] = []
+    output = plan.chain.output
     for _, server, nodes in publisher_servers(plan):
         for node in nodes:
-            own = [writer for writer in writers if writer.node == node]
-            if node == plan.chain.publisher and plan.chain.output is not None:
-                _check_output(plan.chain.output, node, own, messages_waiting(plan, server))
-            delayed = sorted(
-                writer.topic
-                for writer in own
-                if writer.asynchronous and writer.topic != plan.chain.output
-            )
+            own = {writer.topic: writer for writer in writers if writer.node == node}
+            if node == plan.chain.publisher and output is not None:
+                _check_output(output, node, own.get(output), messages_waiting(plan, server))
+            delayed = sorted(t for t, writer in own.items() if writer.asynchronous and t != output)
             if delayed:
                 warnings.append(
                     f"{', '.join(delayed)} of {node} will be delayed as well, until the slots of"
@@ -157,8 +141,7 @@ def check_publication(plan: Plan, writers: Sequence[Writer]) -> list[str]:
     return warnings
 
 
-def _check_output(topic: str, node: str, own: Sequence[Writer], waiting: int) -> None:
-    writer = next((writer for writer in own if writer.topic == topic), None)
+def _check_output(topic: str, node: str, writer: Writer | None, waiting: int) -> None:
     if writer is None:
         raise InputError(
             f"the plan gates the thread by which {node} publishes {topic}, but {node} does not"
@@ -194,9 +177,8 @@ def publication_warnings(plan: Plan) -> list[str]:
                 f" give it {format_duration(ROOMY_SLOT_NS)} (--publish-slot), since outputs leave"
                 " when it opens."
             )
-        depth = plan.chain.output_depth
-        waiting = messages_waiting(plan, server)
-        if depth == waiting and plan.overrun == "wait" and plan.chain.publisher in nodes:
+        depth, mine = plan.chain.output_depth, plan.chain.publisher in nodes
+        if mine and plan.overrun == "wait" and depth == messages_waiting(plan, server):
             warnings.append(
                 f"a history of {depth} has no room for an output that overran: it will be"
                 " overwritten by the next. A depth of one more would keep it."
@@ -215,84 +197,90 @@ def publication_warnings(plan: Plan) -> list[str]:
 
 def plan_warnings(plan: Plan) -> list[str]:
     """What a person must know before relying on a plan; one sentence each, none if all is well."""
-    evidence, cycle, margin = plan.evidence, plan.cycle_ns, plan.margin
-    longest, used = evidence.max_latency_ns, evidence.utilisation or 0.0
-    last = max((end for _, end in publish_slots(plan)), default=longest)
-    low, high = map(format_duration, margin.confidence_interval_ns or (0, 0))
-    doubts = [
-        (
-            evidence.realtime is False,
-            "the latencies were taken without real-time scheduling: other programs are in them,"
-            " and the chain's slot is longer than it needs to be. Record again with the privilege"
-            " to use SCHED_FIFO.",
-        ),
-        (
-            evidence.lost_events,
-            f"{evidence.lost_events} events were lost while recording: cycles are missing, and the"
-            " longest latency may be among them. Record again, see the recording's notes.",
-        ),
-        (
-            evidence.incomplete,
-            f"{evidence.incomplete} executions of the chain have no end in the recording; their"
-            " latencies, which may be the longest, are not in the plan.",
-        ),
-        (
-            margin.confidence_interval_ns,
-            f"the margin {format_duration(margin.epsilon_ns)} is an estimate; with 95 % confidence"
-            f" it lies between {low} and {high}.",
-        ),
-        (
-            NEARLY_FULL * cycle < last <= cycle,
-            f"the plan fills {last / cycle:.1%} of the cycle {format_duration(cycle)}: an"
-            " execution a little longer than any measured delays the next one.",
-        ),
-        (
-            longest >= cycle,
-            f"the longest latency {format_duration(longest)} is not shorter than the cycle"
-            f" {format_duration(cycle)}: executions of the chain overlapped while they were"
-            " measured, and response times have each other's interference in them.",
-        ),
-        (
-            NEARLY_FULL * cycle < longest < cycle,
-            "a cycle as long as the longest measured keeps its core busy for more than"
-            f" {NEARLY_FULL:.0%}, where the kernel throttles real-time threads"
-            " (/proc/sys/kernel/sched_rt_runtime_us).",
-        ),
-        (
-            used > NEARLY_FULL,
-            f"the chain's execution takes {used:.1%} of its core: latencies will pile up from"
-            " cycle to cycle, whatever the slots.",
-        ),
-    ]
-    found = [sentence for doubtful, sentence in doubts if doubtful]
-    return [*_about_late_outputs(plan), *found, *publication_warnings(plan)]
+    return [*_about_late_outputs(plan), *_about_evidence(plan), *publication_warnings(plan)]
 
 
-def _about_late_outputs(plan: Plan) -> list[str]:
+def _about_late_outputs(plan: Plan) -> Iterator[str]:
     """How many outputs will be late, if the sample tells, and what the machine's stalls cost."""
     evidence, margin = plan.evidence, plan.margin
     cycles, needed = evidence.samples + evidence.disturbed, cycles_needed(OVERRUN_PROBABILITY)
-    found = []
+    if evidence.all_disturbed:
+        cycles = max(evidence.samples, evidence.disturbed)
     if cycles < needed:
-        found.append(
+        yield (
             f"the sample is small: {cycles} cycles are too few to say how late one output in a"
             f" hundred will be. Record {needed} cycles or more."
         )
-    if evidence.disturbed:
-        stall = evidence.longest_stall_ns
-        what = "" if stall is None else f", longest stall {milliseconds(stall)} ms"
-        found.append(f"the machine disturbed {evidence.disturbed} of {cycles} cycles{what}.")
+    stall = evidence.longest_stall_ns
+    what = "" if stall is None else f", longest stall {milliseconds(stall)} ms"
+    if evidence.all_disturbed:
+        yield (
+            f"the machine disturbed every cycle, but one at most{what}: the plan rests on latencies"
+            " with its stalls in them. Record again on a calmer machine."
+        )
+    elif evidence.disturbed:
+        yield f"the machine disturbed {evidence.disturbed} of {cycles} cycles{what}."
     if margin.stalls_ns:
         end = evidence.max_latency_ns + margin.epsilon_ns
-        found.append(
+        yield (
             f"covering the disturbed cycles costs {milliseconds(margin.stalls_ns)} ms: outputs"
             f" leave at {milliseconds(end)} ms; on a machine that does not stall it would be"
             f" {milliseconds(end - margin.stalls_ns)} ms (--ideal-machine)."
         )
     late = margin.overrun_probability or 0.0
     if cycles >= needed and late > OVERRUN_PROBABILITY and margin.source != "derived":
-        found.append(
+        yield (
             f"by the latencies of all cycles, up to {late:.1%} of the outputs will miss their slot"
             f" ({plan.overrun}): a larger margin (--epsilon) or a calmer machine helps."
         )
-    return found
+
+
+def _about_evidence(plan: Plan) -> Iterator[str]:
+    """What is doubtful about the measurements, or about how much of the cycle is used."""
+    evidence, cycle, margin = plan.evidence, plan.cycle_ns, plan.margin
+    longest, used = evidence.max_latency_ns, evidence.utilisation or 0.0
+    last = max((end for _, end in publish_slots(plan)), default=longest)
+    if evidence.realtime is False:
+        yield (
+            "the latencies were taken without real-time scheduling: other programs are in them,"
+            " and the chain's slot is longer than it needs to be. Record again with the privilege"
+            " to use SCHED_FIFO."
+        )
+    if evidence.lost_events:
+        yield (
+            f"{evidence.lost_events} events were lost while recording: cycles are missing, and the"
+            " longest latency may be among them. Record again, see the recording's notes."
+        )
+    if evidence.incomplete:
+        yield (
+            f"{evidence.incomplete} executions of the chain have no end in the recording; their"
+            " latencies, which may be the longest, are not in the plan."
+        )
+    if margin.confidence_interval_ns:
+        low, high = map(format_duration, margin.confidence_interval_ns)
+        yield (
+            f"the margin {format_duration(margin.epsilon_ns)} is an estimate; with 95 % confidence"
+            f" it lies between {low} and {high}."
+        )
+    if NEARLY_FULL * cycle < last <= cycle:
+        yield (
+            f"the plan fills {last / cycle:.1%} of the cycle {format_duration(cycle)}: an execution"
+            " a little longer than any measured delays the next one."
+        )
+    if longest >= cycle:
+        yield (
+            f"the longest latency {format_duration(longest)} is not shorter than the cycle"
+            f" {format_duration(cycle)}: executions of the chain overlapped while they were"
+            " measured, and response times have each other's interference in them."
+        )
+    if NEARLY_FULL * cycle < longest < cycle:
+        yield (
+            "a cycle as long as the longest measured has its core busy for more than"
+            f" {NEARLY_FULL:.0%}, where the kernel throttles real-time threads"
+            " (/proc/sys/kernel/sched_rt_runtime_us)."
+        )
+    if used > NEARLY_FULL:
+        yield (
+            f"the chain's execution takes {used:.1%} of its core: latencies will pile up from"
+            " cycle to cycle, whatever the slots."
+        )

@@ -1,107 +1,105 @@
 """The plan: which reservation servers, slots, threads and shaping nodes make a latency constant.
 
-A plan is a value. It is computed from measured latencies (:mod:`chainshaper.planning.shaping`),
-written as YAML that people edit (:mod:`chainshaper.planning.plan_file`), and carried out by the
-back ends. Every :class:`Plan` obeys every rule checked here, whichever way it came about.
-
-Durations are integer nanoseconds, in fields that end in ``_ns``; in YAML the same keys stand
-without the suffix and their values carry a unit (``period: 100ms``). Slots are half-open intervals
-``(start, end)`` in nanoseconds after the start of a cycle.
+Every :class:`Plan` obeys every rule checked here, whichever way it came about. Durations are
+integer nanoseconds, in fields that end in ``_ns``; in YAML the same keys stand without the suffix,
+their values with a unit (``period: 100ms``). Slots are half-open and count from a cycle's start.
 
 A server may stop the thread of an asynchronous publisher (design 1, section 3.2.1), which shares
-locks with the rest of its process. With Fast DDS 2.14, three things turned out to be destructive:
-
-* *a slot that is hardly longer than a send*: stopped in the midst of one, the thread has what
-  every publisher and the executor need, until the slot opens again. 0.25 ms did that; the bound
-  is four times as much, and four times the longest send where sends were measured.
-* *a thread that out-ranks its executor*: the executor hands a message over under the writer's
-  lock, for which the publisher thread spins. Above the executor on the same core, it never lets
-  it give that lock back. Before the shortest latency measured nothing is handed over, so what
-  happens until then is not looked at.
-* *a history that is too shallow*: what is handed over while the thread may not run has to fit in.
+locks with the rest of its process. With Fast DDS 2.14, three things are destructive and refused:
+a slot hardly longer than a send (stopped in the midst of one, 0.25 ms did that, the thread has what
+every publisher and the executor need); a thread that out-ranks its executor on the same core (it
+spins for the lock under which the executor hands a message over, which happens only after the
+shortest latency measured); and a history too shallow for what is handed over while it may not run.
 """
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import combinations, pairwise, product
+from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 
+import yaml
 from pydantic import AfterValidator, Field, model_validator
 
 from chainshaper.gate.decision import Anchor, Late, Messages, Overrun
 from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import OperationError
+from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.plan_choices import Fallback, Policy
 from chainshaper.values.yaml_file import (
+    AS_YAML,
     Duration,
     FullName,
     Part,
     PositiveDuration,
+    read_model,
     wrong_value,
     wrong_values_refused,
 )
 
-SHORTEST_SLOT_NS = 1_000_000
-"""Of an asynchronous publisher."""
+SHORTEST_SLOT_NS = 1_000_000  # of an asynchronous publisher
 SENDS_PER_SLOT = 4
-
 PER_CALLBACK = ("server-per-callback", "let-per-callback")
 """Policies whose slots follow from the callbacks, so that an execution may span cycles."""
 
 
 def _plain_name(what: str) -> AfterValidator:
     def check(value: str) -> str:
-        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", value):
-            raise ValueError(
-                f"{value!r} is not a {what}'s name: write letters, digits and underscores,"
-                f" {'no slash, ' if what == 'node' else ''}no digit first"
-            )
-        return value
+        if re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", value):
+            return value
+        raise ValueError(
+            f"{value!r} is not a {what}'s name: write letters, digits and underscores, no slash,"
+            " no digit first"
+        )
 
     return AfterValidator(check)
 
 
 ModeName = Annotated[str, _plain_name("mode")]
-
+Count = Annotated[int, Field(ge=0)]
+FromOne = Annotated[int, Field(ge=1)]
 Slot: TypeAlias = tuple[Duration, Duration]
 """A time slot [start, end) of a cycle."""
 
 
 class ChainOfPlan(Part):
-    """The chain that is planned for, as far as it is known.
+    """The chain that is planned for, as far as it is known: a plan from bare latencies knows only
+    the period, and can be studied but not carried out.
 
-    A plan from bare latencies knows only the period; it can be studied but not carried out.
     ``publisher`` is the node that publishes ``output``, ``output_depth`` its writer's history.
     """
 
     spec: str | None = None
     output: FullName | None = None
     publisher: FullName | None = None
-    output_depth: Annotated[int, Field(ge=1)] | None = None
+    output_depth: FromOne | None = None
     period_ns: PositiveDuration
 
 
 class Evidence(Part):
     """The measurements that the plan rests on: end-to-end latencies under high SCHED_FIFO.
 
-    The latencies are those of undisturbed cycles; ``max_of_all_ns`` is the longest of all.
-    ``incomplete`` counts traversals without an end, ``disturbed`` those that a stall of the machine
-    hit; ``utilisation`` is the share of its core that the chain's execution takes,
-    ``longest_send_ns`` is of the output's asynchronous publisher. ``None`` is: not known.
+    They are of undisturbed cycles; where the machine disturbed all but one at most
+    (``all_disturbed``), of all. ``max_of_all_ns`` is the longest of all, ``incomplete`` counts
+    traversals without an end, ``disturbed`` those hit by a stall of the machine; ``utilisation`` is
+    the share of its core that the chain takes, ``longest_send_ns`` is of the output's asynchronous
+    publisher. ``None`` is: not known.
     """
 
     recording: str | None = None
-    samples: Annotated[int, Field(ge=1)]
+    samples: FromOne
     min_latency_ns: Duration
     mean_latency_ns: Duration
     max_latency_ns: PositiveDuration
     max_of_all_ns: PositiveDuration | None = None
-    incomplete: Annotated[int, Field(ge=0)] = 0
-    disturbed: Annotated[int, Field(ge=0)] = 0
+    incomplete: Count = 0
+    disturbed: Count = 0
     realtime: bool | None = None
     longest_stall_ns: Duration | None = None
     utilisation: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
     longest_send_ns: Duration | None = None
-    lost_events: Annotated[int, Field(ge=1)] | None = None
+    lost_events: FromOne | None = None
+    all_disturbed: Literal[True] | None = None
 
     @model_validator(mode="after")
     def _ordered(self) -> "Evidence":
@@ -113,10 +111,9 @@ class Evidence(Part):
 class Margin(Part):
     """How far the chain's slot reaches beyond the longest undisturbed latency (ε of eq. 1).
 
-    ``given`` by a person; ``measured``: it covers all cycles but a share, also those that the
-    machine disturbed, for which ``stalls_ns`` of it are needed; ``derived`` from the tail of the
-    latencies, with its confidence interval. ``overrun_probability`` is the share of late outputs,
-    at most, with 95 % confidence.
+    ``given``; ``measured``: it covers all cycles but a share, for which ``stalls_ns`` of it are
+    needed; ``derived`` from the tail of the latencies, with its confidence interval.
+    ``overrun_probability`` is the share of late outputs, at most, with 95 % confidence.
     """
 
     epsilon_ns: Duration
@@ -127,9 +124,8 @@ class Margin(Part):
 
 
 class Thread(Part):
-    """A thread of a node that runs inside a server: its executor, or its asynchronous publisher.
-
-    Other DDS threads are never gated (section 3.1), so they have no role.
+    """A thread of a node that runs inside a server; other DDS threads are never gated (section
+    3.1).
     """
 
     node: FullName
@@ -137,14 +133,13 @@ class Thread(Part):
 
 
 class Server(Part):
-    """A table-driven reservation server (section 2.2.1): its threads run in its slots only.
-
-    A smaller ``priority`` is better, which is LITMUS^RT's order.
+    """A table-driven reservation server (section 2.2.1): its threads run in its slots only. A
+    smaller ``priority`` is better, as in LITMUS^RT.
     """
 
     name: Annotated[str, Field(min_length=1)]
-    core: Annotated[int, Field(ge=0)]
-    priority: Annotated[int, Field(ge=1)]
+    core: Count
+    priority: FromOne
     slots: Annotated[tuple[Slot, ...], Field(min_length=1)]
     threads: tuple[Thread, ...] = ()
 
@@ -163,27 +158,26 @@ class Server(Part):
 
 
 class ShapingNode(Part):
-    """The node that takes the chain's output from ``input`` and republishes it on ``output``.
+    """The node that takes the chain's output from ``input`` and republishes it on ``output``, in
+    the slots of the server that has its thread.
 
-    It publishes in the slots of the server that has its thread. It sleeps until ``spin_ns`` before
-    the slot and spins from there, and pauses for ``pause_ns`` after a publication so that delivery
-    is not delayed by it. ``publisher`` is the node whose output it takes, where that is not
-    `chain.publisher`. While the plan is in force the executors of ``receivers``, which subscribe to
-    the output, run under SCHED_FIFO below all servers. ``depth`` is how many messages may wait in
-    it; None: as many as the history of the output's publisher has room for, as far as that is
-    known, and 10 at least. The histories of its subscribers do not count.
+    It sleeps until ``spin_ns`` before the slot and spins from there; it pauses for ``pause_ns``
+    after a publication so that it does not delay delivery. ``publisher`` is the node whose output
+    it takes, where that is not `chain.publisher`. The executors of ``receivers``, which subscribe
+    to the output, run under SCHED_FIFO below all servers. ``depth`` is how many messages may wait
+    in it; None: as many as the history of the output's publisher has room for, and 10 at least.
     """
 
     name: Annotated[str, _plain_name("node")]
     input: FullName
     output: FullName
     publisher: FullName | None = None
-    core: Annotated[int, Field(ge=0)]
+    core: Count
     fifo_priority: Annotated[int, Field(ge=1, le=98)]
     spin_ns: Duration
     pause_ns: Duration
     receivers: tuple[FullName, ...] = ()
-    depth: Annotated[int, Field(ge=1)] | None = None
+    depth: FromOne | None = None
 
     @property
     def thread(self) -> Thread:
@@ -202,17 +196,16 @@ class ShapingNode(Part):
 
 
 class Modes(Part):
-    """Which latency band the chain's output has in each mode of the system (sections 3.3, 6).
+    """Which latency band, 1 for the first slot, the output has in each mode (sections 3.3, 6).
 
-    The active mode's name is read from ``topic``, a ``std_msgs/msg/String``; until one is read it
-    is ``default``. ``bands`` has the number of each mode's band, 1 for the first slot. An early
-    output waits for its mode's slot. A late one waits for the same slot of the next cycle
+    The active mode is read from ``topic``, a ``std_msgs/msg/String``; until then it is ``default``.
+    An early output waits for its mode's slot. A late one waits for the same slot of the next cycle
     (``wait``), is discarded, leaves at once (``publish``), or takes the ``next-slot`` of the cycle.
     """
 
     topic: FullName
     default: ModeName
-    bands: Annotated[dict[ModeName, Annotated[int, Field(ge=1)]], Field(min_length=1)]
+    bands: Annotated[dict[ModeName, FromOne], Field(min_length=1)]
     late: Late = "wait"
 
     @model_validator(mode="after")
@@ -256,15 +249,13 @@ def slot_text(slot: Slot) -> str:
 class Plan(Part):
     """Servers and shaping nodes for one chain, with the evidence and the prediction.
 
-    ``cycle_ns`` is the servers' cycle time: the chain's period, or a whole multiple of it. This
-    chain's cycles start ``offset_ns`` after the instant from which those of all chains count.
-    ``anchor`` says what starts a cycle for the shaping node: the stamp that each message carries
-    from the chain's first callback, or the servers' own cycle. ``overrun`` says what becomes of an
-    output that missed its last slot, ``messages`` which of several outputs of one cycle leave,
+    ``cycle_ns`` is a whole multiple of the chain's period. Its cycles start ``offset_ns`` after the
+    instant from which those of all chains count; ``anchor``: by the stamp that each message carries
+    from the chain's first callback, or by the servers' own cycle. ``overrun`` says what becomes of
+    an output that missed its last slot, ``messages`` which of several outputs of one cycle leave,
     ``fallback`` what becomes of outputs while their shaping node is not there. ``shaping_node``
-    serves the chain's output; it is absent when the publisher's own thread is gated or nothing is.
-    ``further_shaping_nodes`` serve other sinks, or the topics inside a chain whose callbacks follow
-    LET one by one.
+    serves the chain's output, unless the publisher's own thread is gated; ``further_shaping_nodes``
+    serve other sinks, or topics inside a chain (LET per callback).
     """
 
     format: Literal[1] = 1
@@ -286,13 +277,10 @@ class Plan(Part):
 
     @model_validator(mode="after")
     def _consistent(self) -> "Plan":
-        _check_cycle(self)
-        _check_servers(self)
-        _check_overlaps(self)
-        for where, node in _placed_nodes(self):
-            _check_shaping_node(self, node, where)
-        _check_modes(self)
-        _check_publisher_threads(self)
+        rules = (_cycle, _servers, _overlaps, _shaping_nodes, _modes, _publisher_threads)
+        for rule in rules:
+            for reason, *where in rule(self):
+                raise wrong_value(str(reason), *where)
         return self
 
 
@@ -303,14 +291,14 @@ def server_of(plan: Plan, thread: Thread) -> Server | None:
 
 def shaping_nodes(plan: Plan) -> list[ShapingNode]:
     """All shaping nodes of a plan, that of the chain's output first."""
-    return [node for _, node in _placed_nodes(plan)]
+    return [*([plan.shaping_node] if plan.shaping_node else []), *plan.further_shaping_nodes]
 
 
 def output_server(plan: Plan) -> Server | None:
     """The server in whose slots the chain's output is published; None without shaping.
 
-    It has the thread of the shaping node or of the asynchronous publisher. A plan from bare
-    latencies names no threads; its server ``output`` is the one meant.
+    It has the thread of the shaping node or of the asynchronous publisher; a plan from bare
+    latencies names no threads, and its server ``output`` is meant.
     """
     server = None
     if plan.shaping_node is not None:
@@ -346,8 +334,7 @@ def publishing_servers(plan: Plan) -> tuple[Server, ...]:
     return tuple(
         server
         for server in plan.servers
-        if server is output
-        or any(thread in nodes or thread.role == "publisher" for thread in server.threads)
+        if server is output or any(t in nodes or t.role == "publisher" for t in server.threads)
     )
 
 
@@ -369,118 +356,117 @@ def until(server: Server, end_ns: int) -> tuple[Slot, ...]:
 def revised(plan: Plan, **changes: object) -> Plan:
     """A copy of a plan with some fields replaced, checked like any other plan.
 
-    Raises:
-        InputError: the fields make no plan together.
+    Raises InputError: the fields make no plan together.
     """
     values = {name: getattr(plan, name) for name in Plan.model_fields}
     with wrong_values_refused(Plan):
         return Plan.model_validate({**values, **changes})
 
 
-def _placed_nodes(plan: Plan) -> Iterator[tuple[tuple[str | int, ...], ShapingNode]]:
-    """The shaping nodes with their places in the file."""
-    if plan.shaping_node is not None:
-        yield ("shaping_node",), plan.shaping_node
-    for number, node in enumerate(plan.further_shaping_nodes):
-        yield ("further_shaping_nodes", number), node
+# The rules: each yields what is wrong, and where (keys as in the file) ------------------------
+
+_Wrong: TypeAlias = Iterator[tuple[str | int, ...]]
 
 
-def _check_cycle(plan: Plan) -> None:
+def _cycle(plan: Plan) -> _Wrong:
     cycle, period, longest = plan.cycle_ns, plan.chain.period_ns, plan.evidence.max_latency_ns
     if cycle % period:
-        raise wrong_value(
+        yield (
             f"the cycle {format_duration(cycle)} is no multiple of the chain's period"
             f" {format_duration(period)}: make it the period, or a whole multiple",
             "cycle",
         )
     if cycle <= longest and plan.policy not in PER_CALLBACK:
-        raise wrong_value(
+        yield (
             f"the cycle {format_duration(cycle)} is not longer than the longest latency measured,"
             f" {format_duration(longest)}: plan with a longer period or a shorter chain",
             "cycle",
         )
 
 
-def _check_servers(plan: Plan) -> None:
+def _servers(plan: Plan) -> _Wrong:
     names: set[str] = set()
     homes: dict[Thread, str] = {}
-    for number, server in enumerate(plan.servers):
-        where = ("servers", number)
+    for place, server in enumerate(plan.servers):
         if server.name in names:
-            raise wrong_value(f"two servers are named {server.name!r}: rename one", *where, "name")
+            reason = f"two servers are named {server.name!r}: rename one"
+            yield reason, "servers", place, "name"
         names.add(server.name)
-        for slot_number, slot in enumerate(server.slots):
+        for number, slot in enumerate(server.slots):
             if slot[1] > plan.cycle_ns:
-                raise wrong_value(
+                reason = (
                     f"the slot {slot_text(slot)} ends after the cycle"
-                    f" {format_duration(plan.cycle_ns)}: move it, or split it in two slots",
-                    *(*where, "slots", slot_number),
+                    f" {format_duration(plan.cycle_ns)}: move it, or split it in two slots"
                 )
-        for thread_number, thread in enumerate(server.threads):
+                yield reason, "servers", place, "slots", number
+        for number, thread in enumerate(server.threads):
             if thread in homes:
-                raise wrong_value(
+                reason = (
                     f"the {thread.role} of {thread.node} is already in server {homes[thread]!r}:"
-                    " a thread belongs to one server, remove it from the other",
-                    *(*where, "threads", thread_number),
+                    " a thread belongs to one server, remove it from the other"
                 )
+                yield reason, "servers", place, "threads", number
             homes[thread] = server.name
 
 
-def _check_overlaps(plan: Plan) -> None:
-    # Two servers of one core may overlap only when a priority says who runs.
-    for (_, one), (number, two) in combinations(enumerate(plan.servers), 2):
+def _overlaps(plan: Plan) -> _Wrong:
+    """Two servers of one core may overlap only when a priority says who runs."""
+    for (_, one), (place, two) in combinations(enumerate(plan.servers), 2):
         if (one.core, one.priority) != (two.core, two.priority):
             continue
-        for (slot_number, slot), other in product(enumerate(two.slots), one.slots):
+        for (number, slot), other in product(enumerate(two.slots), one.slots):
             if slot[0] < other[1] and other[0] < slot[1]:
-                raise wrong_value(
+                reason = (
                     f"the slot {slot_text(slot)} overlaps {slot_text(other)} of server"
-                    f" {one.name!r} on core {one.core} at the same priority {one.priority}:"
-                    " move one of them, or give one server another priority",
-                    *("servers", number, "slots", slot_number),
+                    f" {one.name!r} on core {one.core} at the same priority {one.priority}: move"
+                    " one of them, or give one server another priority"
                 )
+                yield reason, "servers", place, "slots", number
 
 
-def _check_shaping_node(plan: Plan, node: ShapingNode, where: tuple[Any, ...]) -> None:
-    others = [other for place, other in _placed_nodes(plan) if place != where]
-    server = server_of(plan, node.thread)
-    if any(node.name == other.name or node.output == other.output for other in others):
-        raise wrong_value(
-            f"another shaping node has the name {node.name} or the output {node.output} too:"
-            " both must be its own",
-            *where,
-        )
-    if where == ("shaping_node",) and plan.chain.output not in (None, node.output):
-        raise wrong_value(
-            f"publishes {node.output}, but the chain's output is {plan.chain.output}: make them"
-            " the same",
-            *(*where, "output"),
-        )
-    if server is None:
-        raise wrong_value(
-            f"no server holds the shaping node's thread: add {{node: {node.thread.node}}} to the"
-            " threads of the server whose slots it publishes in",
-            *(*where, "name"),
-        )
-    if server.core != node.core:
-        raise wrong_value(
-            f"core {node.core}, but its server {server.name!r} is on core {server.core}: make them"
-            " the same",
-            *(*where, "core"),
-        )
+def _shaping_nodes(plan: Plan) -> _Wrong:
+    further = enumerate(plan.further_shaping_nodes)
+    first = [] if plan.shaping_node is None else [(("shaping_node",), plan.shaping_node)]
+    placed = [*first, *((("further_shaping_nodes", number), node) for number, node in further)]
+    for where, node in placed:
+        others = [other for place, other in placed if place != where]
+        server, output = server_of(plan, node.thread), plan.chain.output
+        if any(node.name == other.name or node.output == other.output for other in others):
+            yield (
+                f"another shaping node has the name {node.name} or the output {node.output} too:"
+                " both must be its own",
+                *where,
+            )
+        if node is plan.shaping_node and output not in (None, node.output):
+            yield (
+                f"publishes {node.output}, but the chain's output is {output}: make them the same",
+                *(*where, "output"),
+            )
+        if server is None:
+            yield (
+                f"no server holds the shaping node's thread: add {{node: {node.thread.node}}} to"
+                " the threads of the server whose slots it publishes in",
+                *(*where, "name"),
+            )
+        elif server.core != node.core:
+            yield (
+                f"core {node.core}, but its server {server.name!r} is on core {server.core}: make"
+                " them the same",
+                *(*where, "core"),
+            )
 
 
-def _check_modes(plan: Plan) -> None:
+def _modes(plan: Plan) -> _Wrong:
     if plan.modes is None:
         return
     if plan.shaping_node is None:
-        raise wrong_value(
+        yield (
             "only a shaping node knows the mode of the system, and the plan has no `shaping_node`:"
             " remove the modes, or plan with synchronous publication",
             "modes",
         )
-    if plan.modes.topic in (plan.shaping_node.input, plan.shaping_node.output):
-        raise wrong_value(
+    elif plan.modes.topic in (plan.shaping_node.input, plan.shaping_node.output):
+        yield (
             f"{plan.modes.topic} carries the chain's output: name the topic on which the mode is"
             " published",
             *("modes", "topic"),
@@ -488,44 +474,72 @@ def _check_modes(plan: Plan) -> None:
     slots = len(publish_slots(plan))
     for mode, band in plan.modes.bands.items():
         if band > slots:
-            raise wrong_value(
+            yield (
                 f"the band {band}, but the shaping node publishes in {slots} slots: write a number"
                 f" from 1 to {slots}, or add a slot",
                 *("modes", "bands", mode),
             )
 
 
-def _check_publisher_threads(plan: Plan) -> None:
-    """Refuse a gated asynchronous publisher that would stop, or be stopped by, its process."""
-    for number, server, nodes in publisher_servers(plan):
-        _check_slots(plan, number, server)
-        for node in nodes:
-            _check_rank(plan, number, server, node)
+def _publisher_threads(plan: Plan) -> _Wrong:
+    """A gated asynchronous publisher must not stop, or be stopped by, its process."""
+    measured, depth = plan.evidence.longest_send_ns, plan.chain.output_depth
+    shortest = max(SHORTEST_SLOT_NS, SENDS_PER_SLOT * (measured or 0))
+    for place, server, nodes in publisher_servers(plan):
+        for number, slot in enumerate(server.slots):
+            if slot[1] - slot[0] < shortest:
+                took = f" (the longest took {format_duration(measured)})" if measured else ""
+                reason = (
+                    f"the slot {slot_text(slot)} is too short for an asynchronous publisher:"
+                    f" stopped in the midst of a send{took}, its thread would block the whole"
+                    f" process; make it {format_duration(shortest)} or longer (--publish-slot)"
+                )
+                yield reason, "servers", place, "slots", number
+        for node, other in product(nodes, plan.servers):
+            for slot in _out_ranked(plan, server, node, other):
+                reason = (
+                    f"the publisher thread of {node} would out-rank its executor, which server"
+                    f" {other.name!r} runs at priority {other.priority} on the same core in"
+                    f" {slot_text(slot)}: spinning for a lock that the executor holds, it would"
+                    f" never let it go on; write a number above {other.priority}, or move the slot"
+                    " behind the executor's"
+                )
+                yield reason, "servers", place, "priority"
         if plan.overrun == "publish" and plan.policy not in ("shaped", "one-long-slot"):
-            raise wrong_value(
+            yield (
                 f"under {plan.policy} an output of an asynchronous publisher that comes in its own"
-                " cycle looks like an overrun of the one before: write wait or discard, or"
-                " plan with --publication synchronous",
+                " cycle looks like an overrun of the one before: write wait or discard, or plan"
+                " with --publication synchronous",
                 "overrun",
             )
-        depth = plan.chain.output_depth
-        if depth is not None and plan.chain.publisher in nodes:
-            waiting = messages_waiting(plan, server)
-            if depth < waiting:
-                raise wrong_value(
-                    f"a history of {depth} is too shallow: while the publisher's thread may not"
-                    f" run, {waiting} messages are handed over, and the oldest would be lost; give"
-                    f" {plan.chain.output or 'the output'} a depth of {waiting + 1}, or the server"
-                    f" {server.name!r} more slots",
-                    *("chain", "output_depth"),
-                )
+        waiting = messages_waiting(plan, server)
+        if depth is not None and plan.chain.publisher in nodes and depth < waiting:
+            yield (
+                f"a history of {depth} is too shallow: while the publisher's thread may not run,"
+                f" {waiting} messages are handed over, and the oldest would be lost; give"
+                f" {plan.chain.output or 'the output'} a depth of {waiting + 1}, or the server"
+                f" {server.name!r} more slots",
+                *("chain", "output_depth"),
+            )
+
+
+def _out_ranked(plan: Plan, server: Server, node: str, other: Server) -> list[Slot]:
+    """Slots in which a node's publisher thread out-ranks its executor, if ``other`` runs that."""
+    if other.core != server.core or other.priority <= server.priority:
+        return []
+    if Thread(node=node) not in other.threads:
+        return []
+    earliest = plan.evidence.min_latency_ns
+    return [
+        slot
+        for slot in server.slots
+        if any(max(slot[0], earliest, start) < min(slot[1], end) for start, end in other.slots)
+    ]
 
 
 def below_executors(servers: Sequence[Server]) -> tuple[Server, ...]:
     """The servers, with those of publishers' threads ranked below what may run at the same time."""
-    publishing = [
-        server for server in servers if any(t.role == "publisher" for t in server.threads)
-    ]
+    publishing = [s for s in servers if any(t.role == "publisher" for t in s.threads)]
     ranked = []
     for server in servers:
         below = [
@@ -540,7 +554,7 @@ def below_executors(servers: Sequence[Server]) -> tuple[Server, ...]:
 
 
 def publisher_servers(plan: Plan) -> Iterator[tuple[int, Server, list[str]]]:
-    """Servers that hold publishers' threads: place in the plan, server, nodes of these threads."""
+    """Servers with publishers' threads: place in the plan, server, nodes of these threads."""
     for number, server in enumerate(plan.servers):
         nodes = [thread.node for thread in server.threads if thread.role == "publisher"]
         if nodes:
@@ -548,9 +562,8 @@ def publisher_servers(plan: Plan) -> Iterator[tuple[int, Server, list[str]]]:
 
 
 def messages_waiting(plan: Plan, server: Server) -> int:
-    """How many messages may be handed over while a server is closed, in one stretch.
-
-    One per period of the chain, and one more for where the stretch begins.
+    """How many messages may be handed over while a server is closed, in one stretch: one per period
+    of the chain, and one more for where the stretch begins.
     """
     (first, _), (_, last) = server.slots[0], server.slots[-1]
     closed = [after[0] - before[1] for before, after in pairwise(server.slots)]
@@ -558,34 +571,119 @@ def messages_waiting(plan: Plan, server: Server) -> int:
     return longest // plan.chain.period_ns + 1
 
 
-def _check_slots(plan: Plan, number: int, server: Server) -> None:
-    measured = plan.evidence.longest_send_ns
-    shortest = max(SHORTEST_SLOT_NS, SENDS_PER_SLOT * (measured or 0))
-    for slot_number, slot in enumerate(server.slots):
-        if slot[1] - slot[0] < shortest:
-            sends = "" if measured is None else f" (the longest took {format_duration(measured)})"
-            raise wrong_value(
-                f"the slot {slot_text(slot)} is too short for an asynchronous publisher: stopped"
-                f" in the midst of a send{sends}, its thread would block the whole process; make"
-                f" it {format_duration(shortest)} or longer (--publish-slot)",
-                *("servers", number, "slots", slot_number),
-            )
+# The file --------------------------------------------------------------------------------------
+
+_HEADER = """\
+# A chainshaper plan: the reservation servers that give a ROS 2 chain a constant latency.
+# Edit it as you like; it is checked when it is used. Durations carry units (59ms, 250us);
+# slots are half-open, [start, end), and count from the start of a cycle.
+"""
+
+_SECTION_COMMENTS = {
+    "evidence": "the measurements behind the plan",
+    "margin": "epsilon: how far the chain's slot reaches beyond the longest latency measured",
+    "offset": "this chain's cycles start so much after the instant that all chains count from",
+    "anchor": "what starts a cycle: the message's origin stamp (stamp), or the servers (cycle)",
+    "overrun": "an output that missed its last slot: wait for the next, discard, publish at once",
+    "messages": "several outputs in one cycle: all leave in order, or the newest, or the first",
+    "fallback": "while the shaping node is not there: bypass, outputs go around it; or silence",
+    "servers": "a thread runs only in its server's slots; a smaller priority is better",
+    "shaping_node": "republishes the output in its slots; receivers get SCHED_FIFO below servers",
+    "modes": "each mode's band, 1 is the first slot; the topic (std_msgs/String) names the mode",
+    "predicted": "for the slots as planned; not updated when they are edited",
+}
 
 
-def _check_rank(plan: Plan, number: int, server: Server, node: str) -> None:
-    """Nowhere may the thread run at a better priority than its node's executor could then."""
-    for other in plan.servers:
-        executes = any(t.node == node and t.role == "executor" for t in other.threads)
-        if not executes or other.core != server.core or other.priority <= server.priority:
-            continue
-        for slot in server.slots:
-            since = max(slot[0], plan.evidence.min_latency_ns)
-            if any(max(since, start) < min(slot[1], end) for start, end in other.slots):
-                raise wrong_value(
-                    f"the publisher thread of {node} would out-rank its executor, which server"
-                    f" {other.name!r} runs at priority {other.priority} on the same core in"
-                    f" {slot_text(slot)}: spinning for a lock that the executor holds, it would"
-                    f" never let it go on; write a number above {other.priority}, or move the slot"
-                    " behind the executor's",
-                    *("servers", number, "priority"),
-                )
+def load_plan(path: str | Path) -> Plan:
+    """Read a plan, however a person has laid it out.
+
+    Raises InputError: no such file, not YAML, or wrong values; each is named with its line, key,
+    reason and remedy.
+    """
+    return read_model(path, Plan, made_by="written by `chainshaper plan`")
+
+
+def dump_plan(plan: Plan) -> str:
+    """The YAML text of a plan; reading it gives an equal plan."""
+    values = plan.model_dump(mode="json", by_alias=True, exclude_none=True, context=AS_YAML)
+    for server in values["servers"]:
+        server["threads"] = [_OnOneLine(thread) for thread in server["threads"]]
+    if "modes" in values:
+        values["modes"]["bands"] = _OnOneLine(values["modes"]["bands"])
+    if plan.offset_ns == 0:
+        del values["offset"]
+    if plan.shaping_node is None and plan.fallback == "bypass":
+        del values["fallback"]
+    if not values["further_shaping_nodes"]:
+        del values["further_shaping_nodes"]
+    text = _HEADER
+    for key, value in values.items():
+        if key in _SECTION_COMMENTS:
+            text += f"# {_SECTION_COMMENTS[key]}\n"
+        text += yaml.dump({key: value}, Dumper=_Dumper, sort_keys=False, width=100)
+    return text
+
+
+class _OnOneLine(dict[str, Any]):
+    """A mapping that is written on one line."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """Sequences stand on one line, unless there are mappings in them."""
+
+    def represent_sequence(self, tag: str, sequence: Any, flow_style: bool | None = None) -> Any:
+        flow = flow_style or not any(isinstance(one, dict) for one in sequence)
+        return super().represent_sequence(tag, sequence, flow)
+
+
+_Dumper.add_representer(
+    _OnOneLine, lambda dumper, data: dumper.represent_mapping("tag:yaml.org,2002:map", data, True)
+)
+
+
+def save_plan(plan: Plan, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write a plan, whole or not at all.
+
+    Raises InputError: ``path`` exists (and ``overwrite`` is not set), or its folder does not.
+    OperationError: it cannot be written; nothing is left behind, an existing file stays.
+    """
+    path = Path(path)
+    if not (overwrite and path.is_file()):
+        new_file(path)
+    write_whole(path, [dump_plan(plan).encode()])
+
+
+def save_plans(plans: Sequence[Plan], folder: str | Path) -> list[Path]:
+    """Write the plans of several chains into a new folder, each named after its output.
+
+    Raises InputError: ``folder`` exists, or what it stands in does not. OperationError: they cannot
+    be written; nothing is left behind.
+    """
+    folder = new_file(folder)
+    try:
+        folder.mkdir()
+    except OSError as error:
+        raise OperationError(f"{folder}: the folder cannot be made: {error}") from error
+    written: list[Path] = []
+    try:
+        for number, plan in enumerate(plans, start=1):
+            name = (plan.chain.output or "plan").strip("/").replace("/", "_")
+            written.append(folder / f"{number}_{name}.yaml")
+            save_plan(plan, written[-1])
+    except OperationError:
+        for path in written:
+            path.unlink(missing_ok=True)
+        folder.rmdir()
+        raise
+    return written
+
+
+def plan_json(plan: Plan) -> dict[str, Any]:
+    """The plan as plain data for ``--json``: integer nanoseconds, keys ending in ``_ns``, with the
+    ends of the publish slots (``bands_ns``) and :func:`band_predictions`.
+    """
+    return {
+        **plan.model_dump(mode="json"),
+        "bands_ns": [end for _, end in publish_slots(plan)],
+        "predicted_bands": [band._asdict() for band in band_predictions(plan)],
+    }

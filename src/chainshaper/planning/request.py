@@ -1,8 +1,7 @@
 """From what was measured of a chain, and what is wished, to its plan of any policy.
 
-:class:`Profile` has the measurements, :class:`PlanRequest` the wishes, and :func:`plan_chain` turns
-one of each into a plan. A profile may come from a recording or consist of bare latencies and a
-period; a policy that needs more says so.
+A :class:`Profile` may come from a recording or consist of bare latencies and a period; a policy
+that needs more says so.
 
 Several chains cannot be planned together where one's plan would move another's outputs. A plan is
 made from latencies that were measured while nothing was shaped: shaping a topic that another
@@ -13,23 +12,13 @@ first callback, are planned right; the others are refused with what they have in
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import chain as joined
 from itertools import combinations, permutations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.gate.decision import Overrun
 from chainshaper.planning.bands import BandChoice, choose_bands, with_bands, with_long_slot
-from chainshaper.planning.baselines import (
-    CallbackTimes,
-    let_per_callback,
-    let_per_callback_asynchronous,
-    let_per_chain,
-    server_per_callback,
-    server_per_chain,
-)
 from chainshaper.planning.margins import (
     EPSILON_NS,
     MOST_PROBABLE,
@@ -40,12 +29,17 @@ from chainshaper.planning.margins import (
     derive_margin,
     late_share,
 )
-from chainshaper.planning.offsets import same_nodes, same_output
+from chainshaper.planning.offsets import refuse_common
 from chainshaper.planning.plan import PER_CALLBACK, Evidence, Margin, Modes, Plan, revised
 from chainshaper.planning.shaping import (
+    CallbackTimes,
     evidence_of,
+    let_per_callback,
+    let_per_chain,
     over_cores,
     plan_shaping,
+    server_per_callback,
+    server_per_chain,
     with_first_node_apart,
     with_sink,
 )
@@ -57,21 +51,22 @@ DEFAULT_CORE = 1
 OWN_SLOTS = (*PER_CALLBACK, "let-per-chain")
 """Policies whose plan has no slot behind the chain's, in the same cycle."""
 UNSHAPED = ("server-per-chain", "server-per-callback")
+_LIMITS = ("grid_ns", "max_gap_ns", "max_share")
 
 
 @dataclass(frozen=True)
 class Profile:
     """What was measured of one chain, under a high SCHED_FIFO priority. Times in nanoseconds.
 
-    ``latencies_ns`` are those of undisturbed cycles, ``every_latency_ns`` those of all (None: all
-    were undisturbed), both in the order of time. ``nodes`` are those of the chain's callbacks, one
-    per callback, ``topics`` what each of these publishes for the chain. ``core_of`` names the core
-    of every node whose executor takes part, also on branches that the chain waits for. ``begins``
-    is the first callback's number in the graph, and its name, ``upstream`` the topics that the
-    output waits for: on the chain, on those branches, and before the chain begins. ``receivers``
-    are the nodes that subscribe to the chain's output and are none of these. ``callbacks`` are
-    those of the chain and its branches, see
-    :func:`~chainshaper.planning.baselines.server_per_callback`. ``output_depth`` is the history of
+    ``latencies_ns`` are those of undisturbed cycles (where ``all_disturbed``, of all),
+    ``every_latency_ns`` those of all (None: all were undisturbed), both in the order of time.
+    ``nodes`` are those of the chain's callbacks, one per callback, ``topics`` what each of these
+    publishes for the chain. ``core_of`` names the core of every node whose executor takes part,
+    also on branches that the chain waits for. ``begins`` is the first callback's number in the
+    graph, and its name, ``upstream`` the topics that the output waits for: on the chain, on those
+    branches, and before the chain begins. ``receivers`` are the nodes that subscribe to the chain's
+    output and are none of these. ``callbacks`` are those of the chain and its branches, see
+    :func:`~chainshaper.planning.shaping.server_per_callback`. ``output_depth`` is the history of
     the output's writer. The rest is :class:`~chainshaper.planning.plan.Evidence`.
     """
 
@@ -96,6 +91,23 @@ class Profile:
     utilisation: float | None = None
     longest_send_ns: int | None = None
     lost_events: int | None = None
+    all_disturbed: bool | None = None
+
+    @property
+    def name(self) -> str:
+        """What the chain is called in messages."""
+        return self.spec or "..".join(self.topics)
+
+    @property
+    def every(self) -> NDArray[np.int64]:
+        """The latencies of all cycles."""
+        every = self.every_latency_ns
+        return check_latencies(self.latencies_ns if every is None else every)
+
+    @property
+    def longest_ns(self) -> int:
+        """The longest of the latencies that are planned from."""
+        return int(check_latencies(self.latencies_ns).max())
 
 
 @dataclass(frozen=True)
@@ -118,25 +130,31 @@ def plan_chain(
 
     ``sinks`` are profiles of further outputs of the same graph, each of which is shaped too.
 
-    Raises:
-        InputError: wishes that exclude each other, or a policy that needs more than the profile
-            has.
-        OperationError: no such plan exists; the message names what prevents it.
-        PlatformError: a library that only this request needs is not installed.
+    Raises InputError: wishes that exclude each other, or a policy that needs more than the profile
+    has. OperationError: no such plan exists; the message names what prevents it. PlatformError: a
+    library that only this request needs is not installed.
     """
     _refuse_contradictions(request, bool(sinks))
     _refuse_entangled((profile, *sinks), request.policy, sinks=True)
+    if any(sink.all_disturbed for sink in sinks) or profile.all_disturbed:
+        profile, sinks = _covered(profile, request), [_covered(sink, request) for sink in sinks]
     margin = _margin(profile, request)
-    if request.policy == "let-per-chain":
-        _refuse_longer_than_period(profile)
-    own_slots = request.policy in OWN_SLOTS
-    measured = _shortened(profile, request, margin) if own_slots else profile
+    longest, period = profile.longest_ns, profile.period_ns
+    if request.policy == "let-per-chain" and longest >= period:
+        raise OperationError(
+            f"the longest latency {format_duration(longest)} is not shorter than the period"
+            f" {format_duration(period)}, in which LET per chain has to be done: plan LET per"
+            " callback, or a longer period"
+        )
+    measured = profile
+    if request.policy in OWN_SLOTS:  # shaping, only the start of the plan, must fit into a cycle
+        most = max(1, period - margin.epsilon_ns - request.publish_slot_ns)
+        latencies = np.minimum(check_latencies(profile.latencies_ns), most)
+        measured = replace(profile, latencies_ns=latencies)
     plan = _with_policy(_shaped(measured, request, margin, sinks), profile, request)
-    if own_slots:
-        figures = evidence_of(profile.latencies_ns)
-        names = ("min_latency_ns", "mean_latency_ns", "max_latency_ns")
-        update = {name: getattr(figures, name) for name in names}
-        plan = revised(plan, evidence=plan.evidence.model_copy(update=update))
+    if request.policy in OWN_SLOTS:
+        figures = evidence_of(profile.latencies_ns).model_dump(exclude_unset=True)
+        plan = revised(plan, evidence=plan.evidence.model_copy(update=figures))
     for sink in sinks:
         if not sink.topics:
             raise InputError("a sink needs the topic it is published on: plan from a recording")
@@ -167,27 +185,35 @@ def plan_chains(profiles: Sequence[Profile], request: PlanRequest = _STANDARD) -
 
 def band_choice(plan: Plan, profile: Profile, request: PlanRequest) -> BandChoice:
     """The curve of figure 7 for a plan, and the number of bands that ``auto`` takes from it."""
-    return choose_bands(plan, profile.latencies_ns, **_placement(request, "least_gain"))
+    latencies = _covered(profile, request).latencies_ns
+    return choose_bands(plan, latencies, **_of(request, *_LIMITS, "least_gain"))
 
 
-def _shortened(profile: Profile, request: PlanRequest, margin: Margin) -> Profile:
-    """The profile with no latency beyond what shaping could fit into a cycle.
-
-    Where the policy has slots of its own, shaping is only the start of the plan.
-    """
-    longest = profile.period_ns - margin.epsilon_ns - request.publish_slot_ns
-    latencies = check_latencies(profile.latencies_ns)
-    return replace(profile, latencies_ns=np.minimum(latencies, max(1, longest)))
+def _of(request: PlanRequest, *names: str) -> dict[str, Any]:
+    return {name: getattr(request, name) for name in names}
 
 
-def _refuse_longer_than_period(profile: Profile) -> None:
-    longest, period = int(check_latencies(profile.latencies_ns).max()), profile.period_ns
-    if longest >= period:
+def _covered(profile: Profile, request: PlanRequest) -> Profile:
+    """Where no cycle was undisturbed, the profile of those that a margin would cover."""
+    if not profile.all_disturbed:
+        return profile
+    if request.ideal_machine:
         raise OperationError(
-            f"the longest latency {format_duration(longest)} is not shorter than the period"
-            f" {format_duration(period)}, in which LET per chain has to be done: plan LET per"
-            " callback, or a longer period"
+            f"{profile.recording or profile.name}: the machine disturbed every cycle of"
+            f" {profile.name}, but one at most, too few to plan an ideal machine from: leave out"
+            " --ideal-machine, or record again on a calmer one"
         )
+    share = request.overrun_probability or OVERRUN_PROBABILITY
+    latest = None if request.policy in OWN_SLOTS else _latest(profile, request)
+    every = profile.every
+    covered = every[every <= covered_latency(every, share, latest)]
+    latencies = covered if covered.size > 1 else every  # none fits, which the planner refuses
+    return replace(profile, latencies_ns=latencies, every_latency_ns=every)
+
+
+def _latest(profile: Profile, request: PlanRequest) -> int:
+    """The longest latency behind which a publish slot fits into the cycle."""
+    return profile.period_ns - request.publish_slot_ns - EPSILON_NS
 
 
 def _shaped(
@@ -199,6 +225,8 @@ def _shaped(
         values["output_depth"] = profile.output_depth
     else:  # how long sends take is no evidence for it
         del values["longest_send_ns"]
+    # At once by default, unless the thread of an asynchronous publisher has outputs due later.
+    bound = request.publication == "asynchronous" and request.policy in OWN_SLOTS
     plan = plan_shaping(
         profile.latencies_ns,
         profile.period_ns,
@@ -209,13 +237,13 @@ def _shaped(
         publisher=last,
         nodes=tuple(dict.fromkeys(profile.nodes)),
         core=profile.core_of.get(last or "", DEFAULT_CORE),
-        overrun=_overrun(request),
+        overrun=request.overrun or ("wait" if bound else "publish"),
         fifo_priority=profile.fifo_priority,
         receivers=profile.receivers if request.with_receivers else (),
-        max_of_all_ns=int(_every_latency(profile).max()),
+        max_of_all_ns=int(profile.every.max()),
         **values,
     )
-    core_of = dict(joined.from_iterable(one.core_of.items() for one in (profile, *sinks)))
+    core_of = {node: core for one in (profile, *sinks) for node, core in one.core_of.items()}
     if request.first_slot_ns is not None:
         if not profile.nodes:
             raise InputError("a slot for the first node needs the chain's nodes: give a recording")
@@ -224,26 +252,14 @@ def _shaped(
     return over_cores(plan, core_of) if core_of else plan
 
 
-def _overrun(request: PlanRequest) -> Overrun:
-    """At once, unless slots only are asked for: age and gaps of what a receiver has are smallest.
-
-    The thread of an asynchronous publisher cannot do that where outputs are due a cycle later.
-    """
-    bound = request.publication == "asynchronous" and request.policy in OWN_SLOTS
-    return request.overrun or ("wait" if bound else "publish")
-
-
 def _margin(profile: Profile, request: PlanRequest) -> Margin:
-    every, longest = _every_latency(profile), int(check_latencies(profile.latencies_ns).max())
+    every, longest, probability = profile.every, profile.longest_ns, request.overrun_probability
     if request.epsilon_ns is not None:
         if request.epsilon_ns < 0:
             raise InputError("epsilon must be 0ms or more")
-        return Margin(
-            epsilon_ns=request.epsilon_ns,
-            overrun_probability=late_share(every, longest + request.epsilon_ns),
-        )
+        late = late_share(every, longest + request.epsilon_ns)
+        return Margin(epsilon_ns=request.epsilon_ns, overrun_probability=late)
     covered = profile.latencies_ns if request.ideal_machine else every
-    probability = request.overrun_probability
     if probability is not None and not 0 < probability < 1:
         raise InputError(f"an overrun probability of {probability}: write one between 0 and 1")
     if probability is not None and probability < MOST_PROBABLE:
@@ -253,10 +269,10 @@ def _margin(profile: Profile, request: PlanRequest) -> Margin:
             f"{covered.size} cycles are too few for an overrun probability of {probability:g}:"
             f" measure {cycles_needed(probability)} or more"
         )
-    stalls, latest = 0, profile.period_ns - request.publish_slot_ns - EPSILON_NS
+    stalls = 0
     if request.policy not in OWN_SLOTS:  # what a stall adds belongs to no single callback
         share = probability or OVERRUN_PROBABILITY
-        stalls = max(0, covered_latency(covered, share, latest) - longest)
+        stalls = max(0, covered_latency(covered, share, _latest(profile, request)) - longest)
     epsilon = EPSILON_NS + stalls
     return Margin(
         epsilon_ns=epsilon,
@@ -266,32 +282,17 @@ def _margin(profile: Profile, request: PlanRequest) -> Margin:
     )
 
 
-def _every_latency(profile: Profile) -> NDArray[np.int64]:
-    every = profile.every_latency_ns
-    return profile.latencies_ns if every is None else check_latencies(every)
-
-
-def _placement(request: PlanRequest, *names: str) -> dict[str, Any]:
-    """What a request says about placing bands: the limits, and what else is named."""
-    return {n: getattr(request, n) for n in ("grid_ns", "max_gap_ns", "max_share", *names)}
-
-
 def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
     if request.policy == "shaped":
-        values = _placement(request, "solver", "minimise", "mean_at_most_ns", "least_gain", "seed")
+        names = ("solver", "minimise", "mean_at_most_ns", "least_gain", "seed")
+        values = _of(request, *_LIMITS, *names)
         return with_bands(plan, profile.latencies_ns, request.bands, **values)
     if request.policy == "one-long-slot":
         if request.slot_start_ns is None:
             raise InputError("one long slot needs its start: add --slot-start, such as 62ms")
         return with_long_slot(plan, profile.latencies_ns, request.slot_start_ns)
-    if request.policy == "server-per-chain":
-        return server_per_chain(plan)
-    if request.policy == "let-per-chain":
-        return let_per_chain(plan)
-    return _per_callback(plan, profile, request)
-
-
-def _per_callback(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
+    if request.policy in ("server-per-chain", "let-per-chain"):
+        return (server_per_chain if request.policy in UNSHAPED else let_per_chain)(plan)
     if not profile.callbacks or not profile.topics:
         raise InputError(
             f"the policy {request.policy} needs the chain's callbacks, which latencies do not tell:"
@@ -299,8 +300,6 @@ def _per_callback(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
         )
     if request.policy == "server-per-callback":
         return server_per_callback(plan, profile.callbacks, margin_ns=plan.margin.epsilon_ns)
-    if request.publication == "asynchronous":
-        return let_per_callback_asynchronous(plan, profile.nodes)
     return let_per_callback(plan, profile.topics, profile.nodes)
 
 
@@ -328,40 +327,32 @@ def _refuse_contradictions(request: PlanRequest, sinks: bool) -> None:
 def _refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: bool = False) -> None:
     """With ``sinks`` all are planned as one: the first chain, and further outputs of its graph."""
     for one, two in combinations(profiles, 2):
-        if one.topics and one.topics[-1:] == two.topics[-1:]:
-            raise InputError(same_output(_name(one), _name(two), one.topics[-1]))
+        outputs = [profile.topics[-1] if profile.topics else None for profile in (one, two)]
+        refuse_common((one.name, two.name), (outputs[0], outputs[1]))
     for shaped, waiting in permutations(profiles, 2):
         # The topics that come later under the plan than they were measured:
         delayed = shaped.topics if policy == "let-per-callback" else shaped.topics[-1:]
-        if on_the_way := sorted(waiting.upstream.intersection(delayed)):
-            if policy in UNSHAPED:
-                continue
+        on_the_way = sorted(waiting.upstream.intersection(delayed))
+        if on_the_way and policy not in UNSHAPED:
             raise InputError(
-                f"{_name(waiting)} waits for {', '.join(on_the_way)}, which the plan for"
-                f" {_name(shaped)} publishes later than it was measured: {_name(waiting)} would"
-                f" miss its own slot. Plan {_name(waiting)} alone, whose output is constant then,"
-                f" or {_name(shaped)} alone"
+                f"{waiting.name} waits for {', '.join(on_the_way)}, which the plan for"
+                f" {shaped.name} publishes later than it was measured: {waiting.name} would miss"
+                f" its own slot. Plan {waiting.name} alone, whose output is constant then, or"
+                f" {shaped.name} alone"
             )
     for one, two in combinations(profiles, 2):
-        if sinks:
-            _refuse_another_beginning(one, two)
-        elif shared := set(one.core_of) & set(two.core_of):
-            raise InputError(same_nodes(_name(one), _name(two), shared))
-
-
-def _refuse_another_beginning(one: Profile, two: Profile) -> None:
-    if one.begins is not None and two.begins is not None and one.begins != two.begins:
-        raise InputError(
-            f"{_name(two)} begins at {two.begins[1]}, {_name(one)} at another callback,"
-            f" {one.begins[1]}: the slots of a sink count from the beginning of the chain. Name a"
-            " sink behind the same first callback, or plan one of the two alone"
-        )
-    if one.period_ns != two.period_ns:
-        raise InputError(
-            f"{_name(two)} has the period {format_duration(two.period_ns)}, {_name(one)}"
-            f" {format_duration(one.period_ns)}: a plan has one cycle. Plan one of the two alone"
-        )
-
-
-def _name(profile: Profile) -> str:
-    return profile.spec or "..".join(profile.topics)
+        if not sinks:
+            shared = one.core_of.keys() & two.core_of.keys()
+            refuse_common((one.name, two.name), (None, None), shared)
+        elif one.begins is not None and two.begins is not None and one.begins != two.begins:
+            raise InputError(
+                f"{two.name} begins at {two.begins[1]}, {one.name} at another callback,"
+                f" {one.begins[1]}: the slots of a sink count from the beginning of the chain. Name"
+                " a sink behind the same first callback, or plan one of the two alone"
+            )
+        elif one.period_ns != two.period_ns:
+            raise InputError(
+                f"{two.name} has the period {format_duration(two.period_ns)}, {one.name}"
+                f" {format_duration(one.period_ns)}: a plan has one cycle. Plan one of the two"
+                " alone"
+            )

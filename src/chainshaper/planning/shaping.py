@@ -1,16 +1,18 @@
-"""Latency shaping: from measured latencies to the chain's server and its publish slots.
+"""From measured latencies to servers and slots: shaping, and the schedules it is compared with.
 
-The chain runs in a server that is open from the start of a cycle until every execution seen so far
-was complete, and its output is published in a server whose slot comes then: late for most cycles,
-but at the same time in all of them (paper, sections 3.1 and 3.2).
+**Shaping** (sections 3.1 and 3.2): the chain runs in a server that is open from the start of a
+cycle until every execution seen so far was complete, and its output is published in a server whose
+slot comes then: late for most cycles, but at the same time in all of them. :func:`plan_shaping`
+plans one chain; :func:`over_cores`, :func:`with_first_node_apart` and :func:`with_sink` take its
+plan and return one that covers more of a graph (sections 5.1 and 5.4).
 
-:func:`plan_shaping` plans one chain; further steps take its plan and return one that covers more of
-a graph (sections 5.1 and 5.4). Within the graph's given assignment of callbacks to cores, shaping
-needs no new idea: one server per core while the graph runs, one publish slot per sink.
+**The others** (sections 2.5, 5.1 and 5.3) take a shaped plan, for the chain, the evidence and the
+cores it names, and return that of another policy. An output in a slot is represented by its end.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -23,8 +25,10 @@ from chainshaper.planning.plan import (
     Evidence,
     Margin,
     Plan,
+    Prediction,
     Server,
     ShapingNode,
+    Slot,
     Thread,
     below_executors,
     output_server,
@@ -42,7 +46,6 @@ from chainshaper.values.yaml_file import wrong_values_refused
 OUTPUT_PRIORITY = 1  # better than the chain's: a publish slot inside its slot has to pre-empt it
 CHAIN_PRIORITY = 2
 PAUSE_NS = 2_000_000  # a receiver on a slow machine takes a millisecond to get to its callback
-
 _WISHES = {field.name for field in fields(Wishes)}
 
 
@@ -64,44 +67,39 @@ def plan_shaping(
     With L̄ the longest latency, ε the margin, Δ the length of the publish slot and CT the period,
     the chain's server R_m gets the slot [0, L̄ + ε) (eq. 1) and the output's server R_m° gets [L̄ +
     ε, L̄ + ε + Δ) (eq. 4 with a shaping node, eq. 2 with an asynchronous publisher thread), in the
-    same cycle (eq. 3). R_m° gets the better priority and, unless ``output_core`` says otherwise,
-    the same core.
+    same cycle (eq. 3), at the better priority, on ``output_core`` (default: the same core).
 
-    Args:
-        latencies_ns: every end-to-end latency to be covered; leave out beforehand what the chain
-            is not to be planned for.
-        period_ns: the chain's period.
-        wishes, margin: ε is the margin's or, without one, 1 ms unless the wishes say otherwise.
-        nodes: those whose executors run the chain's callbacks.
-        core, output_core: cores of the two servers.
-        fifo_priority, receivers: for the shaping node.
-        values: fields of :class:`~chainshaper.planning.plan.ChainOfPlan` (without ``output`` the
-            plan names no publishing thread: it can be studied, not carried out), single
-            :class:`~chainshaper.values.plan_choices.Wishes`, and how the latencies were taken:
-            fields of :class:`~chainshaper.planning.plan.Evidence`.
+    ε is the margin's or, without one, 1 ms unless the wishes say otherwise. ``nodes`` are those
+    whose executors run the chain. ``fifo_priority`` and ``receivers`` are for the shaping node.
+    ``values`` are fields of :class:`~chainshaper.planning.plan.ChainOfPlan` (without ``output`` the
+    plan can be studied, not carried out) and of :class:`~chainshaper.planning.plan.Evidence`, and
+    single :class:`~chainshaper.values.plan_choices.Wishes`.
 
-    Raises:
-        InputError: latencies or values that no plan may have.
-        OperationError: L̄ + ε + Δ does not fit into the period.
+    Raises InputError: latencies or values that no plan may have. OperationError: L̄ + ε + Δ does
+    not fit into the period.
     """
     latencies = check_latencies(latencies_ns)
     of_chain = {n: values.pop(n) for n in ChainOfPlan.model_fields.keys() & values.keys()}
     wishes = replace(wishes or Wishes(), **{n: values.pop(n) for n in _WISHES & values.keys()})
+    length, longest = wishes.publish_slot_ns, int(latencies.max())
     given = EPSILON_NS if wishes.epsilon_ns is None else wishes.epsilon_ns
     epsilon = given if margin is None else margin.epsilon_ns
-    if epsilon < 0 or wishes.publish_slot_ns <= 0 or period_ns <= 0:
+    if epsilon < 0 or length <= 0 or period_ns <= 0:
         raise InputError(
-            "epsilon must be 0ms or more, the publish slot and the period longer than 0ms;"
-            f" found {format_duration(epsilon)}, {format_duration(wishes.publish_slot_ns)} and"
-            f" {format_duration(period_ns)}"
+            "epsilon must be 0ms or more, the publish slot and the period longer than 0ms; found"
+            f" {format_duration(epsilon)}, {format_duration(length)}, {format_duration(period_ns)}"
         )
-    chain_end = int(latencies.max()) + epsilon
-    slot_end = chain_end + wishes.publish_slot_ns
-    _refuse_too_long(int(latencies.max()), epsilon, wishes.publish_slot_ns, period_ns)
+    _refuse_too_long(longest, epsilon, length, period_ns)
+    start, end = longest + epsilon, longest + epsilon + length
     output_core = core if output_core is None else output_core
     with wrong_values_refused(Plan):
         chain = ChainOfPlan(period_ns=period_ns, **of_chain)
         node, gated = _gate(chain, wishes, output_core, fifo_priority, receivers)
+        threads = tuple(Thread(node=name) for name in nodes)
+        slots = ((0, start),)
+        running = Server(
+            name="chain", core=core, priority=CHAIN_PRIORITY, slots=slots, threads=threads
+        )
         return Plan(
             chain=chain,
             evidence=evidence_of(latencies, **values),
@@ -112,41 +110,29 @@ def plan_shaping(
             overrun=wishes.overrun or "publish",
             messages=wishes.messages,
             fallback=wishes.fallback,
-            servers=(
-                Server(
-                    name="chain",
-                    core=core,
-                    priority=CHAIN_PRIORITY,
-                    slots=((0, chain_end),),
-                    threads=tuple(Thread(node=name) for name in nodes),
-                ),
-                Server(
-                    name="output",
-                    core=output_core,
-                    priority=OUTPUT_PRIORITY,
-                    slots=((chain_end, slot_end),),
-                    threads=gated,
-                ),
-            ),
+            servers=(running, _publishing("output", output_core, (start, end), gated)),
             shaping_node=node,
-            predicted=predict_bands(latencies, [slot_end], wishes.publish_slot_ns),
+            predicted=predict_bands(latencies, [end], length),
         )
+
+
+def _publishing(name: str, core: int, slot: Slot, threads: tuple[Thread, ...]) -> Server:
+    return Server(name=name, core=core, priority=OUTPUT_PRIORITY, slots=(slot,), threads=threads)
 
 
 def _gate(
     chain: ChainOfPlan, wishes: Wishes, core: int, fifo_priority: int, receivers: Sequence[str]
 ) -> tuple[ShapingNode | None, tuple[Thread, ...]]:
     """The shaping node of a chain's output, if any, and the threads that publish it."""
-    if wishes.publication == "asynchronous":
-        if chain.publisher is not None:
-            return None, (Thread(node=chain.publisher, role="publisher"),)
-        if chain.output is not None:
-            raise InputError(
-                "asynchronous publication gates the publisher's own thread: name the node that"
-                " publishes the chain's output"
-            )
+    if wishes.publication == "asynchronous" and chain.publisher is not None:
+        return None, (Thread(node=chain.publisher, role="publisher"),)
     if chain.output is None:
         return None, ()
+    if wishes.publication == "asynchronous":
+        raise InputError(
+            "asynchronous publication gates the publisher's own thread: name the node that"
+            " publishes the chain's output"
+        )
     pause = min(PAUSE_NS, chain.period_ns // 20) if wishes.pause_ns is None else wishes.pause_ns
     node = ShapingNode(
         **_names(chain.output),
@@ -166,7 +152,7 @@ def _names(output: str) -> dict[str, str]:
     return {"name": name, "input": f"{output}_tmp", "output": output}
 
 
-def shaping_node_like(
+def _node_like(
     node: ShapingNode, output: str, publisher: str | None, receivers: Sequence[str] = ()
 ) -> ShapingNode:
     """A shaping node for another topic, with the core, priority and waiting of a given one."""
@@ -207,15 +193,13 @@ def _refuse_too_long(longest: int, epsilon: int, publish_slot: int, period: int)
 def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
     """One server per core for the chain's threads, each with the chain's slot (section 5.4).
 
-    ``core_of`` names the core of every node whose executor takes part, also of nodes that the plan
-    does not know yet: branches that the chain waits for.
+    ``core_of`` names the core of every node that takes part, also on branches that the chain waits
+    for and that the plan does not know yet.
 
-    Raises:
-        InputError: a node of the plan is missing.
+    Raises InputError: a node of the plan is missing.
     """
-    chain = _chain_server(plan)
-    missing = [thread.node for thread in chain.threads if thread.node not in core_of]
-    if missing:
+    chain, others = _chain_and_others(plan)
+    if missing := [thread.node for thread in chain.threads if thread.node not in core_of]:
         raise InputError(f"no core is named for {', '.join(missing)}: name one for each node")
     cores = sorted(set(core_of.values()))
     with wrong_values_refused(Plan):
@@ -229,21 +213,18 @@ def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
             )
             for core in cores
         ]
-        others = tuple(server for server in plan.servers if server is not chain)
         return revised(plan, servers=(*split, *others))
 
 
 def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int) -> Plan:
     """The chain's first node in a server of its own, [0, ``slot_end_ns``), the rest behind it.
 
-    For a chain whose first callback is not a timer: stopped until its slot, it starts every
-    execution at the beginning of a cycle as if it were one (table 4, rows 2 to 5: [0, 2] and [2,
-    86] ms).
+    Stopped until its slot, a first callback that is no timer starts every execution at the
+    beginning of a cycle (table 4, rows 2 to 5: [0, 2] and [2, 86] ms).
 
-    Raises:
-        InputError: the chain's server has no thread of that node, or is shorter than the slot.
+    Raises InputError: the chain's server has no thread of that node, or is shorter than the slot.
     """
-    chain = _chain_server(plan)
+    chain, others = _chain_and_others(plan)
     (start, end), thread = chain.slots[0], Thread(node=node)
     if thread not in chain.threads:
         raise InputError(f"{node} is no node of the chain's server: name its first node")
@@ -253,13 +234,18 @@ def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int) -> Plan:
             f" {format_duration(end)}, where the chain's does: not at"
             f" {format_duration(slot_end_ns)}"
         )
+    alone = {"name": "first", "slots": ((start, slot_end_ns),), "threads": (thread,)}
     rest = tuple(other for other in chain.threads if other != thread)
-    first = chain.model_copy(
-        update={"name": "first", "slots": ((start, slot_end_ns),), "threads": (thread,)}
-    )
-    behind = chain.model_copy(update={"slots": ((slot_end_ns, end),), "threads": rest})
-    others = tuple(server for server in plan.servers if server is not chain)
-    return revised(plan, servers=(first, behind, *others))
+    behind = {"slots": ((slot_end_ns, end),), "threads": rest}
+    split = (chain.model_copy(update=alone), chain.model_copy(update=behind))
+    return revised(plan, servers=(*split, *others))
+
+
+def _chain_and_others(plan: Plan) -> tuple[Server, list[Server]]:
+    found = next((server for server in plan.servers if server.name == "chain"), None)
+    if found is None:
+        raise InputError("the plan has no server named 'chain': begin with a shaped plan")
+    return found, [server for server in plan.servers if server is not found]
 
 
 def with_sink(
@@ -279,76 +265,241 @@ def with_sink(
     chain's servers stay open as long as the slowest sink needs. The prediction stays that of the
     first output.
 
-    Raises:
-        InputError: a plan that shapes nothing or publishes in the other way, a sink that it shapes
-            already, latencies or a topic that no plan may have.
-        OperationError: the slot does not fit into the cycle.
+    Raises InputError: a plan that shapes nothing or publishes in the other way, a sink that it
+    shapes already, latencies or a topic that no plan may have. OperationError: the slot does not
+    fit into the cycle.
     """
     node, publishing = plan.shaping_node, output_server(plan)
     if publishing is None or not publishing.threads:
         raise InputError("a further sink needs a plan that shapes one output already")
     if output in {plan.chain.output, *(other.output for other in plan.further_shaping_nodes)}:
         raise InputError(f"the plan shapes {output} already: name each sink once")
-    slot_start, slot_end = publish_slots(plan)[-1]
-    length = slot_end - slot_start
-    done = int(check_latencies(latencies_ns).max()) + plan.margin.epsilon_ns
-    start = done
-    taken = [
-        slot
-        for server in publishing_servers(plan)
-        if server.core == publishing.core
-        for slot in server.slots
-    ]
+    if node is None and publisher is None:
+        raise InputError(
+            f"the plan gates publishers' threads, and who publishes {output} is not known: name it"
+        )
+    done = start = int(check_latencies(latencies_ns).max()) + plan.margin.epsilon_ns
+    length = publishing.slots[-1][1] - publishing.slots[-1][0]
+    gates = publishing_servers(plan)
+    taken = [slot for server in gates if server.core == publishing.core for slot in server.slots]
     for other_start, other_end in sorted(taken):
         if start < other_end and other_start < start + length:
             start = other_end
-    if start + length > plan.cycle_ns:
+    slot = (start, start + length)
+    if slot[1] > plan.cycle_ns:
         raise OperationError(
-            f"the sink {output} would be published until {format_duration(start + length)}, after"
-            f" the cycle of {format_duration(plan.cycle_ns)}: plan with a longer period, a"
-            " shorter slot, or another core for one of the outputs"
+            f"the sink {output} would be published until {format_duration(slot[1])}, after the"
+            f" cycle of {format_duration(plan.cycle_ns)}: plan with a longer period, a shorter"
+            " slot, or another core for one of the outputs"
         )
+    # Servers that run the graph to its end stay open until the slowest sink is done.
+    running = [server for server in plan.servers if server not in gates]
+    latest = max((server.slots[-1][1] for server in running), default=done)
+    slowest = [server for server in running if server.slots[-1][1] == latest < done]
+    longer = with_slots(plan.servers, {server.name: until(server, done) for server in slowest})
     with wrong_values_refused(Plan):
-        added, thread = _gate_like(node, output, publisher, receivers)
-        server = Server(
-            name=f"output_{thread.node.strip('/')}",
-            core=publishing.core,
-            priority=OUTPUT_PRIORITY,
-            slots=((start, start + length),),
-            threads=(thread,),
-        )
+        added = () if node is None else (_node_like(node, output, publisher, receivers),)
+        thread = added[0].thread if added else Thread(node=publisher or "", role="publisher")
+        name = f"output_{thread.node.strip('/')}"
+        server = _publishing(name, publishing.core, slot, (thread,))
         return revised(
             plan,
-            servers=below_executors([*_open_until(plan, done), server]),
+            servers=below_executors([*longer, server]),
             further_shaping_nodes=(*plan.further_shaping_nodes, *added),
         )
 
 
-def _gate_like(
-    node: ShapingNode | None, output: str, publisher: str | None, receivers: Sequence[str]
-) -> tuple[tuple[ShapingNode, ...], Thread]:
-    """The shaping node that a further sink needs, if any, and the thread that publishes it."""
-    if node is not None:
-        added = shaping_node_like(node, output, publisher, receivers)
-        return (added,), added.thread
-    if publisher is not None:
-        return (), Thread(node=publisher, role="publisher")
-    raise InputError(
-        f"the plan gates publishers' threads, and who publishes {output} is not known: name it"
-    )
+# What shaping is compared with -----------------------------------------------------------------
 
 
-def _chain_server(plan: Plan) -> Server:
-    found = next((server for server in plan.servers if server.name == "chain"), None)
-    if found is None:
-        raise InputError("the plan has no server named 'chain': begin with a shaped plan")
-    return found
+@dataclass(frozen=True)
+class CallbackTimes:
+    """Measured response times of one callback; ``after`` are the places, in the sequence that this
+    stands in, of the callbacks whose data it needs.
+    """
+
+    node: str
+    core: int
+    min_response_ns: int
+    mean_response_ns: int
+    max_response_ns: int
+    after: tuple[int, ...] = ()
 
 
-def _open_until(plan: Plan, end: int) -> tuple[Server, ...]:
-    """The servers, of which those that run the graph to its end stay open until ``end``."""
-    publishing = publishing_servers(plan)
-    running = [server for server in plan.servers if server not in publishing]
-    latest = max((server.slots[-1][1] for server in running), default=end)
-    longer = [server for server in running if server.slots[-1][1] == latest < end]
-    return with_slots(plan.servers, {server.name: until(server, end) for server in longer})
+def server_per_chain(plan: Plan) -> Plan:
+    """One server for the whole chain, nothing shaped (section 3.1; table 4 row 2): its latency is
+    what was measured.
+    """
+    publishing, evidence = output_server(plan), plan.evidence
+    shortest, longest = evidence.min_latency_ns, evidence.max_latency_ns
+    mean = evidence.mean_latency_ns
+    predicted = Prediction(mean_ns=mean, max_ns=longest, jitter_ns=longest - shortest)
+    servers = tuple(server for server in plan.servers if server is not publishing)
+    return _unshaped(plan, policy="server-per-chain", servers=servers, predicted=predicted)
+
+
+def _unshaped(plan: Plan, **changes: object) -> Plan:
+    return revised(plan, shaping_node=None, further_shaping_nodes=(), **changes)
+
+
+def server_per_callback(
+    plan: Plan,
+    callbacks: Sequence[CallbackTimes],
+    *,
+    margin_ns: int = 0,
+    boundary_ns: int = 1_000_000,
+) -> Plan:
+    """Time-triggered scheduling: each callback runs in a slot of its own, as long as its longest.
+
+    A slot starts when the slots of all callbacks that this one waits for have ended (table 4 row
+    1), and the slot before it on its core. It is the longest response time plus ``margin_ns`` long,
+    rounded up to a multiple of ``boundary_ns``. Callbacks of one node share a server with several
+    slots. Each of ``callbacks`` comes after those it waits for; the chain's last stands last.
+
+    Raises InputError: no callbacks, or one that waits for itself or a later one. OperationError:
+    the slots do not fit into the cycle.
+    """
+    slots = _slots_in_sequence(callbacks, margin_ns, boundary_ns)
+    end = max(slot[1] for slot in slots)
+    if end > plan.cycle_ns:
+        raise OperationError(
+            f"one slot per callback takes {format_duration(end)}, the cycle is"
+            f" {format_duration(plan.cycle_ns)}: shape the chain instead, plan with a smaller"
+            " margin (--epsilon), or move callbacks to another core"
+        )
+    last, (start, _) = callbacks[-1], slots[-1]
+    of_node: dict[str, list[tuple[int, Slot]]] = {}
+    for callback, slot in zip(callbacks, slots, strict=True):
+        of_node.setdefault(callback.node, []).append((callback.core, slot))
+    with wrong_values_refused(Plan):
+        return _unshaped(
+            plan,
+            policy="server-per-callback",
+            servers=tuple(_server_of_node(node, own) for node, own in of_node.items()),
+            predicted=Prediction(
+                mean_ns=start + last.mean_response_ns,
+                max_ns=start + last.max_response_ns,
+                jitter_ns=last.max_response_ns - last.min_response_ns,
+            ),
+        )
+
+
+def _slots_in_sequence(
+    callbacks: Sequence[CallbackTimes], margin_ns: int, boundary_ns: int
+) -> list[Slot]:
+    if not callbacks or margin_ns < 0 or boundary_ns <= 0:
+        raise InputError(
+            "slots per callback need callbacks, a margin of 0ms or more and a boundary longer"
+            " than 0ms"
+        )
+    slots: list[Slot] = []
+    busy_until: dict[int, int] = {}
+    for number, callback in enumerate(callbacks):
+        if any(not 0 <= before < number for before in callback.after):
+            raise InputError(
+                f"callback {number} of {callback.node} waits for {callback.after}, which must be"
+                " callbacks before it: order them along the graph"
+            )
+        waited_for = [slots[before][1] for before in callback.after]
+        start = max([busy_until.get(callback.core, 0), *waited_for])
+        steps = -(-(callback.max_response_ns + margin_ns) // boundary_ns)
+        slots.append((start, start + max(1, steps) * boundary_ns))
+        busy_until[callback.core] = slots[-1][1]
+    return slots
+
+
+def _server_of_node(node: str, own: list[tuple[int, Slot]]) -> Server:
+    """A server with a node's slots, adjacent ones joined."""
+    cores = {core for core, _ in own}
+    if len(cores) > 1:
+        raise InputError(f"{node} runs on one core, not on {sorted(cores)}: correct it")
+    joined: list[Slot] = []
+    for _, (start, end) in own:
+        adjacent = bool(joined) and joined[-1][1] == start
+        joined.append((joined.pop()[0] if adjacent else start, end))
+    server = _publishing(node.strip("/"), cores.pop(), joined[0], (Thread(node=node),))
+    return server.model_copy(update={"slots": tuple(joined)})
+
+
+def let_per_chain(plan: Plan) -> Plan:
+    """Logical execution time for the chain as one task: its output leaves in a slot at the start of
+    the next cycle, so the latency is one period (section 5.3, table 5).
+
+    Raises InputError: a plan without a publish slot, or a chain so fast that it could publish in
+    the cycle it began in.
+    """
+    publishing, length = _one_slot(plan)
+    if plan.evidence.min_latency_ns <= length:
+        raise InputError(
+            f"the shortest latency {format_duration(plan.evidence.min_latency_ns)} is not longer"
+            f" than the publish slot {format_duration(length)}, so an output could leave in its"
+            " own cycle: use a shorter slot"
+        )
+    ends = {s.name: length if s is publishing else plan.cycle_ns for s in plan.servers}
+    slots = {name: ((0, end),) for name, end in ends.items()}
+    predicted = _after_periods(plan, 1, length)
+    servers = with_slots(plan.servers, slots)
+    return revised(plan, policy="let-per-chain", servers=servers, predicted=predicted)
+
+
+def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str] = ()) -> Plan:
+    """Logical execution time for every callback: each one's output waits for the next cycle.
+
+    ``topics`` are the outputs of the chain's callbacks in order, the chain's own last;
+    ``publishers`` their nodes, where known. Behind each topic a shaping node republishes at the
+    beginning of the next cycle, or the publishers' threads run then, where the plan gates one: as
+    many periods as there are callbacks (section 5.3, table 5).
+
+    Raises InputError: a plan that shapes nothing, topics (or gated publishers) that do not end with
+    the chain's, or repeat one. OperationError: the slots do not fit into the cycle.
+    """
+    publishing, length = _one_slot(plan)
+    last = plan.shaping_node
+    end, given = (plan.chain.publisher, publishers) if last is None else (last.output, topics)
+    if end is None or list(given[-1:]) != [end]:
+        raise InputError(
+            "LET per callback needs a plan with a shaping node and all topics of the chain, its"
+            " output last; or one for asynchronous publication and the nodes of the chain, the one"
+            " that publishes its output last"
+        )
+    if length * len(given) > plan.cycle_ns:
+        raise OperationError(
+            f"{len(given)} publish slots of {format_duration(length)} do not fit into the cycle"
+            f" {format_duration(plan.cycle_ns)}: use shorter slots"
+        )
+    others = [server for server in plan.servers if server is not publishing]
+    chain = with_slots(others, {server.name: ((0, plan.cycle_ns),) for server in others})
+    with wrong_values_refused(Plan):
+        inside: tuple[ShapingNode, ...] = ()
+        threads = [Thread(node=name, role="publisher") for name in publishers]
+        if last is not None:
+            known = zip_longest(topics[:-1], publishers[: len(topics) - 1])
+            inside = tuple(_node_like(last, topic, publisher) for topic, publisher in known)
+            threads = [node.thread for node in (*inside, last)]
+        gates = []
+        # Backwards: whatever a fast callback makes of the data of one slot, that of its own
+        # output is over.
+        for number, thread in enumerate(reversed(threads)):
+            name = f"output_{thread.node.strip('/')}" if number else "output"
+            slot = (number * length, (number + 1) * length)
+            gates.append(_publishing(name, publishing.core, slot, (thread,)))
+        return revised(
+            plan,
+            policy="let-per-callback",
+            servers=(*chain, *gates),
+            further_shaping_nodes=inside,
+            predicted=_after_periods(plan, len(threads), length),
+        )
+
+
+def _one_slot(plan: Plan) -> tuple[Server, int]:
+    """The server of the output, and how long its only slot is."""
+    publishing, slots = output_server(plan), publish_slots(plan)
+    if publishing is None or len(slots) != 1:
+        raise InputError(f"LET needs a plan with one publish slot; this one has {len(slots)}")
+    return publishing, slots[0][1] - slots[0][0]
+
+
+def _after_periods(plan: Plan, periods: int, slot_ns: int) -> Prediction:
+    latency = periods * plan.chain.period_ns + slot_ns
+    return Prediction(mean_ns=latency, max_ns=latency, jitter_ns=slot_ns, shares=(1.0,))
