@@ -15,7 +15,7 @@ from pathlib import Path
 
 from chainshaper.enforcement.back_ends import make_back_end
 from chainshaper.enforcement.freezer import Freezer
-from chainshaper.enforcement.guardian import start_guardians
+from chainshaper.enforcement.guardian import Guardians
 from chainshaper.enforcement.scheduling_memory import change_all
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.enforcement.undoing import undo_run
@@ -32,7 +32,7 @@ def main() -> None:
     runs, core, cycle, slot = Path(sys.argv[2]), *map(int, sys.argv[3:6])
     server = ReservationServer("gated", core, 1, ((0, slot * MS),))
     journal = open_journal(runs)
-    guardians = start_guardians(journal)
+    guardians = Guardians(journal)
     guardians.await_ready()
     table = ServerTable(cycle * MS, (server,))
     servers = make_back_end(sys.argv[1], table, journal)

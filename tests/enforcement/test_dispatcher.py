@@ -27,17 +27,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from processes import wait_for
 
-from chainshaper.enforcement.freezer import Freezer, create
+from chainshaper.enforcement.freezer import (
+    Anchoring,
+    Freezer,
+    first_anchoring,
+    next_anchoring,
+)
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.enforcement.slot_dispatcher import (
     PRIORITY,
-    Anchoring,
     Boundary,
     boundaries_of,
-    first_anchoring,
     instants,
     moved,
-    next_anchoring,
     overrun,
 )
 from chainshaper.linux import cgroups
@@ -184,7 +186,7 @@ def freezer(folder: Path, cycle: int, *slots: tuple[tuple[int, int], ...]) -> It
         ReservationServer(f"server-{number}", CORE, 1, own) for number, own in enumerate(slots)
     )
     journal = open_journal(folder)
-    back_end = create(ServerTable(cycle, servers), journal)
+    back_end = Freezer(ServerTable(cycle, servers), journal)
     try:
         yield back_end
     finally:

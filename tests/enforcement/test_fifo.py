@@ -97,7 +97,7 @@ def test_threads_that_a_plan_has_scheduled_already_stay_as_they_are(
 
 
 def test_a_server_that_does_not_exist_is_refused(journal: Journal) -> None:
-    with pytest.raises(InputError, match="no server 'chains': choose of chain, output"):
+    with pytest.raises(InputError, match="no server is named chains: chain, output are"):
         Fifo(TABLE, journal).assign(1, "chains")
 
 

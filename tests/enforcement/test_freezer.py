@@ -24,7 +24,7 @@ from gated import (
 )
 from processes import children_of, wait_for
 
-from chainshaper.enforcement.freezer import Freezer, create
+from chainshaper.enforcement.freezer import Freezer
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.linux.cgroups import (
     QUICK_MOVES,
@@ -57,7 +57,7 @@ def freezer(folder: Path, *servers: ReservationServer, cycle: int = CYCLE) -> It
     """Servers in force; afterwards nothing of them is left, whatever the test did to them."""
     mounted, journal = mount_options(), open_journal(folder)
     try:
-        back_end = create(ServerTable(cycle, servers), journal)
+        back_end = Freezer(ServerTable(cycle, servers), journal)
         assert set(back_end.dispatchers.values()) <= set(children_of(os.getpid()))
         try:
             yield back_end
@@ -329,7 +329,7 @@ def test_what_a_run_without_a_journal_left_mounted_is_not_taken_for_another_prog
 ) -> None:
     make_moves_quick(plain)  # and nothing else says who did
     journal = open_journal(tmp_path)
-    create(ServerTable(CYCLE, (server("a", (0, 1)),)), journal).release()
+    Freezer(ServerTable(CYCLE, (server("a", (0, 1)),)), journal).release()
     discard_journal(journal)
     assert mount_options() == plain
 
@@ -339,7 +339,7 @@ def test_the_last_of_two_runs_at_once_leaves_it_mounted_as_the_first_found_it(
 ) -> None:
     table = ServerTable(CYCLE, (server("a", (0, 1)),))
     journals = [open_journal(tmp_path, name) for name in ("first", "second")]
-    runs = [create(table, journal) for journal in journals]
+    runs = [Freezer(table, journal) for journal in journals]
     for run, journal in zip(runs, journals, strict=True):
         run.release()
         discard_journal(journal)
@@ -372,7 +372,7 @@ def test_one_run_at_a_time_has_a_thread(tmp_path: Path) -> None:
     with sleeping() as pid, freezer(tmp_path, server("a", (5, 12))) as back_end:
         back_end.assign(pid, "a")
         journal = open_journal(tmp_path, "another")
-        other = create(ServerTable(CYCLE, (server("b", (0, 1)),)), journal)
+        other = Freezer(ServerTable(CYCLE, (server("b", (0, 1)),)), journal)
         try:
             with pytest.raises(OperationError, match=f"thread {pid} is in .* of another run"):
                 other.assign(pid, "b")

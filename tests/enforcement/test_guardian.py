@@ -21,7 +21,7 @@ from applied_plans import Governed, needs_fifo, node_to_govern
 from gated import CORE, MS, ahead_of_others, cpu_ns, groups_left, kill, needs_cgroups
 from processes import children_of, wait_for
 
-from chainshaper.enforcement.freezer_state import open_page, run_of
+from chainshaper.enforcement.freezer import CounterPage, run_of
 from chainshaper.enforcement.guardian import GROUP, let_go
 from chainshaper.enforcement.undoing import undo_run
 from chainshaper.linux.cgroups import cgroup_of, mount_options, mount_point
@@ -249,7 +249,7 @@ def test_threads_that_a_guardian_lets_go_when_the_dispatcher_is_back_are_closed_
         (journal,) = find_journals(run.runs)
         freezer = run_of(journal)
         assert freezer is not None
-        let_go(journal, open_page(freezer.page, freezer.table), CORE)  # as the slower of two may
+        let_go(journal, CounterPage(freezer.page, freezer.table), CORE)  # as the slower of two may
         wait_for(run.is_frozen, "it to be closed again")
         assert run.ask("failure") == "None"
 

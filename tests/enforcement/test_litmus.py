@@ -18,7 +18,7 @@ from litmus_stand_in import StandIn, install
 
 from chainshaper.enforcement import litmus
 from chainshaper.enforcement.litmus import (
-    create,
+    Litmus,
     create_command,
     interval_text,
     litmus_commands,
@@ -26,7 +26,7 @@ from chainshaper.enforcement.litmus import (
     restore_plugin,
     turned,
 )
-from chainshaper.enforcement.scheduling_memory import restore_scheduling
+from chainshaper.enforcement.scheduling_memory import release_threads
 from chainshaper.enforcement.servers import BackEnd, ReservationServer, ServerTable
 from chainshaper.linux.runs import Journal, find_journals, open_journal
 from chainshaper.linux.scheduling import available_cores, state_of
@@ -231,7 +231,7 @@ def test_servers_are_made_threads_attached_and_everything_put_back(
     stand_in: StandIn, journal: Journal, actor: Actor
 ) -> None:
     before = {tid: state_of(tid) for tid in actor.tids.values()}
-    servers: BackEnd = create(TABLE, journal, stand_in.proc)
+    servers: BackEnd = Litmus(TABLE, journal, stand_in.proc)
     servers.assign(actor.tids["a"], "chain")
     assert stand_in.calls == [], "nothing before it is armed"
     servers.arm(anchor_ns=0)
@@ -253,7 +253,7 @@ def test_servers_are_made_threads_attached_and_everything_put_back(
 def test_another_anchor_turns_the_slots_and_moves_the_threads(
     stand_in: StandIn, journal: Journal, actor: Actor
 ) -> None:
-    servers = create(TABLE, journal, stand_in.proc)
+    servers = Litmus(TABLE, journal, stand_in.proc)
     servers.assign(actor.tids["a"], "chain")
     servers.arm(anchor_ns=0)
     servers.arm(anchor_ns=1_030 * MS)
@@ -269,7 +269,7 @@ def test_the_plugin_that_was_active_comes_back(
     (tmp_path / "other").mkdir()
     stand_in = install(tmp_path / "other", plugin="GSN-EDF")
     monkeypatch.setenv("PATH", str(stand_in.programs), prepend=os.pathsep)
-    servers = create(TABLE, journal, stand_in.proc)
+    servers = Litmus(TABLE, journal, stand_in.proc)
     servers.arm(anchor_ns=0)
     assert stand_in.plugin == "P-RES"
     servers.release()
@@ -282,7 +282,7 @@ def test_reservations_of_others_are_not_put_at_risk(
     stand_in = install(tmp_path, plugin="P-RES")
     monkeypatch.setenv("PATH", str(stand_in.programs), prepend=os.pathsep)
     with pytest.raises(OperationError, match=r"P-RES is active already.*`setsched Linux`"):
-        create(TABLE, journal, stand_in.proc)
+        Litmus(TABLE, journal, stand_in.proc)
     assert stand_in.calls == []
 
 
@@ -290,7 +290,7 @@ def test_a_kernel_that_is_not_litmus_is_named_with_the_remedy(
     tmp_path: Path, journal: Journal
 ) -> None:
     with pytest.raises(PlatformError, match=r"not LITMUS.RT.*--backend auto.*--dry-run"):
-        create(TABLE, journal, tmp_path / "nothing")
+        Litmus(TABLE, journal, tmp_path / "nothing")
 
 
 def test_tools_that_are_not_installed_are_named(
@@ -299,19 +299,19 @@ def test_tools_that_are_not_installed_are_named(
     (stand_in.programs / "resctl").unlink()
     monkeypatch.setenv("PATH", str(stand_in.programs))
     with pytest.raises(PlatformError, match=r"resctl is not on \$PATH.*liblitmus"):
-        create(TABLE, journal, stand_in.proc)
+        Litmus(TABLE, journal, stand_in.proc)
 
 
 def test_a_server_that_does_not_exist_is_refused(stand_in: StandIn, journal: Journal) -> None:
-    with pytest.raises(InputError, match="no server 'chains': choose of output, chain"):
-        create(TABLE, journal, stand_in.proc).assign(1, "chains")
+    with pytest.raises(InputError, match="no server is named chains: output, chain are"):
+        Litmus(TABLE, journal, stand_in.proc).assign(1, "chains")
 
 
 def test_what_litmus_refuses_is_said_in_its_words_and_undone(
     stand_in: StandIn, journal: Journal
 ) -> None:
     beyond = ReservationServer("far", 4095, 1, ((0, MS),))
-    servers = create(ServerTable(100 * MS, (beyond,)), journal, stand_in.proc)
+    servers = Litmus(ServerTable(100 * MS, (beyond,)), journal, stand_in.proc)
     with pytest.raises(OperationError, match="failed to create reservation 4095001"):
         servers.arm(anchor_ns=0)
     servers.release()
@@ -321,7 +321,7 @@ def test_what_litmus_refuses_is_said_in_its_words_and_undone(
 def test_threads_that_have_ended_are_passed_over(
     stand_in: StandIn, journal: Journal, actor: Actor
 ) -> None:
-    servers = create(TABLE, journal, stand_in.proc)
+    servers = Litmus(TABLE, journal, stand_in.proc)
     servers.assign(actor.tids["a"], "chain")
     servers.assign(actor.tids["b"], "chain")
     actor.end("a")
@@ -333,7 +333,7 @@ def test_threads_that_have_ended_are_passed_over(
 
 
 def test_a_plugin_that_somebody_changed_is_a_failure(stand_in: StandIn, journal: Journal) -> None:
-    servers = create(TABLE, journal, stand_in.proc)
+    servers = Litmus(TABLE, journal, stand_in.proc)
     servers.arm(anchor_ns=0)
     subprocess.run([str(stand_in.programs / "setsched"), "GSN-EDF"], check=True)
     assert servers.failure() == "the scheduler plugin was changed from P-RES to GSN-EDF"
@@ -350,7 +350,7 @@ from chainshaper.enforcement.servers import ReservationServer, ServerTable
 
 litmus.SCHED_LITMUS = os.SCHED_BATCH
 server = ReservationServer("chain", int(sys.argv[3]), 1, ((0, 1_000_000),))
-servers = litmus.create(
+servers = litmus.Litmus(
     ServerTable(100_000_000, (server,)), open_journal(sys.argv[2]), Path(sys.argv[1])
 )
 servers.assign(int(sys.argv[4]), "chain")
@@ -371,7 +371,7 @@ def test_after_a_crash_another_process_puts_all_back(
     with pytest.raises(OperationError, match="Setting new plugin failed"):
         restore_plugin(left)  # threads first
     for _ in range(2):
-        restore_scheduling(left)
+        release_threads(left)
         restore_plugin(left)
     assert state_of(actor.tids["a"]) == before
     assert stand_in.plugin == "Linux"

@@ -168,7 +168,7 @@ def test_before_it_is_armed_threads_run_freely_and_release_is_harmless() -> None
 
 
 def test_an_unknown_server_is_refused() -> None:
-    with pytest.raises(InputError, match="server B does not stand in the table"):
+    with pytest.raises(InputError, match="no server is named B: A are"):
         scx.ScxServers(TABLE).assign(os.getpid(), "B")
 
 

@@ -25,7 +25,8 @@ from typing import TYPE_CHECKING
 
 from chainshaper.enforcement import threads as allocation
 from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, make_back_end
-from chainshaper.enforcement.guardian import Guardians, run_claimed, start_guardians
+from chainshaper.enforcement.freezer import groups_of, run_of
+from chainshaper.enforcement.guardian import Guardians, run_claimed
 from chainshaper.enforcement.scheduling_memory import change_all, look_alikes, note_descendants
 from chainshaper.enforcement.servers import (
     BackEnd,
@@ -169,7 +170,7 @@ def apply_plan(
     journal = claim_run(cores, nodes, folder, lambda: _go_on(asked))
     run = _Run(given, plan, choice, journal, recorded, taken, asked)
     try:
-        run.guardians = start_guardians(journal)
+        run.guardians = Guardians(journal)
         if command:
             run.command = start_command(command, stdout=command_stdout)
         if wait_ns is None:
@@ -181,7 +182,7 @@ def apply_plan(
         state = _naming_strangers(_initial_state(run, table, command, plan_path), found)
         state = _arm(run, run.servers, found, state, phase_ns, progress)
         state = _keep(run, run.servers, found, state, watch)
-        strangers = look_alikes(journal)
+        strangers = look_alikes(journal, groups_of(run_of(journal)))
     finally:
         _put_back(run)
     if state.failure is not None:
