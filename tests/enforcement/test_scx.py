@@ -26,7 +26,7 @@ TABLE = ServerTable(50_000_000, (ReservationServer("A", CORE, 1, ((0, 10_000_000
 
 
 def test_the_compiled_policy_is_up_to_date_with_its_sources() -> None:
-    names = ("kernel_abi.h", "table_abi.h", "table_lookup.h", "table.bpf.c")
+    names = ("kernel_abi.h", "table_abi.h", "table.bpf.c")
     sources = [POLICY.with_name(name) for name in names]
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
     assert digest.encode() in POLICY.read_bytes(), "run scripts/build_policy"

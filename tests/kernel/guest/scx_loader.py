@@ -35,7 +35,7 @@ def main() -> None:
             elif method == "change":
                 servers.change(table_of(arguments[0]), arguments[1])  # type: ignore[union-attr]
             elif method == "since":
-                result = servers.in_force_since_ns  # type: ignore[union-attr]
+                result = servers.in_force_from()  # type: ignore[union-attr]
             elif method == "kickers":
                 result = {core: k.pid for core, k in servers._kickers.items()}  # type: ignore[union-attr]
             elif method == "counters":

@@ -1,13 +1,10 @@
 """Back end `scx`: the table of servers inside the kernel, as a sched_ext policy.
 
 The policy (`policy/table.bpf.c`, which explains how it works) is compiled ahead. While it is
-in force, *every* thread of the machine's fair class is scheduled by it: those assigned to servers
-inside their slots, all others first come first served behind them. Real-time threads stand above
-it, as they do above the fair class, so a thread that shall be governed must not be one.
-
-A policy begins with an empty table, under which everything is best effort. Each table after that
-is written into the generation that is not in force, and comes into force on all cores at one
-instant that lies a little ahead: until then, every core must learn that it has to decide there.
+in force, *every* thread of the machine's fair class is scheduled by it. Real-time threads stand
+above it, so a thread that shall be governed must not be one. It begins with an empty table, under
+which everything is best effort. Each table after that is written into the generation that is not in
+force, and comes into force on all cores at one instant that lies a little ahead.
 
 Nothing has to be put back by hand. The policy hangs on a file descriptor of this process, and
 however it ends, the kernel returns to its fair class. (A fork without exec inherits the
@@ -19,9 +16,7 @@ PREEMPT_RT kernels refuse BPF timers. There each core has a **kicker**, a proces
 
 Under SCHED_FIFO, of the lowest priority, it sleeps on the core until the next boundary. Waking up,
 it pushes whatever ran there back to its queue; asleep again, it leaves a core that has to look at
-the table. The policy's program `table_boundary` computes boundaries, and writes down when the
-kicker has promised to be back: a little after each boundary, so that it does not delay those who
-wait for one. (A thread of the loader would wait for the interpreter's lock.)
+the table. (A thread of the loader would wait for the interpreter's lock.)
 """
 
 import ctypes
@@ -272,15 +267,11 @@ def _check(table: ServerTable) -> None:
 
 
 class ScxServers:
-    """A table of servers in the kernel; see :class:`chainshaper.enforcement.servers.BackEnd`.
-
-    ``in_force_since_ns`` is the instant from which the present table has governed all cores.
-    """
+    """A table of servers in the kernel; see :class:`chainshaper.enforcement.servers.BackEnd`."""
 
     name = "scx"
 
     def __init__(self, table: ServerTable) -> None:
-        self.in_force_since_ns = 0
         self._table = table
         self._ids = number_servers(table, {})
         self._members: dict[int, tuple[int, int]] = {}  # tid -> (thread descriptor, server id)
@@ -290,6 +281,7 @@ class ScxServers:
         self._link = 0
         self._kickers: dict[int, subprocess.Popen[bytes]] = {}
         self._generation = 0
+        self._since_ns: int | None = None  # the present table has governed all cores
         self._failure: str | None = None
         self._released = threading.Event()
         self._last_counters: dict[str, ServerCounters] = {}
@@ -315,7 +307,7 @@ class ScxServers:
         self.change(self._table, anchor_ns)
 
     def in_force_from(self) -> int | None:
-        return self.in_force_since_ns or None
+        return self._since_ns
 
     def change(self, table: ServerTable, anchor_ns: int) -> None:
         """Put another table in force, on all cores at one instant.
@@ -335,7 +327,7 @@ class ScxServers:
             instant = self._put_in_force(self._policy, table, cores, anchor_ns)
             while (left := instant - time.monotonic_ns()) > 0:
                 time.sleep(left / 1e9)
-            self._table, self.in_force_since_ns = table, instant
+            self._table, self._since_ns = table, instant
             present = {self._ids[server.name] for server in table.servers}
             for tid, (descriptor, number) in tuple(self._members.items()):
                 if number not in present:
@@ -441,7 +433,7 @@ class ScxServers:
         try:
             ahead = _VISIT_NS * (1 + len(cores)) if self._has_timer else _KICKER_ROUND_NS
             instant = time.monotonic_ns() + ahead
-            word = change_word(generation, instant, replaces=self.in_force_since_ns > 0)
+            word = change_word(generation, instant, replaces=self._since_ns is not None)
             update_element(policy.map_descriptor("in_force"), 0, word)
             for core in cores if self._has_timer else ():
                 os.sched_setaffinity(0, {core})
