@@ -209,7 +209,6 @@ def test_it_runs_on_the_core_that_it_gates_above_everything_there(tmp_path: Path
         (thread,) = list_threads(dispatcher_of(back_end))
         assert (thread.policy, thread.priority, thread.cores) == ("SCHED_FIFO", PRIORITY, (CORE,))
         assert thread.comm == f"dispatcher/{CORE}"
-        assert back_end.real_time()
         status = Path(f"/proc/{thread.pid}/status").read_text()
         locked = next(line for line in status.splitlines() if line.startswith("VmLck"))
         assert int(locked.split()[1]) > 0, "its memory may be swapped out"
@@ -226,7 +225,7 @@ def test_what_a_terminal_sends_is_not_for_them(tmp_path: Path) -> None:
         assert dispatcher_of(back_end) == dispatcher
 
 
-def test_without_the_class_it_gates_as_well_as_it_can_and_says_so(tmp_path: Path) -> None:
+def test_without_the_class_it_gates_as_well_as_it_can(tmp_path: Path) -> None:
     if os.geteuid() != 0:
         pytest.skip("dropping one capability needs root")
     libc = ctypes.CDLL(None)
@@ -247,11 +246,9 @@ def test_without_the_class_it_gates_as_well_as_it_can_and_says_so(tmp_path: Path
         assert owner.stdin is not None
         assert owner.stdout is not None
         with owner, owner.stdin:
-            assert owner.stdout.readline().startswith("in force")
+            *_, dispatcher = owner.stdout.readline().split()
+            assert list_threads(int(dispatcher))[0].policy == "SCHED_OTHER"
             begin = time.monotonic_ns()
-            owner.stdin.write("real time\n")
-            owner.stdin.flush()
-            assert owner.stdout.readline() == "False\n"
             time.sleep(1)
             end = time.monotonic_ns()
         windows = spinner.windows(begin, end)

@@ -145,11 +145,6 @@ def test_an_old_libbpf_is_told_with_its_version(monkeypatch: pytest.MonkeyPatch)
         libbpf.load_libbpf.cache_clear()
 
 
-def test_a_wrong_table_is_refused_before_the_machine_is_looked_at() -> None:
-    with pytest.raises(InputError, match="twice"):
-        scx.create(ServerTable(TABLE.cycle_ns, TABLE.servers * 2))
-
-
 def test_a_core_that_is_not_there_is_refused() -> None:
     wrong = ServerTable(1000, (ReservationServer("A", 500, 1, ((0, 10),)),))
     with pytest.raises(PlatformError, match="core 500, which server A asks for"):

@@ -163,16 +163,9 @@ def test_a_full_table_is_accepted() -> None:
 @pytest.mark.parametrize(
     ("wrong", "reason"),
     [
-        (ServerTable(0, (server(),)), "cycle time is 0 ns"),
-        (table(server(), server()), "server a stands in the table twice"),
         (table(*(server(f"s{k}", k) for k in range(128))), "128 servers are more than the 127"),
         (table(*(server(f"s{k}", 3) for k in range(33))), "33 servers on core 3 are more than"),
         (table(server("a", 512)), "core 512; back end scx knows 0 to 511"),
-        (table(server("a", 0, -1)), "priority -1"),
-        (table(server("a", 0, 1, (10, 10))), r"slot \[10, 10\)"),
-        (table(server("a", 0, 1, (20, 30), (10, 15))), r"slot \[10, 15\) .* after 30"),
-        (table(server("a", 0, 1, (0, 30), (29, 40))), r"slot \[29, 40\)"),
-        (table(server("a", 0, 1, (0, 50 * MS + 1))), "not inside"),
         (table(ReservationServer("a", 0, 1, ())), "0 slots; back end scx takes 1 to 64"),
         (table(server("a", 0, 1, *((k, k + 1) for k in range(65)))), "has 65 slots"),
     ],

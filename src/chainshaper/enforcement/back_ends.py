@@ -12,23 +12,12 @@ from dataclasses import dataclass
 
 from chainshaper.enforcement import litmus
 from chainshaper.enforcement.freezer import Freezer
-from chainshaper.enforcement.scheduling_memory import (
-    change_all,
-    release_threads,
-    remembered_threads,
-)
+from chainshaper.enforcement.scheduling_memory import release_threads
 from chainshaper.enforcement.scx import back_end as scx
 from chainshaper.enforcement.servers import BackEnd, ServerCounters, ServerTable, server_named
-from chainshaper.enforcement.threads import (
-    NodeThread,
-    below_their_siblings,
-    server_priorities,
-    wanted_of_members,
-)
 from chainshaper.linux import cgroups
 from chainshaper.linux.runs import Journal
 from chainshaper.linux.scheduling import may_use_fifo
-from chainshaper.linux.threads import find_thread
 from chainshaper.values.errors import InputError, PlatformError
 
 
@@ -105,41 +94,23 @@ def make_back_end(
 class Fifo:
     """Servers as SCHED_FIFO priorities, on any kernel, without slots; see :class:`BackEnd`.
 
-    Each server's threads get its core and a real-time priority in the order of the servers. That
-    isolates a chain from what is less important; a shaping node's gate has to do the rest. Several
-    threads of one server take turns under SCHED_RR. Threads that stand in the journal already are
-    left as they are: who carries out a whole plan has given them their priorities
-    (:func:`.threads.plan_scheduling`), in an order that also knows of shaping nodes. Raises
-    InputError: the table has more priorities than there are.
+    Each server's threads have its core and a real-time priority in the order of the servers from
+    whoever carries out the plan (:func:`.threads.plan_scheduling`), so nothing is left to do. That
+    isolates a chain from what is less important; a shaping node's gate has to do the rest.
     """
 
     name = "fifo"
 
     def __init__(self, table: ServerTable, journal: Journal) -> None:
-        server_priorities(server.priority for server in table.servers)
         self._table = table
         self._journal = journal
-        self._members: dict[str, list[NodeThread]] = {s.name: [] for s in table.servers}
-        self._scheduled = {one.identity for one in remembered_threads(journal)}
         self._since_ns: int | None = None
 
-    def assign(self, tid: int, server: str) -> None:
-        members = self._members[server_named(self._table, server).name]
-        thread = find_thread(tid)
-        if thread is None or thread.identity in self._scheduled:
-            return
-        self._scheduled.add(thread.identity)
-        members.append(NodeThread(thread, (), "", ""))
-        if self._since_ns is not None:
-            self._schedule()
+    def assign(self, tid: int, server: str) -> None:  # noqa: ARG002 - it has its priority
+        server_named(self._table, server)
 
     def arm(self, anchor_ns: int) -> None:  # noqa: ARG002 - priorities know no cycle
-        self._schedule()
         self._since_ns = time.monotonic_ns()
-
-    def _schedule(self) -> None:
-        wanted = below_their_siblings(wanted_of_members(self._members, self._table.servers))
-        change_all(self._journal, ((one.thread.thread, one.wanted) for one in wanted))
 
     def in_force_from(self) -> int | None:
         return self._since_ns
@@ -151,7 +122,6 @@ class Fifo:
         return None
 
     def release(self) -> None:
-        self._since_ns = None
         release_threads(self._journal)
 
 

@@ -1,15 +1,13 @@
 """The freezer: reservation servers for unmodified threads on a stock kernel.
 
 Each server's threads are put into cgroups of its own, and a dispatcher on the server's core opens
-and closes these by freezing them (DESIGN section 6). What a slot does not cover does not run, not
-even on an idle core. A thread sees nothing of it but the time, except that ``epoll_wait``,
-``recvmsg`` with a timeout, ``sigtimedwait`` and ``semtimedop`` return EINTR. Threads and processes
-that a gated thread creates are born in its server, count as its members and are put back with it.
+and closes these by freezing them (DESIGN section 6). A thread sees nothing of it but the time,
+except that ``epoll_wait``, ``recvmsg`` with a timeout, ``sigtimedwait`` and ``semtimedop`` return
+EINTR. What a gated thread creates is born in its server, and put back with it.
 
 The journal says, before anything is changed, which servers there will be and how the hierarchy was
-mounted. Groups need no line each: their names say which process made them and for which server, so
-they are found even where the journal is gone. A group is made directly beneath the one from which
-its threads came: their way back is its parent.
+mounted. Groups need no line each: their names say which process made them and for which server. A
+group is made directly beneath the one from which its threads came: their way back is its parent.
 
 Dispatchers write their numbers to memory of the owner, reached through its descriptors. Not to a
 file on a disk: a store to a mapped page that is being written back waits for 0.1 s and more.
@@ -166,10 +164,9 @@ class CoreNumbers(ctypes.Structure):
 
     beats: int
     acknowledged: int
-    real_time: int
     let_go: int
     silent: int
-    _fields_ = _numbers("beats", "acknowledged", "real_time", "let_go", "silent")
+    _fields_ = _numbers("beats", "acknowledged", "let_go", "silent")
 
 
 class ServerNumbers(ctypes.Structure):
@@ -362,10 +359,6 @@ class Freezer:
     def dispatchers(self) -> dict[int, int]:
         """The process id of each core's dispatcher."""
         return {core: process.pid for core, process in self._dispatchers.items()}
-
-    def real_time(self) -> bool:
-        """Whether the dispatchers may be SCHED_FIFO; if not, slots open and close late."""
-        return all(own.real_time for own in self._page.cores.values())
 
     def failure(self) -> str | None:
         """See :meth:`BackEnd.failure`. A lost group or thread leaves the others enforced."""

@@ -2,18 +2,15 @@
 
     python -m chainshaper.enforcement.guardian OWNER FOLDER READY_FD
 
-Every run has two guardians, whatever its back end, which do the same: each is there should the
-other be killed or stopped at the same instant as what they watch over. They learn of a death from a
-pidfd, at once, and of a dispatcher that hangs from the sign of life that stands still; then they
-undo all that the journal says. The owner starts anew the one that it has lost. They are out of
-reach of what befalls the application or the owner: each has a session of its own, a cgroup that is
-neither's, and a priority above the dispatchers'.
+Every run has two, which do the same: each is there should the other be killed or stopped at the
+same instant as what they watch over. They learn of a death from a pidfd, at once, and of a
+dispatcher that hangs from its sign of life; then they undo all that the journal says. Each has a
+session and a cgroup of its own, and a priority above the dispatchers'.
 
-A dispatcher that gives no sign of life for a tenth of a second may hang, or its core may have been
+A dispatcher without a sign of life for a tenth of a second may hang, or its core may have been
 taken from the machine for a moment. So its threads are let go first: one that comes back closes
-what has to be closed, at the price of a cycle or less in which a server's threads ran freely; one
-that stays away for half a second has failed. The sign of life must stand still over several looks,
-rather than for some time: that a machine stalls as a whole is no fault.
+what has to be closed; one that stays away for half a second has failed. The sign must stand still
+over several looks, rather than for some time: that a machine stalls as a whole is no fault.
 """
 
 import contextlib

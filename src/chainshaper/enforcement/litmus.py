@@ -9,12 +9,9 @@ reservations, and each thread moves by itself: for the two milliseconds that a c
 runs freely. Threads that are created by one in a reservation run in it as well, so threads are
 attached one by one, after those of DDS exist, and detached by giving them another class.
 
-`resctl` reads times as decimal milliseconds, turns them into a C double, multiplies it by a million
-and drops what is behind the point, so a text is chosen that survives this. Intervals are written
-half-open, `[2,86)`, which ends one nanosecond earlier than `[2,86]`: `resctl` refuses a closed
-interval that ends with the major cycle, and takes `[2,86] [86,87]` for overlapping. They must
-ascend; the kernel wants two nanoseconds at least and 1024 intervals at most. A table counts from
-time zero of CLOCK_MONOTONIC; another anchor is reached by turning the slots.
+Intervals are written half-open, `[2,86)`: `resctl` refuses a closed interval that ends with the
+major cycle, and takes `[2,86] [86,87]` for overlapping. They must ascend. A table counts from time
+zero of CLOCK_MONOTONIC; another anchor is reached by turning the slots.
 
 Upstream: liblitmus, `bin/resctl.c`, `doc/howto-use-resctl.md`, `doc/table-driven-scheduling.md`;
 LITMUS^RT, `litmus/reservations/alloc.c`.
@@ -282,6 +279,8 @@ def interval_text(start_ns: int, end_ns: int) -> str:
 
 def milliseconds_text(duration_ns: int) -> str:
     """The shortest decimal milliseconds that `resctl` turns into exactly this duration.
+
+    It makes a C double of them, multiplies it by a million and drops what is behind the point.
 
     >>> milliseconds_text(86_500_000)
     '86.5'

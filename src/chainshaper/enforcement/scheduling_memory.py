@@ -1,20 +1,16 @@
 """Changing the class and cores of threads that are not ours, and putting them back.
 
 Before a change, the journal learns what was there and what is wanted. Putting back looks at each
-aspect of a thread (:mod:`chainshaper.linux.scheduling`) by itself. One that is as we set it goes
-back to what it was; one that another program has changed since is left. A thread that has ended is
-done with; one that has its id by now is recognised by its start.
+aspect of a thread (:mod:`chainshaper.linux.scheduling`) by itself: one that is as we set it goes
+back to what it was; one that another program has changed since is left.
 
 Threads inherit class and cores from those that create them. What an application starts while it is
 changed is put back as well, if it is the application's beyond doubt: a thread of a process in the
 journal, that process being the same (its id *and* its start); a process that descends from one of
 these, or did when it was last looked (:func:`note_descendants`); a thread in a cgroup of the run.
 Of these, what started after the change and has what we gave to its family gets its parent's
-original. All others are strangers, whatever class, core and cgroup they have, and are left alone.
-So is a daemon whose parent ended before a look; :func:`look_alikes` names both.
-
-SCHED_DEADLINE has parameters that the kernel admits only together with all others: threads under
-it are refused.
+original. All others are strangers, and so is a daemon whose parent ended before a look:
+:func:`look_alikes` names them, and they are left alone.
 """
 
 from collections.abc import Iterable, Mapping

@@ -301,13 +301,13 @@ def overrun(groups: Iterable[int]) -> bool | None:
     return None if undecided else False
 
 
-def become_real_time(core: int) -> bool:
-    """Highest class first, then the core, then memory; False when the class is not permitted.
+def _become_real_time(core: int) -> None:
+    """Highest class, if it is permitted, then the core, then memory.
 
     The class goes first: on a core where a SCHED_FIFO thread spins, a process that moves there as
     SCHED_OTHER would not run again. Raises PlatformError: the core is not available.
     """
-    permitted = become_fifo(PRIORITY)
+    become_fifo(PRIORITY)
     try:
         os.sched_setaffinity(0, {core})
     except OSError as error:
@@ -317,7 +317,6 @@ def become_real_time(core: int) -> bool:
         ) from error
     lock_memory()
     stop_garbage_collection()
-    return permitted
 
 
 def _end(_number: int, _frame: FrameType | None) -> None:
@@ -337,7 +336,7 @@ def main() -> None:
     dispatcher = Dispatcher(run.table, core, CounterPage(run.page, run.table), owner, commands)
     set_thread_name(f"dispatcher/{core}")
     try:
-        dispatcher.own.real_time = become_real_time(core)
+        _become_real_time(core)
         dispatcher.run()
     except ChainshaperError as error:
         dispatcher.thaw_all()

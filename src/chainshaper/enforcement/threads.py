@@ -2,9 +2,7 @@
 
 The paper's Thread Allocator (section 4.2). Evidence for a thread's role, the stronger first: the
 callbacks that a recording saw it run; its name, which DDS implementations choose; its place, since
-executors spin on the main thread unless the program arranges it otherwise. The nodes of a process:
-a recording (also an earlier one, where the command line names one of them), the remap rules of its
-command line, or the name of its program, a guess. Only processes of the run's users are nodes.
+executors spin on the main thread unless the program arranges it otherwise.
 
 On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DESIGN section 6):
 
@@ -13,8 +11,7 @@ On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DES
   is received, they have the first of these cores, which the shaping node leaves clear;
 * servers stand below 88 in the order of their own priority, smaller first; several threads of one
   server share a priority under SCHED_RR, so that they take turns;
-* who receives what a shaping node publishes stands below all servers, on the shaping node's core:
-  idle then, and just awake;
+* who receives what a shaping node publishes stands below all servers, on the shaping node's core;
 * an asynchronous publisher stands below every other thread of its process on its core: it spins on
   the writer's lock, and above them would never let them release it;
 * all others, best effort, are left alone.
@@ -366,18 +363,83 @@ def scheduling_around(
     get, whose processes are treated alike. Raises OperationError: a thread cannot leave the core of
     a publisher that would outrank it. InputError: see :func:`server_priorities`.
     """
-    own = wanted_of_members(members, servers)
-    ours = [*joined.from_iterable(members.values()), *(one.thread for one in receiving)]
-    pids = {member.thread.pid for member in ours}
-    planned = {member.thread.identity for member in ours}
-    others = [
-        one
-        for one in allocation.threads
-        if one.thread.pid in pids and one.thread.identity not in planned
+    ranks = server_priorities(server.priority for server in servers)
+    own = [
+        WantedScheduling(
+            member,
+            Scheduling(ranks[server.priority], (server.core,), len(members[server.name]) > 1),
+            server.name,
+            f"server priority {server.priority}",
+        )
+        for server in sorted(servers, key=lambda one: one.priority)
+        for member in members[server.name]
     ]
+    planned = {one.thread.thread.identity: one.thread.thread.pid for one in (*own, *receiving)}
     free_cores = tuple(sorted(set(available_cores) - {server.core for server in servers}))
-    dds = _dds_threads(others, free_cores, {one.thread.thread.pid for one in receiving})
-    return below_their_siblings((*own, *receiving, *dds, *_out_of_the_way(own, others)))
+    receivers = {one.thread.thread.pid for one in receiving}
+    beside = (
+        _beside(one, own, free_cores, one.thread.pid in receivers)
+        for one in allocation.threads
+        if one.thread.pid in planned.values() and one.thread.identity not in planned
+    )
+    wanted = [*own, *receiving, *(one for one in beside if one is not None)]
+    # What a person reads: servers' threads, DDS threads, the others.
+    wanted.sort(key=lambda one: one.wanted.priority is None)
+    return tuple(
+        _below(one, wanted) if one.thread.thread.role == "publisher" else one for one in wanted
+    )
+
+
+def _beside(
+    one: NodeThread, own: Sequence[WantedScheduling], cores: tuple[int, ...], receives_output: bool
+) -> WantedScheduling | None:
+    """What a thread in no server shall get, in a process that has one in a server.
+
+    DDS threads stand above all servers; on machines without a free core they stay where they are.
+    Others, of no class of their own, leave the core of a publisher, which would outrank them.
+    """
+    thread = one.thread
+    if thread.role == "dds":
+        receives = thread.kind == "receive"
+        allowed = cores[:1] if receives and receives_output else cores
+        scheduling = Scheduling(DDS_PRIORITY + receives, allowed or None)
+        return WantedScheduling(one, scheduling, None, "DDS threads deliver for the servers")
+    publishers = (
+        publisher.wanted.cores or ()
+        for publisher in own
+        if publisher.thread.thread.role == "publisher" and publisher.thread.thread.pid == thread.pid
+    )
+    shared = set(thread.cores).intersection(joined.from_iterable(publishers))
+    if not shared:
+        return None
+    elsewhere = tuple(sorted(set(thread.cores) - shared))
+    if not elsewhere:
+        raise OperationError(
+            f"thread {thread.tid} ({thread.comm}) of process {thread.pid} may run on core "
+            f"{min(shared)} only, where the process's asynchronous publisher would outrank it and "
+            "never let it release the writer's lock: let it run on another core too (`taskset`)"
+        )
+    reason = "not on the core of its process's asynchronous publisher"
+    return WantedScheduling(one, Scheduling(None, elsewhere), None, reason)
+
+
+def _below(publisher: WantedScheduling, wanted: Iterable[WantedScheduling]) -> WantedScheduling:
+    """A publisher below the other threads of its process on its core."""
+    core = (publisher.wanted.cores or (None,))[0]
+    siblings = [
+        one.wanted.priority - 1
+        for one in wanted
+        if one.thread.thread.pid == publisher.thread.thread.pid
+        and one.thread.thread.role != "publisher"
+        and one.wanted.priority is not None
+        and core in (one.wanted.cores or one.thread.thread.cores)
+    ]
+    below = max(1, min(siblings, default=99))
+    if below >= (publisher.wanted.priority or 0):
+        return publisher
+    scheduling = replace(publisher.wanted, priority=below)
+    reason = "below its siblings, whose locks it spins on"
+    return replace(publisher, wanted=scheduling, reason=reason)
 
 
 def left_by_back_end(
@@ -399,83 +461,3 @@ def left_by_back_end(
         elif one.reason != _RECEIVES:
             left.append(one)
     return tuple(left)
-
-
-def wanted_of_members(
-    members: Mapping[str, Sequence[NodeThread]], servers: Collection[Server | ReservationServer]
-) -> tuple[WantedScheduling, ...]:
-    """Class, priority and core of servers' threads; ``members`` are by server's name."""
-    ranks = server_priorities(server.priority for server in servers)
-    return tuple(
-        WantedScheduling(
-            member,
-            Scheduling(ranks[server.priority], (server.core,), len(members[server.name]) > 1),
-            server.name,
-            f"server priority {server.priority}",
-        )
-        for server in sorted(servers, key=lambda one: one.priority)
-        for member in members[server.name]
-    )
-
-
-def below_their_siblings(wanted: Sequence[WantedScheduling]) -> tuple[WantedScheduling, ...]:
-    """The same with each publisher below the other threads of its process on its core."""
-    return tuple(
-        _below(one, wanted) if one.thread.thread.role == "publisher" else one for one in wanted
-    )
-
-
-def _below(publisher: WantedScheduling, wanted: Iterable[WantedScheduling]) -> WantedScheduling:
-    core = (publisher.wanted.cores or (None,))[0]
-    siblings = [
-        one.wanted.priority - 1
-        for one in wanted
-        if one.thread.thread.pid == publisher.thread.thread.pid
-        and one.thread.thread.role != "publisher"
-        and one.wanted.priority is not None
-        and core in (one.wanted.cores or one.thread.thread.cores)
-    ]
-    below = max(1, min(siblings, default=99))
-    if below >= (publisher.wanted.priority or 0):
-        return publisher
-    scheduling = replace(publisher.wanted, priority=below)
-    reason = "below its siblings, whose locks it spins on"
-    return replace(publisher, wanted=scheduling, reason=reason)
-
-
-def _dds_threads(
-    others: Sequence[NodeThread], cores: tuple[int, ...], receivers: Collection[int]
-) -> Iterable[WantedScheduling]:
-    """DDS threads above all servers; on machines without a free core they stay where they are.
-
-    ``receivers`` are the processes that receive an output.
-    """
-    for one in others:
-        if one.thread.role == "dds":
-            receives = one.thread.kind == "receive"
-            own = cores[:1] if receives and one.thread.pid in receivers else cores
-            scheduling = Scheduling(DDS_PRIORITY + receives, own or None)
-            yield WantedScheduling(one, scheduling, None, "DDS threads deliver for the servers")
-
-
-def _out_of_the_way(
-    own: Sequence[WantedScheduling], others: Sequence[NodeThread]
-) -> Iterable[WantedScheduling]:
-    """Siblings of no class of their own leave the core of a publisher, which would outrank them."""
-    publishers = [one for one in own if one.thread.thread.role == "publisher"]
-    for one in others:
-        thread = one.thread
-        cores = (p.wanted.cores or () for p in publishers if p.thread.thread.pid == thread.pid)
-        shared = set(thread.cores).intersection(joined.from_iterable(cores))
-        if not shared or thread.role == "dds":
-            continue
-        elsewhere = tuple(sorted(set(thread.cores) - shared))
-        if not elsewhere:
-            raise OperationError(
-                f"thread {thread.tid} ({thread.comm}) of process {thread.pid} may run on core "
-                f"{min(shared)} only, where the process's asynchronous publisher would outrank it "
-                "and never let it release the writer's lock: let it run on another core too "
-                "(`taskset`)"
-            )
-        reason = "not on the core of its process's asynchronous publisher"
-        yield WantedScheduling(one, Scheduling(None, elsewhere), None, reason)

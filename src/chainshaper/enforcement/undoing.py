@@ -2,11 +2,9 @@
 
 Two plans never govern the same core or node, since their slots contradict each other. So a run
 first writes into its journal which cores and nodes it is for, and looks at what the others claim,
-both under a lock of the folder of all runs. A claim ends with its journal.
-
-A run that is in force is asked to end; one whose owner is gone, or does not react, is undone from
-what its journal says, by whichever process is left. Where the journal itself is gone, cgroups of
-ours are found by their names.
+both under a lock of the folder of all runs. A run that is in force is asked to end; one whose owner
+is gone, or does not react, is undone from its journal, by whichever process is left. Where the
+journal itself is gone, cgroups of ours are found by their names.
 """
 
 import contextlib

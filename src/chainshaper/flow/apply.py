@@ -243,12 +243,8 @@ def _await_nodes(run: _Run, wait_ns: int, progress: Callable[[float, str], None]
 def _schedule(run: _Run, found: Allocation) -> None:
     """Give threads their priorities and cores, as far as the back end leaves that to us."""
     wanted = allocation.plan_scheduling(run.plan, found, available_cores())
-    changes = (
-        (one.thread.thread, one.wanted)
-        for one in allocation.left_by_back_end(run.choice.name, wanted)
-        if one.server is None or run.choice.name != "fifo"  # that is all the latter does
-    )
-    change_all(run.journal, changes)
+    left = allocation.left_by_back_end(run.choice.name, wanted)
+    change_all(run.journal, ((one.thread.thread, one.wanted) for one in left))
 
 
 def _initial_state(
