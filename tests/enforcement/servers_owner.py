@@ -3,9 +3,9 @@
     python servers_owner.py BACK_END RUNS CORE CYCLE_MS SLOT_MS TID…
 
 Its threads run in [0, SLOT_MS) of each cycle; the first one begins as soon as may be. The journal
-is in a folder of RUNS. It prints a line with its dispatchers and guardians when the servers are in
-force, raises when it reads `raise`, tells `failure()` or `real_time()` when it reads `failure` or
-`real time`, and releases when its input ends.
+is in a folder of RUNS. It prints a line with its guardians and dispatchers when the servers are in
+force, raises when it reads `raise`, answers `failure()` to any other line, and releases when its
+input ends.
 """
 
 import sys
@@ -25,7 +25,6 @@ from chainshaper.linux.threads import find_thread
 from chainshaper.values.errors import PlatformError
 
 MS = 1_000_000
-GIVEN = 5
 
 
 def main() -> None:
@@ -39,9 +38,8 @@ def main() -> None:
     for tid in map(int, sys.argv[6:]):
         thread = find_thread(tid)
         assert thread is not None
-        if sys.argv[1] == "freezer":
-            with suppress(PlatformError):
-                change_all(journal, [(thread, Scheduling(GIVEN, None))])
+        with suppress(PlatformError):
+            change_all(journal, [(thread, Scheduling(5, None))])
         servers.assign(tid, "gated")
     servers.arm(time.monotonic_ns() + 320 * MS)
     own = [one.pid for one in guardians.processes]

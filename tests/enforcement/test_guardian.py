@@ -183,7 +183,7 @@ def test_what_loses_guardians_only_goes_on_being_served(
     with run_on(node) as run:
         for pid in run.pids(name):
             kill(pid, number)
-        time.sleep(1)
+        time.sleep(0.6)
         assert run.is_frozen()
         assert run.ask("failure") == "None"
 
@@ -257,7 +257,7 @@ def test_threads_that_a_guardian_lets_go_when_the_dispatcher_is_back_are_closed_
 def test_an_owner_that_is_stopped_goes_on_being_served(node: Governed) -> None:
     with run_on(node) as run:
         kill(run.owner.pid, STOP)
-        time.sleep(1)
+        time.sleep(0.6)
         assert run.is_frozen()
         kill(run.owner.pid, signal.SIGCONT)
         assert run.ask("failure") == "None"
@@ -294,21 +294,10 @@ def test_guardians_are_out_of_reach_of_what_befalls_the_owner(node: Governed) ->
         assert run.ask("failure") == "None"
 
 
-def test_a_process_that_is_killed_while_frozen_is_no_failure(tmp_path: Path) -> None:
-    with node_to_govern(tmp_path) as node, run_on(node) as run:
-        node.process.kill()
-        node.process.wait(timeout=20)
-        assert run.ask("failure") == "None"
-        assert run.owner.stdin is not None
-        run.owner.stdin.close()
-        assert run.owner.wait(timeout=20) == 0
-        assert groups_left(run.owner.pid) == []
-
-
 @pytest.mark.parametrize("victim", ["owner", "dispatcher"])
 def test_killed_at_any_moment_of_a_cycle_they_leave_nothing(node: Governed, victim: str) -> None:
     chance = random.Random(victim)
-    for _ in range(4):
+    for _ in range(2):
         with run_on(node, cycle_ms=20, slot_ms=8) as run:
             time.sleep(chance.uniform(0, 0.1))
             kill(run.pids(victim)[0])
@@ -317,7 +306,7 @@ def test_killed_at_any_moment_of_a_cycle_they_leave_nothing(node: Governed, vict
 
 def test_killed_while_the_servers_are_made_the_owner_leaves_nothing(node: Governed) -> None:
     chance = random.Random(7)
-    for attempt in range(8):
+    for attempt in range(4):
         runs = node.folder / str(attempt)
         with ExitStack() as stack:
             arguments = ("freezer", runs, CORE, MINUTE, 2, node.pid)
