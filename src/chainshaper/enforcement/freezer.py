@@ -188,17 +188,15 @@ class CounterPage:
         with path.open("r+b") as file:
             memory = mmap.mmap(file.fileno(), 0)
         self.released = ctypes.c_int64.from_buffer(memory)
-        cores = sorted({server.core for server in table.servers})
-        size, place = ctypes.sizeof(CoreNumbers), ctypes.sizeof(ctypes.c_int64)
-        self.cores = {
-            core: CoreNumbers.from_buffer(memory, place + size * number)
-            for number, core in enumerate(cores)
-        }
-        place += size * len(cores)
-        self.servers = {
-            server.name: ServerNumbers.from_buffer(memory, place + size * number)
-            for number, server in enumerate(table.servers)
-        }
+        place = ctypes.sizeof(ctypes.c_int64)
+        self.cores: dict[int, CoreNumbers] = {}
+        for core in sorted({server.core for server in table.servers}):
+            self.cores[core] = CoreNumbers.from_buffer(memory, place)
+            place += ctypes.sizeof(CoreNumbers)
+        self.servers: dict[str, ServerNumbers] = {}
+        for server in table.servers:
+            self.servers[server.name] = ServerNumbers.from_buffer(memory, place)
+            place += ctypes.sizeof(ServerNumbers)
 
 
 @dataclass(frozen=True)
