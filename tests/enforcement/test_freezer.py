@@ -403,7 +403,9 @@ def frozen(folder: Path) -> bool:
     return "frozen 1" in (folder / "cgroup.events").read_text()
 
 
-def test_it_runs_on_the_core_that_it_gates_above_everything_there(tmp_path: Path) -> None:
+def test_a_dispatcher_runs_above_everything_on_its_core_and_hears_no_terminal(
+    tmp_path: Path,
+) -> None:
     if not may_use_fifo():
         pytest.skip("SCHED_FIFO is not permitted (CAP_SYS_NICE)")
     with freezer(tmp_path, server("a", (0, 5))) as back_end:
@@ -413,17 +415,15 @@ def test_it_runs_on_the_core_that_it_gates_above_everything_there(tmp_path: Path
         status = Path(f"/proc/{thread.pid}/status").read_text()
         locked = next(line for line in status.splitlines() if line.startswith("VmLck"))
         assert int(locked.split()[1]) > 0, "its memory may be swapped out"
-
-
-def test_what_a_terminal_sends_is_not_for_them(tmp_path: Path) -> None:
-    with freezer(tmp_path, server("a", (0, 5))) as back_end:
-        dispatcher = back_end.dispatchers[CORE]
-        assert os.getsid(dispatcher) != os.getsid(0)
+        # A store to a page that is being written back would wait for the disk.
+        maps = [line.split() for line in Path(f"/proc/{thread.pid}/maps").read_text().splitlines()]
+        (shared,) = [line for line in maps if line[1] == "rw-s"]
+        assert shared[5] == "/memfd:counters"
+        assert os.getsid(thread.pid) != os.getsid(0)
         for number in (signal.SIGINT, signal.SIGHUP):
-            kill(dispatcher, number)
+            kill(thread.pid, number)
         time.sleep(0.2)
         assert back_end.failure() is None
-        assert back_end.dispatchers[CORE] == dispatcher
 
 
 def test_without_the_class_it_gates_as_well_as_it_can(tmp_path: Path) -> None:
@@ -545,14 +545,3 @@ def test_where_a_frozen_thread_was_tells_whether_it_wanted_to_run(tmp_path: Path
         assert overrun(threads.values()) is False, "the groups are gone"
         for file in threads.values():
             os.close(file)
-
-
-def test_what_it_writes_to_is_on_no_disk(tmp_path: Path) -> None:
-    """A store to a page that is being written back would wait for the disk."""
-    with freezer(tmp_path, server("a", (0, 5))) as back_end:
-        maps = Path(f"/proc/{back_end.dispatchers[CORE]}/maps").read_text().splitlines()
-        shared = [
-            line for line in maps if line.split()[1].startswith("rw") and "s" in line.split()[1]
-        ]
-        assert len(shared) == 1
-        assert "/memfd:counters" in shared[0]
