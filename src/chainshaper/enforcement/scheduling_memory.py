@@ -204,10 +204,8 @@ def release_threads(journal: Journal, groups: Iterable[Path] = ()) -> None:
         except ProcessLookupError:
             return False
         except OSError as error:
-            refused[thread.tid] = (
-                f"{thread.tid} ({thread.comm}): the kernel refuses {state_text(target)}: "
-                f"{error.strerror}"
-            )
+            why = f"the kernel refuses {state_text(target)}: {error.strerror}"
+            refused[thread.tid] = f"thread {thread.tid} ({thread.comm}): {why}"
             return False
         return now != target
 
@@ -220,10 +218,7 @@ def release_threads(journal: Journal, groups: Iterable[Path] = ()) -> None:
         if not any(changed):
             break
     if refused:
-        raise OperationError(
-            f"not everything could be put back: {'; '.join(refused.values())}; {journal.path} "
-            "says what was there, `chainshaper release` tries again"
-        )
+        raise OperationError("; ".join(refused.values()))
 
 
 def look_alikes(journal: Journal, groups: Iterable[Path] = ()) -> tuple[str, ...]:
