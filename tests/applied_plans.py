@@ -184,12 +184,6 @@ def in_force(folder: Path, *options: str) -> Iterator[tuple[Governed, subprocess
         yield governed, run
 
 
-def verb(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """A verb of the command line as a process of its own, and what it said."""
-    command = [*CLI, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=100)
-
-
 def processes_of(run: subprocess.Popen[str], name: str) -> list[int]:
     """Processes of a run by what they do; `apply` itself is the run."""
     if name == "apply":

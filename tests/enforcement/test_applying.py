@@ -42,12 +42,12 @@ from applied_plans import (
     scheduling,
     server,
     started,
-    verb,
 )
+from command_line import called, chainshaper
 from gated import cpu_ns, kill, needs_cgroups
 from processes import wait_for
 
-import chainshaper
+from chainshaper import __file__ as package_file
 from chainshaper.linux import cgroups
 from chainshaper.linux.runs import journals_folder
 from chainshaper.linux.threads import list_threads
@@ -82,7 +82,7 @@ def test_a_node_runs_inside_its_slots_and_is_as_before_afterwards(tmp_path: Path
             begun = time.monotonic_ns() + 1_000 * MS
             time.sleep(3.0)
             ended = time.monotonic_ns()
-            (status,) = json.loads(verb("status", "--json").stdout)
+            (status,) = json.loads(called("status", "--json").out)
             run.send_signal(signal.SIGINT)
             stdout, _ = run.communicate(timeout=30)
             assert run.returncode == 0
@@ -112,13 +112,13 @@ def test_a_command_is_started_governed_and_ended(tmp_path: Path) -> None:
 def test_a_command_that_fails_is_reported_and_so_is_one_without_the_nodes(tmp_path: Path) -> None:
     path = tmp_path / "plan.yaml"
     save_plan(one_server_plan(), path)
-    ended = verb("apply", path, *FIFO, "--", "false")
-    assert ended.returncode == 1
-    assert "ended with code 1 before all nodes" in ended.stderr
-    absent = verb("apply", path, *FIFO)
-    assert absent.returncode == 1
-    assert "/origin" in absent.stderr
-    assert verb("apply", path, "--backend", "magic").returncode == 2
+    ended = chainshaper("apply", path, *FIFO, "--", "false")
+    assert ended.code == 1
+    assert "ended with code 1 before all nodes" in ended.err
+    absent = chainshaper("apply", path, *FIFO)
+    assert absent.code == 1
+    assert "/origin" in absent.err
+    assert called("apply", path, "--backend", "magic").code == 2
     assert not [one for one in leftovers() if "chainshaper-" in one.name]
 
 
@@ -310,7 +310,7 @@ def test_a_stopped_run_goes_on_being_served_and_can_be_released(tmp_path: Path) 
         run.send_signal(signal.SIGSTOP)
         ran = cpu_ns(governed.pid)
         wait_for(lambda: cpu_ns(governed.pid) > ran + 10 * MS, "some slots")
-        assert verb("release").returncode == 0
+        assert called("release").code == 0
         assert run.wait(timeout=20) == 0
         governed.check_as_before()
 
@@ -364,7 +364,7 @@ def test_a_node_that_is_started_again_is_taken_in(tmp_path: Path) -> None:
             wait_for(lambda: "chainshaper-" in cgroups.cgroup_of(again.pid).name, "its server")
             assert scheduling(again.pid) != before
             time.sleep(1.1)  # status is written every second
-            said = verb("status", "--json").stdout
+            said = called("status", "--json").out
             run.send_signal(signal.SIGINT)
             assert run.wait(timeout=20) == 0
             governed.check_as_before()
@@ -441,7 +441,7 @@ def test_steps_of_the_wall_clock_are_not_seen() -> None:
     `gate/decision.py` alone reads the wall clock, since messages are stamped with it; its tests
     step it.
     """
-    package = Path(chainshaper.__file__).parent
+    package = Path(package_file).parent
     rooms = [*(package / room for room in ("enforcement", "gate", "linux"))]
     sources = [path for room in rooms for path in room.rglob("*.py")]
     sources += [package / "flow" / name for name in ("apply.py", "phase.py", "threads.py")]

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 from actors import Actor, acting
-from applied_plans import one_server_plan, verb
+from applied_plans import one_server_plan
+from command_line import called
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from litmus_stand_in import StandIn, install
@@ -54,10 +55,10 @@ def test_the_commands_of_a_plan_are_these() -> None:
 def test_litmus_commands_are_printed_on_any_kernel(tmp_path: Path) -> None:
     path = tmp_path / "plan.yaml"
     save_plan(one_server_plan(), path)
-    said = verb("apply", path, "--backend", "litmus", "--dry-run")
+    said = called("apply", path, "--backend", "litmus", "--dry-run")
     core = available_cores()[-1]
     number = core * 1000 + 1
-    assert said.stdout.splitlines() == [
+    assert said.out.splitlines() == [
         "setsched P-RES",
         f"resctl -n {number} -t table-driven -c {core} -m 100 -q 1 '[0,30)'",
         f"resctl -a TID:/origin -r {number} -c {core}",

@@ -26,9 +26,9 @@ from applied_plans import (
     scheduling,
     server,
     started,
-    verb,
     wait_until_in_force,
 )
+from command_line import called
 from gated import CORE, OTHER_CORE, cpu_ns, groups_left, kill, needs_cgroups, own_cgroup
 from processes import wait_for
 
@@ -63,9 +63,9 @@ def test_what_a_killed_run_and_its_stopped_processes_left_is_undone(tmp_path: Pa
             kill(pid, signal.SIGSTOP)
         run.kill()
         run.wait()
-        assert "crashed" in verb("status").stdout
-        done = verb("release")
-        assert done.returncode == 0, done.stderr
+        assert "crashed" in called("status").out
+        done = called("release")
+        assert done.code == 0, done.err
         governed.check_as_before()
         assert not [pid for pid in left if Path(f"/proc/{pid}/exe").exists()]
 
@@ -75,8 +75,8 @@ def test_a_run_whose_folder_is_removed_has_it_again_and_can_be_released(tmp_path
         (journal,) = find_journals()
         shutil.rmtree(journal.path.parent)
         wait_for(journal.path.exists, "the journal to be written again")
-        assert str(run.pid) in verb("status").stdout
-        assert verb("release").returncode == 0
+        assert str(run.pid) in called("status").out
+        assert called("release").code == 0
         assert run.wait(timeout=20) == 0
         governed.check_as_before()
 
@@ -90,17 +90,17 @@ def test_without_a_journal_threads_run_again_and_what_cannot_be_put_back_is_name
         for journal in find_journals():
             shutil.rmtree(journal.path.parent)
         (group,) = groups_left(run.pid)
-        assert f"{group} was left by a run whose journal is gone" in verb("status").stderr
-        done = verb("release")
-        assert f"{group}, of a run whose journal is gone: its threads run again" in done.stdout
-        assert done.returncode == 1
-        assert f"thread {governed.pid}" in done.stderr
-        assert f"chrt --other --pid 0 {governed.pid}" in done.stderr
+        assert f"{group} was left by a run whose journal is gone" in called("status").err
+        done = called("release")
+        assert f"{group}, of a run whose journal is gone: its threads run again" in done.out
+        assert done.code == 1
+        assert f"thread {governed.pid}" in done.err
+        assert f"chrt --other --pid 0 {governed.pid}" in done.err
         assert cgroup_of(governed.pid) == governed.cgroup
         ran = cpu_ns(governed.pid)
         wait_for(lambda: cpu_ns(governed.pid) > ran, "the node to run on")
         assert mount_options() == mounted
-        assert "nothing was left behind" in verb("release").stdout
+        assert "nothing was left behind" in called("release").out
 
 
 def test_a_strange_line_of_a_journal_is_named_and_all_else_undone(tmp_path: Path) -> None:
@@ -108,16 +108,16 @@ def test_a_strange_line_of_a_journal_is_named_and_all_else_undone(tmp_path: Path
         (journal,) = find_journals()
         with journal.path.open("a") as file:
             file.write('hello\n{"kind": "scheduling", "tid": "x"}\n{"kind": "freezer"}\n')
-        seen = verb("status")
-        assert seen.returncode == 0
-        assert seen.stderr.count("is not a line of a journal") == 3
+        seen = called("status")
+        assert seen.code == 0
+        assert seen.err.count("is not a line of a journal") == 3
         kill_all(run)
-        done = verb("release")
-        assert done.returncode == 1
-        assert "'hello'" in done.stderr
-        assert "Traceback" not in done.stderr
+        done = called("release")
+        assert done.code == 1
+        assert "'hello'" in done.err
+        assert "Traceback" not in done.err
         governed.check_as_before()
-        assert "nothing was left behind" in verb("release").stdout
+        assert "nothing was left behind" in called("release").out
 
 
 def test_a_full_disk_does_not_end_a_plan_in_force(full_disk: Path, tmp_path: Path) -> None:
