@@ -175,7 +175,7 @@ def test_threads_that_come_and_go_are_left_alone_and_named(tmp_path: Path) -> No
         run = stack.enter_context(applied(one_server_plan(), tmp_path, *options))
         threads = {one.comm: one for one in list_threads(node.pid)}
         assert threads["recvUC"].priority == 91, "one that stays has what the plan says"
-        time.sleep(2.5)
+        wait_for(lambda: "come and go" in called("status", "--json").out, "several looks")
         asked = time.monotonic()
         run.send_signal(signal.SIGINT)
         said = ended(run)

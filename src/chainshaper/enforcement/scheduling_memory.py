@@ -110,7 +110,7 @@ def note_scheduling(
     under SCHED_DEADLINE, or the journal cannot be written.
     """
     known = {one.identity: one for one in remembered_threads(journal)}
-    families = _by_process(known.values())
+    families = _families(journal, list(known.values()))
     noted, entries = [], []
     for thread, target in changes:
         try:
@@ -268,13 +268,14 @@ def _born_of(
 
 def _families(journal: Journal, remembered: list[Change]) -> dict[int, list[Change]]:
     """Processes that are the application's, each with the changes that it may have inherited."""
-    # A process that had begun when its thread was changed is still the same.
-    families = {
-        pid: family
-        for pid, family in _by_process(remembered).items()
-        if (begun := start_of(pid, pid)) is not None
-        and begun <= min(one.changed_at for one in family)
-    }
+    families: dict[int, list[Change]] = {}
+    for one in remembered:
+        families.setdefault(one.pid, []).append(one)
+    for pid, family in list(families.items()):
+        begun = start_of(pid, pid)
+        # A process that had begun when its thread was changed is still the same.
+        if begun is None or begun > min(one.changed_at for one in family):
+            del families[pid]
     for pid, started in journal.read(DESCENDANTS, process_of):
         if start_of(pid, pid) == started:
             families.setdefault(pid, remembered)
@@ -282,13 +283,6 @@ def _families(journal: Journal, remembered: list[Change]) -> dict[int, list[Chan
     for ancestor, family in list(families.items()):
         for pid in descendants(parent_of, ancestor):
             families.setdefault(pid, family)
-    return families
-
-
-def _by_process(changes: Iterable[Change]) -> dict[int, list[Change]]:
-    families: dict[int, list[Change]] = {}
-    for one in changes:
-        families.setdefault(one.pid, []).append(one)
     return families
 
 
