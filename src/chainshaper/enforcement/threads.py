@@ -30,10 +30,10 @@ from chainshaper.linux.processes import (
     guessed_name,
     named_nodes,
     takes_ros_arguments,
+    user_name,
 )
 from chainshaper.linux.scheduling import Scheduling
 from chainshaper.linux.threads import TICK_NS, Thread, ThreadRole
-from chainshaper.linux.users import user_name
 from chainshaper.planning.plan import Plan, Server, shaping_nodes
 from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.values.errors import InputError, OperationError
