@@ -1,6 +1,7 @@
 """Plans put in force by `chainshaper apply` on real processes, and what must be true afterwards."""
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -125,7 +126,8 @@ def leftovers() -> list[Path]:
     """Groups and runs that are on this machine, those of living processes of others apart."""
     ours = {None, *descendants(parents(), os.getpid())}
     runs = [journal.path.parent for journal in find_journals() if journal.owner in ours]
-    owners = {group: int(group.name.split("-")[1].split(".")[0]) for group in groups_left()}
+    names = ((group, re.match(r"chainshaper-(\d+)", group.name)) for group in groups_left())
+    owners = {group: int(name[1]) for group, name in names if name is not None}
     gone = (g for g, pid in owners.items() if pid in ours or start_of(pid, pid) is None)
     return [*runs, *(group for group in gone if not cgroups.has_unseen_threads(group))]
 
@@ -182,12 +184,6 @@ def in_force(folder: Path, *options: str) -> Iterator[tuple[Governed, subprocess
         applied(one_server_plan(), folder, *(options or FREEZER)) as run,
     ):
         yield governed, run
-
-
-def verb(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """A verb of the command line as a process of its own, and what it said."""
-    command = [*CLI, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=100)
 
 
 def processes_of(run: subprocess.Popen[str], name: str) -> list[int]:

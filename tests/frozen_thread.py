@@ -42,7 +42,7 @@ def freezing_publisher_of(node: str, slot: tuple[int, int], cycle_ns: int) -> En
     def in_force(started: StartedNodes) -> Iterator[None]:
         (thread,) = (t for t in list_threads(started.pids[node]) if t.role == "publisher")
         home = need_threaded_cgroups()
-        group = home / f"chainshaper-test-{thread.tid}"
+        group = home / f"frozen-test-{thread.tid}"
         group.mkdir()
         over = threading.Event()
         gating = threading.Thread(

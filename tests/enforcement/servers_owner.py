@@ -3,9 +3,9 @@
     python servers_owner.py BACK_END RUNS CORE CYCLE_MS SLOT_MS TID…
 
 Its threads run in [0, SLOT_MS) of each cycle; the first one begins as soon as may be. The journal
-is in a folder of RUNS. It prints a line with its dispatchers and guardians when the servers are in
-force, raises when it reads `raise`, tells `failure()` or `real_time()` when it reads `failure` or
-`real time`, and releases when its input ends.
+is in a folder of RUNS. It prints a line with its guardians and dispatchers when the servers are in
+force, raises when it reads `raise`, answers `failure()` to any other line, and releases when its
+input ends.
 """
 
 import sys
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from chainshaper.enforcement.back_ends import make_back_end
 from chainshaper.enforcement.freezer import Freezer
-from chainshaper.enforcement.guardian import start_guardians
+from chainshaper.enforcement.guardian import Guardians
 from chainshaper.enforcement.scheduling_memory import change_all
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.enforcement.undoing import undo_run
@@ -25,23 +25,21 @@ from chainshaper.linux.threads import find_thread
 from chainshaper.values.errors import PlatformError
 
 MS = 1_000_000
-GIVEN = 5
 
 
 def main() -> None:
     runs, core, cycle, slot = Path(sys.argv[2]), *map(int, sys.argv[3:6])
     server = ReservationServer("gated", core, 1, ((0, slot * MS),))
     journal = open_journal(runs)
-    guardians = start_guardians(journal)
+    guardians = Guardians(journal)
     guardians.await_ready()
     table = ServerTable(cycle * MS, (server,))
     servers = make_back_end(sys.argv[1], table, journal)
     for tid in map(int, sys.argv[6:]):
         thread = find_thread(tid)
         assert thread is not None
-        if sys.argv[1] == "freezer":
-            with suppress(PlatformError):
-                change_all(journal, [(thread, Scheduling(GIVEN, None))])
+        with suppress(PlatformError):
+            change_all(journal, [(thread, Scheduling(5, None))])
         servers.assign(tid, "gated")
     servers.arm(time.monotonic_ns() + 320 * MS)
     own = [one.pid for one in guardians.processes]
@@ -54,8 +52,7 @@ def main() -> None:
     for line in sys.stdin:
         if line == "raise\n":
             raise ValueError("something that nobody foresaw")
-        real_time = isinstance(servers, Freezer) and servers.real_time()
-        answer(str(real_time if line == "real time\n" else servers.failure()))
+        answer(str(servers.failure()))
     servers.release()
     assert undo_run(journal, by_owner=True) == ()
     guardians.end()

@@ -12,16 +12,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from applied_plans import Governed, needs_fifo, node_to_govern
-from gated import CORE, MS, ahead_of_others, cpu_ns, groups_left, kill, needs_cgroups
-from processes import children_of, wait_for
+from gated import CORE, ahead_of_others, cpu_ns, groups_left, kill, needs_cgroups
+from processes import wait_for
 
-from chainshaper.enforcement.freezer_state import open_page, run_of
+from chainshaper.enforcement.freezer import CounterPage, run_of
 from chainshaper.enforcement.guardian import GROUP, let_go
 from chainshaper.enforcement.undoing import undo_run
 from chainshaper.linux.cgroups import cgroup_of, mount_options, mount_point
@@ -183,19 +183,9 @@ def test_what_loses_guardians_only_goes_on_being_served(
     with run_on(node) as run:
         for pid in run.pids(name):
             kill(pid, number)
-        time.sleep(1)
+        time.sleep(0.6)
         assert run.is_frozen()
         assert run.ask("failure") == "None"
-
-
-def test_a_release_restores_everything(node: Governed) -> None:
-    with run_on(node) as run:
-        assert run.ask("failure") == "None"
-        assert run.owner.stdin is not None
-        run.owner.stdin.close()
-        assert run.owner.wait(timeout=30) == 0
-        assert list(run.runs.iterdir()) == []
-        run.wait_until_restored()
 
 
 def test_an_owner_that_raises_leaves_nothing(node: Governed) -> None:
@@ -203,16 +193,6 @@ def test_an_owner_that_raises_leaves_nothing(node: Governed) -> None:
         assert run.ask("raise") == ""
         assert run.owner.wait(timeout=20) == 1
         run.wait_until_restored()
-
-
-@pytest.mark.parametrize(
-    ("number", "reason"), [(KILL, "was killed by SIGKILL"), (STOP, "hung, or was stopped")]
-)
-def test_a_lost_dispatcher_is_named(node: Governed, number: signal.Signals, reason: str) -> None:
-    with run_on(node) as run:
-        kill(run.dispatchers[0], number)
-        wait_for(lambda: run.ask("failure") != "None", "the failure")
-        assert f"dispatcher of core {CORE} {reason}" in run.ask("failure")
 
 
 def test_a_dispatcher_that_is_asked_to_end_thaws_first(node: Governed) -> None:
@@ -249,33 +229,9 @@ def test_threads_that_a_guardian_lets_go_when_the_dispatcher_is_back_are_closed_
         (journal,) = find_journals(run.runs)
         freezer = run_of(journal)
         assert freezer is not None
-        let_go(journal, open_page(freezer.page, freezer.table), CORE)  # as the slower of two may
+        let_go(journal, CounterPage(freezer.page, freezer.table), CORE)  # as the slower of two may
         wait_for(run.is_frozen, "it to be closed again")
         assert run.ask("failure") == "None"
-
-
-def test_an_owner_that_is_stopped_goes_on_being_served(node: Governed) -> None:
-    with run_on(node) as run:
-        kill(run.owner.pid, STOP)
-        time.sleep(1)
-        assert run.is_frozen()
-        kill(run.owner.pid, signal.SIGCONT)
-        assert run.ask("failure") == "None"
-
-
-def test_what_is_left_when_all_are_killed_at_once_can_be_undone(node: Governed) -> None:
-    with run_on(node) as run:
-        ours = [run.owner.pid, *run.guardians, *run.dispatchers]
-        for number in (STOP, KILL):  # each is stopped before it sees another die
-            for pid in ours:
-                kill(pid, number)
-        run.owner.wait()
-        wait_for(lambda: not any(map(alive, ours)), "their end")
-        assert run.is_frozen()
-        (journal,) = find_journals(run.runs)
-        assert undo_run(journal) == ()
-        run.wait_until_restored()
-        assert undo_run(journal) == (), "once more does no harm"
 
 
 def test_guardians_are_out_of_reach_of_what_befalls_the_owner(node: Governed) -> None:
@@ -294,44 +250,11 @@ def test_guardians_are_out_of_reach_of_what_befalls_the_owner(node: Governed) ->
         assert run.ask("failure") == "None"
 
 
-def test_a_process_that_is_killed_while_frozen_is_no_failure(tmp_path: Path) -> None:
-    with node_to_govern(tmp_path) as node, run_on(node) as run:
-        node.process.kill()
-        node.process.wait(timeout=20)
-        assert run.ask("failure") == "None"
-        assert run.owner.stdin is not None
-        run.owner.stdin.close()
-        assert run.owner.wait(timeout=20) == 0
-        assert groups_left(run.owner.pid) == []
-
-
 @pytest.mark.parametrize("victim", ["owner", "dispatcher"])
 def test_killed_at_any_moment_of_a_cycle_they_leave_nothing(node: Governed, victim: str) -> None:
     chance = random.Random(victim)
-    for _ in range(4):
+    for _ in range(2):
         with run_on(node, cycle_ms=20, slot_ms=8) as run:
             time.sleep(chance.uniform(0, 0.1))
             kill(run.pids(victim)[0])
             run.wait_until_restored()
-
-
-def test_killed_while_the_servers_are_made_the_owner_leaves_nothing(node: Governed) -> None:
-    chance = random.Random(7)
-    for attempt in range(8):
-        runs = node.folder / str(attempt)
-        with ExitStack() as stack:
-            arguments = ("freezer", runs, CORE, MINUTE, 2, node.pid)
-            owner = stack.enter_context(owner_of(node.folder, *arguments))
-            time.sleep(chance.uniform(0.1, 1.2))
-            children = children_of(owner.pid)
-            kill(owner.pid)
-            owner.wait()
-        wait_for(lambda: not any(map(alive, children)), "our processes to end")  # noqa: B023
-        # Killed between opening its journal and starting guardians, it has changed nothing.
-        for journal in find_journals(runs):
-            assert not journal.entries("scheduling")
-            assert undo_run(journal) == ()
-        assert groups_left(owner.pid) == []
-        assert cgroup_of(node.pid) == node.cgroup
-    ran = cpu_ns(node.pid)
-    wait_for(lambda: cpu_ns(node.pid) > ran + MS, "the node to run")

@@ -46,156 +46,106 @@ def _process(
 ) -> Process:
     """A process whose threads get the ids behind its own; in a container ids start from 1."""
     inner = pid if inner_pid is None else inner_pid
-    threads = tuple(
-        Thread(
-            tid=pid + index,
-            pid=pid,
-            comm=name,
-            role=role_of(name, is_main=index == 0),
-            policy="SCHED_OTHER",
-            priority=0,
-            cores=(0, 1),
-            started=10,
-            inner_tid=inner + index,
-            kind=None if index == 0 else dds_kind(name),
-        )
-        for index, name in enumerate(("main", *names))
-    )
-    return Process(
-        pid=pid,
-        parent=parent,
-        command=tuple(command.split()),
-        inner_pid=inner,
-        participates=participates,
-        threads=threads,
-    )
+    threads = []
+    for index, name in enumerate(("main", *names)):
+        role, kind = role_of(name, is_main=index == 0), None if index == 0 else dds_kind(name)
+        thread = Thread(pid + index, pid, name, role, "SCHED_OTHER", 0, (0, 1), 10)
+        threads.append(replace(thread, inner_tid=inner + index, kind=kind))
+    return Process(pid, parent, tuple(command.split()), inner, participates, tuple(threads))
 
 
 def _seen(pid: int, nodes: tuple[str, ...], *threads: RecordedThread) -> RecordedProcess:
     return RecordedProcess(pid, nodes, threads, seen_ns=time.monotonic_ns())
 
 
-def _roles(allocation: Allocation) -> list[tuple[str, str, str]]:
-    return [(t.thread.comm, t.thread.role, t.known_by) for t in allocation.threads]
+X = "talker --ros-args -r __node:=x"
+BOX = ("/c", "/a", "/b")
+RAN_A = RecordedThread(101, "executor", ("/a",))
+RAN_BOTH = RecordedThread(102, "executor", ("/a", "/b"))
+SENT = RecordedThread(103, "publisher", ())
+OTHERS = _seen(100, ("/other",), RecordedThread(101, "executor", ("/other",)))
+ENDED_BEFORE = RecordedProcess(100, ("/x",), (RecordedThread(101, "executor", ("/x",)),), 0)
+EARLIER = [_seen(31, ("/d", "/e")), _seen(30, BOX, RecordedThread(30, "executor", ("/a",)))]
 
 
-def test_a_named_node_executes_on_its_main_thread() -> None:
-    found = allocate([_process(100, "talker --ros-args -r __node:=x -r __ns:=/y", "recv", "pool")])
-    assert _roles(found) == [
-        ("main", "executor", "main thread"),
-        ("recv", "dds", "name"),
-        ("pool", "unknown", ""),
-    ]
-    assert {t.nodes for t in found.threads} == {("/y/x",)}
-    assert {t.nodes_known_by for t in found.threads} == {"command line"}
-    assert found.notes == ()
+@pytest.mark.parametrize(
+    ("process", "recorded", "expected", "known_by"),
+    [
+        (_process(1, X, "recv", "pool"), [], "executor/main dds/name unknown/", "command line"),
+        (_process(1, "/opt/lib/talker"), [], "executor/main", "program's name"),
+        (_process(1, "/bin/bash", participates=False), [], "unknown/", ""),
+        # Fast DDS before 2.13 names no threads.
+        (_process(1, X, "talker", "talker"), [], "executor/main unknown/ unknown/", "command line"),
+        # A recording knows executors and publishers without names; main ran no callback.
+        (
+            _process(100, "container --ros-args -r __node:=c", *["container"] * 4),
+            [_seen(100, BOX, RAN_A, RAN_BOTH, SENT)],
+            "unknown/ executor/recording executor/recording publisher/recording unknown/",
+            "recording",
+        ),
+        # In a container a recording counts in the container's own ids.
+        (
+            _process(9000, "talker", "talker", inner_pid=100),
+            [_seen(100, ("/a",), RAN_A)],
+            "unknown/ executor/recording",
+            "recording",
+        ),
+        # It says nothing about another process with that id.
+        (
+            _process(100, X, "recv"),
+            [OTHERS, ENDED_BEFORE],
+            "executor/main dds/name",
+            "command line",
+        ),
+        # An earlier run tells what a container's components are.
+        (_process(70, "box --ros-args -r __node:=c"), EARLIER, "executor/main", "recording"),
+    ],
+)
+def test_what_each_thread_of_a_process_does(
+    process: Process, recorded: list[RecordedProcess], expected: str, known_by: str
+) -> None:
+    found = allocate([process], recorded)
+    roles = [f"{t.thread.role}/{t.known_by.removesuffix(' thread')}" for t in found.threads]
+    assert roles == expected.split()
+    assert {t.nodes_known_by for t in found.threads} == {known_by}
+    guess = "process 1 is called /talker after its program, which is a guess"
+    assert [guess in note for note in found.notes] == [True] * (known_by == "program's name")
 
 
-def test_a_name_guessed_from_the_program_is_said_to_be_a_guess() -> None:
-    found = allocate([_process(100, "/opt/lib/talker", "recv")])
-    assert found.threads[0].nodes == ("/talker",)
-    assert found.threads[0].nodes_known_by == "program's name"
-    assert "process 100 is called /talker after its program, which is a guess" in found.notes[0]
+def test_the_nodes_of_a_process_and_of_its_threads() -> None:
+    def nodes_of(process: Process, *recorded: RecordedProcess) -> list[tuple[str, ...]]:
+        return [one.nodes for one in allocate([process], recorded).threads]
+
+    assert nodes_of(_process(1, f"{X} -r __ns:=/y", "recv")) == [("/y/x",)] * 2
+    assert nodes_of(_process(1, "two --ros-args -r a:__node:=x -r b:__node:=y")) == [("/x", "/y")]
+    assert nodes_of(_process(70, "box --ros-args -r __node:=c"), *EARLIER) == [BOX]
+    assert nodes_of(_process(1, "/bin/bash", participates=False)) == [()]
+    seen = _seen(100, BOX, RAN_A, RAN_BOTH)
+    assert nodes_of(_process(100, "c", "c", "c"), seen) == [BOX, ("/a",), ("/a", "/b")]
 
 
-def test_a_process_without_ros_or_dds_executes_nothing() -> None:
-    found = allocate([_process(100, "/bin/bash", participates=False)])
-    assert _roles(found) == [("main", "unknown", "")]
-    assert found.threads[0].nodes == ()
-    assert found.notes == ()
+RUN = _process(50, f"ros2 run p {X}", participates=False)
+NODE = _process(100, X, "recv", parent=50)
+SUDO = _process(50, f"sudo {X}", participates=False)
+TASKSET = _process(60, f"taskset {X}", participates=False, parent=50)
+INNERMOST = _process(70, X, participates=False, parent=60)
 
 
-def test_unnamed_fast_dds_threads_stay_unknown() -> None:
-    """Fast DDS before 2.13: all threads carry the process's name."""
-    found = allocate([_process(100, "talker --ros-args -r __node:=x", *["talker"] * 6)])
-    assert [role for _, role, _ in _roles(found)] == ["executor", *["unknown"] * 6]
-
-
-def test_a_recording_tells_executors_and_publishers_without_names() -> None:
-    process = _process(100, "container --ros-args -r __node:=c", *["container"] * 4)
-    seen = _seen(
-        100,
-        ("/c", "/a", "/b"),
-        RecordedThread(101, "executor", ("/a",)),
-        RecordedThread(102, "executor", ("/a", "/b")),
-        RecordedThread(103, "publisher", ()),
-    )
-    found = allocate([process], [seen])
-    assert [(t.thread.tid, t.thread.role, t.nodes, t.known_by) for t in found.threads] == [
-        (100, "unknown", ("/c", "/a", "/b"), ""),  # it ran no callback, others did
-        (101, "executor", ("/a",), "recording"),
-        (102, "executor", ("/a", "/b"), "recording"),
-        (103, "publisher", ("/c", "/a", "/b"), "recording"),
-        (104, "unknown", ("/c", "/a", "/b"), ""),
-    ]
-    assert {t.nodes_known_by for t in found.threads} == {"recording"}
-
-
-def test_a_recording_in_a_container_counts_in_its_own_ids() -> None:
-    process = _process(9000, "talker", "talker", inner_pid=7)
-    found = allocate([process], [_seen(7, ("/a",), RecordedThread(8, "executor", ("/a",)))])
-    assert [(t.thread.tid, t.thread.role) for t in found.threads] == [
-        (9000, "unknown"),
-        (9001, "executor"),
-    ]
-
-
-def test_a_recording_of_another_process_with_that_id_says_nothing() -> None:
-    process = _process(100, "talker --ros-args -r __node:=x", "recv")
-    other_name = _seen(100, ("/other",), RecordedThread(101, "executor", ("/other",)))
-    ended_before = RecordedProcess(100, ("/x",), (RecordedThread(101, "executor", ("/x",)),), 0)
-    for seen in (other_name, ended_before):
-        found = allocate([process], [seen])
-        assert found.threads[0].nodes == ("/x",)
-        assert found.threads[0].nodes_known_by == "command line"
-        assert found.threads[1].thread.role == "dds"
-
-
-def test_an_earlier_run_tells_what_a_containers_components_are() -> None:
-    container = _process(70, "container --ros-args -r __node:=box", *CYCLONE)
-    earlier = _seen(30, ("/box", "/first", "/second"), RecordedThread(30, "executor", ("/first",)))
-    found = allocate([container], [earlier]).threads
-    assert found[0].nodes == ("/box", "/first", "/second")
-    assert (found[0].thread.role, found[0].nodes_known_by) == ("executor", "recording")
-    stranger = _seen(31, ("/other", "/third"))
-    assert allocate([container], [stranger]).threads[0].nodes == ("/box",)
-
-
-def test_two_processes_with_one_name_are_a_note_and_nobody_is_chosen() -> None:
-    line = "talker --ros-args -r __node:=x"
-    found = allocate([_process(100, line, "recv"), _process(200, line, "recv")])
-    assert [t.nodes for t in found.threads] == [("/x",)] * 4
-    assert "node /x is ambiguous: processes 100, 200 all have it" in found.notes[0]
-
-
-def test_what_runs_a_node_is_not_the_node() -> None:
-    """`ros2 run` and its child have the same arguments; the child takes part in DDS."""
-    runner = _process(50, "python3 ros2 run p talker --ros-args -r __node:=x", participates=False)
-    node = _process(100, "talker --ros-args -r __node:=x", "recv", parent=50)
-    found = allocate([runner, node])
-    assert {t.thread.pid for t in found.threads if "/x" in t.nodes} == {100}
-    assert found.notes == ()
-
-
-def test_of_those_that_do_not_take_part_yet_the_innermost_is_the_node() -> None:
-    line = "--ros-args -r __node:=x"
-    outer = _process(50, f"sudo talker {line}", participates=False)
-    middle = _process(60, f"taskset talker {line}", participates=False, parent=50)
-    node = _process(70, f"talker {line}", participates=False, parent=60)
-    found = allocate([outer, middle, node])
-    assert {t.thread.pid for t in found.threads if "/x" in t.nodes} == {70}
-
-
-def test_who_runs_whom_is_seen_also_outside_the_processes_asked_for() -> None:
-    runner = _process(50, "ros2 run --ros-args -r __node:=x", participates=False)
-    node = _process(100, "talker --ros-args -r __node:=x", "recv", parent=50)
-    found = allocate([runner], among=[runner, node])
-    assert [(t.thread.pid, t.nodes) for t in found.threads] == [(50, ())]
-
-
-def test_several_nodes_of_one_process_share_its_threads() -> None:
-    found = allocate([_process(100, "two --ros-args -r a:__node:=x -r b:__node:=y", "recv")])
-    assert {t.nodes for t in found.threads} == {("/x", "/y")}
+@pytest.mark.parametrize(
+    ("processes", "nodes"),
+    [
+        ([RUN, NODE], {100}),  # the child takes part in DDS
+        ([SUDO, TASKSET, INNERMOST], {70}),  # none takes part yet
+        ([_process(100, X), _process(200, X)], {100, 200}),
+    ],
+)
+def test_which_of_several_processes_is_the_node(processes: list[Process], nodes: set[int]) -> None:
+    found = allocate(processes)
+    assert {t.thread.pid for t in found.threads if "/x" in t.nodes} == nodes
+    ambiguous = ["node /x is ambiguous: processes 100, 200" in note for note in found.notes]
+    assert ambiguous == [True] * (len(nodes) > 1)
+    # Who runs whom counts also outside the processes that are asked for.
+    assert bool(allocate(processes[:1], among=processes).threads[0].nodes) == (len(nodes) > 1)
 
 
 def test_threads_that_appear_and_end_are_found_by_looking_again(tmp_path: Path) -> None:
@@ -221,20 +171,10 @@ def test_threads_that_appear_and_end_are_found_by_looking_again(tmp_path: Path) 
 def test_an_id_that_is_used_again_is_another_thread() -> None:
     """Ids alone would say that nothing has changed."""
     before = allocate([_process(100, "talker", "recv")])
-    reborn = [
-        t
-        if t.thread.tid == 100
-        else NodeThread(
-            thread=Thread(**{**vars(t.thread), "started": 99}),
-            nodes=t.nodes,
-            known_by=t.known_by,
-            nodes_known_by=t.nodes_known_by,
-        )
-        for t in before.threads
-    ]
-    new, ended = new_and_ended(before, Allocation(tuple(reborn), ()))
-    assert [t.thread.tid for t in new] == [101]
-    assert [t.thread.tid for t in ended] == [101]
+    main, recv = before.threads
+    reborn = replace(recv, thread=replace(recv.thread, started=99))
+    new, ended = new_and_ended(before, Allocation((main, reborn), ()))
+    assert ([t.thread.tid for t in new], [t.thread.tid for t in ended]) == ([101], [101])
 
 
 @pytest.mark.parametrize("started_later", [False, True])
@@ -273,16 +213,7 @@ def _node(
     name: str, pid: int, *roles: ThreadRole, cores: tuple[int, ...] = (0, 1)
 ) -> list[NodeThread]:
     threads = [
-        Thread(
-            tid=pid + index,
-            pid=pid,
-            comm=role,
-            role=role,
-            policy="SCHED_OTHER",
-            priority=0,
-            cores=cores,
-            started=1,
-        )
+        Thread(pid + index, pid, role, role, "SCHED_OTHER", 0, cores, 1)
         for index, role in enumerate(roles)
     ]
     return [NodeThread(thread, (name,), "name", "command line") for thread in threads]
@@ -373,14 +304,6 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
     assert set(_by_tid(plan_scheduling(alone, allocation, (0, 1)))) == {100, 200}
 
 
-def test_several_threads_of_a_server_take_turns() -> None:
-    plan = _plan(_server("chain", EXECUTOR_A, EXECUTOR_B))
-    allocation = _allocation(_node("/a", 100, "executor", "executor"), _node("/b", 200, "executor"))
-    assert set(_by_tid(plan_scheduling(plan, allocation, (0, 1))).values()) == {
-        Scheduling(87, (1,), takes_turns=True)
-    }
-
-
 def test_an_asynchronous_publisher_stands_below_its_siblings_on_its_core() -> None:
     plan = _plan(
         _server("chain", EXECUTOR_A, EXECUTOR_B, priority=2),
@@ -400,20 +323,19 @@ def test_an_asynchronous_publisher_stands_below_its_siblings_on_its_core() -> No
     assert wanted[203] == Scheduling(None, (0,)), "it would be outranked on core 1"
 
 
-def test_a_publisher_on_a_core_of_its_own_keeps_its_servers_priority() -> None:
-    plan = _plan(
-        _server("chain", EXECUTOR_B, priority=2, core=1),
-        _server("output", PUBLISHER_B, priority=1, core=2),
-    )
+def test_several_threads_of_a_server_take_turns() -> None:
+    plan = _plan(_server("chain", EXECUTOR_A, EXECUTOR_B))
+    allocation = _allocation(_node("/a", 100, "executor", "executor"), _node("/b", 200, "executor"))
+    assert set(_by_tid(plan_scheduling(plan, allocation, (0, 1))).values()) == {
+        Scheduling(87, (1,), takes_turns=True)
+    }
+
+
+def test_a_publisher_on_a_core_of_its_own_has_its_servers_priority() -> None:
+    output = _server("output", PUBLISHER_B, priority=1, core=2)
+    plan = _plan(_server("chain", EXECUTOR_B, priority=2, core=1), output)
     allocation = _allocation(_node("/b", 200, "executor", "publisher"))
     assert _by_tid(plan_scheduling(plan, allocation, (0, 1, 2)))[201] == Scheduling(87, (2,))
-
-
-def test_a_sibling_that_cannot_leave_the_publishers_core_is_named() -> None:
-    plan = _plan(_server("output", PUBLISHER_B))
-    allocation = _allocation(_node("/b", 200, "executor", "publisher", "unknown", cores=(1,)))
-    with pytest.raises(OperationError, match=r"thread 200 \(executor\).*core 1 only.*taskset"):
-        plan_scheduling(plan, allocation, (0, 1))
 
 
 def test_without_a_free_core_dds_threads_stay_where_they_are_but_above() -> None:
@@ -422,33 +344,31 @@ def test_without_a_free_core_dds_threads_stay_where_they_are_but_above() -> None
     assert _by_tid(plan_scheduling(plan, allocation, (0, 1)))[101] == Scheduling(90, None)
 
 
-def test_a_node_that_is_not_running_is_named_with_those_that_are() -> None:
-    allocation = _allocation(_node("/other", 100, "executor"))
-    with pytest.raises(OperationError, match=r"/a of the plan is not running.*running: /other"):
-        server_members(_plan(_server("chain", EXECUTOR_A)), allocation)
-    with pytest.raises(OperationError, match="running: no node"):
-        server_members(_plan(_server("chain", EXECUTOR_A)), _allocation())
+ALONE = _node("/b", 200, "executor", "publisher", "unknown", cores=(1,))
+UNKNOWN = _node("/b", 200, "executor", "unknown")
+OTHER = _node("/other", 100, "executor")
+TWICE = [*_node("/a", 100, "executor"), *_node("/a", 200, "executor")]
 
 
-def test_a_publisher_that_is_not_recognised_is_named_with_how_to_look() -> None:
-    plan = _plan(_server("output", PUBLISHER_B))
-    allocation = _allocation(_node("/b", 200, "executor", "unknown"))
-    with pytest.raises(OperationError, match=r"process 200 .* asynchronous publisher.*threads 200"):
-        server_members(plan, allocation)
-
-
-def test_of_two_processes_that_are_one_node_none_is_chosen() -> None:
-    plan = _plan(_server("chain", EXECUTOR_A))
-    allocation = _allocation(_node("/a", 100, "executor"), _node("/a", 200, "executor"))
-    with pytest.raises(OperationError, match="/a is ambiguous: processes 100, 200 all have it"):
-        server_members(plan, allocation)
+@pytest.mark.parametrize(
+    ("planned", "threads", "reason"),
+    [
+        (PUBLISHER_B, ALONE, r"thread 200 \(executor\).*core 1 only.*taskset"),
+        (EXECUTOR_A, OTHER, "/a of the plan is not running.*running: /other"),
+        (EXECUTOR_A, [], "running: no node"),
+        (PUBLISHER_B, UNKNOWN, "process 200 .* asynchronous publisher.*threads 200"),
+        (EXECUTOR_A, TWICE, "/a is ambiguous: processes 100, 200 all have it"),
+    ],
+)
+def test_what_cannot_be_planned_is_named_with_the_remedy(
+    planned: PlannedThread, threads: list[NodeThread], reason: str
+) -> None:
+    with pytest.raises(OperationError, match=reason):
+        plan_scheduling(_plan(_server("server", planned)), _allocation(threads), (0, 1))
 
 
 def test_nodes_that_share_an_executor_are_one_thread_of_one_server() -> None:
-    shared = [
-        NodeThread(one.thread, ("/a", "/b"), one.known_by, one.nodes_known_by)
-        for one in _node("/a", 100, "executor")
-    ]
+    shared = [replace(one, nodes=("/a", "/b")) for one in _node("/a", 100, "executor")]
     together = _plan(_server("chain", EXECUTOR_A, EXECUTOR_B))
     assert _by_tid(plan_scheduling(together, _allocation(shared), (0, 1))) == {
         100: Scheduling(87, (1,))
@@ -522,12 +442,3 @@ def test_whatever_the_plan_the_order_of_priorities_holds(
                 assert new.priority is not None
                 assert one.wanted.priority is not None
                 assert one.wanted.priority < new.priority
-
-
-def test_reasons_are_given_for_every_wish() -> None:
-    plan = _plan(_server("chain", EXECUTOR_A))
-    wanted = plan_scheduling(plan, _allocation(_node("/a", 100, "executor", "dds")), (0, 1))
-    assert [one.reason for one in wanted] == [
-        "server priority 2",
-        "DDS threads deliver for the servers",
-    ]

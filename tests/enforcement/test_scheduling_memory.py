@@ -15,12 +15,10 @@ from actors import Actor, acting
 from processes import wait_for
 
 from chainshaper.enforcement.scheduling_memory import (
-    Outcome,
     change_all,
     look_alikes,
     note_descendants,
-    restore_inherited,
-    restore_scheduling,
+    release_threads,
 )
 from chainshaper.linux import runs as journal_module
 from chainshaper.linux.runs import Journal, find_journals, open_journal
@@ -48,10 +46,6 @@ def journal(tmp_path: Path) -> Journal:
     return open_journal(tmp_path / "journals", "run")
 
 
-def _fates(outcomes: tuple[Outcome, ...]) -> dict[str, str]:
-    return {outcome.comm: outcome.fate for outcome in outcomes}
-
-
 def _states(actor: Actor) -> dict[str, SchedulingState]:
     return {name: state_of(tid) for name, tid in actor.tids.items()}
 
@@ -67,10 +61,9 @@ def test_class_and_cores_are_changed_and_put_back(tmp_path: Path, journal: Journ
         assert (a.scheduling_class.policy, a.scheduling_class.priority) == (os.SCHED_FIFO, 30)
         assert (b.scheduling_class.policy, b.scheduling_class.priority) == (os.SCHED_RR, 31)
         assert (a.cores, b.cores) == ((LAST,), (FIRST,))
-        assert _fates(restore_scheduling(journal)) == {"a": "restored", "b": "restored"}
-        assert _states(actor) == before
-        assert _fates(restore_scheduling(journal)) == {"a": "unchanged", "b": "unchanged"}
-        assert _states(actor) == before
+        for _ in range(2):
+            release_threads(journal)
+            assert _states(actor) == before
 
 
 def test_several_changes_go_back_to_what_was_there_at_first(
@@ -80,7 +73,7 @@ def test_several_changes_go_back_to_what_was_there_at_first(
         before = _states(actor)
         for wanted in (WANTED, Scheduling(None, (FIRST,)), Scheduling(12, None)):
             change_all(journal, [(actor.thread("a"), wanted)])
-        restore_scheduling(journal)
+        release_threads(journal)
         assert _states(actor) == before
 
 
@@ -90,9 +83,7 @@ def test_what_somebody_else_has_changed_since_is_theirs(tmp_path: Path, journal:
         before = state_of(tid)
         change_all(journal, [(actor.thread("a"), WANTED)])
         os.sched_setscheduler(tid, os.SCHED_RR, os.sched_param(5))
-        (outcome,) = restore_scheduling(journal)
-        assert outcome.fate == "left"
-        assert "another program has changed it since: SCHED_RR 5" in outcome.reason
+        release_threads(journal)
         now = state_of(tid)
         assert now.scheduling_class.policy == os.SCHED_RR
         assert now.cores == before.cores, "the cores were ours still"
@@ -106,22 +97,23 @@ def test_what_somebody_else_set_between_two_changes_is_what_was_there(
         change_all(journal, [(actor.thread("a"), WANTED)])
         os.sched_setscheduler(tid, os.SCHED_RR, os.sched_param(5))
         change_all(journal, [(actor.thread("a"), Scheduling(40, None))])
-        assert _fates(restore_scheduling(journal)) == {"a": "restored"}
-        held = state_of(tid).scheduling_class
-        assert (held.policy, held.priority) == (os.SCHED_RR, 5)
+        release_threads(journal)
+        now = state_of(tid).scheduling_class
+        assert (now.policy, now.priority) == (os.SCHED_RR, 5)
 
 
 def test_threads_and_processes_that_have_ended_are_no_error(
     tmp_path: Path, journal: Journal
 ) -> None:
     with acting(tmp_path, "a", "b") as actor:
-        ended = actor.thread("a")
+        ended, before = actor.thread("a"), state_of(actor.tids["b"])
         change_all(journal, [(ended, WANTED)])
         change_all(journal, [(actor.thread("b"), WANTED)])
         actor.end("a")
         change_all(journal, [(ended, WANTED)])
-        assert _fates(restore_scheduling(journal)) == {"a": "ended", "b": "restored"}
-    assert _fates(restore_scheduling(journal)) == {"a": "ended", "b": "ended"}
+        release_threads(journal)
+        assert state_of(actor.tids["b"]) == before
+    release_threads(journal)
 
 
 def test_a_thread_that_got_the_id_of_one_that_ended_is_not_touched(
@@ -133,11 +125,9 @@ def test_a_thread_that_got_the_id_of_one_that_ended_is_not_touched(
         started = actor.thread("a").started
         journal.path.write_text(text.replace(f'"started": {started}', f'"started": {started - 1}'))
         changed = state_of(actor.tids["a"])
-        (outcome,) = [one for one in restore_scheduling(journal) if one.comm == "a"][:1]
-        assert outcome.fate == "ended"
+        release_threads(journal)
+        assert state_of(actor.tids["a"]) == changed
         journal.path.write_text(text)
-        assert changed.scheduling_class.priority == 30
-        assert _fates(restore_scheduling(journal))["a"] in ("restored", "unchanged")
 
 
 def test_what_threads_inherited_goes_back_to_what_their_parents_had(
@@ -153,14 +143,10 @@ def test_what_threads_inherited_goes_back_to_what_their_parents_had(
         child = actor.fork()
         for tid in (actor.tids["late"], child):
             assert state_of(tid).scheduling_class.priority == 30, "the kernel lets it inherit"
-        assert {one.tid for one in restore_inherited(journal)} == {actor.tids["late"], child}
-        for tid in (actor.tids["late"], child):
+        release_threads(journal)
+        for tid in (actor.tids["late"], child, actor.pid):
             assert state_of(tid) == before
-        assert state_of(actor.pid).scheduling_class.priority == 30, "what we set stays"
         assert state_of(actor.tids["early"]) == early
-        assert restore_inherited(journal) == ()
-        restore_scheduling(journal)
-        assert state_of(actor.pid) == before
 
 
 def test_a_thread_that_is_changed_after_it_inherited_gets_its_parents_original(
@@ -173,7 +159,7 @@ def test_a_thread_that_is_changed_after_it_inherited_gets_its_parents_original(
         time.sleep(0.05)
         actor.begin("late")
         change_all(journal, [(actor.thread("late"), Scheduling(29, (FIRST,)))])
-        assert set(_fates(restore_scheduling(journal)).values()) == {"restored"}
+        release_threads(journal)
         assert state_of(actor.tids["late"]) == before
 
 
@@ -183,7 +169,7 @@ def test_a_new_thread_of_a_class_of_its_own_is_left_alone(tmp_path: Path, journa
         time.sleep(0.05)
         tid = actor.begin("late")
         os.sched_setscheduler(tid, os.SCHED_FIFO, os.sched_param(3))
-        restore_scheduling(journal)
+        release_threads(journal)
         assert state_of(tid).scheduling_class.priority == 3
 
 
@@ -222,8 +208,7 @@ def test_killed_at_any_moment_it_leaves_nothing_that_cannot_be_put_back(tmp_path
             applier.communicate()
             (journal,) = find_journals(folder)
             assert journal.owner is None
-            outcomes = restore_scheduling(journal)
-            assert set(_fates(outcomes).values()) <= {"restored", "unchanged"}
+            release_threads(journal)
             assert _states(actor) == before, f"attempt {attempt}"
 
 
@@ -248,7 +233,9 @@ def test_what_the_kernel_refuses_names_the_thread_and_what_was_wanted(
             change_all(journal, [(actor.thread("a"), Scheduling(500, None))])
         with pytest.raises(OperationError, match=r"cores 1023: Invalid argument"):
             change_all(journal, [(actor.thread("a"), Scheduling(None, (1023,)))])
-        assert _fates(restore_scheduling(journal)) == {"a": "unchanged"}
+        before = _states(actor)
+        release_threads(journal)
+        assert _states(actor) == before
 
 
 def test_after_a_boot_nothing_is_touched(
@@ -258,8 +245,7 @@ def test_after_a_boot_nothing_is_touched(
         change_all(journal, [(actor.thread("a"), WANTED)])
         with monkeypatch.context() as another_boot:
             another_boot.setattr(journal_module, "boot_id", lambda: "another")
-            assert restore_scheduling(journal) == ()
-            assert restore_inherited(journal) == ()
+            release_threads(journal)
         assert state_of(actor.tids["a"]).scheduling_class.priority == 30
 
 
@@ -279,12 +265,12 @@ def test_sched_deadline_is_refused_and_stays(tmp_path: Path, journal: Journal) -
         with pytest.raises(OperationError, match=r"\(a\).* runs under SCHED_DEADLINE.*chrt"):
             change_all(journal, [(actor.thread("a"), WANTED)])
         assert state_of(actor.tids["a"]).scheduling_class.policy == 6
-        assert restore_scheduling(journal) == ()
+        release_threads(journal)
         # Somebody may also give it to a thread that we have changed.
         os.sched_setscheduler(actor.tids["a"], os.SCHED_OTHER, os.sched_param(0))
         change_all(journal, [(actor.thread("a"), Scheduling(30, None))])
         assert _set_deadline(actor.tids["a"])
-        assert _fates(restore_scheduling(journal)) == {"a": "left"}
+        release_threads(journal)
         assert state_of(actor.tids["a"]).scheduling_class.policy == 6
 
 
@@ -314,7 +300,6 @@ def test_many_threads_are_written_down_at_once_and_again_only_when_they_change(
         assert len(written) == 1
         change_all(journal, wanted)
         assert len(written) == 1
-        assert len(restore_scheduling(journal)) == 21
 
 
 def test_a_descendant_is_known_by_what_was_written_down_when_its_parent_has_ended(
@@ -331,10 +316,8 @@ def test_a_descendant_is_known_by_what_was_written_down_when_its_parent_has_ende
         text = journal.path.read_text()
         # As if it had lost its parent: the thread of the journal is another process's.
         journal.path.write_text(text.replace(f'"pid": {actor.pid}, "comm"', '"pid": 1, "comm"'))
-        assert {one.tid for one in restore_inherited(journal)} == {between}
+        release_threads(journal)
         assert state_of(between) == before
-        journal.path.write_text(text)
-        restore_scheduling(journal)
 
 
 def test_a_stranger_with_all_that_we_gave_is_named_and_left(
@@ -350,7 +333,7 @@ def test_a_stranger_with_all_that_we_gave_is_named_and_left(
             set_state(other.pid, state_of(actor.pid), ["scheduling_class", "cores"])  # older
             (named,) = look_alikes(journal)
             assert f"thread {stranger.pid} (sleep) is left as it is: SCHED_FIFO 30" in named
-            restore_scheduling(journal)
+            release_threads(journal)
             assert state_of(stranger.pid).scheduling_class.priority == 30
             assert state_of(other.pid).scheduling_class.priority == 30
             stranger.kill()

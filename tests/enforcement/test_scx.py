@@ -2,8 +2,10 @@
 
 import hashlib
 import os
+import re
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import threading
@@ -11,11 +13,22 @@ import time
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from chainshaper.enforcement.scx import back_end as scx
 from chainshaper.enforcement.scx import libbpf
-from chainshaper.enforcement.scx.back_end import POLICY
-from chainshaper.enforcement.servers import ReservationServer, ServerTable
+from chainshaper.enforcement.scx.back_end import (
+    POLICY,
+    change_word,
+    check_table,
+    number_servers,
+    pack_cores,
+    pack_servers,
+    unpack_counters,
+    unpack_exit,
+)
+from chainshaper.enforcement.servers import ReservationServer, ServerCounters, ServerTable
 from chainshaper.linux.own_processes import what_happened
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
@@ -26,7 +39,7 @@ TABLE = ServerTable(50_000_000, (ReservationServer("A", CORE, 1, ((0, 10_000_000
 
 
 def test_the_compiled_policy_is_up_to_date_with_its_sources() -> None:
-    names = ("kernel_abi.h", "table_abi.h", "table_lookup.h", "table.bpf.c")
+    names = ("kernel_abi.h", "table_abi.h", "table.bpf.c")
     sources = [POLICY.with_name(name) for name in names]
     digest = hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
     assert digest.encode() in POLICY.read_bytes(), "run scripts/build_policy"
@@ -50,35 +63,22 @@ def test_compiling_the_policy_again_gives_the_same_bytes(tmp_path: Path) -> None
     assert made.read_bytes() == POLICY.read_bytes()
 
 
-def test_without_sched_ext_the_remedy_is_a_kernel(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(scx, "SCHED_EXT", tmp_path / "none")
-    assert "CONFIG_SCHED_CLASS_EXT" in (scx.missing() or "")
-    with pytest.raises(PlatformError, match="back end scx: this kernel has no sched_ext"):
-        scx.create(TABLE)
+BPF = 1 << 39 | 1 << 38
 
 
-def machine(monkeypatch: pytest.MonkeyPatch, folder: Path, capabilities: int) -> Path:
-    """A machine with everything, as far as files tell; its sched_ext folder."""
-    sched_ext = folder / "sched_ext"
-    (sched_ext / "root").mkdir(parents=True)
-    (sched_ext / "state").write_text("disabled\n")
-    status = folder / "status"
-    status.write_text(f"Name:\tx\nCapEff:\t{capabilities:016x}\n")
-    monkeypatch.setattr(scx, "SCHED_EXT", sched_ext)
-    monkeypatch.setattr(scx, "STATUS", status)
-    monkeypatch.setattr(scx, "KERNEL_TYPES", status)
+@pytest.fixture
+def machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A machine with everything, as far as files tell."""
+    (tmp_path / "sched_ext" / "root").mkdir(parents=True)
+    (tmp_path / "sched_ext" / "state").write_text("disabled\n")
+    (tmp_path / "status").write_text(f"Name:\tx\nCapEff:\t{BPF:016x}\n")
+    monkeypatch.setattr(scx, "SCHED_EXT", tmp_path / "sched_ext")
+    for name in ("STATUS", "KERNEL_TYPES"):
+        monkeypatch.setattr(scx, name, tmp_path / "status")
     monkeypatch.setattr(scx, "load_libbpf", lambda: None)
     monkeypatch.setattr(scx, "is_realtime_kernel", lambda: False)
-    return sched_ext
-
-
-def test_nothing_is_missing_on_a_machine_that_has_everything(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    machine(monkeypatch, tmp_path, 1 << 39 | 1 << 38)
     assert scx.missing() is None
+    return tmp_path
 
 
 @pytest.mark.parametrize(
@@ -86,68 +86,58 @@ def test_nothing_is_missing_on_a_machine_that_has_everything(
     [(0, "CAP_BPF and CAP_PERFMON:"), (1 << 39, "CAP_PERFMON:"), (1 << 21, None)],
 )
 def test_lacking_capabilities_are_named(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capabilities: int, lacking: str | None
+    machine: Path, capabilities: int, lacking: str | None
 ) -> None:
-    machine(monkeypatch, tmp_path, capabilities)
+    (machine / "status").write_text(f"Name:\tx\nCapEff:\t{capabilities:016x}\n")
     reason = scx.missing()
     assert reason is None if lacking is None else f"lacks {lacking}" in (reason or "")
 
 
-def test_a_real_time_kernel_needs_two_more(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    machine(monkeypatch, tmp_path, 1 << 39 | 1 << 38)
+def test_a_real_time_kernel_needs_two_more(machine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scx, "is_realtime_kernel", lambda: True)
     monkeypatch.setattr(scx, "may_use_fifo", lambda: False)
     monkeypatch.setattr("resource.getrlimit", lambda _: (65536, 65536))
     assert "CAP_SYS_NICE and CAP_IPC_LOCK" in (scx.missing() or "")
 
 
-def test_a_scheduler_that_is_in_force_is_named(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_what_else_a_machine_lacks_is_named_with_the_remedy(
+    machine: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = machine(monkeypatch, tmp_path, 1 << 39 | 1 << 38)
-    (folder / "state").write_text("enabled\n")
-    (folder / "root" / "ops").write_text("scx_lavd\n")
+    (machine / "sched_ext" / "state").write_text("enabled\n")
+    (machine / "sched_ext" / "root" / "ops").write_text("scx_lavd\n")
     assert "scx_lavd is in force" in (scx.missing() or "")
-
-
-def test_a_kernel_without_type_information_is_told(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    machine(monkeypatch, tmp_path, 1 << 39 | 1 << 38)
-    monkeypatch.setattr(scx, "KERNEL_TYPES", tmp_path / "none")
+    monkeypatch.setattr(scx, "KERNEL_TYPES", machine / "none")
     assert "CONFIG_DEBUG_INFO_BTF" in (scx.missing() or "")
+    monkeypatch.setattr(scx, "SCHED_EXT", machine / "none")
+    with pytest.raises(PlatformError, match=r"scx: this kernel has no sched_ext.*SCHED_CLASS_EXT"):
+        scx.create(TABLE)
 
 
-def test_an_absent_libbpf_is_told_with_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
+class Old:
+    """A libbpf of version 1.1."""
+
+    def libbpf_major_version(self) -> int:
+        return 1
+
+    libbpf_minor_version = libbpf_major_version
+
+
+@pytest.mark.parametrize(
+    ("library", "reason"),
+    [(None, "apt install libbpf1"), (Old(), r"is version 1\.1: install libbpf 1\.4 or newer")],
+)
+def test_an_absent_or_old_libbpf_is_named_with_its_package(
+    monkeypatch: pytest.MonkeyPatch, library: object, reason: str
+) -> None:
     monkeypatch.setattr(libbpf, "LIBRARY", "libbpf-that-is-not-there.so.1")
+    if library is not None:
+        monkeypatch.setattr("ctypes.CDLL", lambda *_, **__: library)
     libbpf.load_libbpf.cache_clear()
     try:
-        with pytest.raises(PlatformError, match="apt install libbpf1"):
+        with pytest.raises(PlatformError, match=reason):
             libbpf.load_libbpf()
     finally:
         libbpf.load_libbpf.cache_clear()
-
-
-def test_an_old_libbpf_is_told_with_its_version(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Old:
-        def libbpf_major_version(self) -> int:
-            return 1
-
-        def libbpf_minor_version(self) -> int:
-            return 1
-
-    monkeypatch.setattr("ctypes.CDLL", lambda *_, **__: Old())
-    libbpf.load_libbpf.cache_clear()
-    try:
-        with pytest.raises(PlatformError, match=r"is version 1\.1: install libbpf 1\.4 or newer"):
-            libbpf.load_libbpf()
-    finally:
-        libbpf.load_libbpf.cache_clear()
-
-
-def test_a_wrong_table_is_refused_before_the_machine_is_looked_at() -> None:
-    with pytest.raises(InputError, match="twice"):
-        scx.create(ServerTable(TABLE.cycle_ns, TABLE.servers * 2))
 
 
 def test_a_core_that_is_not_there_is_refused() -> None:
@@ -168,7 +158,7 @@ def test_before_it_is_armed_threads_run_freely_and_release_is_harmless() -> None
 
 
 def test_an_unknown_server_is_refused() -> None:
-    with pytest.raises(InputError, match="server B does not stand in the table"):
+    with pytest.raises(InputError, match="no server is named B: A are"):
         scx.ScxServers(TABLE).assign(os.getpid(), "B")
 
 
@@ -223,3 +213,155 @@ def test_on_this_machine_arming_needs_make_test_kernel() -> None:
     finally:
         servers.release()
     assert scx.scheduler_in_force() is None
+
+
+ABI = POLICY.with_name("table_abi.h")
+MS = 1_000_000
+
+
+def server(
+    name: str = "a", core: int = 0, priority: int = 1, *slots: tuple[int, int]
+) -> ReservationServer:
+    return ReservationServer(name, core, priority, slots or ((10 * MS, 20 * MS),))
+
+
+def table(*servers: ReservationServer) -> ServerTable:
+    return ServerTable(50 * MS, servers)
+
+
+def test_the_layouts_are_those_that_a_c_compiler_makes_of_the_header(tmp_path: Path) -> None:
+    compiler = shutil.which("cc")
+    if compiler is None:
+        pytest.skip("no C compiler to ask: apt install gcc")
+    lines = [
+        "sizeof(struct table_server)",
+        "offsetof(struct table_server, slots)",
+        "sizeof(struct table_slot)",
+        "offsetof(struct table_server, cpu)",
+        "sizeof(struct table_cpu)",
+        "sizeof(struct table_counters)",
+        "sizeof(struct table_exit)",
+        "offsetof(struct table_exit, reason)",
+        "offsetof(struct table_exit, message)",
+        "sizeof(struct table_config)",
+        "sizeof(struct table_wake)",
+        "offsetof(struct table_wake, planning)",
+    ]
+    source = tmp_path / "layout.c"
+    source.write_text(
+        f'#include <stddef.h>\n#include <stdio.h>\n#include "{ABI}"\nint main(void)\n{{\n'
+        + "".join(f'\tprintf("%zu\\n", (size_t){line});\n' for line in lines)
+        + "\treturn 0;\n}\n"
+    )
+    program = tmp_path / "layout"
+    subprocess.run([compiler, "-o", program, source], check=True)
+    found = subprocess.run([program], check=True, capture_output=True, text=True).stdout.split()
+    assert [int(number) for number in found] == [
+        scx.SERVER.size + scx.MAX_SLOTS * scx.SLOT.size,
+        scx.SERVER.size,
+        scx.SLOT.size,
+        24,
+        scx.CORE.size,
+        scx.COUNTERS.size,
+        scx.EXIT.size,
+        16,
+        80,
+        scx.CONFIG.size,
+        scx.WAKE.size,
+        scx.INSTANT.size,
+    ]
+
+
+def test_the_limits_are_those_of_the_header() -> None:
+    text = ABI.read_text()
+    for name, value in {
+        "TABLE_MAX_SERVERS": scx.MAX_SERVERS,
+        "TABLE_MAX_SLOTS": scx.MAX_SLOTS,
+        "TABLE_MAX_SERVERS_PER_CPU": scx.MAX_SERVERS_PER_CORE,
+        "TABLE_MAX_CPUS": scx.MAX_CORES,
+    }.items():
+        assert re.search(rf"#define {name} (\d+)", text)[1] == str(value)  # type: ignore[index]
+
+
+def test_a_server_is_packed_field_by_field() -> None:
+    value = pack_servers(
+        table(server("a", 3, 7, (1 * MS, 2 * MS), (4 * MS, 6 * MS))), {"a": 5}, 123
+    )[5]
+    head = struct.unpack_from("<QQQIIII", value)
+    assert head == (50 * MS, 123, scx.ROTATION_NS, 3, 7, 2, 0)
+    assert struct.unpack_from("<QQQQ", value, 40) == (1 * MS, 2 * MS, 4 * MS, 6 * MS)
+    assert not any(value[72:])
+
+
+def test_every_id_is_written_so_that_nothing_of_an_older_table_stays() -> None:
+    packed = pack_servers(table(server("a")), {"a": 1, "gone": 2}, 0)
+    assert sorted(packed) == list(range(scx.MAX_SERVERS))
+    assert not any(packed[2])
+
+
+def test_servers_of_a_core_stand_best_first_and_equals_in_the_order_of_the_table() -> None:
+    servers = table(
+        server("worst", 0, 9), server("b", 0, 2), server("c", 0, 2), server("x", 1), server("a", 0)
+    )
+    ids = number_servers(servers, {})
+    packed = pack_cores(servers, ids, 2)
+    names = {number: name for name, number in ids.items()}
+    count, *numbers = struct.unpack("<33I", packed[0])
+    assert [names[number] for number in numbers[:count]] == ["a", "b", "c", "worst"]
+    assert not any(numbers[count:])
+    assert struct.unpack_from("<II", packed[1]) == (1, ids["x"])
+
+
+def test_a_server_keeps_its_id_when_the_table_changes() -> None:
+    first = number_servers(table(server("a"), server("b")), {})
+    second = number_servers(table(server("c"), server("b")), first)
+    assert second == {"a": 1, "b": 2, "c": 3}
+
+
+def test_ids_run_out_with_a_message() -> None:
+    known = {f"s{number}": number for number in range(1, 128)}
+    assert number_servers(table(server("s1")), known) == known
+    with pytest.raises(InputError, match="release it and start again"):
+        number_servers(table(server("another")), known)
+
+
+@given(st.integers(0, 1), st.integers(0, 2**61 - 1), st.booleans(), st.integers(-(2**40), 2**40))
+def test_one_word_says_which_generation_holds_at_each_instant(
+    generation: int, instant: int, replaces: bool, offset: int
+) -> None:
+    word = int.from_bytes(change_word(generation, instant, replaces=replaces), "little")
+    now = instant + offset
+    # as the policy reads it
+    in_force = word & 1 if now >= word >> 2 else 1 - (word & 1)
+    assert in_force == (generation if offset >= 0 else 1 - generation)
+    assert bool(word & 2) == replaces
+
+
+def test_counters_and_the_reason_of_the_end_are_read_back() -> None:
+    assert unpack_counters(struct.pack("<6Q", 5, 1, 123456, 2, 99, 98)) == ServerCounters(
+        5, 1, 123456, 2
+    )
+    ended = unpack_exit(struct.pack("<iiq64s192s", 1026, 0, 0, b"stall", b"late\0rest"))
+    assert ended == "stall: late"
+    assert unpack_exit(bytes(272)) is None
+
+
+def test_a_full_table_is_accepted() -> None:
+    slots = tuple((k * 1000, k * 1000 + 1000) for k in range(64))
+    servers = [ReservationServer(f"s{k}", k % 4, k, slots) for k in range(127)]
+    check_table(ServerTable(64_000, tuple(servers)))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        (table(*(server(f"s{k}", k) for k in range(128))), "128 servers are more than the 127"),
+        (table(*(server(f"s{k}", 3) for k in range(33))), "33 servers on core 3 are more than"),
+        (table(server("a", 512)), "core 512; back end scx knows 0 to 511"),
+        (table(ReservationServer("a", 0, 1, ())), "0 slots; back end scx takes 1 to 64"),
+        (table(server("a", 0, 1, *((k, k + 1) for k in range(65)))), "has 65 slots"),
+    ],
+)
+def test_a_wrong_table_is_refused_with_its_reason(wrong: ServerTable, reason: str) -> None:
+    with pytest.raises(InputError, match=reason):
+        check_table(wrong)

@@ -116,6 +116,7 @@ def test_nothing_of_a_strangers_environment_runs_unless_its_user_is_named_and_th
         with applied(plan, tmp_path, users=["nobody"]):
             wait_for(ran.exists, "what the nodes' user wants to be run")
             assert realtime(others.pid)
+            assert realtime(gate.pid), "the shaping node has its server's priority, too"
     lines = ran.read_text().splitlines()
     status = dict(line.split(":\t", 1) for line in lines if ":\t" in line)
     assert set(status["Uid"].split()) == {str(NOBODY)}

@@ -28,36 +28,23 @@ class PackageError(Exception):
 
 
 def fetch_userland() -> list[Path]:
-    """Packages of the guests' programs.
-
-    Raises:
-        PackageError: they are not in the cache and cannot be downloaded.
-    """
+    """Packages of the guests' programs. Raises PackageError: they cannot be had."""
     return _cached("userland", SUITES, lambda apt: apt.download_all(USERLAND))
 
 
 def fetch_kernels(name: str = "newest") -> list[Path]:
-    """The kernel of the named package, or the newest of each flavour.
-
-    Raises:
-        PackageError: as for :func:`fetch_userland`.
-    """
+    """The kernel of the named package, or the newest of each flavour. Raises PackageError."""
     return _cached(name, SUITES, lambda apt: apt.download_kernels(name))
 
 
 def fetch_for_tracing() -> list[Path]:
-    """Debian 12's kernel and its headers, the sources of LTTng's modules, and `depmod`.
-
-    Raises:
-        PackageError: as for :func:`fetch_userland`.
-    """
+    """Debian 12's kernel and its headers, the sources of LTTng's modules, and `depmod`."""
     return _cached("tracing", (TRACING_SUITE,), _Apt.download_for_tracing)
 
 
 def _cached(
     key: str, suites: tuple[str, ...], download: Callable[["_Apt"], list[Path]]
 ) -> list[Path]:
-    """What was downloaded before under this key, or is now."""
     CACHE.mkdir(parents=True, exist_ok=True)
     manifest = CACHE / "manifest.json"
     known: dict[str, dict[str, str]] = {}
@@ -91,8 +78,6 @@ def _updated_apt(suites: tuple[str, ...]) -> "_Apt":
 
 
 class _Apt:
-    """apt with folders of its own."""
-
     def __init__(self, folder: Path, suites: tuple[str, ...]) -> None:
         if not KEYS.exists():
             raise PackageError(f"no {KEYS}: apt install debian-archive-keyring")
@@ -123,7 +108,6 @@ class _Apt:
         ]
 
     def run(self, program: str, *arguments: str) -> str:
-        """Its output."""
         command = [program, *self._options, *arguments]
         done = subprocess.run(
             command, capture_output=True, text=True, check=False, cwd=self._archives
@@ -134,25 +118,21 @@ class _Apt:
         return done.stdout
 
     def download_all(self, names: tuple[str, ...]) -> list[Path]:
-        """Packages with all that they depend on."""
         for old in self._archives.glob("*.deb"):
             old.unlink()
         self.run("apt-get", "install", "--yes", "--download-only", *names)
         return sorted(self._archives.glob("*.deb"))
 
     def download(self, name: str) -> Path:
-        """One package by itself."""
         uri = self.run("apt-get", "download", "--print-uris", name).split()
         self.run("apt-get", "download", name)
         return self._archives / uri[1]
 
     def download_kernels(self, name: str) -> list[Path]:
-        """The named one, or the newest of each flavour."""
         names = self.newest_kernels() if name == "newest" else [name]
         return [self.download(each) for each in names]
 
     def download_for_tracing(self) -> list[Path]:
-        """What :func:`fetch_for_tracing` promises."""
         (headers,) = self._dependencies("linux-headers-amd64")
         names = [headers, headers.replace("headers", "image", 1), "lttng-modules-dkms", "kmod"]
         names += [n for n in self._dependencies(headers) if "-common" in n or "-kbuild-" in n]

@@ -30,7 +30,6 @@ guest_init.main()
 
 
 def unpack_kernel(package: Path, folder: Path) -> Path:
-    """The bootable image in a kernel package."""
     subprocess.run(["dpkg-deb", "--extract", package, folder], check=True)
     images = [*folder.glob("**/vmlinuz"), *folder.glob("boot/vmlinuz-*")]
     if len(images) != 1:

@@ -64,7 +64,6 @@ class Outcome:
 
 
 def say(text: str, end: str = "\n") -> None:
-    """Progress, to standard error."""
     sys.stderr.write(text + end)
     sys.stderr.flush()
 
@@ -147,7 +146,6 @@ def check_tracers(userland: list[Path], folder: Path) -> Outcome:
 
 
 def packages_of_absent(tools: dict[str, str]) -> str:
-    """Of programs that are not there."""
     return " ".join(package for tool, package in tools.items() if shutil.which(tool) is None)
 
 
@@ -172,7 +170,6 @@ def show(outcomes: list[Outcome]) -> None:
 
 
 def main() -> int:
-    """The exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kernel", action="append", default=[], help="a Debian kernel package")
     parser.add_argument("--check", action="append", default=[], help="a function's name")

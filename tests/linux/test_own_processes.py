@@ -32,7 +32,7 @@ SOURCES = Path(chainshaper.__file__).parent
 MODULES = [
     "chainshaper.enforcement.slot_dispatcher",
     "chainshaper.enforcement.guardian",
-    "chainshaper.enforcement.scx.kicker",
+    "chainshaper.enforcement.scx.back_end",
     "chainshaper.workload.node_process",
     "chainshaper.workload.stall_meter",
 ]

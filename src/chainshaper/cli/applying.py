@@ -185,7 +185,7 @@ def status(
 
     And the outputs that have a shaping node: which of them go around it, or are silent.
     """
-    from chainshaper.enforcement.freezer_state import stray_groups
+    from chainshaper.enforcement.freezer import stray_groups
     from chainshaper.enforcement.undoing import runs_as_json, strange_lines
     from chainshaper.reporting.overviews import runs_table, servers_table
     from chainshaper.splicing.shaped_outputs import find_outputs, output_text
@@ -220,6 +220,7 @@ def release(
     ),
 ) -> None:
     """End plans in force, and put back what crashed runs have left changed."""
+    from chainshaper.enforcement.freezer import groups_of, run_of
     from chainshaper.enforcement.scheduling_memory import look_alikes
     from chainshaper.enforcement.undoing import release_strays
     from chainshaper.linux.runs import find_journals
@@ -233,7 +234,7 @@ def release(
     strangers: list[str] = []
     for journal in chosen:
         try:
-            strangers += look_alikes(journal)
+            strangers += look_alikes(journal, groups_of(run_of(journal)))
             left = cs.end_run(journal)
         except OperationError as error:  # the others are ended all the same
             left = (str(error),)

@@ -10,24 +10,14 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from chainshaper.enforcement import freezer, litmus
-from chainshaper.enforcement.scheduling_memory import (
-    change_all,
-    release_threads,
-    remembered_threads,
-)
+from chainshaper.enforcement import litmus
+from chainshaper.enforcement.freezer import Freezer
+from chainshaper.enforcement.scheduling_memory import release_threads
 from chainshaper.enforcement.scx import back_end as scx
-from chainshaper.enforcement.servers import BackEnd, ServerCounters, ServerTable
-from chainshaper.enforcement.threads import (
-    NodeThread,
-    below_their_siblings,
-    server_priorities,
-    wanted_of_members,
-)
+from chainshaper.enforcement.servers import BackEnd, ServerCounters, ServerTable, server_named
 from chainshaper.linux import cgroups
 from chainshaper.linux.runs import Journal
 from chainshaper.linux.scheduling import may_use_fifo
-from chainshaper.linux.threads import find_thread
 from chainshaper.values.errors import InputError, PlatformError
 
 
@@ -56,28 +46,24 @@ def offered_back_ends() -> tuple[Offer, ...]:
 def choose_back_end(name: str = "auto") -> Choice:
     """The back end of this name; for ``auto`` the strongest that works here.
 
-    Raises:
-        InputError: there is no such back end.
-        PlatformError: it, or any, cannot be used here.
+    Raises InputError: there is no such back end. PlatformError: it, or any, cannot be used here.
     """
-    if name not in ("auto", *BACK_ENDS):
-        raise InputError(f"no back end {name!r}: choose one of auto, {', '.join(BACK_ENDS)}")
+    if name not in ("auto", *_KNOWN):
+        raise InputError(f"no back end {name!r}: choose one of auto, {', '.join(_KNOWN)}")
     if name != "auto":
         strength, missing = _KNOWN[name]
         if (reason := missing()) is not None:
             raise PlatformError(f"back end {name}: {reason}")
         return Choice(name, f"asked for; {strength}")
-    offers = offered_back_ends()
-    passed: list[str] = []
-    for offer in offers:
+    passed: list[Offer] = []
+    for offer in offered_back_ends():
         if offer.missing is None:
-            without = f"; not {' or '.join(passed)} (`chainshaper doctor` says why)" * bool(passed)
+            others = " or ".join(one.name for one in passed)
+            without = f"; not {others} (`chainshaper doctor` says why)" * bool(passed)
             return Choice(offer.name, f"the strongest here: {offer.strength}{without}")
-        passed.append(offer.name)
-    raise PlatformError(
-        "no back end can be used here: "
-        + "; ".join(f"{offer.name}: {offer.missing}" for offer in offers)
-    )
+        passed.append(offer)
+    reasons = "; ".join(f"{offer.name}: {offer.missing}" for offer in passed)
+    raise PlatformError(f"no back end can be used here: {reasons}")
 
 
 def gates(name: str) -> bool:
@@ -91,19 +77,16 @@ def make_back_end(
     """Make a back end for a table; no application notices anything yet.
 
     ``journal`` remembers what was there before. Where processes have to start, ``go_on`` is called
-    again and again meanwhile, and may raise.
-
-    Raises:
-        InputError: the table is not one, or more than the back end can do.
-        OperationError, PlatformError: see the ``create`` of the back end's module.
+    again and again meanwhile, and may raise. Raises InputError: the table is not one, or more than
+    the back end can do. OperationError, PlatformError: see the back end.
     """
     match name:
         case "scx":
             return scx.create(table)
         case "litmus":
-            return litmus.create(table, journal)
+            return litmus.Litmus(table, journal)
         case "freezer":
-            return freezer.create(table, journal, go_on)
+            return Freezer(table, journal, go_on)
         case _:
             return Fifo(table, journal)
 
@@ -111,37 +94,22 @@ def make_back_end(
 class Fifo:
     """Servers as SCHED_FIFO priorities, on any kernel, without slots; see :class:`BackEnd`.
 
-    Each server's threads get its core and a real-time priority in the order of the servers. That
-    isolates a chain from what is less important; a shaping node's gate has to do the rest. Several
-    threads of one server take turns under SCHED_RR. Threads that stand in the journal already are
-    left as they are: who carries out a whole plan has given them their priorities
-    (:func:`.threads.plan_scheduling`), in an order that also knows of shaping nodes. Raises
-    InputError: the table has more priorities than there are.
+    Each server's threads have its core and a real-time priority in the order of the servers from
+    whoever carries out the plan (:func:`.threads.plan_scheduling`), so nothing is left to do. That
+    isolates a chain from what is less important; a shaping node's gate has to do the rest.
     """
 
     name = "fifo"
 
     def __init__(self, table: ServerTable, journal: Journal) -> None:
-        server_priorities(server.priority for server in table.servers)
         self._table = table
         self._journal = journal
-        self._members: dict[str, list[NodeThread]] = {s.name: [] for s in table.servers}
-        self._scheduled = {one.identity for one in remembered_threads(journal)}
         self._since_ns: int | None = None
 
-    def assign(self, tid: int, server: str) -> None:
-        if server not in self._members:
-            raise InputError(f"no server {server!r}: choose of {', '.join(self._members)}")
-        thread = find_thread(tid)
-        if thread is None or thread.identity in self._scheduled:
-            return
-        self._scheduled.add(thread.identity)
-        self._members[server].append(NodeThread(thread, (), "", ""))
-        if self._since_ns is not None:
-            self._schedule()
+    def assign(self, tid: int, server: str) -> None:  # noqa: ARG002 - it has its priority
+        server_named(self._table, server)
 
     def arm(self, anchor_ns: int) -> None:  # noqa: ARG002 - priorities know no cycle
-        self._schedule()
         self._since_ns = time.monotonic_ns()
 
     def in_force_from(self) -> int | None:
@@ -154,19 +122,7 @@ class Fifo:
         return None
 
     def release(self) -> None:
-        self._since_ns = None
         release_threads(self._journal)
-
-    def _schedule(self) -> None:
-        wanted = below_their_siblings(wanted_of_members(self._members, self._table.servers))
-        if wanted:
-            change_all(self._journal, ((one.thread.thread, one.wanted) for one in wanted))
-
-
-def _missing_for_litmus() -> str | None:
-    if litmus.PROC.is_dir():
-        return None
-    return "this kernel is not LITMUS^RT: boot one (https://litmus-rt.org)"
 
 
 def _missing_for_freezer() -> str | None:
@@ -193,10 +149,7 @@ def _missing_for_fifo() -> str | None:
 
 _KNOWN: dict[str, tuple[str, Callable[[], str | None]]] = {
     "scx": ("the kernel itself keeps threads inside their slots (sched_ext)", scx.missing),
-    "litmus": (
-        "the kernel itself keeps threads inside their slots (LITMUS^RT)",
-        _missing_for_litmus,
-    ),
+    "litmus": ("the kernel itself keeps threads inside their slots (LITMUS^RT)", litmus.missing),
     "freezer": (
         "unmodified threads are kept inside their slots by freezing them (cgroup v2)",
         _missing_for_freezer,
@@ -207,4 +160,3 @@ _KNOWN: dict[str, tuple[str, Callable[[], str | None]]] = {
     ),
 }
 """Back ends, strongest first: what each does, and what says why it cannot be used here."""
-BACK_ENDS = tuple(_KNOWN)

@@ -2,18 +2,15 @@
 
     python -m chainshaper.enforcement.guardian OWNER FOLDER READY_FD
 
-Every run has two guardians, whatever its back end, which do the same: each is there should the
-other be killed or stopped at the same instant as what they watch over. They learn of a death from a
-pidfd, at once, and of a dispatcher that hangs from the sign of life that stands still; then they
-undo all that the journal says. The owner starts anew the one that it has lost. They are out of
-reach of what befalls the application or the owner: each has a session of its own, a cgroup that is
-neither's, and a priority above the dispatchers'.
+Every run has two, which do the same: each is there should the other be killed or stopped at the
+same instant as what they watch over. They learn of a death from a pidfd, at once, and of a
+dispatcher that hangs from its sign of life; then they undo all that the journal says. Each has a
+session and a cgroup of its own, and a priority above the dispatchers'.
 
-A dispatcher that gives no sign of life for a tenth of a second may hang, or its core may have been
+A dispatcher without a sign of life for a tenth of a second may hang, or its core may have been
 taken from the machine for a moment. So its threads are let go first: one that comes back closes
-what has to be closed, at the price of a cycle or less in which a server's threads ran freely; one
-that stays away for half a second has failed. The sign of life must stand still over several looks,
-rather than for some time: that a machine stalls as a whole is no fault.
+what has to be closed; one that stays away for half a second has failed. The sign must stand still
+over several looks, rather than for some time: that a machine stalls as a whole is no fault.
 """
 
 import contextlib
@@ -24,10 +21,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 
-from chainshaper.enforcement.freezer_state import CounterPage, groups_of, open_page, run_of, thaw
+from chainshaper.enforcement.freezer import CounterPage, groups_of, run_of, thaw
 from chainshaper.enforcement.undoing import claim_run, undo_run
 from chainshaper.linux import cgroups, runs
 from chainshaper.linux.own_processes import module_command, what_happened
@@ -36,54 +32,58 @@ from chainshaper.linux.scheduling import become_fifo, set_thread_name
 from chainshaper.linux.threads import open_process
 from chainshaper.values.errors import OperationError
 
-HOW_MANY = 2
-PRIORITY = 98
-LOOK_S = 0.02
-LOOKS_UNTIL_THAWED = 4
-LOOKS_UNTIL_HUNG = 24
 GROUP = "chainshaper.guardians"
+_HOW_MANY = 2
+_PRIORITY = 98
+_LOOK_S = 0.02
+_LOOKS_UNTIL_THAWED = 4
+_LOOKS_UNTIL_HUNG = 24
 _IDLE_S = 0.1
 _LOOKS_AT_ONCE = 5
 """Between two at the journal: nothing that can wait is to keep a core from those in their slots."""
 _START_S = 20.0
 
 
-@dataclass
 class Guardians:
-    """The guardians of a run, as its owner has them."""
+    """The guardians of a run, as its owner has them; making them starts them."""
 
-    journal: Journal
-    processes: list["subprocess.Popen[bytes]"] = field(default_factory=list)
-    ready: dict[int, int] = field(default_factory=dict)
-    """By process: the pipe by which it says that it watches."""
+    def __init__(self, journal: Journal) -> None:
+        self.journal = journal
+        self.processes: list[subprocess.Popen[bytes]] = []
+        self.ready: dict[int, int] = {}  # by process: the pipe by which it says that it watches
+        self.renew()
 
-    def start_one(self) -> None:
-        reading, writing = os.pipe()
-        folder = str(self.journal.path.parent)
-        try:
-            process = subprocess.Popen(
-                [*module_command(__name__), str(os.getpid()), folder, str(writing)],
-                pass_fds=(writing,),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-                start_new_session=True,
-            )
-        finally:
-            os.close(writing)
-        self.processes.append(process)
-        self.ready[process.pid] = reading
+    def renew(self) -> None:
+        """Start anew those that are lost."""
+        for lost in [one for one in self.processes if what_happened(one) is not None]:
+            lost.kill()
+            lost.wait()
+            self.processes.remove(lost)
+        while len(self.processes) < _HOW_MANY:
+            reading, writing = os.pipe()
+            own = (str(os.getpid()), str(self.journal.path.parent), str(writing))
+            try:
+                process = subprocess.Popen(
+                    [*module_command(__name__), *own],
+                    pass_fds=(writing,),
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                    start_new_session=True,
+                )
+            finally:
+                os.close(writing)
+            self.processes.append(process)
+            self.ready[process.pid] = reading
 
     def await_ready(self, go_on: Callable[[], None] = lambda: None) -> None:
         """Until they watch; ``go_on`` may raise. Raises OperationError: one does not start."""
-        for process in self.processes:
-            reading = self.ready.pop(process.pid, None)
-            if reading is None:
-                continue
+        while self.ready:
+            _, reading = self.ready.popitem()
             try:
-                for _ in range(int(_START_S / LOOK_S)):
+                for _ in range(int(_START_S / _LOOK_S)):
                     go_on()
-                    if select.select([reading], [], [], LOOK_S)[0]:  # it says so, or ends
+                    if select.select([reading], [], [], _LOOK_S)[0]:  # it says so, or ends
                         break
                 said = os.read(reading, 1) if select.select([reading], [], [], 0)[0] else b""
             finally:
@@ -94,15 +94,8 @@ class Guardians:
                     "machine overloaded, or are our processes being ended?"
                 )
 
-    def renew(self) -> None:
-        for lost in [one for one in self.processes if what_happened(one) is not None]:
-            lost.kill()
-            lost.wait()
-            self.processes.remove(lost)
-        while len(self.processes) < HOW_MANY:
-            self.start_one()
-
     def end(self) -> None:
+        """Kill them, when there is nothing left to undo."""
         for process in self.processes:
             process.kill()
         for process in self.processes:
@@ -125,7 +118,7 @@ def run_claimed(
     journal = claim_run(cores, nodes, folder)
     guardians = None
     try:
-        guardians = start_guardians(journal)
+        guardians = Guardians(journal)
         guardians.await_ready()
         yield journal
     finally:
@@ -139,14 +132,6 @@ def run_claimed(
             )
 
 
-def start_guardians(journal: Journal) -> Guardians:
-    """Have processes watch over the caller's run; see :meth:`Guardians.await_ready`."""
-    guardians = Guardians(journal)
-    for _ in range(HOW_MANY):
-        guardians.start_one()
-    return guardians
-
-
 class _Watch:
     """What a guardian sees. ``owner`` is a pidfd."""
 
@@ -156,17 +141,16 @@ class _Watch:
         self.read_until = -1
         self.page: CounterPage | None = None
         self.cores: dict[int, int] = {}  # by pidfd of its dispatcher
-        self.seen: dict[int, int] = {}
-        self.still: dict[int, int] = {}
+        self.beats: dict[int, tuple[int, int]] = {}  # by core: the last one, and how often seen
         self.poll = select.poll()
         self.poll.register(owner, select.POLLIN)
 
     def run(self) -> bool:
         """Until something is lost, or the run is over: whether there is something to undo."""
-        while self.keep_journal():
+        while self.journal_is_there():
             lost = self.look_for_dispatchers()
             for _ in range(_LOOKS_AT_ONCE):
-                ended = self.poll.poll(1000 * (LOOK_S if self.cores else _IDLE_S))
+                ended = self.poll.poll(1000 * (_LOOK_S if self.cores else _IDLE_S))
                 if any(pidfd == self.owner for pidfd, _ in ended):
                     return True
                 if self.page is None or self.page.released.value:
@@ -177,7 +161,7 @@ class _Watch:
                     return True
         return False
 
-    def keep_journal(self) -> bool:
+    def journal_is_there(self) -> bool:
         try:
             return self.journal.keep()
         except OSError:  # its folder is gone, and there is no room for another: it is in memory
@@ -186,27 +170,25 @@ class _Watch:
     def look_for_dispatchers(self) -> bool:
         """Learn of new ones; whether one of them has ended already."""
         lost, size = False, self.journal.size()
-        if size == self.read_until:
-            return False
+        run = None if size == self.read_until else run_of(self.journal)
         self.read_until = size
-        run = run_of(self.journal)
         if run is None:
             return False
         if self.page is None:
             try:
-                self.page = open_page(run.page, run.table)
+                self.page = CounterPage(run.page, run.table)
             except OSError:  # the owner is gone, which its pidfd will say
                 return False
         for one in runs.own_processes(self.journal, runs.DISPATCHER):
-            if one.core is None or one.core in self.seen:
+            if one.core is None or one.core in self.beats:
                 continue
-            self.seen[one.core], self.still[one.core] = -1, 0
+            self.beats[one.core] = (-1, 0)
             pidfd = open_process(one.pid, one.started)
             if pidfd is None:
                 lost = True
-                continue
-            self.cores[pidfd] = one.core
-            self.poll.register(pidfd, select.POLLIN)
+            else:
+                self.cores[pidfd] = one.core
+                self.poll.register(pidfd, select.POLLIN)
         if elsewhere := self.available - set(self.cores.values()):
             os.sched_setaffinity(0, elsewhere)
         return lost
@@ -220,14 +202,14 @@ class _Watch:
     def hangs(self, page: CounterPage) -> bool:
         """Whether a dispatcher does; threads of one that may are let go."""
         for core in self.cores.values():
-            beats = page.cores[core].beats
-            self.still[core] = self.still[core] + 1 if beats == self.seen[core] else 0
-            self.seen[core] = beats
-            if beats == 0:
+            beat, (last, still) = page.cores[core].beats, self.beats[core]
+            still = still + 1 if beat == last else 0
+            self.beats[core] = (beat, still)
+            if beat == 0:
                 continue  # it starts; the owner waits for it
-            if self.still[core] == LOOKS_UNTIL_THAWED:
+            if still == _LOOKS_UNTIL_THAWED:
                 let_go(self.journal, page, core)
-            if self.still[core] >= LOOKS_UNTIL_HUNG:
+            if still >= _LOOKS_UNTIL_HUNG:
                 page.cores[core].silent = 1
                 return True
         return False
@@ -258,7 +240,7 @@ def main() -> None:
         owner = os.pidfd_open(owner_pid)
         if os.getppid() != owner_pid:
             raise ProcessLookupError(owner_pid)
-        become_fifo(PRIORITY)
+        become_fifo(_PRIORITY)
         with contextlib.suppress(BrokenPipeError):
             os.write(ready, b"!")
         os.close(ready)

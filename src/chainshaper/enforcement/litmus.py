@@ -9,12 +9,9 @@ reservations, and each thread moves by itself: for the two milliseconds that a c
 runs freely. Threads that are created by one in a reservation run in it as well, so threads are
 attached one by one, after those of DDS exist, and detached by giving them another class.
 
-`resctl` reads times as decimal milliseconds, turns them into a C double, multiplies it by a million
-and drops what is behind the point, so a text is chosen that survives this. Intervals are written
-half-open, `[2,86)`, which ends one nanosecond earlier than `[2,86]`: `resctl` refuses a closed
-interval that ends with the major cycle, and takes `[2,86] [86,87]` for overlapping. They must
-ascend; the kernel wants two nanoseconds at least and 1024 intervals at most. A table counts from
-time zero of CLOCK_MONOTONIC; another anchor is reached by turning the slots.
+Intervals are written half-open, `[2,86)`: `resctl` refuses a closed interval that ends with the
+major cycle, and takes `[2,86] [86,87]` for overlapping. They must ascend. A table counts from time
+zero of CLOCK_MONOTONIC; another anchor is reached by turning the slots.
 
 Upstream: liblitmus, `bin/resctl.c`, `doc/howto-use-resctl.md`, `doc/table-driven-scheduling.md`;
 LITMUS^RT, `litmus/reservations/alloc.c`.
@@ -27,9 +24,15 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from chainshaper.enforcement.scheduling_memory import note_scheduling, release_threads
-from chainshaper.enforcement.servers import ReservationServer, ServerCounters, ServerTable
+from chainshaper.enforcement.servers import (
+    ReservationServer,
+    ServerCounters,
+    ServerTable,
+    server_named,
+)
 from chainshaper.linux.own_processes import is_installed, tool_environment
 from chainshaper.linux.runs import Journal
 from chainshaper.linux.scheduling import SchedulingClass, set_state, state_of
@@ -37,76 +40,77 @@ from chainshaper.linux.threads import find_thread
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
-SCHED_LITMUS = 7
-PROC = Path("/proc/litmus")
 NOTE = "litmus-plugin"
-COMMAND_S = 10.0
 Command = tuple[str, ...]
-MOST_INTERVALS = 1024
-SHORTEST_NS = 2
-PLUGIN = "P-RES"
-NO_PLUGIN = "Linux"
+SCHED_LITMUS = 7
+_PROC = Path("/proc/litmus")
+_COMMAND_S = 10.0
+_MOST_INTERVALS = 1024
+_SHORTEST_NS = 2
+_PLUGIN = "P-RES"
+_NO_PLUGIN = "Linux"
 
 
-def create(table: ServerTable, journal: Journal, proc: Path = PROC) -> "Litmus":
-    """Prepare servers; nothing is changed before :meth:`Litmus.arm`.
-
-    ``journal`` remembers what was there, ``proc`` is where LITMUS^RT shows itself. Raises
-    PlatformError: the kernel is not LITMUS^RT, or its tools are not installed. OperationError:
-    others use the plugin. InputError: the table has what LITMUS^RT cannot do.
-    """
-    if not proc.is_dir():
-        raise PlatformError(
-            f"this kernel ({os.uname().release}) is not LITMUS^RT, there is no {proc}: boot one, "
-            "or use another back end (`--backend auto`); `--dry-run` prints the commands"
-        )
-    for tool in ("setsched", "resctl"):
-        if not is_installed(tool):
-            raise PlatformError(
-                f"{tool} is not on $PATH: build liblitmus (github.com/LITMUS-RT/liblitmus) and "
-                "add its folder"
-            )
-    if _active_plugin(proc) == PLUGIN:
-        raise OperationError(
-            f"the plugin {PLUGIN} is active already, and may hold reservations of others, which "
-            f"LITMUS^RT cannot tell from ours or delete alone: when they are not needed, "
-            f"`setsched {NO_PLUGIN}`"
-        )
-    litmus_commands(table, {}, anchor_ns=0)
-    return Litmus(table, journal, proc)
+def missing(proc: Path = _PROC) -> str | None:
+    """Why the kernel has no LITMUS^RT servers, with the remedy; None when it has."""
+    if proc.is_dir():
+        return None
+    return (
+        f"this kernel ({os.uname().release}) is not LITMUS^RT, there is no {proc}: boot one "
+        "(https://litmus-rt.org), or use another back end (`--backend auto`); `--dry-run` prints "
+        "the commands"
+    )
 
 
 class Litmus:
-    """A table of servers in force as reservations; see :class:`.servers.BackEnd`."""
+    """A table of servers in force as reservations; see :class:`.servers.BackEnd`.
+
+    Nothing is changed before :meth:`arm`. ``proc`` is where LITMUS^RT shows itself. Raises
+    PlatformError: the kernel is not LITMUS^RT, or its tools are not installed. OperationError:
+    others use the plugin. InputError: the table has what LITMUS^RT cannot do.
+    """
 
     name = "litmus"
 
-    def __init__(self, table: ServerTable, journal: Journal, proc: Path) -> None:
+    def __init__(self, table: ServerTable, journal: Journal, proc: Path = _PROC) -> None:
+        if (reason := missing(proc)) is not None:
+            raise PlatformError(reason)
+        for tool in ("setsched", "resctl"):
+            if not is_installed(tool):
+                raise PlatformError(
+                    f"{tool} is not on $PATH: build liblitmus (github.com/LITMUS-RT/liblitmus) and "
+                    "add its folder"
+                )
+        if _active_plugin(proc) == _PLUGIN:
+            raise OperationError(
+                f"the plugin {_PLUGIN} is active already, and may hold reservations of others, "
+                "which LITMUS^RT cannot tell from ours or delete alone: when they are not needed, "
+                f"`setsched {_NO_PLUGIN}`"
+            )
+        litmus_commands(table, {}, anchor_ns=0)
         self._table = table
         self._journal = journal
         self._proc = proc
-        self._members: dict[int, str] = {}
+        self._members: dict[int, ReservationServer] = {}
         self._ids: dict[str, int] = {}
         self._generation = 0
         self._since_ns: int | None = None
 
     def assign(self, tid: int, server: str) -> None:
-        names = [one.name for one in self._table.servers]
-        if server not in names:
-            raise InputError(f"no server {server!r}: choose of {', '.join(names)}")
-        self._members[tid] = server
+        self._members[tid] = server_named(self._table, server)
         if self._ids:
             self._attach(tid)
 
     def arm(self, anchor_ns: int) -> None:
-        if not self._ids:
+        moving = bool(self._ids)
+        if not moving:
             self._journal.note(NOTE, previous=_active_plugin(self._proc), proc=str(self._proc))
-            _run(plugin_command(PLUGIN))
-        ids = reservation_ids(self._table, self._generation)
+            _run(("setsched", _PLUGIN))
+        ids = _reservation_ids(self._table, self._generation)
         self._generation += 1
         for server in self._table.servers:
             _run(create_command(ids[server.name], server, self._table.cycle_ns, anchor_ns))
-        moving, self._ids = bool(self._ids), ids
+        self._ids = ids
         for tid in self._members if moving else ():
             _leave_reservation(tid)
         self._attach(*self._members)
@@ -119,9 +123,9 @@ class Litmus:
         return {server.name: ServerCounters() for server in self._table.servers}
 
     def failure(self) -> str | None:
-        if not self._ids or (active := _active_plugin(self._proc)) == PLUGIN:
+        if not self._ids or (active := _active_plugin(self._proc)) == _PLUGIN:
             return None
-        return f"the scheduler plugin was changed from {PLUGIN} to {active}"
+        return f"the scheduler plugin was changed from {_PLUGIN} to {active}"
 
     def release(self) -> None:
         self._ids = {}
@@ -129,23 +133,27 @@ class Litmus:
         restore_plugin(self._journal)
 
     def _attach(self, *tids: int) -> None:
-        cores = {server.name: server.core for server in self._table.servers}
         reserved = SchedulingClass(SCHED_LITMUS, 0, reset_on_fork=False)
         targets = []
         for tid in tids:
             thread = find_thread(tid)
             with contextlib.suppress(ProcessLookupError):
                 if thread is not None:
-                    core = cores[self._members[tid]]
-                    target = replace(state_of(tid), scheduling_class=reserved, cores=(core,))
+                    cores = (self._members[tid].core,)
+                    target = replace(state_of(tid), scheduling_class=reserved, cores=cores)
                     targets.append((thread, target))
-        for thread, target in note_scheduling(self._journal, targets):
-            number = self._ids[self._members[thread.tid]]
+        for thread, _ in note_scheduling(self._journal, targets):
+            server = self._members[thread.tid]
             try:
-                _run(attach_command(thread.tid, number, target.cores[0]))
+                _run(_attach_command(thread.tid, self._ids[server.name], server.core))
             except OperationError:
                 if find_thread(thread.tid) is not None:
                     raise
+
+
+def read_note(entry: Mapping[str, Any]) -> tuple[str, Path]:
+    """A journal's entry as a value: the plugin before ours, and where LITMUS^RT shows itself."""
+    return str(entry["previous"]), Path(entry["proc"])
 
 
 def restore_plugin(journal: Journal) -> None:
@@ -154,14 +162,11 @@ def restore_plugin(journal: Journal) -> None:
     To be called when the threads are restored: the kernel changes no plugin that has threads.
     Raises OperationError: it refuses.
     """
-    notes = journal.entries(NOTE)
-    if not notes or journal.outdated:
-        return
-    previous, proc = notes[0]["previous"], Path(notes[0]["proc"])
-    if _active_plugin(proc) == PLUGIN:
-        _run(plugin_command(NO_PLUGIN))
-        if previous != NO_PLUGIN:
-            _run(plugin_command(previous))
+    for previous, proc in () if journal.outdated else journal.read(NOTE, read_note)[:1]:
+        if _active_plugin(proc) == _PLUGIN:
+            _run(("setsched", _NO_PLUGIN))
+            if previous != _NO_PLUGIN:
+                _run(("setsched", previous))
 
 
 def _leave_reservation(tid: int) -> None:
@@ -195,7 +200,7 @@ def _run(command: Command) -> None:
             capture_output=True,
             text=True,
             check=False,
-            timeout=COMMAND_S,
+            timeout=_COMMAND_S,
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise OperationError(f"`{' '.join(command)}` cannot be run: {error}") from error
@@ -216,29 +221,25 @@ def litmus_commands(
     What stands for a thread that does not run yet may be a text. Raises InputError: the table has
     what LITMUS^RT cannot do.
     """
-    ids = reservation_ids(table)
+    ids = _reservation_ids(table)
     return (
-        plugin_command(PLUGIN),
+        ("setsched", _PLUGIN),
         *(
             create_command(ids[server.name], server, table.cycle_ns, anchor_ns)
             for server in table.servers
         ),
         *(
-            attach_command(tid, ids[server.name], server.core)
+            _attach_command(tid, ids[server.name], server.core)
             for server in table.servers
             for tid in members.get(server.name, ())
         ),
     )
 
 
-def reservation_ids(table: ServerTable, generation: int = 0) -> dict[str, int]:
+def _reservation_ids(table: ServerTable, generation: int = 0) -> dict[str, int]:
     """An id per server and core, `core x 1000 + index`, different in every generation."""
     first = generation * len(table.servers) + 1
     return {s.name: s.core * 1000 + index for index, s in enumerate(table.servers, start=first)}
-
-
-def plugin_command(plugin: str) -> Command:
-    return ("setsched", plugin)
 
 
 def create_command(
@@ -249,16 +250,16 @@ def create_command(
     Raises InputError: it has more slots, or a shorter one, than the kernel takes.
     """
     slots = turned(server.slots, cycle_ns, anchor_ns)
-    if len(slots) > MOST_INTERVALS:
+    if len(slots) > _MOST_INTERVALS:
         raise InputError(
-            f"server {server.name} has {len(slots)} slots, and LITMUS^RT takes {MOST_INTERVALS} "
+            f"server {server.name} has {len(slots)} slots, and LITMUS^RT takes {_MOST_INTERVALS} "
             "in a reservation: use a shorter cycle, or another back end"
         )
     for start, end in server.slots:
-        if end - start < SHORTEST_NS:
+        if end - start < _SHORTEST_NS:
             raise InputError(
                 f"server {server.name}: the slot at {format_duration(start)} is shorter than "
-                f"{SHORTEST_NS} ns, the least that LITMUS^RT takes: make it longer"
+                f"{_SHORTEST_NS} ns, the least that LITMUS^RT takes: make it longer"
             )
     return (
         *("resctl", "-n", str(number), "-t", "table-driven", "-c", str(server.core)),
@@ -267,7 +268,7 @@ def create_command(
     )
 
 
-def attach_command(tid: int | str, number: int, core: int) -> Command:
+def _attach_command(tid: int | str, number: int, core: int) -> Command:
     return ("resctl", "-a", str(tid), "-r", str(number), "-c", str(core))
 
 
@@ -278,6 +279,8 @@ def interval_text(start_ns: int, end_ns: int) -> str:
 
 def milliseconds_text(duration_ns: int) -> str:
     """The shortest decimal milliseconds that `resctl` turns into exactly this duration.
+
+    It makes a C double of them, multiplies it by a million and drops what is behind the point.
 
     >>> milliseconds_text(86_500_000)
     '86.5'
@@ -306,4 +309,4 @@ def turned(
         first = (start + anchor_ns) % cycle_ns
         last = first + end - start
         pieces += [(first, min(last, cycle_ns)), (0, max(0, last - cycle_ns))]
-    return tuple(sorted(piece for piece in pieces if piece[1] - piece[0] >= SHORTEST_NS))
+    return tuple(sorted(piece for piece in pieces if piece[1] - piece[0] >= _SHORTEST_NS))

@@ -1,16 +1,16 @@
 """Reservation servers as the back ends see them, and what every back end can do.
 
-A plan says which *nodes* run in which server; by the time it is carried out, nodes have become
-threads. What is left is a **table**: servers with slots that repeat every cycle (paper, section
-2.2.1), and thread ids assigned to them. Between slots a server's threads do not run at all
-(``fifo`` excepted, which isolates only); where servers overlap on a core, the better priority runs,
-a smaller number; threads of one server take turns; threads of no server run when no server's wants
-to. Whatever a back end changes it changes back, and a crash of ours must not leave an application
-stopped.
+By the time a plan is carried out, its nodes have become threads. What is left is a **table**:
+servers with slots that repeat every cycle (paper, section 2.2.1), and thread ids assigned to them.
+Between slots a server's threads do not run at all (``fifo`` excepted, which isolates only); where
+servers overlap on a core, the better priority runs, a smaller number; threads of one server take
+turns; threads of no server run when no server's wants to.
 """
 
 from dataclasses import dataclass
 from typing import Protocol
+
+from chainshaper.values.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,22 @@ class ServerTable:
     servers: tuple[ReservationServer, ...]
 
 
+def server_named(table: ServerTable, name: str) -> ReservationServer:
+    """The server of a name. Raises InputError: there is none."""
+    for server in table.servers:
+        if server.name == name:
+            return server
+    names = ", ".join(server.name for server in table.servers)
+    raise InputError(f"no server is named {name}: {names} are")
+
+
 @dataclass(frozen=True)
 class ServerCounters:
     """What a server has done since it was armed; None: the back end cannot know.
 
-    ``slots`` counts the slots that were opened, ``late_entries`` those of them that opened more
-    than 100 us after their start, ``longest_lateness_ns`` the worst of these; ``overruns`` counts
-    the slots at whose end a thread of the server still wanted to run.
+    ``late_entries`` are slots that opened more than 100 us after their start,
+    ``longest_lateness_ns`` the worst of them; ``overruns`` are slots at whose end a thread of the
+    server still wanted to run.
     """
 
     slots: int | None = None
@@ -52,8 +61,8 @@ class ServerCounters:
 class BackEnd(Protocol):
     """A table of servers in force on this machine.
 
-    Made by the ``create`` of a back end's module, which changes nothing yet that an application
-    could notice. Then ``assign`` and ``arm`` in any order and number; ``release`` ends it.
+    Making one changes nothing yet that an application could notice. Then ``assign`` and ``arm`` in
+    any order and number; ``release`` ends it. All raise OperationError where the kernel refuses.
     """
 
     name: str
@@ -61,20 +70,14 @@ class BackEnd(Protocol):
     def assign(self, tid: int, server: str) -> None:
         """Put a thread into a server; before ``arm`` it goes on running freely.
 
-        One that has ended is passed over: threads come and go.
-
-        Raises:
-            InputError: no such server.
-            OperationError: the kernel refuses.
+        One that has ended is passed over: threads come and go. Raises InputError: no such server.
         """
 
     def arm(self, anchor_ns: int) -> None:
         """Enforce the slots from now on; cycles start at ``anchor_ns`` (CLOCK_MONOTONIC) + k * CT.
 
         Once more with another anchor, it moves the cycles without letting threads slip between.
-
-        Raises:
-            OperationError: the kernel refuses; what was done before stays until the release.
+        Where the kernel refuses, what was done before stays until the release.
         """
 
     def in_force_from(self) -> int | None:
@@ -87,8 +90,4 @@ class BackEnd(Protocol):
         """Why the servers are no longer enforced, None while they are."""
 
     def release(self) -> None:
-        """Everything as it was before; harmless when repeated.
-
-        Raises:
-            OperationError: something could not be put back; the rest is.
-        """
+        """Everything as it was before, as far as possible; harmless when repeated."""

@@ -9,20 +9,9 @@ exactly. The price is that the next thread runs only when the dispatcher sleeps 
 waking and sleeping it does nothing that can wait. All else is done at **ticks** between boundaries:
 counting, commands of the owner, the sign of life, and looking for overruns.
 
-A thread that is caught in user mode by the end of its slot still wanted to run: an overrun. The
-kernel shows where a frozen thread was in ``/proc/TID/syscall``; -1 is user mode. (Its state says
-nothing any more: freezing wakes sleepers.) One caught inside a system call passes for one that
-waits.
-
 It thaws its threads however it ends, and ends when the owner is gone. Only SIGKILL and SIGSTOP
 prevent that, which is what guardians are for. Should those be gone together with the owner, it
 undoes the whole run.
-
-A table becomes a list of **boundaries**: instants of the cycle with the servers that are open from
-there on. Slots are half-open, so nothing is open twice. A boundary stands at 0 always, because
-cycles of another anchor may begin there. Moving to another anchor must let no thread slip between:
-either the old cycle is cut short by less than half of its length, or all servers wait, closed, for
-less than that.
 """
 
 import contextlib
@@ -32,13 +21,12 @@ import signal
 import sys
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, takewhile
 from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
 
-from chainshaper.enforcement.freezer_state import CounterPage, open_page, run_of
+from chainshaper.enforcement.freezer import Anchoring, CounterPage, run_of
 from chainshaper.enforcement.servers import ServerTable
 from chainshaper.gate.decision import sleep_until, watch_until
 from chainshaper.linux.runs import remembered_journal
@@ -48,22 +36,21 @@ from chainshaper.linux.scheduling import (
     set_thread_name,
     stop_garbage_collection,
 )
+from chainshaper.linux.threads import read_proc
 from chainshaper.values.errors import ChainshaperError, OperationError, PlatformError
 from chainshaper.values.safe_text import shown
 
 PRIORITY = 97
-LATE_NS = 100_000
-TICK_NS = 20_000_000
+_LATE_NS = 100_000
+_TICK_NS = 20_000_000
 _REST_NS = 1_000_000  # after a boundary; frozen threads, too, need the core to reach the freezer
 _ROOM_NS = 200_000  # at least, between a tick and the boundaries around it
 _WATCH_NS = 100_000  # before a boundary, instead of sleeping
 _THAWED_AFTER_NS = 60_000_000  # guardians wait for a sign of life a little longer
 _FAR = 1 << 62
-_NOTHING: frozenset[int] = frozenset()
 
 
-@dataclass(frozen=True)
-class Boundary:
+class Boundary(NamedTuple):
     """From ``offset_ns`` into the cycle on, exactly the servers in ``open`` are open.
 
     ``starts`` are those of them of which a slot begins here. Servers are counted by their place
@@ -75,40 +62,24 @@ class Boundary:
     starts: frozenset[int]
 
 
-@dataclass(frozen=True)
-class Anchoring:
-    """Cycles start at ``begin_ns`` and every cycle time thereafter; the old ones end at ``end_ns``.
-
-    Both are instants of CLOCK_MONOTONIC. The earlier of the two is when the old cycles are left.
-    """
-
-    begin_ns: int
-    end_ns: int
-
-
 def boundaries_of(
     cycle_ns: int, slots: tuple[tuple[tuple[int, int], ...], ...]
 ) -> tuple[Boundary, ...]:
     """The boundaries of one cycle, ascending; ``slots`` has one entry per server.
 
+    One stands at 0 always: cycles of another anchor may begin there.
+
     >>> [(b.offset_ns, set(b.open)) for b in boundaries_of(10, (((0, 4),), ((4, 10),)))]
     [(0, {0}), (4, {1})]
     """
+
     offsets = {0} | {edge % cycle_ns for own in slots for slot in own for edge in slot}
-    return tuple(
-        Boundary(
-            offset,
-            frozenset(
-                server
-                for server, own in enumerate(slots)
-                if any(start <= offset < end for start, end in own)
-            ),
-            frozenset(
-                server for server, own in enumerate(slots) if any(s == offset for s, _ in own)
-            ),
-        )
-        for offset in sorted(offsets)
-    )
+    found = []
+    for at in sorted(offsets):
+        inside = (n for n, own in enumerate(slots) if any(a <= at < b for a, b in own))
+        begun = (n for n, own in enumerate(slots) if any(a == at for a, _ in own))
+        found.append(Boundary(at, frozenset(inside), frozenset(begun)))
+    return tuple(found)
 
 
 def instants(
@@ -116,17 +87,18 @@ def instants(
 ) -> Iterator[tuple[int, Boundary]]:
     """Every boundary with its time (ns), without end, from the cycle at ``begin_ns`` on.
 
-    Where nothing changes no dispatcher wakes up: from the second cycle on such a boundary (only
+    No dispatcher wakes up where nothing changes: from the second cycle on such a boundary (only
     the one at 0 can be) is left out.
     """
     first, last = boundaries[0], boundaries[-1]
     idle = len(boundaries) > 1 and first.open == last.open and not first.starts
-    for boundary in boundaries:
-        yield begin_ns + boundary.offset_ns, boundary
+    yield begin_ns, first
     while True:
-        begin_ns += cycle_ns
-        for boundary in boundaries[1:] if idle else boundaries:
+        for boundary in boundaries[1:]:
             yield begin_ns + boundary.offset_ns, boundary
+        begin_ns += cycle_ns
+        if not idle:
+            yield begin_ns, first
 
 
 def moved(
@@ -137,42 +109,11 @@ def moved(
 ) -> Iterator[tuple[int, Boundary]]:
     """The boundaries ``ahead`` until the new anchoring's turn comes, and its own from there on."""
     turn = min(anchoring.begin_ns, anchoring.end_ns)
-    for at, boundary in ahead:
-        if at >= turn:
-            break
-        yield at, boundary
+    yield from takewhile(lambda item: item[0] < turn, ahead)
     del ahead  # it may itself be a stream that was moved: only the last move matters now
     if anchoring.end_ns < anchoring.begin_ns:
         yield anchoring.end_ns, Boundary(cycle_ns, frozenset(), frozenset())
     yield from instants(boundaries, cycle_ns, anchoring.begin_ns)
-
-
-def first_anchoring(anchor_ns: int, cycle_ns: int, earliest_ns: int) -> Anchoring:
-    """The first start of a cycle at or after ``earliest_ns``; before it nothing is enforced."""
-    begin = anchor_ns + -((anchor_ns - earliest_ns) // cycle_ns) * cycle_ns
-    return Anchoring(begin, begin)
-
-
-def next_anchoring(
-    in_force: Anchoring, anchor_ns: int, cycle_ns: int, earliest_ns: int
-) -> Anchoring:
-    """From the anchoring in force to another anchor, at the first end of a cycle that allows it.
-
-    ``earliest_ns`` is when the change may happen at the earliest. Worked by hand, cycle time 100,
-    cycles at 0, 100, 200, …, not before 950:
-
-        >>> next_anchoring(Anchoring(0, 0), 30, 100, 950)       # wait, closed, from 1000 to 1030
-        Anchoring(begin_ns=1030, end_ns=1000)
-        >>> next_anchoring(Anchoring(0, 0), 80, 100, 950)       # cut the cycle from 900 short
-        Anchoring(begin_ns=980, end_ns=1000)
-    """
-    end = first_anchoring(in_force.begin_ns, cycle_ns, max(earliest_ns, in_force.begin_ns)).begin_ns
-    shift = (anchor_ns - end) % cycle_ns
-    if shift > cycle_ns // 2:
-        shift -= cycle_ns
-    if end + shift < earliest_ns:
-        end += cycle_ns
-    return Anchoring(end + shift, end)
 
 
 class OpenGroup(NamedTuple):
@@ -194,9 +135,9 @@ class Dispatcher:
         self.places = {server.name: number for number, server in enumerate(servers)}
         self.counters = [page.servers[server.name] for server in servers]
         self.own = page.cores[core]
-        self.commands = commands
-        self.heard = b""
+        self.commands, self.heard = commands, b""
         self.groups: list[dict[str, OpenGroup]] = [{} for _ in servers]
+        self.all = frozenset(range(len(servers)))
         self.open: frozenset[int] | None = None  # None: not armed, all are
         self.upcoming = (_FAR, self.boundaries[0])
         self.ahead: Iterator[tuple[int, Boundary]] = iter(())
@@ -211,9 +152,9 @@ class Dispatcher:
             self._tick_until_boundary()
             at, boundary = self.upcoming
             following = next(self.ahead)
-            closing, opening = self._changes(boundary)
+            before = self.all if self.open is None else self.open
             rest = min(_REST_NS, (following[0] - at) // 2)
-            if opening and not closing and self.open == _NOTHING:
+            if boundary.open and not before:
                 # Waking an idle core takes longest, and delays no thread of ours now.
                 sleep_until(at - _WATCH_NS)
                 watch_until(at)
@@ -222,54 +163,38 @@ class Dispatcher:
             while following[0] <= time.monotonic_ns():
                 # A stall took more than a boundary: what should be open by now counts.
                 (at, boundary), following = following, next(self.ahead)
-                closing, opening = self._changes(boundary)
-            for server in closing:
-                self._write(server, b"1")
-            for server in opening:
-                self._write(server, b"0")
+            closing = before - boundary.open
+            self._write(closing, b"1")
+            self._write(boundary.open - before, b"0")
             switched = time.monotonic_ns()
             if rest >= _ROOM_NS:
                 sleep_until(at + rest)  # those who were let in wait for us to sleep
-            self._note(boundary, closing, switched - at)
+            for server in boundary.starts:
+                counters, lateness = self.counters[server], switched - at
+                counters.slots += 1
+                counters.late += lateness > _LATE_NS
+                counters.longest = max(counters.longest, lateness)
+            if self.open is not None:
+                self.unexamined |= closing
+            self.open = boundary.open
             self._give_sign(switched)
             self.upcoming = following
 
     def thaw_all(self) -> None:
-        for server in range(len(self.groups)):
-            self._write(server, b"0")
+        """Let all threads go."""
+        self._write(self.all, b"0")
         self.open = None
 
-    def _changes(self, boundary: Boundary) -> tuple[list[int], list[int]]:
-        before = frozenset(range(len(self.groups))) if self.open is None else self.open
-        return sorted(before - boundary.open), sorted(boundary.open - before)
-
-    def _note(self, boundary: Boundary, closed: list[int], lateness: int) -> None:
-        for server in boundary.starts:
-            counters = self.counters[server]
-            counters.slots += 1
-            counters.late += lateness > LATE_NS
-            counters.longest = max(counters.longest, lateness)
-        if self.open is not None:
-            self.unexamined.update(closed)
-        self.open = boundary.open
-
-    def _write(self, server: int, value: bytes) -> None:
-        try:
-            for group in self.groups[server].values():
-                os.pwrite(group.freeze, value, 0)
-        except OSError:
-            self._drop_lost(server, value)
-
-    def _drop_lost(self, server: int, value: bytes) -> None:
-        """A group was removed, which takes its threads away from us: the others go on."""
-        for folder, group in list(self.groups[server].items()):
-            try:
-                os.pwrite(group.freeze, value, 0)
-            except OSError:
-                del self.groups[server][folder]
-                os.close(group.freeze)
-                os.close(group.threads)
-                self.counters[server].lost += 1
+    def _write(self, servers: Iterable[int], value: bytes) -> None:
+        for server in sorted(servers):
+            for folder, group in list(self.groups[server].items()):
+                try:
+                    os.pwrite(group.freeze, value, 0)
+                except OSError:  # it was removed, with its threads: the others go on
+                    del self.groups[server][folder]
+                    os.close(group.freeze)
+                    os.close(group.threads)
+                    self.counters[server].lost += 1
 
     def _tick_until_boundary(self) -> None:
         """Tick once, and on and on until the boundary is near.
@@ -277,12 +202,12 @@ class Dispatcher:
         Where boundaries are so close that there is never room, ten ticks are let go by at most.
         """
         tick_at = time.monotonic_ns()
-        if tick_at - self.last_tick > 10 * TICK_NS:
+        if tick_at - self.last_tick > 10 * _TICK_NS:
             self._tick()
         while tick_at + _ROOM_NS <= self.upcoming[0]:
             sleep_until(tick_at)
             self._tick()
-            tick_at = self.last_tick + TICK_NS
+            tick_at = self.last_tick + _TICK_NS
 
     def _tick(self) -> None:
         """A sign of life, and all that has waited."""
@@ -301,45 +226,41 @@ class Dispatcher:
         """
         self.own.beats += 1
         let_go = self.own.let_go
-        thawed = let_go != self.let_go or now - self.last_sign > _THAWED_AFTER_NS
-        if thawed and self.open is not None:
-            for server in sorted(set(range(len(self.groups))) - self.open):
-                self._write(server, b"1")
+        if self.open is not None and (
+            let_go != self.let_go or now - self.last_sign > _THAWED_AFTER_NS
+        ):
+            self._write(self.all - self.open, b"1")
         self.last_sign, self.let_go = now, let_go
 
     def _examine(self) -> None:
         """Count overruns of servers that have closed, as soon as their threads have stopped."""
         for server in list(self.unexamined):
-            if self.open is None or server in self.open:
-                self.unexamined.discard(server)  # open again before anybody could look
-                continue
-            try:
-                wanted_to_run = overrun(group.threads for group in self.groups[server].values())
-            except PermissionError:
-                self.counters[server].overruns = -1
+            counters = self.counters[server]
+            ran: bool | None = False
+            if self.open is not None and server not in self.open:
+                try:
+                    ran = overrun(group.threads for group in self.groups[server].values())
+                except PermissionError:
+                    counters.overruns = -1
+            if ran is not None:
                 self.unexamined.discard(server)
-                continue
-            if wanted_to_run is not None:
-                self.unexamined.discard(server)
-            if wanted_to_run and self.counters[server].overruns >= 0:
-                self.counters[server].overruns += 1
+                counters.overruns += ran and counters.overruns >= 0
 
     def _obey(self) -> None:
-        try:
-            while True:
-                received = os.read(self.commands, 65536)
-                if not received:
-                    raise OperationError("the owner is gone")
+        with contextlib.suppress(BlockingIOError):
+            while received := os.read(self.commands, 65536):
                 self.heard += received
-        except BlockingIOError:
-            pass
+            raise OperationError("the owner is gone")
         *lines, self.heard = self.heard.split(b"\n")
         for line in lines:
             command = json.loads(line)
             if "folder" in command:
                 self._add(self.places[command["server"]], command["folder"])
             else:
-                self._move(Anchoring(command["begin_ns"], command["end_ns"]))
+                anchoring = Anchoring(command["begin_ns"], command["end_ns"])
+                ahead = chain([self.upcoming], self.ahead)
+                self.ahead = moved(ahead, anchoring, self.boundaries, self.cycle_ns)
+                self.upcoming = next(self.ahead)
             self.own.acknowledged = command["number"]
 
     def _add(self, server: int, folder: str) -> None:
@@ -352,19 +273,16 @@ class Dispatcher:
             self.counters[server].lost += 1
             return
         closed = self.open is not None and server not in self.open
-        self._write(server, b"1" if closed else b"0")
-
-    def _move(self, anchoring: Anchoring) -> None:
-        ahead = chain([self.upcoming], self.ahead)
-        self.ahead = moved(ahead, anchoring, self.boundaries, self.cycle_ns)
-        self.upcoming = next(self.ahead)
+        self._write([server], b"1" if closed else b"0")
 
 
 def overrun(groups: Iterable[int]) -> bool | None:
-    """Whether a frozen thread was computing when it was stopped.
+    """Whether a frozen thread was computing when it was stopped, at the end of its slot.
 
-    ``groups`` are open ``cgroup.threads`` files. None when a thread has not reached the freezer
-    yet, for want of the core.
+    ``groups`` are open ``cgroup.threads`` files. The kernel shows where a frozen thread was in
+    ``/proc/TID/syscall``; -1 is user mode. (Its state says nothing any more: freezing wakes
+    sleepers.) One caught inside a system call passes for one that waits. None when a thread has not
+    reached the freezer yet, for want of the core. Raises PermissionError: not to be seen by us.
     """
     undecided = False
     for group in groups:
@@ -374,11 +292,7 @@ def overrun(groups: Iterable[int]) -> bool | None:
             continue
         for tid in tids:
             try:
-                file = os.open(f"/proc/{tid}/syscall", os.O_RDONLY | os.O_CLOEXEC)
-                try:
-                    where = os.read(file, 8)
-                finally:
-                    os.close(file)
+                where = read_proc(f"/proc/{tid}/syscall")
             except (FileNotFoundError, ProcessLookupError):
                 continue  # it ended while frozen
             if where.startswith(b"-1"):
@@ -387,13 +301,13 @@ def overrun(groups: Iterable[int]) -> bool | None:
     return None if undecided else False
 
 
-def become_real_time(core: int) -> bool:
-    """Highest class first, then the core, then memory; False when the class is not permitted.
+def _become_real_time(core: int) -> None:
+    """Highest class, if it is permitted, then the core, then memory.
 
     The class goes first: on a core where a SCHED_FIFO thread spins, a process that moves there as
     SCHED_OTHER would not run again. Raises PlatformError: the core is not available.
     """
-    permitted = become_fifo(PRIORITY)
+    become_fifo(PRIORITY)
     try:
         os.sched_setaffinity(0, {core})
     except OSError as error:
@@ -403,7 +317,6 @@ def become_real_time(core: int) -> bool:
         ) from error
     lock_memory()
     stop_garbage_collection()
-    return permitted
 
 
 def _end(_number: int, _frame: FrameType | None) -> None:
@@ -420,22 +333,20 @@ def main() -> None:
     run = run_of(journal)
     if run is None:
         sys.exit(f"{path} speaks of no servers")
-    dispatcher = Dispatcher(run.table, core, open_page(run.page, run.table), owner, commands)
+    dispatcher = Dispatcher(run.table, core, CounterPage(run.page, run.table), owner, commands)
     set_thread_name(f"dispatcher/{core}")
     try:
-        dispatcher.own.real_time = become_real_time(core)
+        _become_real_time(core)
         dispatcher.run()
-    except OperationError as error:
+    except ChainshaperError as error:
         dispatcher.thaw_all()
         with contextlib.suppress(OSError):  # the owner may be gone, who would read it
             sys.stderr.write(shown(str(error)) + "\n")
-        # Guardians have learnt of it earlier. If there is none left, it is for us.
-        from chainshaper.enforcement.undoing import undo_run
+        if isinstance(error, OperationError):
+            # Guardians have learnt of it earlier. If there is none left, it is for us.
+            from chainshaper.enforcement.undoing import undo_run
 
-        undo_run(journal)
-        sys.exit(error.exit_code)
-    except ChainshaperError as error:
-        sys.stderr.write(shown(str(error)) + "\n")
+            undo_run(journal)
         sys.exit(error.exit_code)
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)

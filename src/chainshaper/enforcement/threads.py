@@ -1,35 +1,27 @@
 """Which thread does what in an application, and what each shall get for a plan.
 
-The paper's Thread Allocator (section 4.2). What is known of a thread, the stronger evidence first:
-a recording saw the callbacks that it ran; its name, which DDS implementations choose; its place:
-executors spin on the main thread, unless the program arranges it otherwise. Which nodes a process
-has, a recording says (also one of an earlier run, where the command line names one of them), or the
-remap rules of its command line; the name of its program is a guess, and called one. Only processes
-of the users that are asked for are nodes (:mod:`chainshaper.linux.processes`); those of others that
-repeat a node's name are named, and left alone.
+The paper's Thread Allocator (section 4.2). Evidence for a thread's role, the stronger first: the
+callbacks that a recording saw it run; its name, which DDS implementations choose; its place, since
+executors spin on the main thread unless the program arranges it otherwise.
 
 On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DESIGN section 6):
 
-* DDS threads of the application stand above all servers, on other cores where there are any:
-  what they deliver must not wait for what it is delivered to;
-* those of them that receive stand above the others, since they are waited for; where the output is
-  received, they have the first of these cores, which the shaping node leaves clear;
-* servers stand below 88 in the order of their own priority, smaller first;
-* who receives what a shaping node publishes stands below all servers, on the shaping node's core:
-  idle then, and just awake. It may take as long as it likes, and delays no chain;
-* several threads of one server share a priority under SCHED_RR, so that they take turns;
-* an asynchronous publisher stands below every other thread of its process on its core. It shares
-  the writer's lock with them and spins on it: above them, it would never let them release it;
+* DDS threads stand above all servers, on other cores where there are any: what they deliver must
+  not wait for what it is delivered to. Those that receive stand above the others; where the output
+  is received, they have the first of these cores, which the shaping node leaves clear;
+* servers stand below 88 in the order of their own priority, smaller first; several threads of one
+  server share a priority under SCHED_RR, so that they take turns;
+* who receives what a shaping node publishes stands below all servers, on the shaping node's core;
+* an asynchronous publisher stands below every other thread of its process on its core: it spins on
+  the writer's lock, and above them would never let them release it;
 * all others, best effort, are left alone.
-
-All is a function of what was seen at one instant. Threads that appear later are found by looking
-again (:func:`new_and_ended`).
 """
 
 import time
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain as joined
+from typing import NamedTuple
 
 from chainshaper.enforcement.servers import ReservationServer
 from chainshaper.linux.processes import (
@@ -47,21 +39,16 @@ from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.values.errors import InputError, OperationError
 
 LEFT_ALONE = "left alone, since users run them whom this run does not name: "
-_MOST_NAMED = 5
 DDS_PRIORITY = 90
-DDS_RECEIVE_PRIORITY = 91
-BEST_SERVER_PRIORITY = 87
-RECEIVES = "receives the output"
-STEP = 2
-"""Between two servers there is room for a publisher below the better one's threads."""
+_BEST_SERVER_PRIORITY = 87
+_STEP = 2  # room for a publisher below the better server's threads
+_RECEIVES = "receives the output"
+_MOST_NAMED = 5
 
 
 @dataclass(frozen=True)
 class RecordedThread:
-    """A thread that a recording saw, by its id in its own pid namespace.
-
-    ``nodes`` are those whose callbacks it ran.
-    """
+    """A thread in a recording, by its id in its own pid namespace, and whose callbacks it ran."""
 
     tid: int
     role: ThreadRole
@@ -70,7 +57,7 @@ class RecordedThread:
 
 @dataclass(frozen=True)
 class RecordedProcess:
-    """A process that a recording saw, last at ``seen_ns`` (ns of CLOCK_MONOTONIC)."""
+    """A process in a recording, seen last at ``seen_ns`` (ns of CLOCK_MONOTONIC)."""
 
     pid: int
     nodes: tuple[str, ...]
@@ -104,14 +91,13 @@ class Allocation:
     strangers: str | None = None
 
 
-@dataclass(frozen=True)
-class _Identified:
+class _Identified(NamedTuple):
     """A process with its nodes, how they are known, and its recorded self if there is one."""
 
     process: Process
-    nodes: tuple[str, ...]
-    nodes_known_by: str
-    recorded: RecordedProcess | None
+    nodes: tuple[str, ...] = ()
+    nodes_known_by: str = ""
+    recorded: RecordedProcess | None = None
 
 
 def allocate(
@@ -122,35 +108,45 @@ def allocate(
 ) -> Allocation:
     """Find out what each thread of ``processes`` does.
 
-    ``among`` are all processes that were looked at, where these are some of them: who started
-    whom tells a node from the commands that run it. Two processes that both are a node, as far
-    as can be seen, are a note, and both are given the node. Where ``users`` are given, processes
-    of others have no nodes.
+    ``among`` are all processes that were looked at, if these are some of them: who started whom
+    tells a node from the commands that run it. Two processes that seem to be one node both get it,
+    with a note. Where ``users`` are given, processes of others have no nodes.
     """
-    everybody = processes if among is None else among
     identified = _with_unique_names(
         [
             _identify(process, recorded)
             if users is None or process.user in users
-            else _Identified(process, (), "", None)
-            for process in everybody
+            else _Identified(process)
+            for process in (processes if among is None else among)
         ]
     )
     wanted = {process.pid for process in processes}
     chosen = [one for one in identified if one.process.pid in wanted]
-    threads = [thread for one in chosen for thread in _threads_of(one)]
-    return Allocation(tuple(threads), (*_guesses(chosen), *_ambiguities(chosen)))
+    guesses = [
+        f"process {one.process.pid} is called {one.nodes[0]} after its program, which is a guess: "
+        "name its recording, or start it with `--ros-args -r __node:=NAME`"
+        for one in chosen
+        if one.nodes_known_by == "program's name" and one.nodes
+    ]
+    ambiguities = [
+        f"node {name} is ambiguous: processes "
+        f"{', '.join(str(one.process.pid) for one in claimants)} all have it; give each "
+        "a name or a namespace of its own, or end those that are not meant"
+        for name, claimants in _claims(chosen).items()
+    ]
+    threads = tuple(thread for one in chosen for thread in _threads_of(one))
+    return Allocation(threads, (*guesses, *ambiguities))
 
 
 def new_and_ended(
     before: Allocation, now: Allocation
 ) -> tuple[tuple[NodeThread, ...], tuple[NodeThread, ...]]:
     """The threads that have appeared and those that are gone since an earlier look."""
-    known = {known.thread.identity for known in before.threads}
-    alive = {known.thread.identity for known in now.threads}
+    known = {one.thread.identity for one in before.threads}
+    alive = {one.thread.identity for one in now.threads}
     return (
-        tuple(found for found in now.threads if found.thread.identity not in known),
-        tuple(gone for gone in before.threads if gone.thread.identity not in alive),
+        tuple(one for one in now.threads if one.thread.identity not in known),
+        tuple(one for one in before.threads if one.thread.identity not in alive),
     )
 
 
@@ -178,18 +174,16 @@ def _identify(process: Process, recorded: Sequence[RecordedProcess]) -> _Identif
     match = next((seen for seen in recorded if _is_same(process, named, seen)), None)
     if match is not None and match.nodes:
         return _Identified(process, match.nodes, "recording", match)
-    if named:
-        # A container's command line names the container only; an earlier run tells its components.
-        earlier = next((seen.nodes for seen in recorded if set(named) < set(seen.nodes)), None)
-        known_by = "command line" if earlier is None else "recording"
-        return _Identified(process, earlier or named, known_by, match)
+    # A container's command line names the container only; an earlier run tells its components.
+    earlier = (seen.nodes for seen in recorded if named and set(named) < set(seen.nodes))
+    if components := next(earlier, None):
+        return _Identified(process, components, "recording", match)
     return _Identified(process, *_own_words(process), match)
 
 
 def _own_words(process: Process) -> tuple[tuple[str, ...], str]:
     """The nodes that a process has by its command line, and which part of that says so."""
-    named = named_nodes(process.command)
-    if named:
+    if named := named_nodes(process.command):
         return named, "command line"
     guess = guessed_name(process.command)
     looks_like_a_node = process.participates or takes_ros_arguments(process.command)
@@ -201,10 +195,18 @@ def _is_same(process: Process, named: tuple[str, ...], seen: RecordedProcess) ->
     if seen.pid != process.inner_pid or not process.threads:
         return False
     asleep_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
-    started_ns = process.threads[0].started * TICK_NS - asleep_ns
-    if started_ns > seen.seen_ns + TICK_NS:
+    if process.threads[0].started * TICK_NS - asleep_ns > seen.seen_ns + TICK_NS:
         return False
     return not (named and seen.nodes) or not set(named).isdisjoint(seen.nodes)
+
+
+def _claims(identified: Iterable[_Identified]) -> dict[str, list[_Identified]]:
+    """The names that several processes have, with these."""
+    claims: dict[str, list[_Identified]] = {}
+    for one in identified:
+        for name in one.nodes:
+            claims.setdefault(name, []).append(one)
+    return {name: claimants for name, claimants in claims.items() if len(claimants) > 1}
 
 
 def _with_unique_names(identified: list[_Identified]) -> list[_Identified]:
@@ -214,73 +216,36 @@ def _with_unique_names(identified: list[_Identified]) -> list[_Identified]:
     the innermost is.
     """
     parent_of = {one.process.pid: one.process.parent for one in identified}
-    claims: dict[str, list[_Identified]] = {}
-    for one in identified:
-        for name in one.nodes:
-            claims.setdefault(name, []).append(one)
-    carriers: set[tuple[int, str]] = set()
-    for name, claimants in claims.items():
-        if len(claimants) == 1:
-            continue
+    carried = set()
+    for name, claimants in _claims(identified).items():
         pids = {one.process.pid for one in claimants}
-        for one in claimants:
-            if any(other.process.participates for other in claimants):
-                carries = not one.process.participates
-            else:
-                below = descendants(parent_of, one.process.pid) - {one.process.pid}
-                carries = bool(below & pids)
-            if carries:
-                carriers.add((one.process.pid, name))
+        some_participate = any(one.process.participates for one in claimants)
+        for pid, participates in ((one.process.pid, one.process.participates) for one in claimants):
+            below = (descendants(parent_of, pid) - {pid}) & pids
+            if not participates if some_participate else below:
+                carried.add((pid, name))
     return [
-        replace(
-            one, nodes=tuple(name for name in one.nodes if (one.process.pid, name) not in carriers)
-        )
+        one._replace(nodes=tuple(n for n in one.nodes if (one.process.pid, n) not in carried))
         for one in identified
     ]
 
 
-def _threads_of(one: _Identified) -> list[NodeThread]:
+def _threads_of(one: _Identified) -> Iterable[NodeThread]:
     seen = {thread.tid: thread for thread in one.recorded.threads} if one.recorded else {}
     executors_seen = any(thread.role == "executor" for thread in seen.values())
-    found = []
     for thread in one.process.threads:
         nodes, role, known_by = one.nodes, thread.role, ""
         recorded = seen.get(thread.inner_tid)
         if recorded is not None and recorded.role != "unknown":
             nodes, role, known_by = recorded.nodes or nodes, recorded.role, "recording"
         elif thread.role == "executor":
-            role, known_by = ("executor", "main thread") if nodes else ("unknown", "")
-            if executors_seen:  # others execute: a program that keeps its main thread out of it
-                role, known_by = "unknown", ""
+            # Where others execute, the program keeps its main thread out of it.
+            main = bool(nodes) and not executors_seen
+            role, known_by = ("executor", "main thread") if main else ("unknown", "")
         elif thread.role != "unknown":
             known_by = "name"
         kind = thread.kind if role in ("dds", "publisher") else None
-        found.append(
-            NodeThread(replace(thread, role=role, kind=kind), nodes, known_by, one.nodes_known_by)
-        )
-    return found
-
-
-def _guesses(identified: Iterable[_Identified]) -> list[str]:
-    return [
-        f"process {one.process.pid} is called {one.nodes[0]} after its program, which is a guess: "
-        "name its recording, or start it with `--ros-args -r __node:=NAME`"
-        for one in identified
-        if one.nodes_known_by == "program's name" and one.nodes
-    ]
-
-
-def _ambiguities(identified: Iterable[_Identified]) -> list[str]:
-    owners: dict[str, list[int]] = {}
-    for one in identified:
-        for name in one.nodes:
-            owners.setdefault(name, []).append(one.process.pid)
-    return [
-        f"node {name} is ambiguous: processes {', '.join(map(str, pids))} all have it; give each "
-        "a name or a namespace of its own, or end those that are not meant"
-        for name, pids in owners.items()
-        if len(pids) > 1
-    ]
+        yield NodeThread(replace(thread, role=role, kind=kind), nodes, known_by, one.nodes_known_by)
 
 
 @dataclass(frozen=True)
@@ -304,15 +269,15 @@ def server_members(plan: Plan, allocation: Allocation) -> dict[str, tuple[NodeTh
     members: dict[str, tuple[NodeThread, ...]] = {}
     for server in plan.servers:
         found = {
-            thread.thread.identity: thread
+            one.thread.identity: one
             for planned in server.threads
-            for thread in _threads_for(planned, allocation)
+            for one in _threads_for(planned, allocation)
         }
-        for identity, thread in found.items():
+        for identity, one in found.items():
             if identity in homes:
                 raise OperationError(
-                    f"thread {thread.thread.tid} ({thread.thread.comm}) executes "
-                    f"{', '.join(thread.nodes)}, which the plan has in the servers "
+                    f"thread {one.thread.tid} ({one.thread.comm}) executes "
+                    f"{', '.join(one.nodes)}, which the plan has in the servers "
                     f"{homes[identity]} and {server.name}: put them into one server, or start "
                     "them as processes of their own"
                 )
@@ -321,19 +286,43 @@ def server_members(plan: Plan, allocation: Allocation) -> dict[str, tuple[NodeTh
     return members
 
 
+def _threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThread]:
+    owners = [one for one in allocation.threads if planned.node in one.nodes]
+    found = [one for one in owners if one.thread.role == planned.role]
+    pids = sorted({one.thread.pid for one in owners})
+    if len(pids) > 1:
+        raise OperationError(
+            f"node {planned.node} is ambiguous: processes {', '.join(map(str, pids))} all have it; "
+            "end those that are not meant, or give each a namespace of its own"
+        )
+    if not pids:
+        known = sorted({node for one in allocation.threads for node in one.nodes})
+        raise OperationError(
+            f"node {planned.node} of the plan is not running, or cannot be recognised; running: "
+            f"{', '.join(known) or 'no node'}; start it with `--ros-args -r __node:=NAME`, or name "
+            "a recording of it" + (f"; {allocation.strangers}" if allocation.strangers else "")
+        )
+    if not found:
+        what = "asynchronous publisher" if planned.role == "publisher" else planned.role
+        raise OperationError(
+            f"process {pids[0]} of node {planned.node} has no thread that is known to be its "
+            f"{what}: see `chainshaper threads {pids[0]}`"
+        )
+    return found
+
+
 def server_priorities(priorities: Iterable[int]) -> dict[int, int]:
     """The real-time priority for each server priority: 87 for the best, 85, 83 …
 
     Raises InputError: there are more than 43 of them.
     """
     ranks = sorted(set(priorities))
-    lowest = BEST_SERVER_PRIORITY - STEP * (len(ranks) - 1)
-    if lowest <= 1:
+    if _BEST_SERVER_PRIORITY - _STEP * (len(ranks) - 1) <= 1:
         raise InputError(
             f"{len(ranks)} different server priorities do not fit below {DDS_PRIORITY}: give "
             "servers that never overlap the same priority"
         )
-    return {rank: BEST_SERVER_PRIORITY - STEP * place for place, rank in enumerate(ranks)}
+    return {rank: _BEST_SERVER_PRIORITY - _STEP * place for place, rank in enumerate(ranks)}
 
 
 def plan_scheduling(
@@ -341,11 +330,20 @@ def plan_scheduling(
 ) -> tuple[WantedScheduling, ...]:
     """What every thread concerned by a plan shall get: servers' threads first, then the others.
 
-    Receivers that do not run are left out: not everybody who subscribes is always there. Raises
-    OperationError: see :func:`server_members`. InputError: see :func:`server_priorities`.
+    Executors that receive an output and are in no server stand below all of these; those that do
+    not run are left out. Raises OperationError: see :func:`server_members`. InputError: see
+    :func:`server_priorities`.
     """
     members = server_members(plan, allocation)
-    receiving = _receiving(plan, members, allocation)
+    planned = {one.thread.identity for group in members.values() for one in group}
+    below = min(server_priorities(server.priority for server in plan.servers).values()) - _STEP
+    cores = {receiver: node.core for node in shaping_nodes(plan) for receiver in node.receivers}
+    receiving = [
+        WantedScheduling(one, Scheduling(max(1, below), (core,)), None, _RECEIVES)
+        for one in allocation.threads
+        if one.thread.role == "executor" and one.thread.identity not in planned
+        for core in [cores[node] for node in one.nodes if node in cores][:1]
+    ]
     return scheduling_around(
         members, plan.servers, allocation, available_cores, receiving=receiving
     )
@@ -365,18 +363,83 @@ def scheduling_around(
     get, whose processes are treated alike. Raises OperationError: a thread cannot leave the core of
     a publisher that would outrank it. InputError: see :func:`server_priorities`.
     """
-    own = wanted_of_members(members, servers)
-    ours = [*joined.from_iterable(members.values()), *(one.thread for one in receiving)]
-    pids = {member.thread.pid for member in ours}
-    planned = {member.thread.identity for member in ours}
-    others = [
-        thread
-        for thread in allocation.threads
-        if thread.thread.pid in pids and thread.thread.identity not in planned
+    ranks = server_priorities(server.priority for server in servers)
+    own = [
+        WantedScheduling(
+            member,
+            Scheduling(ranks[server.priority], (server.core,), len(members[server.name]) > 1),
+            server.name,
+            f"server priority {server.priority}",
+        )
+        for server in sorted(servers, key=lambda one: one.priority)
+        for member in members[server.name]
     ]
+    planned = {one.thread.thread.identity: one.thread.thread.pid for one in (*own, *receiving)}
     free_cores = tuple(sorted(set(available_cores) - {server.core for server in servers}))
-    beside = _dds_threads(others, free_cores, {one.thread.thread.pid for one in receiving})
-    return below_their_siblings((*own, *receiving, *beside, *_out_of_the_way(own, others)))
+    receivers = {one.thread.thread.pid for one in receiving}
+    beside = (
+        _beside(one, own, free_cores, one.thread.pid in receivers)
+        for one in allocation.threads
+        if one.thread.pid in planned.values() and one.thread.identity not in planned
+    )
+    wanted = [*own, *receiving, *(one for one in beside if one is not None)]
+    # What a person reads: servers' threads, DDS threads, the others.
+    wanted.sort(key=lambda one: one.wanted.priority is None)
+    return tuple(
+        _below(one, wanted) if one.thread.thread.role == "publisher" else one for one in wanted
+    )
+
+
+def _beside(
+    one: NodeThread, own: Sequence[WantedScheduling], cores: tuple[int, ...], receives_output: bool
+) -> WantedScheduling | None:
+    """What a thread in no server shall get, in a process that has one in a server.
+
+    DDS threads stand above all servers; on machines without a free core they stay where they are.
+    Others, of no class of their own, leave the core of a publisher, which would outrank them.
+    """
+    thread = one.thread
+    if thread.role == "dds":
+        receives = thread.kind == "receive"
+        allowed = cores[:1] if receives and receives_output else cores
+        scheduling = Scheduling(DDS_PRIORITY + receives, allowed or None)
+        return WantedScheduling(one, scheduling, None, "DDS threads deliver for the servers")
+    publishers = (
+        publisher.wanted.cores or ()
+        for publisher in own
+        if publisher.thread.thread.role == "publisher" and publisher.thread.thread.pid == thread.pid
+    )
+    shared = set(thread.cores).intersection(joined.from_iterable(publishers))
+    if not shared:
+        return None
+    elsewhere = tuple(sorted(set(thread.cores) - shared))
+    if not elsewhere:
+        raise OperationError(
+            f"thread {thread.tid} ({thread.comm}) of process {thread.pid} may run on core "
+            f"{min(shared)} only, where the process's asynchronous publisher would outrank it and "
+            "never let it release the writer's lock: let it run on another core too (`taskset`)"
+        )
+    reason = "not on the core of its process's asynchronous publisher"
+    return WantedScheduling(one, Scheduling(None, elsewhere), None, reason)
+
+
+def _below(publisher: WantedScheduling, wanted: Iterable[WantedScheduling]) -> WantedScheduling:
+    """A publisher below the other threads of its process on its core."""
+    core = (publisher.wanted.cores or (None,))[0]
+    siblings = [
+        one.wanted.priority - 1
+        for one in wanted
+        if one.thread.thread.pid == publisher.thread.thread.pid
+        and one.thread.thread.role != "publisher"
+        and one.wanted.priority is not None
+        and core in (one.wanted.cores or one.thread.thread.cores)
+    ]
+    below = max(1, min(siblings, default=99))
+    if below >= (publisher.wanted.priority or 0):
+        return publisher
+    scheduling = replace(publisher.wanted, priority=below)
+    reason = "below its siblings, whose locks it spins on"
+    return replace(publisher, wanted=scheduling, reason=reason)
 
 
 def left_by_back_end(
@@ -390,147 +453,11 @@ def left_by_back_end(
     """
     if back_end not in ("scx", "litmus"):
         return tuple(wanted)
-    wanted = (one for one in wanted if one.reason != RECEIVES)
-    return tuple(
-        one
-        if one.server is None
-        else replace(
-            one,
-            wanted=Scheduling(
-                0 if back_end == "scx" and one.thread.thread.priority else None, one.wanted.cores
-            ),
-        )
-        for one in wanted
-    )
-
-
-def wanted_of_members(
-    members: Mapping[str, Sequence[NodeThread]], servers: Collection[Server | ReservationServer]
-) -> tuple[WantedScheduling, ...]:
-    """Class, priority and core of servers' threads; ``members`` are by server's name."""
-    ranks = server_priorities(server.priority for server in servers)
-    return tuple(
-        WantedScheduling(
-            member,
-            Scheduling(
-                ranks[server.priority], (server.core,), takes_turns=len(members[server.name]) > 1
-            ),
-            server.name,
-            f"server priority {server.priority}",
-        )
-        for server in sorted(servers, key=lambda one: one.priority)
-        for member in members[server.name]
-    )
-
-
-def below_their_siblings(wanted: Sequence[WantedScheduling]) -> tuple[WantedScheduling, ...]:
-    """The same with each publisher below the other threads of its process on its core."""
-    family: dict[int, list[WantedScheduling]] = {}
+    left = []
     for one in wanted:
-        if one.thread.thread.role != "publisher" and one.wanted.priority is not None:
-            family.setdefault(one.thread.thread.pid, []).append(one)
-    return tuple(
-        _below(one, family.get(one.thread.thread.pid, ()))
-        if one.thread.thread.role == "publisher"
-        else one
-        for one in wanted
-    )
-
-
-def _below(publisher: WantedScheduling, family: Iterable[WantedScheduling]) -> WantedScheduling:
-    core = (publisher.wanted.cores or (None,))[0]
-    siblings = [
-        (one.wanted.priority or 0) - 1
-        for one in family
-        if core in (one.wanted.cores or one.thread.thread.cores)
-    ]
-    below = max(1, min(siblings, default=99))
-    if below >= (publisher.wanted.priority or 0):
-        return publisher
-    wanted = replace(publisher.wanted, priority=below)
-    return replace(publisher, wanted=wanted, reason="below its siblings, whose locks it spins on")
-
-
-def _threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThread]:
-    owners = [thread for thread in allocation.threads if planned.node in thread.nodes]
-    found = [owner for owner in owners if owner.thread.role == planned.role]
-    pids = sorted({owner.thread.pid for owner in owners})
-    if len(pids) > 1:
-        raise OperationError(
-            f"node {planned.node} is ambiguous: processes {', '.join(map(str, pids))} all have it; "
-            "end those that are not meant, or give each a namespace of its own"
-        )
-    if not pids:
-        known = sorted({node for thread in allocation.threads for node in thread.nodes})
-        raise OperationError(
-            f"node {planned.node} of the plan is not running, or cannot be recognised; running: "
-            f"{', '.join(known) or 'no node'}; start it with `--ros-args -r __node:=NAME`, or name "
-            "a recording of it" + (f"; {allocation.strangers}" if allocation.strangers else "")
-        )
-    if not found:
-        what = "asynchronous publisher" if planned.role == "publisher" else planned.role
-        raise OperationError(
-            f"process {pids[0]} of node {planned.node} has no thread that is known to be its "
-            f"{what}: see `chainshaper threads {pids[0]}`"
-        )
-    return found
-
-
-def _receiving(
-    plan: Plan, members: Mapping[str, Sequence[NodeThread]], allocation: Allocation
-) -> list[WantedScheduling]:
-    """The executors of nodes that receive an output, unless they are in a server themselves."""
-    planned = {one.thread.identity for group in members.values() for one in group}
-    below = min(server_priorities(server.priority for server in plan.servers).values()) - STEP
-    cores = {receiver: node.core for node in shaping_nodes(plan) for receiver in node.receivers}
-    return [
-        WantedScheduling(one, Scheduling(max(1, below), (core,)), None, RECEIVES)
-        for one in allocation.threads
-        if one.thread.role == "executor" and one.thread.identity not in planned
-        for core in [cores[node] for node in one.nodes if node in cores][:1]
-    ]
-
-
-def _dds_threads(
-    others: Sequence[NodeThread], cores: tuple[int, ...], receivers: Collection[int]
-) -> list[WantedScheduling]:
-    """DDS threads above all servers; on machines without a free core they stay where they are.
-
-    ``receivers`` are the processes that receive an output.
-    """
-    wanted = []
-    for one in others:
-        if one.thread.role != "dds":
-            continue
-        receives = one.thread.kind == "receive"
-        own = cores[:1] if receives and one.thread.pid in receivers else cores
-        priority = DDS_RECEIVE_PRIORITY if receives else DDS_PRIORITY
-        reason = "DDS threads deliver for the servers"
-        wanted.append(WantedScheduling(one, Scheduling(priority, own or None), None, reason))
-    return wanted
-
-
-def _out_of_the_way(
-    own: Sequence[WantedScheduling], others: Sequence[NodeThread]
-) -> list[WantedScheduling]:
-    """Siblings of no class of their own leave the core of a publisher, which would outrank them."""
-    cores: dict[int, set[int]] = {}
-    for one in own:
-        if one.thread.thread.role == "publisher" and one.wanted.cores:
-            cores.setdefault(one.thread.thread.pid, set()).update(one.wanted.cores)
-    moved = []
-    for thread in others:
-        shared = cores.get(thread.thread.pid, set()) & set(thread.thread.cores)
-        if not shared or thread.thread.role == "dds":
-            continue
-        elsewhere = tuple(sorted(set(thread.thread.cores) - shared))
-        if not elsewhere:
-            raise OperationError(
-                f"thread {thread.thread.tid} ({thread.thread.comm}) of process "
-                f"{thread.thread.pid} may run on core {min(shared)} only, where the process's "
-                "asynchronous publisher would outrank it and never let it release the writer's "
-                "lock: let it run on another core too (`taskset`)"
-            )
-        reason = "not on the core of its process's asynchronous publisher"
-        moved.append(WantedScheduling(thread, Scheduling(None, elsewhere), None, reason))
-    return moved
+        if one.server is not None:
+            priority = 0 if back_end == "scx" and one.thread.thread.priority else None
+            left.append(replace(one, wanted=Scheduling(priority, one.wanted.cores)))
+        elif one.reason != _RECEIVES:
+            left.append(one)
+    return tuple(left)

@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING
 from chainshaper.enforcement import threads as allocation
 from chainshaper.enforcement import undoing
 from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, make_back_end
-from chainshaper.enforcement.guardian import Guardians, run_claimed, start_guardians
+from chainshaper.enforcement.freezer import groups_of, run_of
+from chainshaper.enforcement.guardian import Guardians, run_claimed
 from chainshaper.enforcement.scheduling_memory import change_all, look_alikes, note_descendants
 from chainshaper.enforcement.servers import BackEnd, ServerCounters, ServerTable
 from chainshaper.enforcement.threads import Allocation, NodeThread, RecordedProcess
@@ -109,7 +110,7 @@ def apply_plan(
     journal = undoing.claim_run(cores, nodes, folder, lambda: _go_on(stop))
     run = _Run(given, plan, choice, journal, recorded, taken, stop)
     try:
-        run.guardians = start_guardians(journal)
+        run.guardians = Guardians(journal)
         if command:
             run.command = start_command(command, stdout=command_stdout)
         run.await_nodes((START_NS if command else 0) if wait_ns is None else wait_ns, progress)
@@ -119,7 +120,7 @@ def apply_plan(
         run.begin_state(table, command, plan_path)
         run.arm(run.servers, phase_ns, progress)
         run.watch_over(run.servers, watch)
-        strangers = look_alikes(journal)
+        strangers = look_alikes(journal, groups_of(run_of(journal)))
     finally:
         run.put_back()
     if run.state.failure is not None:
@@ -199,12 +200,8 @@ class _Run:
     def schedule(self) -> None:
         """Give threads their priorities and cores, as far as the back end leaves that to us."""
         wanted = allocation.plan_scheduling(self.plan, self.found, available_cores())
-        changes = (
-            (one.thread.thread, one.wanted)
-            for one in allocation.left_by_back_end(self.choice.name, wanted)
-            if one.server is None or self.choice.name != "fifo"  # that is all the latter does
-        )
-        change_all(self.journal, changes)
+        left = allocation.left_by_back_end(self.choice.name, wanted)
+        change_all(self.journal, ((one.thread.thread, one.wanted) for one in left))
 
     def begin_state(self, table: ServerTable, command: Sequence[str], plan_path: str) -> None:
         keeper = self.choice.name if gates(self.choice.name) else "none: priority only"

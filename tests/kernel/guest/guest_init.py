@@ -67,7 +67,6 @@ def run_checks(say: Any, names: list[str]) -> None:
 
 
 def main() -> None:
-    """PID 1 must not end."""
     prepare()
     with Path("/dev/ttyS1").open("w", buffering=1) as port:
 

@@ -11,7 +11,6 @@ Intervals = list[tuple[int, int]]
 
 
 def read_windows(log: Path) -> Intervals:
-    """What `spin` has written."""
     return list(struct.iter_unpack("<qq", log.read_bytes()))
 
 
@@ -30,12 +29,10 @@ def slots_between(
 
 
 def cut(windows: Intervals, start: int, end: int) -> Intervals:
-    """The windows inside [start, end)."""
     return [(max(a, start), min(b, end)) for a, b in windows if b > start and a < end]
 
 
 def overlap(left: Intervals, right: Intervals) -> int:
-    """How long both hold."""
     total, i, j = 0, 0, 0
     while i < len(left) and j < len(right):
         total += max(0, min(left[i][1], right[j][1]) - max(left[i][0], right[j][0]))
@@ -47,7 +44,6 @@ def overlap(left: Intervals, right: Intervals) -> int:
 
 
 def length(intervals: Intervals) -> int:
-    """How long they are together."""
     return sum(end - start for start, end in intervals)
 
 
@@ -62,7 +58,6 @@ class Precision:
     longest_outside: int
 
     def text(self) -> str:
-        """In microseconds: minimum, median, maximum."""
         return (
             f"{len(self.enter)} slots, enter {_spread(self.enter)} us, leave "
             f"{_spread(self.leave)} us, outside {self.outside / 1e3:.1f} us"

@@ -23,12 +23,10 @@ MS = 1_000_000
 def server(
     name: str, start_ms: int, end_ms: int, priority: int = 1, core: int = 0
 ) -> ReservationServer:
-    """A server with one slot."""
     return ReservationServer(name, core, priority, ((start_ms * MS, end_ms * MS),))
 
 
 def table(*servers: ReservationServer, cycle_ms: int = 50) -> ServerTable:
-    """A table of such servers."""
     return ServerTable(cycle_ms * MS, servers)
 
 
@@ -42,7 +40,6 @@ def scheduler_state() -> str:
 
 
 def wait(milliseconds: float) -> None:
-    """Sleep."""
     time.sleep(milliseconds / 1e3)
 
 
@@ -93,7 +90,6 @@ class Loader:
         self.ask("create", asdict(servers))
 
     def answer(self, method: str, *arguments: Any) -> dict[str, Any]:
-        """A call's result or error."""
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         self.process.stdin.write(json.dumps([method, *arguments]).encode() + b"\n")
@@ -115,13 +111,10 @@ class Loader:
 
 
 class Scene:
-    """What takes part in a check."""
-
     def __init__(self) -> None:
         self._processes: list[subprocess.Popen[bytes]] = []
 
     def spinner(self, name: str, core: int = 0, job: Any = None) -> Spinner:
-        """One more thread."""
         made = Spinner(name, core, job)
         self._processes.append(made.process)
         return made
@@ -149,7 +142,6 @@ class Scene:
 
 @contextlib.contextmanager
 def scene() -> Iterator[Scene]:
-    """A scene that ends with the check."""
     made = Scene()
     try:
         yield made

@@ -15,7 +15,6 @@ from chainshaper.values.errors import ChainshaperError
 
 
 def table_of(text: dict[str, Any]) -> ServerTable:
-    """The table that `asdict` has made JSON of."""
     servers = tuple(
         ReservationServer(s["name"], s["core"], s["priority"], tuple(map(tuple, s["slots"])))
         for s in text["servers"]
@@ -24,7 +23,6 @@ def table_of(text: dict[str, Any]) -> ServerTable:
 
 
 def main() -> None:
-    """Serve until the input ends."""
     servers = None
     for line in sys.stdin:
         method, *arguments = json.loads(line)
@@ -35,7 +33,7 @@ def main() -> None:
             elif method == "change":
                 servers.change(table_of(arguments[0]), arguments[1])  # type: ignore[union-attr]
             elif method == "since":
-                result = servers.in_force_since_ns  # type: ignore[union-attr]
+                result = servers.in_force_from()  # type: ignore[union-attr]
             elif method == "kickers":
                 result = {core: k.pid for core, k in servers._kickers.items()}  # type: ignore[union-attr]
             elif method == "counters":

@@ -1,29 +1,35 @@
 """Back end `scx`: the table of servers inside the kernel, as a sched_ext policy.
 
 The policy (`policy/table.bpf.c`, which explains how it works) is compiled ahead. While it is
-in force, *every* thread of the machine's fair class is scheduled by it: those assigned to servers
-inside their slots, all others first come first served behind them. Real-time threads stand above
-it, as they do above the fair class, so a thread that shall be governed must not be one.
-
-A policy begins with an empty table, under which everything is best effort. Each table after that
-is written into the generation that is not in force, and comes into force on all cores at one
-instant that lies a little ahead: until then, every core must learn that it has to decide there.
+in force, *every* thread of the machine's fair class is scheduled by it. Real-time threads stand
+above it, so a thread that shall be governed must not be one. It begins with an empty table, under
+which everything is best effort. Each table after that is written into the generation that is not in
+force, and comes into force on all cores at one instant that lies a little ahead.
 
 Nothing has to be put back by hand. The policy hangs on a file descriptor of this process, and
 however it ends, the kernel returns to its fair class. (A fork without exec inherits the
 descriptor, and keeps the policy for as long as it lives.)
+
+PREEMPT_RT kernels refuse BPF timers. There each core has a **kicker**, a process of its own:
+
+    python -m chainshaper.enforcement.scx.back_end CORE DESCRIPTOR
+
+Under SCHED_FIFO, of the lowest priority, it sleeps on the core until the next boundary. Waking up,
+it pushes whatever ran there back to its queue; asleep again, it leaves a core that has to look at
+the table. (A thread of the loader would wait for the interpreter's lock.)
 """
 
+import ctypes
 import os
 import resource
+import struct
 import subprocess
+import sys
 import threading
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 
-from chainshaper.enforcement.scx import table as layout
-from chainshaper.enforcement.scx.kicker import start_kicker
 from chainshaper.enforcement.scx.libbpf import (
     BpfObject,
     ProgramRun,
@@ -33,9 +39,15 @@ from chainshaper.enforcement.scx.libbpf import (
     look_up_element,
     update_element,
 )
-from chainshaper.enforcement.servers import ServerCounters, ServerTable
-from chainshaper.linux.own_processes import what_happened
-from chainshaper.linux.scheduling import check_cores, may_use_fifo
+from chainshaper.enforcement.servers import ServerCounters, ServerTable, server_named
+from chainshaper.linux.own_processes import module_command, what_happened
+from chainshaper.linux.scheduling import (
+    check_cores,
+    lock_memory,
+    may_use_fifo,
+    set_thread_name,
+    stop_garbage_collection,
+)
 from chainshaper.linux.threads import POLICIES, RESET_ON_FORK
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
@@ -43,12 +55,27 @@ POLICY = Path(__file__).with_name("policy") / "table.bpf.o"
 SCHED_EXT = Path("/sys/kernel/sched_ext")
 KERNEL_TYPES = Path("/sys/kernel/btf/vmlinux")
 STATUS = Path("/proc/self/status")
-WATCH_S = 0.02
-PIDFD_THREAD = os.O_EXCL
-VISIT_NS = 1_000_000
-KICKER_ROUND_NS = 60_000_000
-"""Each kicker looks for a new table every 20 ms at least."""
 
+# As in policy/table_abi.h; a test compares them with what a C compiler makes of that file.
+MAX_SERVERS = 128  # with id 0, which means best effort
+MAX_SLOTS = 64
+MAX_SERVERS_PER_CORE = 32
+MAX_CORES = 512
+_VISITOR = 0xFFFFFFFF
+SERVER = struct.Struct("<QQQIIII")
+SLOT = struct.Struct("<QQ")
+CORE = struct.Struct(f"<I{MAX_SERVERS_PER_CORE}I")
+COUNTERS = struct.Struct("<QQQQQQ")
+EXIT = struct.Struct("<iiq64s192s")
+CONFIG = struct.Struct("<II")
+WAKE = struct.Struct("<qqqq")
+INSTANT = struct.Struct("<qq")
+_FLAGS = struct.Struct("<Q")
+
+ROTATION_NS = 2_000_000  # one thread of a server runs so long before the next has its turn
+_WATCH_S = 0.02
+_VISIT_NS = 1_000_000
+_KICKER_ROUND_NS = 60_000_000  # each kicker looks for a new table every 20 ms at least
 _FAIR_POLICIES = (os.SCHED_OTHER, os.SCHED_BATCH, os.SCHED_IDLE, 7)
 _CAPABILITIES = {"CAP_IPC_LOCK": 14, "CAP_SYS_ADMIN": 21, "CAP_PERFMON": 38, "CAP_BPF": 39}
 
@@ -69,8 +96,7 @@ def missing() -> str | None:
         load_libbpf()
     except PlatformError as error:
         return str(error)
-    lacking = _lacking_privileges()
-    if lacking:
+    if lacking := _lacking_privileges():
         return (
             f"this process lacks {' and '.join(lacking)}: run as root, or give it these "
             "capabilities (AmbientCapabilities= of a systemd unit, or capsh --addamb=)"
@@ -101,7 +127,8 @@ def _other_scheduler() -> str | None:
 
 
 def _lacking_privileges() -> list[str]:
-    granted = _capabilities()
+    mask = int(STATUS.read_text().partition("CapEff:")[2].split()[0], 16)
+    granted = {name for name, bit in _CAPABILITIES.items() if mask >> bit & 1}
     lacking = []
     if "CAP_SYS_ADMIN" not in granted:
         lacking += [name for name in ("CAP_BPF", "CAP_PERFMON") if name not in granted]
@@ -114,139 +141,92 @@ def _lacking_privileges() -> list[str]:
     return lacking
 
 
-def _capabilities() -> set[str]:
-    for line in STATUS.read_text().splitlines():
-        if line.startswith("CapEff:"):
-            mask = int(line.split()[1], 16)
-            return {name for name, bit in _CAPABILITIES.items() if mask >> bit & 1}
-    return set()
-
-
-@dataclass(frozen=True)
-class LoadedPolicy:
-    """The policy's programs and maps in the kernel (file descriptors), not in force by itself."""
-
-    bpf: BpfObject
-    has_timer: bool
-    servers: int
-    cpus: int
-    in_force: int
-    assignments: int
-    counters: int
-    ended: int
-    boundary: int
-    decide: ProgramRun
-
-
-def load_policy(*, has_timer: bool) -> LoadedPolicy:
-    """Have the kernel verify the policy; an OperationError where it refuses."""
-    try:
-        bpf = BpfObject(POLICY)
-    except OSError as error:
-        raise OperationError(f"the scheduling policy cannot be read: {error.strerror}") from error
-    layout.CONFIG.pack_into(
-        bpf.initial_bytes(".rodata.config", layout.CONFIG.size), 0, has_timer, core_count()
-    )
-    # Where the kernel has it: threads that must not migrate are ours to place, too.
-    flags = bpf.initial_bytes("table_ops", layout.OPERATIONS_FLAGS.size)
-    wanted = kernel_enum_value("scx_ops_flags", "SCX_OPS_ENQ_MIGRATION_DISABLED") or 0
-    layout.OPERATIONS_FLAGS.pack_into(
-        flags, 0, layout.OPERATIONS_FLAGS.unpack_from(flags)[0] | wanted
-    )
-    try:
-        bpf.load()
-    except OSError as error:
-        bpf.close()
-        raise _refusal(error) from error
-    return LoadedPolicy(
-        bpf=bpf,
-        has_timer=has_timer,
-        servers=bpf.map_descriptor("servers"),
-        cpus=bpf.map_descriptor("cpus"),
-        in_force=bpf.map_descriptor("in_force"),
-        assignments=bpf.map_descriptor("assignments"),
-        counters=bpf.map_descriptor("counters"),
-        ended=bpf.map_descriptor("ended"),
-        boundary=bpf.program_descriptor("table_boundary"),
-        decide=ProgramRun(bpf.program_descriptor("table_decide"), layout.WAKE.size),
-    )
-
-
-def attach_policy(policy: LoadedPolicy) -> int:
-    """Put the policy in force; the address of the link that keeps it there.
-
-    Raises OperationError: the kernel refuses, or another scheduler was quicker.
-    """
-    if (reason := _other_scheduler()) is not None:
-        raise OperationError(reason)
-    try:
-        return policy.bpf.attach_operations("table_ops")
-    except OSError as error:
-        raise _refusal(error) from error
-
-
-def _refusal(error: OSError) -> OperationError:
-    return OperationError(
-        f"the kernel ({os.uname().release}) refuses the scheduling policy: {error.strerror}"
-    )
-
-
-def core_count() -> int:
-    """How many cores the machine may have, as far as the policy can count."""
-    return min(os.sysconf("SC_NPROCESSORS_CONF"), layout.MAX_CORES)
-
-
-def write_table(
-    policy: LoadedPolicy, table: ServerTable, ids: layout.ServerIds, generation: int, anchor_ns: int
-) -> None:
-    """Write a table into a generation that is not in force."""
-    past_anchor_ns = anchor_ns % table.cycle_ns  # cycles repeat: within the first after booting
-    for number, value in layout.pack_servers(table, ids, past_anchor_ns).items():
-        update_element(policy.servers, generation * layout.MAX_SERVERS + number, value)
-    for core, value in layout.pack_cores(table, ids, core_count()).items():
-        update_element(policy.cpus, generation * layout.MAX_CORES + core, value)
-
-
-def put_in_force(policy: LoadedPolicy, generation: int, cores: list[int], *, replaces: bool) -> int:
-    """Have all cores change over to a generation; the instant at which they will, a little ahead.
-
-    Until then each core has to learn that it must decide at that instant. Kickers look by
-    themselves. A timer belongs to the core that starts it, so the calling thread goes round; the
-    policy lets it pass before everything else, because it must not wait for a core that servers
-    keep busy. ``replaces``: another table is in force until then. Raises OperationError: the
-    calling thread may not run on one of the cores.
-    """
-    start_timer = ProgramRun(policy.boundary, layout.WAKE.size)
-    home = os.sched_getaffinity(0)
-    ahead = VISIT_NS * (1 + len(cores)) if policy.has_timer else KICKER_ROUND_NS
-    to_visit = cores if policy.has_timer else []
-    descriptor = thread_descriptor(threading.get_native_id())
-    update_element(policy.assignments, descriptor, layout.VISITOR.to_bytes(4, "little"))
-    try:
-        instant = time.monotonic_ns() + ahead
-        update_element(
-            policy.in_force, 0, layout.change_word(generation, instant, replaces=replaces)
+def check_table(table: ServerTable) -> None:
+    """Refuse a table that the policy cannot hold. Raises InputError: a limit is exceeded."""
+    if len(table.servers) >= MAX_SERVERS:
+        raise InputError(
+            f"{len(table.servers)} servers are more than the {MAX_SERVERS - 1} that back end scx "
+            "can hold; join servers that share slots"
         )
-        for core in to_visit:
-            os.sched_setaffinity(0, {core})
-            start_timer()
-    except OSError as error:
-        raise OperationError(
-            f"the table cannot be put in force on the cores {cores}: {error}"
-        ) from error
-    finally:
-        delete_element(policy.assignments, descriptor)
-        os.close(descriptor)
-        os.sched_setaffinity(0, home)
-    return instant
+    cores = [server.core for server in table.servers]
+    for server in table.servers:
+        name, core = f"server {server.name}", server.core
+        if core >= MAX_CORES:
+            raise InputError(f"{name} is on core {core}; back end scx knows 0 to {MAX_CORES - 1}")
+        if cores.count(core) > MAX_SERVERS_PER_CORE:
+            raise InputError(
+                f"{cores.count(core)} servers on core {core} are more than the "
+                f"{MAX_SERVERS_PER_CORE} that back end scx can hold there; move some to other cores"
+            )
+        if not 1 <= len(server.slots) <= MAX_SLOTS:
+            raise InputError(
+                f"{name} has {len(server.slots)} slots; back end scx takes 1 to {MAX_SLOTS}"
+            )
 
 
-def thread_descriptor(tid: int) -> int:
-    """A file descriptor that stands for a thread, and never for another that gets its id.
+def number_servers(table: ServerTable, known: Mapping[str, int]) -> dict[str, int]:
+    """Ids for all servers of a table; those in ``known`` keep theirs, even when no longer used.
 
-    Raises OSError: there is no such thread.
+    Raises InputError: no id is left.
     """
-    return os.pidfd_open(tid, PIDFD_THREAD)
+    ids = dict(known)
+    for server in table.servers:
+        ids.setdefault(server.name, len(ids) + 1)
+    if len(ids) >= MAX_SERVERS:
+        raise InputError(
+            f"back end scx has had {len(ids)} servers of different names by now and cannot hold "
+            f"more than {MAX_SERVERS - 1}; release it and start again"
+        )
+    return ids
+
+
+def pack_servers(table: ServerTable, ids: Mapping[str, int], anchor_ns: int) -> dict[int, bytes]:
+    """Map `servers` by id: every id below :data:`MAX_SERVERS`, empty where there is no server.
+
+    ``anchor_ns`` must lie in the past.
+    """
+    size = SERVER.size + MAX_SLOTS * SLOT.size
+    packed = dict.fromkeys(range(MAX_SERVERS), bytes(size))
+    for server in table.servers:
+        where = (server.core, server.priority, len(server.slots), 0)
+        head = SERVER.pack(table.cycle_ns, anchor_ns, ROTATION_NS, *where)
+        slots = b"".join(SLOT.pack(start, end) for start, end in server.slots)
+        packed[ids[server.name]] = (head + slots).ljust(size, b"\0")
+    return packed
+
+
+def pack_cores(table: ServerTable, ids: Mapping[str, int], core_count: int) -> dict[int, bytes]:
+    """Map `cpus` by core below ``core_count``: its servers, best priority first.
+
+    Equal priorities are taken in the order of the table.
+    """
+    packed = dict.fromkeys(range(core_count), bytes(CORE.size))
+    for core in {server.core for server in table.servers}:
+        here = sorted((s for s in table.servers if s.core == core), key=lambda s: s.priority)
+        padding = [0] * (MAX_SERVERS_PER_CORE - len(here))
+        packed[core] = CORE.pack(len(here), *(ids[server.name] for server in here), *padding)
+    return packed
+
+
+def change_word(generation: int, instant_ns: int, *, replaces: bool) -> bytes:
+    """Map `in_force`: this generation from the instant on, the other one before it.
+
+    ``replaces``: that one holds a table; otherwise nothing is governed before the instant.
+    """
+    return (instant_ns << 2 | replaces << 1 | generation).to_bytes(8, "little")
+
+
+def unpack_counters(value: bytes) -> ServerCounters:
+    """An element of map `counters`."""
+    slots, late, longest, overruns, _, _ = COUNTERS.unpack(value)
+    return ServerCounters(slots, late, longest, overruns)
+
+
+def unpack_exit(value: bytes) -> str | None:
+    """The element of map `ended`: why the kernel ended the policy, None if it has not."""
+    kind, _, _, *texts = EXIT.unpack(value)
+    said = [text.split(b"\0", 1)[0].decode(errors="replace") for text in texts]
+    return ": ".join(filter(None, said)) if kind else None
 
 
 def create(table: ServerTable) -> "ScxServers":
@@ -262,23 +242,27 @@ def create(table: ServerTable) -> "ScxServers":
     return ScxServers(table)
 
 
-class ScxServers:
-    """A table of servers in the kernel; see :class:`chainshaper.enforcement.servers.BackEnd`.
+def _check(table: ServerTable) -> None:
+    check_table(table)
+    check_cores({server.core: f"server {server.name}" for server in table.servers})
 
-    ``in_force_since_ns`` is the instant from which the present table has governed all cores.
-    """
+
+class ScxServers:
+    """A table of servers in the kernel; see :class:`chainshaper.enforcement.servers.BackEnd`."""
 
     name = "scx"
 
     def __init__(self, table: ServerTable) -> None:
-        self.in_force_since_ns = 0
         self._table = table
-        self._ids = layout.number_servers(table, {})
+        self._ids = number_servers(table, {})
         self._members: dict[int, tuple[int, int]] = {}  # tid -> (thread descriptor, server id)
-        self._policy: LoadedPolicy | None = None
+        self._has_timer = not is_realtime_kernel()
+        self._core_count = min(os.sysconf("SC_NPROCESSORS_CONF"), MAX_CORES)
+        self._policy: BpfObject | None = None
         self._link = 0
         self._kickers: dict[int, subprocess.Popen[bytes]] = {}
         self._generation = 0
+        self._since_ns: int | None = None  # the present table has governed all cores
         self._failure: str | None = None
         self._released = threading.Event()
         self._last_counters: dict[str, ServerCounters] = {}
@@ -286,53 +270,51 @@ class ScxServers:
 
     def assign(self, tid: int, server: str) -> None:
         """See :meth:`BackEnd.assign`; refused where it is real-time, or may not use the core."""
-        core = next((s.core for s in self._table.servers if s.name == server), None)
-        if core is None:
-            raise InputError(f"server {server} does not stand in the table")
+        core = server_named(self._table, server).core
         with self._lock:
             self._check_in_use()
             descriptor = _examine_thread(tid, server, core)
             if descriptor is None:
                 return
-            known = self._members.pop(tid, None)
-            if known is not None:
-                os.close(known[0])
+            if tid in self._members:
+                os.close(self._members.pop(tid)[0])
             self._members[tid] = (descriptor, self._ids[server])
             if self._policy is not None:
                 self._hand_over(self._policy, tid)
-                self._policy.decide()
+                ProgramRun(self._policy.program_descriptor("table_decide"), WAKE.size)()
 
     def arm(self, anchor_ns: int) -> None:
         """See :meth:`BackEnd.arm`; returns when the slots are in force, on all cores at once."""
         self.change(self._table, anchor_ns)
 
     def in_force_from(self) -> int | None:
-        return self.in_force_since_ns or None
+        return self._since_ns
 
     def change(self, table: ServerTable, anchor_ns: int) -> None:
         """Put another table in force, on all cores at one instant.
 
         Threads stay in the server of the same name; those of a server that is no longer there run
-        as best effort until they are assigned anew. Raises as :func:`create`, and
-
-            OperationError: the kernel refuses the policy, or it has ended (:meth:`failure`).
+        as best effort until they are assigned anew. Raises as :func:`create`, and OperationError:
+        the kernel refuses the policy, or it has ended (:meth:`failure`).
         """
         _check(table)
         with self._lock:
             self._check_in_use()
-            self._ids = layout.number_servers(table, self._ids)
+            self._ids = number_servers(table, self._ids)
             cores = sorted({s.core for s in (*self._table.servers, *table.servers)})
-            policy = self._policy or self._begin(cores)
-            self._start_kickers(policy, cores)
-            self._generation = 1 - self._generation
-            write_table(policy, table, self._ids, self._generation, anchor_ns)
-            instant = put_in_force(
-                policy, self._generation, cores, replaces=self.in_force_since_ns > 0
-            )
+            if self._policy is None:
+                self._policy = self._begin(cores)
+            self._start_kickers(self._policy, cores)
+            instant = self._put_in_force(self._policy, table, cores, anchor_ns)
             while (left := instant - time.monotonic_ns()) > 0:
                 time.sleep(left / 1e9)
-            self._table, self.in_force_since_ns = table, instant
-            self._forget_removed(policy)
+            self._table, self._since_ns = table, instant
+            present = {self._ids[server.name] for server in table.servers}
+            for tid, (descriptor, number) in tuple(self._members.items()):
+                if number not in present:
+                    delete_element(self._policy.map_descriptor("assignments"), descriptor)
+                    os.close(descriptor)
+                    del self._members[tid]
 
     def counters(self) -> dict[str, ServerCounters]:
         """See :meth:`BackEnd.counters`; after :meth:`release`, the last ones.
@@ -341,21 +323,21 @@ class ScxServers:
         """
         with self._lock:
             if self._policy is not None:
+                counters = self._policy.map_descriptor("counters")
                 for name, number in self._ids.items():
-                    value = look_up_element(self._policy.counters, number, layout.COUNTERS.size)
-                    self._last_counters[name] = layout.unpack_counters(value)
+                    value = look_up_element(counters, number, COUNTERS.size)
+                    self._last_counters[name] = unpack_counters(value)
             none = ServerCounters(0, 0, 0, 0)
             return {s.name: self._last_counters.get(s.name, none) for s in self._table.servers}
 
     def failure(self) -> str | None:
         with self._lock:
             if self._failure is None and self._policy is not None:
-                ended = layout.unpack_exit(look_up_element(self._policy.ended, 0, layout.EXIT.size))
-                if ended.kind:
-                    detail = f": {ended.message}" if ended.message else ""
+                ended = self._policy.map_descriptor("ended")
+                if reason := unpack_exit(look_up_element(ended, 0, EXIT.size)):
                     self._failure = (
-                        f"the kernel has ended the scheduling policy ({ended.reason}{detail}); "
-                        "all threads run freely"
+                        f"the kernel has ended the scheduling policy ({reason}); all threads run "
+                        "freely"
                     )
             return self._failure
 
@@ -370,32 +352,89 @@ class ScxServers:
     def _check_in_use(self) -> None:
         if self._released.is_set():
             raise OperationError("these servers were released; create them anew")
-        failure = self.failure()
-        if failure is not None:
+        if (failure := self.failure()) is not None:
             raise OperationError(f"{failure}; release these servers and create them anew")
 
-    def _begin(self, cores: list[int]) -> LoadedPolicy:
+    def _begin(self, cores: list[int]) -> BpfObject:
         """The policy with an empty table in force: for now, everything runs as best effort."""
-        policy = load_policy(has_timer=not is_realtime_kernel())
         try:
+            policy = BpfObject(POLICY)
+        except OSError as error:
+            raise OperationError(
+                f"the scheduling policy cannot be read: {error.strerror}"
+            ) from error
+        try:
+            config = policy.initial_bytes(".rodata.config", CONFIG.size)
+            CONFIG.pack_into(config, 0, self._has_timer, self._core_count)
+            # Where the kernel has it: threads that must not migrate are ours to place, too.
+            flags = policy.initial_bytes("table_ops", _FLAGS.size)
+            wanted = kernel_enum_value("scx_ops_flags", "SCX_OPS_ENQ_MIGRATION_DISABLED") or 0
+            _FLAGS.pack_into(flags, 0, _FLAGS.unpack_from(flags)[0] | wanted)
+            policy.load()
             for tid in tuple(self._members):
                 self._hand_over(policy, tid)
             self._start_kickers(policy, cores)
-            self._link = attach_policy(policy)
-        except OperationError:
+            if (reason := _other_scheduler()) is not None:
+                raise OperationError(reason)
+            self._link = policy.attach_operations("table_ops")
+        except (OperationError, OSError) as error:
             self._stop_kickers()
-            policy.bpf.close()
-            raise
-        self._policy = policy
-        if not policy.has_timer:
+            policy.close()
+            if isinstance(error, OperationError):
+                raise
+            raise OperationError(
+                f"the kernel ({os.uname().release}) refuses the scheduling policy: {error.strerror}"
+            ) from error
+        if not self._has_timer:
             threading.Thread(target=self._watch, name="scx watch", daemon=True).start()
         return policy
 
-    def _hand_over(self, policy: LoadedPolicy, tid: int) -> None:
-        """Tell the policy the server of a thread; one that has ended is forgotten."""
+    def _put_in_force(
+        self, policy: BpfObject, table: ServerTable, cores: list[int], anchor_ns: int
+    ) -> int:
+        """Write the idle generation and have all cores change over; the instant at which they will.
+
+        It lies a little ahead. Until then each core has to learn that it must decide then. Kickers
+        look by themselves. A timer belongs to the core that starts it, so the calling thread goes
+        round; the policy lets it pass before everything else, because it must not wait for a core
+        that servers keep busy. Raises OperationError: it may not run on one of the cores.
+        """
+        generation = self._generation = 1 - self._generation
+        # Cycles repeat: the anchor lies within the first one after booting.
+        packed = pack_servers(table, self._ids, anchor_ns % table.cycle_ns)
+        for number, value in packed.items():
+            key = generation * MAX_SERVERS + number
+            update_element(policy.map_descriptor("servers"), key, value)
+        for core, value in pack_cores(table, self._ids, self._core_count).items():
+            update_element(policy.map_descriptor("cpus"), generation * MAX_CORES + core, value)
+        start_timer = ProgramRun(policy.program_descriptor("table_boundary"), WAKE.size)
+        assignments, home = policy.map_descriptor("assignments"), os.sched_getaffinity(0)
+        descriptor = _thread_descriptor(threading.get_native_id())
+        update_element(assignments, descriptor, _VISITOR.to_bytes(4, "little"))
+        try:
+            ahead = _VISIT_NS * (1 + len(cores)) if self._has_timer else _KICKER_ROUND_NS
+            instant = time.monotonic_ns() + ahead
+            word = change_word(generation, instant, replaces=self._since_ns is not None)
+            update_element(policy.map_descriptor("in_force"), 0, word)
+            for core in cores if self._has_timer else ():
+                os.sched_setaffinity(0, {core})
+                start_timer()
+        except OSError as error:
+            raise OperationError(
+                f"the table cannot be put in force on the cores {cores}: {error}"
+            ) from error
+        finally:
+            delete_element(assignments, descriptor)
+            os.close(descriptor)
+            os.sched_setaffinity(0, home)
+        return instant
+
+    def _hand_over(self, policy: BpfObject, tid: int) -> None:
+        """Give the policy the server of a thread; one that has ended is forgotten."""
         descriptor, number = self._members[tid]
         try:
-            update_element(policy.assignments, descriptor, number.to_bytes(4, "little"))
+            assignments = policy.map_descriptor("assignments")
+            update_element(assignments, descriptor, number.to_bytes(4, "little"))
         except (ProcessLookupError, FileNotFoundError):
             os.close(descriptor)
             del self._members[tid]
@@ -404,53 +443,37 @@ class ScxServers:
                 f"the kernel refuses to put thread {tid} into a server: {error.strerror}"
             ) from error
 
-    def _forget_removed(self, policy: LoadedPolicy) -> None:
-        """Threads whose server no longer stands in the table are best effort from here on."""
-        present = {self._ids[server.name] for server in self._table.servers}
-        for tid, (descriptor, number) in tuple(self._members.items()):
-            if number not in present:
-                delete_element(policy.assignments, descriptor)
-                os.close(descriptor)
-                del self._members[tid]
-
-    def _start_kickers(self, policy: LoadedPolicy, cores: list[int]) -> None:
-        if policy.has_timer:
-            return
-        for core in cores:
+    def _start_kickers(self, policy: BpfObject, cores: list[int]) -> None:
+        for core in () if self._has_timer else cores:
             if core not in self._kickers:
-                self._kickers[core] = start_kicker(core, policy.boundary)
+                boundary = policy.program_descriptor("table_boundary")
+                self._kickers[core] = _start_kicker(core, boundary)
 
     def _watch(self) -> None:
         """Fail open when a kicker stops: an idle core would never notice by itself."""
-        while not self._released.wait(WATCH_S):
+        while not self._released.wait(_WATCH_S):
             with self._lock:
-                if self.failure() is None:
-                    self._failure = self._kicker_failure()
-                if self._failure is not None:
+                for core, kicker in self._kickers.items():
+                    what = what_happened(kicker)
+                    if self.failure() is None and what is not None:
+                        self._failure = (
+                            f"the kicker of core {core} (process {kicker.pid}) {what}, so its "
+                            "slots are no longer exact; the policy was taken away and all threads "
+                            "run freely"
+                        )
+                if self.failure() is not None:
                     self._end()
                     return
 
-    def _kicker_failure(self) -> str | None:
-        for core, kicker in self._kickers.items():
-            what = what_happened(kicker)
-            if what is not None:
-                return (
-                    f"the kicker of core {core} (process {kicker.pid}) {what}, so its slots "
-                    "cannot be kept; the policy was taken away and all threads run freely"
-                )
-        return None
-
     def _end(self) -> None:
-        """Take the policy away, keeping what it has counted and why it ended."""
-        policy = self._policy
-        if policy is None:
-            return
-        self.counters()
-        self.failure()
-        policy.bpf.detach(self._link)
-        self._stop_kickers()
-        policy.bpf.close()
-        self._policy = None
+        """Take the policy away, and remember what it has counted and why it ended."""
+        if self._policy is not None:
+            self.counters()
+            self.failure()
+            self._policy.detach(self._link)
+            self._stop_kickers()
+            self._policy.close()
+            self._policy = None
 
     def _stop_kickers(self) -> None:
         for kicker in self._kickers.values():
@@ -459,15 +482,18 @@ class ScxServers:
         self._kickers.clear()
 
 
-def _check(table: ServerTable) -> None:
-    layout.check_table(table)
-    check_cores({server.core: f"server {server.name}" for server in table.servers})
+def _thread_descriptor(tid: int) -> int:
+    """A file descriptor that stands for a thread, and never for another that gets its id.
+
+    Raises OSError: there is no such thread.
+    """
+    return os.pidfd_open(tid, os.O_EXCL)  # PIDFD_THREAD
 
 
 def _examine_thread(tid: int, server: str, core: int) -> int | None:
     """A descriptor of a thread that the policy can govern on this core; None when it has ended."""
     try:
-        descriptor = thread_descriptor(tid)
+        descriptor = _thread_descriptor(tid)
         policy = os.sched_getscheduler(tid) & ~RESET_ON_FORK
         cores = os.sched_getaffinity(tid)
     except ProcessLookupError:
@@ -476,7 +502,6 @@ def _examine_thread(tid: int, server: str, core: int) -> int | None:
         raise OperationError(
             f"thread {tid} cannot be put into server {server}: {error.strerror}"
         ) from error
-    problem = None
     if policy not in _FAIR_POLICIES:
         problem = (
             f"it runs under {POLICIES.get(policy, policy)}, above every server: give it another "
@@ -487,7 +512,56 @@ def _examine_thread(tid: int, server: str, core: int) -> int | None:
             f"it may not run on core {core}: allow it to first (`taskset --pid --cpu-list {core} "
             f"{tid}`)"
         )
-    if problem is not None:
-        os.close(descriptor)
-        raise OperationError(f"thread {tid} cannot be put into server {server}: {problem}")
-    return descriptor
+    else:
+        return descriptor
+    os.close(descriptor)
+    raise OperationError(f"thread {tid} cannot be put into server {server}: {problem}")
+
+
+def _start_kicker(core: int, program: int) -> subprocess.Popen[bytes]:
+    """Start the kicker of a core; returns when it is at work.
+
+    ``program`` is the file descriptor of `table_boundary`. Raises OperationError: it cannot be
+    started.
+    """
+    process = subprocess.Popen(
+        [*module_command(__name__), str(core), str(program)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        pass_fds=(program,),
+        start_new_session=True,  # Ctrl-C is for the loader, which ends the kicker last
+    )
+    if not process.stdout or not process.stdout.readline():
+        _, said = process.communicate()
+        reason = said.decode(errors="replace").strip().rpartition("\n")[2]
+        raise OperationError(f"the kicker of core {core} cannot start: {reason}")
+    return process
+
+
+def _kick(core: int, program: int) -> None:
+    """Kick the core at each boundary until the loader has gone."""
+    loader = os.getppid()
+    set_thread_name(f"kicker/{core}")
+    # The class first: moved to a busy core as SCHED_OTHER, it might not run again to ask for it.
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    os.sched_setaffinity(0, {core})
+    lock_memory()
+    stop_garbage_collection()
+    sleep, monotonic, absolute = ctypes.CDLL(None).clock_nanosleep, 1, 1
+    boundary = ProgramRun(program, WAKE.size)
+    until = ctypes.c_void_p(ctypes.addressof(boundary.context))
+    once_more = ctypes.c_void_p(ctypes.addressof(boundary.context) + INSTANT.size)
+    boundary()
+    sys.stdout.write("at work\n")
+    sys.stdout.close()
+    # From here on each microsecond delays the threads that wait for a slot to begin.
+    parent, plan, (descriptor, options) = os.getppid, boundary.function, boundary.arguments
+    while parent() == loader:
+        plan(descriptor, options)
+        sleep(monotonic, absolute, until, None)
+        sleep(monotonic, absolute, once_more, None)
+
+
+if __name__ == "__main__":
+    _kick(int(sys.argv[1]), int(sys.argv[2]))

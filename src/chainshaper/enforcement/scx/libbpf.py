@@ -16,16 +16,11 @@ from typing import Any
 from chainshaper.values.errors import PlatformError
 
 LIBRARY = "libbpf.so.1"
-OLDEST = (1, 4)
+_OLDEST = (1, 4)
 """From here on libbpf tolerates members of sched_ext_ops that the kernel does not know."""
-
 _KIND_ENUM64 = 19
 _BTF_TYPE = struct.Struct("<III")
 _TEST_RUN_OPTIONS = struct.Struct("<QQQIIQQIIIIIIII")
-_WARNING = 0
-_LONGEST_LOG = 1 << 20
-_TOLD = 400
-
 _messages: list[str] = []
 """What libbpf has warned of since the object was opened; it has no better place for reasons."""
 
@@ -33,13 +28,13 @@ _messages: list[str] = []
 @functools.cache
 def load_libbpf() -> Any:
     """The library, with its functions declared. Raises PlatformError: it is absent or too old."""
-    remedy = f"install libbpf {OLDEST[0]}.{OLDEST[1]} or newer (Debian 13: apt install libbpf1)"
+    remedy = f"install libbpf {_OLDEST[0]}.{_OLDEST[1]} or newer (Debian 13: apt install libbpf1)"
     try:
         library = ctypes.CDLL(LIBRARY, use_errno=True)
     except OSError as error:
         raise PlatformError(f"{LIBRARY} cannot be loaded ({error}): {remedy}") from error
     found = (library.libbpf_major_version(), library.libbpf_minor_version())
-    if found < OLDEST:
+    if found < _OLDEST:
         raise PlatformError(f"{LIBRARY} is version {found[0]}.{found[1]}: {remedy}")
     pointer, text, number = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_int
     for name, result, *arguments in (
@@ -71,8 +66,8 @@ def load_libbpf() -> Any:
 
 
 def _keep_message(level: int, pattern: bytes, arguments: int) -> int:
-    if level == _WARNING:
-        text = ctypes.create_string_buffer(_LONGEST_LOG)
+    if level == 0:  # a warning
+        text = ctypes.create_string_buffer(1 << 20)
         ctypes.CDLL(None).vsnprintf(
             text, ctypes.c_size_t(len(text)), pattern, ctypes.c_void_p(arguments)
         )
@@ -80,15 +75,14 @@ def _keep_message(level: int, pattern: bytes, arguments: int) -> int:
     return 0
 
 
-_printer = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int, ctypes.c_char_p, ctypes.c_void_p)(
-    _keep_message
-)
+_PRINTER = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int, ctypes.c_char_p, ctypes.c_void_p)
+_printer = _PRINTER(_keep_message)
 
 
 def _failure(step: str) -> OSError:
     number = ctypes.get_errno()
     # The verifier gives its reason at the end of a long log.
-    said = "; ".join(message[-_TOLD:] for message in _messages[-3:] if message)
+    said = "; ".join(message[-400:] for message in _messages[-3:] if message)
     reason = f"{step}: {os.strerror(number)}"
     return OSError(number, f"{reason} ({said})" if said else reason)
 
@@ -96,7 +90,8 @@ def _failure(step: str) -> OSError:
 class BpfObject:
     """An object file: opened first, then adjusted, then loaded into the kernel.
 
-    Raises OSError: libbpf cannot read it.
+    What takes a name raises KeyError: the object has nothing of this name. The rest raises OSError:
+    libbpf cannot read the file, or the kernel refuses, with the last messages of libbpf.
     """
 
     def __init__(self, path: Path) -> None:
@@ -106,46 +101,38 @@ class BpfObject:
         if not self._object:
             raise _failure(f"opening {path}")
 
-    def _map(self, name: str) -> int:
-        found: int | None = self._library.bpf_object__find_map_by_name(self._object, name.encode())
+    def _find(self, kind: str, name: str) -> int:
+        find = getattr(self._library, f"bpf_object__find_{kind}_by_name")
+        found: int | None = find(self._object, name.encode())
         if not found:
-            raise KeyError(f"the object has no map {name}")
+            raise KeyError(f"the object has no {kind} {name}")
         return found
 
     def initial_bytes(self, map_name: str, size: int) -> "ctypes.Array[ctypes.c_char]":
         """The first ``size`` bytes that a map of constants or operations will have; writable."""
         address = self._library.bpf_map__initial_value(
-            self._map(map_name), ctypes.byref(ctypes.c_size_t())
+            self._find("map", map_name), ctypes.byref(ctypes.c_size_t())
         )
         if not address:
             raise KeyError(f"map {map_name} has no initial value")
         return (ctypes.c_char * size).from_address(address)
 
     def load(self) -> None:
-        """Have the kernel verify and keep all maps and programs.
-
-        Raises OSError: the kernel refuses; with the last messages of libbpf.
-        """
+        """Have the kernel verify and keep all maps and programs."""
         if self._library.bpf_object__load(self._object):
             raise _failure("loading")
 
     def map_descriptor(self, name: str) -> int:
         """The file descriptor of a map of a loaded object."""
-        return int(self._library.bpf_map__fd(self._map(name)))
+        return int(self._library.bpf_map__fd(self._find("map", name)))
 
     def program_descriptor(self, name: str) -> int:
         """The file descriptor of a program of a loaded object."""
-        program = self._library.bpf_object__find_program_by_name(self._object, name.encode())
-        if not program:
-            raise KeyError(f"the object has no program {name}")
-        return int(self._library.bpf_program__fd(program))
+        return int(self._library.bpf_program__fd(self._find("program", name)))
 
     def attach_operations(self, map_name: str) -> int:
-        """Put a struct_ops map in force; the address of its link, for :meth:`detach`.
-
-        Raises OSError: the kernel refuses.
-        """
-        link: int | None = self._library.bpf_map__attach_struct_ops(self._map(map_name))
+        """Put a struct_ops map in force; the address of its link, for :meth:`detach`."""
+        link: int | None = self._library.bpf_map__attach_struct_ops(self._find("map", map_name))
         if not link:
             raise _failure("attaching")
         return link
@@ -169,10 +156,7 @@ def update_element(map_descriptor: int, key: int, value: bytes) -> None:
 
 
 def look_up_element(map_descriptor: int, key: int, size: int) -> bytes:
-    """Read one element, of ``size`` bytes, of a map with 32-bit keys.
-
-    Raises OSError: there is none.
-    """
+    """Read one element, of ``size`` bytes. Raises OSError: there is none."""
     number, value = ctypes.c_uint32(key), ctypes.create_string_buffer(size)
     if load_libbpf().bpf_map_lookup_elem(map_descriptor, ctypes.byref(number), value):
         raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
@@ -194,9 +178,9 @@ class ProgramRun:
 
     def __init__(self, descriptor: int, context_size: int) -> None:
         self.context = ctypes.create_string_buffer(context_size)
-        address = ctypes.addressof(self.context)
         values = [0] * 15
-        values[0], values[5], values[7] = _TEST_RUN_OPTIONS.size, address, context_size
+        values[0], values[7] = _TEST_RUN_OPTIONS.size, context_size
+        values[5] = ctypes.addressof(self.context)
         self._options = ctypes.create_string_buffer(_TEST_RUN_OPTIONS.pack(*values))
         self.function = load_libbpf().bpf_prog_test_run_opts
         self.arguments = (descriptor, ctypes.c_void_p(ctypes.addressof(self._options)))
@@ -213,10 +197,8 @@ def kernel_enum_value(enum: str, name: str) -> int | None:
     """The value of an enumerator of the running kernel, None when it has none of this name."""
     library = load_libbpf()
     btf = library.btf__load_vmlinux_btf()
-    if not btf:
-        return None
+    number = library.btf__find_by_name(btf, enum.encode()) if btf else -1
     try:
-        number = library.btf__find_by_name(btf, enum.encode())
         if number < 0:
             return None
         address = library.btf__type_by_id(btf, number)

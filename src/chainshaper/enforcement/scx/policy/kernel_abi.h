@@ -2,10 +2,9 @@
 /*
  * The part of the kernel's interface that the policy uses, and how it changed from 6.12 to 7.3.
  *
- * Written out here rather than taken from a vmlinux.h: it is little, members and enums are found
- * by name when the policy is loaded (CO-RE), and the object then fits every kernel. Functions that
- * were renamed are declared weakly under all their names; whatever follows `___` is not part of a
- * name. The loader resolves those that the running kernel has, and the verifier drops the rest.
+ * No vmlinux.h: members and enums are found by name when the policy is loaded (CO-RE), so the
+ * object fits every kernel. Functions that were renamed are declared weakly under all their names,
+ * without what follows `___`: the loader resolves those that the running kernel has.
  */
 #ifndef KERNEL_ABI_H
 #define KERNEL_ABI_H
@@ -46,9 +45,8 @@ struct sched_ext_entity {
 } FOUND_BY_NAME;
 
 /*
- * A whole struct, though nothing of it is used: libbpf rejects a prototype with a forward
- * declaration, which is all that clang emits for a struct that is only pointed to by a member.
- * Hence also `const void *` below.
+ * Whole, though unused: libbpf rejects a prototype with a forward declaration, which is all that
+ * clang emits for a struct that a member points to. Hence also `const void *` below.
  */
 struct cpumask {
 	unsigned long bits[1];

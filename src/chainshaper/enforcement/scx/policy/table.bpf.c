@@ -6,23 +6,22 @@
  * at no other time; of several servers with an open slot the best priority runs; threads of one
  * server take turns; everything else ("best effort") runs when no server's thread wants to.
  *
- * How it works. Each server has a queue, best effort has one more. Whenever a core has to decide
- * (dispatch), the table is looked up with the present time, and the best server that is open and
- * has a thread gets the core. What makes the slots exact is that every core is made to decide at
- * each boundary, that is, where a slot starts or ends or a turn is over:
+ * Each server has a queue, best effort has one more. Whenever a core has to decide (dispatch), the
+ * table is looked up with the present time, and the best server that is open and has a thread gets
+ * the core. The slots are exact because every core is made to decide at each boundary, where a slot
+ * starts or ends or a turn is over:
  *
  *  - normally by a timer per core whose callback kicks the core;
- *  - on PREEMPT_RT, which refuses bpf_timer, by a SCHED_FIFO thread per core ("kicker", in the
- *    loader's hands) that sleeps from boundary to boundary: its running pushes the present thread
- *    back to its queue, and when it sleeps again the core decides anew. Should it stop, decisions
- *    find its boundary overdue and end the policy: a table that only the tick follows is none.
+ *  - on PREEMPT_RT, which refuses bpf_timer, by a SCHED_FIFO thread per core ("kicker", of the
+ *    loader) that sleeps from boundary to boundary: its running pushes the present thread back to
+ *    its queue, and when it sleeps again the core decides anew. Should it stop, decisions find its
+ *    boundary overdue and end the policy: a table that only the tick follows is none.
  *
- * Changing the table. There are two generations of it. One 64-bit word says which is in force
- * from which instant on, the other one being in force before that. So the loader writes the idle
- * generation, then the word, and all cores change over at the same instant without ever seeing
- * half a table. Threads keep their server's id, and with it their queue. Those that waited for the
- * first table are in a queue that is emptied first when it has come: each gets as far as `running`,
- * which has it sent to the queue where it belongs now.
+ * There are two generations of the table. One 64-bit word says which is in force from which instant
+ * on, the other one being in force before that. So the loader writes the idle generation, then the
+ * word, and all cores change over at one instant without ever seeing half a table. Threads that
+ * waited for the first table are in a queue that is emptied first when it has come: each gets as
+ * far as `running`, which has it sent to the queue where it belongs now.
  *
  * Everything fails open: the kernel goes back to its fair class when the loader's link is closed,
  * by whatever, and when a runnable thread has not run for half a minute.
@@ -33,7 +32,6 @@
 #include <bpf/bpf_core_read.h>
 #include "kernel_abi.h"
 #include "table_abi.h"
-#include "table_lookup.h"
 
 #define LATE 100000ULL
 #define KICKER_GRACE 5000000ULL		/* virtual machines stand still for longer than 1 ms */
@@ -50,7 +48,197 @@ const volatile struct table_config config SEC(".rodata.config") = {
 /* Lets a test see that this object was compiled from these sources. */
 const volatile char source_digest[] = SOURCE_DIGEST;
 
-/* ---- turns and counters ---- */
+#define NEVER (~0ULL)
+#define SECOND 1000000000ULL
+/* Queues; a server's is named by its id. */
+#define BEST_EFFORT 1000
+#define UNSORTED 1001			/* assigned threads, until the first table is in force */
+
+/*
+ * bpf_ktime_get_ns() may be some nanoseconds behind the clock that timers follow. Without slack, a
+ * core that is kicked at the end of a slot could find three nanoseconds of it left, and go on.
+ */
+#define CLOCK_SLACK 200ULL
+
+struct timer_of_cpu {
+	struct bpf_timer timer;
+};
+
+struct cpu_state {
+	u64 due;			/* when the kicker has promised to be back */
+	u64 missed;			/* a `due` that was found to have passed, */
+	u64 missed_at;			/* and when */
+	u32 server;			/* that the running thread belongs to, or 0 */
+	u32 priority;			/* of that server */
+};
+
+/* What a server's slots mean at one instant. */
+struct moment {
+	u64 slot_start;			/* of the open slot, absolute */
+	u64 turn_start;			/* of the rotation period within it, absolute */
+	u64 left;			/* of the open slot; 0: closed */
+	u64 turn_left;
+	u64 until_boundary;		/* where a slot starts or ends */
+};
+
+#define ARRAY(name, count, element) \
+	struct { \
+		__uint(type, BPF_MAP_TYPE_ARRAY); \
+		__uint(max_entries, count); \
+		__type(key, u32); \
+		__type(value, element); \
+	} name SEC(".maps")
+
+ARRAY(servers, TABLE_GENERATIONS * TABLE_MAX_SERVERS, struct table_server);
+ARRAY(cpus, TABLE_GENERATIONS * TABLE_MAX_CPUS, struct table_cpu);
+/*
+ * instant << 2 | replaces << 1 | generation: that generation from the instant on, the other one
+ * before it, which holds no table yet unless `replaces` is set. 0: there is no table.
+ */
+ARRAY(in_force, 1, u64);
+/* Server id by thread: ends with the thread, and no thread id is ever taken for another's. */
+struct {
+	__uint(type, BPF_MAP_TYPE_TASK_STORAGE);
+	__uint(map_flags, BPF_F_NO_PREALLOC);
+	__type(key, int);
+	__type(value, u32);
+} assignments SEC(".maps");
+ARRAY(counters, TABLE_MAX_SERVERS, struct table_counters);
+ARRAY(cpu_states, TABLE_MAX_CPUS, struct cpu_state);
+ARRAY(timers, TABLE_MAX_CPUS, struct timer_of_cpu);
+ARRAY(ended, 1, struct table_exit);
+
+static __always_inline u64 time_to_decide_for(void)
+{
+	return bpf_ktime_get_ns() + CLOCK_SLACK;
+}
+
+static __always_inline u64 word_in_force(void)
+{
+	u32 zero = 0;
+	u64 *word = bpf_map_lookup_elem(&in_force, &zero);
+
+	return word ? READ_ONCE(*word) : 0;
+}
+
+static __always_inline bool is_governed(u64 now)
+{
+	u64 word = word_in_force();
+
+	return word && ((word & 2) || now >= word >> 2);
+}
+
+static __always_inline u32 generation_at(u64 now)
+{
+	u64 word = word_in_force();
+	u32 generation = word & 1;
+
+	return now >= word >> 2 ? generation : !generation;
+}
+
+static __always_inline struct table_server *find_server(u32 generation, u32 id)
+{
+	u32 key = generation * TABLE_MAX_SERVERS + id;
+	struct table_server *s;
+
+	if (!id || id >= TABLE_MAX_SERVERS)
+		return 0;
+	s = bpf_map_lookup_elem(&servers, &key);
+	return s && s->cycle ? s : 0;
+}
+
+static __always_inline struct table_cpu *find_cpu(u32 generation, u32 cpu)
+{
+	u32 key = generation * TABLE_MAX_CPUS + cpu;
+
+	return cpu < TABLE_MAX_CPUS ? bpf_map_lookup_elem(&cpus, &key) : 0;
+}
+
+static __always_inline u32 id_of(struct task_struct *p)
+{
+	u32 *id = bpf_task_storage_get(&assignments, p, 0, 0);
+
+	return id ? *id : 0;
+}
+
+static __noinline int look_up(struct table_server *s, u64 now, struct moment *m)
+{
+	u64 phase, inside;
+	u32 n;
+	int i;
+
+	if (!s || !m)
+		return 0;
+	*m = (struct moment){ .until_boundary = NEVER };
+	n = s->slot_count;
+	if (!s->cycle || !s->rotation || !n || n > TABLE_MAX_SLOTS)
+		return 0;
+	phase = (now - s->anchor) % s->cycle;
+	bpf_for(i, 0, n) {
+		if (i < 0 || i >= TABLE_MAX_SLOTS)	/* for the verifier */
+			break;
+		if (phase >= s->slots[i].end)
+			continue;
+		if (phase < s->slots[i].start) {
+			m->until_boundary = s->slots[i].start - phase;
+		} else {
+			m->slot_start = now - phase + s->slots[i].start;
+			m->left = s->slots[i].end - phase;
+			m->until_boundary = m->left;
+		}
+		break;
+	}
+	if (m->until_boundary == NEVER)
+		m->until_boundary = s->cycle - phase + s->slots[0].start;
+	if (m->left) {
+		inside = (now - m->slot_start) % s->rotation;
+		m->turn_start = now - inside;
+		m->turn_left = s->rotation - inside;
+		if (m->turn_left > m->left)
+			m->turn_left = m->left;
+	}
+	return 0;
+}
+
+/* Whether turns matter: a thread by itself is not interrupted for them. */
+static __always_inline bool is_shared(u32 id, u32 cpu)
+{
+	struct cpu_state *state = bpf_map_lookup_elem(&cpu_states, &cpu);
+
+	return scx_bpf_dsq_nr_queued(id) + (state && state->server == id) > 1;
+}
+
+/*
+ * When this core has to decide anew at the latest. (A thread that comes to share a server in the
+ * middle of a slot waits for the tick to end the present turn.)
+ */
+static __noinline u64 next_boundary(u32 cpu, u64 now)
+{
+	u32 generation = generation_at(now);
+	u64 change = word_in_force() >> 2, soonest = SECOND;
+	struct table_cpu *c = find_cpu(generation, cpu);
+	struct table_server *s;
+	struct moment m;
+	int i;
+
+	if (c) {
+		bpf_for(i, 0, TABLE_MAX_SERVERS_PER_CPU) {
+			if (i < 0 || i >= TABLE_MAX_SERVERS_PER_CPU || i >= c->count)
+				break;
+			s = find_server(generation, c->ids[i]);
+			if (!s)
+				continue;
+			look_up(s, now, &m);
+			if (m.until_boundary < soonest)
+				soonest = m.until_boundary;
+			if (m.left && m.turn_left < soonest && is_shared(c->ids[i], cpu))
+				soonest = m.turn_left;
+		}
+	}
+	if (change > now && change - now < soonest)
+		soonest = change - now;
+	return now + soonest;
+}
 
 /* Whether the thread that ran last in this server was chosen in the present rotation period. */
 static __always_inline bool has_its_turn(u32 id, struct moment *m)
@@ -69,14 +257,13 @@ static __always_inline void take_turn(u32 id, struct moment *m)
 }
 
 /*
- * Called with every decision of the server's core: the first one inside a slot is its opening, the
- * first one after it its end. A core that a higher class has taken decides when it is given back,
- * so what that costs a server counts as lateness.
+ * At every decision of the server's core: the first one inside a slot is its opening, the first one
+ * after it its end. What a higher class costs a server counts as lateness.
  */
 static __noinline int count(u32 id, struct moment *m, u64 now, bool wants_to_run)
 {
 	struct table_counters *k = bpf_map_lookup_elem(&counters, &id);
-	u64 change = changes_at(), entry, lateness;
+	u64 change = word_in_force() >> 2, entry, lateness;
 
 	if (!k || !m || k->open_since == m->slot_start)
 		return 0;
@@ -96,8 +283,6 @@ static __noinline int count(u32 id, struct moment *m, u64 now, bool wants_to_run
 		k->longest_lateness = lateness;
 	return 0;
 }
-
-/* ---- decisions ---- */
 
 s32 SEC("struct_ops/table_select_cpu")
 BPF_PROG(table_select_cpu, struct task_struct *p, s32 previous, u64 wake_flags)
@@ -180,9 +365,9 @@ static __always_inline bool run_server(u32 id, struct moment *m, struct task_str
 }
 
 /*
- * The kicker outranks whatever this decision is about: were it able to run, it would have. But a
- * machine that stands still for a moment may find itself here with the kicker's timer interrupt
- * still pending, so it has to be overdue in two decisions, with time for interrupts in between.
+ * The kicker outranks whatever this decision is about: were it able to run, it would have. After a
+ * standstill of the machine its timer interrupt may still be pending, so it has to be overdue in
+ * two decisions, with time for interrupts in between.
  */
 static __always_inline void check_kicker(u32 cpu, u64 now)
 {
@@ -237,10 +422,7 @@ void BPF_PROG(table_dispatch, s32 cpu, struct task_struct *prev)
 	}
 	if (decided || move_to_local(BEST_EFFORT) || move_to_local(UNSORTED))
 		return;
-	/*
-	 * A thread of a closed server keeps no slice: with SCX_OPS_ENQ_LAST the kernel then enqueues
-	 * it, and it waits in its server's queue even if nothing else wants the core.
-	 */
+	/* a closed server's thread keeps no slice: by SCX_OPS_ENQ_LAST it waits in the queue */
 	if (prev_wants && !find_server(generation, prev_id))
 		set_slice(prev, BEST_EFFORT_SLICE);
 }
@@ -280,17 +462,12 @@ void BPF_PROG(table_stopping, struct task_struct *p, bool runnable)
 	}
 }
 
-/*
- * A higher class takes the core. What is on its local queue would run on afterwards without a new
- * look at the table, so it goes back to where it came from.
- */
+/* A higher class takes the core: the local queue, which would run on afterwards, is sorted anew. */
 SEC("struct_ops/table_cpu_release")
 void BPF_PROG(table_cpu_release, s32 cpu, struct scx_cpu_release_args *args)
 {
 	reenqueue_local();
 }
-
-/* ---- boundaries ---- */
 
 static int at_boundary(void *map, u32 *key, struct timer_of_cpu *t)
 {
@@ -314,8 +491,8 @@ static __always_inline void tell(struct table_instant *when, u64 instant)
 /*
  * Have the calling core decide at its next boundary. With a timer, the loader runs this once on
  * each core after each change of the table (a timer is pinned to the core that starts it);
- * without, the core's kicker runs it again and again. It sleeps until the boundary, then, because
- * planning would delay those who wait for that boundary, for a little longer, and then plans anew.
+ * without, the core's kicker runs it again and again: it sleeps until the boundary, a little longer
+ * since planning would delay those who wait for it, and then plans anew.
  */
 SEC("syscall")
 int table_boundary(struct table_wake *wake)
@@ -358,8 +535,6 @@ int table_decide(struct table_wake *unused)
 		scx_bpf_kick_cpu(cpu, SCX_KICK_PREEMPT);
 	return 0;
 }
-
-/* ---- beginning and end ---- */
 
 s32 SEC("struct_ops.s/table_init")
 BPF_PROG(table_init)

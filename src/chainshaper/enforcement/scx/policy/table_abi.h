@@ -1,9 +1,7 @@
 /* SPDX-License-Identifier: MIT OR GPL-2.0-only */
 /*
- * The maps between the policy (table.bpf.c) and its loader (../scx_table.py).
- *
- * Every table exists twice: one generation is in force while the loader writes the other. All
- * times are nanoseconds of CLOCK_MONOTONIC.
+ * The maps between the policy (table.bpf.c) and its loader (../back_end.py). All times are
+ * nanoseconds of CLOCK_MONOTONIC.
  */
 #ifndef TABLE_ABI_H
 #define TABLE_ABI_H
@@ -64,8 +62,8 @@ struct table_config {
 	unsigned int cpu_count;		/* one more than the highest number of a core */
 };
 
-struct table_instant {
-	long long seconds, nanoseconds;	/* as in struct timespec */
+struct table_instant {			/* as struct timespec */
+	long long seconds, nanoseconds;
 };
 
 /* What a kicker gets from table_boundary: until when to sleep, and until when then once more. */
