@@ -18,10 +18,9 @@ from uuid import UUID
 
 import polars as pl
 
-from chainshaper.sources.ctf.tables import MAGIC
+from chainshaper.sources.ctf.layout import MAGIC
 from chainshaper.sources.ctf.trace import METADATA_MAGIC
-from chainshaper.sources.ctf.tsdl import parse_tsdl
-from chainshaper.sources.ctf.types import (
+from chainshaper.sources.ctf.tsdl import (
     ArrayType,
     EnumType,
     EventClass,
@@ -36,6 +35,7 @@ from chainshaper.sources.ctf.types import (
     VariantType,
     alignment,
     field_name,
+    parse_tsdl,
 )
 from chainshaper.values import events
 

@@ -124,8 +124,10 @@ def test_a_few_bytes_take_little_memory_and_time(tmp_path: Path) -> None:
         folders[-1].mkdir()
         write_bomb(folders[-1], declared, fields, payload)
     folders += [tmp_path / "headers", tmp_path / "damaged"]
-    header = "struct { u32 magic; u32 n; struct { chr x[0]; } v[n]; }"
-    write_packets(folders[-2], header, struct.pack("<IIII", 0xC1FC1FC1, 10**6, 128, 128), 20_000)
+    header = """struct { u32 magic; u32 n; enum : u32 { none = 0 } t;
+        struct { variant <t> { struct { } none; } v; } v[n]; }"""
+    packet = struct.pack("<IIIII", 0xC1FC1FC1, 10**6, 0, 160, 160)
+    write_packets(folders[-2], header, packet, 20_000)
     damaged = struct.pack("<III", 0xC1FC1FC1, 8 * 13, 8 * 13) + b"\1"
     write_packets(folders[-1], "struct { u32 magic; }", damaged, 5_000)
     *found, headers, damaged_packets = read_in_a_child(*folders)

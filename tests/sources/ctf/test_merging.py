@@ -7,7 +7,7 @@ import pytest
 from ctf_writing import EventRecord, encode_packet, lttng_metadata, write_trace
 
 from chainshaper.sources.ctf import open_trace, read_events
-from chainshaper.sources.ctf.tables import AHEAD
+from chainshaper.sources.ctf.layout import AHEAD
 from chainshaper.sources.ctf.tsdl import parse_tsdl
 
 EVENTS = {"ros2:number": {"place": "u64"}, "ros2:text": {"place": "u64", "text": "string"}}

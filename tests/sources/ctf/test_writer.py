@@ -143,7 +143,7 @@ def test_equal_times_stand_in_order_of_the_files(tmp_path: Path) -> None:
 def test_many_spans_and_threads_give_the_same_frames(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from chainshaper.sources.ctf import decode
+    from chainshaper.sources.ctf import read as decode
 
     make_trace(tmp_path, streams=4, packets=10, events=60)
     trace = open_trace(tmp_path)

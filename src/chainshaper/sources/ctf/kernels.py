@@ -1,6 +1,6 @@
 """The compiled passes over a trace: find packets, count events, merge streams and write columns.
 
-They run without Python's lock. `tables` says what they are given, `program` what the operations
+They run without Python's lock. `layout` says what they are given, `layout` what the operations
 mean.
 """
 
@@ -9,7 +9,7 @@ mean.
 
 import numpy as np
 
-from chainshaper.sources.ctf import tables as tb
+from chainshaper.sources.ctf import layout as tb
 from chainshaper.sources.ctf.interpreter import advance_clock, afforded, execute, move_batch
 from chainshaper.values.compiled.memory import compiled, get, load_word, put, store_long, store_word
 

@@ -31,15 +31,15 @@ from typing import TypeAlias
 import polars as pl
 
 from chainshaper.sources.ctf import CtfTrace, Events, count_events, open_trace, read_events
-from chainshaper.sources.ctf.types import (
+from chainshaper.sources.ctf.tsdl import (
     ArrayType,
     EnumType,
     IntegerType,
     SequenceType,
-    StringType,
     StructType,
     Type,
     field_name,
+    is_text,
 )
 from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids, rmw_of_threads
 from chainshaper.values import events
@@ -374,12 +374,9 @@ def _decoded_type(declared: Type) -> pl.DataType | None:
     match declared:
         case IntegerType() | EnumType():
             return pl.Int64()
-        case StringType():
-            return pl.String()
-        case ArrayType(element=IntegerType() as one) | SequenceType(element=IntegerType() as one):
-            text = one.encoding != "none" and one.size == one.align == 8
-            return pl.String() if text else pl.List(pl.Int64())
-    return None
+        case ArrayType(element=IntegerType()) | SequenceType(element=IntegerType()):
+            return pl.String() if is_text(declared) else pl.List(pl.Int64())
+    return pl.String() if is_text(declared) else None
 
 
 def _castable(found: pl.DataType | None, wanted: pl.DataType) -> bool:
