@@ -321,15 +321,16 @@ def move_batch(machine, event, batch):
 
 
 @compiled()
-def execute(machine, first, last, base, mapped, end, position, regs, row):
-    """Run the operations [first, last) from ``position``; the position after or a failure.
+def execute(machine, owner, column, base, mapped, end, position, regs, row):
+    """Run operations from ``position``; the position after or a failure.
 
+    Their first and the one after their last stand in the ``column`` of ``owner`` and the next.
     ``base`` is the address of the packet, ``mapped`` the bytes that may be loaded from there,
     ``end`` the end of the content in bits, ``regs`` the address of the registers,
     ``row`` that of the table that the event goes to.
     """
     ops, state = get(machine, tb.M_OPS), get(machine, tb.M_STATE)
-    op, stop = ops + (first << 7), ops + (last << 7)
+    op, stop = ops + (get(owner, column) << 7), ops + (get(owner, column + 1) << 7)
     depth = np.int64(0)
     while op < stop:
         code, align = get(op, tb.O_CODE), get(op, tb.O_ALIGN)

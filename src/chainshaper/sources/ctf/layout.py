@@ -34,7 +34,6 @@ from chainshaper.sources.ctf.tsdl import (
     Field,
     IntegerType,
     Number,
-    SequenceType,
     StreamClass,
     StringType,
     StructType,
@@ -417,7 +416,7 @@ class _Writer:
                 frame = at.frames[-1][name] = _Frame()
                 self._skip(kind.align, 0)
                 return sum(self._type(f.name, f.type, at.inside(frame)) for f in kind.fields)
-            case ArrayType() | SequenceType():
+            case ArrayType():
                 return min(self._array(name, kind, at), _ENDLESS_BITS)
             case VariantType():
                 return self._variant(name, kind, at)
@@ -450,9 +449,9 @@ class _Writer:
             row[O_CODE] = MOVE
         return base.size
 
-    def _array(self, name: str, kind: ArrayType | SequenceType, at: _Place) -> int:
+    def _array(self, name: str, kind: ArrayType, at: _Place) -> int:
         rows, count, register = self.layout.operations, 0, -1
-        if isinstance(kind, ArrayType):
+        if isinstance(kind.length, int):
             count = kind.length
         else:
             register = self._referred(kind.length, at).register

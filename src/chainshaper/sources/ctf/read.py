@@ -23,7 +23,6 @@ from chainshaper.sources.ctf.trace import CtfStream, CtfTrace, MappedFile, Scrat
 from chainshaper.sources.ctf.tsdl import (
     ArrayType,
     CtfError,
-    SequenceType,
     StringType,
     StructType,
     Type,
@@ -381,14 +380,13 @@ class _Columns:
         variants structs, an absent option null.
         """
         match kind:
-            case StringType() | ArrayType() | SequenceType() if is_text(kind):
+            case StringType() | ArrayType() if is_text(kind):
                 return texts.gather(pl.Series(next(self._slots))).alias(name)
-            case ArrayType(element) | SequenceType(element):
-                count = kind.length if isinstance(kind, ArrayType) else 0
-                zeros = np.zeros(rows, np.uint32)
-                lengths = next(self._slots) if isinstance(kind, SequenceType) else zeros
+            case ArrayType(element, count):
+                whole = isinstance(count, int)
+                lengths = np.zeros(rows, np.uint32) if whole else next(self._slots)
                 values = self._column(name, element, next(self._levels), texts)
-                if values is None or not count:
+                if values is None or not count or isinstance(count, str):
                     return None if values is None else _ragged(values, lengths)
                 deeper = values.dtype.shape if isinstance(values.dtype, pl.Array) else ()
                 return values.reshape((rows, count, *deeper))

@@ -79,18 +79,10 @@ class StringType:
 
 @dataclass(frozen=True, slots=True)
 class ArrayType:
-    """``T name[length]`` (section 4.2.3)."""
+    """``T name[length]`` (section 4.2.3); of a sequence (4.2.4) the path as written, ``a.b.c``."""
 
     element: Type
-    length: int
-
-
-@dataclass(frozen=True, slots=True)
-class SequenceType:
-    """``T name[path]`` (section 4.2.4); ``length`` is the path as written, ``a.b.c``."""
-
-    element: Type
-    length: str
+    length: int | str
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +110,7 @@ class VariantType:
 
 
 Number = IntegerType | FloatType | EnumType
-Type = Number | StringType | ArrayType | SequenceType | StructType | VariantType
+Type = Number | StringType | ArrayType | StructType | VariantType
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +180,7 @@ def field_name(name: str) -> str:
 def alignment(kind: Type) -> int:
     """The alignment of a type in bits (section 4.1.2, 4.2); a variant has none of its own."""
     match kind:
-        case EnumType(container=inner) | ArrayType(element=inner) | SequenceType(element=inner):
+        case EnumType(container=inner) | ArrayType(element=inner):
             return alignment(inner)
         case StringType():
             return 8
@@ -198,13 +190,11 @@ def alignment(kind: Type) -> int:
 
 
 def is_text(kind: Type) -> bool:
-    """Whether values are texts: a string, or an array or sequence of encoded bytes."""
+    """Whether values are texts: a string, or an array of encoded bytes."""
     match kind:
-        case ArrayType(IntegerType(8, 8, encoded=True)):
+        case StringType() | ArrayType(IntegerType(8, 8, encoded=True)):
             return True
-        case SequenceType(IntegerType(8, 8, encoded=True)):
-            return True
-    return isinstance(kind, StringType)
+    return False
 
 
 # Tokens
@@ -572,10 +562,7 @@ class _Parser:
                 self.fail("array of too many dimensions")
             element = kind
             for length in reversed(lengths):
-                if isinstance(length, int):
-                    element = ArrayType(element, length)
-                else:
-                    element = SequenceType(element, length)
+                element = ArrayType(element, length)
             yield Field(name, element)
             more = self.accept(",")
 

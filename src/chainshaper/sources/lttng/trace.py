@@ -35,7 +35,6 @@ from chainshaper.sources.ctf.tsdl import (
     ArrayType,
     EnumType,
     IntegerType,
-    SequenceType,
     StructType,
     Type,
     field_name,
@@ -374,7 +373,7 @@ def _decoded_type(declared: Type) -> pl.DataType | None:
     match declared:
         case IntegerType() | EnumType():
             return pl.Int64()
-        case ArrayType(element=IntegerType()) | SequenceType(element=IntegerType()):
+        case ArrayType(element=IntegerType()):
             return pl.String() if is_text(declared) else pl.List(pl.Int64())
     return pl.String() if is_text(declared) else None
 
