@@ -22,7 +22,6 @@ from chainshaper.sources.ctf.layout import MAGIC
 from chainshaper.sources.ctf.trace import METADATA_MAGIC
 from chainshaper.sources.ctf.tsdl import (
     ArrayType,
-    EnumType,
     Field,
     FloatType,
     IntegerType,
@@ -126,11 +125,9 @@ def _encode(bits: _Bits, kind: Type, value: Any, name: str = "", depth: int = 0)
             _encode(bits, option.type, inside_value, chosen, depth + 1)
         case ArrayType():
             _encode_array(bits, kind, value, depth)
-        case EnumType(container, mappings):
-            if isinstance(value, str):
-                value = next(m.low for m in mappings if m.label == value)
-            _encode(bits, container, value, name, depth)
         case IntegerType():
+            if isinstance(value, str):
+                value = next(m.low for m in kind.mappings if m.label == value)
             bits.align(kind.align)
             stamp = kind.clock is not None or (depth == 1 and name in bits.stamps)
             if stamp and kind.size == 64:
@@ -225,7 +222,10 @@ def _event_header(header: StructType, number: int, time: int, clock: int) -> Map
     """The header's values: LTTng's compact form where it suffices, else its extended one."""
     long = {"id": number, "timestamp": time}
     match [member.type for member in header.fields]:
-        case [EnumType(_, mappings), VariantType(_, [Field(_, StructType([Field(_, stamp)])), *_])]:
+        case [
+            IntegerType(mappings=mappings),
+            VariantType(_, [Field(_, StructType([Field(_, stamp)])), *_]),
+        ]:
             last = max(m.low for m in mappings)
             # A compact stamp can tell of less than one turn of its bits since the event before.
             if number < last and 0 <= time - clock < 1 << stamp.size:  # type: ignore[union-attr]

@@ -268,8 +268,11 @@ def as_table(frame: pl.DataFrame, name: str) -> pl.DataFrame:
     """
     if "cpu" not in frame.columns:
         frame = frame.with_columns(cpu=pl.lit(None, COMMON_COLUMNS["cpu"]))
-    types = {column: kind for column, kind in _types(name).items() if column in frame.columns}
-    frame = frame.cast({**types}, strict=True)
+    frame = frame.with_columns(
+        pl.col(column).cast(kind, strict=True)
+        for column, kind in _types(name).items()
+        if column in frame.columns
+    )
     if frame["time"].null_count():
         raise pl.exceptions.InvalidOperationError("rows without a time")
     return frame

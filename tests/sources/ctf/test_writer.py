@@ -128,18 +128,6 @@ def test_repeated_packets_go_on_in_time(tmp_path: Path) -> None:
     assert times[count:] == [time + period for time in times[:-count]]
 
 
-def test_equal_times_stand_in_order_of_the_files(tmp_path: Path) -> None:
-    text = lttng_metadata({"e": {"n": "u32"}})
-    declared = parse_tsdl(text)
-    files = {}
-    for cpu in (2, 0, 1):
-        same = [EventRecord("e", START, {"n": 10 * cpu + i}) for i in range(2)]
-        about = {"cpu_id": cpu}
-        files[f"channel_{cpu}"] = [encode_packet(declared, same, about, instance=cpu)]
-    write_trace(tmp_path, text, files)
-    assert read_events(open_trace(tmp_path))["e"]["n"].to_list() == [0, 1, 10, 11, 20, 21]
-
-
 def test_many_spans_and_threads_give_the_same_frames(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -162,7 +150,7 @@ def test_many_different_strings(tmp_path: Path) -> None:
     made = [
         EventRecord("e", START + i, {"s": f"{i:x}" * (i % 4), "t": f"text {i}", "_n_length": i % 3,
                                      "n": [i & 255] * (i % 3)})
-        for i in range(4000)
+        for i in range(2200)
     ]  # fmt: skip
     write_packet(tmp_path, text, made)
     frame = read_events(open_trace(tmp_path))["e"]

@@ -29,11 +29,10 @@ from chainshaper.sources.ctf.tsdl import (
     CtfError,
     CtfFolder,
     EnumMapping,
-    EnumType,
     EventClass,
     Field,
+    FloatType,
     IntegerType,
-    Number,
     StreamClass,
     StringType,
     StructType,
@@ -422,32 +421,30 @@ class _Writer:
                 return self._variant(name, kind, at)
         return self._number(name, kind, at)
 
-    def _number(self, name: str, kind: Number, at: _Place) -> int:
-        base = kind.container if isinstance(kind, EnumType) else kind
-        big = self.big if base.byte_order == "native" else base.byte_order == "be"
+    def _number(self, name: str, kind: IntegerType | FloatType, at: _Place) -> int:
+        big = self.big if kind.byte_order == "native" else kind.byte_order == "be"
         code, register, clock = "f", -1, False
         at.frames[-1][name] = None
-        if isinstance(base, IntegerType):
-            code, clock = "i" if base.signed else "u", base.clock is not None
+        if isinstance(kind, IntegerType):
+            code, clock = "i" if kind.signed else "u", kind.clock is not None
             if self.fixed and name in REGISTERS and (len(at.frames) == 1 or name == "id"):
                 register = REGISTERS[name]
                 # The end of a packet is no instant that its events follow.
                 clock = clock and register != R_END
             elif name in self.referenced:
                 register, self.registers = self.registers, self.registers + 1
-            mappings = kind.mappings if isinstance(kind, EnumType) else ()
-            at.frames[-1][name] = _Number(register, base.signed, mappings)
-        width = next(width for width in (1, 2, 4, 8) if base.size <= 8 * width)
+            at.frames[-1][name] = _Number(register, kind.signed, kind.mappings)
+        width = next(width for width in (1, 2, 4, 8) if kind.size <= 8 * width)
         place = self._slot(f"{code}{width}", at)
         if not place and register < 0 and not clock:
-            self._skip(base.align, base.size)
-            return base.size
+            self._skip(kind.align, kind.size)
+            return kind.size
         flags = (code == "i") + 2 * big + 4 * clock
-        columns = {O_ALIGN: base.align, O_SIZE: base.size, O_FLAGS: flags, O_REGISTER: register}
+        columns = {O_ALIGN: kind.align, O_SIZE: kind.size, O_FLAGS: flags, O_REGISTER: register}
         row = self._row(NUMBER, columns | place)
         if at.level == 0 and _is_moved(row):
             row[O_CODE] = MOVE
-        return base.size
+        return kind.size
 
     def _array(self, name: str, kind: ArrayType, at: _Place) -> int:
         rows, count, register = self.layout.operations, 0, -1
@@ -714,7 +711,7 @@ def _quick_header(header: StructType | None, big: bool) -> list[int]:
     match header:
         case StructType(
             fields=(
-                Field("id", EnumType(IntegerType(signed=False) as number, mappings)),
+                Field("id", IntegerType(signed=False) as number),
                 Field(_, VariantType("id", options)),
             )
         ) if not big:
@@ -727,7 +724,7 @@ def _quick_header(header: StructType | None, big: bool) -> list[int]:
                 ):
                     align, inner = header.align, compact.align
                     shift = -(-number.size // inner) * inner
-                    quick = {m.label: (m.low, m.high) for m in mappings} == wanted
+                    quick = {m.label: (m.low, m.high) for m in number.mappings} == wanted
                     quick &= "be" not in (number.byte_order, clock.byte_order)
                     quick &= clock.size <= 63 and shift + clock.size <= 64
                     if quick and align >= max(8, inner):
@@ -737,7 +734,7 @@ def _quick_header(header: StructType | None, big: bool) -> list[int]:
 
 def _clock_names(kind: Type | None) -> list[str]:
     match kind:
-        case IntegerType(clock=str(name)) | EnumType(container=IntegerType(clock=str(name))):
+        case IntegerType(clock=str(name)):
             return [name]
         case StructType(fields=fields) | VariantType(options=fields):
             return [name for f in fields for name in _clock_names(f.type)]

@@ -32,27 +32,6 @@ class TsdlError(ValueError):
     """Metadata that is no TSDL; ``args`` are the character offset and the reason."""
 
 
-@dataclass(frozen=True, slots=True)
-class IntegerType:
-    """``integer { … }`` (section 4.1.5); ``clock`` is the name of the clock it is mapped to."""
-
-    size: int
-    align: int
-    signed: bool = False
-    byte_order: ByteOrder = "native"
-    encoded: bool = False  # as UTF-8 or ASCII
-    clock: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class FloatType:
-    """``floating_point { … }`` (section 4.1.7), IEEE 754 of 32 or 64 bits."""
-
-    size: int
-    align: int
-    byte_order: ByteOrder = "native"
-
-
 class EnumMapping(NamedTuple):
     """One label of an enumeration and the closed range of values that carry it."""
 
@@ -62,14 +41,29 @@ class EnumMapping(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class EnumType:
-    """``enum : container { … }`` (section 4.1.8); ranges may overlap.
+class IntegerType:
+    """``integer { … }`` (section 4.1.5), or ``enum`` (4.1.8) with ``mappings``, which may overlap.
 
-    Enumerations of other labels are equal: their values lie alike.
+    ``clock`` is the name of the clock it is mapped to. Other labels make no other type: values
+    lie alike.
     """
 
-    container: IntegerType
-    mappings: tuple[EnumMapping, ...] = field(compare=False)
+    size: int
+    align: int
+    signed: bool = False
+    byte_order: ByteOrder = "native"
+    encoded: bool = False  # as UTF-8 or ASCII
+    clock: str | None = None
+    mappings: tuple[EnumMapping, ...] = field(default=(), compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class FloatType:
+    """``floating_point { … }`` (section 4.1.7), IEEE 754 of 32 or 64 bits."""
+
+    size: int
+    align: int
+    byte_order: ByteOrder = "native"
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,8 +103,7 @@ class VariantType:
     options: tuple[Field, ...]
 
 
-Number = IntegerType | FloatType | EnumType
-Type = Number | StringType | ArrayType | StructType | VariantType
+Type = IntegerType | FloatType | StringType | ArrayType | StructType | VariantType
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,8 +173,8 @@ def field_name(name: str) -> str:
 def alignment(kind: Type) -> int:
     """The alignment of a type in bits (section 4.1.2, 4.2); a variant has none of its own."""
     match kind:
-        case EnumType(container=inner) | ArrayType(element=inner):
-            return alignment(inner)
+        case ArrayType(element):
+            return alignment(element)
         case StringType():
             return 8
         case VariantType():
@@ -566,9 +559,7 @@ class _Parser:
             yield Field(name, element)
             more = self.accept(",")
 
-    def _enum(self, container: Type | None) -> EnumType:
-        if isinstance(container, EnumType):
-            container = container.container
+    def _enum(self, container: Type | None) -> IntegerType:
         if not isinstance(container, IntegerType):
             self.fail("an enumeration needs an integer type")
         mappings: list[EnumMapping] = []
@@ -588,7 +579,7 @@ class _Parser:
             if not self.accept(","):
                 break
         self.expect("}")
-        return EnumType(container, tuple(mappings))
+        return replace(container, mappings=tuple(mappings))
 
     def declaration(self) -> bool:
         """Read ``typealias``, ``typedef`` or a lone named type; False where none stands here."""

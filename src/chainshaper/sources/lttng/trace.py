@@ -33,7 +33,6 @@ import polars as pl
 from chainshaper.sources.ctf import CtfTrace, Events, count_events, open_trace, read_events
 from chainshaper.sources.ctf.tsdl import (
     ArrayType,
-    EnumType,
     IntegerType,
     StructType,
     Type,
@@ -190,7 +189,12 @@ class TraceTables(Mapping[str, pl.DataFrame]):
     def field_lengths(self) -> dict[str, dict[str, int]]:
         """Event → its declared fields, with the length of those that are arrays (0: no array)."""
         return {
-            name: {f: t.length if isinstance(t, ArrayType) else 0 for f, t in fields.items()}
+            name: {
+                field: kind.length
+                if isinstance(kind, ArrayType) and isinstance(kind.length, int)
+                else 0
+                for field, kind in fields.items()
+            }
             for name, fields in self._fields.items()
         }
 
@@ -371,7 +375,7 @@ def _missing_fields(declared: _DeclaredFields, happened: set[str]) -> list[str]:
 def _decoded_type(declared: Type) -> pl.DataType | None:
     """What the values of a declared field become, of the kinds that a table has."""
     match declared:
-        case IntegerType() | EnumType():
+        case IntegerType():
             return pl.Int64()
         case ArrayType(element=IntegerType()):
             return pl.String() if is_text(declared) else pl.List(pl.Int64())
