@@ -1,5 +1,6 @@
 """What the writer writes comes back, from us and from babeltrace2."""
 
+import random
 from pathlib import Path
 from typing import Any
 
@@ -16,39 +17,34 @@ from made import START, USER_CONTEXT, USER_EVENTS, make_trace, records
 from reference import actual_rows, assert_equal_to_babeltrace, lean
 
 from chainshaper.sources.ctf import count_events, open_trace, read_events
+from chainshaper.sources.ctf.layout import AHEAD
 from chainshaper.sources.ctf.tsdl import parse_tsdl
-
-
-def expected(made: Any) -> Any:
-    rows: dict[str, list[Any]] = {}
-    for event in made:
-        context = dict(event.context)
-        row = {"time": event.time, "pid": context.get("vpid"), "tid": context.get("vtid")}
-        rows.setdefault(event.name, []).append(lean(row | dict(event.payload)))
-    return {name: sorted(map(repr, found)) for name, found in rows.items()}
 
 
 @pytest.mark.parametrize("options", [
     {}, {"header": "compact"}, {"big": True}, {"big": True, "header": "compact"},
     {"aligned": True}, {"aligned": True, "header": "compact", "big": True},
 ], ids=str)  # fmt: skip
-def test_round_trip(tmp_path: Path, options: Any) -> None:
-    made = make_trace(tmp_path, **options)
+def test_round_trip(tmp_path: Path, options: dict[str, Any]) -> None:
+    expected: dict[str, list[Any]] = {}
+    for event in make_trace(tmp_path, **options):
+        who = {"time": event.time, "pid": event.context["vpid"], "tid": event.context["vtid"]}
+        expected.setdefault(event.name, []).append(lean({**who, **event.payload}))
     frames = read_events(open_trace(tmp_path))
-    dropped = ("cpu", "procname")
-    rows = actual_rows({n: f.drop(dropped) for n, f in frames.items()})
-    assert {n: sorted(map(repr, found)) for n, found in rows.items()} == expected(made)
+    rows = actual_rows({n: f.drop("cpu", "procname") for n, f in frames.items()})
+    assert rows.keys() == expected.keys()
+    for name, found in expected.items():
+        assert sorted(map(repr, rows[name])) == sorted(map(repr, found))
     assert_equal_to_babeltrace(tmp_path)
 
 
 @pytest.mark.parametrize("header", ["compact", "large"])
 @pytest.mark.parametrize("aligned", [False, True])
-def test_kernel_traces(tmp_path: Path, header: Any, aligned: Any) -> None:
+def test_kernel_traces(tmp_path: Path, header: str, aligned: bool) -> None:
     make_trace(tmp_path / "kernel", kernel=True, header=header, aligned=aligned)
     trace, frames = assert_equal_to_babeltrace(tmp_path, kernel=True)
     assert trace.env["domain"] == "kernel"
-    switches = frames["sched_switch"]
-    assert {"prev_comm", "prev_tid", "next_tid", "pid", "tid", "cpu"} <= set(switches.columns)
+    assert {"prev_comm", "pid", "tid", "cpu"} <= set(frames["sched_switch"].columns)
     assert "payload.tid" in frames["sched_wakeup"].columns
 
 
@@ -80,7 +76,7 @@ def test_metadata_as_plain_text(tmp_path: Path) -> None:
         write_trace(tmp_path, text, {})
 
 
-@pytest.mark.parametrize("files", [1, 2], ids=["one file", "rotated files"])
+@pytest.mark.parametrize("files", [4, 2], ids=["one file", "rotated files"])
 def test_losses_are_counted(tmp_path: Path, files: Any) -> None:
     text = lttng_metadata(USER_EVENTS, USER_CONTEXT)
     declared = parse_tsdl(text)
@@ -90,10 +86,7 @@ def test_losses_are_counted(tmp_path: Path, files: Any) -> None:
         start = part[-1].time + 1
         about = {"packet_seq_num": sequence, "events_discarded": discarded}
         packets.append(encode_packet(declared, part, about))
-    if files == 1:
-        write_trace(tmp_path, text, {"a": packets})
-    else:
-        write_trace(tmp_path, text, {"a_1": packets[:2], "a_0": packets[2:]})
+    write_trace(tmp_path, text, {"a_1": packets[:files], "a_0": packets[files:]})
     trace, _ = assert_equal_to_babeltrace(tmp_path)
     assert (trace.discarded_events, trace.lost_packets) == (11, 4)
     assert len(trace.warnings) == 2
@@ -157,3 +150,36 @@ def test_many_different_strings(tmp_path: Path) -> None:
     assert frame["s"].to_list() == [event.payload["s"] for event in made]
     assert frame["t"].to_list() == [event.payload["t"] for event in made]
     assert frame["n"].to_list() == [event.payload["n"] for event in made]
+
+
+EVENTS = {"ros2:number": {"place": "u64"}, "ros2:text": {"place": "u64", "text": "string"}}
+
+
+@pytest.mark.parametrize("streams", [1, 2, 5, 13])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_every_event_is_where_a_sort_by_time_and_file_puts_it(
+    tmp_path: Path, streams: int, threads: int
+) -> None:
+    """Steps of 0 and 1 make many equal times; texts end what is read ahead, and so do packets."""
+    chance = random.Random(streams)
+    made: list[tuple[int, int, int, str]] = []
+    encoded = {}
+    declared = parse_tsdl(lttng_metadata(EVENTS, {}))
+    for file in range(streams):
+        time, found = 1 << 40, []
+        for _ in range(chance.choice([0, 1, AHEAD, AHEAD + 1, 5 * AHEAD])):
+            time += chance.choice([0, 0, 1, 3])
+            name = chance.choice(["ros2:number"] * 30 + ["ros2:text"])
+            payload = {"place": len(made)} | ({"text": "x"} if name == "ros2:text" else {})
+            made.append((time, file, len(made), name))
+            found.append(EventRecord(name, time, payload, {}))
+        sizes = [found[n : n + 100] for n in range(0, len(found), 100)]
+        encoded[f"channel_{file:02}"] = [
+            encode_packet(declared, part, {"cpu_id": file, "packet_seq_num": n}, instance=file)
+            for n, part in enumerate(sizes)
+        ]
+    write_trace(tmp_path / "trace", lttng_metadata(EVENTS, {}), encoded)
+    frames = read_events(open_trace(tmp_path / "trace"), threads=threads)
+    for name in EVENTS:
+        expected = [(place, file) for _, file, place, its in sorted(made) if its == name]
+        assert list(zip(frames[name]["place"], frames[name]["cpu"], strict=True)) == expected
