@@ -19,21 +19,6 @@ from typing import TypeAlias
 
 import polars as pl
 
-__all__ = [
-    "COMMON_COLUMNS",
-    "CREATION",
-    "FIELDS",
-    "NODE_NAME",
-    "OPTIONAL_FIELDS",
-    "VERSION_FIELDS",
-    "EventTables",
-    "as_table",
-    "column_problems",
-    "empty",
-    "happened",
-    "table",
-]
-
 EventTables: TypeAlias = Mapping[str, pl.DataFrame]
 """One frame per event name, each sorted by ``time``."""
 

@@ -25,23 +25,6 @@ from chainshaper.values.events import EventTables, as_table, column_problems
 from chainshaper.values.files import free_place, open_to_all
 from chainshaper.values.yaml_file import wrong_values_refused
 
-__all__ = [
-    "Check",
-    "EndpointInfo",
-    "InForceInfo",
-    "MachineReport",
-    "Recording",
-    "RecordingInfo",
-    "StallMeterInfo",
-    "State",
-    "ThreadInfo",
-    "event_counts",
-    "lost_text",
-    "open_recording",
-    "refuse_existing",
-    "write_recording",
-]
-
 INFO_FILE = "recording.json"
 FORMAT = 1
 MOST_ROWS = 1_000_000

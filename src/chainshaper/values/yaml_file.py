@@ -28,20 +28,6 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import InputError
 
-__all__ = [
-    "AS_YAML",
-    "Duration",
-    "FullName",
-    "Part",
-    "PlainData",
-    "PositiveDuration",
-    "compose",
-    "read_model",
-    "read_text",
-    "wrong_value",
-    "wrong_values_refused",
-]
-
 Model = TypeVar("Model", bound=BaseModel)
 _Path: TypeAlias = tuple[str | int, ...]
 
@@ -142,9 +128,7 @@ def read_model(path: str | Path, model: type[Model], *, made_by: str) -> Model:
     try:
         return model.model_validate(values, context=AS_YAML)
     except ValidationError as error:
-        wrong = _explanations(error, model)
-        lines = [f"{path}:{plain.line(at)}: {_key_text(at)}: {reason}" for at, reason in wrong]
-        raise InputError("\n".join(lines)) from error
+        raise plain.problems(error, model) from error
 
 
 def read_text(path: Path, made_by: str) -> str:
@@ -280,11 +264,15 @@ class PlainData:
         line = node.start_mark.line + 1
         return InputError(f"{self.name}:{line}: {_key_text(where)}: {reason}")
 
-    def line(self, where: _Path) -> int:
-        """The line of a value; of a missing key, that of the mapping it is missing from."""
-        while where and where not in self.lines:
-            where = where[:-1]
-        return self.lines.get(where, 1)
+    def problems(self, error: ValidationError, model: type[BaseModel]) -> InputError:
+        """What a model refused, each with its line."""
+        lines = []
+        for where, reason in _explanations(error, model):
+            # A missing key has no line of its own: the mapping it is missing from has.
+            places = (where[:end] for end in range(len(where), -1, -1))
+            line = next((self.lines[place] for place in places if place in self.lines), 1)
+            lines.append(f"{self.name}:{line}: {_key_text(where)}: {reason}")
+        return InputError("\n".join(lines))
 
 
 @contextmanager

@@ -105,7 +105,7 @@ KNOWN: dict[str, tuple[Any, ...]] = {
 
 def test_known_bytes_mean_what_the_specification_says(tmp_path: Path) -> None:
     for name, (fields, payload, expected, *order) in KNOWN.items():
-        row = one_event(tmp_path / name, fields, payload, *order, name=name)
+        row = one_event(tmp_path / name, fields, payload, "".join(order) or "le", name)
         assert row == [{"time": 1000, **expected}], name
     assert_equal_to_babeltrace(tmp_path)
 
