@@ -434,8 +434,8 @@ class _Writer:
             elif name in self.referenced:
                 register, self.registers = self.registers, self.registers + 1
             at.frames[-1][name] = _Number(register, kind.signed, kind.mappings)
-        width = next(width for width in (1, 2, 4, 8) if kind.size <= 8 * width)
-        place = self._slot(f"{code}{width}", at)
+        width = 1 << ((kind.size + 7 >> 3) - 1).bit_length()
+        place = self._slot(f"{code}{width}", at) if at.keep else {}
         if not place and register < 0 and not clock:
             self._skip(kind.align, kind.size)
             return kind.size

@@ -224,6 +224,8 @@ def _tokens(text: str) -> list[Token]:
     tokens: list[Token] = []
     for match in _TOKEN.finditer(text):
         kind, found, offset = str(match.lastgroup), match.group(), match.start()
+        if kind == "space":
+            continue
         if len(tokens) > _MOST_TOKENS:
             raise TsdlError(offset, f"more than {_MOST_TOKENS} tokens")
         if kind == "wrong":
@@ -241,11 +243,9 @@ def _tokens(text: str) -> list[Token]:
             if len(found) > 80:
                 raise TsdlError(offset, "integer out of range")
             digits = found.rstrip("uUlL")
-            octal = re.fullmatch("0[0-7]+", digits)
-            decimal = digits.isdecimal() and not octal
-            found = str(int(digits, 8 if octal else 10 if decimal else 0))
-        if kind != "space":
-            tokens.append(Token(kind, found, offset))
+            octal = digits[0] == "0" and re.fullmatch("0[0-7]+", digits)
+            found = str(int(digits, 8 if octal else 10 if digits.isdecimal() else 0))
+        tokens.append(Token(kind, found, offset))
     return [*tokens, Token("end", "", len(text))]
 
 
@@ -353,6 +353,7 @@ def _float_type(values: Attributes, offset: int) -> FloatType:
 # Grammar
 
 _DEEPEST = 32
+_DECLARING = frozenset(("typealias", "typedef", "struct", "variant", "enum"))
 
 
 @dataclass
@@ -583,6 +584,9 @@ class _Parser:
 
     def declaration(self) -> bool:
         """Read ``typealias``, ``typedef`` or a lone named type; False where none stands here."""
+        start = self.position
+        if self.token.text not in _DECLARING or self.token.kind != "word":
+            return False
         if self.accept("typealias"):
             kind = self.type(declares=False)
             if not self.at(":="):
@@ -598,14 +602,11 @@ class _Parser:
         elif self.accept("typedef"):
             for declared in self._declarators(self.type(declares=True)):
                 self.scope[declared.name] = declared.type
-        elif self.at("struct") or self.at("variant") or self.at("enum"):
-            start = self.position
+        else:
             self.type(declares=False)
             if not self.at(";"):
                 self.position = start
                 return False
-        else:
-            return False
         self.expect(";")
         return True
 
