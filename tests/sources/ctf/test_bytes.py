@@ -118,6 +118,9 @@ def test_what_babeltrace_shows_otherwise(tmp_path: Path) -> None:
         "b": "",
         "c": "",
     }
+    fields = "struct { struct { } a[3]; u8 n; struct { } b[n]; u8 c[n][0]; u8 d; }"
+    expected = {"time": 1000, "n": 2, "c": [[], []], "d": 7}
+    assert one_event(tmp_path, fields, b"\2\7") == [expected], "there is nothing to show in these"
     row = one_event(tmp_path, "struct { string s; }", b"a\xffb\0")[0]
     assert row["s"] == "a\\xffb", "bytes that are no UTF-8 are shown"
 

@@ -62,8 +62,13 @@ def test_kernel_beside_user_space_and_per_process_folders(tmp_path: Path) -> Non
     alone = read_events(open_trace(tmp_path / "ust/pid/first-1-20260101"))
     for name, frame in alone.items():
         assert set(frame["time"]) <= set(frames[name]["time"])
+    other = lttng_metadata({"ros2:callback_end": {"other": "u32"}})
+    write_packet(tmp_path / "other", other, [EventRecord("ros2:callback_end", START, {"other": 1})])
+    both = read_events(open_trace(tmp_path))["ros2:callback_end"]
+    assert both["other"][0] == 1, "events of one name and other fields are in one frame"
+    assert both["callback"][1:].to_list() == frames["ros2:callback_end"]["callback"].to_list()
     # Naming a folder twice does not read it twice.
-    assert open_trace(tmp_path, tmp_path / "kernel").packets == trace.packets
+    assert open_trace(tmp_path, tmp_path / "kernel").packets == trace.packets + 1
 
 
 def test_metadata_as_plain_text(tmp_path: Path) -> None:
