@@ -41,12 +41,9 @@ def note_packet(packet, offset, mapped, stream, known, regs, end):
     put(packet, tb.P_BYTES, min(bits >> 3, mapped))
     put(packet, tb.P_END, min(end, mapped * 8))
     put(packet, tb.P_STREAM, stream)
-    put(packet, tb.P_INSTANCE, known_or(known, tb.R_INSTANCE, regs, np.int64(-1)))
-    put(packet, tb.P_BEGIN, known_or(known, tb.R_BEGIN, regs, np.int64(-1)))
-    put(packet, tb.P_LAST, known_or(known, tb.R_END, regs, np.int64(-1)))
-    put(packet, tb.P_SEQUENCE, known_or(known, tb.R_SEQUENCE, regs, np.int64(-1)))
-    put(packet, tb.P_DISCARDED, known_or(known, tb.R_DISCARDED, regs, np.int64(-1)))
-    put(packet, tb.P_CPU, known_or(known, tb.R_CPU, regs, np.int64(-1)))
+    for index in range(6):  # from INSTANCE to CPU, as their registers stand
+        number = known_or(known, tb.R_INSTANCE + index, regs, np.int64(-1))
+        put(packet, tb.P_INSTANCE + index, number)
     put(packet, tb.P_ERROR, np.int64(0))
 
 

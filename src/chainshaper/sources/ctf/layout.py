@@ -158,13 +158,13 @@ REGISTERS = {
     name: number
     for number, name in enumerate((
         "id", "magic", "stream_id", "stream_instance_id", "timestamp_begin", "timestamp_end",
-        "content_size", "packet_size", "packet_seq_num", "events_discarded", "cpu_id",
+        "packet_seq_num", "events_discarded", "cpu_id", "content_size", "packet_size",
         "uuid_low", "uuid_high",
     ))
 }
 """The numbers that the decoder itself needs, by their TSDL name in packet header and context."""
-R_ID, R_MAGIC, R_STREAM, R_INSTANCE, R_BEGIN, R_END = range(6)
-R_CONTENT, R_PACKET, R_SEQUENCE, R_DISCARDED, R_CPU, R_UUID_LOW, R_UUID_HIGH = range(6, 13)
+R_ID, R_MAGIC, R_STREAM, R_INSTANCE, R_BEGIN, R_END, R_SEQUENCE, R_DISCARDED, R_CPU = range(9)
+R_CONTENT, R_PACKET, R_UUID_LOW, R_UUID_HIGH = range(9, 13)
 
 MAGIC = 0xC1FC1FC1
 BILLION = 1_000_000_000

@@ -264,12 +264,7 @@ def _unescape(text: str) -> str:
 Attributes = dict[str, tuple[int | str | Type, int]]
 """Name → value and its character offset."""
 _T = TypeVar("_T")
-_BYTE_ORDERS: dict[int | str, ByteOrder] = {
-    "le": "le",
-    "be": "be",
-    "network": "be",
-    "native": "native",
-}
+_ORDERS: dict[int | str, ByteOrder] = {"le": "le", "be": "be", "network": "be", "native": "native"}
 _SIGNED: dict[int | str, bool] = {
     **dict.fromkeys((0, "false", "FALSE"), False),
     **dict.fromkeys((1, "true", "TRUE"), True),
@@ -288,10 +283,6 @@ def _typed(values: Attributes, name: str, wanted: type[_T], what: str) -> _T | N
 def _number(values: Attributes, name: str, default: int) -> int:
     found = _typed(values, name, int, "an integer")
     return default if found is None else found
-
-
-def _struct(values: Attributes, name: str) -> StructType | None:
-    return _typed(values, name, StructType, "a structure")
 
 
 def _identifier(values: Attributes, name: str) -> int | None:
@@ -334,7 +325,7 @@ def _integer_type(values: Attributes, offset: int) -> IntegerType:
         size=size,
         align=_alignment(_number(values, "align", 1 if size % 8 else 8), offset),
         signed=_one_of(_SIGNED, values, "signed", False),
-        byte_order=_one_of(_BYTE_ORDERS, values, "byte_order", "native"),
+        byte_order=_one_of(_ORDERS, values, "byte_order", "native"),
         encoded=_one_of(_ENCODED, values, "encoding", False),
         clock=clock,
     )
@@ -346,7 +337,7 @@ def _float_type(values: Attributes, offset: int) -> FloatType:
         given = f"floating point of {exponent} + {mantissa} bits"
         raise TsdlError(offset, f"{given}; IEEE 32 or 64 supported")
     align = _alignment(_number(values, "align", 8), offset)
-    order = _one_of(_BYTE_ORDERS, values, "byte_order", "native")
+    order = _one_of(_ORDERS, values, "byte_order", "native")
     return FloatType(exponent + mantissa, align, order)
 
 
@@ -642,7 +633,7 @@ def parse_tsdl(text: str) -> TraceClass:
     return TraceClass(
         byte_order="le" if byte_order == "le" else "be",
         uuid=uuid if isinstance(uuid, str) else None,
-        packet_header=_struct(trace, "packet.header"),
+        packet_header=_typed(trace, "packet.header", StructType, "a structure"),
         env={name: value for name, value in environment.items() if isinstance(value, int | str)},
         clocks={clock.name: clock for clock in clocks},
         streams=_streams(found["stream"], found["event"]),
@@ -670,8 +661,8 @@ def _streams(
         identifier = _identifier(values, "id") or 0
         if identifier in streams:
             raise TsdlError(offset, f"stream {identifier} declared twice")
-        scopes = ("packet.context", "event.header", "event.context")
-        packet, header, context = (_struct(values, scope) for scope in scopes)
+        names = ("packet.context", "event.header", "event.context")
+        packet, header, context = (_typed(values, s, StructType, "a structure") for s in names)
         streams[identifier] = StreamClass(identifier, packet, header, context)
     streams = streams or {0: StreamClass(0)}
     only = next(iter(streams)) if len(streams) == 1 else 0
@@ -686,6 +677,7 @@ def _streams(
             raise TsdlError(offset, f"event {name!r} of undeclared stream {target}")
         if identifier in events[target]:
             raise TsdlError(offset, f"event {name!r}: id {identifier} declared twice")
-        context, fields = (_struct(values, scope) for scope in ("context", "fields"))
+        scopes = ("context", "fields")
+        context, fields = (_typed(values, s, StructType, "a structure") for s in scopes)
         events[target][identifier] = EventClass(identifier, name, context, fields)
     return {number: replace(stream, events=events[number]) for number, stream in streams.items()}
