@@ -1,9 +1,9 @@
-"""Run by an interpreter that has bt2: pickle every event of a trace to standard output.
+"""Run by an interpreter that has bt2: pickle a trace's first events to standard output.
 
-    python babeltrace_dump.py FOLDER…
+    python babeltrace_dump.py MOST FOLDER…
 
-Writes a dict: ``events`` (name, clock cycles or None, packet context, contexts, payload),
-``discarded`` and ``lost``.
+Writes a dict: ``events`` (name, clock cycles or None, packet context, contexts, payload), at most
+MOST of them, ``discarded`` and ``lost``.
 """
 
 import pickle
@@ -25,28 +25,25 @@ def plain(field: Any) -> Any:
         return {names[field.selected_option_index]: plain(field.selected_option)}
     if "String" in kind:
         return str(field)
-    if "Real" in kind:
-        return float(field)
-    return int(field)
+    return float(field) if "Real" in kind else int(field)
 
 
-def main() -> None:
-    events, discarded, lost = [], 0, 0
-    for message in bt2.TraceCollectionMessageIterator(sys.argv[1:]):
-        if type(message) is bt2._DiscardedEventsMessageConst:
-            discarded += message.count or 0
-        elif type(message) is bt2._DiscardedPacketsMessageConst:
-            lost += message.count or 0
-        elif type(message) is bt2._EventMessageConst:
-            event = message.event
-            clock = message.default_clock_snapshot.value
-            packet = plain(event.packet.context_field) if event.packet.context_field else {}
-            context: dict[str, Any] = {}
-            for field in (event.common_context_field, event.specific_context_field):
-                context |= plain(field) if field is not None else {}
-            payload = plain(event.payload_field) if event.payload_field is not None else {}
-            events.append((event.name, clock, packet, context, payload))
-    pickle.dump({"events": events, "discarded": discarded, "lost": lost}, sys.stdout.buffer)
+def fields(of: Any) -> Any:
+    return plain(of) if of is not None else {}
 
 
-main()
+events, discarded, lost = [], 0, 0
+for message in bt2.TraceCollectionMessageIterator(sys.argv[2:]):
+    if type(message) is bt2._DiscardedEventsMessageConst:
+        discarded += message.count or 0
+    elif type(message) is bt2._DiscardedPacketsMessageConst:
+        lost += message.count or 0
+    elif type(message) is bt2._EventMessageConst:
+        event = message.event
+        context = fields(event.common_context_field) | fields(event.specific_context_field)
+        packet, payload = fields(event.packet.context_field), fields(event.payload_field)
+        clock = message.default_clock_snapshot.value
+        events.append((event.name, clock, packet, context, payload))
+        if len(events) == int(sys.argv[1]):
+            break
+pickle.dump({"events": events, "discarded": discarded, "lost": lost}, sys.stdout.buffer)

@@ -18,17 +18,13 @@ from uuid import UUID
 
 import polars as pl
 
-from chainshaper.sources.ctf.tables import MAGIC
+from chainshaper.sources.ctf.layout import MAGIC
 from chainshaper.sources.ctf.trace import METADATA_MAGIC
-from chainshaper.sources.ctf.tsdl import parse_tsdl
-from chainshaper.sources.ctf.types import (
+from chainshaper.sources.ctf.tsdl import (
     ArrayType,
-    EnumType,
-    EventClass,
+    Field,
     FloatType,
     IntegerType,
-    SequenceType,
-    StreamClass,
     StringType,
     StructType,
     TraceClass,
@@ -36,20 +32,9 @@ from chainshaper.sources.ctf.types import (
     VariantType,
     alignment,
     field_name,
+    parse_tsdl,
 )
 from chainshaper.values import events
-
-__all__ = [
-    "EncodedPacket",
-    "EventRecord",
-    "encode_packet",
-    "lttng_metadata",
-    "metadata_packets",
-    "repeat_packets",
-    "write_lttng_trace",
-    "write_packet",
-    "write_trace",
-]
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +94,9 @@ class _Bits:
         around |= (value & (1 << size) - 1) << (8 * count - shift - size if big else shift)
         self.data[first:] = around.to_bytes(count, order)
 
+    def is_big(self, kind: IntegerType | FloatType) -> bool:
+        return self.big if kind.byte_order == "native" else kind.byte_order == "be"
+
     def raw(self, data: bytes) -> None:
         """Write bytes at the next whole byte."""
         self.align(8)
@@ -119,17 +107,14 @@ class _Bits:
 def _encode(bits: _Bits, kind: Type, value: Any, name: str = "", depth: int = 0) -> None:
     """Append ``value`` as ``kind``; raises ValueError or KeyError where it does not fit."""
     match kind:
-        case IntegerType() | EnumType():
-            _encode_integer(bits, kind, value, name, depth)
-        case FloatType(size=size, align=align, byte_order=order):
-            bits.align(align)
+        case FloatType(size=size):
             packed = struct.pack("<d" if size == 64 else "<f", value)
-            big = bits.big if order == "native" else order == "be"
-            bits.integer(int.from_bytes(packed, "little"), size, big)
+            bits.align(kind.align)
+            bits.integer(int.from_bytes(packed, "little"), size, bits.is_big(kind))
         case StringType():
             bits.raw((value.encode() if isinstance(value, str) else value) + b"\0")
         case StructType():
-            bits.align(alignment(kind))
+            bits.align(kind.align)
             for member in kind.fields:
                 shown, inside = field_name(member.name), member.type
                 empty = isinstance(inside, StructType) and not inside.fields
@@ -138,41 +123,33 @@ def _encode(bits: _Bits, kind: Type, value: Any, name: str = "", depth: int = 0)
             chosen, inside_value = value
             option = next(o for o in options if field_name(o.name) == chosen)
             _encode(bits, option.type, inside_value, chosen, depth + 1)
-        case ArrayType() | SequenceType():
+        case ArrayType():
             _encode_array(bits, kind, value, depth)
+        case IntegerType():
+            if isinstance(value, str):
+                value = next(m.low for m in kind.mappings if m.label == value)
+            bits.align(kind.align)
+            stamp = kind.clock is not None or (depth == 1 and name in bits.stamps)
+            if stamp and kind.size == 64:
+                bits.clocks.append(bits.position)
+            if depth == 1:
+                bits.names[name] = bits.position
+            if kind.clock is not None:
+                value &= (1 << kind.size) - 1
+            bits.integer(value, kind.size, bits.is_big(kind))
 
 
-def _encode_integer(
-    bits: _Bits, kind: IntegerType | EnumType, value: Any, name: str, depth: int
-) -> None:
-    number = kind.container if isinstance(kind, EnumType) else kind
-    if isinstance(kind, EnumType) and isinstance(value, str):
-        value = next(m.low for m in kind.mappings if m.label == value)
-    bits.align(number.align)
-    is_stamp = depth == 1 and name in bits.stamps
-    if (number.clock is not None or is_stamp) and number.size == 64:
-        bits.clocks.append(bits.position)
-    if depth == 1:
-        bits.names[name] = bits.position
-    if number.clock is not None:
-        value &= (1 << number.size) - 1
-    big = bits.big if number.byte_order == "native" else number.byte_order == "be"
-    bits.integer(value, number.size, big)
-
-
-def _encode_array(bits: _Bits, kind: ArrayType | SequenceType, value: Any, depth: int) -> None:
+def _encode_array(bits: _Bits, kind: ArrayType, value: Any, depth: int) -> None:
     bits.align(alignment(kind))
-    element = kind.element
-    if isinstance(value, str):
-        value = value.encode()
-    if isinstance(kind, ArrayType):
-        if isinstance(value, bytes):
-            value = value.ljust(kind.length, b"\0")
+    value = value.encode() if isinstance(value, str) else value
+    if isinstance(kind.length, int):
+        value = value.ljust(kind.length, b"\0") if isinstance(value, bytes) else value
         if len(value) != kind.length:
             raise ValueError(f"{len(value)} elements for an array of {kind.length}")
-    signed = isinstance(element, IntegerType) and element.signed
+    signed = isinstance(kind.element, IntegerType) and kind.element.signed
     for item in value:
-        _encode(bits, element, item - 256 if signed and item > 127 else item, "", depth + 1)
+        one = item - 256 if signed and item > 127 else item
+        _encode(bits, kind.element, one, "", depth + 1)
 
 
 def encode_packet(
@@ -185,12 +162,10 @@ def encode_packet(
     padding: int = 0,
     stamps: Collection[str] = (),
 ) -> EncodedPacket:
-    """One packet of ``records``, which are in order of time.
+    """One packet of ``records``, which are in order of time, and ``padding`` bytes.
 
-    ``context`` gives the packet context's fields that cannot be told from the events
-    (``cpu_id``, ``packet_seq_num``, ``events_discarded``, by default 0); ``padding`` bytes follow
-    the content.
-    ``stamps`` names 64-bit fields of payloads that hold times: `repeat_packets` moves them too.
+    ``context`` gives packet context (``cpu_id``, ``packet_seq_num``, ``events_discarded``, by
+    default 0), ``stamps`` names 64-bit fields with times, which `repeat_packets` moves too.
     """
     stream = declared.streams[stream_id]
     begin = records[0].time if records else 0
@@ -217,7 +192,17 @@ def encode_packet(
     clock = int(values["timestamp_begin"])
     by_name = {event.name: event for event in stream.events.values()}
     for record in records:
-        _encode_event(bits, stream, by_name[record.name], record, clock)
+        event = by_name[record.name]
+        if stream.event_header is not None:
+            header = _event_header(stream.event_header, event.id, record.time, clock)
+            _encode(bits, stream.event_header, header)
+        for kind, part in (
+            (stream.event_context, record.context),
+            (event.context, record.context),
+            (event.fields, record.payload),
+        ):
+            if kind is not None:
+                _encode(bits, kind, part)
         clock = record.time
     size = -(-bits.position // 8) + padding
     # Sizes come first but are known last: the head is written again over itself.
@@ -233,39 +218,20 @@ def encode_packet(
     )
 
 
-def _encode_event(
-    bits: _Bits, stream: StreamClass, declared: EventClass, event: EventRecord, clock: int
-) -> None:
-    if stream.event_header is not None:
-        values = _event_header(stream.event_header, declared, event, clock)
-        _encode(bits, stream.event_header, values)
-    for kind, values in (
-        (stream.event_context, event.context),
-        (declared.context, event.context),
-        (declared.fields, event.payload),
-    ):
-        if kind is not None:
-            _encode(bits, kind, values)
-
-
-def _event_header(
-    header: StructType, declared: EventClass, event: EventRecord, clock: int
-) -> Mapping[str, Any]:
+def _event_header(header: StructType, number: int, time: int, clock: int) -> Mapping[str, Any]:
     """The header's values: LTTng's compact form where it suffices, else its extended one."""
-    long = {"id": declared.id, "timestamp": event.time}
-    kinds = {member.name: member.type for member in header.fields}
-    variant = kinds.get("v")
-    if not isinstance(variant, VariantType):
-        return long
-    compact = next(o.type for o in variant.options if field_name(o.name) == "compact")
-    stamp = compact.fields[0].type if isinstance(compact, StructType) else None
-    if not isinstance(stamp, IntegerType):
-        raise ValueError("event header is none of LTTng's")
-    last = max(m.low for m in kinds["id"].mappings)  # type: ignore[union-attr]
-    # A compact stamp can tell of less than one turn of its bits since the event before.
-    if declared.id < last and 0 <= event.time - clock < 1 << stamp.size:
-        return {"id": declared.id, "v": ("compact", {"timestamp": event.time})}
-    return {"id": last, "v": ("extended", long)}
+    long = {"id": number, "timestamp": time}
+    match [member.type for member in header.fields]:
+        case [
+            IntegerType(mappings=mappings),
+            VariantType(_, [Field(_, StructType([Field(_, stamp)])), *_]),
+        ]:
+            last = max(m.low for m in mappings)
+            # A compact stamp can tell of less than one turn of its bits since the event before.
+            if number < last and 0 <= time - clock < 1 << stamp.size:  # type: ignore[union-attr]
+                return {"id": number, "v": ("compact", {"timestamp": time})}
+            return {"id": last, "v": ("extended", long)}
+    return long
 
 
 def metadata_packets(text: str, uuid: str, *, big: bool = False, size: int = 4096) -> bytes:
@@ -338,87 +304,49 @@ def write_trace(
 # LTTng's declarations: those of lttng-ust 2.13 and lttng-modules 2.13, from traces of theirs.
 
 _UUID = "2a6422d0-6cee-11e0-8c08-cb07d7b3a564"
-_KINDS = {
-    "u8": (8, 0, 10), "u16": (16, 0, 10), "u32": (32, 0, 10), "u64": (64, 0, 10),
-    "s8": (8, 1, 10), "s16": (16, 1, 10), "s32": (32, 1, 10), "s64": (64, 1, 10),
-    "x64": (64, 0, 16), "char": (8, 1, 10),
-}  # fmt: skip
-_FIELD = re.compile(r"(?P<kind>\w+)(\[(?P<length>\w*)\])?")
-
+_FIELD = re.compile(r"(?:(?P<sign>[usx])(?P<size>\d+)|char)(\[(?P<length>\w*)\])?")
 _HEAD = """/* CTF 1.8 */
-
 typealias integer {{ size = 8; align = 8; signed = false; }} := uint8_t;
 typealias integer {{ size = 16; align = {a16}; signed = false; }} := uint16_t;
 typealias integer {{ size = 32; align = {a32}; signed = false; }} := uint32_t;
 typealias integer {{ size = 64; align = {a64}; signed = false; }} := uint64_t;
 typealias integer {{ size = 64; align = {a64}; signed = false; }} := unsigned long;
 typealias integer {{ size = 5; align = 1; signed = false; }} := uint5_t;
-typealias integer {{ size = 27; align = 1; signed = false; }} := uint27_t;
-
-trace {{
-	major = 1;
-	minor = 8;
-	uuid = "{uuid}";
-	byte_order = {order};
-	packet.header := struct {{
-		uint32_t magic; uint8_t  uuid[16]; uint32_t stream_id; uint64_t stream_instance_id;
-	}};
+trace {{ major = 1; minor = 8; uuid = "{uuid}"; byte_order = {order};
+    packet.header := struct {{
+        uint32_t magic; uint8_t  uuid[16]; uint32_t stream_id; uint64_t stream_instance_id;
+    }};
 }};
-
-env {{
-	hostname = "{host}";
-	domain = "{domain}";
-	tracer_name = "{tracer}";
-	tracer_major = 2;
-	tracer_minor = 13;
-}};
-
+env {{ hostname = "{host}"; domain = "{domain}"; tracer_name = "{tracer}"; }};
 clock {{
-	name = "monotonic";
-	uuid = "d499e0ca-e836-4e4d-b711-80e0e67a24a1";
-	description = "Monotonic Clock";
-	freq = 1000000000; /* Frequency, in Hz */
-	/* clock value offset from Epoch is: offset * (1/freq) */
-	offset = {offset};
+    name = "monotonic"; uuid = "d499e0ca-e836-4e4d-b711-80e0e67a24a1";
+    description = "Monotonic Clock"; freq = 1000000000; /* Frequency, in Hz */
+    offset = {offset}; /* clock value offset from Epoch is: offset * (1/freq) */
 }};
-
-typealias integer {{ size = 27; align = 1; signed = false; map = clock.monotonic.value; }}
-	:= uint27_clock_monotonic_t;
-typealias integer {{ size = 32; align = {a32}; signed = false; map = clock.monotonic.value; }}
-	:= uint32_clock_monotonic_t;
-typealias integer {{ size = 64; align = {a64}; signed = false; map = clock.monotonic.value; }}
-	:= uint64_clock_monotonic_t;
-
+typealias integer {{ size = 27; align = 1; map = clock.monotonic.value; }} := uint27_clock_t;
+typealias integer {{ size = 32; align = {a32}; map = clock.monotonic.value; }} := uint32_clock_t;
+typealias integer {{ size = 64; align = {a64}; map = clock.monotonic.value; }} := uint64_clock_t;
 struct packet_context {{
-	uint64_clock_monotonic_t timestamp_begin;
-	uint64_clock_monotonic_t timestamp_end;
-	uint64_t content_size;
-	uint64_t packet_size;
-	uint64_t packet_seq_num;
-	unsigned long events_discarded;
-	uint32_t cpu_id;
+    uint64_clock_t timestamp_begin; uint64_clock_t timestamp_end;
+    uint64_t content_size; uint64_t packet_size; uint64_t packet_seq_num;
+    unsigned long events_discarded; uint32_t cpu_id;
 }};
-
 struct event_header_compact {{
-	enum : uint5_t {{ compact = 0 ... 30, extended = 31 }} id;
-	variant <id> {{
-		struct {{ uint27_clock_monotonic_t timestamp; }} compact;
-		struct {{ uint32_t id; uint64_clock_monotonic_t timestamp; }} extended;
-	}} v;
+    enum : uint5_t {{ compact = 0 ... 30, extended = 31 }} id;
+    variant <id> {{
+        struct {{ uint27_clock_t timestamp; }} compact;
+        struct {{ uint32_t id; uint64_clock_t timestamp; }} extended;
+    }} v;
 }} align({a32});
-
 struct event_header_large {{
-	enum : uint16_t {{ compact = 0 ... 65534, extended = 65535 }} id;
-	variant <id> {{
-		struct {{ uint32_clock_monotonic_t timestamp; }} compact;
-		struct {{ uint32_t id; uint64_clock_monotonic_t timestamp; }} extended;
-	}} v;
+    enum : uint16_t {{ compact = 0 ... 65534, extended = 65535 }} id;
+    variant <id> {{
+        struct {{ uint32_clock_t timestamp; }} compact;
+        struct {{ uint32_t id; uint64_clock_t timestamp; }} extended;
+    }} v;
 }} align({a16});
-
-stream {{
-	id = 0;
-	event.header := struct event_header_{header};
-	packet.context := struct packet_context;
+stream {{ id = 0; event.header := struct event_header_{header};
+    packet.context := struct packet_context;
 """
 
 
@@ -441,9 +369,7 @@ def lttng_metadata(
     it.  ``aligned`` gives integers their natural alignment, as on machines that need it.
     """
     text = _HEAD.format(
-        a16=16 if aligned else 8,
-        a32=32 if aligned else 8,
-        a64=64 if aligned else 8,
+        **{f"a{size}": size if aligned else 8 for size in (16, 32, 64)},
         uuid=_UUID,
         order="be" if big else "le",
         host=host,
@@ -453,11 +379,12 @@ def lttng_metadata(
         header=header,
     )
     if context:
-        text += "\tevent.context := struct {\n" + _fields(context, aligned) + "\t};\n"
-    text += "};\n\n"
-    for number, (name, fields) in enumerate(events.items()):
-        text += f'event {{\n\tname = "{name}";\n\tid = {number};\n\tstream_id = 0;\n'
-        text += "\tfields := struct {\n" + _fields(fields, aligned) + "\t};\n};\n\n"
+        text += f"    event.context := struct {{ {_fields(context, aligned)} }};\n"
+    text += "};\n"
+    for number, (name, kinds) in enumerate(events.items()):
+        fields = _fields(kinds, aligned)
+        head = f'name = "{name}"; id = {number}; stream_id = 0;'
+        text += f"event {{ {head} fields := struct {{ {fields} }}; }};\n"
     return text
 
 
@@ -467,23 +394,20 @@ def _fields(fields: Mapping[str, str], aligned: bool) -> str:
 
 def _field(name: str, kind: str, aligned: bool) -> str:
     if kind == "string":
-        return f"\t\tstring _{name};\n"
+        return f"string _{name};\n"
     match = _FIELD.fullmatch(kind)
-    if match is None or match["kind"] not in _KINDS:
+    if match is None:
         raise ValueError(f"field {name}: unknown kind {kind!r}")
-    size, signed, base = _KINDS[match["kind"]]
-    encoding = "UTF8" if match["kind"] == "char" else "none"
+    text = match["sign"] is None
+    size, signed = int(match["size"] or 8), int(text or match["sign"] == "s")
     integer = (
         f"integer {{ size = {size}; align = {size if aligned else 8}; signed = {signed};"
-        f" encoding = {encoding}; base = {base}; }}"
+        f" encoding = {'UTF8' if text else 'none'}; base = {16 if match['sign'] == 'x' else 10}; }}"
     )
-    length = match["length"]
-    if length is None:
-        return f"\t\t{integer} _{name};\n"
-    if length:
-        return f"\t\t{integer} _{name}[{length}];\n"
-    counter = "integer { size = 32; align = 8; signed = 0; encoding = none; base = 10; }"
-    return f"\t\t{counter} __{name}_length;\n\t\t{integer} _{name}[ __{name}_length ];\n"
+    if match["length"] == "":
+        counter = "integer { size = 32; align = 8; signed = 0; encoding = none; base = 10; }"
+        return f"{counter} __{name}_length;\n{integer} _{name}[ __{name}_length ];\n"
+    return f"{integer} _{name}{'' if match['length'] is None else '[' + match['length'] + ']'};\n"
 
 
 # Event tables as a trace
@@ -510,14 +434,12 @@ def write_lttng_trace(
     decides about the stream (null: 0), ``discarded_events`` is what the tracer claims to have
     dropped on the first. Returns ``folder``.
     """
-    folder = Path(folder)
-    names = process_names or {}
-    kernel = {name: frame for name, frame in tables.items() if name in _KERNEL}
-    user = {name: frame for name, frame in tables.items() if name not in _KERNEL}
-    for part, chosen in (("ust/uid/1000/64-bit", user), ("kernel", kernel)):
+    folder, names = Path(folder), process_names or {}
+    for part in ("ust/uid/1000/64-bit", "kernel"):
+        in_kernel = part == "kernel"
+        chosen = {name: t for name, t in tables.items() if (name in _KERNEL) == in_kernel}
         if not chosen:
             continue
-        in_kernel = part == "kernel"
         kinds = {
             _full_name(name): {
                 column: _kind(kind, gid_length)
@@ -530,9 +452,17 @@ def write_lttng_trace(
         if in_kernel:
             context = {"pid": "s32", "tid": "s32"}
         text = lttng_metadata(kinds, context, kernel=in_kernel, offset=clock_offset_ns, host=host)
-        records = _records(chosen, names, in_kernel)
+        records: dict[int, list[EventRecord]] = {}
+        for name, frame in chosen.items():
+            for row in frame.iter_rows(named=True):
+                time, pid, tid, cpu = (row.pop(column, None) for column in events.COMMON_COLUMNS)
+                process = names.get(pid, f"process_{pid}")[:_CHARACTERS]
+                about = {"vpid": pid, "vtid": tid, "procname": process, "pid": pid, "tid": tid}
+                record = EventRecord(_full_name(name), time, row, about)
+                records.setdefault(cpu or 0, []).append(record)
         declared, streams = parse_tsdl(text), {}
         for cpu, found in sorted(records.items()):
+            found.sort(key=lambda record: record.time)
             dropped = discarded_events if not in_kernel and cpu == min(records) else 0
             streams[f"channel_{cpu}"] = [
                 encode_packet(
@@ -557,23 +487,3 @@ def _kind(kind: pl.DataType, gid_length: int) -> str:
     if isinstance(kind, pl.List):
         return f"u8[{gid_length}]"
     return {pl.UInt64(): "x64", pl.Int64(): "s64", pl.Int32(): "s32", pl.String(): "string"}[kind]
-
-
-def _records(
-    tables: events.EventTables, names: Mapping[int, str], in_kernel: bool
-) -> dict[int, list[EventRecord]]:
-    """The events of each core, in order of time."""
-    records: dict[int, list[EventRecord]] = {}
-    for name, frame in tables.items():
-        for row in frame.iter_rows(named=True):
-            time, pid, tid, cpu = (row.pop(column, None) for column in events.COMMON_COLUMNS)
-            context: dict[str, Any] = {"vpid": pid, "vtid": tid}
-            context["procname"] = names.get(pid, f"process_{pid}")[:_CHARACTERS]
-            if in_kernel:
-                context = {"pid": pid, "tid": tid}
-            records.setdefault(cpu or 0, []).append(
-                EventRecord(_full_name(name), time, row, context)
-            )
-    for found in records.values():
-        found.sort(key=lambda record: record.time)
-    return records

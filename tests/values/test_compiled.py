@@ -38,58 +38,70 @@ print(kernel("made.summing", "total")(numbers.ctypes.data, 4), numbers, "numba" 
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """A package with a kernel."""
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package with a kernel, beside the user's cache."""
     (tmp_path / "made").mkdir()
     (tmp_path / "made" / "__init__.py").touch()
     (tmp_path / "made" / "summing.py").write_text(_KERNEL.format(more=""))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     return tmp_path
 
 
-def called(folder: Path, **environment: str) -> str:
+@pytest.fixture
+def compiles(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool]:
+    """Whether a process that begins here and now, so to speak, needs the compiler."""
+
+    def call() -> bool:
+        with monkeypatch.context() as patched:
+            for name in ("made", "made.summing"):
+                patched.delitem(sys.modules, name, raising=False)
+            importlib.invalidate_caches()
+            loading._digest.cache_clear()
+            compiler = mock.Mock(wraps=loading._compiled)
+            patched.setattr(loading, "_compiled", compiler)
+            numbers = np.arange(1, 5)
+            assert loading.kernel.__wrapped__("made.summing", "total")(numbers.ctypes.data, 4) >= 10
+            assert numbers.tolist() == [1, 3, 6, 10]
+        return compiler.called
+
+    return call
+
+
+def test_the_compiler_is_imported_once_and_runs_again_when_the_source_changed(
+    folder: Path, compiles: Callable[[], bool]
+) -> None:
     path = os.pathsep.join((str(folder), str(Path(chainshaper.__file__).parents[1])))
-    named = {"PYTHONPATH": path, "XDG_CACHE_HOME": str(folder / "cache"), **environment}
-    command = [sys.executable, "-c", _CALL]
-    found = subprocess.run(
-        command, env={**os.environ, **named}, capture_output=True, text=True, check=False
-    )
-    assert found.returncode == 0, (found.returncode, found.stderr)
-    return found.stdout.strip()
-
-
-def test_the_compiler_is_needed_once_and_again_when_the_source_changed(folder: Path) -> None:
-    assert called(folder) == "10 [ 1  3  6 10] True"
-    assert called(folder) == "10 [ 1  3  6 10] False"
+    environment = {**os.environ, "PYTHONPATH": path}
+    for compiler in ("True", "False"):
+        command = [sys.executable, "-c", _CALL]
+        found = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        assert found.stdout.strip() == f"10 [ 1  3  6 10] {compiler}"
     (folder / "made" / "summing.py").write_text(_KERNEL.format(more="+ 1"))
-    assert called(folder) == "11 [ 1  3  6 10] True"
+    assert compiles()
     assert len(list((folder / "made" / "__pycache__").glob("*.o"))) == 1
 
 
-def test_code_goes_to_the_users_cache_where_the_package_cannot_be_written(folder: Path) -> None:
+def test_code_goes_to_the_users_cache_where_the_package_cannot_be_written(
+    folder: Path, compiles: Callable[[], bool]
+) -> None:
     (folder / "made" / "__pycache__").touch()  # a file, which takes no other
-    assert called(folder).endswith("True")
+    assert [compiles(), compiles()] == [True, False]
     assert len(list((folder / "cache" / "chainshaper").glob("made.summing.total-*.o"))) == 1
-    assert called(folder).endswith("False")
 
 
-def test_without_any_folder_every_process_compiles(folder: Path) -> None:
+def test_without_any_folder_every_process_compiles(
+    folder: Path, compiles: Callable[[], bool]
+) -> None:
     (folder / "made" / "__pycache__").touch()
     (folder / "cache").touch()
-    assert called(folder) == called(folder) == "10 [ 1  3  6 10] True"
-
-
-def cut_in_half(file: Path) -> None:
-    os.truncate(file, file.stat().st_size // 2)
+    assert [compiles(), compiles()] == [True, True]
 
 
 def altered(file: Path) -> None:
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
     file.write_bytes(content)
-
-
-def emptied(file: Path) -> None:
-    file.write_bytes(b"")
 
 
 def of_an_older_source(file: Path) -> None:
@@ -99,59 +111,39 @@ def of_an_older_source(file: Path) -> None:
     file.rename(file.with_name(f"made.summing.total-{loading._digest(file.parents[1])}.o"))
 
 
-def writable_by_others(file: Path) -> None:
-    file.chmod(0o666)
-
-
-def in_a_folder_of_others(file: Path) -> None:
-    file.parent.chmod(0o777)
-
-
 def of_another_user(file: Path) -> None:
     if os.geteuid() != 0:
         pytest.skip("giving a file to another user needs root")
     os.chown(file, NOBODY, -1)
 
 
-@pytest.mark.parametrize(
-    "spoil",
-    [
-        *(cut_in_half, altered, emptied, of_an_older_source),
-        *(writable_by_others, in_a_folder_of_others, of_another_user),
-    ],
-)
+SPOILT: dict[str, Callable[[Path], object]] = {
+    "cut in half": lambda file: os.truncate(file, file.stat().st_size // 2),
+    "altered": altered,
+    "emptied": lambda file: file.write_bytes(b""),
+    "of an older source": of_an_older_source,
+    "writable by others": lambda file: file.chmod(0o666),
+    "in a folder of others": lambda file: file.parent.chmod(0o777),
+    "of another user": of_another_user,
+}
+
+
+@pytest.mark.parametrize("how", SPOILT)
 def test_code_that_is_not_as_we_wrote_it_is_made_anew(
-    folder: Path, spoil: Callable[[Path], None], monkeypatch: pytest.MonkeyPatch
+    folder: Path, compiles: Callable[[], bool], how: str
 ) -> None:
-    monkeypatch.syspath_prepend(folder)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
-    assert compiles_here(monkeypatch)
-    assert not compiles_here(monkeypatch)
-    spoil(next((folder / "made" / "__pycache__").glob("*.o")))
-    assert compiles_here(monkeypatch)
-    assert not compiles_here(monkeypatch)
-
-
-def compiles_here(monkeypatch: pytest.MonkeyPatch) -> bool:
-    """Whether a process that begins here and now, so to speak, needs the compiler."""
-    with monkeypatch.context() as patched:
-        for name in ("made", "made.summing"):
-            patched.delitem(sys.modules, name, raising=False)
-        importlib.invalidate_caches()
-        loading._digest.cache_clear()
-        compiler = mock.Mock(wraps=loading._compiled)
-        patched.setattr(loading, "_compiled", compiler)
-        numbers = np.arange(1, 5)
-        assert loading.kernel.__wrapped__("made.summing", "total")(numbers.ctypes.data, 4) >= 10
-        assert numbers.tolist() == [1, 3, 6, 10]
-    return compiler.called
+    assert [compiles(), compiles()] == [True, False]
+    SPOILT[how](next((folder / "made" / "__pycache__").glob("*.o")))
+    assert [compiles(), compiles()] == [True, False]
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="another user's folder needs root")
-def test_root_runs_no_code_from_the_cache_of_another_user(folder: Path) -> None:
+def test_root_runs_no_code_from_the_cache_of_another_user(
+    folder: Path, compiles: Callable[[], bool], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """`sudo -E` keeps XDG_CACHE_HOME and HOME; what lies there may be anybody's program."""
     (folder / "made" / "__pycache__").touch()
-    assert called(folder).endswith("True")
+    assert compiles()
     cache = folder / "cache"
     planted = next((cache / "chainshaper").glob("*.o"))
     for place in (cache, cache / "chainshaper", planted):
@@ -160,13 +152,15 @@ def test_root_runs_no_code_from_the_cache_of_another_user(folder: Path) -> None:
     own = Path(pwd.getpwuid(0).pw_dir, ".cache", "chainshaper", planted.name)
     own.unlink(missing_ok=True)
     try:
-        assert called(folder) == "10 [ 1  3  6 10] True"
+        assert compiles()
         assert own.exists()
         assert (planted.read_bytes(), planted.stat().st_mtime_ns) == before
         # The same by HOME, and by a link of theirs that leads to ours.
         (folder / ".cache").symlink_to("cache")
         os.chown(folder / ".cache", NOBODY, -1, follow_symlinks=False)
         planted.write_bytes(b"evil")
-        assert called(folder, XDG_CACHE_HOME="", HOME=str(folder)) == "10 [ 1  3  6 10] False"
+        monkeypatch.setenv("XDG_CACHE_HOME", "")
+        monkeypatch.setenv("HOME", str(folder))
+        assert not compiles()
     finally:
         own.unlink(missing_ok=True)

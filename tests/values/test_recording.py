@@ -70,21 +70,29 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     assert (tmp_path / "rec").stat().st_mode & 0o777 == 0o755, "others may read it"
 
 
+@pytest.fixture
+def whole(tmp_path: Path) -> Path:
+    return write_recording(tmp_path / "rec", _tables(), INFO).path
+
+
+def _refused(path: Path, table: str | None = None) -> str:
+    """The one line that opening a recording, or reading a table of it, ends with."""
+    with pytest.raises(InputError) as refused:
+        recording = open_recording(path)
+        if table is not None:
+            _ = recording.events[table]
+    assert "\n" not in str(refused.value)
+    return str(refused.value)
+
+
 def test_nothing_of_the_users_is_overwritten(tmp_path: Path) -> None:
     folder = tmp_path / "thesis"
     folder.mkdir()
     (folder / "chapter1.tex").write_text("years of work")
-    file = tmp_path / "file"
-    file.touch()
-    for path in (folder, file, folder / "chapter1.tex"):
+    for path in (folder, folder / "chapter1.tex"):
         with pytest.raises(InputError, match="exists already and is not overwritten: name another"):
             write_recording(path, _tables(), INFO)
     assert (folder / "chapter1.tex").read_text() == "years of work"
-
-
-def test_an_empty_folder_may_be_filled(tmp_path: Path) -> None:
-    (tmp_path / "rec").mkdir()
-    assert len(write_recording(tmp_path / "rec", _tables(), INFO).events) == 2
 
 
 def test_places_that_cannot_take_a_folder_are_refused_before(
@@ -92,12 +100,12 @@ def test_places_that_cannot_take_a_folder_are_refused_before(
 ) -> None:
     with pytest.raises(InputError, match=f"{tmp_path / 'no'}: no such folder to write rec into"):
         refuse_existing(tmp_path / "no" / "rec")
-    here = tmp_path / "here"
-    here.mkdir()
-    monkeypatch.chdir(here)
+    monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match="name one inside it"):
         refuse_existing(".")
     assert refuse_existing("rec") == Path("rec")
+    (tmp_path / "rec").mkdir()
+    assert len(write_recording("rec", _tables(), INFO).events) == 2, "an empty folder is filled"
 
 
 def test_a_folder_without_permission_is_refused_before() -> None:
@@ -128,54 +136,43 @@ def test_a_full_disk_leaves_nothing_that_looks_whole(full_disk: Path) -> None:
 
 
 class _Breaks(pl.DataFrame):
-    """A table that cannot be written: stands in for a disk that fails half-way."""
+    """A table that cannot be written: a disk fails half-way, or somebody presses Ctrl-C."""
+
+    error: BaseException
 
     def write_parquet(self, *_: object, **__: object) -> None:
-        raise OSError(5, "Input/output error")
+        raise self.error
 
 
-class _Interrupted(pl.DataFrame):
-    """A table during whose writing somebody presses Ctrl-C."""
-
-    def write_parquet(self, *_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-
-def test_a_table_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("there", [False, True], ids=["no folder", "an empty folder"])
+@pytest.mark.parametrize(
+    ("error", "raised", "said"),
+    [
+        (OSError(5, "Input/output error"), OperationError, "Input/output error"),
+        (KeyboardInterrupt(), KeyboardInterrupt, None),
+    ],
+)
+def test_a_table_that_cannot_be_written_leaves_nothing(
+    tmp_path: Path, error: BaseException, raised: type[BaseException], said: str | None, there: bool
+) -> None:
     path = tmp_path / "rec"
-    with pytest.raises(OperationError, match=f"{path}: .*Input/output error"):
-        write_recording(path, {**_tables(), "rmw_take": _Breaks()}, INFO)
-    assert _names(tmp_path) == []
-
-
-def test_ctrl_c_while_writing_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        write_recording(tmp_path / "rec", {**_tables(), "rmw_take": _Interrupted()}, INFO)
-    assert _names(tmp_path) == []
-
-
-def test_an_empty_folder_stays_when_writing_fails(tmp_path: Path) -> None:
-    (tmp_path / "rec").mkdir()
-    with pytest.raises(OperationError):
-        write_recording(tmp_path / "rec", {"rmw_take": _Breaks()}, INFO)
-    assert _names(tmp_path) == ["rec"]
-    assert _names(tmp_path / "rec") == []
-
-
-@pytest.fixture
-def whole(tmp_path: Path) -> Path:
-    return write_recording(tmp_path / "rec", _tables(), INFO).path
+    if there:
+        path.mkdir()
+    table = _Breaks()
+    table.error = error
+    with pytest.raises(raised, match=said):
+        write_recording(path, {**_tables(), "rmw_take": table}, INFO)
+    assert _names(tmp_path) == ["rec"] * there
+    assert not there or _names(path) == []
 
 
 def test_what_is_no_recording_is_said_to_be_none(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match=r"a folder without recording.json; a recording is made"):
-        open_recording(tmp_path / "empty")
-    with pytest.raises(InputError, match="no such folder; a recording is made with"):
-        open_recording(tmp_path / "nothing")
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="is made with `chainshaper run"):
-        open_recording(tmp_path / "file")
+    made = "a recording is made with `chainshaper run"
+    assert f"a folder without recording.json; {made}" in _refused(tmp_path / "empty")
+    assert f"no such folder; {made}" in _refused(tmp_path / "nothing")
+    assert made in _refused(tmp_path / "file")
 
 
 @pytest.mark.parametrize(
@@ -192,38 +189,29 @@ def test_what_is_no_recording_is_said_to_be_none(tmp_path: Path) -> None:
 )
 def test_an_unreadable_description_is_named(whole: Path, content: bytes, said: str) -> None:
     (whole / "recording.json").write_bytes(content)
-    with pytest.raises(InputError) as refused:
-        open_recording(whole)
-    text = str(refused.value)
+    text = _refused(whole)
     assert text.startswith(f"{whole / 'recording.json'}: ")
     assert said in text
-    assert "\n" not in text, "one message"
 
 
 def test_a_newer_format_asks_for_an_update_whatever_else_it_holds(whole: Path) -> None:
     values = {"format": 2, "origin": "live", "clocks": []}
     (whole / "recording.json").write_text(json.dumps(values))
-    with pytest.raises(InputError, match="format 2, this chainshaper reads format 1; update it"):
-        open_recording(whole)
+    assert "format 2, this chainshaper reads format 1; update it" in _refused(whole)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.99])
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.99])
 def test_a_cut_off_table_is_named_when_it_is_opened(whole: Path, share: float) -> None:
     file = whole / "callback_end.parquet"
     content = file.read_bytes()
     file.write_bytes(content[: int(len(content) * share)])
-    with pytest.raises(InputError, match=f"{file}: not a readable event table"):
-        open_recording(whole)
+    assert _refused(whole).startswith(f"{file}: not a readable event table")
 
 
-def test_a_table_without_time_is_no_event_table(whole: Path) -> None:
-    pl.DataFrame({"a": [1]}).write_parquet(whole / "mine.parquet")
-    with pytest.raises(InputError, match=r"mine.parquet: an event table needs a column `time`"):
-        _ = open_recording(whole).events["mine"]
-
-
-def test_a_table_that_vanishes_is_named(whole: Path) -> None:
+def test_a_table_that_is_no_events_or_vanishes_is_named(whole: Path) -> None:
     recording = open_recording(whole)
+    pl.DataFrame({"a": [1]}).write_parquet(whole / "mine.parquet")
+    assert "mine.parquet: an event table needs a column `time`" in _refused(whole, "mine")
     shutil.rmtree(whole)
     with pytest.raises(InputError, match=r"callback_end.parquet: not a readable event table"):
         _ = recording.events["callback_end"]
@@ -232,13 +220,11 @@ def test_a_table_that_vanishes_is_named(whole: Path) -> None:
 def test_every_flipped_bit_is_noticed(whole: Path) -> None:
     file = whole / "callback_end.parquet"
     content = file.read_bytes()
-    for place in range(0, len(content), 7):
+    for place in range(0, len(content), 21):
         damaged = bytearray(content)
         damaged[place] ^= 1 << place % 8
         file.write_bytes(damaged)
-        with pytest.raises(InputError) as refused:
-            _ = open_recording(whole).events["callback_end"]
-        assert str(refused.value).startswith(f"{file}: "), place
+        assert _refused(whole, "callback_end").startswith(f"{file}: "), place
 
 
 def test_a_table_of_several_parts_has_a_checksum_for_each(tmp_path: Path) -> None:
@@ -248,11 +234,9 @@ def test_a_table_of_several_parts_has_a_checksum_for_each(tmp_path: Path) -> Non
     parts = sorted((path / "callback_end.parquet").iterdir())
     assert {str(part.relative_to(path)) for part in parts} < set(recording.info.checksums or {})
     parts[1].write_bytes(parts[0].read_bytes().replace(b"Polars", b"Qolars"))
-    with pytest.raises(InputError, match=f"{parts[1]}: damaged: its checksum is crc32:"):
-        _ = open_recording(path).events["callback_end"]
+    assert f"{parts[1]}: damaged: its checksum is crc32:" in _refused(path, "callback_end")
     parts[2].unlink()
-    with pytest.raises(InputError, match=f"{parts[2]}: no such file, but recording.json names it"):
-        open_recording(path)
+    assert f"{parts[2]}: no such file, but recording.json names it" in _refused(path)
 
 
 def _without_checksums(whole: Path) -> Path:
@@ -291,10 +275,9 @@ def test_columns_that_are_not_the_events_are_named(
     frame = pl.read_parquet(file)
     changed = frame.drop("callback") if column is None else frame.with_columns(callback=column)
     changed.write_parquet(file)
-    with pytest.raises(InputError) as refused:
-        _ = open_recording(whole).events["callback_end"]
-    assert str(refused.value).startswith(f"{file}: ")
-    assert said in str(refused.value)
+    text = _refused(whole, "callback_end")
+    assert text.startswith(f"{file}: ")
+    assert said in text
 
 
 def test_integers_of_another_width_and_tables_without_cores_are_taken(whole: Path) -> None:
@@ -310,8 +293,7 @@ def test_rows_that_no_file_of_this_size_has_are_refused(whole: Path) -> None:
     zeros = {name: pl.repeat(0, 20_000_000, dtype=kind, eager=True)
              for name, kind in events.empty("callback_end").schema.items()}  # fmt: skip
     pl.DataFrame(zeros).write_parquet(file, compression="zstd", statistics=False)
-    with pytest.raises(InputError, match=r"20000000 rows in .* bytes are more than any run has"):
-        _ = open_recording(whole).events["callback_end"]
+    assert "20000000 rows in" in _refused(whole, "callback_end")
 
 
 @pytest.mark.parametrize(
@@ -328,8 +310,6 @@ def test_rows_that_no_file_of_this_size_has_are_refused(whole: Path) -> None:
 def test_facts_of_the_wrong_type_are_named(whole: Path, change: dict[str, object]) -> None:
     file = whole / "recording.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), **change}))
-    with pytest.raises(InputError) as refused:
-        open_recording(whole)
-    assert str(refused.value).startswith(f"{file}: ")
-    assert next(iter(change)) in str(refused.value)
-    assert "\n" not in str(refused.value)
+    text = _refused(whole)
+    assert text.startswith(f"{file}: ")
+    assert next(iter(change)) in text

@@ -2,11 +2,6 @@
 
 Files and the command line carry units, because a bare number in a timing file is how robots get
 hurt.
-
-    >>> parse_duration("1.5ms")
-    1500000
-    >>> format_duration(1500000)
-    '1.5ms'
 """
 
 import re

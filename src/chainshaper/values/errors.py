@@ -1,8 +1,7 @@
 """What can go wrong, and the exit code it ends the command line with.
 
-Every error names the thing (file, line, topic, thread), the reason and the remedy in its
-message; the command line prints that message and nothing else. Three kinds are enough, because
-a caller has three ways to react: correct the input, look at what failed, or change the machine.
+Every message names the thing (file, line, topic, thread), the reason and the remedy. A caller has
+three ways to react: correct the input, look at what failed, or change the machine.
 """
 
 import importlib
@@ -39,8 +38,7 @@ def extra_library(name: str, purpose: str) -> Any:
     """Import a library that only some uses need, or one module of it.
 
     Raises:
-        PlatformError: it is not installed; the message says what it is needed for and how to
-            get it.
+        PlatformError: it is not installed; says what it is needed for and how to get it.
     """
     try:
         return importlib.import_module(name)

@@ -1,45 +1,23 @@
-"""The event tables: their names, columns and units, in one place.
+"""The event tables: their names, columns and units, whoever traced them.
 
-Everything chainshaper knows about a run it knows from these tables. They are the events of
-`ros2_tracing` (tracetools 8.x, Jazzy) under their own names and fields, whether they came from
-an LTTng trace, from eBPF, from the live workload or from the simulator, so that the analysis
-needs to know only this page.
+They are the events of `ros2_tracing` (tracetools 8.x, Jazzy, `tracetools.h`) under their own names
+and fields, and the kernel's `sched:sched_switch`. Every table has the columns of
+:data:`COMMON_COLUMNS` followed by the event's own fields:
 
-Every table has the columns of :data:`COMMON_COLUMNS` followed by the event's own fields:
-
-* ``time``: nanoseconds of CLOCK_MONOTONIC. Add the recording's ``clock_offset_ns`` for
-  wall-clock time, which is what DDS source timestamps are.
+* ``time``: nanoseconds of CLOCK_MONOTONIC. Add the recording's ``clock_offset_ns`` for wall-clock
+  time, which is what DDS source timestamps are.
 * ``pid``, ``tid``: process and thread, as the kernel numbers them in the traced container.
 * ``cpu``: the core, null where the source does not know it.
 
 Handles (``*_handle``, ``callback``, ``message``, ``subscription``) are addresses: unique only
 within one process and only until they are freed. Tables lack columns that their source cannot
-know (``rmw_publish`` has neither handle nor timestamp before Jazzy); a table that is missing
-altogether is the same as an empty one.
-
-Upstream: `tracetools/include/tracetools/tracetools.h` of ros2_tracing, and
-`sched:sched_switch` of the Linux kernel.
+know; a table that is missing altogether is the same as an empty one.
 """
 
 from collections.abc import Iterable, Mapping
 from typing import TypeAlias
 
 import polars as pl
-
-__all__ = [
-    "COMMON_COLUMNS",
-    "CREATION",
-    "FIELDS",
-    "NODE_NAME",
-    "OPTIONAL_FIELDS",
-    "VERSION_FIELDS",
-    "EventTables",
-    "as_table",
-    "column_problems",
-    "empty",
-    "happened",
-    "table",
-]
 
 EventTables: TypeAlias = Mapping[str, pl.DataFrame]
 """One frame per event name, each sorted by ``time``."""
@@ -197,14 +175,11 @@ VERSION_FIELDS = {
 }
 """Fields that not every version has, and that the analysis asks for as such."""
 
-CREATION = frozenset(
-    name
-    for name in FIELDS
-    if name.endswith(("_init", "_added", "_register", "_link_node", "_to_ipb", "_to_subscription"))
-) | {"rmw_implementation", "rclcpp_construct_ring_buffer"}
+_CREATION_ENDINGS = ("_init", "_added", "_register", "_link_node", "_to_ipb", "_to_subscription")
+CREATION = frozenset(name for name in FIELDS if name.endswith(_CREATION_ENDINGS)) | {
+    *("rmw_implementation", "rclcpp_construct_ring_buffer")
+}
 """The events of objects' creation, which say what all others are about."""
-
-
 NODE_NAME = pl.col("namespace").fill_null("").str.strip_chars_end("/") + "/" + pl.col("node_name")
 """The full name of the node that a row of `rcl_node_init` is about: ``/front/filter``."""
 
@@ -214,13 +189,13 @@ def happened(tables: EventTables, since_ns: int, until_ns: int | None = None) ->
 
     A gate's decision belongs to the cycle that it was about: one that began before is left out.
     """
-    kept = dict(tables)
+    found = dict(tables)
     for name, frame in tables.items():
         if name not in CREATION:
             begun = pl.min_horizontal("time", *{"origin"}.intersection(frame.columns))
             ended = pl.lit(False) if until_ns is None else pl.col("time") >= until_ns
-            kept[name] = frame.filter((begun >= since_ns) & ~ended)
-    return kept
+            found[name] = frame.filter((begun >= since_ns) & ~ended)
+    return found
 
 
 def empty(name: str) -> pl.DataFrame:
@@ -231,13 +206,9 @@ def empty(name: str) -> pl.DataFrame:
 def table(tables: EventTables, name: str, columns: Iterable[str] = ()) -> pl.DataFrame:
     """The table of event ``name``, empty when absent, with ``columns`` present (null if unknown).
 
-    This is how version differences are met: code asks for the columns it can use and finds
-    nulls where a distribution or a tracer did not record them.
+    So code asks for the columns it can use, whatever a distribution or tracer did not record.
     """
-    frame = tables.get(name)
-    if frame is None:
-        frame = empty(name)
-    known = {**COMMON_COLUMNS, **FIELDS[name], **OPTIONAL_FIELDS.get(name, {})}
+    frame, known = tables.get(name, empty(name)), _types(name)
     missing = [column for column in columns if column not in frame.columns]
     return frame.with_columns(pl.lit(None, dtype=known[column]).alias(column) for column in missing)
 
@@ -282,12 +253,11 @@ def as_table(frame: pl.DataFrame, name: str) -> pl.DataFrame:
     """
     if "cpu" not in frame.columns:
         frame = frame.with_columns(cpu=pl.lit(None, COMMON_COLUMNS["cpu"]))
-    wrong = [
+    frame = frame.with_columns(
         pl.col(column).cast(kind, strict=True)
         for column, kind in _types(name).items()
-        if column in frame.columns and frame.schema[column] != kind
-    ]
-    frame = frame.with_columns(wrong) if wrong else frame
+        if column in frame.columns
+    )
     if frame["time"].null_count():
         raise pl.exceptions.InvalidOperationError("rows without a time")
     return frame

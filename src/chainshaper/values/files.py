@@ -19,10 +19,7 @@ __all__ = ["free_place", "new_file", "open_to_all", "why_distrusted", "write_who
 
 
 def why_distrusted(path: str | Path) -> str | None:
-    """Why others may change a file, a folder or what leads there; None if they cannot.
-
-    A name that others wrote is in the reason: it is shown as any other.
-    """
+    """Why others may change a file, a folder or what leads there; None if they cannot."""
     place = Path(os.path.realpath(path))
     for part in (place, *place.parents):
         try:
@@ -52,15 +49,12 @@ def _is_own_group(gid: int, uid: int) -> bool:
         user, group = pwd.getpwuid(uid), grp.getgrgid(gid)
     except KeyError:
         return False
-    return (
-        user.pw_gid == gid and group.gr_name == user.pw_name and {*group.gr_mem} <= {user.pw_name}
-    )
+    own = user.pw_gid == gid and group.gr_name == user.pw_name
+    return own and {*group.gr_mem} <= {user.pw_name}
 
 
 def free_place(path: Path, taken: bool) -> Path:
-    """The path, if it is not ``taken`` by what is the user's, and its folder is there.
-
-    Asked before long work begins, so that its user need not wait to learn it at the end.
+    """The path, if it is not ``taken`` and its folder is there; asked before long work begins.
 
     Raises:
         InputError: it is taken, or its folder does not exist.

@@ -1,7 +1,6 @@
-"""What a plan can be asked for: the wishes, once, for the planner, sweeps and the command line.
+"""What a plan can be asked for: the wishes of the planner, sweeps and the command line's options.
 
-The command line makes its options from the fields of :class:`Wishes`. This module imports nothing
-slow: the planner takes a while to import, and `chainshaper plan --help` should not.
+This module imports nothing slow: the planner takes a while, `chainshaper plan --help` should not.
 """
 
 from dataclasses import dataclass
@@ -46,6 +45,7 @@ BANDS, MARGIN = "Latency bands", "Margin"
 """Panels of the help."""
 
 
+# fmt: off
 @dataclass(frozen=True)
 class Wishes:
     """The wishes for a plan, all but the modes of the system. Times in nanoseconds.
@@ -59,100 +59,53 @@ class Wishes:
     """
 
     policy: Annotated[Policy, Option("How it is scheduled.")] = "shaped"
-    publication: Annotated[
-        Publication, Option("By a shaping node, or the publisher's own thread.")
-    ] = "synchronous"
+    publication: Annotated[Publication, Option(
+        "By a shaping node, or the publisher's own thread.")] = "synchronous"
     publish_slot_ns: Annotated[int, Option("Length of the publish slot.")] = 1_000_000
     slot_start_ns: Annotated[int | None, Option("Where the slot of one-long-slot starts.")] = None
-    epsilon_ns: Annotated[
-        int | None,
-        Option(
-            "A given margin behind the longest undisturbed latency. Default: 1ms behind the latency"
-            " that all cycles but 1 % stay below.",
-            MARGIN,
-        ),
-    ] = None
-    overrun_probability: Annotated[
-        float | None,
-        Option(
-            "Share of all cycles that may be late, such as 0.01; below 0.001 it is derived from"
-            " the tail of the latencies.",
-            MARGIN,
-            "P",
-        ),
-    ] = None
-    ideal_machine: Annotated[
-        bool,
-        Option("Leave out cycles that the machine disturbed: for one that does not stall.", MARGIN),
-    ] = False
-    bands: Annotated[
-        int | Literal["auto"],
-        Option("Number of bands; auto: as many as are worth it.", BANDS, "N|auto"),
-    ] = 1
+    epsilon_ns: Annotated[int | None, Option(
+        "A given margin behind the longest undisturbed latency. Default: 1ms behind the latency"
+        " that all cycles but 1 % stay below.", MARGIN)] = None
+    overrun_probability: Annotated[float | None, Option(
+        "Share of all cycles that may be late, such as 0.01; below 0.001 it is derived from"
+        " the tail of the latencies.", MARGIN, "P")] = None
+    ideal_machine: Annotated[bool, Option(
+        "Leave out cycles that the machine disturbed: for one that does not stall.", MARGIN,
+    )] = False
+    bands: Annotated[int | Literal["auto"], Option(
+        "Number of bands; auto: as many as are worth it.", BANDS, "N|auto")] = 1
     solver: Annotated[Solver, Option("What places bands.", BANDS)] = "exact"
     grid_ns: Annotated[int, Option("Slots end at multiples of this.", BANDS)] = 1_000
-    max_gap_ns: Annotated[
-        int | None, Option("Longest distance of neighbouring bands (LV).", BANDS)
-    ] = None
-    max_share: Annotated[
-        float | None, Option("Most cycles in one band: 0.4 or 40%.", BANDS, "SHARE")
-    ] = None
+    max_gap_ns: Annotated[int | None, Option(
+        "Longest distance of neighbouring bands (LV).", BANDS)] = None
+    max_share: Annotated[float | None, Option(
+        "Most cycles in one band: 0.4 or 40%.", BANDS, "SHARE")] = None
     minimise: Annotated[Goal, Option("What to make small.", BANDS)] = "mean"
-    mean_at_most_ns: Annotated[
-        int | None, Option("The average that --minimise may cost.", BANDS)
-    ] = None
-    least_gain: Annotated[
-        float,
-        Option("With --bands auto: what another band must take off the average.", BANDS, "SHARE"),
-    ] = 0.02
+    mean_at_most_ns: Annotated[int | None, Option(
+        "The average that --minimise may cost.", BANDS)] = None
+    least_gain: Annotated[float, Option(
+        "With --bands auto: what another band must take off the average.", BANDS, "SHARE")] = 0.02
     seed: Annotated[int, Option("For pso, random and the derived margin.", least=0)] = 0
-    first_slot_ns: Annotated[
-        int | None,
-        Option("A server of its own for the chain's first node, this long.", "More of the graph"),
-    ] = None
-    anchor: Annotated[
-        Anchor, Option("What slots count from: the message's stamp, or the cycle.")
-    ] = "stamp"
-    overrun: Annotated[
-        Overrun | None,
-        Option(
-            "An output that missed its slot: at once; or in slots only: wait for the next, or"
-            " discard. Default: publish."
-        ),
-    ] = None
-    messages: Annotated[Messages, Option("Which of several outputs in one cycle leave.")] = (
-        "all-in-order"
-    )
-    depth: Annotated[
-        int | None,
-        Option(
-            "How many outputs may wait in the gate. Default: as many as the history of its"
-            " publisher has room for, 10 at least.",
-            least=1,
-        ),
-    ] = None
-    fallback: Annotated[
-        Fallback,
-        Option(
-            "While the shaping node is not there: outputs go around it, or none is published."
-            " Default: bypass, or what the plan says."
-        ),
-    ] = "bypass"
-    spin_ns: Annotated[int, Option("How long the gate watches the clock before its slot.")] = (
-        1_000_000
-    )
-    pause_ns: Annotated[
-        int | None,
-        Option(
-            "How long the gate rests after publishing. Default: 2ms, a twentieth of the cycle at"
-            " most."
-        ),
-    ] = None
-    with_receivers: Annotated[
-        bool,
-        Option(
-            "Give nodes that subscribe to the shaped output SCHED_FIFO below all servers, while"
-            " the plan is in force.",
-            flag="--receivers/--no-receivers",
-        ),
-    ] = True
+    first_slot_ns: Annotated[int | None, Option(
+        "A server of its own for the chain's first node, this long.", "More of the graph")] = None
+    anchor: Annotated[Anchor, Option(
+        "What slots count from: the message's stamp, or the cycle.")] = "stamp"
+    overrun: Annotated[Overrun | None, Option(
+        "An output that missed its slot: at once; or in slots only: wait for the next, or"
+        " discard. Default: publish.")] = None
+    messages: Annotated[Messages, Option(
+        "Which of several outputs in one cycle leave.")] = "all-in-order"
+    depth: Annotated[int | None, Option(
+        "How many outputs may wait in the gate. Default: as many as the history of its"
+        " publisher has room for, 10 at least.", least=1)] = None
+    fallback: Annotated[Fallback, Option(
+        "While the shaping node is not there: outputs go around it, or none is published."
+        " Default: bypass, or what the plan says.")] = "bypass"
+    spin_ns: Annotated[int, Option(
+        "How long the gate watches the clock before its slot.")] = 1_000_000
+    pause_ns: Annotated[int | None, Option(
+        "How long the gate rests after publishing. Default: 2ms, a twentieth of the cycle at"
+        " most.")] = None
+    with_receivers: Annotated[bool, Option(
+        "Give nodes that subscribe to the shaped output SCHED_FIFO below all servers, while"
+        " the plan is in force.", flag="--receivers/--no-receivers")] = True

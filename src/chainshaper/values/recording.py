@@ -1,19 +1,18 @@
 """A recording on disk: a folder with one Parquet file per event table and a `recording.json`.
 
-The folder is written beside its final place and renamed when it is complete, so a recording
-that exists is whole. `recording.json` says under which conditions the events were taken, and
-what was lost on the way. It also has a checksum of every other file, which is compared when the
-file is read; the columns of all tables are looked at when the recording is opened.
+The folder is written beside its final place and renamed when it is complete, so a recording that
+exists is whole. `recording.json` has the conditions of the run, what was lost, and a checksum of
+every other file, which is compared when the file is read.
 """
 
 import io
 import json
 import os
 import platform
-import shutil
 import tempfile
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
@@ -26,30 +25,11 @@ from chainshaper.values.events import EventTables, as_table, column_problems
 from chainshaper.values.files import free_place, open_to_all
 from chainshaper.values.yaml_file import wrong_values_refused
 
-__all__ = [
-    "Check",
-    "EndpointInfo",
-    "InForceInfo",
-    "MachineReport",
-    "Recording",
-    "RecordingInfo",
-    "StallMeterInfo",
-    "State",
-    "ThreadInfo",
-    "event_counts",
-    "lost_text",
-    "open_recording",
-    "refuse_existing",
-    "write_recording",
-]
-
 INFO_FILE = "recording.json"
 FORMAT = 1
 MOST_ROWS = 1_000_000
 MOST_ROWS_PER_BYTE = 16
 """A file has no more rows than both together; events as regular as a clock take four bytes each."""
-UNREADABLE = (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError)
-
 Integer: TypeAlias = Annotated[int, Field(ge=-(1 << 63), lt=1 << 63)]
 
 
@@ -67,10 +47,9 @@ class ThreadInfo(BaseModel, frozen=True):
 
 
 class EndpointInfo(BaseModel, frozen=True):
-    """A publisher or subscription with its QoS, as DDS discovery and the trace show them.
+    """A publisher or subscription with its QoS, in the words of `ros2 topic info -v`, lower case.
 
-    What neither shows is None: not every RMW publishes its history. Durations are ns, None also
-    where there is no limit. QoS words are those of `ros2 topic info -v` in lower case.
+    What neither DDS discovery nor the trace shows is None. Durations are ns, None: no limit.
     """
 
     node: str
@@ -103,13 +82,10 @@ class StallMeterInfo(BaseModel, frozen=True):
 
 
 class InForceInfo(BaseModel, frozen=True):
-    """When the plan was in force (ns of CLOCK_MONOTONIC; ``until_ns`` None: to the end).
-
-    From the start of the first cycle that was governed as a whole.
-    """
+    """When the plan was in force, from its first whole cycle (ns of CLOCK_MONOTONIC)."""
 
     since_ns: int
-    until_ns: int | None = None
+    until_ns: int | None = None  # None: to the end
 
 
 class RecordingInfo(BaseModel, frozen=True):
@@ -155,14 +131,15 @@ class Recording:
 
 
 class _TablesOnDisk(Mapping[str, pl.DataFrame]):
+    """The tables of a folder; one of several parts is a folder of files."""
+
     def __init__(self, path: Path, checksums: Mapping[str, str]) -> None:
-        self._path = path
-        self._checksums = checksums
+        self._path, self._checksums = path, checksums
+        self._read: dict[str, pl.DataFrame] = {}
         self._files = {
             file.stem: sorted(file.glob("*.parquet")) if file.is_dir() else [file]
             for file in sorted(path.glob("*.parquet"))
         }
-        self._read: dict[str, pl.DataFrame] = {}
         known = {str(file.relative_to(path)) for files in self._files.values() for file in files}
         if missing := sorted(checksums.keys() - known):
             raise InputError(
@@ -171,32 +148,30 @@ class _TablesOnDisk(Mapping[str, pl.DataFrame]):
             )
         for name, files in self._files.items():
             for file in files:
-                _check_columns(file, name)
+                with _readable(file), file.open("rb") as stream:
+                    problems = column_problems(pl.read_parquet_schema(stream), name)
+                if problems:
+                    raise InputError(f"{file}: {'; '.join(problems)}; record the run again")
 
     def __getitem__(self, name: str) -> pl.DataFrame:
         if name not in self._read:
-            self._read[name] = self._table(name).sort("time", maintain_order=True)
+            files = self._files[name]
+            with _readable(files[0].parent if len(files) > 1 else files[0]) as file:
+                parts: list[Any] = [io.BytesIO(self._content(part)) for part in files]
+                lazy = pl.scan_parquet(parts, glob=False)
+                rows = lazy.select(pl.len()).collect().item()
+                size = sum(part.getbuffer().nbytes for part in parts)
+                if rows > MOST_ROWS + MOST_ROWS_PER_BYTE * size:
+                    raise InputError(
+                        f"{file}: {rows} rows in {size} bytes are more than any run has; record"
+                        " the run again"
+                    )
+                table = as_table(lazy.collect(), name)
+            self._read[name] = table.sort("time", maintain_order=True)
         return self._read[name]
 
-    def _table(self, name: str) -> pl.DataFrame:
-        """A table's rows, once it is sure that they are what was written."""
-        files = self._files[name]
-        file = files[0].parent if len(files) > 1 else files[0]
-        try:
-            parts: list[Any] = [io.BytesIO(self._content(part)) for part in files]
-            lazy = pl.scan_parquet(parts, glob=False)
-            rows = lazy.select(pl.len()).collect().item()
-            size = sum(part.getbuffer().nbytes for part in parts)
-            if rows > MOST_ROWS + MOST_ROWS_PER_BYTE * size:
-                raise InputError(
-                    f"{file}: {rows} rows in {size} bytes are more than any run has; record the"
-                    " run again"
-                )
-            return as_table(lazy.collect(), name)
-        except UNREADABLE as error:
-            raise _unreadable(file, error) from error
-
     def _content(self, file: Path) -> bytes:
+        """A file's bytes, once it is sure that they are what was written."""
         content = file.read_bytes()
         expected = self._checksums.get(str(file.relative_to(self._path)))
         if expected is not None and expected != _checksum(content):
@@ -206,27 +181,23 @@ class _TablesOnDisk(Mapping[str, pl.DataFrame]):
             )
         return content
 
-    def __iter__(self) -> Any:
+    def __iter__(self) -> Iterator[str]:
         return iter(self._files)
 
     def __len__(self) -> int:
         return len(self._files)
 
 
-def _check_columns(file: Path, name: str) -> None:
-    """Refuse a table whose columns are not those of its event."""
+@contextmanager
+def _readable(file: Path) -> Iterator[Path]:
+    """Inside, what is wrong with a table's file ends in an InputError."""
     try:
-        with file.open("rb") as stream:
-            problems = column_problems(pl.read_parquet_schema(stream), name)
-    except UNREADABLE as error:
-        raise _unreadable(file, error) from error
-    if problems:
-        raise InputError(f"{file}: {'; '.join(problems)}; record the run again")
-
-
-def _unreadable(file: Path, error: BaseException) -> InputError:
-    reason = " ".join(str(error).split())
-    return InputError(f"{file}: not a readable event table ({reason}); record the run again")
+        yield file
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"{file}: not a readable event table ({reason}); record the run again"
+        ) from error
 
 
 def _checksum(content: bytes | memoryview) -> str:
@@ -236,9 +207,8 @@ def _checksum(content: bytes | memoryview) -> str:
 def event_counts(recording: Recording) -> pl.DataFrame:
     """How often each event happened: ``event, count``, ordered by event.
 
-    Names are the tracer's own, with the provider (``ros2:callback_start``), also of events that the
-    analysis makes no use of, and also in a recording that was converted from a trace; where we
-    recorded ourselves they are the names of the tables.
+    A tracer's events have their provider in front (``ros2:callback_start``), also those that the
+    analysis makes no use of; where we recorded ourselves, events are the tables.
     """
     counts = getattr(recording.events, "counts", recording.info.trace_events)
     if not counts:
@@ -270,11 +240,6 @@ def open_recording(path: str | Path) -> Recording:
             f"{path}: {what}; a recording is made with `chainshaper run APP.yaml -o {path}`, a "
             "trace, which is accepted as well, with `ros2 trace`"
         )
-    info = _read_info(file)
-    return Recording(path, info, _TablesOnDisk(path, info.checksums or {}))
-
-
-def _read_info(file: Path) -> RecordingInfo:
     try:
         values = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
@@ -286,7 +251,8 @@ def _read_info(file: Path) -> RecordingInfo:
             f"{file}: format {format_}, this chainshaper reads format {FORMAT}; update it"
         )
     with wrong_values_refused(RecordingInfo, f"{file}: not a recording's description: "):
-        return RecordingInfo.model_validate_json(json.dumps(values), strict=True)
+        info = RecordingInfo.model_validate_json(json.dumps(values), strict=True)
+    return Recording(path, info, _TablesOnDisk(path, info.checksums or {}))
 
 
 def refuse_existing(path: str | Path) -> Path:
@@ -314,25 +280,21 @@ def write_recording(
         OperationError: it cannot be written (disk full, no permission); nothing is left behind.
     """
     path = refuse_existing(path)
-    partial: Path | None = None
     try:
-        partial = Path(
-            tempfile.mkdtemp(prefix=f".{path.name}.partial-", dir=path.absolute().parent)
-        )
-        checksums: dict[str, str] = {}
-        for part in [tables] if isinstance(tables, Mapping) else tables:
-            for name, frame in part.items():
-                file = _next_part(partial / f"{name}.parquet", checksums)
-                checksums[str(file.relative_to(partial))] = _write_table(file, frame)
-        info = info.model_copy(update={"checksums": checksums})
-        (partial / INFO_FILE).write_text(info.model_dump_json(indent=2) + "\n")
-        open_to_all(partial)
-        partial.rename(path)
+        with tempfile.TemporaryDirectory(
+            prefix=f".{path.name}.partial-", dir=path.absolute().parent, ignore_cleanup_errors=True
+        ) as made:
+            partial, checksums = Path(made), dict[str, str]()
+            for part in [tables] if isinstance(tables, Mapping) else tables:
+                for name, frame in part.items():
+                    file = _next_part(partial / f"{name}.parquet", checksums)
+                    checksums[str(file.relative_to(partial))] = _write_table(file, frame)
+            info = info.model_copy(update={"checksums": checksums})
+            (partial / INFO_FILE).write_text(info.model_dump_json(indent=2) + "\n")
+            open_to_all(partial)
+            partial.rename(path)
     except (OSError, pl.exceptions.PolarsError) as error:
         raise OperationError(f"{path}: the recording cannot be written: {error}") from error
-    finally:
-        if partial is not None and partial.exists():
-            shutil.rmtree(partial, ignore_errors=True)
     return open_recording(path)
 
 

@@ -1,9 +1,8 @@
 """Text of others made safe to show: names in a trace, of processes, hosts, topics, files.
 
-A name may be anything. On a terminal, control characters move the cursor,
-rewrite what stands there, or answer in the user's place; others turn the direction of reading
-around, are not seen, or end an XML file. All of these are shown as Python writes them (``\\x1b``).
-Whatever shows text passes it through here, all of it and last; JSON escapes by itself.
+Control characters rewrite a terminal or answer in the user's place; others turn the direction of
+reading around, are not seen, or end an XML file. All of these are shown as Python writes them
+(``\\x1b``). Whatever shows text passes it through here, all of it and last; JSON escapes by itself.
 """
 
 import html
@@ -22,13 +21,9 @@ _UNSAFE = re.compile(
 
 def shown(text: str, but: str = "") -> str:
     """The text with every character escaped that does more than be seen, ``but`` these."""
-    return _UNSAFE.sub(lambda found: found[0] if found[0] in but else _escaped(found[0]), text)
+    return _UNSAFE.sub(lambda found: found[0] if found[0] in but else ascii(found[0])[1:-1], text)
 
 
 def escape(text: str) -> str:
     """The same for HTML and SVG, in elements and attributes; lines stay lines."""
     return html.escape(shown(text, but="\n"))
-
-
-def _escaped(character: str) -> str:
-    return character.encode("unicode_escape").decode("ascii")

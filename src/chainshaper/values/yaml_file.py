@@ -1,7 +1,6 @@
-"""YAML files that people write: read them, and say exactly where they are wrong.
+"""YAML files that people write, read with PyYAML's lines and Pydantic's paths of wrong values.
 
-PyYAML knows the line of every key, Pydantic knows the path of every wrong value; a message has
-both: ``robot.yaml:14: nodes.node3.callbacks[0].execution: …``.
+A message has both: ``robot.yaml:14: nodes.node3.callbacks[0].execution: …``.
 """
 
 import difflib
@@ -29,28 +28,10 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import InputError
 
-__all__ = [
-    "AS_YAML",
-    "Duration",
-    "FullName",
-    "Part",
-    "PlainData",
-    "PositiveDuration",
-    "compose",
-    "explanations",
-    "in_words",
-    "key_text",
-    "read_model",
-    "read_text",
-    "scalar",
-    "wrong_value",
-    "wrong_values_refused",
-]
-
 Model = TypeVar("Model", bound=BaseModel)
 _Path: TypeAlias = tuple[str | int, ...]
 
-_WANTED = {
+_KINDS = {
     "tuple_type": "a list in [square brackets]",
     "model_type": "a mapping of keys and values",
     "string_type": "a text",
@@ -59,12 +40,6 @@ _WANTED = {
     "finite_number": "a finite number",
     "bool_type": "true or false",
 }
-
-_SAID = {
-    "missing": "is missing: add it",
-    "too_short": "is too short: write one element at least",
-}
-
 AS_YAML = "yaml"
 """The Pydantic context in which durations are texts with units, on the way in and out."""
 
@@ -132,17 +107,12 @@ class Part(BaseModel):
 
 
 def wrong_value(reason: str, *where: str | int) -> PydanticCustomError:
-    """The error for a wrong value that a validator found.
-
-    ``where`` leads from the model that is being checked to the value at fault.
-    """
+    """The error for a wrong value that a validator found, ``where`` in the model it checks."""
     return PydanticCustomError("wrong_value", "{reason}", {"reason": reason, "where": where})
 
 
 def read_model(path: str | Path, model: type[Model], *, made_by: str) -> Model:
-    """A YAML file as a Pydantic model.
-
-    ``made_by`` completes the sentence "such a file is …" for those who have none.
+    """A YAML file as a Pydantic model; ``made_by`` completes the sentence "such a file is …".
 
     Raises:
         InputError: no such file, not YAML, or wrong values; each is named with its line, key,
@@ -150,14 +120,11 @@ def read_model(path: str | Path, model: type[Model], *, made_by: str) -> Model:
     """
     path = Path(path)
     root = compose(read_text(path, made_by), path)
-    if root is None:
-        raise InputError(f"{path}:1: the file is empty; such a file is {made_by}")
     plain = PlainData(path)
-    values = plain.of(root)
+    values = plain.of(root) if root is not None else None
     if not isinstance(values, dict):
-        raise InputError(
-            f"{path}:1: expected a YAML mapping (key: value); such a file is {made_by}"
-        )
+        found = "the file is empty" if root is None else "expected a YAML mapping (key: value)"
+        raise InputError(f"{path}:1: {found}; such a file is {made_by}")
     try:
         return model.model_validate(values, context=AS_YAML)
     except ValidationError as error:
@@ -186,6 +153,20 @@ def read_text(path: Path, made_by: str) -> str:
         raise InputError(f"{path}:{line}: not a text in UTF-8 ({error.reason}); {such}") from error
 
 
+class _Loader(yaml.SafeLoader):
+    depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.depth > DEEPEST:
+            reason = f"more than {DEEPEST} lists and mappings inside each other"
+            mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
+            raise yaml.composer.ComposerError(None, None, reason, mark)
+        self.depth += 1
+        node: yaml.Node | None = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
+
+
 def compose(text: str, name: str | Path) -> yaml.Node | None:
     """The YAML nodes of a text, which ``name`` stands for in messages; None of an empty one.
 
@@ -203,21 +184,10 @@ def compose(text: str, name: str | Path) -> yaml.Node | None:
     raise InputError(f"{name}:{line}: not YAML: {reason}; correct the line")
 
 
-class _Loader(yaml.SafeLoader):
-    depth = 0
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        if self.depth > DEEPEST:
-            reason = f"more than {DEEPEST} lists and mappings inside each other"
-            mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
-            raise yaml.composer.ComposerError(None, None, reason, mark)
-        self.depth += 1
-        node: yaml.Node | None = super().compose_node(parent, index)
-        self.depth -= 1
-        return node
+_SCALARS = yaml.SafeLoader("")
 
 
-def scalar(node: yaml.ScalarNode) -> str | int | float | bool | None:
+def _scalar(node: yaml.ScalarNode) -> str | int | float | bool | None:
     """A scalar's value. Dates and other things that no file of ours has are texts.
 
     Raises:
@@ -238,9 +208,6 @@ def scalar(node: yaml.ScalarNode) -> str | int | float | bool | None:
     if isinstance(value, int) and not -(1 << 63) <= value < 1 << 64:
         raise ValueError("a number of more than 64 bits: write a smaller one")
     return value if isinstance(value, str | int | float | None) else str(node.value)
-
-
-_SCALARS = yaml.SafeLoader("")
 
 
 @dataclass
@@ -265,7 +232,7 @@ class PlainData:
         self.lines[where] = node.start_mark.line + 1
         if isinstance(node, yaml.ScalarNode):
             try:
-                return scalar(node)
+                return _scalar(node)
             except ValueError as error:
                 raise self._wrong(node, where, str(error)) from error
         if id(node) in self._seen and self.ours:
@@ -277,9 +244,6 @@ class PlainData:
         self._seen.add(id(node))
         if isinstance(node, yaml.SequenceNode):
             return tuple(self.of(item, (*where, number)) for number, item in enumerate(node.value))
-        return self._mapping(node, where)
-
-    def _mapping(self, node: yaml.Node, where: _Path) -> dict[str, object]:
         values: dict[str, object] = {}
         for key_node, value_node in node.value:
             if not isinstance(key_node, yaml.ScalarNode):
@@ -298,32 +262,17 @@ class PlainData:
 
     def _wrong(self, node: yaml.Node, where: _Path, reason: str) -> InputError:
         line = node.start_mark.line + 1
-        return InputError(f"{self.name}:{line}: {key_text(where)}: {reason}")
+        return InputError(f"{self.name}:{line}: {_key_text(where)}: {reason}")
 
     def problems(self, error: ValidationError, model: type[BaseModel]) -> InputError:
         """What a model refused, each with its line."""
-        said = [
-            f"{self.name}:{self._line(where)}: {key_text(where)}: {reason}"
-            for where, reason in explanations(error, model)
-        ]
-        return InputError("\n".join(said))
-
-    def _line(self, where: _Path) -> int:
-        # A missing key has no line of its own: the mapping it is missing from has.
-        while where and where not in self.lines:
-            where = where[:-1]
-        return self.lines.get(where, 1)
-
-
-def key_text(where: _Path) -> str:
-    """``servers[1].slots[0]``"""
-    text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in where)
-    return text.removeprefix(".") or "the file"
-
-
-def in_words(error: ValidationError, model: type[BaseModel]) -> str:
-    """What a model refused, in one line."""
-    return "; ".join(f"{key_text(at)}: {reason}" for at, reason in explanations(error, model))
+        lines = []
+        for where, reason in _explanations(error, model):
+            # A missing key has no line of its own: the mapping it is missing from has.
+            places = (where[:end] for end in range(len(where), -1, -1))
+            line = next((self.lines[place] for place in places if place in self.lines), 1)
+            lines.append(f"{self.name}:{line}: {_key_text(where)}: {reason}")
+        return InputError("\n".join(lines))
 
 
 @contextmanager
@@ -335,22 +284,21 @@ def wrong_values_refused(model: type[BaseModel], what: str = "") -> Iterator[Non
     try:
         yield
     except ValidationError as error:
-        raise InputError(what + in_words(error, model)) from error
+        wrong = [f"{_key_text(at)}: {reason}" for at, reason in _explanations(error, model)]
+        raise InputError(what + "; ".join(wrong)) from error
 
 
-def explanations(error: ValidationError, model: type[BaseModel]) -> list[tuple[_Path, str]]:
-    """Each wrong value once: a list is not too short because one of its elements is wrong.
+def _key_text(where: _Path) -> str:
+    """``servers[1].slots[0]``"""
+    text = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in where)
+    return text.removeprefix(".") or "the file"
 
-    Only the first ones of very many.
-    """
+
+def _explanations(error: ValidationError, model: type[BaseModel]) -> list[tuple[_Path, str]]:
+    """The first wrong values; a list is not too short because one of its elements is wrong."""
     details = error.errors()
-    places = [detail["loc"] for detail in details]
-    wrong = [
-        detail
-        for detail in details
-        if detail["type"] != "too_short"
-        or not any(place[:-1][: len(detail["loc"])] == detail["loc"] for place in places)
-    ]
+    parents = {detail["loc"][:end] for detail in details for end in range(len(detail["loc"]))}
+    wrong = [d for d in details if d["type"] != "too_short" or d["loc"] not in parents]
     found = [_explain(detail, model) for detail in wrong[:_MOST_PROBLEMS]]
     if len(wrong) > _MOST_PROBLEMS:
         found.append(((), f"{len(wrong) - _MOST_PROBLEMS} more values are wrong"))
@@ -359,30 +307,31 @@ def explanations(error: ValidationError, model: type[BaseModel]) -> list[tuple[_
 
 def _explain(error: ErrorDetails, model: type[BaseModel]) -> tuple[_Path, str]:
     """Where a value is wrong, and why and what to do, in words."""
-    where = tuple(error["loc"])
-    kind, context, found = error["type"], error.get("ctx", {}), error["input"]
-    if kind == "wrong_value":
-        return where + tuple(context["where"]), str(context["reason"])
-    if kind == "value_error":
-        return where, str(context["error"])
-    if kind in _SAID:
-        return where, _SAID[kind]
-    if kind == "extra_forbidden":
-        near = difflib.get_close_matches(str(where[-1]), _known_keys(model), n=1, cutoff=0.75)
-        return where, "unknown key: " + (f"did you mean {near[0]!r}?" if near else "remove it")
-    shown = repr(found) if isinstance(found, str | int | float | None) else "what stands here"
-    if kind in _WANTED:
-        return where, f"{shown} is not {_WANTED[kind]}: write one"
-    reason = error["msg"].removeprefix("Input ")
-    return where, f"{shown} {reason}: correct it" if reason.startswith("should") else reason
+    where, context = tuple(error["loc"]), error.get("ctx", {})
+    value = error["input"]
+    shown = repr(value) if isinstance(value, str | int | float | None) else "what stands here"
+    match error["type"]:
+        case "wrong_value":
+            return where + tuple(context["where"]), str(context["reason"])
+        case "value_error":
+            reason = str(context["error"])
+        case "missing":
+            reason = "is missing: add it"
+        case "too_short":
+            reason = "is too short: write one element at least"
+        case "extra_forbidden":
+            near = difflib.get_close_matches(str(where[-1]), _known_keys(model), n=1, cutoff=0.75)
+            reason = "unknown key: " + (f"did you mean {near[0]!r}?" if near else "remove it")
+        case kind if kind in _KINDS:
+            reason = f"{shown} is not {_KINDS[kind]}: write one"
+        case _:
+            reason = error["msg"].removeprefix("Input ")
+            reason = f"{shown} {reason}: correct it" if reason.startswith("should") else reason
+    return where, reason
 
 
 @cache
 def _known_keys(model: type[BaseModel]) -> list[str]:
-    keys: set[str] = set()
-    pending = [model.model_json_schema(by_alias=True)]
-    while pending:
-        schema = pending.pop()
-        keys.update(schema.get("properties", {}))
-        pending.extend(schema.get("$defs", {}).values())
-    return sorted(keys)
+    schema = model.model_json_schema(by_alias=True)
+    parts = [schema, *schema.get("$defs", {}).values()]
+    return sorted({key for part in parts for key in part.get("properties", {})})

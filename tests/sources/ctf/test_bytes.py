@@ -1,7 +1,5 @@
 """Traces assembled byte by byte, so that neither our writer nor our types are trusted."""
 
-# ruff: noqa: PLR0917
-
 import struct
 from pathlib import Path
 from typing import Any
@@ -14,7 +12,7 @@ from chainshaper.sources.ctf import open_trace, read_events
 PLAIN = """/* CTF 1.8 */
 typealias integer {{ size = 8; align = 8; }} := u8;
 typealias integer {{ size = 32; align = 8; }} := u32;
-clock {{ name = c; freq = 1000000000; offset = 5; }};
+clock {{ name = c; uuid = "d499e0ca-e836-4e4d-b711-80e0e67a24a1"; freq = 1000000000; offset = 5; }};
 typealias integer {{ size = 64; align = 8; map = clock.c.value; }} := stamp;
 trace {{ major = 1; minor = 8; byte_order = {order}; packet.header := struct {{ u32 magic; }}; }};
 stream {{
@@ -25,151 +23,106 @@ event {{ name = "e"; id = 0; fields := {fields}; }};
 """
 
 
-def one_event(folder: Any, fields: Any, payload: Any, order: Any = "le", bits: Any = None) -> Any:
+def one_event(folder: Any, fields: Any, payload: Any, order: Any = "le", name: Any = "e") -> Any:
     """A trace of one packet with one event at time 1000."""
-    mark = "<" if order == "le" else ">"
-    content = 8 * (12 + 9) + (8 * len(payload) if bits is None else bits)
+    mark, content = "<" if order == "le" else ">", 8 * (21 + len(payload))
     folder.mkdir(exist_ok=True)
-    (folder / "metadata").write_text(PLAIN.format(order=order, fields=fields))
-    head = struct.pack(mark + "III", 0xC1FC1FC1, content, 8 * (21 + len(payload)))
+    text = PLAIN.format(order=order, fields=fields).replace('"e"', f'"{name}"')
+    (folder / "metadata").write_text(text)
+    head = struct.pack(mark + "III", 0xC1FC1FC1, content, content)
     (folder / "stream").write_bytes(head + struct.pack(mark + "BQ", 0, 1000) + payload)
-    return read_events(open_trace(folder))["e"].drop("cpu", "pid", "tid").to_dicts()
+    return read_events(open_trace(folder))[name].drop("cpu", "pid", "tid").to_dicts()
 
 
-def check(
-    folder: Any,
-    fields: Any,
-    payload: Any,
-    expected: Any,
-    order: Any = "le",
-    bits: Any = None,
-    reference: Any = True,
-) -> None:
-    assert one_event(folder, fields, payload, order, bits) == [{"time": 1000, **expected}]
-    if reference:
-        assert_equal_to_babeltrace(folder)
+BITS = """struct {
+    integer { size = 3; align = 1; } a; integer { size = 7; align = 1; signed = true; } b;
+    integer { size = 14; align = 1; } c; integer { size = 16; align = 8; } d; }"""
+WIDE = """struct { integer { size = 5; align = 1; } a;
+    integer { size = 64; align = 1; signed = true; } b; integer { size = 3; align = 1; } c; }"""
+NUMBER = -0x123456789ABCDEF
+UNSIGNED = NUMBER & (1 << 64) - 1
+GAP = b"\xff" * 3
+VARIANT = """struct { enum : u8 { number = 0, text = 5 ... 9, many = 128 ... 255 } tag;
+    variant <tag> { u8 number; string text; struct { u8 n; u8 v[n]; } many; } v; u8 after; }"""
 
 
-def test_bits_are_packed_from_the_low_end_in_little_endian(tmp_path: Path) -> None:
-    fields = """struct {
-        integer { size = 3; align = 1; } a;
-        integer { size = 7; align = 1; signed = true; } b;
-        integer { size = 14; align = 1; } c;
-        integer { size = 8; } d; }"""
-    word = 5 | (-3 & 0x7F) << 3 | 0x2BCD << 10
-    payload = word.to_bytes(3, "little") + b"\x7e"
-    check(tmp_path, fields, payload, {"a": 5, "b": -3, "c": 0x2BCD, "d": 0x7E})
+def chosen(tag: int, **option: Any) -> dict[str, Any]:
+    return {"tag": tag, "v": {"number": None, "text": None, "many": None} | option, "after": 9}
 
 
-def test_bits_are_packed_from_the_high_end_in_big_endian(tmp_path: Path) -> None:
-    fields = """struct {
-        integer { size = 3; align = 1; } a;
-        integer { size = 7; align = 1; signed = true; } b;
-        integer { size = 14; align = 1; } c;
-        integer { size = 16; align = 8; } d; }"""
-    word = 5 << 21 | (-3 & 0x7F) << 14 | 0x2BCD
-    payload = word.to_bytes(3, "big") + b"\x12\x34"
-    check(tmp_path, fields, payload, {"a": 5, "b": -3, "c": 0x2BCD, "d": 0x1234}, order="be")
-
-
-@pytest.mark.parametrize("order", ["le", "be"])
-def test_a_64_bit_number_across_nine_bytes(tmp_path: Path, order: Any) -> None:
-    fields = """struct {
-        integer { size = 5; align = 1; } a;
-        integer { size = 64; align = 1; signed = true; } b;
-        integer { size = 3; align = 1; } c; }"""
-    number = -0x123456789ABCDEF
-    wide = number & (1 << 64) - 1
-    if order == "le":
-        payload = (21 | wide << 5 | 6 << 69).to_bytes(9, "little")
-    else:
-        payload = (21 << 67 | wide << 3 | 6).to_bytes(9, "big")
-    check(tmp_path, fields, payload, {"a": 21, "b": number, "c": 6}, order=order)
-
-
-def test_alignment_counts_from_the_packet(tmp_path: Path) -> None:
-    fields = """struct {
-        integer { size = 8; } a;
-        integer { size = 32; align = 32; } b;
-        struct { integer { size = 8; } x; } align(64) s;
-        struct { } align(32) padding;
-        integer { size = 8; } c; }"""
+# Fields of the event, its payload, what it means; the byte order where it is not little-endian.
+KNOWN: dict[str, tuple[Any, ...]] = {
+    "bits_from_the_low_end": (
+        BITS, (5 | (-3 & 0x7F) << 3 | 0x2BCD << 10).to_bytes(3, "little") + b"\x34\x12",
+        {"a": 5, "b": -3, "c": 0x2BCD, "d": 0x1234}),
+    "bits_from_the_high_end": (
+        BITS, (5 << 21 | (-3 & 0x7F) << 14 | 0x2BCD).to_bytes(3, "big") + b"\x12\x34",
+        {"a": 5, "b": -3, "c": 0x2BCD, "d": 0x1234}, "be"),
+    "a_number_across_nine_bytes": (
+        WIDE, (21 | UNSIGNED << 5 | 6 << 69).to_bytes(9, "little"), {"a": 21, "b": NUMBER, "c": 6}),
+    "a_number_across_nine_bytes_from_the_high_end": (
+        WIDE, (21 << 67 | UNSIGNED << 3 | 6).to_bytes(9, "big"),
+        {"a": 21, "b": NUMBER, "c": 6}, "be"),
     # The event header ends at byte 21; s aligns the payload to 24: a there, b at 28, s at 32.
-    gap = b"\xff" * 3
-    payload = gap + b"\x01" + gap + b"\x02\0\0\0" + b"\x03" + gap + b"\x04"
-    check(tmp_path, fields, payload, {"a": 1, "b": 2, "s": {"x": 3}, "c": 4})
+    "alignment_counts_from_the_packet": (
+        """struct { integer { size = 8; } a; integer { size = 32; align = 32; } b;
+        struct { integer { size = 8; } x; } align(64) s; struct { } align(32) padding;
+        integer { size = 8; } c; }""",
+        GAP + b"\x01" + GAP + b"\x02\0\0\0" + b"\x03" + GAP + b"\x04",
+        {"a": 1, "b": 2, "s": {"x": 3}, "c": 4}),
+    "floats_and_their_byte_orders": (
+        """struct { floating_point { exp_dig = 8; mant_dig = 24; align = 8; } f;
+        floating_point { exp_dig = 11; mant_dig = 53; align = 8; byte_order = be; } d; }""",
+        struct.pack("<f", 1.5) + struct.pack(">d", -2.25e100), {"f": 1.5, "d": -2.25e100}),
+    "text_ends_at_its_nul": (
+        """struct { string s; integer { size = 8; encoding = UTF8; } t[6]; integer { size = 8; } n;
+        integer { size = 8; encoding = ASCII; } q[n]; string { encoding = ASCII; } empty; }""",
+        "caf\u00e9\0".encode() + b"ab\0xyz" + b"\x03" + b"ful" + b"\0",
+        {"s": "caf\u00e9", "t": "ab", "n": 3, "q": "ful", "empty": ""}),
+    "texts_of_whole_words": (
+        "struct { string s; integer { size = 8; encoding = UTF8; } t[16]; string u; }",
+        b"eight by\0" + b"sixteen bytes...eight by\0",
+        {"s": "eight by", "t": "sixteen bytes...", "u": "eight by"}),
+    "arrays_sequences_and_structures_nest": (
+        """struct { struct { u8 x; u8 n; } pair[2]; u8 n; u8 grid[2][3];
+        struct { u8 m; u32 v[m]; string s; } list[n]; u8 none[0];
+        struct { u8 n; u8 v[n]; } ragged[2]; }""",
+        bytes([1, 2, 3, 4, 2, *range(6), 1]) + struct.pack("<I", 70000) + b"one\0\0none\0"
+        + bytes([0, 2, 7, 8]),
+        {"pair": [{"x": 1, "n": 2}, {"x": 3, "n": 4}], "n": 2, "grid": [[0, 1, 2], [3, 4, 5]],
+         "list": [{"m": 1, "v": [70000], "s": "one"}, {"m": 0, "v": [], "s": "none"}],
+         "none": [], "ragged": [{"n": 0, "v": []}, {"n": 2, "v": [7, 8]}]}),
+    "the_first_option": (VARIANT, b"\0\x2a\x09", chosen(0, number=42)),
+    "a_range_of_tags": (VARIANT, b"\x07hello\0\x09", chosen(7, text="hello")),
+    "an_option_with_a_sequence": (
+        VARIANT, bytes([200, 2, 8, 9, 9]), chosen(200, many={"n": 2, "v": [8, 9]})),
+    "negative_tags": (
+        """struct { enum : integer { size = 8; signed = true; } { low = -5 ... -1, "high" = 3 } tag;
+        variant <tag> { u8 low; u32 high; } v; }""",
+        b"\xfd\x11", {"tag": -3, "v": {"low": 17, "high": None}}),
+}  # fmt: skip
 
 
-def test_floats_and_their_byte_orders(tmp_path: Path) -> None:
-    fields = """struct {
-        floating_point { exp_dig = 8; mant_dig = 24; align = 8; } f;
-        floating_point { exp_dig = 11; mant_dig = 53; align = 8; byte_order = be; } d; }"""
-    payload = struct.pack("<f", 1.5) + struct.pack(">d", -2.25e100)
-    check(tmp_path, fields, payload, {"f": 1.5, "d": -2.25e100})
+def test_known_bytes_mean_what_the_specification_says(tmp_path: Path) -> None:
+    for name, (fields, payload, expected, *order) in KNOWN.items():
+        row = one_event(tmp_path / name, fields, payload, "".join(order) or "le", name)
+        assert row == [{"time": 1000, **expected}], name
+    assert_equal_to_babeltrace(tmp_path)
 
 
-def test_text_ends_at_its_nul(tmp_path: Path) -> None:
-    fields = """struct {
-        string s;
-        integer { size = 8; encoding = UTF8; } t[6];
-        integer { size = 8; } n;
-        integer { size = 8; encoding = ASCII; } q[n];
-        string { encoding = ASCII; } empty; }"""
-    payload = "caf\u00e9\0".encode() + b"ab\0xyz" + b"\x03" + b"full"[:3] + b"\0"
-    expected = {"s": "caf\u00e9", "t": "ab", "n": 3, "q": "ful", "empty": ""}
-    check(tmp_path, fields, payload, expected)
-
-
-def test_empty_texts_are_empty(tmp_path: Path) -> None:
+def test_what_babeltrace_shows_otherwise(tmp_path: Path) -> None:
     fields = "struct { string a; string b; integer { size = 8; encoding = UTF8; } c[2]; }"
-    check(tmp_path, fields, b"x\0\0\0\0", {"a": "x", "b": "", "c": ""}, reference=False)
-
-
-def test_bytes_that_are_no_utf8_are_shown(tmp_path: Path) -> None:
-    expected = {"s": "a\\xffb"}
-    check(tmp_path, "struct { string s; }", b"a\xffb\0", expected, reference=False)
-
-
-def test_arrays_sequences_and_structures_nest(tmp_path: Path) -> None:
-    fields = """struct {
-        struct { u8 x; u8 n; } pair[2];
-        u8 n;
-        u8 grid[2][3];
-        struct { u8 m; u32 v[m]; string s; } list[n];
-        u8 none[0];
-        struct { u8 n; u8 v[n]; } ragged[2]; }"""
-    payload = bytes([1, 2, 3, 4, 2]) + bytes(range(6))
-    payload += b"\x01" + struct.pack("<I", 70000) + b"one\0" + b"\x00" + b"none\0"
-    payload += bytes([0, 2, 7, 8])
-    expected = {
-        "pair": [{"x": 1, "n": 2}, {"x": 3, "n": 4}],
-        "n": 2,
-        "grid": [[0, 1, 2], [3, 4, 5]],
-        "list": [{"m": 1, "v": [70000], "s": "one"}, {"m": 0, "v": [], "s": "none"}],
-        "none": [],
-        "ragged": [{"n": 0, "v": []}, {"n": 2, "v": [7, 8]}],
+    assert one_event(tmp_path, fields, b"x\0\0\0\0")[0] == {
+        "time": 1000,
+        "a": "x",
+        "b": "",
+        "c": "",
     }
-    check(tmp_path, fields, payload, expected)
-
-
-@pytest.mark.parametrize(("tag", "body", "chosen"), [
-    (0, b"\x2a", {"number": 42, "text": None, "many": None}),
-    (7, b"hello\0", {"number": None, "text": "hello", "many": None}),
-    (200, bytes([2, 8, 9]), {"number": None, "text": None, "many": {"n": 2, "v": [8, 9]}}),
-])  # fmt: skip
-def test_variants_follow_their_tag(tmp_path: Path, tag: Any, body: Any, chosen: Any) -> None:
-    fields = """struct {
-        enum : u8 { number = 0, text = 5 ... 9, many = 128 ... 255 } tag;
-        variant <tag> { u8 number; string text; struct { u8 n; u8 v[n]; } many; } v;
-        u8 after; }"""
-    check(tmp_path, fields, bytes([tag]) + body + b"\x09", {"tag": tag, "v": chosen, "after": 9})
-
-
-def test_negative_tags_and_values_of_enumerations(tmp_path: Path) -> None:
-    fields = """struct {
-        enum : integer { size = 8; signed = true; } { low = -5 ... -1, "high" = 3 } tag;
-        variant <tag> { u8 low; u32 high; } v; }"""
-    check(tmp_path, fields, b"\xfd\x11", {"tag": -3, "v": {"low": 17, "high": None}})
+    fields = "struct { struct { } a[3]; u8 n; struct { } b[n]; u8 c[n][0]; u8 d; }"
+    expected = {"time": 1000, "n": 2, "c": [[], []], "d": 7}
+    assert one_event(tmp_path, fields, b"\2\7") == [expected], "there is nothing to show in these"
+    row = one_event(tmp_path, "struct { string s; }", b"a\xffb\0")[0]
+    assert row["s"] == "a\\xffb", "bytes that are no UTF-8 are shown"
 
 
 HEADER_27 = """/* CTF 1.8 */

@@ -4,15 +4,14 @@
     count_events(trace)                       # {"ros2:callback_start": 4711, …}
     read_events(trace, {"ros2:callback_start"})["ros2:callback_start"]
 
-From a folder to frames: `tsdl` reads the metadata (`types`), `program` and `assembly` make
-operations of them, `decode` runs these (`kernels`, `interpreter`) over the files, and `read` makes
-columns of what they write. `trace` opens, `tables` has the numbers that all share.
+From a folder to frames: `tsdl` reads the metadata, `layout` makes operations and tables of it,
+`trace` finds packets, and `read` runs the operations (`kernels`, `interpreter`) over the files and
+makes columns of what they write.
 """
 
-from chainshaper.sources.ctf.decode import CtfStream
 from chainshaper.sources.ctf.read import Events, count_events, read_events
-from chainshaper.sources.ctf.trace import CtfTrace, open_trace
-from chainshaper.sources.ctf.types import CtfError, CtfFolder
+from chainshaper.sources.ctf.trace import CtfStream, CtfTrace, open_trace
+from chainshaper.sources.ctf.tsdl import CtfError, CtfFolder
 
 __all__ = [
     "CtfError",

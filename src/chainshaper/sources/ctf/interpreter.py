@@ -2,7 +2,7 @@
 
 Positions are bits from the start of a packet. Every operation checks the end of the packet's
 content before it reads, and every load the number of bytes mapped behind the packet's start; a
-failed check ends the run with a negative code of `tables`. Texts go to a dictionary, in which
+failed check ends the run with a negative code of `layout`. Texts go to a dictionary, in which
 every different string is once.
 """
 
@@ -11,7 +11,7 @@ every different string is once.
 
 import numpy as np
 
-from chainshaper.sources.ctf import tables as tb
+from chainshaper.sources.ctf import layout as tb
 from chainshaper.values.compiled.memory import (
     compiled,
     get,
@@ -42,43 +42,23 @@ def word_at(base, at, mapped):
 
 @compiled(inline=True)
 def digest_text(base, at, limit, mapped):
-    """Read a text in [at, limit) up to its first NUL.
+    """Read a text in [at, limit) up to its first NUL or the limit.
 
-    Returns (length or -1 where there is no NUL, its hash, its last word with zeros behind it).
+    Returns (length, its hash, its last word with zeros behind it).
     """
-    digest, word = tb.FACTOR, tb.U0
-    place = at
-    while place < limit:
+    digest, word, place, zeros = tb.FACTOR, tb.U0, at, tb.U0
+    while zeros == tb.U0:
         word = word_at(base, place, mapped)
+        if place + 8 > limit:  # what lies behind the limit counts as NUL
+            word &= (tb.U1 << np.uint64(8 * (limit - place))) - tb.U1
         zeros = (word - tb.ONES) & ~word & tb.HIGHS
         if zeros != tb.U0:
             # The first NUL is the lowest marked byte; what lies behind it does not count.
-            length = place - at + (trailing_zeros(zeros) >> 3)
             word &= ((zeros & (tb.U0 - zeros)) >> np.uint64(7)) - tb.U1
-            if at + length >= limit:
-                break
-            digest = (digest ^ word) * tb.FACTOR
-            return length, digest ^ (digest >> tb.U29), word
         digest = (digest ^ word) * tb.FACTOR
         digest ^= digest >> tb.U29
         place += 8
-    return np.int64(-1), digest, word
-
-
-@compiled()
-def digest_whole(base, at, length, mapped):
-    """The same of a text of ``length`` bytes without NUL."""
-    digest, word = tb.FACTOR, tb.U0
-    offset = length * 0
-    while offset + 8 <= length:
-        word = word_at(base, at + offset, mapped)
-        digest = (digest ^ word) * tb.FACTOR
-        digest ^= digest >> tb.U29
-        offset += 8
-    word = word_at(base, at + offset, mapped)
-    word &= (tb.U1 << np.uint64(8 * (length - offset))) - tb.U1
-    digest = (digest ^ word) * tb.FACTOR
-    return length, digest ^ (digest >> tb.U29), word
+    return place - 8 - at + (trailing_zeros(zeros) >> 3), digest, word
 
 
 @compiled(inline=True)
@@ -166,18 +146,23 @@ def bits_at(base, position, size, big, mapped):
 
 
 @compiled(inline=True)
+def store(column, width, row, value):
+    """Write the low bytes of a value to a row of a column."""
+    if width == 8:
+        store_long(column + 8 * row, value)
+    elif width == 4:
+        store_word(column + 4 * row, value)
+    elif width == 2:
+        store_half(column + 2 * row, value)
+    else:
+        store_byte(column + row, value)
+
+
+@compiled(inline=True)
 def keep(op, value, rows):
     """Write a value to its slot's row."""
-    width = get(op, tb.O_WIDTH)
-    target = get(op, tb.O_ADDRESS) + get(rows, get(op, tb.O_COUNTER)) * width
-    if width == 8:
-        store_long(target, value)
-    elif width == 4:
-        store_word(target, value)
-    elif width == 1:
-        store_byte(target, value)
-    else:
-        store_half(target, value)
+    row = get(rows, get(op, tb.O_COUNTER))
+    store(get(op, tb.O_ADDRESS), get(op, tb.O_WIDTH), row, value)
 
 
 @compiled(inline=True)
@@ -224,7 +209,7 @@ def run_text(machine, op, base, mapped, end, position, regs):
     at = position >> 3
     if get(op, tb.O_CODE) == tb.TEXT:
         length, digest, word = digest_text(base, at, end >> 3, mapped)
-        if length < 0:
+        if at + length >= end >> 3:
             return np.int64(tb.UNTERMINATED)
         following = (at + length + 1) << 3
     else:
@@ -233,8 +218,6 @@ def run_text(machine, op, base, mapped, end, position, regs):
         if count < 0 or count > (end - position) >> 3:
             return np.int64(tb.BAD_LENGTH)
         length, digest, word = digest_text(base, at, at + count, mapped)
-        if length < 0:
-            length, digest, word = digest_whole(base, at, count, mapped)
         following = (at + count) << 3
     if get(op, tb.O_ADDRESS) != 0:
         code = intern(machine, base + at, length, digest, word)
@@ -305,19 +288,6 @@ def run_many(machine, op, base, end, position, regs, depth):
     return position + count * get(op, tb.O_SIZE)
 
 
-@compiled(inline=True)
-def move(code, column, row, word):
-    """Write the low bytes of a word to a row of a column."""
-    if code == tb.MOVE_LONG:
-        store_long(column + 8 * row, word)
-    elif code == tb.MOVE_WORD:
-        store_word(column + 4 * row, word)
-    elif code == tb.MOVE_HALF:
-        store_half(column + 2 * row, word)
-    else:
-        store_byte(column + row, word)
-
-
 @compiled()
 def move_batch(machine, event, batch):
     """Run the operations of a class of events of constant layout, one operation at a time.
@@ -337,37 +307,35 @@ def move_batch(machine, event, batch):
             for index in range(count):
                 place = get(batch, 2 * index + 1) + offset
                 found, digest, word = digest_text(place, np.int64(0), length, size - offset + 8)
-                if found < 0:
-                    found, digest, word = digest_whole(
-                        place, np.int64(0), length, size - offset + 8
-                    )
                 text = intern(machine, place, found, digest, word)
                 if text < 0:
                     return np.int64(tb.FULL_DICTIONARY)
                 store_word(column + 4 * get(batch, 2 * index + 2), np.uint64(text))
         else:
+            width = get(op, tb.O_WIDTH)
             for index in range(count):
                 word = load_word(get(batch, 2 * index + 1) + offset)
-                move(code, column, get(batch, 2 * index + 2), word)
+                store(column, width, get(batch, 2 * index + 2), word)
     put(batch, 0, np.int64(0))
     return np.int64(0)
 
 
 @compiled()
-def execute(machine, first, last, base, mapped, end, position, regs, row):
-    """Run the operations [first, last) from ``position``; the position after or a failure.
+def execute(machine, owner, column, base, mapped, end, position, regs, row):
+    """Run operations from ``position``; the position after or a failure.
 
+    Their first and the one after their last stand in the ``column`` of ``owner`` and the next.
     ``base`` is the address of the packet, ``mapped`` the bytes that may be loaded from there,
     ``end`` the end of the content in bits, ``regs`` the address of the registers,
     ``row`` that of the table that the event goes to.
     """
     ops, state = get(machine, tb.M_OPS), get(machine, tb.M_STATE)
-    op, stop = ops + (first << 7), ops + (last << 7)
+    op, stop = ops + (get(owner, column) << 7), ops + (get(owner, column + 1) << 7)
     depth = np.int64(0)
     while op < stop:
         code, align = get(op, tb.O_CODE), get(op, tb.O_ALIGN)
         position = (position + align - 1) & -align
-        if code >= tb.MOVE_LONG:
+        if code == tb.MOVE:
             place = position >> 3
             position += get(op, tb.O_SIZE)
             if position > end:
@@ -375,7 +343,7 @@ def execute(machine, first, last, base, mapped, end, position, regs, row):
             if place + 8 > mapped:
                 run_number(machine, op, base, mapped, position - get(op, tb.O_SIZE), regs)
             else:
-                move(code, get(op, tb.O_ADDRESS), row, load_word(base + place))
+                store(get(op, tb.O_ADDRESS), get(op, tb.O_WIDTH), row, load_word(base + place))
             op += tb.O_ROW
         elif code == tb.NUMBER:
             following = position + get(op, tb.O_SIZE)

@@ -1,6 +1,6 @@
 """The compiled passes over a trace: find packets, count events, merge streams and write columns.
 
-They run without Python's lock. `tables` says what they are given, `program` what the operations
+They run without Python's lock. `layout` says what they are given, `layout` what the operations
 mean.
 """
 
@@ -9,11 +9,12 @@ mean.
 
 import numpy as np
 
-from chainshaper.sources.ctf import tables as tb
+from chainshaper.sources.ctf import layout as tb
 from chainshaper.sources.ctf.interpreter import advance_clock, afforded, execute, move_batch
 from chainshaper.values.compiled.memory import compiled, get, load_word, put, store_long, store_word
 
 A_ALL = tb.A_ROW * tb.AHEAD
+ZERO = np.int64(0)
 
 
 @compiled(inline=True)
@@ -40,12 +41,9 @@ def note_packet(packet, offset, mapped, stream, known, regs, end):
     put(packet, tb.P_BYTES, min(bits >> 3, mapped))
     put(packet, tb.P_END, min(end, mapped * 8))
     put(packet, tb.P_STREAM, stream)
-    put(packet, tb.P_INSTANCE, known_or(known, tb.R_INSTANCE, regs, np.int64(-1)))
-    put(packet, tb.P_BEGIN, known_or(known, tb.R_BEGIN, regs, np.int64(-1)))
-    put(packet, tb.P_LAST, known_or(known, tb.R_END, regs, np.int64(-1)))
-    put(packet, tb.P_SEQUENCE, known_or(known, tb.R_SEQUENCE, regs, np.int64(-1)))
-    put(packet, tb.P_DISCARDED, known_or(known, tb.R_DISCARDED, regs, np.int64(-1)))
-    put(packet, tb.P_CPU, known_or(known, tb.R_CPU, regs, np.int64(-1)))
+    for index in range(6):  # from INSTANCE to CPU, as their registers stand
+        number = known_or(known, tb.R_INSTANCE + index, regs, np.int64(-1))
+        put(packet, tb.P_INSTANCE + index, number)
     put(packet, tb.P_ERROR, np.int64(0))
 
 
@@ -67,9 +65,8 @@ def scan_packets(machine, regs, base, size, packets, room, reached, first, last)
         known = get(leading, tb.S_KNOWN)
         put(regs, tb.R_STREAM, get(leading, tb.S_ID))
         position = execute(
-            machine, get(leading, tb.S_HEADER), get(leading, tb.S_HEADER_STOP),
-            start, mapped, mapped * 8, np.int64(0), regs, np.int64(0),
-        )  # fmt: skip
+            machine, leading, tb.S_HEADER, start, mapped, mapped * 8, ZERO, regs, ZERO
+        )
         if position < 0:
             return np.int64(tb.BAD_HEADER)
         if known >> tb.R_MAGIC & 1 and get(regs, tb.R_MAGIC) != tb.MAGIC:
@@ -88,9 +85,8 @@ def scan_packets(machine, regs, base, size, packets, room, reached, first, last)
         if not afforded(state, get(row, tb.S_COST) + stream - first):
             return np.int64(tb.COSTLY)
         position = execute(
-            machine, get(row, tb.S_CONTEXT), get(row, tb.S_CONTEXT_STOP),
-            start, mapped, mapped * 8, position, regs, np.int64(0),
-        )  # fmt: skip
+            machine, row, tb.S_CONTEXT, start, mapped, mapped * 8, position, regs, ZERO
+        )
         if position < 0:
             return np.int64(tb.BAD_HEADER)
         known = get(row, tb.S_KNOWN)
@@ -111,16 +107,10 @@ def open_packet(machine, packet, base, size, regs):
     """Read a packet's header and context anew; returns the position of the first event."""
     stream = get(machine, tb.M_STREAMS) + get(packet, tb.P_STREAM) * tb.S_ROW
     at, end = get(packet, tb.P_BYTE), get(packet, tb.P_END)
-    position = execute(
-        machine, get(stream, tb.S_HEADER), get(stream, tb.S_HEADER_STOP),
-        base + at, size - at, end, np.int64(0), regs, np.int64(0),
-    )  # fmt: skip
+    position = execute(machine, stream, tb.S_HEADER, base + at, size - at, end, ZERO, regs, ZERO)
     if position < 0:
         return position
-    return execute(
-        machine, get(stream, tb.S_CONTEXT), get(stream, tb.S_CONTEXT_STOP),
-        base + at, size - at, end, position, regs, np.int64(0),
-    )  # fmt: skip
+    return execute(machine, stream, tb.S_CONTEXT, base + at, size - at, end, position, regs, ZERO)
 
 
 @compiled(inline=True)
@@ -147,10 +137,7 @@ def event_class(machine, stream, identifier):
 def read_other_header(machine, stream, start, mapped, end, position, regs):
     """`read_header` for every form of header, by its operations."""
     put(regs, tb.R_ID, get(stream, tb.S_DEFAULT))
-    after = execute(
-        machine, get(stream, tb.S_EVENT), get(stream, tb.S_EVENT_STOP),
-        start, mapped, end, position, regs, np.int64(0),
-    )  # fmt: skip
+    after = execute(machine, stream, tb.S_EVENT, start, mapped, end, position, regs, ZERO)
     if after < 0:
         return after, np.int64(-1)
     event = event_class(machine, stream, get(regs, tb.R_ID))
@@ -185,10 +172,7 @@ def step_over(machine, row, start, mapped, end, position, regs):
     if align != 0:
         position = ((position + align - 1) & -align) + get(row, tb.E_SIZE)
         return position if position <= end else np.int64(-1)
-    return execute(
-        machine, get(row, tb.E_WALK), get(row, tb.E_WALK_STOP),
-        start, mapped, end, position, regs, np.int64(0),
-    )  # fmt: skip
+    return execute(machine, row, tb.E_WALK, start, mapped, end, position, regs, ZERO)
 
 
 @compiled()
@@ -355,10 +339,9 @@ def write_apart(machine, event, file, cursor, packets, regs, row):
     packet = packets + get(cursor, tb.C_PACKET) * tb.P_ROW
     at = get(packet, tb.P_BYTE)
     put(state, tb.X_CLOCK, get(cursor, tb.C_CLOCK))
-    position = execute(
-        machine, get(event, tb.E_FILL), get(event, tb.E_FILL_STOP), get(file, tb.F_BASE) + at,
-        get(file, tb.F_SIZE) - at, get(packet, tb.P_END), get(cursor, tb.C_POSITION), regs, row,
-    )  # fmt: skip
+    base, size, end = get(file, tb.F_BASE), get(file, tb.F_SIZE), get(packet, tb.P_END)
+    position = get(cursor, tb.C_POSITION)
+    position = execute(machine, event, tb.E_FILL, base + at, size - at, end, position, regs, row)
     if position < 0:
         if levels > 1:
             copy_numbers(counters, get(machine, tb.M_SAVED), levels)

@@ -1,44 +1,56 @@
-"""Counting events and reading them into data frames."""
+"""Counting events and reading them into data frames.
+
+Pass 1 (`_File.walk`) steps over every event of every stream, counts, and finds where each span of
+time begins in each file. Pass 2 (`_fill`) merges the streams of one span by time and writes the
+wanted events straight to their rows. Spans are independent and run on several threads; with many
+of them only a part of a large trace is in memory at once.
+"""
 
 # ruff: noqa: PLR0917 - the parts of one pass
 
+import os
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from chainshaper.sources.ctf import tables as tb
-from chainshaper.sources.ctf.assembly import Assembly, Table, Wanted, assemble, attach
-from chainshaper.sources.ctf.decode import (
-    LARGE_BYTES,
-    CtfStream,
-    MappedFile,
-    Stream,
-    Walk,
-    default_threads,
-    fill,
-    span_borders,
-    walk,
+from chainshaper.sources.ctf import layout as tb
+from chainshaper.sources.ctf.layout import Layout, Table, Wanted, lay_out
+from chainshaper.sources.ctf.trace import CtfStream, CtfTrace, MappedFile, Scratch
+from chainshaper.sources.ctf.tsdl import (
+    ArrayType,
+    CtfError,
+    StringType,
+    StructType,
+    Type,
+    VariantType,
+    field_name,
+    is_text,
 )
-from chainshaper.sources.ctf.program import (
-    ListShape,
-    OptionShape,
-    RecordShape,
-    ScalarShape,
-    Shape,
-    Storage,
-    TextShape,
-)
-from chainshaper.sources.ctf.trace import CtfTrace
+from chainshaper.values.compiled import kernel
 
 __all__ = ["Events", "count_events", "read_events"]
 
+_walk_events = kernel("chainshaper.sources.ctf.kernels", "walk_events")
+_fill_columns = kernel("chainshaper.sources.ctf.kernels", "fill_columns")
+_CHUNK_BYTES = 128 << 20
+_SMALL_BYTES = 4 << 20
+_LARGE_BYTES = 512 << 20
 _HUGE_PAGE = 2 << 20
-_NULL_COLUMNS = {"cpu": pl.Int32, "pid": pl.Int32, "tid": pl.Int32}
+_MOST_WARNINGS = 20
+_FAILURES = {
+    tb.TRUNCATED: "an event reaches past the end of its packet's content",
+    tb.NO_OPTION: "a variant's tag names none of its options",
+    tb.BAD_LENGTH: "an array or sequence is longer than the rest of its packet",
+    tb.UNTERMINATED: "a string does not end within its packet",
+    tb.UNKNOWN_EVENT: "an event id that the metadata does not declare",
+    tb.OVER_BUDGET: "its fields, most of them of no bits, would take far more memory than its size"
+    f" warrants ({tb.BUDGET} times)",
+    tb.FULL_TABLE: "more events than were counted",
+}
 _Progress = Callable[[float], None]
 
 
@@ -59,10 +71,8 @@ def count_events(trace: CtfTrace, threads: int | None = None) -> dict[str, int]:
 
     Raises `CtfError` where a file is gone.
     """
-    assembly = assemble(trace.folders, Wanted())
-    with _mapped(trace.streams) as streams:
-        walks = _walks(streams, assembly, np.zeros(0, np.int64), threads)
-    return _counts(trace, assembly, walks)
+    layout = lay_out(trace.folders, Wanted())
+    return _counts(trace, layout, _walked(trace.streams, layout, np.zeros(0, np.int64), threads))
 
 
 def read_events(
@@ -97,80 +107,227 @@ def read_events(
     Raises `CtfError` where a file is gone or changes while it is read.
     """
     asked = frozenset(trace.event_names if names is None else names)
-    assembly = assemble(trace.folders, Wanted(asked, frozenset(nameless), context))
-    rows = {event.stream for event in assembly.events if event.table >= 0}
+    layout = lay_out(trace.folders, Wanted(asked, frozenset(nameless), context))
+    rows = {event.stream for event in layout.events if event.table is not None}
     used = [s for s in trace.streams if not rows.isdisjoint(s.table[:, tb.P_STREAM].tolist())]
-    borders = span_borders(used, threads or default_threads())
-    with _mapped(used) as streams:
-        walks = _walks(streams, assembly, borders, threads, lambda share: progress(share / 3))
-        total = sum((w.reached[-1] for w in walks), np.zeros(max(assembly.counters, 1), np.int64))
-        storage = [_allocate(assembly, number, total) for number in range(len(assembly.tables))]
-        texts = _fill(
-            streams, walks, assembly, storage, threads, lambda share: progress((1 + 2 * share) / 3)
-        )
-    unsorted = not all(w.sorted for w in walks)
-    events = Events(_frames(assembly, storage, texts, unsorted))
-    events.warnings = tuple(w for found in walks for w in found.warnings)
-    events.counts = _counts(trace, assembly, walks)
+    borders = _span_borders(used, layout, threads or _cores())
+    files = _walked(used, layout, borders, threads, lambda share: progress(share / 3))
+    total = sum((file.reached[-1] for file in files), np.zeros(max(layout.counters, 1), np.int64))
+    columns = [_Columns(layout, table, total) for table in layout.tables]
+    texts = _filled(
+        files, layout, len(borders) + 1, columns, threads, lambda n: progress((1 + 2 * n) / 3)
+    )
+    unsorted = any(file.unsorted for file in files)
+    events = Events(_frames(columns, texts, unsorted))
+    events.warnings = tuple(warning for file in files for warning in file.warnings())
+    events.counts = _counts(trace, layout, files)
     read_paths = {stream.path for stream in used}
     events.unread = tuple(s for s in trace.streams if s.path not in read_paths)
     return events
 
 
-def _counts(trace: CtfTrace, assembly: Assembly, walks: list[Walk]) -> dict[str, int]:
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+
+
+# Pass 1
+
+
+class _File:
+    """A stream file that is being read, and what pass 1 finds in it.
+
+    ``counts`` per event class; ``marks`` (spans - 1, 3) where each span but the first begins:
+    packet, bit position, clock; ``reached`` (spans + 1, counters) the rows before each span and
+    before the end; ``unsorted`` whether time went back.
+    """
+
+    def __init__(self, stream: CtfStream) -> None:
+        self.path = stream.path
+        self.packets = stream.table.copy()
+        self.map = MappedFile(stream.path)
+        self.counts: NDArray[np.int64] = np.zeros(0, np.int64)
+        self.marks = self.reached = np.zeros((0, 0), np.int64)
+        self.unsorted = False
+
+    def walk(self, layout: Layout, borders: NDArray[np.int64], lean: bool) -> None:
+        """Step over all events, and shorten packets to what can be read.
+
+        ``lean`` gives back the file's memory behind it.
+        """
+        scratch, packets = Scratch(layout), self.packets
+        self.counts = np.zeros(max(len(layout.events), 1), np.int64)
+        marks = np.zeros((len(borders) + 1, 3 + len(scratch.rows)), np.int64)
+        scratch.state[tb.X_LATEST] = -(1 << 62)
+        border = first = 0
+        while first < len(packets):
+            limit = packets[first, tb.P_BYTE] + _CHUNK_BYTES
+            last = max(int(np.searchsorted(packets[:, tb.P_BYTE], limit)), first + 1)
+            border = _walk_events(
+                scratch.address, scratch.registers.ctypes.data, self.map.address, self.map.size,
+                packets.ctypes.data, first, last, self.counts.ctypes.data, borders.ctypes.data,
+                border, len(borders), marks.ctypes.data,
+            )  # fmt: skip
+            if lean:
+                self.map.forget(packets[first:last])
+            first = last
+        marks[border:, 0], marks[border:, 1], marks[border:, 3:] = len(packets), -1, scratch.rows
+        self.marks = marks[:-1, :3]
+        self.reached = np.vstack([np.zeros_like(scratch.rows), marks[:, 3:]])
+        self.unsorted = bool(scratch.state[tb.X_UNSORTED])
+
+    def warnings(self) -> Iterator[str]:
+        """What cannot be read, packet by packet, the first ones of very many."""
+        damaged = self.packets[self.packets[:, tb.P_ERROR] < 0]
+        for packet in damaged[:_MOST_WARNINGS]:
+            place = int(packet[tb.P_BYTE] + (packet[tb.P_ERROR_AT] >> 3))
+            reason, remedy = (
+                _FAILURES[int(packet[tb.P_ERROR])],
+                "the rest of this packet is not read",
+            )
+            yield str(CtfError(self.path, place, reason, remedy))
+        if len(damaged) > _MOST_WARNINGS:
+            yield f"{self.path}: {len(damaged) - _MOST_WARNINGS} more packets are like that"
+
+
+def _walked(
+    streams: Sequence[CtfStream],
+    layout: Layout,
+    borders: NDArray[np.int64],
+    threads: int | None,
+    progress: _Progress = lambda _: None,
+) -> list[_File]:
+    """Pass 1 over all streams."""
+    files, done = [_File(stream) for stream in streams], 0
+    size = sum(file.map.size for file in files)
+    # Read twice, a trace that fits into memory had better stay there in between.
+    lean = size > _LARGE_BYTES
+    with ThreadPoolExecutor(threads or _cores()) as pool:
+        steps = pool.map(lambda file: file.walk(layout, borders, lean), files)
+        for file, _ in zip(files, steps, strict=True):
+            done += file.map.size
+            progress(done / max(size, 1))
+    return files
+
+
+def _counts(trace: CtfTrace, layout: Layout, files: list[_File]) -> dict[str, int]:
     counts = dict.fromkeys(trace.event_names, 0)
-    for found in walks:
-        for event, number in zip(assembly.events, found.counts.tolist(), strict=False):
+    for file in files:
+        for event, number in zip(layout.events, file.counts.tolist(), strict=False):
             counts[event.name] += number
     return counts
 
 
-@contextmanager
-def _mapped(streams: Sequence[CtfStream]) -> Iterator[list[Stream]]:
-    opened: list[Stream] = []
-    try:
-        for stream in streams:
-            opened.append(Stream(stream.path, stream.table.copy(), MappedFile(stream.path)))
-        yield opened
-    finally:
-        for one in opened:
-            one.file.close()
+def _span_borders(streams: list[CtfStream], layout: Layout, threads: int) -> NDArray[np.int64]:
+    """Instants (ns) that cut the streams into spans of about equal size in bytes."""
+    table = np.concatenate(
+        [np.zeros((0, tb.PACKET_COLUMNS), np.int64), *(s.table for s in streams)]
+    )
+    total = int(table[:, tb.P_BYTES].sum())
+    spans = max(-(-total // _CHUNK_BYTES), threads) if total > _SMALL_BYTES else 1
+    rates = {layout.streams[row][tb.S_FREQUENCY] for row in np.unique(table[:, tb.P_STREAM])}
+    if spans <= 1 or rates != {tb.BILLION} or any(s.table[0, tb.P_BEGIN] < 0 for s in streams):
+        return np.zeros(0, np.int64)
+    table = table[np.argsort(table[:, tb.P_BEGIN], kind="stable")]
+    reached = np.cumsum(table[:, tb.P_BYTES])
+    places = np.searchsorted(reached, total * np.arange(1, spans) / spans)
+    return np.unique(table[np.minimum(places, len(table) - 1), tb.P_BEGIN])
 
 
-def _walks(
-    streams: list[Stream],
-    assembly: Assembly,
-    borders: NDArray[np.int64],
+# Pass 2
+
+
+def _filled(
+    files: list[_File],
+    layout: Layout,
+    spans: int,
+    columns: list["_Columns"],
     threads: int | None,
-    progress: _Progress = lambda _: None,
-) -> list[Walk]:
-    size = sum(stream.file.size for stream in streams)
-    # Read twice, a trace that fits into memory had better stay there in between.
-    lean = size > LARGE_BYTES
-    walks, done = [], 0
-    with ThreadPoolExecutor(threads or default_threads()) as pool:
-        found = pool.map(lambda stream: walk(stream, assembly, borders, lean), streams)
-        for stream, one in zip(streams, found, strict=True):
-            walks.append(one)
-            done += stream.file.size
-            progress(done / max(size, 1))
-    return walks
+    progress: _Progress,
+) -> list[str]:
+    """Pass 2 over all spans; returns the strings that text slots then hold codes of."""
+    if not files:
+        return []
+    packets = np.concatenate([file.packets for file in files])
+    codes: dict[bytes, int] = {}
+    with ThreadPoolExecutor(threads or _cores()) as pool:
+        found = pool.map(lambda span: _fill(span, files, packets, layout), range(spans))
+        for span, strings in enumerate(found):
+            own = [codes.setdefault(string, len(codes)) for string in strings]
+            if own != list(range(len(own))):
+                before, after = (sum(f.reached[end] for f in files) for end in (span, span + 1))
+                for table in columns:
+                    table.recode(before, after, np.array(own, np.uint32))
+            progress((span + 1) / spans)
+    return [string.decode(errors="backslashreplace") for string in codes]
 
 
-class _Arrays:
-    """The arrays of one table: time, cpu (or None) and its slots.
+def _fill(span: int, files: list[_File], packets: NDArray[np.int64], layout: Layout) -> list[bytes]:
+    """Pass 2 over one span; returns the strings that its text slots hold codes of.
+
+    ``packets`` are those of all ``files``, one behind the other. Raises `CtfError` where a
+    file changed since pass 1.
+    """
+    table, count = _span_files(span, files), len(files)
+    scratch = Scratch(layout, count)
+    scratch.rows[:] = sum(file.reached[span] for file in files)
+    scratch.caps[:] = sum(file.reached[span + 1] for file in files)
+    cursors = np.zeros((count, tb.CURSOR_COLUMNS), np.int64)
+    ahead = np.zeros((count * tb.AHEAD, tb.AHEAD_COLUMNS), np.int64)
+    leaves = 1 << (count - 1).bit_length()
+    tree = np.full((2 * leaves, 2), tb.NEVER, np.int64)
+    tree[0] = 0
+    status = tb.FULL_DICTIONARY
+    while status == tb.FULL_DICTIONARY:
+        status = _fill_columns(
+            scratch.address, table.ctypes.data, count, cursors.ctypes.data, ahead.ctypes.data,
+            tree.ctypes.data, leaves, packets.ctypes.data, scratch.registers.ctypes.data,
+            layout.registers, len(layout.events),
+        )  # fmt: skip
+        if status == tb.FULL_DICTIONARY:
+            scratch.grow()
+    if status < 0:
+        reason = f"{_FAILURES[status]}: the files changed while they were read"
+        raise CtfError(files[0].path.parent, None, reason, "stop the recording first")
+    strings = scratch.strings()
+    for file, (first, last) in zip(files, table[:, [tb.F_PACKET, tb.F_LAST_PACKET]], strict=True):
+        if first < last:  # this span was the last to read these
+            file.map.forget(packets[first:last])
+    return strings
+
+
+def _span_files(span: int, files: list[_File]) -> NDArray[np.int64]:
+    """The kernels' table of files for one span."""
+    table = np.zeros((len(files), tb.FILE_COLUMNS), np.int64)
+    first = 0
+    for row, file in zip(table, files, strict=True):
+        begin, end = (0, -1, 0), (len(file.packets), -1, 0)
+        if span:
+            begin = file.marks[span - 1]
+        if span < len(file.marks):
+            end = file.marks[span]
+        row[tb.F_BASE], row[tb.F_SIZE] = file.map.address, file.map.size
+        row[tb.F_PACKET], row[tb.F_POSITION], row[tb.F_CLOCK] = first + begin[0], *begin[1:]
+        row[tb.F_LAST_PACKET], row[tb.F_LAST_POSITION] = first + end[0], end[1]
+        first += len(file.packets)
+    return table
+
+
+# Columns
+
+
+class _Columns:
+    """The arrays of one table: time, cpu (or None) and its slots; ``rows`` of each level.
 
     They are parts of one piece of memory, large enough for huge pages: at millions of rows a
     second, the kernel's page faults would else be a third of all work.
     """
 
-    def __init__(self, table: Table, total: NDArray[np.int64]) -> None:
-        self.rows = [int(n) for n in total[table.counter : table.counter + table.levels]]
-        wanted: list[tuple[int, np.dtype[Any]]] = [
-            (self.rows[0], np.dtype("i8")),
-            (self.rows[0] * table.has_cpu, np.dtype("i4")),
-        ]
-        wanted += [(self.rows[slot.level], np.dtype(slot.dtype)) for slot in table.slots]
+    def __init__(self, layout: Layout, table: Table, total: NDArray[np.int64]) -> None:
+        self.table = table
+        self.rows: list[int] = total[table.counter : table.counter + table.levels].tolist()
+        wanted: list[tuple[int, np.dtype[Any]]] = [(self.rows[0], np.dtype("i8"))]
+        wanted.append((self.rows[0] * table.has_cpu, np.dtype("i4")))
+        wanted += [(self.rows[slot.level], slot.dtype) for slot in table.slots]
         # Columns side by side must not begin alike in their pages, or they would compete for
         # the same few lines of the processor's cache.
         sizes = [-(-rows * kind.itemsize // 4096) * 4096 + 320 for rows, kind in wanted]
@@ -180,12 +337,74 @@ class _Arrays:
         for (rows, kind), size in zip(wanted, sizes, strict=True):
             arrays.append(memory[start : start + rows * kind.itemsize].view(kind))
             start += size
-        self.time = arrays[0]
-        self.cpu = arrays[1] if table.has_cpu else None
-        self.slots = arrays[2:]
+        self.time, self.cpu, *self.slots = arrays
         for slot, array in zip(table.slots, self.slots, strict=True):
             if slot.sparse:
                 array[:] = 0
+        cpu = self.cpu.ctypes.data if table.has_cpu else 0
+        slots = [(array.ctypes.data, array.itemsize) for array in self.slots]
+        layout.attach(table, self.time.ctypes.data, cpu, slots)
+
+    def recode(
+        self, before: NDArray[np.int64], after: NDArray[np.int64], codes: NDArray[np.uint32]
+    ) -> None:
+        """Replace one span's own codes of strings by those of the whole."""
+        for slot, array in zip(self.table.slots, self.slots, strict=True):
+            if slot.kind == tb.TEXT_CODES:
+                counter = self.table.counter + slot.level
+                part = array[before[counter] : after[counter]]
+                part[:] = codes[part]
+
+    def frame(self, strings: pl.Series, categories: pl.Series) -> pl.DataFrame:
+        """The table's frame; texts are codes of ``strings``, procnames of ``categories``."""
+        self._slots, self._levels = iter(self.slots), iter(self.rows[1:])
+        rows = self.rows[0]
+        found = {"time": pl.Series("time", self.time)}
+        if self.table.has_cpu:
+            found["cpu"] = pl.Series("cpu", self.cpu)
+        for name, kind in self.table.columns:
+            texts = categories if name == "procname" else strings
+            column = self._column(name, kind, rows, texts)
+            if column is not None:
+                found[name] = column
+        for name in ("cpu", "pid", "tid"):
+            if name not in found:
+                found[name] = pl.Series(name, [None], pl.Int32).new_from_index(0, rows)
+        leading = [n for n in ("time", "cpu", "pid", "tid", "procname") if n in found]
+        return pl.DataFrame([found[n] for n in dict.fromkeys([*leading, *found])])
+
+    def _column(self, name: str, kind: Type, rows: int, texts: pl.Series) -> pl.Series | None:
+        """One column, from the next slots and levels; None for a structure without fields.
+
+        Numbers keep their type; arrays become Polars arrays, sequences lists, structures and
+        variants structs, an absent option null.
+        """
+        match kind:
+            case StringType() | ArrayType() if is_text(kind):
+                return texts.gather(pl.Series(next(self._slots))).alias(name)
+            case ArrayType(element, count):
+                whole = isinstance(count, int)
+                lengths = np.zeros(rows, np.uint32) if whole else next(self._slots)
+                values = self._column(name, element, next(self._levels), texts)
+                if values is None or not count or isinstance(count, str):
+                    return None if values is None else _ragged(values, lengths)
+                deeper = values.dtype.shape if isinstance(values.dtype, pl.Array) else ()
+                return values.reshape((rows, count, *deeper))
+            case StructType(fields):
+                found = [self._column(field_name(f.name), f.type, rows, texts) for f in fields]
+                columns = [column for column in found if column is not None]
+                return _struct(name, columns) if columns else None
+            case VariantType(_, options):
+                chosen, parts = pl.Series(next(self._slots)), []
+                for number, option in enumerate(options, start=1):
+                    values = self._column(field_name(option.name), option.type, rows, texts)
+                    if values is not None:
+                        present = pl.when(pl.Series(chosen == number)).then(pl.lit(values))
+                        alone = present.otherwise(None).alias(values.name)
+                        parts.append(pl.select(alone).to_series())
+                nothing = pl.Series(name, [None], pl.Null).new_from_index(0, rows)
+                return _struct(name, parts) if parts else nothing
+        return pl.Series(name, next(self._slots))
 
 
 def _memory(size: int) -> NDArray[np.uint8]:
@@ -201,80 +420,14 @@ def _memory(size: int) -> NDArray[np.uint8]:
     return memory[first : first + size]
 
 
-def _allocate(assembly: Assembly, number: int, total: NDArray[np.int64]) -> _Arrays:
-    table = assembly.tables[number]
-    arrays = _Arrays(table, total)
-    storage = Storage(
-        table.counter,
-        addresses=[a.ctypes.data for a in arrays.slots],
-        widths=[a.itemsize for a in arrays.slots],
-    )
-    cpu = arrays.cpu.ctypes.data if arrays.cpu is not None else 0
-    attach(assembly, number, storage, arrays.time.ctypes.data, cpu)
-    return arrays
-
-
-def _fill(
-    streams: list[Stream],
-    walks: list[Walk],
-    assembly: Assembly,
-    storage: list[_Arrays],
-    threads: int | None,
-    progress: _Progress,
-) -> list[str]:
-    """Pass 2 over all spans; returns the strings that text slots then hold codes of."""
-    if not streams:
-        return []
-    packets = np.concatenate([stream.packets for stream in streams])
-    spans = len(walks[0].reached) - 1
-    codes: dict[bytes, int] = {}
-    with ThreadPoolExecutor(threads or default_threads()) as pool:
-        found = pool.map(lambda s: fill(s, streams, walks, packets, assembly), range(spans))
-        for span, strings in enumerate(found):
-            own = [codes.setdefault(string, len(codes)) for string in strings]
-            if own != list(range(len(own))):
-                _recode(span, walks, assembly, storage, np.array(own, np.uint32))
-            progress((span + 1) / spans)
-    return [string.decode(errors="backslashreplace") for string in codes]
-
-
-def _recode(
-    span: int,
-    walks: list[Walk],
-    assembly: Assembly,
-    storage: list[_Arrays],
-    codes: NDArray[np.uint32],
-) -> None:
-    """Replace one span's own codes of strings by those of the whole."""
-    before, after = (sum(w.reached[border] for w in walks) for border in (span, span + 1))
-    for table, arrays in zip(assembly.tables, storage, strict=True):
-        for place in (place for _, shape in table.columns for place in _text_slots(shape)):
-            counter = table.counter + table.slots[place].level
-            part = arrays.slots[place][before[counter] : after[counter]]
-            part[:] = codes[part]
-
-
-def _text_slots(shape: Shape | None) -> Iterator[int]:
-    match shape:
-        case TextShape(slot=slot):
-            yield slot
-        case ListShape(element=element):
-            yield from _text_slots(element)
-        case RecordShape(fields=parts) | OptionShape(options=parts):
-            for _, part in parts:
-                yield from _text_slots(part)
-
-
-def _frames(
-    assembly: Assembly, storage: list[_Arrays], texts: list[str], unsorted: bool
-) -> dict[str, pl.DataFrame]:
+def _frames(columns: list[_Columns], texts: list[str], unsorted: bool) -> dict[str, pl.DataFrame]:
     strings = pl.Series("", texts or [""], dtype=pl.String)
     categories = strings.cast(pl.Categorical)
     parts: dict[str, list[pl.DataFrame]] = {}
-    for table in assembly.tables:
+    while columns:
         # Arrays are let go one table at a time: Polars has copies of its own.
-        frame = _frame(table, storage.pop(0), strings, categories)
-        parts.setdefault(table.name, []).append(frame)
+        table = columns.pop(0)
+        parts.setdefault(table.table.name, []).append(table.frame(strings, categories))
     frames: dict[str, pl.DataFrame] = {}
     for name in sorted(parts):
         frame = pl.concat(parts[name], how="diagonal_relaxed", rechunk=True)
@@ -284,75 +437,14 @@ def _frames(
     return frames
 
 
-def _frame(
-    table: Table, arrays: _Arrays, strings: pl.Series, categories: pl.Series
-) -> pl.DataFrame:
-    rows = arrays.rows
-    found = {"time": pl.Series("time", arrays.time)}
-    if arrays.cpu is not None:
-        found["cpu"] = pl.Series("cpu", arrays.cpu)
-    for name, shape in table.columns:
-        texts = categories if name == "procname" else strings
-        found[name] = _column(name, shape, arrays.slots, rows, texts)
-    for name, kind in _NULL_COLUMNS.items():
-        if name not in found:
-            found[name] = pl.Series(name, [None], dtype=kind).new_from_index(0, rows[0])
-    leading = ["time", "cpu", "pid", "tid", *(["procname"] if "procname" in found else [])]
-    return pl.DataFrame([found[n] for n in leading + [n for n in found if n not in leading]])
-
-
-def _column(
-    name: str,
-    shape: Shape,
-    slots: Sequence[NDArray[Any]],
-    rows: Sequence[int],
-    texts: pl.Series,
-    level: int = 0,
-) -> pl.Series:
-    """One column of a table.
-
-    ``slots`` are the table's arrays, ``rows`` the rows of each level, ``texts`` the strings
-    that text slots hold codes of. Numbers keep their type; arrays become Polars arrays,
-    sequences lists, structures and variants structs, an absent option null.
-    """
-    match shape:
-        case ScalarShape(slot=slot):
-            return pl.Series(name, slots[slot])
-        case TextShape(slot=slot):
-            return texts.gather(pl.Series(slots[slot])).alias(name)
-        case ListShape(slot=slot, level=inner, count=count, element=element):
-            values = _column(name, element, slots, rows, texts, inner)
-            if slot < 0 and count > 0:
-                deeper = values.dtype.shape if isinstance(values.dtype, pl.Array) else ()
-                return values.reshape((rows[level], count, *deeper))
-            return _ragged(values, slots[slot] if slot >= 0 else np.zeros(rows[level], np.uint32))
-        case RecordShape(fields=fields):
-            parts = [_column(n, s, slots, rows, texts, level) for n, s in fields]
-        case OptionShape(slot=slot, options=options):
-            chosen = pl.Series(slots[slot])
-            parts = []
-            for number, (option, inside) in enumerate(options, start=1):
-                if inside is not None:
-                    values = _column(option, inside, slots, rows, texts, level)
-                    present = pl.when(pl.Series(chosen == number)).then(pl.lit(values))
-                    parts.append(pl.select(present.otherwise(None).alias(option)).to_series())
-            if not parts:
-                return pl.Series(name, [None] * rows[level], dtype=pl.Null)
-    return pl.DataFrame(_distinct(parts)).to_struct(name)
-
-
 def _ragged(values: pl.Series, lengths: NDArray[Any]) -> pl.Series:
     """``values`` cut into lists of the given lengths, in order."""
     full = np.flatnonzero(lengths)
     if not len(full):
         return pl.Series(values.name, [[]] * len(lengths), dtype=pl.List(values.dtype))
     owner = pl.Series("owner", np.repeat(full, lengths[full])).set_sorted()
-    lists = (
-        pl.DataFrame([owner, values.alias("value")])
-        .group_by("owner", maintain_order=True)
-        .agg("value")["value"]
-        .alias(values.name)
-    )
+    rows = pl.DataFrame([owner, values.alias("value")]).group_by("owner", maintain_order=True)
+    lists = rows.agg("value")["value"].alias(values.name)
     if len(full) == len(lengths):
         return lists
     # Rows without an element point at an empty list behind the others.
@@ -362,12 +454,12 @@ def _ragged(values: pl.Series, lengths: NDArray[Any]) -> pl.Series:
     return pl.concat([lists, empty]).gather(pl.Series(places))
 
 
-def _distinct(parts: list[pl.Series]) -> list[pl.Series]:
-    """Columns with a name each: ``_a`` and ``a`` of one structure are both shown as ``a``."""
+def _struct(name: str, parts: list[pl.Series]) -> pl.Series:
+    """A column of structures; ``_a`` and ``a`` of one structure would both be shown as ``a``."""
     found: dict[str, pl.Series] = {}
     for part in parts:
-        name = part.name
-        while name in found:
-            name = "_" + name
-        found[name] = part.alias(name)
-    return list(found.values())
+        own = part.name
+        while own in found:
+            own = "_" + own
+        found[own] = part.alias(own)
+    return pl.DataFrame(list(found.values())).to_struct(name)

@@ -1,29 +1,43 @@
-"""Opening CTF traces: metadata files, what was recorded where by which clock, what was lost."""
+"""Opening CTF traces: metadata files, packets, what was recorded by which clock, what was lost."""
 
+import ctypes
+import mmap
 import struct
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.sources.ctf import tables as tb
-from chainshaper.sources.ctf.assembly import Wanted, assemble
-from chainshaper.sources.ctf.decode import CtfStream, packet_table
-from chainshaper.sources.ctf.tsdl import TsdlError, parse_tsdl
-from chainshaper.sources.ctf.types import CtfError, CtfFolder, TraceClass
+from chainshaper.sources.ctf import layout as tb
+from chainshaper.sources.ctf.layout import Layout, Wanted, lay_out
+from chainshaper.sources.ctf.tsdl import CtfError, CtfFolder, TraceClass, TsdlError, parse_tsdl
+from chainshaper.values.compiled import kernel
 
-__all__ = ["METADATA_MAGIC", "CtfTrace", "open_trace", "read_metadata", "read_metadata_text"]
+__all__ = ["METADATA_MAGIC", "CtfStream", "CtfTrace", "open_trace", "read_metadata"]
 
-METADATA_MAGIC = 0x75D11D57
-_HEADER = "I16sIIIBBBBB"
-_LARGEST = 64 << 20
-_RECORD_SEPARATOR = b"\x1e"  # begins every fragment of CTF 2's JSON text sequence
+_scan_packets = kernel("chainshaper.sources.ctf.kernels", "scan_packets")
+_rehash = kernel("chainshaper.sources.ctf.interpreter", "rehash")
+_REASONS = {
+    tb.BAD_MAGIC: "packet does not begin with the CTF magic number",
+    tb.BAD_UUID: "packet belongs to another trace (uuid differs from the metadata's)",
+    tb.BAD_STREAM: "packet of a stream class that the metadata does not declare",
+    tb.BAD_SIZE: "packet with impossible content or packet size",
+    tb.BAD_HEADER: "packet header cut short",
+    tb.COSTLY: "packet headers that take far more work than their size warrants",
+    tb.CUT: "last packet cut short by the end of the file",
+}
 
-_Tables = list[tuple[Path, NDArray[np.int64]]]
-"""Stream files and their packets."""
+
+@dataclass(frozen=True)
+class CtfStream:
+    """One stream file of a folder (by number) and the table of its packets (see `layout`)."""
+
+    path: Path
+    folder: int
+    table: NDArray[np.int64] = field(repr=False, compare=False)
 
 
 @dataclass(frozen=True)
@@ -53,105 +67,70 @@ def open_trace(*paths: Path | str) -> CtfTrace:
     metadata cannot be understood; stream files with damage give ``warnings`` instead.
     """
     folders = [CtfFolder(path, read_metadata(path / "metadata")) for path in _find(paths)]
-    assembly = assemble(folders, Wanted())
-    rates = [row[tb.S_FREQUENCY] for row in assembly.stream_rows]
-    warnings = _clock_warnings(folders)
+    layout = lay_out(folders, Wanted())
+    first = folders[0].clock
+    warnings = [
+        f"{folder.path}: clock {folder.clock.name!r} is not the clock of {folders[0].path};"
+        " times of the two cannot be compared"
+        for folder in folders[1:]
+        if (folder.clock.name, folder.clock.uuid) != (first.name, first.uuid)
+    ]
     streams: list[CtfStream] = []
+    groups: dict[object, list[CtfStream]] = {}
     for number, folder in enumerate(folders):
-        tables: _Tables = []
-        for path in _stream_paths(folder.path):
-            table, found = packet_table(path, assembly, number)
-            warnings += found
+        for path in sorted(p for p in folder.path.iterdir() if p.is_file()):
+            if path.name == "metadata" or path.name.startswith("."):
+                continue
+            table, warning = _packet_table(path, layout, number)
+            warnings += warning
             if len(table):
-                tables.append((path, table))
-        streams += _streams(number, tables, rates, warnings)
-    names = {
-        e.name for f in folders for s in f.declared.streams.values() for e in s.events.values()
-    }
+                streams.append(CtfStream(path, number, table))
+                kind, instance = table[0, [tb.P_STREAM, tb.P_INSTANCE]].tolist()
+                name = path if instance < 0 else instance
+                groups.setdefault((kind, name), []).append(streams[-1])
+    losses = [_losses(group) for group in groups.values()]
+    for group, (discarded, lost) in zip(groups.values(), losses, strict=True):
+        if discarded:
+            warnings.append(
+                f"{group[0].path}: the tracer discarded {discarded} events of this stream"
+                " (record with more or larger sub-buffers)"
+            )
+        if lost:
+            warnings.append(
+                f"{group[0].path}: {lost} packets of this stream are missing"
+                " (overwritten, or not copied with the trace)"
+            )
+    classes = [s for folder in folders for s in folder.declared.streams.values()]
     return CtfTrace(
         folders=tuple(folders),
         streams=tuple(streams),
-        event_names=tuple(sorted(names)),
+        event_names=tuple(sorted({e.name for s in classes for e in s.events.values()})),
         env=folders[0].declared.env,
-        clock_offset_ns=folders[0].clock.offset_ns,
-        packets=sum(stream.packets for stream in streams),
-        discarded_events=sum(stream.discarded_events for stream in streams),
-        lost_packets=sum(stream.lost_packets for stream in streams),
+        clock_offset_ns=first.offset_ns,
+        packets=sum(len(stream.table) for stream in streams),
+        discarded_events=sum(discarded for discarded, _ in losses),
+        lost_packets=sum(lost for _, lost in losses),
         warnings=tuple(warnings),
     )
 
 
-def _find(paths: Iterable[Path | str]) -> list[Path]:
+def _find(paths: Iterable[Path | str]) -> Iterator[Path]:
     found: dict[Path, Path] = {}
     for path in map(Path, paths):
         if not path.exists():
             raise CtfError(path, None, "no such file or folder")
         here = sorted(p.parent for p in path.rglob("metadata") if p.is_file())
         if not here:
-            raise CtfError(
-                path, None, "no CTF trace: no file named metadata in it", "give a trace's folder"
-            )
+            reason = "no CTF trace: no file named metadata in it"
+            raise CtfError(path, None, reason, "give a trace's folder")
         for folder in here:
             found.setdefault(folder.resolve(), folder)
     if not found:
         raise CtfError(".", None, "no trace given")
-    return list(found.values())
+    return iter(found.values())
 
 
-def _stream_paths(folder: Path) -> list[Path]:
-    """The stream files of a trace folder: all plain files but ``metadata`` and hidden ones."""
-    return sorted(
-        path
-        for path in folder.iterdir()
-        if path.is_file() and path.name != "metadata" and not path.name.startswith(".")
-    )
-
-
-def _clock_warnings(folders: list[CtfFolder]) -> list[str]:
-    first = folders[0].clock
-    return [
-        f"{folder.path}: clock {folder.clock.name!r} is not the clock of {folders[0].path};"
-        " times of the two cannot be compared"
-        for folder in folders[1:]
-        if (folder.clock.name, folder.clock.uuid) != (first.name, first.uuid)
-    ]
-
-
-def _streams(
-    folder: int, tables: _Tables, rates: list[int], warnings: list[str]
-) -> list[CtfStream]:
-    """The streams of a folder's files, with what was lost counted per stream."""
-    groups: dict[Any, list[int]] = {}
-    for index, (path, table) in enumerate(tables):
-        stream, instance = table[0, [tb.P_STREAM, tb.P_INSTANCE]].tolist()
-        groups.setdefault((stream, path if instance < 0 else instance), []).append(index)
-    losses = {
-        group[0]: _count_losses([tables[i] for i in group], warnings) for group in groups.values()
-    }
-    found = []
-    for index, (path, table) in enumerate(tables):
-        stream, instance, begin = table[0, [tb.P_STREAM, tb.P_INSTANCE, tb.P_BEGIN]].tolist()
-        end, rate = int(table[-1, tb.P_LAST]), rates[stream]
-        discarded, lost = losses.get(index, (0, 0))
-        found.append(
-            CtfStream(
-                path=path,
-                folder=folder,
-                instance=None if instance < 0 else instance,
-                packets=len(table),
-                begin_ns=begin * tb.BILLION // rate if begin >= 0 else None,
-                end_ns=end * tb.BILLION // rate if end >= 0 else None,
-                discarded_events=discarded,
-                lost_packets=lost,
-                table=table,
-            )
-        )
-    return found
-
-
-def _count_losses(
-    files: Sequence[tuple[Path, NDArray[np.int64]]], warnings: list[str]
-) -> tuple[int, int]:
+def _losses(files: list[CtfStream]) -> tuple[int, int]:
     """Discarded events and lost packets of one stream (LTTng's packet context, section 5.2).
 
     ``events_discarded`` counts from the beginning of the stream (32-bit tracers' counters wrap).
@@ -159,7 +138,7 @@ def _count_losses(
     trace begins anywhere, and what was lost before it is not its own. A gap in
     ``packet_seq_num`` is that many packets lost.
     """
-    table = np.concatenate([table for _, table in files])
+    table = np.concatenate([file.table for file in files])
     # Files of one stream follow each other (tracefile rotation), not always by name.
     table = table[np.argsort(table[:, tb.P_BEGIN], kind="stable")]
     counter, sequence = table[:, tb.P_DISCARDED], table[:, tb.P_SEQUENCE]
@@ -167,19 +146,112 @@ def _count_losses(
     steps[steps < 0] += 1 << 32
     discarded = int(steps[steps > 0].sum()) if (counter >= 0).all() else 0
     gaps = np.diff(sequence) - 1
-    lost = int(gaps[gaps > 0].sum()) if (sequence >= 0).all() else 0
-    path = files[0][0]
-    if discarded:
-        warnings.append(
-            f"{path}: the tracer discarded {discarded} events of this stream"
-            " (record with more or larger sub-buffers)"
-        )
-    if lost:
-        warnings.append(
-            f"{path}: {lost} packets of this stream are missing"
-            " (overwritten, or not copied with the trace)"
-        )
-    return discarded, lost
+    return discarded, int(gaps[gaps > 0].sum()) if (sequence >= 0).all() else 0
+
+
+# Stream files and the kernels' memory
+
+
+class MappedFile:
+    """A file mapped for reading: ``address`` and ``size`` in bytes, valid as long as this lives."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            with path.open("rb") as file:
+                self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        except (OSError, ValueError) as error:
+            raise CtfError(path, None, f"cannot map the file: {error}") from error
+        self.address = int(np.frombuffer(self._map, np.uint8).ctypes.data)
+        self.size = len(self._map)
+
+    def forget(self, packets: NDArray[np.int64]) -> None:
+        """Give back the memory of packets in a row; the file's pages stay cached."""
+        first = -(-int(packets[0, tb.P_BYTE]) // mmap.PAGESIZE) * mmap.PAGESIZE
+        last = int(packets[-1, tb.P_BYTE] + packets[-1, tb.P_BYTES])
+        if last - first >= mmap.PAGESIZE and hasattr(mmap, "MADV_DONTNEED"):
+            self._map.madvise(mmap.MADV_DONTNEED, first, last - first)
+
+
+class Scratch:
+    """The tables that kernels work with in one thread.
+
+    ``address`` is that of the table of addresses (see `layout`), valid as long as this lives.
+    """
+
+    def __init__(self, layout: Layout, files: int = 1) -> None:
+        counters = max(layout.counters, 1)
+        self.state = np.zeros(tb.STATE_WORDS, np.int64)
+        self.state[tb.X_BUDGET] = 1 << 62
+        self.rows = np.zeros(counters, np.int64)
+        self.caps = np.full(counters, 1 << 62, np.int64)
+        self.registers = np.zeros((files, layout.registers), np.int64)
+        self._tables = {
+            **layout.arrays(),
+            tb.M_STATE: self.state,
+            tb.M_ROWS: self.rows,
+            tb.M_CAPS: self.caps,
+            tb.M_SAVED: np.zeros(counters, np.int64),
+            tb.M_BATCHES: np.zeros((len(layout.events), 1 + 2 * tb.BATCH), np.int64),
+        }
+        self._words = np.zeros(tb.MACHINE_WORDS, np.int64)
+        for word, table in self._tables.items():
+            self._words[word] = table.ctypes.data
+        self._words[tb.M_COUNTERS] = counters
+        self.address = int(self._words.ctypes.data)
+        self.entries = np.zeros((0, 4), np.int64)
+        self.grow()
+
+    def strings(self) -> list[bytes]:
+        """The strings in the dictionary, by code."""
+        entries = self.entries[: self.state[tb.X_STRINGS]].tolist()
+        return [ctypes.string_at(address, length) for address, length, _, _ in entries]
+
+    def grow(self) -> None:
+        """Give the dictionary four times its places."""
+        room = max(512, 4 * len(self.entries))
+        self.entries = np.concatenate([self.entries, np.zeros((room - len(self.entries), 4), "i8")])
+        # One place more than used: places are read eight bytes at a time.
+        self._slots = np.zeros(2 * room + 1, np.int32)
+        self._words[tb.M_SLOTS], self._words[tb.M_MASK] = self._slots.ctypes.data, 2 * room - 1
+        self._words[tb.M_ENTRIES], self._words[tb.M_ROOM] = self.entries.ctypes.data, room
+        if self.state[tb.X_STRINGS]:
+            _rehash(self.address, int(self.state[tb.X_STRINGS]))
+
+
+def _packet_table(path: Path, layout: Layout, folder: int) -> tuple[NDArray[np.int64], list[str]]:
+    """The packets of a stream file (see `layout`) and warnings about it.
+
+    Reading stops where a packet's header makes no sense, since nothing says where the next one
+    begins; of a packet that the end of the file cuts short, what is there counts.
+    """
+    packets = np.zeros((256, tb.PACKET_COLUMNS), np.int64)
+    if path.stat().st_size == 0:
+        return packets[:0], []
+    file, scratch = MappedFile(path), Scratch(layout)
+    scratch.state[tb.X_BUDGET] = tb.BUDGET * file.size
+    reached = np.zeros(2, np.int64)
+    status = tb.FULL
+    while status == tb.FULL:
+        status = _scan_packets(
+            scratch.address, scratch.registers.ctypes.data, file.address, file.size,
+            packets.ctypes.data, len(packets), reached.ctypes.data, *layout.folders[folder],
+        )  # fmt: skip
+        if status == tb.FULL:
+            packets = np.concatenate([packets, np.zeros_like(packets)])
+    offset, found = reached.tolist()
+    if status == tb.DONE:
+        return packets[:found].copy(), []
+    unread = f"the last {file.size - offset} bytes of the file are not read"
+    remedy = "events up to the cut are read" if status == tb.CUT else unread
+    return packets[:found].copy(), [str(CtfError(path, offset, _REASONS[status], remedy))]
+
+
+# The metadata file
+
+METADATA_MAGIC = 0x75D11D57
+_HEADER = "I16sIIIBBBBB"
+_LARGEST = 64 << 20
+_RECORD_SEPARATOR = b"\x1e"  # begins every fragment of CTF 2's JSON text sequence
 
 
 def read_metadata(path: Path) -> TraceClass:
@@ -210,12 +282,8 @@ def read_metadata_text(path: Path) -> tuple[str, list[tuple[int, int]]]:
     except OSError as error:
         raise CtfError(path, None, f"cannot read metadata: {error.strerror}") from error
     if data[:1] == _RECORD_SEPARATOR:
-        raise CtfError(
-            path,
-            0,
-            "CTF 2 metadata; CTF 1.8 is supported",
-            "LTTng 2.15 and later: record with `lttng create --trace-format=ctf-1.8`",
-        )
+        remedy = "LTTng 2.15 and later: record with `lttng create --trace-format=ctf-1.8`"
+        raise CtfError(path, 0, "CTF 2 metadata; CTF 1.8 is supported", remedy)
     pieces = [(0, 0)]
     for order in "<>":
         if data[:4] == struct.pack(order + "I", METADATA_MAGIC):
@@ -223,12 +291,8 @@ def read_metadata_text(path: Path) -> tuple[str, list[tuple[int, int]]]:
     try:
         return data.decode(), pieces
     except UnicodeDecodeError as error:
-        raise CtfError(
-            path,
-            _in_file(error.start, pieces),
-            "metadata is not UTF-8 text",
-            "is this a CTF 1.8 trace?",
-        ) from None
+        place, remedy = _in_file(error.start, pieces), "is this a CTF 1.8 trace?"
+        raise CtfError(path, place, "metadata is not UTF-8 text", remedy) from None
 
 
 def _in_file(position: int, pieces: list[tuple[int, int]]) -> int:
@@ -238,24 +302,23 @@ def _in_file(position: int, pieces: list[tuple[int, int]]) -> int:
 
 
 def _unpacked(path: Path, data: bytes, order: str) -> tuple[bytes, list[tuple[int, int]]]:
-    header_size = struct.calcsize(order + _HEADER)
+    header = struct.Struct(order + _HEADER)
     text, pieces, offset = bytearray(), [], 0
     while offset < len(data):
-        if offset + header_size > len(data):
+        if offset + header.size > len(data):
             raise CtfError(path, offset, "metadata packet header cut short", "file is truncated")
-        magic, _, _, content, size, compression, encryption, _, _, _ = struct.unpack_from(
-            order + _HEADER, data, offset
-        )
-        content_bytes, size_bytes = content // 8, size // 8
+        found: tuple[Any, ...] = header.unpack_from(data, offset)
+        magic, _, _, content, size, compression, encryption, *_ = found
+        begin, end = offset + header.size, offset + content // 8
         if magic != METADATA_MAGIC:
             raise CtfError(path, offset, f"metadata packet begins with 0x{magic:08X}")
         if compression or encryption:
             raise CtfError(path, offset, "compressed or encrypted metadata is not supported")
-        if not header_size <= content_bytes <= size_bytes:
+        if not begin <= end <= offset + size // 8:
             raise CtfError(path, offset, f"metadata packet of {content} content, {size} bits")
-        if offset + content_bytes > len(data):
+        if end > len(data):
             raise CtfError(path, offset, "metadata packet reaches past the end of the file")
-        pieces.append((len(text), offset + header_size))
-        text += data[offset + header_size : offset + content_bytes]
-        offset += size_bytes
+        pieces.append((len(text), begin))
+        text += data[begin:end]
+        offset += size // 8
     return bytes(text), pieces

@@ -1,7 +1,7 @@
-"""Reading TSDL, the language of a trace's metadata (CTF 1.8, sections 4 and 7, appendix C).
+"""What a trace's metadata says, from its text in TSDL (CTF 1.8, sections 4 and 7, appendix C).
 
-Text becomes tokens; `_Parser` walks them and understands types, aliases and declarators; `_Blocks`
-reads the blocks around them (``trace``, ``stream``, ``event``, …) into a `TraceClass`.
+Types and classes are immutable plain data. Names stay as TSDL writes them, with LTTng's leading
+underscore; `field_name` gives the name that users see. Sizes and alignments are in bits.
 """
 
 from __future__ import annotations
@@ -11,40 +11,194 @@ from collections import ChainMap, Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Literal, NamedTuple, NoReturn, TypeVar
 
-from chainshaper.sources.ctf.types import (
-    ArrayType,
-    ByteOrder,
-    Clock,
-    Encoding,
-    EnumMapping,
-    EnumType,
-    EventClass,
-    Field,
-    FloatType,
-    IntegerType,
-    SequenceType,
-    StreamClass,
-    StringType,
-    StructType,
-    TraceClass,
-    Type,
-    VariantType,
-    alignment,
-)
+from chainshaper.values.errors import InputError
+
+ByteOrder = Literal["native", "le", "be"]
 
 
-class Token(NamedTuple):
-    """A token, its text (strings unescaped) and its character offset in the metadata."""
+class CtfError(InputError):
+    """A trace that cannot be read: which file or folder, where in it (bytes), why, what to do."""
 
-    kind: Literal["word", "integer", "string", "mark", "end"]
-    text: str
-    offset: int
+    def __init__(self, path: Path | str, offset: int | None, reason: str, remedy: str = "") -> None:
+        self.path, self.offset, self.reason = Path(path), offset, reason
+        place = f"{path}" if offset is None else f"{path}, byte {offset}"
+        super().__init__(f"{place}: {reason}" + (f" ({remedy})" if remedy else ""))
 
 
 class TsdlError(ValueError):
     """Metadata that is no TSDL; ``args`` are the character offset and the reason."""
+
+
+class EnumMapping(NamedTuple):
+    """One label of an enumeration and the closed range of values that carry it."""
+
+    label: str
+    low: int
+    high: int
+
+
+@dataclass(frozen=True, slots=True)
+class IntegerType:
+    """``integer { … }`` (section 4.1.5), or ``enum`` (4.1.8) with ``mappings``, which may overlap.
+
+    ``clock`` is the name of the clock it is mapped to. Other labels make no other type: values
+    lie alike.
+    """
+
+    size: int
+    align: int
+    signed: bool = False
+    byte_order: ByteOrder = "native"
+    encoded: bool = False  # as UTF-8 or ASCII
+    clock: str | None = None
+    mappings: tuple[EnumMapping, ...] = field(default=(), compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class FloatType:
+    """``floating_point { … }`` (section 4.1.7), IEEE 754 of 32 or 64 bits."""
+
+    size: int
+    align: int
+    byte_order: ByteOrder = "native"
+
+
+@dataclass(frozen=True, slots=True)
+class StringType:
+    """``string`` (section 4.2.5): bytes up to and including the first NUL."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayType:
+    """``T name[length]`` (section 4.2.3); of a sequence (4.2.4) the path as written, ``a.b.c``."""
+
+    element: Type
+    length: int | str
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A named member of a structure or option of a variant."""
+
+    name: str
+    type: Type
+
+
+@dataclass(frozen=True, slots=True)
+class StructType:
+    """``struct { … } align(n)`` (section 4.2.1); ``align`` is at least ``n`` and each field's."""
+
+    fields: tuple[Field, ...] = ()
+    align: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class VariantType:
+    """``variant <tag> { … }`` (section 4.2.2); ``tag`` is the path as written or ``None``."""
+
+    tag: str | None
+    options: tuple[Field, ...]
+
+
+Type = IntegerType | FloatType | StringType | ArrayType | StructType | VariantType
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """``clock { … }`` (section 8): ``frequency`` in Hz, ``offset_ns`` from the Epoch, exact."""
+
+    name: str
+    frequency: int = 1_000_000_000
+    offset_ns: int = 0
+    uuid: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class EventClass:
+    """``event { … }`` (section 7.2)."""
+
+    id: int
+    name: str
+    context: StructType | None = None
+    fields: StructType | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StreamClass:
+    """``stream { … }`` (section 7.2) with its event classes by id."""
+
+    id: int
+    packet_context: StructType | None = None
+    event_header: StructType | None = None
+    event_context: StructType | None = None
+    events: Mapping[int, EventClass] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class TraceClass:
+    """Everything one ``metadata`` file declares.
+
+    ``referenced`` are the names of the fields that lengths and tags refer to.
+    """
+
+    byte_order: Literal["le", "be"]
+    uuid: str | None
+    packet_header: StructType | None
+    env: Mapping[str, str | int]
+    clocks: Mapping[str, Clock]
+    streams: Mapping[int, StreamClass]
+    referenced: frozenset[str]
+
+
+@dataclass(frozen=True)
+class CtfFolder:
+    """A folder with a ``metadata`` file: what it declares, and its clock (1 GHz without one)."""
+
+    path: Path
+    declared: TraceClass = field(repr=False)
+
+    @property
+    def clock(self) -> Clock:
+        return next(iter(self.declared.clocks.values()), Clock("none"))
+
+
+def field_name(name: str) -> str:
+    """The name users see: TSDL's without one leading underscore, as babeltrace2 shows it."""
+    return name[1:] if name.startswith("_") and len(name) > 1 else name
+
+
+def alignment(kind: Type) -> int:
+    """The alignment of a type in bits (section 4.1.2, 4.2); a variant has none of its own."""
+    match kind:
+        case ArrayType(element):
+            return alignment(element)
+        case StringType():
+            return 8
+        case VariantType():
+            return 1
+    return kind.align
+
+
+def is_text(kind: Type) -> bool:
+    """Whether values are texts: a string, or an array of encoded bytes."""
+    match kind:
+        case StringType() | ArrayType(IntegerType(8, 8, encoded=True)):
+            return True
+    return False
+
+
+# Tokens
+
+
+class Token(NamedTuple):
+    """A word, integer, string or mark, its text (strings unescaped) and its character offset."""
+
+    kind: str
+    text: str
+    offset: int
 
 
 _TOKEN = re.compile(
@@ -55,163 +209,142 @@ _TOKEN = re.compile(
   | (?P<integer>0[xX][0-9a-fA-F]+[uUlL]*|0[bB][01]+|[0-9]+[uUlL]*)
   | (?P<word>[A-Za-z_][A-Za-z0-9_]*)
   | (?P<mark>\.\.\.|:=|->|[{}()\[\]<>;,:=.*+-])
+  | (?P<wrong>.)
     """,
     re.VERBOSE | re.DOTALL,
 )
-_NANOSECONDS = 1_000_000_000
-_MOST = 4_000_000
+_MOST_TOKENS = 4_000_000
 """Tokens that fit into memory; a kernel trace with all its events has some 100,000."""
-_ESCAPE = re.compile(r"\\(x[0-9a-fA-F]{1,2}|[0-7]{1,3}|.)", re.DOTALL)
+_ESCAPE = re.compile(r"\\(?:x([0-9a-fA-F]{1,2})|([0-7]{1,3})|(.))", re.DOTALL)
 _ESCAPES = {"n": "\n", "t": "\t", "r": "\r", "a": "\a", "b": "\b", "f": "\f", "v": "\v"}
 
 
 def _tokens(text: str) -> list[Token]:
-    """The tokens of ``text`` without white space and comments, closed by one of kind ``end``.
-
-    Raises `TsdlError` at the first character that begins no token.
-    """
+    """The tokens of ``text`` without white space and comments, closed by one of kind ``end``."""
     tokens: list[Token] = []
-    position = 0
-    while position < len(text):
-        if len(tokens) > _MOST:
-            raise TsdlError(position, f"more than {_MOST} tokens")
-        matched = _TOKEN.match(text, position)
-        if matched is None:
-            rest = text[position : position + 2]
-            reason = "unterminated comment" if rest == "/*" else "unterminated string"
-            if rest != "/*" and rest[0] not in "\"'":
-                reason = f"unexpected character {rest[0]!r}"
-            raise TsdlError(position, reason)
-        kind, found = matched.lastgroup, matched.group()
-        match kind:
-            case "string":
-                tokens.append(Token(kind, _unescape(found[found.index('"') + 1 : -1]), position))
-            case "character":
-                tokens.append(Token("integer", str(ord(_unescape(found[1:-1])[:1])), position))
-            case "integer":
-                if len(found) > 80:
-                    raise TsdlError(position, "integer out of range")
-                tokens.append(Token(kind, str(_integer_of(found)), position))
-            case "word" | "mark":
-                tokens.append(Token(kind, found, position))
-        position = matched.end()
-    return [*tokens, Token("end", "", position)]
-
-
-def _integer_of(text: str) -> int:
-    digits = text.rstrip("uUlL") if text[:2].lower() != "0b" else text
-    if re.fullmatch("0[0-9]+", digits):
-        return int(digits, 10 if set(digits) & {"8", "9"} else 8)
-    return int(digits, 0)
+    for match in _TOKEN.finditer(text):
+        kind, found, offset = str(match.lastgroup), match.group(), match.start()
+        if kind == "space":
+            continue
+        if len(tokens) > _MOST_TOKENS:
+            raise TsdlError(offset, f"more than {_MOST_TOKENS} tokens")
+        if kind == "wrong":
+            reason = f"unexpected character {found!r}"
+            if found in "\"'":
+                reason = "unterminated string"
+            elif text.startswith("/*", offset):
+                reason = "unterminated comment"
+            raise TsdlError(offset, reason)
+        if kind == "string":
+            found = _unescape(found[found.index('"') + 1 : -1])
+        elif kind == "character":
+            kind, found = "integer", str(ord(_unescape(found[1:-1])[:1]))
+        elif kind == "integer":
+            if len(found) > 80:
+                raise TsdlError(offset, "integer out of range")
+            digits = found.rstrip("uUlL")
+            octal = digits[0] == "0" and re.fullmatch("0[0-7]+", digits)
+            found = str(int(digits, 8 if octal else 10 if digits.isdecimal() else 0))
+        tokens.append(Token(kind, found, offset))
+    return [*tokens, Token("end", "", len(text))]
 
 
 def _unescape(text: str) -> str:
     def value(match: re.Match[str]) -> str:
-        code = match.group(1)
-        if code[0] == "x" and len(code) > 1:
-            return chr(int(code[1:], 16))
-        if code[0] in "01234567":
-            return chr(int(code, 8) & 0xFF)
-        return _ESCAPES.get(code, code)
+        hexadecimal, octal, other = match.groups()
+        if other is not None:
+            return _ESCAPES.get(other, other)
+        return chr(int(hexadecimal, 16) if hexadecimal else int(octal, 8) & 0xFF)
 
     return _ESCAPE.sub(value, text) if "\\" in text else text
 
 
-Value = int | str
-Attributes = dict[str, tuple[Value, int]]
-"""Name → value and its character offset."""
+# Attributes of blocks and basic types
 
+Attributes = dict[str, tuple[int | str | Type, int]]
+"""Name → value and its character offset."""
 _T = TypeVar("_T")
-_BYTE_ORDERS: dict[Value, ByteOrder] = {"le": "le", "be": "be", "network": "be", "native": "native"}
-_SIGNED: dict[Value, bool] = {
+_ORDERS: dict[int | str, ByteOrder] = {"le": "le", "be": "be", "network": "be", "native": "native"}
+_SIGNED: dict[int | str, bool] = {
     **dict.fromkeys((0, "false", "FALSE"), False),
     **dict.fromkeys((1, "true", "TRUE"), True),
 }
-_BASES = {
-    name: name  # how a person would like to see it
-    for name in (
-        *("decimal", "dec", "d", "i", "u", 10, "hexadecimal", "hex", "x", "X", "p", 16),
-        *("octal", "oct", "o", 8, "binary", "b", 2),
-    )
-}
-_ENCODINGS: dict[Value, Encoding] = {"none": "none", "utf8": "utf8", "ascii": "ascii"}
+_ENCODED: dict[int | str, bool] = {"none": False, "utf8": True, "ascii": True}
 
 
-def _checked_alignment(align: int, offset: int) -> int:
-    """``align`` in bits, if it is one; else `TsdlError`."""
-    if not 0 < align <= 1 << 20 or align & (align - 1):
-        raise TsdlError(offset, f"alignment {align} is not a power of two")
-    return align
-
-
-def _integer_type(found: Attributes, offset: int) -> IntegerType:
-    """``integer { … }``, which begins at character ``offset``; raises `TsdlError`."""
-    size = _number(found, "size", 0)
-    if not 0 < size <= 64:
-        raise TsdlError(offset, f"integer of {size} bits; 1 to 64 are supported")
-    _one_of(_BASES, found, "base", 10)
-    return IntegerType(
-        size=size,
-        align=_checked_alignment(_number(found, "align", 1 if size % 8 else 8), offset),
-        signed=_one_of(_SIGNED, found, "signed", 0),
-        byte_order=_one_of(_BYTE_ORDERS, found, "byte_order", "native"),
-        encoding=_encoding(found, "none"),
-        clock=_clock(found),
-    )
-
-
-def _clock(found: Attributes) -> str | None:
-    if "map" not in found:
-        return None
-    target, offset = found["map"]
-    parts = str(target).split(".")
-    if len(parts) != 3 or parts[0] != "clock" or parts[2] != "value":
-        raise TsdlError(offset, f"map must be clock.NAME.value, not {target!r}")
-    return parts[1]
-
-
-def _float_type(found: Attributes, offset: int) -> FloatType:
-    """``floating_point { … }``, which begins at character ``offset``; raises `TsdlError`."""
-    exponent, mantissa = _number(found, "exp_dig", 0), _number(found, "mant_dig", 0)
-    if (exponent, mantissa) not in ((8, 24), (11, 53)):
-        raise TsdlError(
-            offset, f"floating point of {exponent} + {mantissa} bits; IEEE 32 or 64 supported"
-        )
-    align = _checked_alignment(_number(found, "align", 8), offset)
-    return FloatType(
-        exponent + mantissa, align, _one_of(_BYTE_ORDERS, found, "byte_order", "native")
-    )
-
-
-def _string_type(found: Attributes) -> StringType:
-    """``string``, with or without attributes; raises `TsdlError`."""
-    return StringType(_encoding(found, "utf8"))
-
-
-def _number(found: Attributes, name: str, default: int) -> int:
-    value, offset = found.get(name, (default, 0))
-    if not isinstance(value, int):
-        raise TsdlError(offset, f"{name} must be an integer, not {value!r}")
+def _typed(values: Attributes, name: str, wanted: type[_T], what: str) -> _T | None:
+    value, offset = values.get(name, (None, 0))
+    if value is not None and not isinstance(value, wanted):
+        found = repr(value) if isinstance(value, int | str) else "a type"
+        raise TsdlError(offset, f"{name} must be {what}, not {found}")
     return value
 
 
-def _one_of(choices: Mapping[Value, _T], found: Attributes, name: str, default: Value) -> _T:
-    value, offset = found.get(name, (default, 0))
-    if value not in choices:
+def _number(values: Attributes, name: str, default: int) -> int:
+    found = _typed(values, name, int, "an integer")
+    return default if found is None else found
+
+
+def _identifier(values: Attributes, name: str) -> int | None:
+    found = _typed(values, name, int, "an unsigned integer")
+    if found is not None and not 0 <= found < 1 << 63:
+        raise TsdlError(values[name][1], f"{name} must be an unsigned integer, not {found}")
+    return found
+
+
+def _one_of(choices: Mapping[int | str, _T], values: Attributes, name: str, default: _T) -> _T:
+    if name not in values:
+        return default
+    value, offset = values[name]
+    if isinstance(value, str) and name == "encoding":
+        value = re.sub("[-_]", "", value.lower())
+    if not isinstance(value, int | str) or value not in choices:
         known = ", ".join(map(str, choices))
         raise TsdlError(offset, f"unknown {name.replace('_', ' ')} {value!r}: none of {known}")
     return choices[value]
 
 
-def _encoding(found: Attributes, default: Encoding) -> Encoding:
-    plain: Attributes = {
-        name: (str(value).lower().replace("-", "").replace("_", ""), offset)
-        for name, (value, offset) in found.items()
-    }
-    return _one_of(_ENCODINGS, plain, "encoding", default)
+def _alignment(align: int, offset: int) -> int:
+    if not 0 < align <= 1 << 20 or align & (align - 1):
+        raise TsdlError(offset, f"alignment {align} is not a power of two")
+    return align
 
+
+def _integer_type(values: Attributes, offset: int) -> IntegerType:
+    size = _number(values, "size", 0)
+    clock: str | None = None
+    if not 0 < size <= 64:
+        raise TsdlError(offset, f"integer of {size} bits; 1 to 64 are supported")
+    if "map" in values:
+        target, place = values["map"]
+        first, *names, last = str(target).split(".")
+        if (first, last, len(names)) != ("clock", "value", 1):
+            raise TsdlError(place, f"map must be clock.NAME.value, not {target!r}")
+        clock = names[0]
+    return IntegerType(
+        size=size,
+        align=_alignment(_number(values, "align", 1 if size % 8 else 8), offset),
+        signed=_one_of(_SIGNED, values, "signed", False),
+        byte_order=_one_of(_ORDERS, values, "byte_order", "native"),
+        encoded=_one_of(_ENCODED, values, "encoding", False),
+        clock=clock,
+    )
+
+
+def _float_type(values: Attributes, offset: int) -> FloatType:
+    exponent, mantissa = _number(values, "exp_dig", 0), _number(values, "mant_dig", 0)
+    if (exponent, mantissa) not in ((8, 24), (11, 53)):
+        given = f"floating point of {exponent} + {mantissa} bits"
+        raise TsdlError(offset, f"{given}; IEEE 32 or 64 supported")
+    align = _alignment(_number(values, "align", 8), offset)
+    order = _one_of(_ORDERS, values, "byte_order", "native")
+    return FloatType(exponent + mantissa, align, order)
+
+
+# Grammar
 
 _DEEPEST = 32
+_DECLARING = frozenset(("typealias", "typedef", "struct", "variant", "enum"))
 
 
 @dataclass
@@ -221,6 +354,7 @@ class _Parser:
     tokens: list[Token]
     position: int = 0
     scope: ChainMap[str, Type] = field(default_factory=ChainMap)
+    referenced: set[str] = field(default_factory=set)
 
     @property
     def token(self) -> Token:
@@ -265,39 +399,47 @@ class _Parser:
     def path(self) -> str:
         """A dotted path such as ``packet.header`` or ``clock.monotonic.value``."""
         parts = [self.take("word")]
-        while self.at(".") or self.at("->"):
-            self.position += 1
+        while self.accept(".") or self.accept("->"):
             parts.append(self.take("word"))
         return ".".join(parts)
 
-    def integer(self) -> int:
-        negative = False
-        while self.at("-") or self.at("+"):
-            negative ^= self.at("-")
-            self.position += 1
-        value = int(self.take("integer"))
-        return -value if negative else value
+    def reference(self) -> str:
+        """The path of a length or tag."""
+        path = self.path()
+        self.referenced.add(path.rpartition(".")[2])
+        return path
 
-    def value(self) -> Value:
+    def integer(self) -> int:
+        sign = 1
+        while self.at("-") or self.at("+"):
+            sign = -sign if self.at("-") else sign
+            self.position += 1
+        return sign * int(self.take("integer"))
+
+    def value(self) -> int | str:
         """The right-hand side of ``name = value``: integer, string or path."""
         if self.token.kind == "string":
-            parts = [self.take("string")]
+            text = ""
             while self.token.kind == "string":
-                parts.append(self.take("string"))
-            return "".join(parts)
-        if self.token.kind == "word":
-            return self.path()
-        return self.integer()
+                text += self.take("string")
+            return text
+        return self.path() if self.token.kind == "word" else self.integer()
 
     def attributes(self) -> Attributes:
-        """``{ name = value; … }`` as a mapping to values and their character offsets."""
+        """``{ name = value; name := type; … }`` with types declared in between."""
         found: Attributes = {}
         with self.block():
             while not self.at("}"):
-                name = self.path()
-                self.expect("=")
+                if self.declaration():
+                    continue
+                offset, name = self.token.offset, self.path()
+                if name in found:
+                    raise TsdlError(offset, f"{name} given twice")
+                typed = self.accept(":=")
+                if not typed:
+                    self.expect("=")
                 offset = self.token.offset
-                found[name] = (self.value(), offset)
+                found[name] = (self.type(declares=False) if typed else self.value(), offset)
                 self.expect(";")
         return found
 
@@ -305,23 +447,24 @@ class _Parser:
         """A type specifier; ``declares`` says that a declarator's name follows it."""
         while self.accept("const"):
             pass
+        word, offset = self.token.text, self.token.offset
         if self.token.kind != "word":
-            self.fail(f"expected a type, found {self.token.text!r}")
-        word, following = self.token.text, self.tokens[self.position + 1].text
-        if word == "struct":
-            return self._struct()
-        if word == "variant":
-            return self._variant()
-        if word == "enum":
-            return self._enum()
-        if word == "string":
-            self.position += 1
-            return _string_type(self.attributes() if self.at("{") else {})
-        if following == "{" and word in ("integer", "floating_point"):
-            offset = self.token.offset
-            self.position += 1
-            build = _integer_type if word == "integer" else _float_type
-            return build(self.attributes(), offset)
+            self.fail(f"expected a type, found {word!r}")
+        braced = self.tokens[self.position + 1].text == "{"
+        match word:
+            case "struct" | "variant" | "enum":
+                self.position += 1
+                return self._compound(word)
+            case "string":
+                self.position += 1
+                _one_of(_ENCODED, self.attributes() if braced else {}, "encoding", True)
+                return StringType()
+            case "integer" if braced:
+                self.position += 1
+                return _integer_type(self.attributes(), offset)
+            case "floating_point" if braced:
+                self.position += 1
+                return _float_type(self.attributes(), offset)
         return self._alias(declares)
 
     def _alias(self, declares: bool) -> Type:
@@ -340,71 +483,62 @@ class _Parser:
             self.fail(f"unknown type {name!r}")
         return found
 
-    def _named(self, keyword: str) -> str:
-        """The optional name behind ``struct``, ``variant`` or ``enum``."""
-        self.expect(keyword)
-        named = self.token.kind == "word" and not (keyword == "struct" and self.at("align"))
-        return f"{keyword} {self.take('word')}" if named else ""
-
-    def _lookup(self, name: str) -> Type:
-        found = self.scope.get(name) if name else None
-        if found is None:
-            self.fail(f"unknown type {name!r}" if name else "expected '{'")
-        return found
-
-    def _struct(self) -> Type:
-        name = self._named("struct")
+    def _compound(self, keyword: str) -> Type:
+        """What follows ``struct``, ``variant`` or ``enum``: a name, a body, or both."""
+        name, tag, container = "", None, self.scope.get("int")
+        if self.token.kind == "word" and not (keyword == "struct" and self.at("align")):
+            name = f"{keyword} {self.take('word')}"
+        if keyword == "variant" and self.accept("<"):
+            tag = self.reference()
+            self.expect(">")
+        if keyword == "enum" and self.accept(":"):
+            container = self.type(declares=False)
+        kind: Type | None
         if not self.at("{"):
-            return self._lookup(name)
-        fields = self._fields()
-        align = 1
+            kind = self.scope.get(name) if name else None
+            if kind is None:
+                self.fail(f"unknown type {name!r}" if name else "expected '{'")
+        else:
+            if keyword == "struct":
+                kind = self._struct()
+            elif keyword == "variant":
+                kind = VariantType(None, self._fields())
+            else:
+                kind = self._enum(container)
+            if name:
+                self.scope[name] = kind
+        return replace(kind, tag=tag) if isinstance(kind, VariantType) else kind
+
+    def _struct(self) -> StructType:
+        fields, align = self._fields(), 1
         if self.accept("align"):
             self.expect("(")
-            align = _checked_alignment(self.integer(), self.token.offset)
+            align = _alignment(self.integer(), self.token.offset)
             self.expect(")")
-        kind = StructType(tuple(fields), max([align, *(alignment(f.type) for f in fields)]))
-        if name:
-            self.scope[name] = kind
-        return kind
+        return StructType(fields, max([align, *(alignment(f.type) for f in fields)]))
 
-    def _variant(self) -> Type:
-        name = self._named("variant")
-        tag = None
-        if self.accept("<"):
-            tag = self.path()
-            self.expect(">")
-        if self.at("{"):
-            kind = VariantType(tag, tuple(self._fields()))
-            if name:
-                self.scope[name] = replace(kind, tag=None)
-            return kind
-        found = self._lookup(name)
-        if not isinstance(found, VariantType):
-            self.fail(f"{name!r} is no variant")
-        return replace(found, tag=tag)
-
-    def _fields(self) -> list[Field]:
+    def _fields(self) -> tuple[Field, ...]:
         fields: list[Field] = []
         with self.block():
             while not self.at("}"):
                 if not self.declaration():
-                    kind = self.type(declares=True)
-                    fields.extend(self._declarators(kind))
+                    fields.extend(self._declarators(self.type(declares=True)))
                     self.expect(";")
                 if len(fields) > 10_000:
                     self.fail("more than 10000 fields")
         for name, count in Counter(f.name for f in fields).most_common(1):
             if count > 1:
                 self.fail(f"field {name!r} declared twice")
-        return fields
+        return tuple(fields)
 
     def _declarators(self, kind: Type) -> Iterator[Field]:
-        while True:
+        """``name``, ``name[length]`` …, with commas between them."""
+        more = True
+        while more:
             name = self.take("word")
             lengths: list[int | str] = []
             while self.accept("["):
-                length: int | str
-                length = self.path() if self.token.kind == "word" else self.integer()
+                length = self.reference() if self.token.kind == "word" else self.integer()
                 if isinstance(length, int) and not 0 <= length <= 1 << 31:
                     self.fail(f"array of {length} elements")
                 lengths.append(length)
@@ -413,25 +547,11 @@ class _Parser:
                 self.fail("array of too many dimensions")
             element = kind
             for length in reversed(lengths):
-                if isinstance(length, int):
-                    element = ArrayType(element, length)
-                else:
-                    element = SequenceType(element, length)
+                element = ArrayType(element, length)
             yield Field(name, element)
-            if not self.accept(","):
-                return
+            more = self.accept(",")
 
-    def _enum(self) -> Type:
-        name = self._named("enum")
-        container: Type | None = None
-        if self.accept(":"):
-            container = self.type(declares=False)
-        if not self.at("{"):
-            return self._lookup(name)
-        if container is None:
-            container = self.scope.get("int")
-        if isinstance(container, EnumType):
-            container = container.container
+    def _enum(self, container: Type | None) -> IntegerType:
         if not isinstance(container, IntegerType):
             self.fail("an enumeration needs an integer type")
         mappings: list[EnumMapping] = []
@@ -451,17 +571,17 @@ class _Parser:
             if not self.accept(","):
                 break
         self.expect("}")
-        kind = EnumType(container, tuple(mappings))
-        if name:
-            self.scope[name] = kind
-        return kind
+        return replace(container, mappings=tuple(mappings))
 
     def declaration(self) -> bool:
         """Read ``typealias``, ``typedef`` or a lone named type; False where none stands here."""
+        start = self.position
+        if self.token.text not in _DECLARING or self.token.kind != "word":
+            return False
         if self.accept("typealias"):
             kind = self.type(declares=False)
-            dimensions = list(self._declarators(kind)) if not self.at(":=") else []
-            kind = dimensions[0].type if dimensions else kind
+            if not self.at(":="):
+                kind = next(self._declarators(kind)).type
             self.expect(":=")
             words: list[str] = []
             while not self.at(";"):
@@ -471,164 +591,93 @@ class _Parser:
                 self.position += 1
             self.scope[" ".join(words)] = kind
         elif self.accept("typedef"):
-            kind = self.type(declares=True)
-            for declared in self._declarators(kind):
+            for declared in self._declarators(self.type(declares=True)):
                 self.scope[declared.name] = declared.type
-        elif self.token.text in ("struct", "variant", "enum") and self.token.kind == "word":
-            start = self.position
+        else:
             self.type(declares=False)
             if not self.at(";"):
                 self.position = start
                 return False
-        else:
-            return False
         self.expect(";")
         return True
 
 
 def parse_tsdl(text: str) -> TraceClass:
-    """Parse a whole metadata text.
+    """Parse a whole metadata text; blocks may come in any order.
 
     Raises `TsdlError` with the character offset and the reason where the text is no TSDL, names
     something undeclared, or declares something twice.
     """
     parser = _Parser(_tokens(text))
-    blocks = _Blocks(parser)
+    found: dict[str, list[tuple[Attributes, int]]]
+    found = {name: [] for name in ("trace", "env", "clock", "callsite", "stream", "event")}
     while parser.token.kind != "end":
-        blocks.read()
-    return blocks.finish()
-
-
-class _Blocks:
-    """The blocks read so far; classes are put together at the end, in any order of blocks."""
-
-    def __init__(self, parser: _Parser) -> None:
-        self.parser = parser
-        self.trace: dict[str, Value | Type] | None = None
-        self.env: dict[str, str | int] = {}
-        self.clocks: dict[str, Clock] = {}
-        self.streams: dict[int, StreamClass] = {}
-        self.events: dict[tuple[int | None, int | None], tuple[EventClass, int]] = {}
-
-    def read(self) -> None:
-        parser = self.parser
-        offset = parser.token.offset
         if parser.declaration():
-            return
-        keyword = parser.take("word")
-        match keyword:
-            case "trace":
-                if self.trace is not None:
-                    raise TsdlError(offset, "a second trace block")
-                self.trace = self._assignments()
-            case "env":
-                values = parser.attributes()
-                self.env |= {name: value for name, (value, _) in values.items()}
-            case "clock":
-                self._clock(parser.attributes(), offset)
-            case "callsite":
-                parser.attributes()
-            case "stream":
-                self._stream(self._assignments(), offset)
-            case "event":
-                self._event(self._assignments(), offset)
-            case _:
-                raise TsdlError(offset, f"unknown block {keyword!r}")
+            continue
+        offset, keyword = parser.token.offset, parser.take("word")
+        if keyword not in found:
+            raise TsdlError(offset, f"unknown block {keyword!r}")
+        found[keyword].append((parser.attributes(), offset))
         parser.expect(";")
+    if not found["trace"]:
+        raise TsdlError(0, "no trace block")
+    if len(found["trace"]) > 1:
+        raise TsdlError(found["trace"][1][1], "a second trace block")
+    trace = found["trace"][0][0]
+    byte_order = trace.get("byte_order", (None, 0))[0]
+    if byte_order not in ("le", "be", "network"):
+        raise TsdlError(0, f"trace byte_order must be le or be, not {byte_order!r}")
+    environment = {n: v for values, _ in found["env"] for n, (v, _) in values.items()}
+    clocks = [_clock(values, offset) for values, offset in found["clock"]]
+    uuid = trace.get("uuid", (None, 0))[0]
+    return TraceClass(
+        byte_order="le" if byte_order == "le" else "be",
+        uuid=uuid if isinstance(uuid, str) else None,
+        packet_header=_typed(trace, "packet.header", StructType, "a structure"),
+        env={name: value for name, value in environment.items() if isinstance(value, int | str)},
+        clocks={clock.name: clock for clock in clocks},
+        streams=_streams(found["stream"], found["event"]),
+        referenced=frozenset(parser.referenced),
+    )
 
-    def _assignments(self) -> dict[str, Value | Type]:
-        """``{ path = value; path := type; … }`` with types declared in between."""
-        parser = self.parser
-        found: dict[str, Value | Type] = {}
-        with parser.block():
-            while not parser.at("}"):
-                if parser.declaration():
-                    continue
-                offset = parser.token.offset
-                path = parser.path()
-                if path in found:
-                    raise TsdlError(offset, f"{path} given twice")
-                if parser.accept(":="):
-                    found[path] = parser.type(declares=False)
-                else:
-                    parser.expect("=")
-                    found[path] = parser.value()
-                parser.expect(";")
-        return found
 
-    def _clock(self, values: Attributes, offset: int) -> None:
-        name = values.get("name", (None, 0))[0]
-        frequency = _number(values, "freq", _NANOSECONDS)
-        if not isinstance(name, str):
-            raise TsdlError(offset, "clock without a name")
-        if not 0 < frequency <= 10**10:
-            raise TsdlError(offset, f"clock frequency of {frequency} Hz; up to 10 GHz supported")
-        seconds, cycles = _number(values, "offset_s", 0), _number(values, "offset", 0)
-        self.clocks[name] = Clock(
-            name=name,
-            frequency=frequency,
-            offset_ns=seconds * _NANOSECONDS + cycles * _NANOSECONDS // frequency,
-            uuid=str(values["uuid"][0]) if "uuid" in values else None,
-        )
+def _clock(values: Attributes, offset: int) -> Clock:
+    name = values.get("name", (None, 0))[0]
+    frequency = _number(values, "freq", 1_000_000_000)
+    if not isinstance(name, str):
+        raise TsdlError(offset, "clock without a name")
+    if not 0 < frequency <= 10**10:
+        raise TsdlError(offset, f"clock frequency of {frequency} Hz; up to 10 GHz supported")
+    seconds, cycles = _number(values, "offset_s", 0), _number(values, "offset", 0)
+    offset_ns = seconds * 1_000_000_000 + cycles * 1_000_000_000 // frequency
+    return Clock(name, frequency, offset_ns, str(values["uuid"][0]) if "uuid" in values else None)
 
-    def _stream(self, values: dict[str, Value | Type], offset: int) -> None:
-        identifier = _integer(values, "id", offset) or 0
-        if identifier in self.streams:
+
+def _streams(
+    blocks: list[tuple[Attributes, int]], event_blocks: list[tuple[Attributes, int]]
+) -> dict[int, StreamClass]:
+    streams: dict[int, StreamClass] = {}
+    for values, offset in blocks:
+        identifier = _identifier(values, "id") or 0
+        if identifier in streams:
             raise TsdlError(offset, f"stream {identifier} declared twice")
-        scopes = ("packet.context", "event.header", "event.context")
-        packet, header, context = (_struct(values, scope, offset) for scope in scopes)
-        self.streams[identifier] = StreamClass(identifier, packet, header, context)
-
-    def _event(self, values: dict[str, Value | Type], offset: int) -> None:
-        stream_id = _integer(values, "stream_id", offset)
-        identifier = _integer(values, "id", offset)
-        name = values.get("name")
+        names = ("packet.context", "event.header", "event.context")
+        packet, header, context = (_typed(values, s, StructType, "a structure") for s in names)
+        streams[identifier] = StreamClass(identifier, packet, header, context)
+    streams = streams or {0: StreamClass(0)}
+    only = next(iter(streams)) if len(streams) == 1 else 0
+    events: dict[int, dict[int, EventClass]] = {identifier: {} for identifier in streams}
+    for values, offset in event_blocks:
+        name, identifier = values.get("name", (None, 0))[0], _identifier(values, "id") or 0
         if not isinstance(name, str):
             raise TsdlError(offset, "event without a name")
-        if (stream_id, identifier) in self.events:
+        stream = _identifier(values, "stream_id")
+        target = only if stream is None else stream
+        if target not in streams:
+            raise TsdlError(offset, f"event {name!r} of undeclared stream {target}")
+        if identifier in events[target]:
             raise TsdlError(offset, f"event {name!r}: id {identifier} declared twice")
-        context, fields = (_struct(values, scope, offset) for scope in ("context", "fields"))
-        event = EventClass(identifier or 0, name, context, fields)
-        self.events[stream_id, identifier] = (event, offset)
-
-    def finish(self) -> TraceClass:
-        if self.trace is None:
-            raise TsdlError(0, "no trace block")
-        byte_order = self.trace.get("byte_order")
-        if byte_order not in ("le", "be", "network"):
-            raise TsdlError(0, f"trace byte_order must be le or be, not {byte_order!r}")
-        streams = self.streams or {0: StreamClass(0)}
-        only = next(iter(streams)) if len(streams) == 1 else 0
-        events: dict[int, dict[int, EventClass]] = {identifier: {} for identifier in streams}
-        for (stream_id, _), (event, offset) in self.events.items():
-            target = only if stream_id is None else stream_id
-            if target not in streams:
-                raise TsdlError(offset, f"event {event.name!r} of undeclared stream {target}")
-            if event.id in events[target]:
-                raise TsdlError(offset, f"event {event.name!r}: id {event.id} declared twice")
-            events[target][event.id] = event
-        uuid = self.trace.get("uuid")
-        return TraceClass(
-            byte_order="le" if byte_order == "le" else "be",
-            uuid=uuid if isinstance(uuid, str) else None,
-            packet_header=_struct(self.trace, "packet.header", 0),
-            env=self.env,
-            clocks=self.clocks,
-            streams={i: replace(stream, events=events[i]) for i, stream in streams.items()},
-        )
-
-
-def _integer(values: dict[str, Value | Type], name: str, offset: int) -> int | None:
-    value = values.get(name)
-    if value is None:
-        return None
-    if not isinstance(value, int) or not 0 <= value < 1 << 63:
-        raise TsdlError(offset, f"{name} must be an unsigned integer, not {value!r}")
-    return value
-
-
-def _struct(values: dict[str, Value | Type], name: str, offset: int) -> StructType | None:
-    value = values.get(name)
-    if value is not None and not isinstance(value, StructType):
-        raise TsdlError(offset, f"{name} must be a structure")
-    return value
+        scopes = ("context", "fields")
+        context, fields = (_typed(values, s, StructType, "a structure") for s in scopes)
+        events[target][identifier] = EventClass(identifier, name, context, fields)
+    return {number: replace(stream, events=events[number]) for number, stream in streams.items()}

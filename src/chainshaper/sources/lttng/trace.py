@@ -22,7 +22,7 @@ from typing import TypeAlias
 import polars as pl
 
 from chainshaper.sources.ctf import CtfTrace, Events, count_events, open_trace, read_events
-from chainshaper.sources.ctf import types as ctf
+from chainshaper.sources.ctf import tsdl as ctf
 from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids, rmw_of_threads
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
@@ -156,7 +156,10 @@ class TraceTables(Mapping[str, pl.DataFrame]):
     def field_lengths(self) -> dict[str, dict[str, int]]:
         """Event → its declared fields, with the length of those that are arrays (0: no array)."""
         return {
-            name: {f: t.length if isinstance(t, ctf.ArrayType) else 0 for f, t in fields.items()}
+            name: {
+                f: t.length if isinstance(t, ctf.ArrayType) and isinstance(t.length, int) else 0
+                for f, t in fields.items()
+            }
             for name, fields in self._fields.items()
         }
 
@@ -328,16 +331,12 @@ def _declared_fields(trace: CtfTrace) -> dict[str, dict[str, ctf.Type]]:
 def _decoded_type(declared: ctf.Type | None) -> pl.DataType | None:
     """What the values of a declared field become, of the kinds that a table has."""
     match declared:
-        case ctf.IntegerType() | ctf.EnumType():
+        case ctf.IntegerType():
             return pl.Int64()
+        case ctf.ArrayType(ctf.IntegerType()):
+            return pl.String() if ctf.is_text(declared) else pl.List(pl.Int64())
         case ctf.StringType():
             return pl.String()
-        case (
-            ctf.ArrayType(element=ctf.IntegerType() as one)
-            | ctf.SequenceType(element=ctf.IntegerType() as one)
-        ):
-            text = one.encoding != "none" and one.size == one.align == 8
-            return pl.String() if text else pl.List(pl.Int64())
     return None
 
 

@@ -1,19 +1,14 @@
 """Compiled loops over bytes and columns, ready to run without their compiler.
 
-Numba makes machine code of loops that are written in Python; importing and setting it up takes
-half a second, which is as long as reading ten million events. Loops that every trace needs are
-therefore written for addresses and counts only (:mod:`~chainshaper.values.compiled.memory`): what
-Numba makes of those needs nothing of Python, so it is compiled once on a machine, then loaded from
-an object file in some tens of milliseconds.
+Importing Numba takes half a second, which is as long as reading ten million events. Loops that
+every trace needs are therefore written for addresses and counts only
+(:mod:`~chainshaper.values.compiled.memory`): what Numba makes of those needs nothing of Python, so
+it is compiled once on a machine, then loaded from an object file in some tens of milliseconds.
 
-The file stands beside the kernel's module like Python's own compiled files, or in the user's
-cache where that folder cannot be written; where neither can, every process compiles anew. Its
-name is a digest of everything that decides what is in it: the sources of the kernel's folder and
-of this one, Numba, LLVM, and the processor that it is for.
-
-Machine code does what it wants, and a part of it ends the process. So only files are loaded that
-root and the user of this process alone can change, and that end with the digest of what is in front
-of it. Whatever is not so is compiled anew, and its file replaced where that is permitted.
+The file stands beside the kernel's module, or in the user's cache where that folder cannot be
+written; where neither can, every process compiles anew. Its name is a digest of the sources of the
+kernel's folder and of this one, Numba, LLVM, and the processor. Only files are loaded that root and
+the user of this process alone can change, and that end with the digest of what is in front of it.
 """
 
 import ctypes
@@ -24,7 +19,7 @@ import importlib.util
 import os
 import pwd
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
@@ -46,8 +41,8 @@ the real one for all code that Numba compiles in this process.
 """
 
 _DIGEST_SIZE = hashlib.sha256().digest_size
-
 _loading = Lock()  # LLVM's loader, and the compiler, are for one thread at a time
+_engines: list[Any] = []  # code lives as long as its engine
 
 
 @functools.cache
@@ -60,15 +55,20 @@ def kernel(module: str, name: str) -> Callable[..., int]:
 
     @functools.cache
     def address() -> int:
-        path, symbol = _module_file(module), f"{module}.{name}"
-        file = f"{symbol}-{_digest(path.parent)}.o"
-        for folder in _folders(path.parent):
-            code = _read(folder / file)
-            if code is not None:
-                return _loaded(code, symbol)
-        code = _compiled(getattr(importlib.import_module(module), name), symbol)
-        _keep(code, _folders(path.parent), symbol, file)
-        return _loaded(code, symbol)
+        spec, symbol = importlib.util.find_spec(module), f"{module}.{name}"
+        if spec is None or spec.origin is None:
+            raise ModuleNotFoundError(module)
+        beside = Path(spec.origin).parent
+        file, folders = f"{symbol}-{_digest(beside)}.o", _folders(beside)
+        code = next((found for folder in folders if (found := _read(folder / file))), None)
+        if code is None:
+            code = _compiled(getattr(importlib.import_module(module), name), symbol)
+            _write(code, folders, symbol, file)
+        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target())
+        engine.add_object_file(llvm.object_file.ObjectFileRef.from_data(code))
+        engine.finalize_object()
+        _engines.append(engine)
+        return int(engine.get_function_address(symbol))
 
     def call(*numbers: int) -> int:
         with _loading:
@@ -77,13 +77,6 @@ def kernel(module: str, name: str) -> Callable[..., int]:
         return int(function(*numbers))
 
     return call
-
-
-def _module_file(module: str) -> Path:
-    spec = importlib.util.find_spec(module)
-    if spec is None or spec.origin is None:
-        raise ModuleNotFoundError(module)
-    return Path(spec.origin)
 
 
 @functools.cache
@@ -97,30 +90,25 @@ def _digest(folder: Path) -> str:
     return digest.hexdigest()[:24]
 
 
-def _folders(beside: Path) -> Iterator[Path]:
-    """Where machine code may be, best first. Links are followed here, once, before any check."""
-    yield Path(os.path.realpath(beside / "__pycache__"))
-    yield Path(os.path.realpath(_users_cache() / "chainshaper"))
+def _folders(beside: Path) -> list[Path]:
+    """Where machine code may be, best first. Links are followed here, once, before any check.
 
-
-def _users_cache() -> Path:
-    """The cache that the environment names; where that is another user's (`sudo -E`), our own."""
-    named = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    if not named.is_absolute():  # and is to be ignored, as its specification has it
-        named = Path(os.path.expanduser("~/.cache"))  # noqa: PTH111 - the other raises without one
-    existing = next(place for place in (named, *named.parents) if os.path.exists(place))  # noqa: PTH110
+    Where the cache that the environment names is another user's (`sudo -E`), it is our own.
+    """
+    cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    if not cache.is_absolute():  # and is to be ignored, as its specification has it
+        cache = Path(os.path.expanduser("~/.cache"))  # noqa: PTH111 - the other raises without one
+    existing = next(place for place in (cache, *cache.parents) if os.path.exists(place))  # noqa: PTH110
     if why_distrusted(existing) is not None:
         with suppress(KeyError):  # a user without a name
-            return Path(pwd.getpwuid(os.geteuid()).pw_dir, ".cache")
-    return named
+            cache = Path(pwd.getpwuid(os.geteuid()).pw_dir, ".cache")
+    return [Path(os.path.realpath(f)) for f in (beside / "__pycache__", cache / "chainshaper")]
 
 
 def _read(file: Path) -> bytes | None:
     """The object file's content, if it is as a trusted user wrote it."""
     try:
-        if why_distrusted(file) is not None:
-            return None
-        content = file.read_bytes()
+        content = file.read_bytes() if why_distrusted(file) is None else b""
     except OSError:
         return None
     code, digest = content[:-_DIGEST_SIZE], content[-_DIGEST_SIZE:]
@@ -159,11 +147,13 @@ def _compiled(dispatcher: Any, symbol: str) -> bytes:
     return bytes(_target().emit_object(llvm.parse_assembly(text)))
 
 
-def _keep(code: bytes, folders: Iterator[Path], symbol: str, file: str) -> None:
+def _write(code: bytes, folders: list[Path], symbol: str, file: str) -> None:
     """Write the object file into the first folder that takes it, in place of older ones."""
     for folder in folders:
         try:
-            _make_own(folder)
+            for one in (*reversed(folder.parents), folder):
+                if not one.exists() and why_distrusted(one.parent) is None:
+                    one.mkdir(mode=0o755, exist_ok=True)
             if why_distrusted(folder) is not None:
                 continue
             # The linker does not mind what is behind the end of an object file.
@@ -174,22 +164,3 @@ def _keep(code: bytes, folders: Iterator[Path], symbol: str, file: str) -> None:
         except (OSError, OperationError):
             continue
         return
-
-
-def _make_own(folder: Path) -> None:
-    """Make a folder, and those above it, wherever root and we alone can change what is there."""
-    for one in (*reversed(folder.parents), folder):
-        if not one.exists() and why_distrusted(one.parent) is None:
-            one.mkdir(mode=0o755, exist_ok=True)
-
-
-_engines: list[Any] = []  # code lives as long as its engine
-
-
-def _loaded(code: bytes, symbol: str) -> int:
-    """The address of ``symbol`` in an object file."""
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target())
-    engine.add_object_file(llvm.object_file.ObjectFileRef.from_data(code))
-    engine.finalize_object()
-    _engines.append(engine)
-    return int(engine.get_function_address(symbol))

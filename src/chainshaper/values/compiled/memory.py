@@ -30,69 +30,57 @@ def compiled(*, inline: bool = False) -> Callable[[Callable[..., Any]], Any]:
     return decorate
 
 
+def _instruction(signature: Any, build: Callable[..., Any]) -> Any:
+    """A function of numbers whose instructions ``build`` gives, from LLVM's builder and values."""
+
+    def generate(context: Any, builder: ir.IRBuilder, _signature: Any, values: Any) -> Any:
+        found = build(builder, *values)
+        return context.get_dummy_value() if signature.return_type == types.void else found
+
+    def of_one(_typing: Any, _number: Any) -> Any:
+        return signature, generate
+
+    def of_two(_typing: Any, _number: Any, _value: Any) -> Any:
+        return signature, generate
+
+    return intrinsic(of_one if len(signature.args) == 1 else of_two)
+
+
 def _pointer(builder: ir.IRBuilder, address: ir.Value, bits: int) -> ir.Value:
     return builder.inttoptr(address, ir.IntType(bits).as_pointer())
 
 
 def _load(bits: int) -> Any:
     """So many bits at an address, little-endian, as uint64."""
-
-    def load(_typing: Any, _address: Any) -> Any:
-        def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, args: Any) -> Any:
-            value = builder.load(_pointer(builder, args[0], bits), align=1)
-            return value if bits == 64 else builder.zext(value, ir.IntType(64))
-
-        return types.uint64(types.int64), generate
-
-    return intrinsic(load)
+    return _instruction(
+        types.uint64(types.int64),
+        lambda b, at: b.zext(b.load(_pointer(b, at, bits), align=1), ir.IntType(64)),
+    )
 
 
 def _store(bits: int) -> Any:
     """Write the low bits of a uint64 to an address."""
-
-    def store(_typing: Any, _address: Any, _value: Any) -> Any:
-        def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, args: Any) -> Any:
-            value = args[1] if bits == 64 else builder.trunc(args[1], ir.IntType(bits))
-            builder.store(value, _pointer(builder, args[0], bits), align=1)
-            return _context.get_dummy_value()
-
-        return types.void(types.int64, types.uint64), generate
-
-    return intrinsic(store)
+    return _instruction(
+        types.void(types.int64, types.uint64),
+        lambda b, at, value: b.store(
+            b.trunc(value, ir.IntType(bits)), _pointer(b, at, bits), align=1
+        ),
+    )
 
 
 load_byte, load_half, load_word = _load(8), _load(32), _load(64)
 store_byte, store_half, store_word, store_long = _store(8), _store(16), _store(32), _store(64)
 
-
-@intrinsic
-def swap_bytes(_typing: Any, _value: Any) -> Any:
-    """A uint64 with its bytes in reverse order."""
-
-    def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, args: Any) -> Any:
-        return builder.bswap(args[0])
-
-    return types.uint64(types.uint64), generate
-
-
-@intrinsic
-def trailing_zeros(_typing: Any, _value: Any) -> Any:
-    """How many low bits of a uint64 are 0 (64 for 0), as int64."""
-
-    def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, args: Any) -> Any:
-        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 0))
-
-    return types.int64(types.uint64), generate
-
-
-@intrinsic
-def table_at(_typing: Any, _address: Any) -> Any:
-    """The int64 table at an address, for ``table[index]``."""
-
-    def generate(_context: Any, builder: ir.IRBuilder, _signature: Any, args: Any) -> Any:
-        return _pointer(builder, args[0], 64)
-
-    return types.CPointer(types.int64)(types.int64), generate
+swap_bytes = _instruction(types.uint64(types.uint64), lambda b, value: b.bswap(value))
+"""A uint64 with its bytes in reverse order."""
+trailing_zeros = _instruction(
+    types.int64(types.uint64), lambda b, value: b.cttz(value, ir.Constant(ir.IntType(1), 0))
+)
+"""How many low bits of a uint64 are 0 (64 for 0), as int64."""
+table_at = _instruction(
+    types.CPointer(types.int64)(types.int64), lambda b, address: _pointer(b, address, 64)
+)
+"""The int64 table at an address, for ``table[index]``."""
 
 
 @compiled(inline=True)

@@ -1,0 +1,759 @@
+"""From a trace's metadata to the tables that the compiled kernels read.
+
+Tables are of int64, a row per thing: a packet, a stream class, an event class, a stream file, a
+cursor in it, an event that was read ahead, an operation. A kernel gets the address of the one
+whose words (``M_…``) are the addresses of the others: Numba counts references to arrays at every
+call, at several times the cost of reading an event.
+
+`lay_out` turns the types of all events into operations. Runs of fixed size that are not asked for
+become one SKIP, so that an event that is not wanted costs one addition. Values go to *slots*, one
+flat array each. A slot belongs to a *level*: level 0 has one row per event; every array or
+sequence opens a level of its own, with one row per element. Slots and levels are numbered in the
+order in which a column's type is walked, here and where columns are made of them.
+"""
+
+# ruff: noqa: PLR0917 - what is known of a trace on the way down its metadata
+
+from __future__ import annotations
+
+from collections.abc import Container, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+from uuid import UUID
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chainshaper.sources.ctf.tsdl import (
+    ArrayType,
+    CtfError,
+    CtfFolder,
+    EnumMapping,
+    EventClass,
+    Field,
+    FloatType,
+    IntegerType,
+    StreamClass,
+    StringType,
+    StructType,
+    TraceClass,
+    Type,
+    VariantType,
+    alignment,
+    field_name,
+    is_text,
+)
+
+# fmt: off
+# A table's columns stand together, with what they hold behind them.
+# The machine. RANGES of variants' tags: low, high, operation to go on with, 1 + option. ROWS are
+# the row counters (COUNTERS of them), CAPS how far each may go, SAVED room for some. SLOTS is the
+# dictionary's hash table, int32, MASK + 1 of them; ENTRIES are its strings: address, length, hash,
+# last word; ROOM of them. BATCHES has per event class a count and BATCH pairs (address, row).
+(
+    M_OPS, M_RANGES, M_STATE, M_ROWS, M_CAPS, M_SAVED, M_SLOTS, M_MASK, M_ENTRIES, M_ROOM,
+    M_STREAMS, M_EVENTS, M_IDS, M_COUNTERS, M_BATCHES, MACHINE_WORDS,
+) = range(16)
+
+BATCH = 128
+AHEAD = 64
+"""Events of one file that are read ahead."""
+NEVER = (1 << 63) - 2
+"""Later than all times; one more is still a number."""
+
+# The state: what a run reads and advances. BUDGET is what may still be spent (see `BUDGET`).
+X_CLOCK, X_STRINGS, X_UNSORTED, X_LATEST, X_BUDGET, X_STACK = range(6)
+STATE_WORDS = X_STACK + 16
+
+# Packets, in order of the file: BYTE its offset there, END the end of the content and ERROR_AT in
+# bits from the packet's start, STREAM the row of its class; from INSTANCE to CPU -1 where unknown;
+# BEGIN and LAST in clock cycles.
+(
+    P_BYTE, P_END, P_STREAM, P_INSTANCE, P_BEGIN, P_LAST, P_SEQUENCE, P_DISCARDED, P_CPU,
+    P_ERROR, P_ERROR_AT, P_BYTES, PACKET_COLUMNS,
+) = range(13)
+
+# Stream classes of all folders: operations (first, end) of packet HEADER, packet CONTEXT and EVENT
+# header; LTTng's event headers in one load, ALIGN 0 where the header is another; event ids in the
+# table of ids, a dense part, then pairs; bit n of KNOWN: register n is read in header or context;
+# the COST of a packet.
+(
+    S_ID, S_HEADER, S_HEADER_STOP, S_CONTEXT, S_CONTEXT_STOP, S_EVENT, S_EVENT_STOP,
+    S_ALIGN, S_ID_BITS, S_SHIFT, S_CLOCK_BITS, S_ID_FIRST, S_ID_DENSE, S_ID_PAIRS, S_DEFAULT,
+    S_FREQUENCY, S_KNOWN, S_UUID_LOW, S_UUID_HIGH, S_COST, STREAM_COLUMNS,
+) = range(21)
+
+# Event classes of all stream classes: operations (first, end) that WALK over context and payload,
+# and that FILL columns; ALIGN and SIZE where the former is one constant step, else 0; the row
+# COUNTER of level 0, -1 where the event is not wanted; addresses of row 0 of TIME and CPU (or 0);
+# CONSTANT 1 where every event is laid out alike, SIZE bits of it.
+(
+    E_WALK, E_WALK_STOP, E_ALIGN, E_SIZE, E_FILL, E_FILL_STOP, E_COUNTER, E_LEVELS,
+    E_TIME, E_CPU, E_CONSTANT, E_COST, EVENT_COLUMNS,
+) = range(13)
+
+# Stream files, for one span of time: its first packet and the position in it, -1 for the packet's
+# first event; where it ends, LAST_POSITION -1 for before the packet's first event.
+(
+    F_BASE, F_SIZE, F_PACKET, F_POSITION, F_CLOCK, F_LAST_PACKET, F_LAST_POSITION, FILE_COLUMNS,
+) = range(8)
+
+# Cursors, one per stream file; PLACE of the next event among the COUNT that were read ahead, CPU
+# of the packet.
+(
+    C_PACKET, C_POSITION, C_END, C_CLOCK, C_PLACE, C_COUNT, C_CPU, CURSOR_COLUMNS,
+) = range(8)
+
+# Events that were read ahead; the address is that of what follows the header, 0 where the length
+# is not known before.
+A_TIME, A_EVENT, A_ADDRESS, AHEAD_COLUMNS = range(4)
+
+# Operations. Rows are two cache lines, and a shift away from each other.
+(
+    O_CODE,
+    O_ALIGN,  # bits
+    O_SIZE,  # bits; of one element for SKIP_MANY and COPY
+    O_FLAGS,  # 1 signed, 2 big-endian, 4 advances the clock
+    O_ADDRESS,  # where row 0 of the slot lies, 0 for no slot
+    O_WIDTH,  # bytes per row of the slot
+    O_COUNTER,  # the level's row counter
+    O_REGISTER,  # written by NUMBER, the length or tag for others; -1 for none
+    O_COUNT,  # constant length; first range of SWITCH
+    O_TARGET,  # operation to go on with
+    O_INNER,  # the element level's row counter, -1 where it is not wanted
+    O_INNER_ADDRESS,  # where COPY writes
+    O_LEAST,  # the least bits an element takes; number of ranges of SWITCH
+    O_OFFSET,  # bytes from the aligned start of an event of constant layout
+    O_COST,  # of an element of SKIP_MANY, COPY and LOOP
+) = range(15)
+OPERATION_COLUMNS = 16
+
+SKIP, NUMBER, TEXT, CHARACTERS, SKIP_MANY, COPY, LOOP, AGAIN, SWITCH, JUMP, MOVE = range(11)
+"""MOVE: a NUMBER of 8, 4, 2 or 1 bytes as they lie in the packet, one per event."""
+
+# Bytes per row.
+P_ROW, S_ROW, E_ROW = 8 * PACKET_COLUMNS, 8 * STREAM_COLUMNS, 8 * EVENT_COLUMNS
+F_ROW, C_ROW, A_ROW = 8 * FILE_COLUMNS, 8 * CURSOR_COLUMNS, 8 * AHEAD_COLUMNS
+O_ROW, B_ROW = 8 * OPERATION_COLUMNS, 8 * (1 + 2 * BATCH)
+
+BUDGET = 64
+"""What decoding may cost for each byte of a packet, and finding packets for each byte of a file.
+
+An operation costs 1, a byte of a column as well. Fields of no bits would else cost nothing: a
+few bytes of a packet could fill the memory. A bit that becomes a number of its own costs 3.
+"""
+
+ENDLESS = 1 << 40
+"""More elements than any packet has, even of no bits; times what one costs it is still a number."""
+
+# Why a run ended early.
+OVER_BUDGET = -8
+FULL_TABLE, FULL_DICTIONARY, UNKNOWN_EVENT = -7, -6, -5
+UNTERMINATED, BAD_LENGTH, NO_OPTION, TRUNCATED = -4, -3, -2, -1
+
+# How a scan for packets ended, and what was wrong where.
+DONE, FULL, BAD_MAGIC, BAD_UUID, BAD_STREAM, BAD_SIZE, BAD_HEADER, CUT, COSTLY = range(9)
+
+REGISTERS = {
+    name: number
+    for number, name in enumerate((
+        "id", "magic", "stream_id", "stream_instance_id", "timestamp_begin", "timestamp_end",
+        "packet_seq_num", "events_discarded", "cpu_id", "content_size", "packet_size",
+        "uuid_low", "uuid_high",
+    ))
+}
+"""The numbers that the decoder itself needs, by their TSDL name in packet header and context."""
+R_ID, R_MAGIC, R_STREAM, R_INSTANCE, R_BEGIN, R_END, R_SEQUENCE, R_DISCARDED, R_CPU = range(9)
+R_CONTENT, R_PACKET, R_UUID_LOW, R_UUID_HIGH = range(9, 13)
+
+MAGIC = 0xC1FC1FC1
+BILLION = 1_000_000_000
+ONES = np.uint64(0x0101010101010101)
+HIGHS = np.uint64(0x8080808080808080)
+FACTOR = np.uint64(0x9E3779B97F4A7C15)
+LOW = np.uint64(0xFFFFFFFF)
+U0, U1, U8, U29, U32, U64 = (np.uint64(n) for n in (0, 1, 8, 29, 32, 64))
+
+# fmt: on
+
+_DEEPEST = 12
+_MOST_STEPS = 200_000
+"""Types to lay out in a trace: one with all the kernel's events has some 10,000."""
+# More bits than any packet has: sizes beyond are all the same and must not overflow int64.
+_ENDLESS_BITS = 1 << 56
+_DENSE_IDS = 4096
+TEXT_CODES = "text"
+"""The kind of a slot that has codes of strings (uint32)."""
+
+
+class LayoutError(ValueError):
+    """Types that cannot be laid out: an unresolved length or tag, too deep a nesting."""
+
+
+class Slot(NamedTuple):
+    """A flat array: its level, its NumPy type code or TEXT_CODES, whether rows may be unwritten."""
+
+    level: int
+    kind: str
+    sparse: bool
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        return np.dtype("u4" if self.kind == TEXT_CODES else self.kind)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Where the events of one name and one shape go.
+
+    ``counter`` is the row counter of level 0 and ``levels`` how many belong to the table; the
+    columns are ``time``, ``cpu`` where known, and those of ``columns``.
+    """
+
+    name: str
+    columns: tuple[tuple[str, Type], ...]
+    slots: tuple[Slot, ...]
+    levels: int
+    has_cpu: bool
+    counter: int = field(compare=False)
+
+
+class Wanted(NamedTuple):
+    """What is to be read: events that get a table, and which of their context.
+
+    pid, tid and procname always, procname not for the ``nameless`` ones; the other context fields
+    with ``context``.
+    """
+
+    names: frozenset[str] = frozenset()
+    nameless: frozenset[str] = frozenset()
+    context: bool = False
+
+
+_Scope = tuple[str, StructType | None, Container[str]]
+"""A dynamic scope, its structure, and the TSDL names of the fields in it that get columns."""
+
+
+class Event(NamedTuple):
+    """An event class: its row, its stream class's row, its scopes, to be read behind ``header``."""
+
+    name: str
+    row: list[int]
+    table: Table | None
+    stream: int
+    header: _Writer
+    scopes: list[_Scope]
+
+
+@dataclass
+class Layout:
+    """Tables for the kernels, and what their rows mean.
+
+    ``ranges`` are those of variants' tags: low, high, target, 1 + option. ``folders`` has the rows
+    of each folder's stream classes (first, end), ``steps`` counts the types that were laid out,
+    ``labels`` has the ranges of enumerations by label.
+    """
+
+    operations: list[list[int]] = field(default_factory=list)
+    ranges: list[list[int]] = field(default_factory=list)
+    streams: list[list[int]] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+    folders: list[tuple[int, int]] = field(default_factory=list)
+    tables: dict[Table, list[Event]] = field(default_factory=dict)
+    ids: list[int] = field(default_factory=list)
+    counters: int = 0
+    registers: int = len(REGISTERS)
+    steps: int = 0
+    labels: dict[int, dict[str, list[tuple[int, int]]]] = field(default_factory=dict)
+    _arrays: dict[int, NDArray[np.int64]] = field(default_factory=dict)
+
+    def arrays(self) -> dict[int, NDArray[np.int64]]:
+        """The kernels' tables by their word in the machine, none of them empty."""
+        if not self._arrays:
+            events = [event.row for event in self.events]
+            rows = {M_OPS: self.operations, M_RANGES: self.ranges, M_STREAMS: self.streams}
+            rows |= {M_EVENTS: events, M_IDS: [[number] for number in self.ids]}
+            self._arrays = {word: np.array(t or [[0]], np.int64) for word, t in rows.items()}
+        return self._arrays
+
+    def attach(self, table: Table, time: int, cpu: int, slots: Sequence[tuple[int, int]]) -> None:
+        """Give a table's event classes the operations that write to its columns.
+
+        ``time`` and ``cpu`` (0: none) are addresses, ``slots`` addresses and bytes per row.
+        """
+        self._arrays, self.steps = {}, 0
+        for event in self.tables[table]:
+            row, writer = event.row, event.header.following(slots)
+            start, stop = row[E_FILL], row[E_FILL_STOP] = writer.run(event.scopes)
+            writer.count_from(table.counter)
+            row[E_TIME], row[E_CPU] = time, cpu
+            constant = row[E_ALIGN] >= 8 and row[E_SIZE] > 0
+            row[E_CONSTANT] = int(constant and self._note_offsets(start, stop))
+
+    def _note_offsets(self, start: int, stop: int) -> bool:
+        """Note where each of an event's operations reads, if that is the same in every event."""
+        position = 0
+        for row in self.operations[start:stop]:
+            if row[O_CODE] not in {SKIP, CHARACTERS, MOVE} or row[O_REGISTER] >= 0:
+                return False
+            position += -position % row[O_ALIGN]
+            row[O_OFFSET] = position >> 3
+            position += 8 * row[O_COUNT] if row[O_CODE] == CHARACTERS else row[O_SIZE]
+        return True
+
+    def cost(self, start: int, stop: int) -> int:
+        """What running operations once costs at most, the turns of their loops aside."""
+        rows = self.operations[start:stop]
+        return len(rows) + sum(row[O_LEAST] for row in rows if row[O_CODE] == SWITCH)
+
+
+def lay_out(folders: Sequence[CtfFolder], wanted: Wanted) -> Layout:
+    """Lay out every stream and event class of all ``folders``.
+
+    Raises `CtfError` for types that cannot be read.
+    """
+    layout = Layout()
+    for folder in folders:
+        first = len(layout.streams)
+        try:
+            _add_folder(layout, folder.declared, wanted)
+        except LayoutError as error:
+            file = folder.path / "metadata"
+            raise CtfError(file, None, str(error), "the trace cannot be read") from None
+        layout.folders.append((first, len(layout.streams)))
+    return layout
+
+
+# Types
+
+
+class _Number(NamedTuple):
+    """An integer that lengths and tags can refer to."""
+
+    register: int
+    signed: bool
+    mappings: tuple[EnumMapping, ...]
+
+
+_Frame = dict[str, "_Number | _Frame | None"]
+
+
+class _Place(NamedTuple):
+    """Where a type stands: the numbers around it, its level, and whether it gets a column."""
+
+    frames: tuple[_Frame, ...]
+    level: int
+    keep: bool
+
+    def inside(self, frame: _Frame) -> _Place:
+        return self._replace(frames=(*self.frames, frame))
+
+
+@dataclass
+class _Writer:
+    """Writes the operations of types that follow each other.
+
+    ``addresses`` are those of the slots, and their bytes per row; without them rows are only
+    counted. ``roots`` maps a dynamic scope (``stream.event.context``, …) to the numbers read there
+    so far; a number whose name is ``referenced`` gets a register, ``registers`` the next one. In
+    headers (``fixed``) the numbers of REGISTERS have those. ``slots`` and ``levels`` grow with
+    every column that is wanted.
+    """
+
+    layout: Layout
+    big: bool
+    referenced: frozenset[str]
+    fixed: bool = True
+    addresses: Sequence[tuple[int, int]] = ()
+    registers: int = len(REGISTERS)
+    roots: dict[str, _Frame] = field(default_factory=dict)
+    slots: list[Slot] = field(default_factory=list)
+    levels: int = 1
+    sparse: bool = False
+    start: int = field(default=0, init=False)
+
+    def following(self, addresses: Sequence[tuple[int, int]] = (), fixed: bool = False) -> _Writer:
+        """A writer for what follows in one of several places."""
+        roots = dict(self.roots)
+        return replace(self, roots=roots, slots=[], levels=1, addresses=addresses, fixed=fixed)
+
+    def run(self, scopes: Sequence[_Scope]) -> tuple[int, int]:
+        """Lay out scopes: their first operation and the one after the last."""
+        self.start = len(self.layout.operations)
+        for scope, kind, wanted in scopes:
+            frame = self.roots[scope] = _Frame()
+            if kind is not None:
+                self._skip(kind.align, 0)
+            for member in kind.fields if kind is not None else ():
+                match member:
+                    case Field("uuid", ArrayType(IntegerType(8, 8), 16)) if self.fixed:
+                        for name in ("uuid_low", "uuid_high"):
+                            half = IntegerType(64, 8, byte_order="le")
+                            self._number(name, half, _Place((frame,), 0, False))
+                    case _:
+                        place = _Place((frame,), 0, member.name in wanted)
+                        self._type(member.name, member.type, place)
+        self.layout.registers = max(self.layout.registers, self.registers)
+        return self.start, len(self.layout.operations)
+
+    def count_from(self, counter: int) -> None:
+        """Set the row counter of level 0."""
+        for row in self.layout.operations[self.start :]:
+            row[O_COUNTER] += counter
+            row[O_INNER] += counter if row[O_INNER] >= 0 else 0
+
+    def _type(self, name: str, kind: Type, at: _Place) -> int:
+        """Lay out a type; returns the least number of bits that it takes, alignment aside."""
+        self.layout.steps += 1
+        if len(at.frames) > _DEEPEST or self.layout.steps > _MOST_STEPS:
+            raise LayoutError(f"{name}: types nested too deeply")
+        match kind:
+            case StringType():
+                self._row(TEXT, {O_ALIGN: 8, **self._slot(TEXT_CODES, at)})
+                return 8
+            case StructType():
+                frame = at.frames[-1][name] = _Frame()
+                self._skip(kind.align, 0)
+                return sum(self._type(f.name, f.type, at.inside(frame)) for f in kind.fields)
+            case ArrayType():
+                return min(self._array(name, kind, at), _ENDLESS_BITS)
+            case VariantType():
+                return self._variant(name, kind, at)
+        return self._number(name, kind, at)
+
+    def _number(self, name: str, kind: IntegerType | FloatType, at: _Place) -> int:
+        big = self.big if kind.byte_order == "native" else kind.byte_order == "be"
+        code, register, clock = "f", -1, False
+        at.frames[-1][name] = None
+        if isinstance(kind, IntegerType):
+            code, clock = "i" if kind.signed else "u", kind.clock is not None
+            if self.fixed and name in REGISTERS and (len(at.frames) == 1 or name == "id"):
+                register = REGISTERS[name]
+                # The end of a packet is no instant that its events follow.
+                clock = clock and register != R_END
+            elif name in self.referenced:
+                register, self.registers = self.registers, self.registers + 1
+            at.frames[-1][name] = _Number(register, kind.signed, kind.mappings)
+        width = 1 << ((kind.size + 7 >> 3) - 1).bit_length()
+        place = self._slot(f"{code}{width}", at) if at.keep else {}
+        if not place and register < 0 and not clock:
+            self._skip(kind.align, kind.size)
+            return kind.size
+        flags = (code == "i") + 2 * big + 4 * clock
+        columns = {O_ALIGN: kind.align, O_SIZE: kind.size, O_FLAGS: flags, O_REGISTER: register}
+        row = self._row(NUMBER, columns | place)
+        if at.level == 0 and _is_moved(row):
+            row[O_CODE] = MOVE
+        return kind.size
+
+    def _array(self, name: str, kind: ArrayType, at: _Place) -> int:
+        rows, count, register = self.layout.operations, 0, -1
+        if isinstance(kind.length, int):
+            count = kind.length
+        else:
+            register = self._referred(kind.length, at).register
+        columns = {O_ALIGN: alignment(kind), O_REGISTER: register, O_COUNT: count}
+        if is_text(kind):
+            place = self._slot(TEXT_CODES, at)
+            if place or register >= 0:
+                self._row(CHARACTERS if place else SKIP_MANY, {**columns, O_SIZE: 8, **place})
+            else:
+                self._skip(8, 8 * count)
+            return 8 * count
+        columns |= self._slot("u4", at) if register >= 0 else {}
+        inner = self.levels
+        if at.keep:
+            self.levels += 1
+            columns[O_INNER] = inner
+        slots, loop = len(self.slots), self._row(LOOP, columns)
+        first = len(rows)
+        place_inside = at.inside({})._replace(level=inner)
+        least = self._type(f"{name}[]", kind.element, place_inside)
+        found = self.slots[slots:]
+        loop[O_COST] = sum(slot.dtype.itemsize for slot in found if slot.level == inner)
+        only = rows[first] if len(rows) == first + 1 else loop
+        even = only[O_CODE] == SKIP and only[O_SIZE] % only[O_ALIGN] == 0
+        if not found and even and only[O_SIZE] == 0:  # an array of empty structures
+            del rows[first - 1 :]
+            self._skip(alignment(kind), 0)
+        elif even and register < 0 and not at.keep:
+            del rows[first - 1 :]
+            self._skip(max(alignment(kind), only[O_ALIGN]), only[O_SIZE] * count)
+        elif even and only[O_SIZE] > 0:
+            loop[O_CODE], loop[O_SIZE] = SKIP_MANY, only[O_SIZE]
+            del rows[first:]
+        elif only[O_CODE] == NUMBER and _is_moved(only) and only[O_SIZE] % only[O_ALIGN] == 0:
+            loop[O_CODE], loop[O_SIZE], loop[O_INNER_ADDRESS] = COPY, only[O_SIZE], only[O_ADDRESS]
+            del rows[first:]
+        else:
+            self._row(AGAIN, {O_TARGET: first, O_INNER: loop[O_INNER]})
+            loop[O_TARGET], loop[O_LEAST] = len(rows), least
+            loop[O_COST] += self.layout.cost(first, len(rows))
+        return count * least
+
+    def _variant(self, name: str, kind: VariantType, at: _Place) -> int:
+        if kind.tag is None:
+            raise LayoutError(f"variant {name!r} has no tag")
+        rows, tag = self.layout.operations, self._referred(kind.tag, at)
+        columns = {O_REGISTER: tag.register, O_FLAGS: int(tag.signed), **self._slot("u2", at)}
+        switch = self._row(SWITCH, {**columns, O_COUNT: len(self.layout.ranges)})
+        by_label, targets = self._ranges_by_label(tag), []
+        for number, option in enumerate(kind.options, start=1):
+            labels = dict.fromkeys((option.name, option.name.removeprefix("_")))
+            ends = [pair for label in labels for pair in by_label.get(label, ())]
+            targets.append([[low, high, 0, number] for low, high in ends])
+            self.layout.ranges += targets[-1]
+        switch[O_LEAST] = sum(map(len, targets))
+        self.layout.steps += switch[O_LEAST]
+        outer, self.sparse = self.sparse, True
+        frame = at.frames[-1][name] = _Frame()
+        jumps, least = [], []
+        for option, ranges in zip(kind.options, targets, strict=True):
+            for one in ranges:
+                one[2] = len(rows)
+            least.append(self._type(option.name, option.type, at.inside(frame)))
+            jumps.append(self._row(JUMP, {}))
+        for jump in jumps:
+            jump[O_TARGET] = len(rows)
+        self.sparse = outer
+        return min(least, default=0)
+
+    def _ranges_by_label(self, tag: _Number) -> dict[str, list[tuple[int, int]]]:
+        """The values that choose each option of a variant; variants may share an enumeration.
+
+        Unsigned tags are compared as signed numbers, both with their top bit turned.
+        """
+        found = self.layout.labels.get(id(tag.mappings))
+        if found is None:
+            found = self.layout.labels[id(tag.mappings)] = {}
+            first, turned = (-(1 << 63), 0) if tag.signed else (0, 1 << 63)
+            last = first + (1 << 64) - 1
+            for label, low, high in tag.mappings:
+                if low <= last and high >= first:
+                    ends = max(low, first) - turned, min(high, last) - turned
+                    found.setdefault(label, []).append(ends)
+        return found
+
+    def _referred(self, path: str, at: _Place) -> _Number:
+        """The number that a length or tag path names, relative or absolute (section 7.3.2)."""
+        places = [(f, path[len(root) + 1 :]) for root, f in self.roots.items()
+                  if path.startswith(root + ".")]  # fmt: skip
+        places += [(f, path) for f in (*reversed(at.frames), *reversed(self.roots.values()))]
+        for frame, names in places:
+            found: _Number | _Frame | None = frame
+            for name in names.split("."):
+                found = found.get(name) if isinstance(found, dict) else None
+            if isinstance(found, _Number):
+                return found
+        raise LayoutError(f"length or tag {path!r} names no number that is read before it")
+
+    def _slot(self, kind: str, at: _Place) -> dict[int, int]:
+        """Add a slot, if one is wanted: the columns of an operation that say where it lies."""
+        if at.keep:
+            self.slots.append(Slot(at.level, kind, self.sparse))
+            if self.addresses:
+                address, width = self.addresses[len(self.slots) - 1]
+                return {O_ADDRESS: address, O_WIDTH: width, O_COUNTER: at.level}
+        return {}
+
+    def _row(self, code: int, columns: dict[int, int]) -> list[int]:
+        row = [0] * OPERATION_COLUMNS
+        row[O_CODE], row[O_ALIGN], row[O_REGISTER], row[O_INNER] = code, 1, -1, -1
+        for column, value in columns.items():
+            row[column] = value
+        self.layout.operations.append(row)
+        return row
+
+    def _skip(self, align: int, size: int) -> None:
+        """Skip ``size`` bits, in one operation with what is skipped before where that is alike."""
+        rows, size = self.layout.operations, min(size, _ENDLESS_BITS)
+        if len(rows) > self.start and rows[-1][O_CODE] == SKIP:
+            last = rows[-1]
+            if last[O_SIZE] == 0 or (align <= last[O_ALIGN] and last[O_SIZE] % align == 0):
+                last[O_ALIGN] = max(last[O_ALIGN], align)
+                last[O_SIZE] = min(last[O_SIZE] + size, _ENDLESS_BITS)
+                return
+        self._row(SKIP, {O_ALIGN: align, O_SIZE: size})
+
+
+def _is_moved(row: list[int]) -> bool:
+    """Whether the bytes of a NUMBER are the same in a packet and in its slot."""
+    alike = row[O_ALIGN] >= 8 and row[O_SIZE] in {8, 16, 32, 64}
+    plain = not row[O_FLAGS] & 4 and (row[O_SIZE] == 8 or not row[O_FLAGS] & 2)
+    return alike and plain and row[O_ADDRESS] != 0 and row[O_REGISTER] < 0
+
+
+# Stream and event classes
+
+
+def _add_folder(layout: Layout, trace: TraceClass, wanted: Wanted) -> None:
+    header = _Writer(layout, trace.byte_order == "be", trace.referenced)
+    in_header = header.run([("trace.packet.header", trace.packet_header, ())])
+    for stream in trace.streams.values():
+        event = header.following(fixed=True)
+        in_context = event.run([("stream.packet.context", stream.packet_context, ())])
+        in_event = event.run([("stream.event.header", stream.event_header, ())])
+        row = [0] * STREAM_COLUMNS
+        row[S_ID : S_EVENT_STOP + 1] = [stream.id, *in_header, *in_context, *in_event]
+        row[S_ALIGN : S_CLOCK_BITS + 1] = _quick_header(stream.event_header, event.big)
+        row[S_FREQUENCY] = _frequency(stream, trace)
+        row[S_COST] = P_ROW + layout.cost(*in_header) + layout.cost(*in_context)
+        for scope in ("trace.packet.header", "stream.packet.context"):
+            for number in event.roots[scope].values():
+                if isinstance(number, _Number) and 0 <= number.register < len(REGISTERS):
+                    row[S_KNOWN] |= 1 << number.register
+        if trace.uuid is None:
+            row[S_KNOWN] &= ~(1 << R_UUID_LOW)
+        else:
+            row[S_UUID_LOW], row[S_UUID_HIGH] = _uuid_words(trace.uuid)
+        ids: dict[int, int] = {}
+        for declared in stream.events.values():
+            ids[declared.id] = len(layout.events)
+            kernel = trace.env.get("domain") == "kernel"
+            scopes, columns = _columns(stream, declared, kernel, wanted)
+            added = _add_event(layout, event, declared.name, scopes, columns, row, wanted)
+            added[E_COST] += layout.cost(*in_event)
+        row[S_ID_FIRST : S_DEFAULT + 1] = _id_table(layout, ids)
+        layout.streams.append(row)
+
+
+def _add_event(
+    layout: Layout,
+    header: _Writer,
+    name: str,
+    scopes: list[_Scope],
+    columns: list[tuple[str, Type]],
+    stream: list[int],
+    wanted: Wanted,
+) -> list[int]:
+    """Lay out an event class; returns its row. A wanted one goes to the table of its shape."""
+    writer, row, table = header.following(), [0] * EVENT_COLUMNS, None
+    start, stop = row[E_WALK], row[E_WALK_STOP] = writer.run(scopes)
+    row[E_COUNTER], row[E_COST] = -1, layout.cost(start, stop)
+    if name in wanted.names:
+        has_cpu, slots = bool(stream[S_KNOWN] >> R_CPU & 1), tuple(writer.slots)
+        table = Table(name, tuple(columns), slots, writer.levels, has_cpu, layout.counters)
+        if table in layout.tables:
+            table = layout.tables[table][0].table or table
+        else:
+            layout.tables[table], layout.counters = [], layout.counters + table.levels
+        writer.count_from(table.counter)
+        row[E_COUNTER], row[E_LEVELS] = table.counter, table.levels
+        row[E_COST] += 8 + 4 * has_cpu + sum(s.dtype.itemsize for s in slots if s.level == 0)
+    if start == stop:
+        row[E_ALIGN] = 1
+    elif stop == start + 1 and layout.operations[start][O_CODE] == SKIP:
+        row[E_ALIGN], row[E_SIZE] = layout.operations[start][O_ALIGN : O_SIZE + 1]
+    layout.events.append(Event(name, row, table, len(layout.streams), header, scopes))
+    if table is not None:
+        layout.tables[table].append(layout.events[-1])
+    return row
+
+
+def _columns(
+    stream: StreamClass, event: EventClass, kernel: bool, asked: Wanted
+) -> tuple[list[_Scope], list[tuple[str, Type]]]:
+    """The scopes of an event behind its header, and its columns by their final names.
+
+    A kernel trace's own pid and tid are those of the initial namespace; user space traces have
+    ``vpid`` and ``vtid`` of the process's namespace only.
+    """
+    contexts = {"stream.event.context": stream.event_context, "event.context": event.context}
+    if event.name not in asked.names:
+        return [(s, k, ()) for s, k in {**contexts, "event.fields": event.fields}.items()], []
+    present: dict[str, tuple[str, str]] = {}
+    for scope, kind in contexts.items():
+        for member in kind.fields if kind is not None else ():
+            present.setdefault(field_name(member.name), (scope, member.name))
+    standard: dict[tuple[str, str], str] = {}
+    for column in ("pid", "tid", *(["procname"] if event.name not in asked.nameless else [])):
+        for name in (column, f"v{column}") if kernel else (f"v{column}", column):
+            if name in present:
+                standard[present[name]] = column
+                break
+    scopes: list[_Scope] = []
+    columns: list[tuple[str, Type]] = []
+    for scope, kind in contexts.items():
+        members = kind.fields if kind is not None else ()
+        chosen = [m for m in members if asked.context or (scope, m.name) in standard]
+        scopes.append((scope, kind, {member.name for member in chosen}))
+        for member in chosen:
+            name = standard.get((scope, member.name), f"context.{field_name(member.name)}")
+            columns.append((name, member.type))
+    members = event.fields.fields if event.fields is not None else ()
+    scopes.append(("event.fields", event.fields, {member.name for member in members}))
+    taken = {"time", "cpu", "pid", "tid", "procname", *(name for name, _ in columns)}
+    for member in members:
+        name = field_name(member.name)
+        while name in taken:
+            name = f"payload.{name}"
+        taken.add(name)
+        columns.append((name, member.type))
+    return scopes, columns
+
+
+def _id_table(layout: Layout, rows: dict[int, int]) -> list[int]:
+    """Append a stream class's event ids; returns where they lie and the id to assume."""
+    first = len(layout.ids)
+    dense = max((i + 1 for i in rows if i < _DENSE_IDS), default=0)
+    layout.ids += [rows.get(i, -1) for i in range(dense)]
+    pairs = sorted((i, row) for i, row in rows.items() if i >= dense)  # searched by halves
+    layout.ids += [number for pair in pairs for number in pair]
+    return [first, dense, len(pairs), next(iter(rows)) if len(rows) == 1 else 0]
+
+
+def _quick_header(header: StructType | None, big: bool) -> list[int]:
+    """Alignment, id bits, clock shift and clock bits of LTTng's compact and large headers.
+
+    Both put an id of few bits and the clock's low bits into one load, and announce anything
+    larger by an id of all ones. Zeros for every other header, which is then interpreted.
+    """
+    match header:
+        case StructType(
+            fields=(
+                Field("id", IntegerType(signed=False) as number),
+                Field(_, VariantType("id", options)),
+            )
+        ) if not big:
+            last = (1 << number.size) - 1
+            wanted = {"compact": (0, last - 1), "extended": (last, last)}
+            compact = next((o.type for o in options if o.name == "compact"), None)
+            match compact:
+                case StructType(
+                    fields=(Field(_, IntegerType(signed=False, clock=str()) as clock),)
+                ):
+                    align, inner = header.align, compact.align
+                    shift = -(-number.size // inner) * inner
+                    quick = {m.label: (m.low, m.high) for m in number.mappings} == wanted
+                    quick &= "be" not in (number.byte_order, clock.byte_order)
+                    quick &= clock.size <= 63 and shift + clock.size <= 64
+                    if quick and align >= max(8, inner):
+                        return [align, number.size, shift, clock.size]
+    return [0, 0, 0, 0]
+
+
+def _clock_names(kind: Type | None) -> list[str]:
+    match kind:
+        case IntegerType(clock=str(name)):
+            return [name]
+        case StructType(fields=fields) | VariantType(options=fields):
+            return [name for f in fields for name in _clock_names(f.type)]
+    return []
+
+
+def _frequency(stream: StreamClass, trace: TraceClass) -> int:
+    """The rate of the clock that a stream's time stamps are mapped to, in Hz."""
+    names = _clock_names(stream.event_header) + _clock_names(stream.packet_context)
+    for name in names:
+        if name not in trace.clocks:
+            raise LayoutError(f"stream {stream.id} is mapped to the undeclared clock {name!r}")
+    names += list(trace.clocks)
+    return trace.clocks[names[0]].frequency if names else BILLION
+
+
+def _uuid_words(text: str) -> tuple[int, int]:
+    try:
+        low, high = np.frombuffer(UUID(text).bytes, "<i8")
+        return int(low), int(high)
+    except ValueError:
+        raise LayoutError(f"trace uuid {text!r} is none") from None
