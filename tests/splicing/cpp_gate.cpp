@@ -6,7 +6,6 @@
 
 #include "chainshaper_shaping/gate.hpp"
 #include "chainshaper_shaping/gate_log.hpp"
-#include "chainshaper_shaping/shaper.hpp"
 
 using namespace chainshaper;  // NOLINT
 
@@ -105,7 +104,7 @@ void walk() {
       now += slept ? late_ns : 0;
       if (queue.replaced(release, now)) {
         dropped = Dropped::replaced;
-      } else if (policy_of(queue.gate) == Policy::discard && missed(queue.gate, release, now)) {
+      } else if (queue.gate.policy() == Policy::discard && missed(queue.gate, release, now)) {
         release.overrun = Policy::discard;
         dropped = Dropped::discarded;
       }

@@ -20,10 +20,10 @@ from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log
 from chainshaper.sources.ros import script as ros_script
 from chainshaper.sources.ros.interpreter import own_environment, run_with_rclpy
-from chainshaper.splicing.generated_package import build_package
 from chainshaper.splicing.shaping_process import (
     NodeKind,
     ShapingProcess,
+    build_package,
     write_shaping_process,
     write_throttler,
 )

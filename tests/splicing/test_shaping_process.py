@@ -21,8 +21,7 @@ from processes import wait_for
 from small_chain import EXECUTOR_CORE
 
 from chainshaper.gate import decision as gate
-from chainshaper.gate.decision import READER_DEPTH
-from chainshaper.gate.parameters import NodeParameters, gate_parameters
+from chainshaper.gate.decision import READER_DEPTH, NodeParameters, gate_parameters
 from chainshaper.planning import Modes, Plan, ShapingNode, let_per_callback
 from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log

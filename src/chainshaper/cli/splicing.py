@@ -61,7 +61,7 @@ def splice(
     names, with your launch arguments; your launch files stay as they are.
     """
     from chainshaper.flow.launch_splicing import undo_splice
-    from chainshaper.splicing.generated_package import build_package, check_build_tools
+    from chainshaper.splicing.shaping_process import build_package, check_build_tools
     from chainshaper.splicing.spliced_launch import NODES
 
     if undo:

@@ -31,8 +31,7 @@ from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.linux.users import run_users
 from chainshaper.planning import Plan, PlanRequest, save_plan
 from chainshaper.reporting.figures import write_comparison
-from chainshaper.splicing.generated_package import build_package, check_build_tools
-from chainshaper.splicing.shaping_process import NodeKind
+from chainshaper.splicing.shaping_process import NodeKind, build_package, check_build_tools
 from chainshaper.splicing.spliced_launch import NODES, LaunchCommand, parse_launch_command
 from chainshaper.values.application import ApplicationGraph
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError

@@ -1,12 +1,11 @@
 """A core that is clear of other work while an output is delivered there.
 
-DDS threads that receive outrank everything else on their core, but that does not help them at once:
-unless the kernel is fully preemptible, an ordinary thread that is inside a system call goes on
-until it is through with it, and a core that idles has to wake up first. So a thread of the lowest
-real-time priority watches the clock there, from somewhat before a release until the output is
-delivered. Ordinary threads do not run meanwhile, and receiving ones preempt it within microseconds.
-
-That thread is a process of its own: within one of Python it would hold up the gate.
+DDS threads that receive outrank everything else on their core, but unless the kernel is fully
+preemptible, an ordinary thread that is inside a system call goes on until it is through with it,
+and a core that idles has to wake up first. So a thread of the lowest real-time priority watches the
+clock there, from somewhat before a release until the output is delivered: ordinary threads do not
+run meanwhile, and receiving ones preempt it within microseconds. It is a process of its own, since
+within one of Python it would hold up the gate.
 """
 
 import inspect
@@ -30,9 +29,9 @@ def _clear(core: int) -> None:
 
 
 class ClearCore:
-    """A process that clears a core. It ends with the one that made it, and hears no Ctrl-C.
+    """A process that clears a core; none where SCHED_FIFO or the core is refused.
 
-    Where SCHED_FIFO or the core is refused, it clears none.
+    It ends with the one that made it, and hears no Ctrl-C.
     """
 
     def __init__(self, core: int) -> None:
@@ -45,11 +44,7 @@ class ClearCore:
             start_new_session=True,
         )
         os.close(times)
-
-    @property
-    def pid(self) -> int:
-        """The id of its process."""
-        return self._process.pid
+        self.pid = self._process.pid
 
     def clear_until(self, time_ns: int) -> None:
         """Clear the core from now until then."""

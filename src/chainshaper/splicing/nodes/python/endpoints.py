@@ -25,8 +25,7 @@ from rclpy.qos import (
     QoSReliabilityPolicy,
 )
 
-from chainshaper.gate.decision import DEPTH, READER_DEPTH
-from chainshaper.gate.parameters import NodeParameters
+from chainshaper.gate.decision import DEPTH, READER_DEPTH, NodeParameters
 
 
 def parameters_of(node: Node) -> NodeParameters:

@@ -9,7 +9,6 @@
 
 #include "chainshaper_shaping/gate_log.hpp"
 #include "chainshaper_shaping/handover.hpp"
-#include "chainshaper_shaping/node.hpp"
 #include "chainshaper_shaping/readiness.hpp"
 #include "rcl/subscription.h"
 #include "std_msgs/msg/string.hpp"
@@ -69,8 +68,6 @@ void publish(Publisher & output, const Message & message) { output.publish(messa
 }  // namespace
 
 #else
-#include "chainshaper_shaping/serialized.hpp"
-
 namespace {
 
 using Message = rclcpp::SerializedMessage;
@@ -124,9 +121,8 @@ std::optional<std::size_t> delivery_core(const std::vector<std::int64_t> & taken
   return std::nullopt;
 }
 
-// What is agreed with the standby; none: the node is alone, since nothing names a page. After
-// several nodes that failed at once this one waits, so that starting over and over does not take a
-// core; so this comes before anything that may fail.
+// What is agreed with the standby; none: the node is alone, since nothing names a page. It waits
+// where nodes before it failed at once, so this comes before anything that may fail.
 std::optional<Turn> turn_of(rclcpp::Node & node) {
   const auto page = parameters_of(node).handover;
   if (page.empty()) return std::nullopt;
@@ -247,7 +243,7 @@ public:
 private:
   // The gate drops what it has no room for, and so counts it: its reader has more of it. What
   // leaves in one slot must find room in the writer, too.
-  rclcpp::QoS asked(rclcpp::QoS qos) const { return deeper(qos, std::max(reader_depth, depth())); }
+  rclcpp::QoS asked(rclcpp::QoS qos) const { return deeper(qos, std::max<std::size_t>(schema::reader_depth, depth())); }
   rclcpp::QoS offered(rclcpp::QoS qos) const {
     const bool latched = qos.durability() == rclcpp::DurabilityPolicy::TransientLocal;
     return latched ? qos : deeper(qos, depth());
@@ -323,7 +319,7 @@ private:
   // How many messages may wait: what the publisher's history has, where it is not said.
   static std::size_t depth_for(const Parameters & parameters, const rclcpp::QoS & offered) {
     return parameters.depth > 0 ? static_cast<std::size_t>(parameters.depth)
-                                : std::max(default_depth, offered.depth());
+                                : std::max<std::size_t>(schema::depth, offered.depth());
   }
 
   static rclcpp::QoS deeper(rclcpp::QoS qos, std::size_t depth) {
