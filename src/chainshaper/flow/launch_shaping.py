@@ -4,10 +4,9 @@
     record                   profile    plan         splice     apply,
                                                                 recorded
 
-Each step is what the verb of its name does, and leaves its result in the folder: any of them can
-be looked at, and repeated by hand. The first, short recording tells which chains there are and
-which nodes a chain has; the second measures it under the paper's profiling condition (section 2.4),
-as far as that is permitted.
+Each step is what the verb of its name does, and leaves its result in the folder. The first, short
+recording tells which chains there are and which nodes a chain has; the second measures it under the
+paper's profiling condition (section 2.4), as far as that is permitted.
 """
 
 import sys
@@ -25,7 +24,7 @@ from chainshaper.flow.exploration import list_chains
 from chainshaper.flow.launch_splicing import Splicing, splice_launch_files
 from chainshaper.flow.plan import plan_recording
 from chainshaper.flow.profiling import chain_nodes, profiling_condition
-from chainshaper.flow.record import Scheduling, record_command
+from chainshaper.flow.record import record_command
 from chainshaper.linux.processes import Process
 from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.linux.users import run_users
@@ -38,10 +37,7 @@ from chainshaper.values.errors import ChainshaperError, InputError, OperationErr
 from chainshaper.values.recording import Recording, refuse_existing
 from chainshaper.verify.measure import Comparison, compare_recordings
 
-__all__ = ["ShapedLaunch", "shape_launch"]
-
-FIRST_LOOK_NS = 10_000_000_000
-"""How long the first recording takes: long enough for everything to have started and run."""
+FIRST_LOOK_NS = 10_000_000_000  # long enough for everything to have started and run
 
 Choose: TypeAlias = Callable[[ApplicationGraph, ChainEnumeration], str]
 """Asked which of the chains that were found is meant."""
@@ -115,45 +111,36 @@ def shape_launch(
 
     first = record("first", command, FIRST_LOOK_NS)
     chain = _chain(first, chain, choose)
-    before = record(
-        "before",
-        command,
-        duration_ns,
-        chain=chain,
-        watch_stalls=True,
-        scheduling=_profiled(first, chain),
-    )
+    permitted = may_use_fifo()  # else it is measured under ordinary scheduling
+    profiled = profiling_condition(chain_nodes(first, chain), like=first) if permitted else None
+    measured: dict[str, Any] = {"chain": chain, "watch_stalls": True}
+    before = record("before", command, duration_ns, scheduling=profiled, **measured)
     progress(0.0, "planning")
     plan = plan_recording(before, chain, request or PlanRequest())
     save_plan(plan, folder / "plan.yaml")
     planned(plan)
-    splicing = _spliced(plan, launch, folder / "launch", node, first)
+    splicing = splice_launch_files(
+        *(plan, [launch.file], folder / "launch"),
+        node=node,
+        arguments=launch.arguments,
+        recording=first,
+    )
     after = record(
         "after",
         _with_shaping_node(launch, splicing),
         duration_ns,
-        chain=chain,
-        watch_stalls=True,
         scheduling=_in_force(plan, back_end, first, taken),
         plan=plan,
         gate_logs=splicing.logs,
+        **measured,
     )
     progress(0.0, "comparing")
     comparison = compare_recordings([before, after], chain)
     write_comparison(comparison, folder)
-    found = [
-        *before.info.notes,
-        *splicing.notes,
-        *after.info.notes,
-    ]
-    if not may_use_fifo():
+    found = [*before.info.notes, *splicing.notes, *after.info.notes]
+    if not permitted:
         found.insert(0, "measured under ordinary scheduling: SCHED_FIFO is not permitted.")
     return ShapedLaunch(folder, chain, plan, splicing, comparison, tuple(dict.fromkeys(found)))
-
-
-def _profiled(first: Recording, chain: str) -> Scheduling | None:
-    """The paper's profiling condition, if we may."""
-    return profiling_condition(chain_nodes(first, chain), like=first) if may_use_fifo() else None
 
 
 def _chain(first: Recording, chain: str | None, choose: Choose | None) -> str:
@@ -172,19 +159,6 @@ def _chain(first: Recording, chain: str | None, choose: Choose | None) -> str:
             + ", ".join(one.spec for one in found.chains[:5])
         )
     return choose(graph_of(flow), found)
-
-
-def _spliced(
-    plan: Plan, launch: LaunchCommand, folder: Path, node: NodeKind, recording: Recording
-) -> Splicing:
-    return splice_launch_files(
-        plan,
-        [launch.file],
-        folder,
-        node=node,
-        arguments=launch.arguments,
-        recording=recording,
-    )
 
 
 def _with_shaping_node(launch: LaunchCommand, splicing: Splicing) -> list[str]:
