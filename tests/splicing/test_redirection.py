@@ -200,10 +200,10 @@ def test_a_node_that_has_ended_is_redirected_no_more() -> None:
 
 
 def test_a_node_is_redirected_once_unless_it_has_ended() -> None:
-    assert started(pose(), NAMED).twice() is None
-    assert started(pose(), NAMED, NAMED, ended=True).twice() is None
+    assert started(pose(), NAMED).mistake([], []) is None
+    assert started(pose(), NAMED, NAMED, ended=True).mistake([], []) is None
     twice = "more was redirected than meant: /ndt was started more than once"
-    assert started(pose(), NAMED, NAMED).twice() == twice
+    assert started(pose(), NAMED, NAMED).mistake([], []) == twice
 
 
 def test_a_message_names_the_topic_and_who_was_found() -> None:
