@@ -153,21 +153,15 @@ class Gate:
 
 @dataclass(slots=True)  # making a frozen one takes a microsecond more, on the way of every message
 class Release:
-    """The gate's decision for one message; times are ns of CLOCK_MONOTONIC.
+    """The gate's decision for one message; times are ns of CLOCK_MONOTONIC."""
 
-    ``at_ns`` is when the message may leave (not after the arrival: at once; None: never),
-    ``slot`` which of the slots that is (None: none), ``cycles_waited`` how many cycles after its
-    own, ``anchor`` what the slots were counted from. ``overrun`` is the policy that was applied to
-    a message that came late, ``mode`` that of its cycle; None: it came in time, there are none.
-    """
-
-    at_ns: int | None
+    at_ns: int | None  # when it may leave (not after the arrival: at once; None: never)
     origin_ns: int
-    slot: int | None
-    cycles_waited: int
-    anchor: str
-    overrun: str | None = None
-    mode: str | None = None
+    slot: int | None  # in which one that is, if in any
+    cycles_waited: int  # after its own
+    anchor: str  # what the slots were counted from
+    overrun: str | None = None  # the policy that was applied to it; None: it came in time
+    mode: str | None = None  # of its cycle; None: there are no modes
 
     def start_ns(self, cycle_ns: int) -> int:
         """When the cycle starts in which the message leaves."""
@@ -183,12 +177,11 @@ def release_of(
     ready_ns: int | None = None,
     phase_ns: int | None = None,
 ) -> Release:
-    """Decide when a message that arrived at ``arrival_ns`` may leave.
+    """Decide when a message that arrived at ``arrival_ns`` may leave (ns of CLOCK_MONOTONIC).
 
-    ``stamp_ns`` is its origin on CLOCK_MONOTONIC (see :func:`origin_of`), None if it has none.
-    ``changes`` are the modes that were announced, each with the time (ns), ascending. It leaves at
-    ``ready_ns`` at the earliest, where others are before it. ``phase_ns`` is in force instead of
-    the gate's own.
+    ``stamp_ns`` is its origin, None if it has none; ``changes`` are the modes that were announced,
+    each with the time, ascending. It leaves at ``ready_ns`` at the earliest, where others are
+    before it. ``phase_ns`` is in force instead of the gate's own.
 
         >>> gate = Gate(slots=((60, 61),), cycle_ns=100)
         >>> release_of(gate, arrival_ns=1040, stamp_ns=1000).at_ns      # early: it waits
@@ -357,8 +350,7 @@ _TIMER_ABSTIME, _EINTR = 1, 4
 def sleep_until(deadline_ns: int) -> None:
     """Sleep until an instant of CLOCK_MONOTONIC; returns at once when it has passed.
 
-    ``time.sleep`` takes a relative time, so a pre-emption between computing and sleeping would
-    be added to it. An absolute sleep cannot be late for that reason.
+    The relative time of ``time.sleep`` would be added to a pre-emption before it.
     """
     request = _Timespec(*divmod(max(0, deadline_ns), 1_000_000_000))
     error = _EINTR  # a signal ends the sleep early; the deadline stays the same
@@ -371,10 +363,7 @@ def sleep_until(deadline_ns: int) -> None:
 
 
 def watch_until(deadline_ns: int) -> int:
-    """Watch the clock until an instant of CLOCK_MONOTONIC has come; returns the time then.
-
-    Waking from a sleep costs the kernel some tens of microseconds, and not always the same.
-    """
+    """Watch the clock, to microseconds, until an instant of CLOCK_MONOTONIC; the time then."""
     clock = time.monotonic_ns
     now = clock()
     while now < deadline_ns:
@@ -400,30 +389,23 @@ def clock_offset() -> int:
 
 @dataclass(eq=False)
 class Waiting:
-    """A message that has come and not left; times are ns of CLOCK_MONOTONIC.
-
-    ``about`` is what its owner knows of it besides. ``lost`` counts those that were lost on the
-    way between the one before it and this one (None: not known).
-    """
+    """A message that has come and not left; times are ns of CLOCK_MONOTONIC."""
 
     payload: bytes
     arrival_ns: int
     stamp_ns: int | None
     phase_ns: int
-    about: Any = None
-    lost: int | None = None
+    about: Any = None  # what its owner knows of it besides
+    lost: int | None = None  # how many, between the one before it and this one; None: not known
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a message: it may leave now, or was ``dropped``, for that reason.
-
-    ``awake_ns`` is when that was clear (CLOCK_MONOTONIC).
-    """
+    """What became of a message: it may leave now, or was ``dropped``, for that reason."""
 
     message: Waiting
     release: Release
-    awake_ns: int
+    awake_ns: int  # when that was clear (CLOCK_MONOTONIC)
     dropped: str | None = None
 
 
@@ -520,10 +502,9 @@ class Shaper:
 
     One shaper belongs to one thread, which does nothing else at the time of a release: so it is a
     witness of the machine's own stalls (:meth:`time_lost`). ``look`` has new messages
-    :meth:`arrive`: it is called while others wait, before each release and behind it.
-    ``on_waking`` is called with the time of a release when it wakes ``spin_ns`` before that, to
-    watch the clock from there; ``on_decision`` with each decision, before it is waited for, and
-    where cycles begin.
+    :meth:`arrive`, while others wait, before each release and behind it. ``on_waking`` gets the
+    time of a release ``spin_ns`` before it, when the clock is watched from; ``on_decision`` each
+    decision, before it is waited for, and where cycles begin.
     """
 
     def __init__(

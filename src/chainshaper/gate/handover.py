@@ -77,10 +77,7 @@ BACK_OFF_AFTER = 3  # so many starts may fail at once; each further one waits tw
 
 
 def page_folders() -> Iterator[str]:
-    """Where pages are, the best place first: of root, of a login session, of any user.
-
-    `/dev/shm` is in memory and empty after booting, like the others.
-    """
+    """Where pages are, in memory, the best first: of root, of a login session, of any user."""
     user, session = os.geteuid(), os.environ.get("XDG_RUNTIME_DIR")
     if user == 0:
         yield "/run/chainshaper/outputs"
