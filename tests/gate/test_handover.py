@@ -21,7 +21,7 @@ from chainshaper.gate.handover import RING, Page, Standby, Turn, open_page
 
 MS = 1_000_000
 PROCESS = Path(__file__).parent / "output_process.py"
-KILLS = int(os.environ.get("CHAINSHAPER_KILLS", "20"))
+KILLS = int(os.environ.get("CHAINSHAPER_KILLS", "10"))
 PERIOD_S, HOLD_NS = 0.004, 2 * MS
 
 
@@ -60,6 +60,14 @@ class Output:
     def kill(self, what: str) -> None:
         self.running[what].kill()
         self.running[what].wait()
+
+    def restart(self, *every: str) -> None:
+        for what in every:
+            self.kill(what)
+        for what in every:
+            self.start(what)
+        for what in every:
+            self.await_ready(what)
 
     def send(self) -> None:
         """Publish one message, to all that listen by now."""
@@ -131,9 +139,7 @@ def test_a_node_that_is_killed_at_random_loses_doubles_and_reorders_nothing(outp
         what = "standby" if number % 5 == 4 else "shaping"
         output.send_many(dice.randrange(5, 12))
         output.receive(dice.random() * PERIOD_S)
-        output.kill(what)
-        output.start(what)
-        output.await_ready(what)
+        output.restart(what)
     output.check(begun)
     assert output.by("B")
     assert output.by("S")
@@ -141,7 +147,7 @@ def test_a_node_that_is_killed_at_random_loses_doubles_and_reorders_nothing(outp
 
 def test_a_node_that_is_stopped_is_gone_around_until_it_goes_on(output: Output) -> None:
     begun, shaping = output.sent, output.running["shaping"]
-    for _ in range(4):
+    for _ in range(2):
         output.send_many(5)
         bypassed = len(output.by("B"))
         shaping.send_signal(signal.SIGSTOP)
@@ -158,9 +164,7 @@ def test_a_standby_that_is_stopped_is_in_nobody_s_way(output: Output) -> None:
     output.send_many(5)
     standby.send_signal(signal.SIGSTOP)
     output.send_many(5)
-    output.kill("shaping")
-    output.start("shaping")
-    output.await_ready("shaping")
+    output.restart("shaping")
     output.send_many(30)
     assert output.by("S")[-1] > output.sent - 3, "the new node publishes"
     standby.send_signal(signal.SIGCONT)
@@ -174,12 +178,7 @@ def test_when_both_are_killed_nothing_comes_twice_and_either_goes_on(output: Out
     dice = random.Random(13)
     for _ in range(KILLS // 5):
         output.send_many(dice.randrange(5, 12))
-        for what in ("standby", "shaping"):
-            output.kill(what)
-        for what in ("standby", "shaping"):
-            output.start(what)
-        for what in ("standby", "shaping"):
-            output.await_ready(what)
+        output.restart("standby", "shaping")
         begun = output.sent
         output.send_many(5)
         output.check(begun)
