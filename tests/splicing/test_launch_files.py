@@ -1,4 +1,7 @@
-"""What splicing writes for launch files: the nodes that it adds, and whose topics it redirects."""
+"""What splicing writes for launch files: the nodes that it adds, and whose topics it redirects.
+
+And which launch file a `ros2 launch …` means, and the same command for another one.
+"""
 
 import ast
 import json
@@ -11,6 +14,7 @@ from launch_cases import NDT, ROBOTS, plan_for
 
 from chainshaper import Plan, Splicing, ThrottledInput, splice_launch_files, splice_throttlers
 from chainshaper.planning.plan import revised
+from chainshaper.splicing.spliced_launch import parse_launch_command
 from chainshaper.values.errors import InputError, PlatformError
 from chainshaper.values.recording import Recording, open_recording
 
@@ -85,7 +89,7 @@ def test_the_user_s_file_is_included_as_it_is(name: str, tmp_path: Path) -> None
     assert "+++ " + str(tmp_path / "out/robot.launch.py") in spliced.diff
 
 
-@pytest.mark.parametrize("folder", ["out", "two words", "a'b", "a$b", 'a"b', "a\\b", "a#b", "a\nb"])
+@pytest.mark.parametrize("folder", ["out", "two 'words'", 'a$"\\b#\nc'])
 def test_both_nodes_are_started_with_their_files_and_again_when_they_end(
     robot: Path, folder: str
 ) -> None:
@@ -312,3 +316,66 @@ def test_a_dry_run_without_ros_2_says_what_it_needs(
     with pytest.raises(PlatformError, match="a dry run needs ROS 2: source its setup"):
         splice_launch_files(PLAN, [robot], robot.parent / "out", dry_run=True)
     assert not (robot.parent / "out").exists()
+
+
+# The command ------------------------------------------------------------------------------------
+
+ROS2 = "/opt/ros/jazzy/bin/ros2"
+
+
+@pytest.fixture
+def share(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The share folder of a package `robot` in the environment, with one launch file."""
+    index = tmp_path / "install/share/ament_index/resource_index/packages"
+    index.mkdir(parents=True)
+    (index / "robot").touch()
+    share = tmp_path / "install/share/robot"
+    (share / "launch").mkdir(parents=True)
+    (share / "launch/all.launch.py").touch()
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"/nowhere:{tmp_path / 'install'}")
+    return share
+
+
+def test_a_package_and_the_name_of_a_file_anywhere_in_it(share: Path) -> None:
+    words = [ROS2, "launch", "-n", "--launch-prefix", "nice", "robot", "all.launch.py"]
+    command = parse_launch_command([*words, "speed:=3", "map:=a:=b", "--debug"])
+    assert command.file == share / "launch/all.launch.py"
+    assert command.arguments == {"speed": "3", "map": "a:=b"}
+    assert command.with_file(Path("/copy.py")) == [
+        *words[:5],
+        "/copy.py",
+        "speed:=3",
+        "map:=a:=b",
+        "--debug",
+    ]
+
+
+def test_a_path_needs_no_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("robot.launch.xml").touch()
+    command = parse_launch_command(["ros2", "launch", "robot.launch.xml", "speed:=3"])
+    assert command.file == tmp_path / "robot.launch.xml"
+    assert command.with_file(Path("/c.xml")) == ["ros2", "launch", "/c.xml", "speed:=3"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["ros2", "run", "robot", "node"], "`ros2 run robot node` is not `ros2 launch"),
+        (["ros2", "launch"], "is not `ros2 launch"),
+        (["ros2", "launch", "-d"], "no launch file given"),
+        (["ros2", "launch", "other", "all.launch.py"], "other: neither a launch file nor a pack"),
+        (["ros2", "launch", "robot"], "no launch file given: `ros2 launch robot FILE`"),
+        (["ros2", "launch", "robot", "a.launch.py"], "robot has no launch file a.launch.py in /"),
+    ],
+)
+def test_what_cannot_be_launched_is_said(share: Path, words: list[str], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        parse_launch_command(words)
+
+
+def test_two_files_of_one_name_are_told_apart_by_their_path(share: Path) -> None:
+    (share / "old").mkdir()
+    (share / "old/all.launch.py").touch()
+    with pytest.raises(InputError, match=r"has 2 files .*launch/all.launch.py or .*old/all"):
+        parse_launch_command(["ros2", "launch", "robot", "all.launch.py"])
