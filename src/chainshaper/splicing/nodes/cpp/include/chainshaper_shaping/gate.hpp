@@ -31,7 +31,6 @@ struct Slot {
   std::int64_t end;
 };
 
-// The place of a word among those that there are; none: it is none of them.
 template <typename Words>
 std::optional<std::size_t> place_of(const Words & words, const std::string & word) {
   const auto found = std::find(words.begin(), words.end(), word);
@@ -60,12 +59,10 @@ struct Gate {
   Messages messages{Messages::all_in_order};
   std::size_t depth{schema::depth};
 
-  // What becomes of a message that comes behind the last slot that is open to it.
   Policy policy() const {
     return modes && modes->late != Policy::next_slot ? modes->late : overrun;
   }
 
-  // Whether a message's slots count from its stamp.
   bool counts_from(Maybe stamp_ns, std::int64_t arrival_ns) const {
     if (!stamp_ns || anchor != Anchor::stamp) return false;
     const auto age_ns = arrival_ns - *stamp_ns;
@@ -87,7 +84,6 @@ struct Release {
   std::optional<Policy> overrun;
   std::optional<std::size_t> mode;
 
-  // When the cycle starts in which the message leaves.
   std::int64_t start_ns(std::int64_t cycle_ns) const {
     return origin_ns + cycles_waited * cycle_ns;
   }
@@ -149,9 +145,6 @@ inline std::int64_t modulo(std::int64_t value, std::int64_t cycle_ns) {
   return rest < 0 ? rest + cycle_ns : rest;
 }
 
-// Decide when a message that arrived at `arrival_ns`, with this stamp (both CLOCK_MONOTONIC), may
-// leave. `changes` are the modes that were announced, ascending in time. It leaves at `ready_ns` at
-// the earliest, where others are before it.
 inline Release release_of(const Gate & gate, std::int64_t arrival_ns, Maybe stamp_ns,
                           const std::deque<Change> & changes, std::int64_t ready_ns,
                           std::int64_t phase_ns) {
@@ -206,7 +199,6 @@ inline Release withheld(Release release) {
   return release;
 }
 
-// Whether the slot that a message was to leave in is over.
 inline bool missed(const Gate & gate, const Release & release, std::int64_t now_ns) {
   return release.slot &&
          now_ns >= release.start_ns(gate.cycle_ns) + gate.slots[*release.slot].end;
@@ -242,7 +234,6 @@ struct Waiting {
   std::uint64_t number;
 };
 
-// What became of a message: it may leave now, or was dropped, for that reason.
 template <typename Message>
 struct Outcome {
   Waiting<Message> waiting;
@@ -258,7 +249,6 @@ public:
     check(this->gate);
   }
 
-  // A message came; the one for which there is no room any more.
   std::optional<Outcome<Message>> arrive(Message message, std::int64_t arrival_ns, Maybe stamp_ns,
                                          Maybe source_timestamp = {}, Maybe lost = {}) {
     waiting.push_back(
@@ -269,7 +259,6 @@ public:
     return Outcome<Message>{take_oldest(), release, arrival_ns, Dropped::overflowed};
   }
 
-  // When the oldest message may leave, or why it never does.
   std::pair<Release, std::optional<Dropped>> decide() {
     const auto & oldest = waiting.front();
     const std::int64_t ready_ns = std::max(oldest.arrival_ns, free_ns);
@@ -289,7 +278,6 @@ public:
     return {release, std::nullopt};
   }
 
-  // Whether a newer message leaves for the oldest one, which was to leave like this.
   bool replaced(const Release & release, std::int64_t now_ns) const {
     if (gate.messages != Messages::newest || !release.slot) return false;
     return std::any_of(waiting.begin() + 1, waiting.end(), [&](const Waiting<Message> & newer) {
@@ -322,7 +310,6 @@ private:
     return release_of(gate, one.arrival_ns, one.stamp_ns, changes, ready_ns, one.phase_ns);
   }
 
-  // Stamps are not quite periodic: cycles are the same less than half a cycle apart.
   bool same_cycle(const Release & release, Maybe start_ns) const {
     return start_ns && 2 * std::abs(release.start_ns(gate.cycle_ns) - *start_ns) < gate.cycle_ns;
   }
@@ -342,8 +329,6 @@ inline std::int64_t clock_ns(clockid_t clock) {
 
 inline std::int64_t monotonic_ns() { return clock_ns(CLOCK_MONOTONIC); }
 
-// Sleep until an instant of CLOCK_MONOTONIC; returns at once when it has passed. A signal ends the
-// sleep early; the deadline stays the same.
 inline void sleep_until(std::int64_t deadline_ns) {
   deadline_ns = std::max<std::int64_t>(0, deadline_ns);
   timespec request{};
@@ -352,14 +337,12 @@ inline void sleep_until(std::int64_t deadline_ns) {
   while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &request, nullptr) == EINTR) continue;
 }
 
-// Watch the clock until an instant has come; the time then.
 inline std::int64_t watch_until(std::int64_t deadline_ns) {
   std::int64_t now = monotonic_ns();
   while (now < deadline_ns) now = monotonic_ns();
   return now;
 }
 
-// CLOCK_REALTIME minus CLOCK_MONOTONIC, to a fraction of a microsecond.
 inline std::int64_t clock_offset() {
   std::int64_t best_width = std::numeric_limits<std::int64_t>::max();
   std::int64_t best = 0;
@@ -403,7 +386,6 @@ public:
     if (schedstat_ >= 0) close(schedstat_);
   }
 
-  // Cycles begin elsewhere, from the first such beginning after `now_ns` on.
   void set_phase(std::int64_t phase_ns, std::int64_t now_ns) {
     next_phase_ = {now_ns + modulo(phase_ns - now_ns, queue.gate.cycle_ns), phase_ns};
   }
@@ -480,14 +462,12 @@ public:
     return Outcome<Message>{queue.leave(release, awake), release, awake, dropped};
   }
 
-  // Whether there is time for something else before the next release.
   bool nothing_due() {
     if (queue.waiting.empty()) return true;
     const auto at_ns = queue.decide().first.at_ns;
     return at_ns && *at_ns > monotonic_ns() + spin_ns_ + schema::others_ns;
   }
 
-  // Pause behind a publication, unless another message has to leave meanwhile.
   void rest(std::int64_t published_ns, std::int64_t pause_ns) {
     queue.free_ns = published_ns;
     look_again();
@@ -500,9 +480,6 @@ public:
     queue.free_ns = monotonic_ns();
   }
 
-  // How much of the delay between a release and the time when the thread was awake the machine
-  // itself took: what the kernel does not say that other threads ran. To be called right after
-  // publishing.
   std::int64_t time_lost(const Outcome<Message> & outcome) {
     if (!outcome.release.at_ns) return 0;
     const std::int64_t others = others_ran_ns() - waited_ns_;

@@ -71,7 +71,6 @@ public:
     return stat(path_.c_str(), &found) == 0 && found.st_ino == inode_;
   }
 
-  // This node has dealt with a message.
   void note_released(std::int64_t key) {
     const auto number = get(Field::released);
     write(static_cast<std::size_t>(schema::released + number % schema::ring), key);
@@ -182,26 +181,22 @@ public:
   // How many nodes before this one have failed, shortly one after the other.
   std::int64_t failed_before() const { return page_->get(Field::failed_starts) - 1; }
 
-  // For how long to wait before starting, because of that.
   double wait_s() const {
     const auto failed = failed_before() - schema::back_off_after;
     if (failed < 0) return 0.0;
     return std::min(10.0, 0.5 * static_cast<double>(1 << std::min<std::int64_t>(failed, 5)));
   }
 
-  // Where cycles began for the shaping node before this one.
   Maybe phase_ns() const {
     if (page_->get(Field::phase_known) == 0) return std::nullopt;
     return page_->get(Field::phase_ns);
   }
 
-  // The mode in force for that node, by its number.
   std::optional<std::size_t> mode() const {
     const auto number = page_->get(Field::mode);
     return number > 0 ? std::optional<std::size_t>(number - 1) : std::nullopt;
   }
 
-  // Whether a message that was received is this node's to deal with.
   bool take(std::int64_t key) {
     if (!in_force_ && !come_into_force(key)) return false;
     page_->set(Field::until_ns, monotonic_ns());
@@ -217,7 +212,6 @@ public:
     page_->set(Field::phase_known, 1);
   }
 
-  // Whether the standby has dealt with a message.
   bool was_bypassed(std::int64_t key) {
     const auto count = page_->get(Field::bypassed);
     if (count != seen_) {
@@ -237,7 +231,6 @@ public:
     return true;
   }
 
-  // A message has been published or discarded.
   void done(std::int64_t key) {
     page_->note_released(key);
     page_->set(Field::until_ns, monotonic_ns());
@@ -256,7 +249,6 @@ public:
   // A message that was received has no room any more, and is never published.
   void drop(std::int64_t key) { page_->note_released(key); }
 
-  // A message has been published, or was dropped; so many were missing before it.
   void count(std::optional<Dropped> dropped, Maybe lost, bool late) {
     const auto reason = [](Dropped why) {  // they stand in the page in their order
       return static_cast<Field>(static_cast<int>(Field::replaced) + static_cast<int>(why));
