@@ -56,24 +56,17 @@ _Written: TypeAlias = tuple[list[ShapingProcess], list[Redirect]]
 
 @dataclass(frozen=True)
 class Splicing:
-    """What was spliced.
-
-    ``launch`` maps each launch file (or the executable of `ros2 run`) to the one to launch instead,
-    ``originals`` that one to the first that it includes. ``processes`` are the nodes that were
-    added, ``logs`` where shaping nodes and their standbys note what they did. ``redirects`` are the
-    nodes that get another topic, ``redirected`` what a dry run found of each. ``diff`` is the new
-    launch file as a unified diff, ``notes`` what to know before relying on it.
-    """
+    """What was spliced."""
 
     folder: Path
-    launch: Mapping[Path, Path]
-    originals: Mapping[Path, Path]
-    processes: tuple[ShapingProcess, ...]
-    logs: tuple[Path, ...]
-    diff: str
-    notes: tuple[str, ...]
-    redirects: tuple[Redirect, ...]
-    redirected: tuple[Mapping[str, Any], ...] = ()
+    launch: Mapping[Path, Path]  # each launch file, or executable: the one to launch instead
+    originals: Mapping[Path, Path]  # that one: the first that it includes
+    processes: tuple[ShapingProcess, ...]  # that were added
+    logs: tuple[Path, ...]  # of shaping nodes and their standbys
+    diff: str  # the new launch file as a unified diff
+    notes: tuple[str, ...]  # what to know before relying on it
+    redirects: tuple[Redirect, ...]  # nodes that get another topic
+    redirected: tuple[Mapping[str, Any], ...] = ()  # what a dry run found of each
 
 
 class ThrottledInput(Part):

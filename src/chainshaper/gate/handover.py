@@ -1,8 +1,7 @@
 """Which process publishes a shaped output: the shaping node, or the standby beside it.
 
-A shaping node is a single point in front of the actuator. So a second process, the **standby**,
-receives the same messages and passes them on while no shaping node is in force. For each message
-one of the two is responsible, whenever either is killed, stopped or started:
+The standby receives the same messages as the shaping node, and passes them on while that is not
+in force. For each one of the two is responsible, whenever either is killed, stopped or started:
 
 * The **lock** of a file says whether a shaping node is in force; the kernel frees it at the node's
   death. The node takes it with the first message that it receives, when its output is ready; the
@@ -10,12 +9,10 @@ one of the two is responsible, whenever either is killed, stopped or started:
 * The file itself is a **page** in memory that both map: which messages each of them has dealt with
   (by their source timestamps), and until when the node may take for the one that it holds.
 
-A message that the node has received and not released when it dies is published by the standby. One
-that the standby has published is left out by the node. A node that is late for its own release by
-more than a given patience hangs, or is stopped: the standby publishes what is due, and the node,
-when it goes on, leaves it out. What is left is the time from a publication until it is noted in
-the page, some microseconds: a process that is killed just there has published a message that the
-other publishes again.
+What the node has received and not released when it dies, the standby publishes; what the standby
+has published, the node leaves out. A node that is late for its own release by more than a given
+patience hangs, or is stopped: the standby publishes what is due. What is left are the microseconds
+from a publication until it is noted: who is killed just there leaves it to be published again.
 
 Standard library only, as the gate; `handover.hpp` is the node's side in C++, with the same page,
 whose layout is filled in from here.
@@ -90,9 +87,7 @@ def open_page(name: str, topic: str) -> "Page":
     """The page of an output: the one that is there, or else a new one.
 
     ``name`` tells it from others in this domain; whoever publishes the ``topic`` gives the same.
-
-    Raises:
-        OSError: no folder is ours alone, or the file is not.
+    OSError: no folder is ours alone, or the file is not.
     """
     domain = os.environ.get("ROS_DOMAIN_ID") or "0"
     problem = OSError("no folder")

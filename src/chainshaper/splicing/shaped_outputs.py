@@ -25,28 +25,23 @@ _TOPIC: TypeAdapter[str] = TypeAdapter(FullName)
 
 @dataclass(frozen=True)
 class ShapedOutput:
-    """An output with a shaping node, as it is now.
+    """An output with a shaping node, as it is now; it counts since the machine has booted.
 
     ``state`` is ``bypassed`` or ``silent`` while no shaping node is in force, and ``no standby``
-    when one is, but nothing would stand in for it. ``since_ns`` (CLOCK_MONOTONIC) is since when it
-    is bypassed or silent, with how many ``messages``; ``messages_in_all`` counts since the machine
-    has booted. The processes are None where there is none. ``starts`` counts those of the node.
-
-    Shaping nodes have ``published`` so many since then, and ``lost`` so many, by reason; of both,
-    ``late`` came behind the last slot that they were due in.
+    when one is, but nothing would stand in for it.
     """
 
     topic: str
     state: OutputState
-    shaping_node: int | None
+    shaping_node: int | None  # the process, if there is one
     standby: int | None
-    since_ns: int | None
-    messages: int
-    messages_in_all: int
-    starts: int
-    published: int
-    lost: dict[str, int]
-    late: int
+    since_ns: int | None  # of CLOCK_MONOTONIC: since when it is bypassed or silent,
+    messages: int  # with how many messages,
+    messages_in_all: int  # beside those before
+    starts: int  # of the shaping node
+    published: int  # by shaping nodes
+    lost: dict[str, int]  # by reason
+    late: int  # of both: behind the last slot that they were due in
     page: str
 
 

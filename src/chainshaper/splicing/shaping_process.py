@@ -42,13 +42,9 @@ SHORTEST_PATIENCE_NS = 10_000_000  # a node later than that hangs, or than half 
 
 @dataclass(frozen=True)
 class ShapingProcess:
-    """A process that a launch file starts: a shaping node, or a throttler.
+    """A process that a launch file starts, again when it ends: a shaping node, or a throttler.
 
-    It is either a ``command`` (without ``--ros-args``; name, namespace, parameters and remappings
-    are for the launch file to add) or an ``executable`` of a ``package``. ``parameters_file`` is
-    a ROS 2 parameters file; ``remappings`` are pairs such as ``("input", "/t5_tmp")``. The
-    launch starts it again when it ends, and its ``standby`` as well, which passes its output on
-    meanwhile.
+    It is either a ``command`` (without ``--ros-args``) or an ``executable`` of a ``package``.
     """
 
     name: str
@@ -56,9 +52,9 @@ class ShapingProcess:
     command: tuple[str, ...] | None
     package: str | None
     executable: str | None
-    parameters_file: Path
-    remappings: tuple[tuple[str, str], ...]
-    standby: "ShapingProcess | None" = None
+    parameters_file: Path  # of ROS 2
+    remappings: tuple[tuple[str, str], ...]  # such as ("input", "/t5_tmp")
+    standby: "ShapingProcess | None" = None  # passes its output on meanwhile
 
     @property
     def command_line(self) -> list[str]:
@@ -322,11 +318,8 @@ class MessageType:
 def message_type_named(text: str) -> MessageType:
     """The message type of this name.
 
-    With a ROS 2 environment it must be installed there (``AMENT_PREFIX_PATH``); without one it
-    only has to look like a type.
-
     Raises:
-        InputError: it is no type's name, or not installed.
+        InputError: it is no type's name, or not installed where there is a ROS 2 environment.
     """
     match = _TYPE.fullmatch(text)
     if match is None:
@@ -433,11 +426,7 @@ def _in_cpp(value: str | int | list[Any]) -> str:
 
 
 def check_build_tools() -> None:
-    """See that a package can be built, before anything is done for it.
-
-    Raises:
-        PlatformError: colcon, CMake, a compiler or the ROS 2 environment is missing.
-    """
+    """PlatformError: colcon, CMake, a compiler or the ROS 2 environment is missing."""
     compiler = os.environ.get("CXX", "c++").split()[0]
     packages = {"colcon": "python3-colcon-common-extensions", "cmake": "cmake", compiler: "g++"}
     for program, package in packages.items():
@@ -454,9 +443,7 @@ def check_build_tools() -> None:
 
 
 def build_package(folder: Path) -> Path:
-    """Build the packages in a folder with colcon, into ``build`` and ``install`` beside them.
-
-    Returns the file to source before the launch, ``install/setup.bash``.
+    """Build the packages in a folder with colcon; the file to source, ``install/setup.bash``.
 
     Raises:
         PlatformError: see :func:`check_build_tools`.

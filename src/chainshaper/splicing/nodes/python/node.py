@@ -51,11 +51,7 @@ def parameters_of(node: Node) -> NodeParameters:
 
 
 def wait(seconds: float) -> None:
-    """Wait, unless the process is to stop.
-
-    Raises:
-        ExternalShutdownException: it is.
-    """
+    """Wait; ExternalShutdownException: the process is to stop."""
     until = time.monotonic() + seconds
     while rclpy.ok() and (left := until - time.monotonic()) > 0:
         time.sleep(min(left, 0.05))
@@ -64,11 +60,7 @@ def wait(seconds: float) -> None:
 
 
 def wait_for_publisher(node: Node, topic: str) -> Any:
-    """A topic's publisher as discovery knows it (`TopicEndpointInfo`), waiting until there is one.
-
-    Raises:
-        ExternalShutdownException: the process is to stop.
-    """
+    """A topic's publisher as discovery knows it (`TopicEndpointInfo`), once there is one."""
     logger, name = node.get_logger(), node.resolve_topic_name(topic)
     said = False
     while True:
@@ -89,8 +81,7 @@ def wait_for_publisher(node: Node, topic: str) -> Any:
 def message_class(type_name: str) -> Any:
     """The class of a type such as ``sensor_msgs/msg/Image``; rclpy cannot do without.
 
-    Raises:
-        ModuleNotFoundError: its package is not installed here.
+    ModuleNotFoundError: its package is not installed here.
     """
     package, kind, name = type_name.split("/")
     return getattr(importlib.import_module(f"{package}.{kind}"), name)
@@ -207,15 +198,13 @@ def run(name: str, set_up: Callable[[Node], Callable[[], bool]], *, realtime: bo
         rclpy.try_shutdown()
 
 
-# Trace points -------------------------------------------------------------------------------------
+# Trace points ------------------------------------------------------------------------------------
 #
-# rclpy has none, and before Jazzy neither rcl nor rmw has any on the way of serialized messages:
-# without these a chain could not begin at the throttler's timer, and the time for which the shaping
-# node holds a message would not be known. The functions behind them are exported by a library that
-# rcl has loaded into this process (ros2_tracing, `tracetools/include/tracetools/tracetools.h`,
-# Humble to Rolling; rcl, `rcl/subscription.h`). Called from here, which takes a microsecond, they
-# make LTTng write its events and uprobes fire. Where that library is not loaded, or was built
-# without tracing, no event is emitted.
+# rclpy has none, and before Jazzy neither rcl nor rmw has any on the way of serialized messages.
+# The functions behind them are exported by a library that rcl has loaded into this process
+# (upstream: ros2_tracing, `tracetools/tracetools.h`; rcl, `rcl/subscription.h`). Called from here,
+# which takes a microsecond, they make LTTng write its events and uprobes fire. Where that library
+# is not loaded, or was built without tracing, no event is emitted.
 
 _POINTER = ctypes.c_void_p
 _CALLBACK_EVENTS = {
@@ -347,7 +336,7 @@ def take_event(subscription: Any) -> Callable[[int | None], None]:
     return lambda source: emit["rmw_take"](handle, id(subscription), source or 0, True)
 
 
-# The log ------------------------------------------------------------------------------------------
+# The log -----------------------------------------------------------------------------------------
 #
 # A process of its own writes the file, so that neither a slow disk nor a full one can delay the
 # gate: that only puts a line into a pipe, and goes on without it where the pipe is full. What is in

@@ -46,16 +46,15 @@ REHEARSAL_NS = 400_000  # none begins later before a release: the first may take
 class Readiness:
     """What follows a release takes the same time in every cycle: rehearsed, and on awake cores.
 
-    Publishing is fast when its code and data are in the processor's caches, and slow, never equally
-    slow, when the chain has run there since the last time. So it is rehearsed shortly before each
-    release: a message without receivers goes the way of the real one, through the same layers of
-    ROS 2 and DDS, and a datagram to ourselves the way through the network stack. Measured on a
-    chain of five nodes, from the release to `rmw_publish` and from there until the message is sent,
+    Publishing is fast while its code and data are in the processor's caches, where the chain has
+    run since. So shortly before each release a message without receivers goes the way of the real
+    one through ROS 2 and DDS, and a datagram to ourselves that through the network stack. Measured
+    on a chain of five nodes, from the release to `rmw_publish` and from there until it is sent,
     p50 / p99.5 in µs: 66 / 163 and 99 / 171 without, 15 / 55 and 45 / 107 with it.
 
-    A core that sleeps takes tens of microseconds to wake up, on virtual machines more, and never
-    the same. While `/dev/cpu_dma_latency` is open, cores wake up within the microseconds written
-    there, 0 at best (Documentation/power/pm_qos_interface.rst), until the process ends.
+    A core that sleeps takes tens of microseconds to wake up, and never the same. While
+    `/dev/cpu_dma_latency` is open, cores wake up within the microseconds written there
+    (Documentation/power/pm_qos_interface.rst).
     """
 
     AWAKE, AS_USUAL = (value.to_bytes(4, sys.byteorder, signed=True) for value in (0, -1))
@@ -102,10 +101,9 @@ class Readiness:
 
 
 def listen_to_modes(node: Node, shaper: Shaper, topic: str) -> None:
-    """Subscribe to the topic of the modes.
+    """Subscribe to the topic of the modes, once discovery has had its time.
 
-    A mode that was announced before is only delivered when it is asked for, and only if its
-    publisher keeps it; so discovery should have had its time.
+    A mode that was announced before is delivered where it is asked for, if its publisher stores it.
     """
     qos, logger = QoSProfile(depth=10), node.get_logger()
     for info in node.get_publishers_info_by_topic(topic):
