@@ -151,7 +151,8 @@ def test_what_waits_in_a_killed_node_goes_around_it_but_not_what_it_has_dropped(
 
     def dealt_with() -> int:
         (output,) = outputs(tmp_path)
-        return Page(*output.page.rsplit("/", 1))["released"]
+        place, name = output.page.rsplit("/", 1)
+        return Page(place, name)["released"]
 
     with both(process, beside, tmp_path) as (shaping, standby):
         say(1, standby)

@@ -28,8 +28,8 @@ def main() -> int:
     while True:
         child, handed_on = subprocess.Popen(command), 0
         while child.poll() is None:
-            for number in asked[handed_on:]:
-                child.send_signal(number)
+            for one in asked[handed_on:]:
+                child.send_signal(one)
                 handed_on += 1
             with suppress(subprocess.TimeoutExpired):
                 child.wait(0.05)
