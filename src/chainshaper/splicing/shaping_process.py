@@ -92,13 +92,18 @@ def write_shaping_process(
             f"the typed shaping node is generated for one type, and that of {node.output} is not "
             "known: name it, as `ros2 topic type` prints it, or choose the kind cpp"
         )
-    package, files = _program(kind, "shaping_node", node.name, message_type)
     remappings = (("input", node.input), ("output", node.output))
+    standby = f"{node.name}{STANDBY}"
+    process, files = _process(
+        *(kind, "shaping_node", node.name, folder),
+        remappings=remappings,
+        message_type=message_type,
+    )
+    beside, files_beside = _process("python", "standby", standby, folder, remappings=remappings)
     # The files may be moved before they are used; the log stays where it is.
     place = hashlib.sha256(str((log or folder).absolute()).encode()).hexdigest()
     parameters = shaping_parameters(plan, node, log)
     parameters["handover"] = f"{node.name}.{place[:8]}"
-    standby = f"{node.name}{STANDBY}"
     of_standby = {name: parameters[name] for name in ("handover", "output_depth", "depth")} | {
         "shaping_node": node.name,
         "fallback": plan.fallback,
@@ -106,14 +111,9 @@ def write_shaping_process(
         "server_cores": _server_cores(plan),
         "log": "" if log is None else str(log.with_stem(standby).absolute()),
     }
-    files |= {
-        f"{node.name}.yaml": _yaml(parameters),
-        f"{standby}.py": python_node("standby"),
-        f"{standby}.yaml": _yaml(of_standby),
-    }
-    _write(into or folder, files)
-    beside = _process(folder, standby, None, "standby", remappings)
-    return replace(_process(folder, node.name, package, "shaping_node", remappings), standby=beside)
+    files |= {f"{node.name}.yaml": _yaml(parameters), f"{standby}.yaml": _yaml(of_standby)}
+    _write(into or folder, {**files, **files_beside})
+    return replace(process, standby=beside)
 
 
 def write_throttler(
@@ -150,9 +150,9 @@ def write_throttler(
         "fifo_priority": fifo_priority or 0,
         "output_depth": depth,
     }
-    package, files = _program(kind, "throttler", name, None)
+    process, files = _process(kind, "throttler", name, folder)
     _write(into or folder, {**files, f"{name}.yaml": _yaml(parameters)})
-    return _process(folder, name, package, "throttler", ())
+    return process
 
 
 def gate_of(plan: Plan, node: ShapingNode, depth: int = DEPTH) -> Gate:
@@ -197,36 +197,34 @@ def _server_cores(plan: Plan) -> list[int]:
     return sorted({server.core for server in plan.servers})
 
 
-def _program(
-    kind: NodeKind, executable: str, name: str, message_type: str | None
-) -> tuple[str | None, dict[str, str]]:
-    """The package that has an executable, if it has one, and the files by their paths."""
-    if kind == "python":
-        respawning = (_NODES / "python/respawning.py").read_text(encoding="utf-8")
-        return None, {f"{name}.py": python_node(executable), "respawning.py": respawning}
-    known = message_type_named(message_type) if kind == "typed" and message_type else None
-    package = GENERIC_PACKAGE if known is None else known.node_package
-    files = generic_package() if known is None else typed_package(known)
-    return package, {f"{package}/{path}": text for path, text in files.items()}
-
-
 def _process(
-    folder: Path,
-    name: str,
-    package: str | None,
+    kind: NodeKind,
     executable: str,
-    remappings: tuple[tuple[str, str], ...],
-) -> ShapingProcess:
-    folder = folder.absolute()
-    return ShapingProcess(
-        name=name,
-        namespace="/",
-        command=("python3", str(folder / f"{name}.py")) if package is None else None,
-        package=package,
-        executable=None if package is None else executable,
-        parameters_file=folder / f"{name}.yaml",
-        remappings=remappings,
-    )
+    name: str,
+    folder: Path,
+    *,
+    remappings: tuple[tuple[str, str], ...] = (),
+    message_type: str | None = None,
+) -> tuple[ShapingProcess, dict[str, str]]:
+    """A process with its program's files, by their paths below the folder."""
+    folder, command, package = folder.absolute(), None, None
+    if kind == "python":
+        command = ("python3", str(folder / f"{name}.py"))
+        files = {f"{name}.py": python_node(executable)}
+        if executable != "standby":  # that stands beside one that has it
+            files["respawning.py"] = _respawning()
+    else:
+        known = message_type_named(message_type) if kind == "typed" and message_type else None
+        package = GENERIC_PACKAGE if known is None else known.node_package
+        filled = generic_package() if known is None else typed_package(known)
+        files = {f"{package}/{path}": text for path, text in filled.items()}
+    runs = None if package is None else executable
+    parameters = folder / f"{name}.yaml"
+    return ShapingProcess(name, "/", command, package, runs, parameters, remappings), files
+
+
+def _respawning() -> str:
+    return (_NODES / "python/respawning.py").read_text(encoding="utf-8")
 
 
 def _yaml(parameters: dict[str, Any]) -> str:
@@ -377,8 +375,7 @@ def _filled(
         "MESSAGE_TARGETS": " ".join(f"${{{name}_TARGETS}}" for name in messages),
         "DEPENDS": "\n".join(f"  <depend>{name}</depend>" for name in messages),
     }
-    respawning = (_NODES / "python/respawning.py").read_text(encoding="utf-8")
-    files = {"scripts/respawning": respawning}
+    files = {"scripts/respawning": _respawning()}
     for path in sorted((_NODES / "cpp").rglob("*.*")):
         text = path.read_text(encoding="utf-8")
         if path.suffix == ".in":
