@@ -32,17 +32,13 @@ _FOR_A_SHELL = re.compile(r"[;&|<>()$`*?~#\n]")
 
 @dataclass
 class Started:
-    """A process or component that is, or may be, ``node``; ``rules`` are those that were added.
-
-    ``named`` is whether the launch says its name. Otherwise the executable may be of that name,
-    and ROS 2 follows the rules if it is. ``action`` is a process's.
-    """
+    """A process or component that is, or may be, ``node``."""
 
     node: str
     label: str
-    named: bool
-    rules: Sequence[str]
-    action: Any = None
+    named: bool  # by the launch; else ROS 2 follows the rules if the executable is of that name
+    rules: Sequence[str]  # that were added
+    action: Any = None  # a process's
 
     @property
     def runs(self) -> bool:
@@ -52,21 +48,16 @@ class Started:
 
 @dataclass
 class Redirect:
-    """``nodes`` (full names) have ``target`` in place of ``topic``, as a ``kind`` of endpoint.
+    """``nodes`` (full names) have ``target`` in place of ``topic``, as a ``kind`` of endpoint."""
 
-    ``kind`` is ``publisher`` or ``subscription``; ``added`` are our own nodes, which have the topic
-    instead. ``others`` and ``elsewhere`` are for messages: what else was started, and who is of a
-    meant name and has another topic by a rule of its own.
-    """
-
-    kind: str
+    kind: str  # publisher or subscription
     topic: str
     target: str
     nodes: Sequence[str]
-    added: Sequence[str]
+    added: Sequence[str]  # our own nodes, which have the topic instead
     started: list[Started] = field(default_factory=list)
-    others: list[str] = field(default_factory=list)
-    elsewhere: list[str] = field(default_factory=list)
+    others: list[str] = field(default_factory=list)  # what else was started
+    elsewhere: list[str] = field(default_factory=list)  # who has another topic by its own rule
 
     def values(self) -> dict[str, Any]:
         """What a launch file says of it, and a dry run is asked."""
@@ -304,11 +295,7 @@ def _listen(context: Any) -> None:
 
 
 def redirect_from_now_on(redirects: Sequence[Redirect]) -> None:
-    """Let whatever this process launches be redirected.
-
-    Raises:
-        AttributeError: this `launch_ros` makes its requests in another way.
-    """
+    """Let whatever this process launches be redirected."""
     from launch.descriptions import Executable
     from launch_ros.actions import load_composable_nodes as loading
 
@@ -330,11 +317,7 @@ def redirect_from_now_on(redirects: Sequence[Redirect]) -> None:
 
 
 def _check(context: Any, redirects: Sequence[Redirect]) -> None:
-    """Hold what was redirected against the graph of ROS 2.
-
-    Raises:
-        RuntimeError: nothing was redirected, or more than is meant. It ends the launch.
-    """
+    """Compare what was redirected with the graph of ROS 2; a RuntimeError ends the launch."""
     import launch.logging
     from launch_ros.ros_adapters import get_ros_node
 

@@ -63,16 +63,12 @@ def generate_launch_description():
 
 @dataclass(frozen=True)
 class LaunchCommand:
-    """`ros2 launch …` as it was typed.
+    """`ros2 launch …` as it was typed."""
 
-    ``before`` and ``after`` are the words around those that name the launch ``file``;
-    ``arguments`` are launch arguments by name.
-    """
-
-    before: tuple[str, ...]
+    before: tuple[str, ...]  # the words before those that name the launch file
     file: Path
     after: tuple[str, ...]
-    arguments: dict[str, str]
+    arguments: dict[str, str]  # of the launch, by name
 
     def with_file(self, file: Path) -> list[str]:
         """The command that launches another file in the same way."""
