@@ -12,6 +12,7 @@ paper's profiling condition (section 2.4), as far as that is permitted.
 import sys
 import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +34,7 @@ from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.shaping_process import NodeKind, build_package, check_build_tools
 from chainshaper.splicing.spliced_launch import NODES, LaunchCommand, parse_launch_command
 from chainshaper.values.application import ApplicationGraph
-from chainshaper.values.errors import ChainshaperError, InputError, OperationError
+from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording, refuse_existing
 from chainshaper.verify.measure import Comparison, compare_recordings
 
@@ -178,40 +179,30 @@ def _in_force(
 
     A thread of its own does what `chainshaper apply` does, until the context ends.
     """
-    stop, ended = threading.Event(), threading.Event()
-    states: list[RunState] = []
-    failures: list[ChainshaperError] = []
+    stop, states = threading.Event(), list[RunState]()
+    with ThreadPoolExecutor(1, "apply") as beside:
+        applied = beside.submit(
+            apply_plan,
+            plan,
+            back_end=back_end,
+            recording=recording,
+            wait_ns=START_NS,
+            users=users,
+            stop=stop,
+            watch=states.append,
+        )
 
-    def apply() -> None:
+        def opened(_: Sequence[Process]) -> bool:
+            if applied.done():
+                applied.result()  # raises what it failed with
+                raise OperationError("the plan was released meanwhile")
+            if not states:
+                return False
+            ours = [one for one in states[-1].servers if one.kept_by == states[-1].back_end]
+            return all(server.counters.slots for server in ours)
+
         try:
-            apply_plan(
-                plan,
-                back_end=back_end,
-                recording=recording,
-                wait_ns=START_NS,
-                users=users,
-                stop=stop,
-                watch=states.append,
-            )
-        except ChainshaperError as error:
-            failures.append(error)
+            yield opened
         finally:
-            ended.set()
-
-    def opened(_: Sequence[Process]) -> bool:
-        if ended.is_set():
-            raise failures[0] if failures else OperationError("the plan was released meanwhile")
-        if not states:
-            return False
-        kept = [one for one in states[-1].servers if one.kept_by == states[-1].back_end]
-        return all(server.counters.slots for server in kept)
-
-    thread = threading.Thread(target=apply, name="apply")
-    thread.start()
-    try:
-        yield opened
-    finally:
-        stop.set()
-        thread.join()
-    if failures:
-        raise failures[0]
+            stop.set()
+    applied.result()
