@@ -37,8 +37,6 @@ Gate read_gate() {
   Gate gate;
   gate.anchor = static_cast<Anchor>(number());
   gate.phase_ns = number();
-  gate.max_age_ns = maybe();
-  gate.max_future_ns = number();
   gate.overrun = static_cast<Policy>(number());
   gate.due_cycles = number();
   gate.messages = static_cast<Messages>(number());

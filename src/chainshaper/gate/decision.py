@@ -84,8 +84,8 @@ class Gate:
 
     ``slots`` are half-open ``(start, end)`` intervals counted from the anchor, ascending, apart
     from each other and inside ``[0, cycle_ns)``. With the ``stamp`` anchor, ``phase_ns`` serves
-    messages whose stamp is of no use: more than ``max_age_ns`` old, or more than ``max_future_ns``
-    from the future (clocks of different hosts disagree a little).
+    messages whose stamp is of no use: it is older than :data:`MAX_AGE_CYCLES`, or from the future
+    (clocks of different hosts disagree a little).
 
     A message is due in the cycle that it belongs to, or ``due_cycles`` later. With the ``cycle``
     anchor it belongs to the cycle it arrives in, and is due in the next one at the latest: the data
@@ -99,8 +99,6 @@ class Gate:
     cycle_ns: int
     anchor: str = "stamp"
     phase_ns: int = 0
-    max_age_ns: int | None = None  # None: MAX_AGE_CYCLES and those it is due after
-    max_future_ns: int = MAX_FUTURE_NS
     overrun: str = "wait"
     due_cycles: int = 0
     modes: Modes | None = None
@@ -145,10 +143,8 @@ class Gate:
         """Whether a message's slots count from its stamp."""
         if stamp_ns is None or self.anchor != "stamp":
             return False
-        max_age = self.max_age_ns
-        if max_age is None:
-            max_age = (MAX_AGE_CYCLES + self.due_cycles) * self.cycle_ns
-        return -self.max_future_ns <= arrival_ns - stamp_ns <= max_age
+        max_age = (MAX_AGE_CYCLES + self.due_cycles) * self.cycle_ns
+        return -MAX_FUTURE_NS <= arrival_ns - stamp_ns <= max_age
 
 
 @dataclass(slots=True)  # making a frozen one takes a microsecond more, on the way of every message

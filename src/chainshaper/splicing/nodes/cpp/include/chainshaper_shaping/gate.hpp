@@ -51,8 +51,6 @@ struct Gate {
   std::int64_t cycle_ns{0};
   Anchor anchor{Anchor::stamp};
   std::int64_t phase_ns{0};
-  Maybe max_age_ns{};  // none: max_age_cycles and those it is due after
-  std::int64_t max_future_ns{schema::max_future_ns};
   Policy overrun{Policy::wait};
   std::int64_t due_cycles{0};
   std::optional<Modes> modes{};
@@ -66,8 +64,8 @@ struct Gate {
   bool counts_from(Maybe stamp_ns, std::int64_t arrival_ns) const {
     if (!stamp_ns || anchor != Anchor::stamp) return false;
     const auto age_ns = arrival_ns - *stamp_ns;
-    const auto oldest = max_age_ns.value_or((schema::max_age_cycles + due_cycles) * cycle_ns);
-    return -max_future_ns <= age_ns && age_ns <= oldest;
+    const auto oldest_ns = (schema::max_age_cycles + due_cycles) * cycle_ns;
+    return -schema::max_future_ns <= age_ns && age_ns <= oldest_ns;
   }
 };
 
