@@ -16,9 +16,14 @@ from typing import Any
 
 from passing import serialized
 
+from chainshaper.planning import Modes, Plan
+from chainshaper.planning.plan import revised
 from chainshaper.splicing.shaped_outputs import ShapedOutput, find_outputs
 from chainshaper.splicing.shaping_process import ShapingProcess
 
+MS = 1_000_000
+# Wide enough that a busy machine wakes the node within them.
+SLOTS = ((15 * MS, 25 * MS), (30 * MS, 45 * MS))
 STAND_IN = Path(__file__).parent / "rclpy_stand_in.py"
 
 # As rmw_cyclonedds tells it of a publisher: neither its history nor its depth is known.
@@ -33,6 +38,21 @@ RELIABLE = {
     "liveliness_lease_duration": "infinite",
 }
 PUBLISHERS = {"/t3_tmp": [{"type": "sensor_msgs/msg/Image", "qos": RELIABLE}]}
+
+
+def with_slots(plan: Plan, *slots: tuple[int, int]) -> Plan:
+    """The plan with these publish slots."""
+    servers = tuple(
+        server.model_copy(update={"slots": slots}) if server.name == "output" else server
+        for server in plan.servers
+    )
+    return revised(plan, servers=servers)
+
+
+def banded(plan: Plan) -> Plan:
+    """Two slots, one for each mode."""
+    modes = Modes(topic="/mode", default="city", bands={"city": 2, "highway": 1}, late="next-slot")
+    return revised(with_slots(plan, *SLOTS), modes=modes)
 
 
 class NodeRun:

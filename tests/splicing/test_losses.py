@@ -12,7 +12,7 @@ from typing import Any
 
 import polars as pl
 import pytest
-from node_run import NodeRun, outputs, running_node, stamped
+from node_run import NodeRun, outputs, running_node, stamped, with_slots
 from processes import wait_for
 
 from chainshaper.planning import Plan
@@ -30,12 +30,8 @@ def at_work(
     plan: Plan, folder: Path, log: Path, slot: tuple[int, int] = (20 * MS, 45 * MS), **changes: Any
 ) -> Iterator[NodeRun]:
     """The node of a plan with one slot; ``log_bytes`` is no part of a plan."""
-    servers = tuple(
-        server.model_copy(update={"slots": (slot,)}) if server.name == "output" else server
-        for server in plan.servers
-    )
     log_bytes = changes.pop("log_bytes", 100_000_000)
-    plan = revised(plan, servers=servers, anchor="cycle", **changes)
+    plan = revised(with_slots(plan, slot), anchor="cycle", **changes)
     assert plan.shaping_node is not None
     process = write_shaping_process(plan, plan.shaping_node, "python", folder, log=log)
     with process.parameters_file.open("a") as file:

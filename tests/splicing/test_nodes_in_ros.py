@@ -13,9 +13,10 @@ from typing import Any
 
 import polars as pl
 import pytest
+from node_run import SLOTS, banded
 from ros2 import ros2_environment
 
-from chainshaper.planning import Modes, Plan
+from chainshaper.planning import Plan
 from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log
 from chainshaper.sources.ros import script as ros_script
@@ -31,7 +32,6 @@ from chainshaper.splicing.shaping_process import (
 pytestmark = [pytest.mark.ros2, pytest.mark.timeout(600)]
 
 MS = 1_000_000
-SLOTS = ((15 * MS, 25 * MS), (30 * MS, 45 * MS))
 TYPE = "geometry_msgs/msg/PointStamped"
 COUNTERPART = Path(__file__).parent / "ros_counterpart.py"
 COUNT = 30
@@ -45,15 +45,6 @@ def in_ros_environment() -> Iterator[None]:
             monkeypatch.setenv(name, value)
         monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         yield
-
-
-def banded(plan: Plan) -> Plan:
-    servers = tuple(
-        server.model_copy(update={"slots": SLOTS}) if server.name == "output" else server
-        for server in plan.servers
-    )
-    modes = Modes(topic="/mode", default="city", bands={"city": 2, "highway": 1}, late="next-slot")
-    return revised(plan, servers=servers, modes=modes)
 
 
 @pytest.fixture(scope="module")
@@ -74,15 +65,12 @@ def started(
     process: ShapingProcess, workspace: Path | None, exit_code: int = 0
 ) -> Iterator["subprocess.Popen[str]"]:
     """The process as a launch file would start it; ended by SIGINT, which it must obey."""
-    command = list(process.command or ())
+    command = process.command_line
     if process.package is not None and workspace is not None and process.executable is not None:
         folder = workspace / "install" / "lib" / process.package
-        command = [str(folder / process.executable)]
-    rules = [("__node", process.name), ("__ns", process.namespace), *process.remappings]
-    remaps = [word for match, target in rules for word in ("-r", f"{match}:={target}")]
-    parameters = ["--params-file", str(process.parameters_file)]
+        command = [str(folder / process.executable), *command]
     child = subprocess.Popen(
-        [*command, "--ros-args", *remaps, *parameters],
+        command,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

@@ -16,13 +16,13 @@ from unittest.mock import MagicMock
 
 import pytest
 import yaml
-from node_run import PUBLISHERS, RELIABLE, NodeRun, running_node, stamped
+from node_run import PUBLISHERS, RELIABLE, SLOTS, NodeRun, banded, running_node, stamped
 from processes import wait_for
 from small_chain import EXECUTOR_CORE
 
 from chainshaper.gate import decision as gate
 from chainshaper.gate.decision import READER_DEPTH, NodeParameters, gate_parameters
-from chainshaper.planning import Modes, Plan, ShapingNode, let_per_callback
+from chainshaper.planning import Plan, ShapingNode, let_per_callback
 from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log
 from chainshaper.splicing.shaping_process import (
@@ -34,8 +34,6 @@ from chainshaper.splicing.shaping_process import (
 from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000
-# Wide enough that a busy machine wakes the node within them.
-SLOTS = ((15 * MS, 25 * MS), (30 * MS, 45 * MS))
 LATENCY = Path("/dev/cpu_dma_latency")
 
 
@@ -43,16 +41,6 @@ LATENCY = Path("/dev/cpu_dma_latency")
 def node(plan: Plan) -> ShapingNode:
     assert plan.shaping_node is not None
     return plan.shaping_node
-
-
-def banded(plan: Plan) -> Plan:
-    """Two slots, one for each mode."""
-    servers = tuple(
-        server.model_copy(update={"slots": SLOTS}) if server.name == "output" else server
-        for server in plan.servers
-    )
-    modes = Modes(topic="/mode", default="city", bands={"city": 2, "highway": 1}, late="next-slot")
-    return revised(plan, servers=servers, modes=modes)
 
 
 def parameters_of(process: ShapingProcess) -> dict[str, Any]:

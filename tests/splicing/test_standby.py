@@ -12,11 +12,11 @@ from typing import Any
 
 import pytest
 import yaml
-from node_run import NodeRun, outputs, running_node, stamped
+from node_run import NodeRun, banded, outputs, running_node, stamped
 from processes import wait_for
 
 from chainshaper.gate.handover import Page, open_page
-from chainshaper.planning import Modes, Plan
+from chainshaper.planning import Plan
 from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log, releases_so_far
 from chainshaper.splicing.shaped_outputs import find_outputs, output_text
@@ -212,13 +212,7 @@ def test_with_the_fallback_silence_nothing_is_published_and_all_is_counted(
 
 
 def test_a_node_that_starts_again_goes_on_in_its_cycle_and_mode(tmp_path: Path, plan: Plan) -> None:
-    slots = ((15 * MS, 25 * MS), (30 * MS, 45 * MS))
-    servers = tuple(
-        server.model_copy(update={"slots": slots}) if server.name == "output" else server
-        for server in plan.servers
-    )
-    modes = Modes(topic="/mode", default="city", bands={"city": 2, "highway": 1}, late="next-slot")
-    process, _ = written(revised(plan, servers=servers, modes=modes, anchor="cycle"), tmp_path)
+    process, _ = written(banded(revised(plan, anchor="cycle")), tmp_path)
     for run_number in (1, 2):
         with running_node(process, tmp_path) as run:
             if run_number == 1:
