@@ -12,12 +12,33 @@ import inspect
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import suppress
+from typing import Any
+
+
+def started_beside(
+    function: Callable[..., None], *arguments: Any
+) -> tuple["subprocess.Popen[bytes]", int]:
+    """A process that has this function only, and a pipe to its standard input.
+
+    It imports what it needs itself. It hears no Ctrl-C, and ends with who has the pipe.
+    """
+    program = f"{inspect.getsource(function)}\n{function.__name__}{arguments!r}"
+    reading, writing = os.pipe()
+    process = subprocess.Popen(
+        [sys.executable, "-I", "-S", "-c", program],
+        stdin=reading,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    os.close(reading)
+    return process, writing
 
 
 def _clear(core: int) -> None:
     """Clear a core until the times (ns of CLOCK_MONOTONIC) that come on standard input."""
-    import os  # this function is all that its process has
+    import os
     import time
 
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
@@ -29,21 +50,10 @@ def _clear(core: int) -> None:
 
 
 class ClearCore:
-    """A process that clears a core; none where SCHED_FIFO or the core is refused.
-
-    It ends with the one that made it, and hears no Ctrl-C.
-    """
+    """A process that clears a core; none where SCHED_FIFO or the core is refused."""
 
     def __init__(self, core: int) -> None:
-        program = f"{inspect.getsource(_clear)}\n_clear({core})"
-        times, self._times = os.pipe()
-        self._process = subprocess.Popen(
-            [sys.executable, "-I", "-S", "-c", program],
-            stdin=times,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
-        os.close(times)
+        self._process, self._times = started_beside(_clear, core)
         self.pid = self._process.pid
 
     def clear_until(self, time_ns: int) -> None:

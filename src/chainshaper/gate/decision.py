@@ -525,20 +525,13 @@ class Shaper:
         """Cycles begin elsewhere, from the first such beginning after ``now_ns`` on."""
         self._next_phase = (now_ns + (phase_ns - now_ns) % self.gate.cycle_ns, phase_ns)
 
-    @property
-    def mode(self) -> str | None:
-        """The mode that was announced last; None without modes."""
-        if self.gate.modes is None:
-            return None
-        changes = self.queue.changes
-        return changes[-1][1] if changes else self.gate.modes.default
-
     def switch(self, mode: str | None, now_ns: int) -> bool:
         """A mode is announced, in force from the next cycle on; False: there is none like it."""
-        if self.gate.modes is None or mode is None or mode not in self.gate.modes.bands:
+        modes, changes = self.gate.modes, self.queue.changes
+        if modes is None or mode is None or mode not in modes.bands:
             return False
-        if mode != self.mode:
-            self.queue.changes.append((now_ns, mode))
+        if mode != (changes[-1][1] if changes else modes.default):
+            changes.append((now_ns, mode))
         return True
 
     def arrive(

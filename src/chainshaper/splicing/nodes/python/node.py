@@ -9,7 +9,6 @@ import fcntl
 import functools
 import gc
 import importlib
-import inspect
 import os
 import signal
 import subprocess
@@ -35,6 +34,7 @@ from rclpy.qos import (
 )
 from rclpy.subscription import Subscription
 
+from chainshaper.gate.clear_core import started_beside
 from chainshaper.gate.decision import DEPTH, LOG_COLUMNS, READER_DEPTH, NodeParameters, Outcome
 
 HUMBLE = not hasattr(Subscription, "CallbackType")
@@ -140,30 +140,25 @@ def become_realtime(node: Node) -> None:
     threads inherit, and those of DDS must not; later ones do not get the class. What is not
     permitted is warned of.
     """
-    logger, parameters = node.get_logger(), parameters_of(node)
+    parameters = parameters_of(node)
     core, priority = parameters.core, parameters.fifo_priority
+
+    def warn(what: str, remedy: str) -> None:
+        node.get_logger().warning(f"{what}; it works on without: {remedy}")
+
     if ctypes.CDLL(None).mlockall(1 | 2):  # MCL_CURRENT | MCL_FUTURE
-        logger.warning(
-            "memory cannot be locked; it works on without: give the user a memlock limit of "
-            "unlimited"
-        )
+        warn("memory cannot be locked", "give the user a memlock limit of unlimited")
     try:
         if priority > 0:
             policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
             os.sched_setscheduler(0, policy, os.sched_param(priority))
     except OSError as error:
-        logger.warning(
-            f"SCHED_FIFO is refused: {error.strerror}; it works on without: give the user an "
-            "rtprio limit of 98"
-        )
+        warn(f"SCHED_FIFO is refused: {error.strerror}", "give the user an rtprio limit of 98")
     try:
         if core >= 0:
             os.sched_setaffinity(0, {core})
     except OSError as error:
-        logger.warning(
-            f"core {core} is refused: {error.strerror}; it works on without: name another in the "
-            "plan"
-        )
+        warn(f"core {core} is refused: {error.strerror}", "name another in the plan")
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -354,7 +349,7 @@ def _write_rows(path: str, header: bytes, most_bytes: int) -> None:
     A file that would have more than half of ``most_bytes`` becomes ``….1``, in place of the one
     before it. A file that has been removed is made anew. Lines that cannot be written are missing.
     """
-    import os  # this function is all that its process has
+    import os
     import time
 
     def append(text: bytes) -> None:
@@ -400,8 +395,7 @@ class GateLog:
         self._pipe: int | None = None
         self._process = f"{os.getpid()},{threading.get_native_id()}"
         self._rows = self._said_ns = 0
-        self._lost: Counter[str] = Counter()
-        self._said: Counter[str] = Counter()
+        self._lost, self._said = Counter[str](), Counter[str]()
         if parameters.log:
             self._start_writer(parameters.log, parameters.log_bytes)
 
@@ -412,18 +406,10 @@ class GateLog:
                 file.write(b"" if file.tell() else LOG_HEADER)
         except OSError as error:
             self._logger.warning(f"no log is written to {path}: {error.strerror}")
-        call = f"_write_rows({path!r}, {LOG_HEADER!r}, {most_bytes})"
-        rows, self._pipe = os.pipe()
+        writer, self._pipe = started_beside(_write_rows, path, LOG_HEADER, most_bytes)
         os.set_blocking(self._pipe, False)
         with suppress(OSError):  # more than a user may have
             fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
-        writer = subprocess.Popen(
-            [sys.executable, "-I", "-S", "-c", f"{inspect.getsource(_write_rows)}\n{call}"],
-            stdin=rows,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,  # it hears no Ctrl-C, and ends behind the last line
-        )
-        os.close(rows)
         atexit.register(self._end, writer)
 
     def _end(self, writer: "subprocess.Popen[bytes]") -> None:
