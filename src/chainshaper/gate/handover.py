@@ -283,6 +283,8 @@ class Turn:
             with suppress(OSError):  # without a folder this page has to do
                 left = self.page
                 self._open()
+                for one in left.noted(bypassed=False):  # a standby that lags has to know them
+                    self.page.note(one, bypassed=False)
                 left.close()
 
     def count(self, dropped: str | None, lost: int | None, *, late: bool) -> None:

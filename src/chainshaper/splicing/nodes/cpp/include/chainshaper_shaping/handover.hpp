@@ -77,12 +77,12 @@ public:
     set(Field::released, number + 1);
   }
 
-  // The latest messages that the standby has dealt with, ascending.
-  std::vector<std::int64_t> bypassed() const {
+  // The latest messages of the ring at this place, ascending.
+  std::vector<std::int64_t> noted(std::size_t ring) const {
     std::vector<std::int64_t> found;
     found.reserve(schema::ring);
     for (std::size_t place = 0; place < schema::ring; ++place)
-      found.push_back(read(schema::bypassed + place));
+      found.push_back(read(ring + place));
     std::sort(found.begin(), found.end());
     return found;
   }
@@ -219,7 +219,7 @@ public:
       const auto give_up = monotonic_ns() + schema::give_up_ns;
       while (page_->is_locked(schema::passing) && monotonic_ns() < give_up)
         sleep_until(monotonic_ns() + 100'000);
-      bypassed_ = page_->bypassed();
+      bypassed_ = page_->noted(schema::bypassed);
       if (seen_ >= 0 && count - seen_ > schema::ring) oldest_ = bypassed_.front();  // so were older
       seen_ = count;
     }
@@ -237,7 +237,10 @@ public:
     page_->set(Field::failed_starts, 0);
     if (page_->is_current()) return;
     try {
-      page_ = open_page(name_, topic_, folders_);
+      auto next = open_page(name_, topic_, folders_);
+      for (const auto one : page_->noted(schema::released))
+        next->note_released(one);  // a standby that lags has to know them
+      page_ = std::move(next);
       in_force_ = false;
       seen_ = -1;
       oldest_ = 0;
@@ -281,7 +284,7 @@ private:
   }
 
   bool is_acknowledged(std::int64_t key) const {
-    const auto bypassed = page_->bypassed();
+    const auto bypassed = page_->noted(schema::bypassed);
     return page_->get(Field::acknowledged) == key ||
            std::binary_search(bypassed.begin(), bypassed.end(), key);
   }
