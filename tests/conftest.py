@@ -25,13 +25,7 @@ settings.load_profile("chainshaper")
 
 # Folders whose tests only compute: `make test` runs them beside all others, which follow each other
 # in one process, because they need the machine's cores or tracers for themselves.
-COMPUTING = {
-    "analysis",
-    "experiments",
-    "planning",
-    "reporting",
-    "simulation",
-}
+COMPUTING = {"analysis", "experiments", "planning", "reporting", "simulation"}
 COMPUTING |= {"sources/ctf", "splicing", "values"}
 LIVE_RUNS = {"unshaped", "shaped"}
 
@@ -91,11 +85,7 @@ def application_file(tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def plan() -> Plan:
     """Single-band shaping of the small chain: publish slot [21 ms, 22 ms)."""
-    return small_chain_plan(
-        5_000_000,
-        20_000_000,
-        core=EXECUTOR_CORE,
-    )
+    return small_chain_plan(5_000_000, 20_000_000, core=EXECUTOR_CORE)
 
 
 @pytest.fixture(scope="session")

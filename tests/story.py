@@ -53,29 +53,18 @@ class Story:
     def node(self, name: str, pid: int, time: int = 0, handle: int | None = None) -> Node:
         node = Node(pid, handle or self.handle())
         namespace, _, short = name.rpartition("/")
-        self.event(
-            "rcl_node_init",
-            time,
-            pid,
-            node_handle=node.handle,
-            rmw_handle=self.handle(),
-            node_name=short,
-            namespace=namespace or "/",
-        )
+        handles = {"node_handle": node.handle, "rmw_handle": self.handle()}
+        names: dict[str, Any] = {"node_name": short, "namespace": namespace or "/"}
+        self.event("rcl_node_init", time, pid, **handles, **names)
         return node
 
     def publisher(self, node: Node, topic: str, time: int = 0) -> Publisher:
         publisher = Publisher(node.pid, self.handle(), self.handle())
-        self.event(
-            "rcl_publisher_init",
-            time,
-            node.pid,
-            publisher_handle=publisher.handle,
-            node_handle=node.handle,
-            rmw_publisher_handle=publisher.rmw_handle,
-            topic_name=topic,
-            queue_depth=10,
-        )
+        about: dict[str, Any] = {"node_handle": node.handle}
+        about |= {"rmw_publisher_handle": publisher.rmw_handle}
+        about |= {"topic_name": topic, "queue_depth": 10}
+        handle = publisher.handle
+        self.event("rcl_publisher_init", time, node.pid, publisher_handle=handle, **about)
         return publisher
 
     def timer(
@@ -87,20 +76,12 @@ class Story:
         symbol: str | None = None,
     ) -> Callback:
         timer, callback = self.handle(), Callback(node.pid, handle or self.handle())
-        pid = node.pid
-        self.event("rcl_timer_init", time, pid, timer_handle=timer, period=period)
-        self.event(
-            "rclcpp_timer_callback_added",
-            time,
-            pid,
-            timer_handle=timer,
-            callback=callback.handle,
-        )
+        at, it = (time, node.pid), {"timer_handle": timer}
+        self.event("rcl_timer_init", *at, **it, period=period)
+        self.event("rclcpp_timer_callback_added", *at, **it, callback=callback.handle)
         if symbol:
-            self.event(
-                "rclcpp_callback_register", time, pid, callback=callback.handle, symbol=symbol
-            )
-        self.event("rclcpp_timer_link_node", time, pid, timer_handle=timer, node_handle=node.handle)
+            self.event("rclcpp_callback_register", *at, callback=callback.handle, symbol=symbol)
+        self.event("rclcpp_timer_link_node", *at, **it, node_handle=node.handle)
         return callback
 
     def subscription(
@@ -115,78 +96,38 @@ class Story:
     ) -> Callback:
         rcl, rmw, rclcpp = self.handle(), self.handle(), self.handle()
         callback = Callback(node.pid, handle or self.handle(), rmw)
-        pid = node.pid
-        self.event(
-            "rcl_subscription_init",
-            time,
-            pid,
-            subscription_handle=rcl,
-            node_handle=node.handle,
-            rmw_subscription_handle=rmw,
-            topic_name=topic,
-            queue_depth=10,
-        )
+        at, it = (time, node.pid), {"subscription_handle": rcl}
+        about: dict[str, Any] = {"node_handle": node.handle, "rmw_subscription_handle": rmw}
+        about |= {"topic_name": topic, "queue_depth": 10, **it}
+        self.event("rcl_subscription_init", time, node.pid, **about)
         if callbackless:
             return callback
-        self.event(
-            "rclcpp_subscription_init", time, pid, subscription_handle=rcl, subscription=rclcpp
-        )
-        self.event(
-            "rclcpp_subscription_callback_added",
-            time,
-            pid,
-            subscription=rclcpp,
-            callback=callback.handle,
-        )
+        self.event("rclcpp_subscription_init", *at, **it, subscription=rclcpp)
+        added = {"subscription": rclcpp, "callback": callback.handle}
+        self.event("rclcpp_subscription_callback_added", *at, **added)
         if symbol:
-            self.event(
-                "rclcpp_callback_register", time, pid, callback=callback.handle, symbol=symbol
-            )
+            self.event("rclcpp_callback_register", *at, callback=callback.handle, symbol=symbol)
         return callback
 
     def start(self, callback: Callback, time: int, tid: int | None = None, intra: int = 0) -> None:
-        self.event(
-            "callback_start",
-            time,
-            callback.pid,
-            tid,
-            callback=callback.handle,
-            is_intra_process=intra,
-        )
+        about = {"callback": callback.handle, "is_intra_process": intra}
+        self.event("callback_start", time, callback.pid, tid, **about)
 
     def end(self, callback: Callback, time: int, tid: int | None = None) -> None:
         self.event("callback_end", time, callback.pid, tid, callback=callback.handle)
 
     def take(
-        self,
-        callback: Callback,
-        time: int,
-        sent: int,
-        tid: int | None = None,
-        taken: int = 1,
+        self, callback: Callback, time: int, sent: int, tid: int | None = None, taken: int = 1
     ) -> None:
         """Take the message that was published at ``sent``."""
-        self.event(
-            "rmw_take",
-            time,
-            callback.pid,
-            tid,
-            rmw_subscription_handle=callback.rmw_subscription,
-            message=1,
-            source_timestamp=sent + OFFSET,
-            taken=taken,
-        )
+        message = {"message": 1, "source_timestamp": sent + OFFSET, "taken": taken}
+        reader = callback.rmw_subscription
+        self.event("rmw_take", time, callback.pid, tid, rmw_subscription_handle=reader, **message)
 
     def publish(self, publisher: Publisher, time: int, tid: int | None = None) -> None:
-        self.event(
-            "rmw_publish",
-            time,
-            publisher.pid,
-            tid,
-            rmw_publisher_handle=publisher.rmw_handle,
-            message=1,
-            timestamp=time + OFFSET,
-        )
+        message = {"message": 1, "timestamp": time + OFFSET}
+        writer = publisher.rmw_handle
+        self.event("rmw_publish", time, publisher.pid, tid, rmw_publisher_handle=writer, **message)
 
     def runs(
         self,
@@ -209,15 +150,10 @@ class Story:
 
     def tables(self) -> dict[str, pl.DataFrame]:
         """The event tables, each sorted by time; events at one time keep the order of telling."""
-        return {
-            name: pl.DataFrame(
-                rows,
-                schema_overrides={
-                    **events.COMMON_COLUMNS,
-                    **events.FIELDS[name],
-                    **events.OPTIONAL_FIELDS.get(name, {}),
-                },
-                infer_schema_length=None,
-            ).sort("time", maintain_order=True)
-            for name, rows in self.rows.items()
-        }
+        found = {}
+        for name, rows in self.rows.items():
+            types = {**events.COMMON_COLUMNS, **events.FIELDS[name]}
+            types |= events.OPTIONAL_FIELDS.get(name, {})
+            table = pl.DataFrame(rows, schema_overrides=types, infer_schema_length=None)
+            found[name] = table.sort("time", maintain_order=True)
+        return found

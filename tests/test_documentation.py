@@ -1,7 +1,9 @@
 """Every command in the README and in docs/ is executed, as a reader would type it.
 
 Commands stand in ``console`` blocks behind ``$``. All blocks of one page run in one folder, in
-order, because later ones use what earlier ones made. Runs are shortened; nothing else differs.
+order, because later ones use what earlier ones made. Runs are shortened; the verbs are called in
+this process, which has them loaded; and live runs of the same example are recorded once for all
+pages. Nothing else differs.
 
 A machine that is busy with others' work disturbs nearly every one of so few cycles at times, and
 there is no planning from what is left. What failed is therefore tried again from its beginning, in
@@ -10,6 +12,7 @@ a fresh folder and with more cycles.
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -17,18 +20,23 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
+from command_line import Finished, called
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 CONSOLE = re.compile(r"```console\n(.*?)```", re.DOTALL)
 YAML_EXAMPLE = re.compile(r"```yaml\n(name: .*?)```", re.DOTALL)
 PYTHON = re.compile(r"```python\n(.*?)```", re.DOTALL)
+EXAMPLE_RUN = re.compile(r"chainshaper (run examples/\S+) -o (\S+) (--cycles \d+)")
 CYCLES = (12, 40, 120)
 
 
 def commands(page: Path) -> list[str]:
     blocks = CONSOLE.findall(page.read_text())
     return [line[2:] for block in blocks for line in block.splitlines() if line.startswith("$ ")]
+
+
+PAGES_WITH_COMMANDS = [page for page in PAGES if commands(page)]
 
 
 def shortened(command: str, cycles: int) -> str:
@@ -45,9 +53,7 @@ def shortened(command: str, cycles: int) -> str:
         command += f" --cycles {cycles}"
     if command.startswith("chainshaper sweep"):
         command += " --workers 1"  # starting more would take longer than so few cycles do
-    if command.startswith("chainshaper doctor") and "--watch" not in command:
-        command += " --watch 300ms"
-    return command
+    return re.sub(r"^(chainshaper doctor).*", r"\1 --watch 300ms", command)
 
 
 def as_in_a_clone(folder: Path) -> None:
@@ -60,67 +66,82 @@ def as_in_a_clone(folder: Path) -> None:
     shutil.copyfile(ROOT / "tests/ctf_writing.py", folder / "tests/ctf_writing.py")
 
 
-def executed(command: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The recordings of examples that earlier pages have made."""
+    return tmp_path_factory.mktemp("recorded")
+
+
+def executed(command: str, folder: Path, recorded: Path) -> Finished:
+    """A command, in a folder; the recording of an example is copied where there is one."""
+    if run := EXAMPLE_RUN.fullmatch(command):
+        known = recorded / re.sub(r"\W+", "_", run[1] + run[3])
+        if known.exists():
+            shutil.copytree(known, folder / run[2])
+            return Finished(0, "", "")
+        finished = executed(f"chainshaper {run[1]} {run[3]} -o {run[2]}", folder, recorded)
+        if finished.code == 0:
+            shutil.copytree(folder / run[2], known)
+        return finished
+    program, *words = shlex.split(command)
+    if program == "chainshaper" and "--" not in words:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(folder)
+            return called(*words)
     binaries = Path(sys.executable).parent
-    return subprocess.run(
-        command,
-        cwd=folder,
-        env={**os.environ, "PATH": f"{binaries}{os.pathsep}{os.environ['PATH']}"},
-        capture_output=True,
-        text=True,
+    environment = {**os.environ, "PATH": f"{binaries}{os.pathsep}{os.environ['PATH']}"}
+    done = subprocess.run(
+        ["sh", "-c", command], cwd=folder, env=environment, capture_output=True, text=True,
         check=False,
-    )
+    )  # fmt: skip
+    return Finished(done.returncode, done.stdout, done.stderr)
 
 
-def tried(steps: Callable[[Path, int], Iterable[list[str]]], folder: Path) -> Path:
+def tried(steps: Callable[[Path, int], Iterable[str]], folder: Path, recorded: Path) -> Path:
     """Execute the commands of ``steps`` one by one in a folder, until none fails; that folder."""
     for cycles in CYCLES:
         clone = folder / f"{cycles}_cycles"
         as_in_a_clone(clone)
         for command in steps(clone, cycles):
-            run = executed(command, clone)
-            if run.returncode:
+            finished = executed(command, clone, recorded)
+            if finished.code:
                 break
         else:
             return clone
-    pytest.fail(f"{run.args}\n{run.stdout}\n{run.stderr}")
+    pytest.fail(f"{command}\n{finished.out}\n{finished.err}")
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_command_runs(page: Path, tmp_path: Path) -> None:
-    def read(folder: Path, cycles: int) -> Iterable[list[str]]:
+@pytest.mark.parametrize("page", PAGES_WITH_COMMANDS, ids=lambda page: page.name)
+def test_every_command_runs(page: Path, tmp_path: Path, recorded: Path) -> None:
+    def read(folder: Path, cycles: int) -> Iterable[str]:
         text = page.read_text()
         for number, example in enumerate(YAML_EXAMPLE.findall(text)):
             name = re.findall(r"Save the example as `([^`]+)`", text)[number]
             (folder / name).write_text(example)
-        return [["sh", "-c", shortened(command, cycles)] for command in commands(page)]
+        return [shortened(command, cycles) for command in commands(page)]
 
-    tried(read, tmp_path)
+    tried(read, tmp_path, recorded)
 
 
-def test_the_python_example_of_the_readme_runs(tmp_path: Path) -> None:
+def test_the_python_example_of_the_readme_runs(tmp_path: Path, recorded: Path) -> None:
     (example,) = PYTHON.findall((ROOT / "README.md").read_text())
 
-    def run(folder: Path, cycles: int) -> Iterable[list[str]]:
+    def run(folder: Path, cycles: int) -> Iterable[str]:
         shutil.copyfile(folder / "examples/synthetic_chain.yaml", folder / "my_robot.yaml")
         short, verbs = re.subn(r'"(before|after)"\)', rf'"\1", cycles={cycles})', example)
         assert verbs == 2
-        return [[sys.executable, "-c", short]]
+        return [shlex.join([sys.executable, "-c", short])]
 
-    assert (tried(run, tmp_path) / "after" / "recording.json").is_file()
+    assert (tried(run, tmp_path, recorded) / "after" / "recording.json").is_file()
 
 
-def test_the_python_example_about_traces_runs(tmp_path: Path) -> None:
+def test_the_python_example_about_traces_runs(tmp_path: Path, recorded: Path) -> None:
     (example,) = PYTHON.findall((ROOT / "docs" / "traces.md").read_text())
-    write = (
-        "import sys, runpy; sys.argv[1:] = ['my_trace']; "
-        "runpy.run_path('examples/write_trace.py', run_name='__main__')"
-    )
     as_in_a_clone(tmp_path)
-    for program in (write, example):
-        run = executed([sys.executable, "-c", program], tmp_path)
-        assert run.returncode == 0, run.stderr
-    assert "jazzy rmw_cyclonedds_cpp" in run.stdout
+    assert executed("python examples/write_trace.py my_trace", tmp_path, recorded).code == 0
+    run = executed(shlex.join(["python", "-c", example]), tmp_path, recorded)
+    assert run.code == 0, run.err
+    assert "jazzy rmw_cyclonedds_cpp" in run.out
 
 
 def test_links_between_pages_lead_somewhere() -> None:

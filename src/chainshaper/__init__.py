@@ -10,226 +10,97 @@ Everything the command line does is one call away:
     after = cs.shape_application(application, plan, "after")
     cs.compare_recordings([before, after])
 
-Names are imported when they are first used, so that importing the package costs nothing.
+A name is imported when it is first used, so that importing the package costs nothing. The imports
+below are for type checkers; at run time they are the table of what is public, and where it is.
 """
 
-import importlib
+from functools import cache
+from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from chainshaper.analysis import (
-        LatencyAnalysis,
-        analyse_latency,
-        application_graph,
-        callback_statistics,
-        data_flow,
-        find_chain,
-        load_named_paths,
-    )
-    from chainshaper.analysis.graph import ApplicationDescription
-    from chainshaper.enforcement.undoing import end_run, find_runs
-    from chainshaper.flow.apply import apply_plan
-    from chainshaper.flow.doctor import examine_machine
-    from chainshaper.flow.exploration import (
-        convert_recording,
-        describe_application,
-        list_chains,
-    )
-    from chainshaper.flow.launch_shaping import ShapedLaunch, shape_launch
-    from chainshaper.flow.launch_splicing import (
-        Splicing,
-        ThrottledInput,
-        splice_launch_files,
-        splice_throttlers,
-        undo_splice,
-    )
-    from chainshaper.flow.plan import (
-        plan_recording,
-        profile_chains,
-        shape_application,
-    )
-    from chainshaper.flow.profiling import profiling_condition
-    from chainshaper.flow.record import Recorded, record_command
-    from chainshaper.flow.sweep import sweep
-    from chainshaper.flow.threads import find_threads, planned_changes
-    from chainshaper.planning import (
-        Plan,
-        PlanRequest,
-        Profile,
-        load_plan,
-        place_chains,
-        plan_chain,
-        plan_shaping,
-        save_plan,
-    )
-    from chainshaper.reporting.figures import draw_distribution, draw_latency
-    from chainshaper.reporting.graph_drawing import write_picture
-    from chainshaper.reporting.page import write_report
-    from chainshaper.reporting.perfetto import export_perfetto
-    from chainshaper.simulation import simulate, simulate_latencies
-    from chainshaper.sources import open_source
-    from chainshaper.sources.gate_log import read_gate_log
-    from chainshaper.splicing.shaping_process import write_shaping_process, write_throttler
-    from chainshaper.values.errors import (
-        ChainshaperError,
-        InputError,
-        OperationError,
-        PlatformError,
-    )
-    from chainshaper.values.recording import Recording, event_counts, open_recording
-    from chainshaper.verify.measure import (
-        Comparison,
-        Measurement,
-        compare_recordings,
-        hop_breakdown,
-        measure_latency,
-    )
-    from chainshaper.workload.description import Application, load_application
-    from chainshaper.workload.live import run_application
+    from chainshaper.analysis import LatencyAnalysis as LatencyAnalysis
+    from chainshaper.analysis import analyse_latency as analyse_latency
+    from chainshaper.analysis import application_graph as application_graph
+    from chainshaper.analysis import callback_statistics as callback_statistics
+    from chainshaper.analysis import data_flow as data_flow
+    from chainshaper.analysis import find_chain as find_chain
+    from chainshaper.analysis import load_named_paths as load_named_paths
+    from chainshaper.analysis.graph import ApplicationDescription as ApplicationDescription
+    from chainshaper.enforcement.undoing import end_run as end_run
+    from chainshaper.enforcement.undoing import find_runs as find_runs
+    from chainshaper.flow.apply import apply_plan as apply_plan
+    from chainshaper.flow.doctor import examine_machine as examine_machine
+    from chainshaper.flow.exploration import convert_recording as convert_recording
+    from chainshaper.flow.exploration import describe_application as describe_application
+    from chainshaper.flow.exploration import list_chains as list_chains
+    from chainshaper.flow.launch_shaping import ShapedLaunch as ShapedLaunch
+    from chainshaper.flow.launch_shaping import shape_launch as shape_launch
+    from chainshaper.flow.launch_splicing import Splicing as Splicing
+    from chainshaper.flow.launch_splicing import ThrottledInput as ThrottledInput
+    from chainshaper.flow.launch_splicing import splice_launch_files as splice_launch_files
+    from chainshaper.flow.launch_splicing import splice_throttlers as splice_throttlers
+    from chainshaper.flow.launch_splicing import undo_splice as undo_splice
+    from chainshaper.flow.plan import plan_recording as plan_recording
+    from chainshaper.flow.plan import profile_chains as profile_chains
+    from chainshaper.flow.plan import shape_application as shape_application
+    from chainshaper.flow.profiling import profiling_condition as profiling_condition
+    from chainshaper.flow.record import Recorded as Recorded
+    from chainshaper.flow.record import record_command as record_command
+    from chainshaper.flow.sweep import sweep as sweep
+    from chainshaper.flow.threads import find_threads as find_threads
+    from chainshaper.flow.threads import planned_changes as planned_changes
+    from chainshaper.planning import Plan as Plan
+    from chainshaper.planning import PlanRequest as PlanRequest
+    from chainshaper.planning import Profile as Profile
+    from chainshaper.planning import load_plan as load_plan
+    from chainshaper.planning import place_chains as place_chains
+    from chainshaper.planning import plan_chain as plan_chain
+    from chainshaper.planning import plan_shaping as plan_shaping
+    from chainshaper.planning import save_plan as save_plan
+    from chainshaper.reporting.figures import draw_distribution as draw_distribution
+    from chainshaper.reporting.figures import draw_latency as draw_latency
+    from chainshaper.reporting.graph_drawing import write_picture as write_picture
+    from chainshaper.reporting.page import write_report as write_report
+    from chainshaper.reporting.perfetto import export_perfetto as export_perfetto
+    from chainshaper.simulation import simulate as simulate
+    from chainshaper.simulation import simulate_latencies as simulate_latencies
+    from chainshaper.sources import open_source as open_source
+    from chainshaper.sources.gate_log import read_gate_log as read_gate_log
+    from chainshaper.splicing.shaping_process import write_shaping_process as write_shaping_process
+    from chainshaper.splicing.shaping_process import write_throttler as write_throttler
+    from chainshaper.values.errors import ChainshaperError as ChainshaperError
+    from chainshaper.values.errors import InputError as InputError
+    from chainshaper.values.errors import OperationError as OperationError
+    from chainshaper.values.errors import PlatformError as PlatformError
+    from chainshaper.values.recording import Recording as Recording
+    from chainshaper.values.recording import event_counts as event_counts
+    from chainshaper.values.recording import open_recording as open_recording
+    from chainshaper.verify.measure import Comparison as Comparison
+    from chainshaper.verify.measure import Measurement as Measurement
+    from chainshaper.verify.measure import compare_recordings as compare_recordings
+    from chainshaper.verify.measure import hop_breakdown as hop_breakdown
+    from chainshaper.verify.measure import measure_latency as measure_latency
+    from chainshaper.workload.description import Application as Application
+    from chainshaper.workload.description import load_application as load_application
+    from chainshaper.workload.live import run_application as run_application
 
-_HOMES = {
-    "chainshaper.analysis": (
-        "LatencyAnalysis",
-        "analyse_latency",
-        "application_graph",
-        "callback_statistics",
-        "data_flow",
-        "find_chain",
-        "load_named_paths",
-    ),
-    "chainshaper.flow.apply": ("apply_plan",),
-    "chainshaper.flow.doctor": ("examine_machine",),
-    "chainshaper.enforcement.undoing": ("end_run", "find_runs"),
-    "chainshaper.values.errors": (
-        "ChainshaperError",
-        "InputError",
-        "OperationError",
-        "PlatformError",
-    ),
-    "chainshaper.flow.exploration": (
-        "convert_recording",
-        "describe_application",
-        "list_chains",
-    ),
-    "chainshaper.flow.launch_shaping": ("ShapedLaunch", "shape_launch"),
-    "chainshaper.flow.launch_splicing": (
-        "Splicing",
-        "ThrottledInput",
-        "splice_launch_files",
-        "splice_throttlers",
-        "undo_splice",
-    ),
-    "chainshaper.planning": (
-        "Plan",
-        "PlanRequest",
-        "Profile",
-        "load_plan",
-        "place_chains",
-        "plan_chain",
-        "plan_shaping",
-        "save_plan",
-    ),
-    "chainshaper.flow.profiling": ("profiling_condition",),
-    "chainshaper.flow.record": ("Recorded", "record_command"),
-    "chainshaper.values.recording": ("Recording", "event_counts", "open_recording"),
-    "chainshaper.verify.measure": (
-        "hop_breakdown",
-        "Comparison",
-        "Measurement",
-        "compare_recordings",
-        "measure_latency",
-    ),
-    "chainshaper.analysis.graph": ("ApplicationDescription",),
-    "chainshaper.reporting.graph_drawing": ("write_picture",),
-    "chainshaper.reporting.figures": ("draw_distribution", "draw_latency"),
-    "chainshaper.reporting.page": ("write_report",),
-    "chainshaper.reporting.perfetto": ("export_perfetto",),
-    "chainshaper.simulation": ("simulate", "simulate_latencies"),
-    "chainshaper.sources": ("open_source",),
-    "chainshaper.sources.gate_log": ("read_gate_log",),
-    "chainshaper.splicing.shaping_process": ("write_shaping_process", "write_throttler"),
-    "chainshaper.flow.plan": (
-        "plan_recording",
-        "profile_chains",
-        "shape_application",
-    ),
-    "chainshaper.flow.sweep": ("sweep",),
-    "chainshaper.flow.threads": ("find_threads", "planned_changes"),
-    "chainshaper.workload.description": ("Application", "load_application"),
-    "chainshaper.workload.live": ("run_application",),
-}
-_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
-__all__ = [
-    "Application",
-    "ApplicationDescription",
-    "ChainshaperError",
-    "Comparison",
-    "InputError",
-    "LatencyAnalysis",
-    "Measurement",
-    "OperationError",
-    "Plan",
-    "PlanRequest",
-    "PlatformError",
-    "Profile",
-    "Recorded",
-    "Recording",
-    "ShapedLaunch",
-    "Splicing",
-    "ThrottledInput",
-    "analyse_latency",
-    "application_graph",
-    "apply_plan",
-    "callback_statistics",
-    "compare_recordings",
-    "convert_recording",
-    "data_flow",
-    "describe_application",
-    "draw_distribution",
-    "draw_latency",
-    "end_run",
-    "event_counts",
-    "examine_machine",
-    "export_perfetto",
-    "find_chain",
-    "find_runs",
-    "find_threads",
-    "hop_breakdown",
-    "list_chains",
-    "load_application",
-    "load_named_paths",
-    "load_plan",
-    "measure_latency",
-    "open_recording",
-    "open_source",
-    "place_chains",
-    "plan_chain",
-    "plan_recording",
-    "plan_shaping",
-    "planned_changes",
-    "profile_chains",
-    "profiling_condition",
-    "read_gate_log",
-    "record_command",
-    "run_application",
-    "save_plan",
-    "shape_application",
-    "shape_launch",
-    "simulate",
-    "simulate_latencies",
-    "splice_launch_files",
-    "splice_throttlers",
-    "sweep",
-    "undo_splice",
-    "write_picture",
-    "write_report",
-    "write_shaping_process",
-    "write_throttler",
-]
+@cache
+def _homes() -> dict[str, str | None]:
+    """Public name → its module, by the imports above."""
+    import ast
+
+    imports = ast.walk(ast.parse(Path(__file__).read_text(encoding="utf-8")))
+    found = [node for node in imports if isinstance(node, ast.ImportFrom)]
+    return {one.asname: node.module for node in found for one in node.names if one.asname}
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME_OF:
+    if name == "__all__":
+        return sorted(_homes())
+    home = _homes().get(name)
+    if home is None:
         raise AttributeError(f"module 'chainshaper' has no attribute {name!r}")
-    return getattr(importlib.import_module(_HOME_OF[name]), name)
+    return getattr(import_module(home), name)

@@ -1,9 +1,11 @@
 """What people do by mistake: one message with the place and the remedy, and the right exit code."""
 
 import errno
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import TypeAlias
 from unittest import mock
 
 import numpy as np
@@ -15,9 +17,38 @@ from small_chain import small_chain_text
 from chainshaper.planning import Plan, save_plan
 from chainshaper.values.recording import Recording
 
+MISSING_CORE = small_chain_text(executor_core=1023)
+Words: TypeAlias = Callable[[str], list[str]]
+EXISTS = "exists already and is not overwritten: name another, or remove it"
 
+
+@pytest.fixture
+def folder(application_file: Path, plan: Plan) -> Path:
+    """A folder with an application, a plan for it, and latencies longer than their period."""
+    save_plan(plan, application_file.with_name("plan.yaml"))
+    application_file.with_name("latencies.txt").write_text("30ms\n120ms\n")
+    return application_file.parent
+
+
+@pytest.fixture
+def words(folder: Path, unshaped: Recording) -> Words:
+    """The words of a command, with files in their places; OUT and MISSING are not there."""
+    places = {
+        "APP": folder / "application.yaml",
+        "PLAN": folder / "plan.yaml",
+        "LATENCIES": folder / "latencies.txt",
+        "REC": unshaped.path,
+        "OUT": folder / "recording",
+        "DIR": folder,
+        "TABLE": unshaped.path / "callback_start.parquet",
+        "MISSING": folder / "missing" / "recording",
+    }
+    return lambda text: [str(places.get(word, word)) for word in text.split()]
+
+
+@pytest.mark.parametrize("verb", ["latency", "plan"])
 @pytest.mark.parametrize(
-    ("chain", "said"),
+    ("chain", "message"),
     [
         ("/t1../t9", "/t9"),
         ("/nobody../t3", "/nobody"),
@@ -26,99 +57,75 @@ from chainshaper.values.recording import Recording
         ("/t1..", "way points"),
     ],
 )
-@pytest.mark.parametrize("verb", ["latency", "plan"])
-def test_a_chain_that_does_not_exist(verb: str, chain: str, said: str, unshaped: Recording) -> None:
-    assert said in refused(2, verb, unshaped.path, "--chain", chain)
+def test_a_chain_that_does_not_exist(
+    verb: str, chain: str, message: str, unshaped: Recording
+) -> None:
+    assert message in refused(2, verb, unshaped.path, "--chain", chain)
 
 
-@pytest.mark.parametrize("verb", ["run", "shape"])
+@pytest.mark.parametrize("command", ["run APP -o OUT", "shape APP PLAN -o OUT"])
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
-        (("subscription: /t2", "subscription: /t9"), "subscription: no node publishes /t9"),
-        (
-            ("chain: /t1../t3", "chain: /t1../brake"),
-            ":2: chain: no topic or node is called '/brake'",
-        ),
-        (("timer: 50ms", "timer: 50"), "50 is not a duration: write a number and a unit"),
-        (("publishes: [/t3]", "publishes: [/t3, /t1]"), "the topics form a cycle"),
-        (("nodes:", "nodes: ["), "not YAML"),
+        ("subscription: /t2 → subscription: /t9", "subscription: no node publishes /t9"),
+        ("/t1../t3 → /t1../brake", ":2: chain: no topic or node is called '/brake'"),
+        ("timer: 50ms → timer: 50", "50 is not a duration: write a number and a unit"),
+        ("publishes: [/t3] → publishes: [/t3, /t1]", "the topics form a cycle"),
+        ("nodes: → nodes: [", "not YAML"),
     ],
 )
 def test_a_mistake_in_the_application(
-    verb: str, change: tuple[str, str], said: str, application_file: Path, plan: Plan
+    command: str, change: str, message: str, folder: Path, words: Words
 ) -> None:
-    application_file.write_text(small_chain_text().replace(*change))
-    output = application_file.parent / "recording"
-    arguments: list[str | Path] = [application_file]
-    if verb == "shape":
-        save_plan(plan, application_file.parent / "plan.yaml")
-        arguments.append(application_file.parent / "plan.yaml")
-    assert said in refused(2, verb, *arguments, "-o", output)
-    assert not output.exists()
+    old, _, new = change.partition(" → ")
+    (folder / "application.yaml").write_text(small_chain_text().replace(old, new))
+    assert message in refused(2, *words(command))
+    assert not (folder / "recording").exists()
 
 
-def test_a_missing_core_is_the_platforms_fault(application_file: Path) -> None:
-    application_file.write_text(small_chain_text(executor_core=1023))
-    output = application_file.parent / "recording"
-    for verb, option in (("run", application_file), ("demo", f"--application={application_file}")):
-        said = refused(3, verb, option, "-o", output)
-        assert "core 1023, which node" in said
-        assert "is not available: this process may use" in said
-        assert not output.exists()
-
-
-def test_a_missing_core_in_a_plan(application_file: Path, plan: Plan) -> None:
-    text = _plan_text(application_file.parent, plan)
-    plan_file = application_file.parent / "plan.yaml"
-    core = next(line for line in text.splitlines() if line.startswith("  core: "))
-    plan_file.write_text(text.replace(core, "  core: 1023"))
-    output = application_file.parent / "recording"
-    said = refused(3, "shape", application_file, plan_file, "-o", output)
-    assert "core 1023, which node chainshaper_t3 asks for" in said
-
-
-def _plan_text(folder: Path, plan: Plan) -> str:
-    save_plan(plan, folder / "plan.yaml")
-    return (folder / "plan.yaml").read_text()
-
-
-def test_a_period_shorter_than_the_longest_latency(tmp_path: Path) -> None:
-    latencies = tmp_path / "latencies.txt"
-    latencies.write_text("30ms\n120ms\n")
-    said = refused(1, "plan", "--latencies", latencies, "--period", "100ms")
-    assert "the longest latency 120ms" in said
-    assert "do not fit into the cycle of 100ms" in said
-    assert "a longer period" in said
-
-
-def test_a_plan_file_with_a_period_shorter_than_the_longest_latency(
-    application_file: Path, plan: Plan
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("50ms", "15ms"), "15ms"),  # shorter than the longest latency
+        (("50ms", "60ms"), "plan again from a recording of this application"),
+        ((r" core: \d+", " core: 1023"), "core 1023, which node chainshaper_t3 asks for"),
+    ],
+)
+def test_a_mistake_in_the_plan(
+    change: tuple[str, str], message: str, folder: Path, words: Words
 ) -> None:
-    text = _plan_text(application_file.parent, plan)
-    plan_file = application_file.parent / "plan.yaml"
-    plan_file.write_text(text.replace("50ms", "15ms"))
-    said = refused(2, "shape", application_file, plan_file, "-o", application_file.parent / "rec")
-    assert f"{plan_file}:" in said
-    assert "15ms" in said
+    text = (folder / "plan.yaml").read_text()
+    (folder / "plan.yaml").write_text(re.sub(*change, text))
+    code = 3 if "core" in message else 2
+    assert message in refused(code, *words("shape APP PLAN -o OUT"))
 
 
-def test_a_plan_for_another_application(application_file: Path, plan: Plan) -> None:
-    text = _plan_text(application_file.parent, plan)
-    plan_file = application_file.parent / "plan.yaml"
-    plan_file.write_text(text.replace("50ms", "60ms"))
-    said = refused(2, "shape", application_file, plan_file, "-o", application_file.parent / "rec")
-    assert "plan again from a recording of this application" in said
+def test_a_missing_core_is_the_platforms_fault(folder: Path, words: Words) -> None:
+    (folder / "application.yaml").write_text(MISSING_CORE)
+    for command in ("run APP -o OUT", "demo --application APP -o OUT"):
+        message = refused(3, *words(command))
+        assert "core 1023, which node" in message
+        assert "is not available: this process may use" in message
+        assert not (folder / "recording").exists()
 
 
-def test_real_time_scheduling_that_is_not_permitted(application_file: Path) -> None:
-    if shutil.which("setpriv") is None:
-        pytest.skip("setpriv, which takes privileges away, is not installed")
+def test_a_period_shorter_than_the_longest_latency(words: Words) -> None:
+    message = refused(1, *words("plan --latencies LATENCIES --period 100ms"))
+    for part in ("the longest latency 120ms", "do not fit into the cycle of 100ms", "a longer"):
+        assert part in message
+
+
+@pytest.mark.skipif(shutil.which("setpriv") is None, reason="setpriv is not installed")
+@pytest.mark.parametrize("options", [["--realtime"], ["--cycles", "2"]])
+def test_without_the_privilege_it_runs_with_what_it_may(
+    options: list[str], application_file: Path
+) -> None:
     output = application_file.parent / "recording"
-    finished = chainshaper(
-        *("run", application_file, "-o", output, "--realtime"),
-        prefix=("setpriv", "--bounding-set=-sys_nice"),
-    )
+    prefix = ("setpriv", "--bounding-set=-sys_nice")
+    finished = chainshaper("run", application_file, "-o", output, *options, prefix=prefix)
+    if options != ["--realtime"]:
+        assert (finished.code, finished.out) == (0, f"{output}\n"), finished.err
+        return
     if finished.code == 0:
         pytest.skip("SCHED_FIFO is permitted here without CAP_SYS_NICE")
     assert finished.code == 3
@@ -126,138 +133,94 @@ def test_real_time_scheduling_that_is_not_permitted(application_file: Path) -> N
     assert not output.exists()
 
 
-def test_without_the_privilege_it_runs_with_what_it_may(application_file: Path) -> None:
-    if shutil.which("setpriv") is None:
-        pytest.skip("setpriv, which takes privileges away, is not installed")
-    output = application_file.parent / "recording"
-    finished = chainshaper(
-        *("run", application_file, "-o", output, "--cycles", "2"),
-        prefix=("setpriv", "--bounding-set=-sys_nice"),
-    )
-    assert finished.code == 0, finished.err
-    assert finished.out == f"{output}\n"
-
-
-def test_outputs_that_exist_are_not_overwritten(
-    application_file: Path, unshaped: Recording, plan: Plan
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("run APP -o DIR", EXISTS),
+        ("run APP -o APP", EXISTS),
+        ("shape APP PLAN -o DIR", EXISTS),
+        ("demo -o DIR", EXISTS),
+        ("plan REC -o PLAN", EXISTS),
+        ("run APP -o MISSING", "missing: no such folder to write"),
+        ("demo -o MISSING", "missing: no such folder to write"),
+        ("plan REC -o MISSING", "missing: no such folder to write"),
+        ("latency DIR", "a recording is made with `chainshaper run"),
+        ("callbacks APP", "a recording is made with `chainshaper run"),
+        ("plan OUT", "a recording is made with `chainshaper run"),
+        ("compare REC DIR", ": a folder without"),
+        # An application as the plan, a plan as the application, a recording as either.
+        ("shape APP APP -o OUT", "nodes: unknown key"),
+        ("run PLAN -o OUT", "scheduling: is missing"),
+        ("run REC -o OUT", "Is a directory"),
+        ("plan --latencies TABLE --period 1s", "one duration a line"),
+        # Options that do not go together.
+        ("plan", "give either a recording or --latencies"),
+        ("plan REC --latencies LATENCIES", "give either a recording or --latencies"),
+        ("plan --latencies LATENCIES", "add --period"),
+        ("plan REC --period 1s", "--period goes with --latencies"),
+        ("plan REC --sink /t1../t3", "both publish /t3"),
+        ("latency REC --instances", "--instances goes with --json"),
+        ("compare REC", "a comparison needs two recordings"),
+        ("record -o OUT", "no command given"),
+        ("record -o OUT --pid 1 -- true", "a COMMAND is started, --pid attaches"),
+        ("profile -o OUT", "no command given"),
+        ("profile -o OUT --chain /a../b -- true", "an earlier recording knows"),
+        ("shape APP -o OUT", "a described application is shaped with its plan"),
+        ("export REC -o OUT", "add --perfetto"),
+        ("release nothing", "no run 'nothing': "),
+    ],
+)
+def test_what_does_not_go_is_refused_and_nothing_written(
+    command: str, message: str, folder: Path, words: Words
 ) -> None:
-    folder = application_file.parent
-    save_plan(plan, folder / "plan.yaml")
     before = {path: path.read_bytes() for path in folder.iterdir()}
-    for arguments in (
-        ("run", application_file, "-o", folder),
-        ("run", application_file, "-o", application_file),
-        ("shape", application_file, folder / "plan.yaml", "-o", folder),
-        ("demo", "-o", folder),
-        ("plan", unshaped.path, "-o", folder / "plan.yaml"),
-    ):
-        said = refused(2, *arguments)
-        assert "exists already and is not overwritten: name another, or remove it" in said
+    assert message in refused(2, *words(command))
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_outputs_in_folders_that_do_not_exist(application_file: Path, unshaped: Recording) -> None:
-    missing = application_file.parent / "missing"
-    for arguments in (
-        ("run", application_file, "-o", missing / "recording"),
-        ("demo", "-o", missing / "folder"),
-        ("plan", unshaped.path, "-o", missing / "plan.yaml"),
-    ):
-        assert f"{missing}: no such folder to write" in refused(2, *arguments)
-    assert not missing.exists()
-
-
-def test_what_is_no_recording(tmp_path: Path, application_file: Path, unshaped: Recording) -> None:
-    for verb in ("latency", "callbacks", "plan"):
-        for path in (tmp_path, application_file, tmp_path / "nothing"):
-            said = refused(2, verb, path)
-            assert f"{path}: " in said
-            assert "a recording is made with `chainshaper run" in said
-    assert f"{tmp_path}: a folder without" in refused(2, "compare", unshaped.path, tmp_path)
-
-
 def test_a_recording_whose_tables_are_broken(tmp_path: Path, unshaped: Recording) -> None:
-    broken = tmp_path / "broken"
-    shutil.copytree(unshaped.path, broken)
+    broken = Path(shutil.copytree(unshaped.path, tmp_path / "broken"))
     table = broken / "callback_start.parquet"
     table.write_bytes(table.read_bytes()[:100])
     for verb in ("latency", "callbacks"):
         assert f"{table}: not a readable event table" in refused(2, verb, broken)
 
 
-def test_files_in_place_of_others(application_file: Path, unshaped: Recording, plan: Plan) -> None:
-    folder = application_file.parent
-    save_plan(plan, folder / "plan.yaml")
-    output = folder / "recording"
-    # An application as the plan, a plan as the application, a recording as either.
-    said = refused(2, "shape", application_file, application_file, "-o", output)
-    assert "nodes: unknown key" in said
-    said = refused(2, "run", folder / "plan.yaml", "-o", output)
-    assert "scheduling: is missing" in said
-    assert "Is a directory" in refused(2, "run", unshaped.path, "-o", output)
-    assert "one duration a line" in refused(
-        2, "plan", "--latencies", unshaped.path / "callback_start.parquet", "--period", "1s"
-    )
-
-
-def test_options_that_do_not_go_together(tmp_path: Path, unshaped: Recording) -> None:
-    latencies = tmp_path / "latencies.npy"
-    np.save(latencies, np.array([1_000_000, 2_000_000]))
-    assert "give either a recording or --latencies" in refused(2, "plan")
-    assert "give either a recording or --latencies" in refused(
-        2, "plan", unshaped.path, "--latencies", latencies
-    )
-    assert "add --period" in refused(2, "plan", "--latencies", latencies)
-    assert "--period goes with --latencies" in refused(2, "plan", unshaped.path, "--period", "1s")
-    assert "--instances goes with --json" in refused(2, "latency", unshaped.path, "--instances")
-    assert "a comparison needs two recordings" in refused(2, "compare", unshaped.path)
-
-
 @pytest.mark.parametrize(
-    "arguments",
+    "command",
     [
-        ("run",),
-        ("run", "app.yaml"),
-        ("run", "app.yaml", "-o", "rec", "--cycles", "0"),
-        ("run", "app.yaml", "-o", "rec", "--cycles", "many"),
-        ("doctor", "--watch", "5"),
-        ("doctor", "--watch", "-5ms"),
-        ("plan", "rec", "--epsilon", "-1ms"),
-        ("plan", "rec", "--anchor", "clock"),
-        ("shape", "app.yaml"),
-        ("latency",),
-        ("dance",),
-        ("--louder",),
+        "run",
+        "run app.yaml",
+        "run app.yaml -o rec --cycles 0",
+        "run app.yaml -o rec --cycles many",
+        "doctor --watch 5",
+        "doctor --watch -5ms",
+        "plan rec --epsilon -1ms",
+        "plan rec --anchor clock",
+        "shape app.yaml",
+        "latency",
+        "dance",
+        "--louder",
     ],
 )
-def test_wrong_use_ends_with_2_and_a_hint(arguments: tuple[str, ...]) -> None:
-    finished = called(*arguments)
-    assert finished.code == 2
-    assert finished.out == ""
+def test_wrong_use_ends_with_2_and_a_hint(command: str) -> None:
+    finished = called(*command.split())
+    assert (finished.code, finished.out) == (2, "")
     assert "Usage: chainshaper" in finished.err
     assert "Traceback" not in finished.err
 
 
 def test_the_exit_code_of_the_process_tells_the_kinds_of_failure_apart(
-    application_file: Path, unshaped: Recording
+    folder: Path, words: Words
 ) -> None:
-    folder = application_file.parent
-    latencies = folder / "latencies.txt"
-    latencies.write_text("30ms\n120ms\n")
-    elsewhere = folder / "elsewhere.yaml"
-    elsewhere.write_text(small_chain_text(executor_core=1023))
-    for code, arguments in (
-        (0, ("callbacks", unshaped.path)),
-        (1, ("plan", "--latencies", latencies, "--period", "100ms")),
-        (2, ("latency", unshaped.path, "--chain", "/t1../t9")),
-        (2, ("run", latencies, "-o", folder / "recording")),
-        (3, ("run", elsewhere, "-o", folder / "recording")),
+    """In processes; the other tests have the codes of the entry point."""
+    (folder / "application.yaml").write_text(MISSING_CORE)
+    for code, command in (
+        (1, "plan --latencies LATENCIES --period 100ms"),
+        (2, "run LATENCIES -o OUT"),
+        (3, "run APP -o OUT"),
     ):
-        finished = chainshaper(*arguments)
-        if code == 0:
-            assert finished.code == 0
-        else:
-            message_of(finished, code)
+        message_of(chainshaper(*words(command)), code)
 
 
 def _lack_of_memory_below() -> None:
@@ -276,7 +239,7 @@ def _polars_panics() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fails", "said"),
+    ("fails", "message"),
     [
         (lambda: np.zeros(1 << 60, np.uint8), "memory ran out (Unable to allocate 1.00 EiB"),
         (lambda: bytearray(1 << 62), "memory ran out (Python could not allocate it)"),
@@ -285,11 +248,11 @@ def _polars_panics() -> None:
         (_polars_panics, "Polars cannot process this data (assertion failed: offset): check"),
     ],
 )
-def test_memory_that_runs_out_is_one_message(fails: Callable[[], object], said: str) -> None:
+def test_memory_that_runs_out_is_one_message(fails: Callable[[], object], message: str) -> None:
     with mock.patch("chainshaper.cli.app.app", lambda *_, **__: fails()):
-        message = refused(1, "info")
-    assert said in message
-    assert message.count("\n") == 1
+        found = refused(1, "info")
+    assert message in found
+    assert found.count("\n") == 1
 
 
 def test_other_mistakes_of_ours_stay_tracebacks() -> None:

@@ -27,6 +27,8 @@ from chainshaper.planning import Plan, dump_plan
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import load_application
 
+pytestmark = pytest.mark.computing
+
 CASES = int(os.environ.get("CHAINSHAPER_FUZZ_CASES", "25"))
 FIRST = int(os.environ.get("CHAINSHAPER_FUZZ_FIRST", "0"))
 SECONDS = 60  # of one case, on a machine that does other things
@@ -159,7 +161,10 @@ def facts_of_recordings(chance: random.Random, folder: Path, recording: Recordin
 
 def traces(chance: random.Random, folder: Path, recording: Recording) -> Arguments:
     """Streams and metadata of a CTF trace."""
-    source = write_lttng_trace(folder / "source", recording.events)
+    whole = recording.path.with_name("trace")
+    if not whole.exists():
+        write_lttng_trace(whole, recording.events)
+    source = Path(shutil.copytree(whole, folder / "source"))
     files = [path for path in sorted(source.rglob("*")) if path.is_file()]
     file = chance.choice(files)
     if file.name == "metadata" and chance.random() < 0.7:

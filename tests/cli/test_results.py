@@ -2,31 +2,18 @@
 
 import json
 import os
+import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from command_line import called, chainshaper, json_of
 from small_chain import DDS_CORE, EXECUTOR_CORE, small_chain_text
 
 from chainshaper import load_plan, measure_latency, open_recording
+from chainshaper.cli import output
+from chainshaper.cli.app import VERBS
+from chainshaper.planning import Plan, save_plan
 from chainshaper.values.recording import Recording
-
-VERBS = (
-    "demo",
-    "run",
-    "latency",
-    "info",
-    "graph",
-    "callbacks",
-    "chains",
-    "convert",
-    "plan",
-    "shape",
-    "compare",
-    "threads",
-    "doctor",
-)
 
 STATISTICS = {
     *("count", "incomplete", "disturbed", "min_ns", "mean_ns", "max_ns", "jitter_ns"),
@@ -38,9 +25,8 @@ STATISTICS = {
 def test_every_verb_explains_itself(verb: str) -> None:
     for option in ("--help", "-h"):
         finished = called(verb, option)
-        assert finished.code == 0
+        assert (finished.code, finished.err) == (0, "")
         assert f"Usage: chainshaper {verb}" in finished.out
-        assert finished.err == ""
 
 
 def test_the_overview_names_every_verb() -> None:
@@ -50,20 +36,17 @@ def test_the_overview_names_every_verb() -> None:
 
 
 def test_latency_as_json_is_what_the_library_finds(unshaped: Recording) -> None:
-    values = json_of("latency", unshaped.path)
+    process = chainshaper("latency", unshaped.path, "--json")
+    assert (process.code, process.err) == (0, "")
+    values = json.loads(process.out)
+    assert values == json_of("latency", unshaped.path)
     found = measure_latency(unshaped).analysis.statistics
     assert set(values) >= STATISTICS
     assert "instances" not in values
-    assert (values["count"], values["incomplete"]) == (found.count, found.incomplete)
-    assert (values["min_ns"], values["max_ns"]) == (found.min_ns, found.max_ns)
+    for name in ("count", "incomplete", "min_ns", "max_ns"):
+        assert values[name] == getattr(found, name)
     assert values["jitter_ns"] == values["max_ns"] - values["min_ns"]
     assert all(isinstance(values[key], int) for key in ("min_ns", "mean_ns", "max_ns", "spread_ns"))
-
-
-def test_a_process_prints_its_document_and_nothing_else(unshaped: Recording) -> None:
-    finished = chainshaper("latency", unshaped.path, "--json")
-    assert (finished.code, finished.err) == (0, "")
-    assert json.loads(finished.out) == json_of("latency", unshaped.path)
 
 
 def test_instances_are_in_wall_clock_time(unshaped: Recording) -> None:
@@ -94,35 +77,6 @@ def test_callbacks_as_json(unshaped: Recording) -> None:
     assert (by_node["/third"]["kind"], by_node["/third"]["topic"]) == ("subscription", "/t2")
 
 
-def test_a_plan_is_written_and_printed(tmp_path: Path, unshaped: Recording) -> None:
-    file = tmp_path / "plan.yaml"
-    values = json_of("plan", unshaped.path, "-o", file, "--epsilon", "2ms", "--anchor", "cycle")
-    planned = load_plan(file)
-    assert values["anchor"] == planned.anchor == "cycle"
-    assert values["margin"]["epsilon_ns"] == planned.margin.epsilon_ns == 2_000_000
-    assert values["bands_ns"] == [planned.servers[-1].slots[-1][1]]
-    assert set(values["predicted"]) == {"mean_ns", "max_ns", "jitter_ns", "shares"}
-    assert [server["core"] for server in values["servers"]] == [EXECUTOR_CORE, EXECUTOR_CORE]
-    longest = measure_latency(unshaped).analysis.undisturbed.max_ns
-    assert values["evidence"]["max_latency_ns"] == longest
-
-
-@pytest.mark.parametrize("suffix", [".txt", ".npy"])
-def test_a_plan_from_bare_latencies(suffix: str, tmp_path: Path) -> None:
-    file = tmp_path / f"latencies{suffix}"
-    if suffix == ".npy":
-        np.save(file, np.array([60_000_000, 63_250_000]))
-    else:
-        file.write_text("# from another tool\n60ms\n\n63.25ms  # the longest\n")
-    values = json_of(
-        *("plan", "--latencies", file, "--period", "100ms", "--publish-slot", "500us"),
-        *("--anchor", "cycle", "--chain", "/t1../t5"),
-    )
-    assert values["bands_ns"] == [63_250_000 + 1_000_000 + 500_000]
-    assert values["evidence"]["max_latency_ns"] == 63_250_000
-    assert (values["anchor"], values["chain"]["spec"]) == ("cycle", "/t1../t5")
-
-
 def test_compare_as_json_and_with_figures(
     tmp_path: Path, unshaped: Recording, shaped: Recording
 ) -> None:
@@ -133,6 +87,11 @@ def test_compare_as_json_and_with_figures(
     assert (before["overruns"], "predicted" in before) == (None, False)
     assert isinstance(after["overruns"], int)
     assert after["predicted"]["max_ns"] == 22_000_000
+    prediction = after["prediction"]
+    assert (prediction["max_ns"]["at_start"], prediction["max_ns"]["at_end"]) == (21e6, 22e6)
+    (band,) = prediction["bands"]
+    slot = (band["slot_start_ns"], band["slot_end_ns"])
+    assert (slot, band["predicted_share"]) == ((21e6, 22e6), 1.0)
     assert before["count"] == after["count"] or not unshaped.info.realtime
     for name in ("latency.png", "distribution.png"):
         assert (figures / name).read_bytes().startswith(b"\x89PNG")
@@ -141,19 +100,8 @@ def test_compare_as_json_and_with_figures(
     assert "exists already and is not overwritten" in again.err
 
 
-def test_doctor_as_json() -> None:
-    values = json_of("doctor", "--watch", "300ms")
-    names = [check["name"] for check in values["checks"]]
-    assert {"cores", "SCHED_FIFO", "memory locking", "Cyclone DDS for Python"} <= set(names)
-    for check in values["checks"]:
-        assert check["state"] in ("good", "limited", "absent")
-        assert check["state"] == "good" or check["remedy"], f"{check['name']} has no remedy"
-    assert {row["core"] for row in values["stalls"]} >= {DDS_CORE, EXECUTOR_CORE}
-    assert values["watched_ns"] == 300_000_000
-
-
-def test_doctor_tries_bpftrace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One that is there and does not work is not good, and the warning before is not the reason."""
+def test_doctor_as_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bpftrace that does not work is not good, and the warning before is not the reason."""
     program = tmp_path / "bpftrace"
     program.write_text(
         "#!/bin/sh\necho 'WARNING: RLIMIT_MEMLOCK is low' >&2\n"
@@ -161,26 +109,29 @@ def test_doctor_tries_bpftrace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     )
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
-    checks = json_of("doctor", "--watch", "100ms")["checks"]
-    (found,) = (check for check in checks if check["name"] == "bpftrace")
-    assert found["state"] == "limited"
+    values = json_of("doctor", "--watch", "100ms")
+    checks = {check["name"]: check for check in values["checks"]}
+    assert {"cores", "SCHED_FIFO", "memory locking", "Cyclone DDS for Python"} <= checks.keys()
+    for check in checks.values():
+        assert check["state"] in ("good", "limited", "absent")
+        assert check["state"] == "good" or check["remedy"], f"{check['name']} has no remedy"
+    assert {row["core"] for row in values["stalls"]} >= {DDS_CORE, EXECUTOR_CORE}
+    assert values["watched_ns"] == 100_000_000
+    assert checks["bpftrace"]["state"] == "limited"
     as_root = "does not work: ERROR: tracepoint not found: sched:sched_switch"
-    assert found["found"] == (as_root if os.geteuid() == 0 else "needs root")
+    assert checks["bpftrace"]["found"] == (as_root if os.geteuid() == 0 else "needs root")
 
 
-def test_demo_keeps_everything_in_one_folder(application_file: Path) -> None:
+def test_demo_puts_everything_into_one_folder(application_file: Path) -> None:
     """With the small chain and few cycles: the flow is the same."""
     for cycles in ("8", "40", "120"):  # a busy machine may disturb eight of eight
         folder = application_file.parent / f"demo{cycles}"
-        made = called(
-            *("demo", "--application", application_file, "--cycles", cycles),
-            *("-o", folder, "--json"),
-        )
+        demo = ("demo", "--application", application_file, "--cycles", cycles)
+        made = called(*demo, "-o", folder, "--json")
         if made.code == 0:
             break
     values = json.loads(made.out)
     assert values["folder"] == str(folder)
-    assert len(values["recordings"]) == 2
     assert sorted(entry.name for entry in folder.iterdir()) == [
         *("after", "application.yaml", "before", "comparison.json"),
         *("distribution.png", "latency.png", "plan.yaml"),
@@ -188,30 +139,78 @@ def test_demo_keeps_everything_in_one_folder(application_file: Path) -> None:
     assert (folder / "application.yaml").read_text() == small_chain_text()
     assert open_recording(folder / "after").info.plan is not None
     # Every figure can be recomputed from what is on disk.
-    assert (
-        json_of("compare", folder / "before", folder / "after")["recordings"]
-        == (values["recordings"])
-    )
+    compared = json_of("compare", folder / "before", folder / "after")
+    assert compared["recordings"] == values["recordings"]
+    assert len(compared["recordings"]) == 2
 
 
-def test_tables_are_for_people(unshaped: Recording, shaped: Recording) -> None:
-    latency = called("latency", unshaped.path).out
-    assert "End-to-end latency of /t1../t3 [ms]" in latency, "figures without a unit"
-    assert "cycles disturbed by the machine" in latency
-    callbacks = called("callbacks", unshaped.path).out
-    assert "Callbacks [ms]" in callbacks
-    assert "/actuator" in callbacks
-    compared = called("compare", unshaped.path, shaped.path)
-    assert "before" in compared.out
-    assert "after" in compared.out
-    assert "slots [21.000, 22.000)" in compared.out
-    plan = called("plan", unshaped.path)
-    assert "Plan for /t1../t3 [ms]" in plan.out
-    assert "note: the sample is small" in plan.err
+def test_tables_are_for_people(unshaped: Recording, shaped: Recording, plan: Plan) -> None:
+    for command, texts in (
+        (
+            ["latency", unshaped.path],
+            ["End-to-end latency of /t1../t3 [ms]", "cycles disturbed by the machine"],
+        ),
+        (["callbacks", unshaped.path], ["Callbacks [ms]", "/actuator"]),
+        (
+            ["compare", unshaped.path, shaped.path],
+            ["before", "after", "Prediction and measurement [ms]", "slots [21.000, 22.000)"],
+        ),
+        (["plan", unshaped.path], ["Plan for /t1../t3 [ms]"]),
+        (["status"], ["plan"]),
+        (["status", "--outputs"], [""]),
+    ):
+        finished = called(*command)
+        assert finished.code == 0, finished
+        assert [text for text in texts if text not in finished.out] == [], command
+    assert "note: the sample is small" in called("plan", unshaped.path).err
 
 
-def test_a_long_path_is_printed_on_one_line(tmp_path: Path, unshaped: Recording) -> None:
+def test_a_dry_run_shows_what_threads_would_get(plan: Plan, tmp_path: Path) -> None:
+    save_plan(plan, tmp_path / "plan.yaml")
+    apply = ("apply", tmp_path / "plan.yaml", "--dry-run", "--backend")
+    commands = called(*apply, "litmus")
+    assert commands.code == 0, commands
+    assert "resctl -n" in commands.out
+    assert json_of(*apply, "litmus")["back_end"] == "litmus"
+
+
+def test_a_plan_is_written_and_printed(tmp_path: Path, unshaped: Recording) -> None:
     folder = tmp_path / ("a" * 100) / ("b" * 100)
     folder.mkdir(parents=True)
-    finished = chainshaper("plan", unshaped.path, "-o", folder / "plan.yaml")
-    assert finished.out.splitlines()[-1] == str(folder / "plan.yaml")
+    file = folder / "plan.yaml"
+    options = ("--epsilon", "2ms", "--anchor", "cycle")
+    values = json_of("plan", unshaped.path, "-o", file, *options)
+    planned = load_plan(file)
+    assert values["anchor"] == planned.anchor == "cycle"
+    assert values["margin"]["epsilon_ns"] == planned.margin.epsilon_ns == 2_000_000
+    assert values["bands_ns"] == [planned.servers[-1].slots[-1][1]]
+    assert set(values["predicted"]) == {"mean_ns", "max_ns", "jitter_ns", "shares"}
+    assert [server["core"] for server in values["servers"]] == [EXECUTOR_CORE, EXECUTOR_CORE]
+    longest = measure_latency(unshaped).analysis.undisturbed.max_ns
+    assert values["evidence"]["max_latency_ns"] == longest
+    file.unlink()
+    printed = called("plan", unshaped.path, "-o", file).out.splitlines()
+    assert printed[-1] == str(file), "on one line, however long"
+
+
+def test_nothing_is_said_about_what_is_quick(capsys: pytest.CaptureFixture[str]) -> None:
+    with output.late_progress("info") as report:
+        report(0.5, "decoding events")
+    assert capsys.readouterr().err == ""
+
+
+def test_what_takes_longer_says_what_it_does(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(output, "PATIENCE_S", 0.01)
+    with output.late_progress("latency") as report:
+        report(0.1, "opening the trace")
+        said = ""
+        for _ in range(200):
+            time.sleep(0.01)
+            said += capsys.readouterr().err
+            if said:
+                break
+        report(0.5, "decoding events")
+    said += capsys.readouterr().err
+    assert said == "latency: opening the trace\nlatency: decoding events\n"

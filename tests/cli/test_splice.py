@@ -1,24 +1,31 @@
 """`chainshaper splice` as a person or a script runs it."""
 
+import json
 from pathlib import Path
+from typing import TypeAlias
 
 import pytest
 from command_line import called, json_of, refused
 
 from chainshaper.planning import Plan, save_plan
 
+pytestmark = pytest.mark.computing
+
 ROBOT = '<launch>\n  <node pkg="robot" exec="third" name="third"/>\n</launch>\n'
 
 
+Files: TypeAlias = tuple[Path, Path, Path]
+
+
 @pytest.fixture
-def files(tmp_path: Path, plan: Plan) -> tuple[Path, Path, Path]:
+def files(tmp_path: Path, plan: Plan) -> Files:
     """A plan, a launch file that starts its publisher, and a folder that is not there yet."""
     save_plan(plan, tmp_path / "plan.yaml")
     (tmp_path / "robot.launch.xml").write_text(ROBOT)
     return tmp_path / "plan.yaml", tmp_path / "robot.launch.xml", tmp_path / "spliced"
 
 
-def test_it_shows_what_is_redirected_and_what_to_launch(files: tuple[Path, Path, Path]) -> None:
+def test_it_shows_what_is_redirected_and_what_to_launch(files: Files) -> None:
     plan, robot, folder = files
     finished = called("splice", plan, robot, "n:=1 2", "-o", folder)
     assert finished.code == 0
@@ -31,7 +38,7 @@ def test_it_shows_what_is_redirected_and_what_to_launch(files: tuple[Path, Path,
     assert robot.read_text() == ROBOT
 
 
-def test_its_json_says_the_same(files: tuple[Path, Path, Path]) -> None:
+def test_its_json_says_the_same(files: Files) -> None:
     plan, robot, folder = files
     said = json_of("splice", plan, robot, "-o", folder)
     copy = str(folder / "robot.launch.py")
@@ -47,14 +54,14 @@ def test_its_json_says_the_same(files: tuple[Path, Path, Path]) -> None:
     assert (said["notes"], said["setup"], said["redirected"]) == ([], None, [])
 
 
-def test_notes_go_to_standard_error(files: tuple[Path, Path, Path]) -> None:
+def test_notes_go_to_standard_error(files: Files) -> None:
     plan, robot, folder = files
     assert called("splice", plan, robot, "-o", folder).code == 0
     finished = called("splice", plan, folder / "robot.launch.py", "-o", folder)
     assert f"note: {folder}/robot.launch.py: spliced from its original, {robot}" in finished.err
 
 
-def test_what_ros2_run_starts_is_given_behind_two_dashes(files: tuple[Path, Path, Path]) -> None:
+def test_what_ros2_run_starts_is_given_behind_two_dashes(files: Files) -> None:
     plan, _, folder = files
     run = ("ros2", "run", "robot", "third", "--ros-args", "-r", "__node:=third")
     finished = called("splice", plan, "-o", folder, "--", *run)
@@ -64,7 +71,7 @@ def test_what_ros2_run_starts_is_given_behind_two_dashes(files: tuple[Path, Path
     assert finished.out.splitlines()[-1] == f"ros2 launch {throttled}/third.launch.py"
 
 
-def test_the_fallback_is_the_plan_s_or_the_option_s(files: tuple[Path, Path, Path]) -> None:
+def test_the_fallback_is_the_plan_s_or_the_option_s(files: Files) -> None:
     plan, robot, folder = files
     fallbacks = []
     for options in ([], ["--fallback", "silence"]):
@@ -76,7 +83,7 @@ def test_the_fallback_is_the_plan_s_or_the_option_s(files: tuple[Path, Path, Pat
     assert "a throttler has no fallback" in refusal
 
 
-def test_a_throttler_needs_no_plan(files: tuple[Path, Path, Path]) -> None:
+def test_a_throttler_needs_no_plan(files: Files) -> None:
     _, robot, folder = files
     said = json_of("splice", "--throttle", "/third:/t1=100ms", robot, "n:=1", "-o", folder)
     assert said["nodes"] == ["chainshaper_throttler"]
@@ -84,18 +91,20 @@ def test_a_throttler_needs_no_plan(files: tuple[Path, Path, Path]) -> None:
     assert called("splice", "--undo", "-o", folder).out == f"{folder} is removed\n"
 
 
-def test_undo_needs_the_folder_only(files: tuple[Path, Path, Path]) -> None:
+def test_undo_needs_the_folder_only(files: Files) -> None:
     plan, robot, folder = files
-    assert called("splice", plan, robot, "-o", folder).code == 0
-    assert called("splice", "--undo", "-o", folder).out == f"{folder} is removed\n"
-    assert not folder.exists()
-    assert called("splice", plan, robot, "-o", folder).code == 0
-    assert json_of("splice", plan, robot, "--undo", "-o", folder) == {"removed": str(folder)}
+    removed = f"{folder} is removed\n"
+    words: list[str | Path] = [plan, robot, "--json"]
+    for undo, printed in (([], removed), (words, None)):
+        assert called("splice", plan, robot, "-o", folder).code == 0
+        finished = called("splice", "--undo", "-o", folder, *(undo or ()))
+        assert finished.out == printed or json.loads(finished.out) == {"removed": str(folder)}
+        assert not folder.exists()
     assert "nothing to undo" in refused(2, "splice", "--undo", "-o", folder)
 
 
 def test_nothing_is_written_where_it_could_not_be_built(
-    files: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch
+    files: Files, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan, robot, folder = files
     monkeypatch.setenv("PATH", "/nowhere")
@@ -104,9 +113,7 @@ def test_nothing_is_written_where_it_could_not_be_built(
     assert not folder.exists()
 
 
-def test_a_plan_s_own_recording_tells_publishers_where_it_exists(
-    files: tuple[Path, Path, Path], plan: Plan
-) -> None:
+def test_a_plan_s_own_recording_tells_publishers_where_it_exists(files: Files, plan: Plan) -> None:
     path, robot, folder = files
     recording = path.parent / "recording"
     recording.mkdir()
@@ -124,33 +131,24 @@ def test_a_plan_s_own_recording_tells_publishers_where_it_exists(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("words", "message"),
     [
-        (["{plan}", "-o", "{folder}"], "give a plan and the launch files"),
-        (["-o", "{folder}"], "give a plan and the launch files"),
-        (["{plan}", "{robot}", "-o", "{folder}", "--build"], "--node python needs no building"),
-        (["{plan}", "{robot}", "-o", "{folder}", "--node", "typed"], "not known: name it"),
-        (
-            ["{plan}", "{robot}", "-o", "{folder}", "--node", "typed", "--type", "Header"],
-            "'Header' is not a message type",
-        ),
-        (["{robot}", "-o", "{folder}", "--throttle", "/t1=100ms"], "--recording REC, or the node"),
-        (["{robot}", "-o", "{folder}", "--throttle", "/third:/t1"], "write a topic and a period"),
-        (["{robot}", "-o", "{folder}", "--throttle", "third:/t1=1s"], "'third' is not a full ROS"),
-        (["{robot}", "-o", "{folder}", "--throttle", "/third:/t1=0ms"], "is zero"),
-        (["-o", "{folder}", "--throttle", "/third:/t1=1s"], "give the launch files"),
-        (
-            ["{robot}", "-o", "{folder}", "--throttle", "/third:/t1=1s", "--node", "typed"],
-            "a throttler is for all types",
-        ),
-        (["{robot}", "{robot}", "-o", "{folder}"], "robot.launch.xml"),
-        (["{plan}", "{plan}", "-o", "{folder}"], "plan.yaml"),
+        ("PLAN -o DIR", "give a plan and the launch files"),
+        ("-o DIR", "give a plan and the launch files"),
+        ("PLAN ROBOT -o DIR --build", "--node python needs no building"),
+        ("PLAN ROBOT -o DIR --node typed", "not known: name it"),
+        ("PLAN ROBOT -o DIR --node typed --type Header", "'Header' is not a message type"),
+        ("ROBOT -o DIR --throttle /t1=100ms", "--recording REC, or the node"),
+        ("ROBOT -o DIR --throttle /third:/t1", "write a topic and a period"),
+        ("ROBOT -o DIR --throttle third:/t1=1s", "'third' is not a full ROS"),
+        ("ROBOT -o DIR --throttle /third:/t1=0ms", "is zero"),
+        ("-o DIR --throttle /third:/t1=1s", "give the launch files"),
+        ("ROBOT -o DIR --throttle /third:/t1=1s --node typed", "a throttler is for all types"),
+        ("ROBOT ROBOT -o DIR", "robot.launch.xml"),
+        ("PLAN PLAN -o DIR", "plan.yaml"),
     ],
 )
-def test_wrong_use_is_refused_and_nothing_written(
-    files: tuple[Path, Path, Path], arguments: list[str], message: str
-) -> None:
-    plan, robot, folder = files
-    words = [word.format(plan=plan, robot=robot, folder=folder) for word in arguments]
-    assert message in refused(2, "splice", *words)
-    assert not folder.exists()
+def test_wrong_use_is_refused_and_nothing_written(files: Files, words: str, message: str) -> None:
+    places = dict(zip(("PLAN", "ROBOT", "DIR"), files, strict=True))
+    assert message in refused(2, "splice", *(places.get(word, word) for word in words.split()))
+    assert not files[2].exists()

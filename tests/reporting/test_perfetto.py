@@ -17,6 +17,7 @@ from chainshaper import data_flow, export_perfetto, measure_latency, open_source
 from chainshaper.reporting.perfetto import Slice, Track, Value, encode_trace
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording
+from chainshaper.values.safe_text import shown
 from chainshaper.verify.measure import Measurement
 
 BEGIN, END, INSTANT = 1, 2, 3
@@ -184,7 +185,7 @@ def test_slices_nest_on_every_track_whatever_they_overlap(spans: Sequence[tuple[
 
 @given(st.text(), st.integers(-(2**63), 2**63 - 1), st.booleans())
 def test_names_and_arguments_arrive_as_they_are(name: str, number: int, truth: bool) -> None:
-    name = name.encode("utf-8", errors="replace").decode()
+    name = shown(name)
     arguments: dict[str, Value] = {"number": number, "truth": truth, "text": name, "nothing": None}
     one = Slice(1, 2, name, arguments)
     trace = _Trace(encode_trace([Track("group", name, [[one]])], 0))

@@ -1,20 +1,28 @@
-"""Tables and figures show what there is, whatever it is called."""
+"""Tables and figures show what there is, whatever its name, but what no plan governed."""
 
 import io
 import shutil
 from pathlib import Path
 
 import pytest
+from command_line import called, json_of
+from known_run import LATENCY_NS, MS, PERIOD_NS, known_run
 from rich.console import Console
 
-from chainshaper import compare_recordings, draw_distribution, draw_latency
+from chainshaper import (
+    compare_recordings,
+    draw_distribution,
+    draw_latency,
+    measure_latency,
+    open_recording,
+)
 from chainshaper.planning import Plan
 from chainshaper.reporting.figures import draw_comparison
 from chainshaper.reporting.latency import comparison_json, comparison_table
-from chainshaper.reporting.plans import plan_table
+from chainshaper.reporting.overviews import plan_table
 from chainshaper.reporting.tables import ResultTable
 from chainshaper.values.errors import InputError, OperationError
-from chainshaper.values.recording import Recording
+from chainshaper.values.recording import InForceInfo, Recording
 from chainshaper.verify.measure import Comparison
 
 
@@ -35,19 +43,16 @@ def comparison(tmp_path: Path, unshaped: Recording, shaped: Recording) -> Compar
 
 def test_brackets_are_shown_and_not_taken_for_markup(comparison: Comparison, plan: Plan) -> None:
     text = _text(comparison_table(comparison))
-    assert "End-to-end latency of /t1../t3 [ms]" in text
-    assert "before [bold]" in text
-    assert "slots [21.000, 22.000)" in text
-    assert "[21.000, 22.000)" in _text(plan_table(plan))
-
-
-def test_a_comparison_names_what_it_compares(comparison: Comparison) -> None:
-    values = comparison_json(comparison)
-    assert [Path(entry["recording"]).name for entry in values["recordings"]] == [
+    for words in (
+        "End-to-end latency of /t1../t3 [ms]",
         "before [bold]",
-        "after",
-    ]
-    assert values["chain"] == "/t1../t3"
+        "slots [21.000, 22.000)",
+    ):
+        assert words in text
+    assert "[21.000, 22.000)" in _text(plan_table(plan))
+    values = comparison_json(comparison)
+    names = [Path(entry["recording"]).name for entry in values["recordings"]]
+    assert (values["chain"], names) == ("/t1../t3", ["before [bold]", "after"])
 
 
 def test_figures_are_drawn_and_never_over_others(comparison: Comparison, tmp_path: Path) -> None:
@@ -66,3 +71,58 @@ def test_a_figure_on_a_full_disk_leaves_nothing(comparison: Comparison, full_dis
         with pytest.raises(OperationError, match=f"{path}: the file cannot be written.*No space"):
             draw(comparison.measurements, path)
         assert not path.exists()
+
+
+@pytest.mark.parametrize(
+    ("since", "until", "starts", "text"),
+    [
+        (0, None, [0, 1, 2, 3], None),
+        (PERIOD_NS, None, [1, 2, 3], "the first 99ms, before the plan came into force"),
+        (PERIOD_NS, 3 * PERIOD_NS, [1, 2], "the first 99ms, before the plan came into "),
+        (0, 3 * PERIOD_NS, [0, 1, 2], "the last "),
+        (9_000 * MS, None, [], "the first "),
+    ],
+)
+def test_what_no_plan_governed_is_left_out(
+    since: int, until: int | None, starts: list[int], text: str | None, tmp_path: Path
+) -> None:
+    in_force = InForceInfo(since_ns=since, until_ns=until)
+    recording = known_run(tmp_path / "known", cycles=4, overran=(0,), in_force=in_force)
+    measured = measure_latency(recording)
+    cycles = measured.analysis.traversals
+    assert cycles["start"].to_list() == [cycle * PERIOD_NS + MS for cycle in starts]
+    overruns = {"publish": 1} if 0 in starts else {}
+    assert (measured.overruns, measured.analysis.statistics.late) == (overruns, len(overruns))
+    values = json_of("latency", recording.path)
+    assert values["in_force"] == {"since_ns": since, "until_ns": until}
+    assert values["count"] == len(starts)
+    shown = " ".join(called("latency", recording.path).out.split())
+    if text is None:
+        assert "left out" not in shown
+    else:
+        assert text in (measured.left_out.text or "")
+        assert "left out" in shown
+        compared = called("compare", recording.path, recording.path).out
+        assert "known: left out" in " ".join(compared.split())
+
+
+def test_over_all_cycles_late_outputs_maximum_and_jitter_are_shown(tmp_path: Path) -> None:
+    """The last output arrives at the end of its slot, and leaves at once."""
+    recording = known_run(tmp_path / "known", cycles=2, overran=(1,))
+    longest = 31 * MS
+    values = json_of("latency", recording.path)
+    assert (values["late"], values["max_all_ns"]) == (1, longest)
+    assert values["jitter_all_ns"] == longest - LATENCY_NS
+    assert values["undisturbed"]["late"] == 1
+    shown = called("compare", recording.path, recording.path).out
+    assert "came late" in shown
+    assert "1 of 2" in shown
+
+
+def test_a_recording_from_before_says_nothing_and_is_read_whole(tmp_path: Path) -> None:
+    recording = known_run(tmp_path / "known")
+    file = recording.path / "recording.json"
+    file.write_text(file.read_text().replace('"in_force": null', '"was_not_there": null'))
+    measured = measure_latency(open_recording(recording.path))
+    assert measured.analysis.statistics.count == 3
+    assert measured.left_out.text is None

@@ -10,7 +10,7 @@ import polars as pl
 import pytest
 
 from chainshaper.flow.exploration import convert_recording
-from chainshaper.reporting.recordings import contents_json
+from chainshaper.reporting.overviews import contents_json
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import (

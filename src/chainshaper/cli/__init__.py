@@ -4,21 +4,39 @@ Results go to stdout, errors and progress to stderr. Exit codes: 0 done, 1 the o
 wrong use or bad input, 3 the platform cannot do it.
 """
 
+import ctypes
+import errno
 import io
+import os
+import resource
 import signal
 import sys
+import textwrap
 from types import FrameType
 from typing import Any
 
 __all__ = ["main"]
 
+REMEDY = "raise the limit (`ulimit -v`), free memory, or give a smaller input"
+_LACK_OF_MEMORY = (
+    "cannot allocate memory",
+    "failed to map segment",  # the loader, of a library
+    "could not find/load shared object file",  # llvmlite, of its own
+    "can't start new thread",
+    "could not spawn threads",
+    "capacity overflow",
+)
+_FRUGAL = {
+    "POLARS_MAX_THREADS": "1",
+    "POLARS_ASYNC_THREAD_COUNT": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "_RJEM_MALLOC_CONF": "background_thread:false",  # of the allocator in Polars
+}
+_handlers: list[Any] = []  # ctypes forgets a callback that nothing refers to
+
 
 def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
-    """Entry point of `chainshaper`: run these arguments (default: the process's own).
-
-    ``name`` is what the command is called in its help.
-    """
-    from chainshaper.cli.exhaustion import catch_aborts, exhausted
+    """Run these arguments (default: the process's own); help calls the command ``name``."""
     from chainshaper.cli.output import say
     from chainshaper.values.errors import ChainshaperError
 
@@ -27,17 +45,17 @@ def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
             signal.signal(number, _end_in_order)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # an ASCII terminal gets "?" for µ
-    catch_aborts()
+    _catch_aborts()
     try:
         sys.exit(_run(arguments, name))
     except ChainshaperError as error:
         say(f"error: {error}")  # the last line of a failed command
         sys.exit(error.exit_code)
     except BaseException as error:  # a panic of Polars is no Exception
-        said = exhausted(error)
-        if said is None:
+        message = _exhausted(error)
+        if message is None:
             raise
-        say(f"error: {said}")
+        say(f"error: {message}")
         sys.exit(1)
 
 
@@ -45,25 +63,61 @@ def _run(arguments: list[str] | None, name: str) -> Any:
     """The verb's exit code, None for 0."""
     from chainshaper.cli.app import USAGE_ERROR, Abort, app
     from chainshaper.cli.output import say
+    from chainshaper.values.safe_text import shown
 
     try:
         return app(arguments, prog_name=name, standalone_mode=False)
     except USAGE_ERROR as error:
-        _show_usage(error)
+        error.message = shown(error.message, but="\n")  # it may quote a file's name
+        error.show()
         return error.exit_code
     except Abort:  # a question without an answer
         say("Aborted.")
         return 1
 
 
-def _show_usage(error: Any) -> None:
-    """As Typer does it, but with what the user, or a file's name, has written made safe."""
-    from chainshaper.values.safe_text import shown
-
-    error.message = shown(error.message, but="\n")
-    error.show()
-
-
 def _end_in_order(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - a signal handler
     """SIGTERM, or a lost terminal, ends us as Ctrl-C does: through every `finally`."""
     raise KeyboardInterrupt
+
+
+def _exhausted(error: BaseException) -> str | None:
+    """The message for lack of memory, or for a panic of Polars; None for every other error."""
+    if isinstance(error, KeyboardInterrupt | SystemExit):
+        return None
+    seen: set[int] = set()
+    link: BaseException | None = error
+    while link is not None and id(link) not in seen:
+        seen.add(id(link))
+        reason = textwrap.shorten(str(link), 160, placeholder=" ...")  # NumPy's has fifty lines
+        if (
+            isinstance(link, MemoryError)
+            or (isinstance(link, OSError) and link.errno == errno.ENOMEM)
+            or any(words in str(link).lower() for words in _LACK_OF_MEMORY)
+        ):
+            return f"memory ran out ({reason or 'Python could not allocate it'}): {REMEDY}"
+        if type(link).__name__ == "PanicException":  # of Polars; its module has no lasting name
+            return f"Polars cannot process this data ({reason}): check the input files"
+        link = link.__cause__ or link.__context__
+    return None
+
+
+def _catch_aborts() -> None:
+    """Where memory is limited (`ulimit -v`), let a library's abort end us with a message.
+
+    Libraries start as few threads as they can there: each one costs address space, Polars waits for
+    ever for one that it cannot start, and its allocator tries to start one for ever.
+    """
+    if resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY:
+        return
+    for name, value in _FRUGAL.items():
+        os.environ.setdefault(name, value)
+    message = f"error: memory ran out in a library: {REMEDY}\n".encode()
+
+    def ended(_: int) -> None:
+        os.write(2, message)
+        os._exit(1)
+
+    handler = ctypes.CFUNCTYPE(None, ctypes.c_int)(ended)
+    _handlers.append(handler)
+    ctypes.CDLL(None).signal(int(signal.SIGABRT), handler)

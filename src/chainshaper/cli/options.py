@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 
 import typer
 
+import chainshaper as cs
 from chainshaper.gate.decision import Late
 from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import BANDS, Wishes
 
 if TYPE_CHECKING:
-    from chainshaper.planning import Modes, Plan
+    from chainshaper.planning import Modes
 
 Source: TypeAlias = Literal["lttng", "ebpf"]
 
@@ -63,65 +64,59 @@ PARSERS: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
 """What reads and writes the values behind a metavar."""
 
 
-def option(default: Any, names: str, help_text: str, **more: Any) -> Any:
+def option(names: str, help_text: str, default: Any = None, **more: Any) -> Any:
     """An option as a parameter's default: ``--epsilon DURATION``, ``--output -o FILE``.
 
     Of a duration (with its unit; in ns), of bands and of a share the value is parsed, and its
-    default written.
+    default written; ``...`` where it must be given.
     """
     words = names.split()
     metavar = None if words[-1].startswith("-") else words.pop()
     parse, write = PARSERS.get(metavar or "", (None, None))
-    if write is not None and default is not None:
+    if write is not None and default not in (None, ...):
         default = write(default)
     return typer.Option(default, *words, help=help_text, metavar=metavar, parser=parse, **more)
 
 
-def argument(default: Any, metavar: str, help_text: str) -> Any:
+def argument(metavar: str, help_text: str, default: Any = None) -> Any:
     """An argument as a parameter's default; ``...`` where it must be given."""
     return typer.Argument(default, metavar=metavar, help=help_text, show_default=False)
 
 
-JSON: bool = option(False, "--json", "Print the figures as JSON (integer ns).")
+JSON: bool = option("--json", "Print the figures as JSON (integer ns).", False)
 CHAIN: str | None = option(
-    None,
     "--chain FIRST..LAST",
     "The chain, by topics or nodes: /t1../t5. Default: the one the recording names.",
 )
 PLAN_IN_FORCE: Path | None = option(
-    None,
-    "--plan plan.yaml",
-    "The plan that the last recording was made with, where it does not say so.",
+    "--plan plan.yaml", "The plan that the last recording was made with, where it does not say so."
 )
 TRACE: list[Path] = argument(
-    ...,
     "TRACE...",
     "An LTTng trace's folder (several of one trace: kernel and user space), or a recording's.",
+    ...,
 )
-APPLICATION: Path = argument(..., "APP.yaml", "The application's description.")
-RECORDING_OUTPUT: Path = option(..., "--output -o REC", "Folder to write; must not exist.")
-CYCLES: int = option(320, "--cycles", "Cycles to record.", min=1)
-SEED: int | None = option(None, "--seed", "Instead of the description's.", min=0)
+APPLICATION: Path = argument("APP.yaml", "The application's description.", ...)
+RECORDING_OUTPUT: Path = option("--output -o REC", "Folder to write; must not exist.", ...)
+CYCLES: int = option("--cycles", "Cycles to record.", 320, min=1)
+SEED: int | None = option("--seed", "Instead of the description's.", min=0)
 REALTIME: bool | None = option(
-    None, "--realtime/--no-realtime", "Use SCHED_FIFO. Default: where it is permitted."
+    "--realtime/--no-realtime", "Use SCHED_FIFO. Default: where it is permitted."
 )
 USERS: list[str] | None = option(
-    None,
     "--user NAME",
     "Whose processes are taken for nodes (may be repeated). Default: yours, also behind sudo, and"
     " root's.",
 )
-SOURCE: Source = option("lttng", "--source", "Who records the events.")
+SOURCE: Source = option("--source", "Who records the events.", "lttng")
 NODE: NodeKind = option(
-    "python", "--node", "A script; a package for all types; or one generated for the type."
+    "--node", "A script; a package for all types; or one generated for the type.", "python"
 )
 
 
-def plan_in_force(path: Path | None) -> "Plan | None":
+def plan_in_force(path: Path | None) -> "cs.Plan | None":
     """The plan of a file, if one is named."""
-    from chainshaper.planning import load_plan
-
-    return None if path is None else load_plan(path)
+    return None if path is None else cs.load_plan(path)
 
 
 _WISHES = {field.name: field for field in fields(Wishes)}
@@ -137,37 +132,27 @@ def wish(name: str, **more: Any) -> Any:
     if described.least is not None:
         more["min"] = described.least
     default = more.pop("default", _WISHES[name].default)
-    return option(
-        default, f"{names} {metavar}", described.help, rich_help_panel=described.panel, **more
-    )
+    panel = described.panel
+    return option(f"{names} {metavar}", described.help, default, rich_help_panel=panel, **more)
 
 
-MODES: str | None = option(
-    None,
+_MODES = option(
     "--modes TOPIC:MODE=BAND,…",
     "Each mode's band, 1 is the first; the first mode named is in force until the topic"
     " (std_msgs/String) names another. Such as /driving_mode:city=2,highway=1.",
     rich_help_panel=BANDS,
 )
-LATE: Late | None = option(
-    None,
+_LATE = option(
     "--late",
     "With --modes, an output behind its mode's slot: at once, wait for the next cycle's, discard,"
     " or in the cycle's next slot. Default: publish.",
     rich_help_panel=BANDS,
 )
-
-
-def _parameter(name: str) -> Parameter:
-    if name in _MODES:
-        kind, default = _MODES[name]
-    else:  # Typer knows no unions
-        kind = str if name == "bands" else get_args(_WISHES[name].type)[0]
-        default = wish(name)
-    return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=kind)
-
-
-_MODES: dict[str, tuple[Any, Any]] = {"modes": (str | None, MODES), "late": (Late | None, LATE)}
+_OTHERS: dict[str, tuple[Any, Any]] = {
+    "modes": (str | None, _MODES),
+    "late": (Late | None, _LATE),
+    "bands": (str, wish("bands")),  # Typer knows no unions
+}
 
 
 def takes_wishes(*names: str) -> Callable[[Callable[..., None]], Any]:
@@ -180,13 +165,15 @@ def takes_wishes(*names: str) -> Callable[[Callable[..., None]], Any]:
     def decorate(verb: Callable[..., None]) -> Any:
         @wraps(verb)
         def called(**values: Any) -> None:
-            from chainshaper.planning import PlanRequest
-
             wished = {name: values.pop(name) for name in names}
             modes = modes_of(wished.pop("modes", None), wished.pop("late", None))
-            verb(**values, request=PlanRequest(**wished, modes=modes))
+            verb(**values, request=cs.PlanRequest(**wished, modes=modes))
 
-        options = [_parameter(name) for name in names]
+        options = []
+        for name in names:
+            kind, default = _OTHERS.get(name) or (get_args(_WISHES[name].type)[0], wish(name))
+            more = {"default": default, "annotation": kind}
+            options.append(Parameter(name, Parameter.KEYWORD_ONLY, **more))
         parameters: list[Parameter] = []
         for one in signature(verb).parameters.values():
             own = [one.replace(kind=Parameter.KEYWORD_ONLY)]

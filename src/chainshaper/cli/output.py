@@ -5,16 +5,21 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
+import chainshaper as cs
 from chainshaper.values.errors import OperationError
 from chainshaper.values.safe_text import shown
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+
+Progress: TypeAlias = Callable[[float, str], None]
+"""Gets the share that is done, and what is done now."""
 
 PATIENCE_S = 2.0
 """What takes longer than this shows its progress."""
@@ -31,19 +36,25 @@ def show(*tables: "RenderableType") -> None:
             console.print(table)
 
 
-def show_line(text: str) -> None:
+def show_line(text: str | Path) -> None:
     """A line on stdout, or several, as they are: a path must not be folded."""
-    _write(shown(text, but="\n"))
-
-
-def _write(text: str) -> None:
     with _written():
-        sys.stdout.write(text + "\n")
+        sys.stdout.write(shown(str(text), but="\n") + "\n")
 
 
 def print_json(value: Any) -> None:
     """One JSON document on stdout; the one control character that JSON leaves alone is escaped."""
-    _write(json.dumps(value, indent=2).replace("\x7f", "\\u007f"))
+    with _written():
+        sys.stdout.write(json.dumps(value, indent=2).replace("\x7f", "\\u007f") + "\n")
+
+
+def present(as_json: bool, value: Any, *tables: "RenderableType") -> bool:
+    """A value as JSON, or the same as tables; whether it was the tables."""
+    if as_json:
+        print_json(value)
+    else:
+        show(*tables)
+    return not as_json
 
 
 @contextmanager
@@ -73,8 +84,15 @@ def notes(lines: Iterable[str]) -> None:
         say(f"note: {line}")
 
 
+def warn(plan: "cs.Plan") -> None:
+    """What is doubtful about a plan, before it is used."""
+    from chainshaper.planning import plan_warnings
+
+    notes(plan_warnings(plan))
+
+
 @contextmanager
-def progress(title: str) -> Iterator[Callable[[float, str], None]]:
+def progress(title: str) -> Iterator[Progress]:
     """A progress bar on stderr; without a terminal one line per stage instead."""
     if not sys.stderr.isatty():
         yield stage_lines(title)
@@ -90,38 +108,36 @@ def progress(title: str) -> Iterator[Callable[[float, str], None]]:
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(shown(title), total=1.0)
-
-        def report(share: float, what: str) -> None:
-            bar.update(task, completed=min(1.0, share), description=shown(f"{title}: {what}"))
-
-        yield report
+        yield lambda share, what: bar.update(
+            task, completed=min(1.0, share), description=shown(f"{title}: {what}")
+        )
 
 
 @contextmanager
-def late_progress(title: str) -> Iterator[Callable[[float, str], None]]:
+def late_progress(title: str) -> Iterator[Progress]:
     """As :func:`progress`, but nothing is shown of what is over in two seconds."""
-    with ExitStack() as shown:
-        lock = threading.Lock()
-        latest = (0.0, "working")
-        bar: Callable[[float, str], None] | None = None
-        over = False
+    lock = threading.Lock()
+    latest = (0.0, "working")
+    bar: Progress | None = None
+    over = False
 
-        def begin() -> None:
-            nonlocal bar
-            with lock:
-                if not over:
-                    bar = shown.enter_context(progress(title))
-                    bar(*latest)
+    def begin() -> None:
+        nonlocal bar
+        with lock:
+            if not over:
+                bar = stack.enter_context(progress(title))
+                bar(*latest)
 
-        def report(share: float, what: str) -> None:
-            nonlocal latest
-            with lock:
-                latest = (share, what)
-                if bar is not None:
-                    bar(share, what)
+    def report(share: float, what: str) -> None:
+        nonlocal latest
+        with lock:
+            latest = (share, what)
+            if bar is not None:
+                bar(share, what)
 
-        timer = threading.Timer(PATIENCE_S, begin)
-        timer.daemon = True
+    timer = threading.Timer(PATIENCE_S, begin)
+    timer.daemon = True
+    with ExitStack() as stack:
         timer.start()
         try:
             yield report
@@ -131,7 +147,7 @@ def late_progress(title: str) -> Iterator[Callable[[float, str], None]]:
                 over = True
 
 
-def stage_lines(title: str) -> Callable[[float, str], None]:
+def stage_lines(title: str) -> Progress:
     """Progress as one line per stage, for where a bar would disturb what others print."""
     last = ""
 
@@ -145,18 +161,33 @@ def stage_lines(title: str) -> Callable[[float, str], None]:
 
 
 @contextmanager
-def stop_on_signals(stop: threading.Event) -> Iterator[None]:
-    """Inside, Ctrl-C, a closed terminal and `kill` are an order to finish: each sets ``stop``."""
+def opened(
+    verb: str, trace: Sequence[Path], *, overview: bool = False
+) -> "Iterator[tuple[cs.Recording, Progress]]":
+    """A trace or recording for a verb that reads it, and what reports the verb's progress."""
+    with late_progress(verb) as report:
+        yield cs.open_source(*trace, progress=report, overview=overview), report
+
+
+def lost_events(recording: "cs.Recording") -> str:
+    """What was lost while recording; "nothing" is said as well."""
+    from chainshaper.values.recording import lost_text
+
+    return lost_text(recording.info.lost)
+
+
+@contextmanager
+def stop_on_signals() -> Iterator[threading.Event]:
+    """Ctrl-C, a closed terminal and `kill` are an order to finish inside: each sets the event."""
+    stop = threading.Event()
 
     def end(_number: int, _frame: FrameType | None) -> None:
         stop.set()
 
-    before = {
-        number: signal.signal(number, end)
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    }
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, end) for number in numbers}
     try:
-        yield
+        yield stop
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

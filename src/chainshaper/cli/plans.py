@@ -1,56 +1,55 @@
-"""Verbs that compute plans, move them against each other, and try out what they would do."""
+"""Verbs that compute plans, move them against each other, try them out, and splice them in."""
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import chainshaper as cs
+from chainshaper.cli.applying import recording_of
 from chainshaper.cli.options import (
     APPLICATION,
     JSON,
+    NODE,
     PLAN_WISHES,
     SEED,
+    NodeKind,
     argument,
     option,
     plan_in_force,
     takes_wishes,
+    wish,
 )
-from chainshaper.cli.output import notes, print_json, progress, show, show_line
+from chainshaper.cli.output import notes, present, print_json, progress, show_line, warn
 from chainshaper.values.errors import InputError
-
-if TYPE_CHECKING:
-    from chainshaper.planning import Plan, PlanRequest, Profile
+from chainshaper.values.plan_choices import Fallback
 
 
 @takes_wishes(*PLAN_WISHES)
 def plan(
-    recording: Path | None = argument(None, "[REC]", "A recording's or a trace's folder."),
+    recording: Path | None = argument("[REC]", "A recording's or a trace's folder."),
     chain: list[str] | None = option(
-        None,
         "--chain FIRST..LAST",
         "The chain, by topics or nodes: /t1../t5. Default: the one the recording names."
         " Give several to plan chains that share cores: their offsets are found.",
     ),
     output: Path | None = option(
-        None,
-        "--output -o plan.yaml",
-        "File to write; for several chains a folder, which must not exist.",
+        "--output -o plan.yaml", "File to write; for several chains a folder, which must not exist."
     ),
     latencies: Path | None = option(
-        None, "--latencies FILE", "Instead of a recording: a duration a line, or .npy in ns."
+        "--latencies FILE", "Instead of a recording: a duration a line, or .npy in ns."
     ),
     period: int | None = option(
-        None, "--period DURATION", "Period, with --latencies or a chain that no timer starts."
+        "--period DURATION", "Period, with --latencies or a chain that no timer starts."
     ),
     *,
-    request: "PlanRequest",
+    request: "cs.PlanRequest",
     curve: Path | None = option(
-        None,
         "--curve FILE.png",
         "With --bands auto: draw the average over the number of bands.",
         rich_help_panel="Latency bands",
     ),
     sink: list[str] | None = option(
-        None,
         "--sink FIRST..LAST",
         "A chain to a further output of the same graph, to be shaped too.",
         rich_help_panel="More of the graph",
@@ -62,7 +61,15 @@ def plan(
 
     From a recording, or from bare latencies with their period.
     """
-    from chainshaper.planning import plan_chain, plan_chains
+    from chainshaper.planning import (
+        band_choice,
+        plan_chains,
+        plan_json,
+        plan_warnings,
+        publish_slots,
+    )
+    from chainshaper.reporting.figures import draw_curve
+    from chainshaper.reporting.overviews import bands_table, choice_json, choice_table, plan_table
 
     if (recording is None) == (latencies is None):
         raise InputError("give either a recording or --latencies FILE --period DURATION")
@@ -71,67 +78,51 @@ def plan(
     wanted: list[str | None] = [*chain] if chain else [None]
     profiles = _profiles(recording, latencies, period, [*wanted, *(sink or [])])
     planned, sinks = profiles[: len(wanted)], profiles[len(wanted) :]
-    if len(planned) == 1:
-        made = plan_chain(planned[0], request, sinks)
-        _print_one(made, planned[0], request, output, curve, json)
-    elif sinks or curve is not None:
-        raise InputError("--sink and --curve go with one chain: plan chains one by one")
-    else:
+    if len(planned) > 1:
+        if sinks or curve is not None:
+            raise InputError("--sink and --curve go with one chain: plan chains one by one")
         _place_and_print(plan_chains(planned, request), output, json)
+        return
+    made = cs.plan_chain(planned[0], request, sinks)
+    choice = band_choice(made, planned[0], request) if request.bands == "auto" else None
+    if output is not None:
+        cs.save_plan(made, output)
+    values: dict[str, Any] = {**plan_json(made), "warnings": plan_warnings(made)}
+    tables = [plan_table(made)]
+    if len(publish_slots(made)) > 1:
+        tables.append(bands_table(made))
+    if choice is not None:
+        values["choice"] = choice_json(choice)
+        tables.append(choice_table(choice))
+        if curve is not None:
+            draw_curve(choice, curve)
+    if present(json, values, *tables):
+        notes(values["warnings"])
+        for path in filter(None, (curve, output)):
+            show_line(path)
 
 
 def _profiles(
     recording: Path | None, latencies: Path | None, period: int | None, chains: Sequence[str | None]
-) -> "tuple[Profile, ...]":
-    from chainshaper.flow.plan import profile_chains
-    from chainshaper.planning import Profile, read_latencies
+) -> "tuple[cs.Profile, ...]":
+    from chainshaper.planning import read_latencies
 
     if recording is not None:
-        return profile_chains(recording, chains, period_ns=period)
+        return cs.profile_chains(recording, chains, period_ns=period)
     if latencies is None or period is None:
         raise InputError("--latencies needs the chain's period: add --period, such as 100ms")
     if len(chains) > 1:
         raise InputError("--latencies are those of one chain: give a recording for several")
-    return (Profile(read_latencies(latencies), period, spec=chains[0]),)
-
-
-def _print_one(
-    planned: "Plan",
-    profile: "Profile",
-    request: "PlanRequest",
-    output: Path | None,
-    curve: Path | None,
-    json: bool,
-) -> None:
-    from chainshaper.planning import band_choice, plan_json, plan_warnings, publish_slots, save_plan
-    from chainshaper.reporting.plans import bands_table, choice_json, choice_table, plan_table
-
-    choice = band_choice(planned, profile, request) if request.bands == "auto" else None
-    if output is not None:
-        save_plan(planned, output)
-    if curve is not None and choice is not None:
-        from chainshaper.reporting.figures import draw_curve
-
-        draw_curve(choice, curve)
-    if json:
-        values: dict[str, Any] = {**plan_json(planned), "warnings": plan_warnings(planned)}
-        print_json(values if choice is None else {**values, "choice": choice_json(choice)})
-        return
-    bands = [bands_table(planned)] if len(publish_slots(planned)) > 1 else []
-    show(plan_table(planned), *bands, *([] if choice is None else [choice_table(choice)]))
-    notes(plan_warnings(planned))
-    for path in (curve, output):
-        if path is not None:
-            show_line(str(path))
+    return (cs.Profile(read_latencies(latencies), period, spec=chains[0]),)
 
 
 def offsets(
-    plans: list[Path] = argument(..., "PLAN PLAN...", "Plans, one a chain."),
+    plans: list[Path] = argument("PLAN PLAN...", "Plans, one a chain.", ...),
     output: Path | None = option(
-        None, "--output -o DIR", "Folder to write the plans into; must not exist."
+        "--output -o DIR", "Folder to write the plans into; must not exist."
     ),
     time_limit: float = option(
-        60.0, "--time-limit SECONDS", "How long to search, per group.", min=0.1
+        "--time-limit SECONDS", "How long to search, per group.", 60.0, min=0.1
     ),
     json: bool = JSON,
 ) -> None:
@@ -140,61 +131,49 @@ def offsets(
     Where chains cannot take turns on a core, they run at the same time at different priorities, and
     only their publish slots are kept apart.
     """
-    from chainshaper.planning import load_plan
-
-    _place_and_print([load_plan(path) for path in plans], output, json, time_limit)
+    _place_and_print([cs.load_plan(path) for path in plans], output, json, time_limit)
 
 
 def _place_and_print(
-    plans: "Sequence[Plan]", output: Path | None, json: bool, time_limit: float = 60.0
+    plans: "Sequence[cs.Plan]", output: Path | None, json: bool, time_limit: float = 60.0
 ) -> None:
-    from chainshaper.planning import place_chains, plan_json, plan_warnings, save_plans
-    from chainshaper.reporting.plans import plan_table
+    from chainshaper.planning import plan_json, plan_warnings, save_plans
+    from chainshaper.reporting.overviews import plan_table
 
-    placed, remarks = place_chains(plans, time_limit_s=time_limit)
+    placed, remarks = cs.place_chains(plans, time_limit_s=time_limit)
     written = [] if output is None else save_plans(placed, output)
-    warnings = [warning for planned in placed for warning in plan_warnings(planned)]
-    if json:
-        print_json(
-            {
-                "plans": [plan_json(planned) for planned in placed],
-                "files": [str(path) for path in written],
-                "warnings": [*remarks, *warnings],
-            }
-        )
-        return
-    show(*(plan_table(planned) for planned in placed))
-    notes(list(dict.fromkeys([*remarks, *warnings])))
-    for path in written:
-        show_line(str(path))
+    warnings = [*remarks, *(warning for one in placed for warning in plan_warnings(one))]
+    files = [str(path) for path in written]
+    values = {"plans": [plan_json(one) for one in placed], "files": files, "warnings": warnings}
+    if present(json, values, *map(plan_table, placed)):
+        notes(dict.fromkeys(warnings))
+        for path in written:
+            show_line(path)
 
 
 def sweep(
     application: Path = APPLICATION,
     vary: list[str] = option(
-        ...,
         "--vary NAME=VALUES",
         "An axis (repeat it for more): a wish for the plan, such as epsilon=0ms,1ms or"
         " bands=1..5; interference=0ms,20ms; or a value of the description by its path, such"
         " as nodes.node3.core=0,1.",
+        ...,
     ),
-    output: Path = option(..., "--output -o FILE.parquet", "File to write, a row for each point."),
+    output: Path = option("--output -o FILE.parquet", "File to write, a row for each point.", ...),
     plan: Path | None = argument(
-        None, "plan.yaml", "A plan that is in force at all points. Default: each is planned."
+        "plan.yaml", "A plan that is in force at all points. Default: each is planned."
     ),
-    cycles: int = option(100_000, "--cycles", "Cycles to plan from, and to judge by.", min=1),
+    cycles: int = option("--cycles", "Cycles to plan from, and to judge by.", 100_000, min=1),
     seed: int | None = SEED,
     workers: int | None = option(
-        None, "--workers", "Threads that compute. Default: one per core.", min=1
+        "--workers", "Threads that compute. Default: one per core.", min=1
     ),
     scheduler: str | None = option(
-        None,
         "--scheduler ADDRESS",
         "Compute on the Dask cluster whose scheduler is there, such as tcp://host:8786.",
     ),
-    draw: Path | None = option(
-        None, "--draw FILE.png", "Draw average and jitter over the first axis."
-    ),
+    draw: Path | None = option("--draw FILE.png", "Draw average and jitter over the first axis."),
     json: bool = JSON,
 ) -> None:
     """Simulate an application at every combination of some values: planned, shaped, judged.
@@ -202,27 +181,24 @@ def sweep(
     Ended before it is whole, it keeps the finished points beside the file that it writes; the same
     command goes on with the others.
     """
-    from chainshaper.flow.sweep import sweep as run_sweep
     from chainshaper.reporting.figures import draw_sweep
-    from chainshaper.reporting.plans import sweep_table
+    from chainshaper.reporting.overviews import sweep_table
     from chainshaper.simulation.grid import parse_axis
     from chainshaper.simulation.sweeping import rows_beside
     from chainshaper.values.files import new_file
-    from chainshaper.workload.description import load_application
 
     if workers is not None and scheduler is not None:
         raise InputError("a cluster has workers of its own: leave out --workers, or --scheduler")
     if draw is not None:
         draw = new_file(draw, (".png", ".pdf", ".svg"))
-    description = load_application(application)
-    in_force = plan_in_force(plan)
+    described, in_force = cs.load_application(application), plan_in_force(plan)
     axes = [parse_axis(text) for text in vary]
     if len(dict(axes)) < len(axes):
         raise InputError("an axis is given twice: give all of its values in one --vary")
     try:
         with progress("sweep") as report:
-            frame = run_sweep(
-                description,
+            frame = cs.sweep(
+                described,
                 dict(axes),
                 output,
                 in_force,
@@ -238,11 +214,146 @@ def sweep(
         raise
     if draw is not None:
         draw_sweep(frame, draw)
-    if json:
-        print_json(frame.to_dicts())
+    if present(json, frame.to_dicts(), sweep_table(frame)):
+        notes(frame["error"].drop_nulls().unique(maintain_order=True))
+        for path in filter(None, (draw, output)):
+            show_line(path)
+
+
+def splice(
+    plan: Path | None = argument("plan.yaml", "The plan; none with --throttle."),
+    launch: list[str] | None = argument(
+        "LAUNCH... [NAME:=VALUE...]",
+        "The launch files (.py, .xml, .yaml) and, for --dry-run, launch arguments; or, behind --, "
+        "a `ros2 run …`.",
+    ),
+    *,
+    output: Path = option("--output -o DIR", "Folder for the launch file.", ...),
+    throttle: list[str] | None = option(
+        "--throttle [NODE:]TOPIC=PERIOD",
+        "Instead of a plan: a throttler before an input that is not quite periodic, for "
+        "NODE or whoever subscribes in the recording (may be repeated).",
+    ),
+    node: NodeKind = NODE,
+    message_type: str | None = option(
+        "--type PKG/msg/TYPE", "Of the output, for --node typed. Default: what the recording says."
+    ),
+    recording: Path | None = option(
+        "--recording REC",
+        "A recording of the application: it tells publishers, subscribers and types. "
+        "Default: the plan's own, where it exists.",
+    ),
+    fallback: Fallback | None = wish("fallback", default=None),
+    build: bool = option("--build", "Build the shaping node's package with colcon.", False),
+    dry_run: bool = option(
+        "--dry-run",
+        "Write nothing, and show what would be redirected: the launch files are carried out in "
+        "this ROS 2 environment, but no process is started.",
+        False,
+    ),
+    undo: bool = option("--undo", "Remove DIR again, unless it was changed since.", False),
+    json: bool = JSON,
+) -> None:
+    """Write a launch file that includes yours, starts a shaping node, and redirects the output.
+
+    With --throttle an input is redirected, and a throttler republishes it once a period; do this
+    first, then record and plan, and splice the plan into its launch file. Launch the file that it
+    names, with your launch arguments; your launch files stay as they are.
+    """
+    from chainshaper.splicing.shaping_process import build_package, check_build_tools
+    from chainshaper.splicing.spliced_launch import NODES
+
+    if undo:
+        cs.undo_splice(output)
+        if json:
+            print_json({"removed": str(output)})
+        else:
+            show_line(f"{output} is removed")
         return
-    show(sweep_table(frame))
-    notes([f"{error}" for error in frame["error"].drop_nulls().unique(maintain_order=True)])
-    for path in (draw, output):
-        if path is not None:
-            show_line(str(path))
+    if build and node == "python":
+        raise InputError("--node python needs no building: leave out --build, or choose another")
+    if build:
+        check_build_tools()  # before anything is written
+    words = [*([str(plan)] if throttle and plan is not None else []), *(launch or [])]
+    ran = words[:2] == ["ros2", "run"]
+    arguments = {} if ran else dict(word.split(":=", 1) for word in words if ":=" in word)
+    files = words if ran else [word for word in words if ":=" not in word]
+    common: dict[str, Any] = {"launch_files": files, "output": output, "node": node}
+    common |= {"arguments": arguments, "dry_run": dry_run}
+    if throttle:
+        if fallback is not None:
+            raise InputError("a throttler has no fallback: --fallback goes with a plan")
+        if message_type is not None or node == "typed":
+            raise InputError(
+                "a throttler is for all types: choose --node python or cpp, and no --type"
+            )
+        splicing = _throttled(throttle, recording, common)
+    elif plan is None or not files:
+        raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
+    else:
+        planned = cs.load_plan(plan)
+        warn(planned)
+        common |= {"message_type": message_type, "fallback": fallback}
+        known = _opened(recording or recording_of(planned))
+        splicing = cs.splice_launch_files(planned, recording=known, **common)
+    setup = build_package(splicing.folder / NODES) if build and not dry_run else None
+    if json:
+        print_json(_splicing_json(splicing, setup))
+        return
+    _show_splicing(splicing, arguments, setup)
+
+
+def _throttled(inputs: list[str], recording: Path | None, common: dict[str, Any]) -> "cs.Splicing":
+    """Inputs as they are written: ``/fusion:/points_raw=100ms``."""
+    from chainshaper.values.durations import parse_duration
+    from chainshaper.values.yaml_file import wrong_values_refused
+
+    if not common["launch_files"]:
+        raise InputError("give the launch files: `splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`")
+    parsed = []
+    for text in inputs:
+        where, equals, period = text.rpartition("=")
+        if not equals:
+            raise InputError(f"--throttle {text}: write a topic and a period: /points_raw=100ms")
+        node, _, topic = where.rpartition(":")
+        values = {"topic": topic, "period_ns": parse_duration(period), "subscriber": node or None}
+        with wrong_values_refused(cs.ThrottledInput):
+            parsed.append(cs.ThrottledInput.model_validate(values))
+    return cs.splice_throttlers(parsed, recording=_opened(recording), **common)
+
+
+def _opened(recording: Path | None) -> "cs.Recording | None":
+    return None if recording is None else cs.open_source(recording)
+
+
+def _show_splicing(splicing: "cs.Splicing", arguments: dict[str, str], setup: Path | None) -> None:
+    for one in splicing.redirects:
+        verb = "publishes" if one.kind == "publisher" else "subscribes to"
+        for node in one.nodes:
+            show_line(f"{node} {verb} {one.target} in place of {one.topic}, for {one.added[0]}")
+    for found in splicing.redirected:
+        for started in found["redirected"]:
+            show_line(f"would add to {started['as']}: {' '.join(started['rules']) or 'nothing'}")
+    notes(splicing.notes)
+    if splicing.redirected:
+        return
+    if setup is not None:
+        show_line(f"source {setup}")
+    words = [f"{name}:={value}" for name, value in arguments.items()]
+    for file in dict.fromkeys(splicing.launch.values()):
+        show_line(shlex.join(["ros2", "launch", str(file), *words]))
+
+
+def _splicing_json(splicing: "cs.Splicing", setup: Path | None) -> dict[str, Any]:
+    return {
+        "folder": str(splicing.folder),
+        "launch": {str(file): str(copy) for file, copy in splicing.launch.items()},
+        "originals": {str(copy): str(file) for copy, file in splicing.originals.items()},
+        "nodes": [process.name for process in splicing.processes],
+        "standbys": [one.standby.name for one in splicing.processes if one.standby is not None],
+        "logs": [str(log) for log in splicing.logs],
+        "setup": None if setup is None else str(setup),
+        "redirected": [dict(one) for one in splicing.redirected],
+        "diff": splicing.diff,
+        "notes": list(splicing.notes),
+    }

@@ -12,8 +12,6 @@ from chainshaper.values.errors import PlatformError
 
 __all__ = ["ChainCommand"]
 
-NAME = "ros2 chain"
-
 
 class ChainCommand:
     """Constant end-to-end latency for computation chains (chainshaper)."""
@@ -38,12 +36,12 @@ def _run(arguments: list[str]) -> int:
     from chainshaper.cli.output import say
 
     try:
-        main(arguments, NAME)
+        main(arguments, "ros2 chain")
     except ModuleNotFoundError as error:  # built with colcon, which installs no dependencies
         say(  # the last line of a failed command
-            f"error: {NAME} needs the Python package {error.name}: install chainshaper's packages "
-            "from PyPI into the Python that ROS runs with (`python3 -m pip install .` in its "
-            "folder)"
+            f"error: ros2 chain needs the Python package {error.name}: install chainshaper's "
+            "packages from PyPI into the Python that ROS runs with (`python3 -m pip install .` in "
+            "its folder)"
         )
         return PlatformError.exit_code
     except SystemExit as ended:

@@ -1,13 +1,13 @@
 """Verbs that run an application: live, simulated, recorded, profiled, shaped; and the demo."""
 
 import sys
-import threading
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
+import chainshaper as cs
 from chainshaper.cli.options import (
     APPLICATION,
     CHAIN,
@@ -28,19 +28,22 @@ from chainshaper.cli.options import (
 )
 from chainshaper.cli.output import (
     late_progress,
+    lost_events,
     notes,
+    present,
     print_json,
     progress,
     show,
     show_line,
     stage_lines,
     stop_on_signals,
+    warn,
 )
+from chainshaper.cli.traces import comparison_tables
 from chainshaper.values.errors import InputError, OperationError
 
 if TYPE_CHECKING:
     from chainshaper.analysis import ChainEnumeration
-    from chainshaper.planning import PlanRequest
     from chainshaper.values.application import ApplicationGraph
 
 MIB = 1 << 20
@@ -49,17 +52,12 @@ DESCRIPTIONS = (".yaml", ".yml")
 SHAPING_DURATION_NS = 60_000_000_000
 
 COMMAND: list[str] | None = argument(
-    None,
-    "[-- COMMAND…]",
-    "Starts the application, such as `ros2 launch …`; ended with the recording.",
+    "[-- COMMAND…]", "Starts the application, such as `ros2 launch …`; ended with the recording."
 )
 DURATION: int | None = option(
-    None,
-    "--duration DURATION",
-    "How long to record. Default: until the application ends, or Ctrl-C.",
+    "--duration DURATION", "How long to record. Default: until the application ends, or Ctrl-C."
 )
 BUFFER: int | None = option(
-    None,
     "--buffer MIB",
     "LTTng's buffer of each core, in MiB, for when events were lost. Default: 4.",
     min=1,
@@ -69,15 +67,15 @@ BUFFER: int | None = option(
 @takes_wishes("ideal_machine")
 def demo(
     output: Path | None = option(
-        None, "--output -o DIR", "Folder for everything. Default: chainshaper-demo-DATE-TIME here."
+        "--output -o DIR", "Folder for everything. Default: chainshaper-demo-DATE-TIME here."
     ),
     application: Path | None = option(
-        None, "--application APP.yaml", "Another application than the paper's synthetic chain."
+        "--application APP.yaml", "Another application than the paper's synthetic chain."
     ),
     cycles: int = CYCLES,
     realtime: bool | None = REALTIME,
     *,
-    request: "PlanRequest",
+    request: "cs.PlanRequest",
     json: bool = JSON,
 ) -> None:
     """Measure a live chain, plan, splice the shaping node, measure again, show the gain.
@@ -86,10 +84,8 @@ def demo(
     a half. Needs no ROS 2.
     """
     from chainshaper.flow.demo import run_demo
-    from chainshaper.planning import plan_warnings
-    from chainshaper.reporting.latency import comparison_json, comparison_table
-    from chainshaper.reporting.plans import plan_table
-    from chainshaper.reporting.recordings import callback_table
+    from chainshaper.reporting.latency import comparison_json
+    from chainshaper.reporting.overviews import callback_table, plan_table
 
     folder = output or Path(f"chainshaper-demo-{datetime.now():%Y%m%d-%H%M%S}")
     with progress("demo") as report:
@@ -100,19 +96,14 @@ def demo(
             request=request,
             realtime=realtime,
             command=sys.argv,
-            planned=lambda plan: notes(plan_warnings(plan)),
+            planned=warn,
             progress=report,
         )
-    if json:
-        print_json({**comparison_json(result.comparison), "folder": str(folder)})
-        return
-    show(
-        callback_table(result.callbacks),
-        plan_table(result.plan),
-        comparison_table(result.comparison),
-    )
-    notes(result.notes)
-    show_line(str(folder.absolute()))
+    tables = [callback_table(result.callbacks), plan_table(result.plan)]
+    tables.append(comparison_tables(result.comparison)[0])
+    if present(json, comparison_json(result.comparison) | {"folder": str(folder)}, *tables):
+        notes(result.notes)
+        show_line(folder.absolute())
 
 
 def run(
@@ -126,44 +117,39 @@ def run(
     Every node is a process of its own, scheduled as the description says (SCHED_FIFO where it is
     permitted). The recording is a folder of Parquet tables.
     """
-    from chainshaper.workload.description import load_application
-    from chainshaper.workload.live import run_application
-
-    description = load_application(application)
-    with progress(f"running {description.name}") as report:
-        recording = run_application(
-            description, output, cycles=cycles, realtime=realtime, command=sys.argv, progress=report
+    described = cs.load_application(application)
+    with progress(f"running {described.name}") as report:
+        recording = cs.run_application(
+            described, output, cycles=cycles, realtime=realtime, command=sys.argv, progress=report
         )
     notes(recording.info.notes)
-    show_line(str(recording.path))
+    show_line(recording.path)
 
 
 def simulate(
     application: Path = APPLICATION,
     output: Path = RECORDING_OUTPUT,
-    plan: Path | None = argument(None, "plan.yaml", "The plan in force."),
+    plan: Path | None = argument("plan.yaml", "The plan in force."),
     cycles: int = CYCLES,
     seed: int | None = SEED,
-    switches: bool = option(False, "--switches", "Record what ran on which core, too."),
+    switches: bool = option("--switches", "Record what ran on which core, too.", False),
     execution_times: Path | None = option(
-        None, "--execution-times REC", "Draw execution times from those recorded there."
+        "--execution-times REC", "Draw execution times from those recorded there."
     ),
-    block: int = option(1, "--block", "So many consecutive ones at a time.", min=1, max=1024),
+    block: int = option("--block", "So many consecutive ones at a time.", 1, min=1, max=1024),
 ) -> None:
     """Simulate an application, with a plan in force or without, and record its events.
 
     The recording is like that of a live run: every other verb takes it.
     """
-    from chainshaper.simulation import simulate as run_simulation
-    from chainshaper.simulation.samples import with_recorded_times
-    from chainshaper.workload.description import load_application
-
-    description = load_application(application)
+    described = cs.load_application(application)
     if execution_times is not None:
-        description = with_recorded_times(description, execution_times, block=block)
-    with late_progress(f"simulating {description.name}") as report:
-        recording = run_simulation(
-            description,
+        from chainshaper.simulation.samples import with_recorded_times
+
+        described = with_recorded_times(described, execution_times, block=block)
+    with late_progress(f"simulating {described.name}") as report:
+        recording = cs.simulate(
+            described,
             output,
             plan_in_force(plan),
             cycles=cycles,
@@ -172,7 +158,7 @@ def simulate(
             command=sys.argv,
             progress=report,
         )
-    show_line(str(recording.path))
+    show_line(recording.path)
 
 
 def record(
@@ -181,7 +167,6 @@ def record(
     source: Source = SOURCE,
     duration: int | None = DURATION,
     pid: list[int] | None = option(
-        None,
         "--pid",
         "Attach to this process and what it has started (ebpf; may be repeated). "
         "Default, without a COMMAND: everything of the users that looks like ROS 2.",
@@ -189,9 +174,9 @@ def record(
     user: list[str] | None = USERS,
     buffer: int | None = BUFFER,
     watch_stalls: bool = option(
-        False,
         "--watch-stalls",
         "Have a sleeper on every core notice when the machine itself stands still.",
+        False,
     ),
     json: bool = JSON,
 ) -> None:
@@ -208,35 +193,33 @@ def record(
             "runs already, add `--source ebpf`"
         )
     _record_and_show(
-        *(output, command or [], json),
+        *(output, command or [], json, buffer),
         source=source,
         duration_ns=duration,
-        buffer=buffer and buffer * MIB,
         pids=pid or [],
         users=user or [],
         watch_stalls=watch_stalls,
     )
 
 
-def _record_and_show(output: Path, command: list[str], json: bool, **how: Any) -> None:
+def _record_and_show(
+    output: Path, command: list[str], json: bool, buffer: int | None, **how: Any
+) -> None:
     """Record, and say what came of it; ``how`` goes to :func:`chainshaper.record_command`."""
-    from chainshaper.flow.exploration import lost_events
-    from chainshaper.flow.record import record_command
     from chainshaper.linux.own_processes import end_in_words
-    from chainshaper.values.recording import event_counts
 
-    stop = threading.Event()
-    with stop_on_signals(stop):
-        recorded = record_command(
+    with stop_on_signals() as stop:
+        recorded = cs.record_command(
             output,
             command,
             command_stdout=STDERR if json else None,  # standard output is ours
+            buffer=buffer and buffer * MIB,
             stop=stop,
             progress=stage_lines("record"),
             **how,
         )
     recording = recorded.recording
-    count = int(event_counts(recording)["count"].sum())
+    count = int(cs.event_counts(recording)["count"].sum())
     if json:
         print_json(
             {
@@ -248,8 +231,8 @@ def _record_and_show(output: Path, command: list[str], json: bool, **how: Any) -
             }
         )
     else:
-        show_line(str(recording.path))
-    notes((*recording.info.notes, f"{count} events; {lost_events(recording.info)}"))
+        show_line(recording.path)
+    notes((*recording.info.notes, f"{count} events; {lost_events(recording)}"))
     if recorded.exit_code:
         raise OperationError(
             f"the command {end_in_words(recorded.exit_code)}; what was recorded until then is in "
@@ -261,23 +244,19 @@ def profile(
     output: Path = RECORDING_OUTPUT,
     command: list[str] | None = COMMAND,
     chain: str | None = option(
-        None,
         "--chain FIRST..LAST",
         "The chain whose nodes get the priority; --like tells which those are.",
     ),
     like: Path | None = option(
-        None,
         "--like REC",
         "An earlier recording of the application: it knows the chain's nodes, components "
         "of containers, and executors with several threads.",
     ),
     node: list[str] | None = option(
-        None,
         "--node NAME",
         "A node that gets the priority (may be repeated). Default: the chain's, or all.",
     ),
     core: int | None = option(
-        None,
         "--core",
         "Where executors run. Default: the last core. DDS threads run on the others.",
         min=0,
@@ -292,9 +271,8 @@ def profile(
     This is how the latencies are measured that a plan is computed from. Whatever ends it, all
     threads are as before. What happened before the priorities were in force is left out.
     """
-    from chainshaper.flow.profiling import chain_nodes, check_profiling, profiling_condition
+    from chainshaper.flow.profiling import chain_nodes, check_profiling
     from chainshaper.linux.own_processes import check_command
-    from chainshaper.sources import open_source
     from chainshaper.values.recording import refuse_existing
 
     if not command:
@@ -308,16 +286,15 @@ def profile(
     check_command(command)
     core = check_profiling(core)
     names = [f"/{name.strip('/')}" for name in node or ()]
-    earlier = None if like is None else open_source(like)
+    earlier = None if like is None else cs.open_source(like)
     if earlier is not None and chain is not None:
         names += chain_nodes(earlier, chain)
     _record_and_show(
-        *(output, command, json),
+        *(output, command, json, buffer),
         source=source,
         duration_ns=duration,
-        buffer=buffer and buffer * MIB,
         chain=chain,
-        scheduling=profiling_condition(names, core, like=earlier),
+        scheduling=cs.profiling_condition(names, core, like=earlier),
         watch_stalls=True,
     )
 
@@ -328,27 +305,27 @@ def profile(
 )
 def shape(
     words: list[str] = argument(
-        ...,
         "APP.yaml plan.yaml | -- ros2 launch ...",
         "A described application and the plan in force; or what launches a real one, "
         "which is then measured and planned first.",
+        ...,
     ),
     output: Path = option(
-        ...,
         "--output -o REC",
         "Folder for the recording; of a launched application, for everything.",
+        ...,
     ),
     cycles: int = CYCLES,
     realtime: bool | None = REALTIME,
     chain: str | None = CHAIN,
     duration: int | None = option(
-        None, "--duration DURATION", "How long to measure, before and after. Default: 60s."
+        "--duration DURATION", "How long to measure, before and after. Default: 60s."
     ),
     source: Source = SOURCE,
     node: NodeKind = NODE,
-    backend: str = option("auto", "--backend NAME", "As for `chainshaper apply`."),
+    backend: str = option("--backend NAME", "As for `chainshaper apply`.", "auto"),
     *,
-    request: "PlanRequest",
+    request: "cs.PlanRequest",
     user: list[str] | None = USERS,
     json: bool = JSON,
 ) -> None:
@@ -384,16 +361,13 @@ def shape(
 def _shape_described(
     application: Path, plan: Path, output: Path, cycles: int, realtime: bool | None
 ) -> None:
-    from chainshaper.flow.plan import shape_application
-    from chainshaper.planning import load_plan, plan_warnings
     from chainshaper.verify.overruns import dropped_in, dropped_text, overruns_in, overruns_text
-    from chainshaper.workload.description import load_application
 
-    description, planned = load_application(application), load_plan(plan)
-    notes(plan_warnings(planned))
-    with progress(f"shaping {description.name}") as report:
-        recording = shape_application(
-            description,
+    described, planned = cs.load_application(application), cs.load_plan(plan)
+    warn(planned)
+    with progress(f"shaping {described.name}") as report:
+        recording = cs.shape_application(
+            described,
             planned,
             output,
             cycles=cycles,
@@ -406,37 +380,31 @@ def _shape_described(
     if dropped := dropped_in(recording):
         notes([dropped_text(dropped)])
     notes(recording.info.notes)
-    show_line(str(recording.path))
+    show_line(recording.path)
 
 
 def _shape_launched(command: list[str], folder: Path, json: bool, **how: Any) -> None:
     """The whole flow; ``how`` goes to :func:`chainshaper.shape_launch`."""
-    from chainshaper.flow.launch_shaping import shape_launch
-    from chainshaper.planning import plan_warnings
-    from chainshaper.reporting.latency import comparison_json, comparison_table, prediction_table
+    from chainshaper.reporting.latency import comparison_json
 
-    stop = threading.Event()
-    with stop_on_signals(stop):
-        shaped = shape_launch(
+    with stop_on_signals() as stop:
+        shaped = cs.shape_launch(
             command,
             folder,
             choose=_ask if sys.stdin.isatty() and not json else None,
             stop=stop,
-            planned=lambda plan: notes(plan_warnings(plan)),
+            planned=warn,
             progress=stage_lines("shape"),
             **how,
         )
-    if json:
-        print_json(comparison_json(shaped.comparison) | {"folder": str(shaped.folder)})
-        return
-    predictions = [one.held for one in shaped.comparison.measurements if one.held is not None]
-    show(comparison_table(shaped.comparison), *map(prediction_table, predictions))
-    notes(shaped.notes)
-    show_line(str(shaped.folder))
+    values = comparison_json(shaped.comparison) | {"folder": str(shaped.folder)}
+    if present(json, values, *comparison_tables(shaped.comparison)):
+        notes(shaped.notes)
+        show_line(shaped.folder)
 
 
 def _ask(graph: "ApplicationGraph", found: "ChainEnumeration") -> str:
-    from chainshaper.reporting.recordings import chain_table
+    from chainshaper.reporting.overviews import chain_table
     from chainshaper.values.safe_text import shown
 
     show(chain_table(graph, found))

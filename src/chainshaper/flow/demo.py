@@ -1,4 +1,4 @@
-"""The demonstration: the whole flow on a live application, everything kept in one folder.
+"""The demonstration: the whole flow on a live application, everything in one folder.
 
 DIR/application.yaml   what ran
 DIR/before             the recording of the unshaped run
@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 
@@ -66,34 +67,27 @@ def run_demo(
 
     Raises:
         InputError: ``folder`` exists and is not empty, or the application is not right.
-        PlatformError, OperationError: a step failed; recordings that are complete are kept. If
-            there is none, nothing is left.
+        PlatformError, OperationError: a step failed; complete recordings stay; without one
+            nothing is left.
     """
     folder = refuse_existing(folder)
     path = synthetic_chain() if application is None else Path(application)
     description = load_application(path)
+    how: dict[str, Any] = {"cycles": cycles, "realtime": realtime, "command": command}
+
+    def part(start: float, title: str) -> Progress:
+        return lambda done, what: progress(start + 0.48 * done, f"{title}, {what}")
+
     with _prepared(folder, path):
         before = run_application(
-            description,
-            folder / "before",
-            cycles=cycles,
-            realtime=realtime,
-            command=command,
-            progress=_part(progress, 0.0, 0.48, "unshaped run"),
+            description, folder / "before", progress=part(0.0, "unshaped run"), **how
         )
     progress(0.48, "planning")
     plan = plan_recording(before, request=request)
     save_plan(plan, folder / "plan.yaml")
     planned(plan)
-    after = shape_application(
-        description,
-        plan,
-        folder / "after",
-        cycles=cycles,
-        realtime=realtime,
-        command=command,
-        progress=_part(progress, 0.5, 0.48, "shaped run"),
-    )
+    report = part(0.5, "shaped run")
+    after = shape_application(description, plan, folder / "after", progress=report, **how)
     progress(0.98, "comparing")
     comparison = compare_recordings([before, after])
     write_comparison(comparison, folder)
@@ -122,8 +116,3 @@ def _prepared(folder: Path, application: Path) -> Iterator[None]:
             copy.unlink(missing_ok=True)
             if made and folder.exists():
                 folder.rmdir()
-
-
-def _part(progress: Progress, start: float, share: float, title: str) -> Progress:
-    """Progress of one run as a part of the whole."""
-    return lambda done, what: progress(start + share * done, f"{title}, {what}")

@@ -27,93 +27,74 @@ def examine_machine(watch_ns: int = 5_000_000_000) -> MachineReport:
 
     realtime = may_use_fifo()
     stalls, meter = measure_stalls(available_cores(), watch_ns, realtime)
-    return MachineReport(tuple(_checks(realtime)), stalls, meter, watch_ns)
+    checks = (*_scheduling_checks(realtime), *_tool_checks())
+    return MachineReport(checks, stalls, meter, watch_ns)
 
 
-def _checks(realtime: bool) -> Iterator[Check]:
+def _scheduling_checks(realtime: bool) -> Iterator[Check]:
     cores, throttled = available_cores(), throttle_fraction()
     lockable, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     others = foreign_realtime_processes()
     text = f"{len(cores)} ({', '.join(map(str, cores))}), kernel {platform.release()}"
-    yield _check(
-        "cores",
-        "DDS threads beside executors",
-        text if len(cores) >= 2 else None,
-        ("limited", text, "use a machine with two cores or more"),
-    )
+    good, remedy = text if len(cores) >= 2 else None, "use a machine with two cores or more"
+    yield _check("cores", "DDS threads beside executors", good, "limited", text, remedy)
+    purpose = "measuring and shaping with real-time scheduling"
     remedy = "run as root, or give your user an rtprio limit of 98 in /etc/security/limits.conf"
-    yield _check(
-        "SCHED_FIFO",
-        "measuring and shaping with real-time scheduling",
-        "permitted" if realtime else None,
-        ("absent", "not permitted", remedy),
-    )
+    good = "permitted" if realtime else None
+    yield _check("SCHED_FIFO", purpose, good, "absent", "not permitted", remedy)
+    purpose, good = "cores that real-time threads fill", "off" if throttled >= 1.0 else None
     found = f"real-time threads are stopped at {throttled:.0%} of a core"
-    yield _check(
-        "real-time throttling",
-        "cores that real-time threads fill",
-        "off" if throttled >= 1.0 else None,
-        ("limited", found, "stay below it, or: sysctl kernel.sched_rt_runtime_us=-1"),
-    )
+    remedy = "stay below it, or: sysctl kernel.sched_rt_runtime_us=-1"
+    yield _check("real-time throttling", purpose, good, "limited", found, remedy)
+    unlimited = os.geteuid() == 0 or lockable == resource.RLIM_INFINITY
+    purpose, good = "no page faults while a gate waits", "permitted" if unlimited else None
     remedy = "give your user an unlimited memlock limit in /etc/security/limits.conf"
     yield _check(
-        "memory locking",
-        "no page faults while a gate waits",
-        "permitted" if os.geteuid() == 0 or lockable == resource.RLIM_INFINITY else None,
-        ("limited", f"up to {lockable // 1024} KiB", remedy),
+        "memory locking", purpose, good, "limited", f"up to {lockable // 1024} KiB", remedy
     )
+    purpose, good = "undisturbed measurements", None if others else "none"
     remedy = "end them while you measure, unless they belong to the application"
-    yield _check(
-        "other real-time processes",
-        "undisturbed measurements",
-        None if others else "none",
-        ("limited", ", ".join(others), remedy),
-    )
+    name, found = "other real-time processes", ", ".join(others)
+    yield _check(name, purpose, good, "limited", found, remedy)
+
+
+def _tool_checks() -> Iterator[Check]:
     yield _dds()
     for offer in offered_back_ends():  # what `chainshaper apply` can use here, strongest first
         found, _, remedy = (offer.missing or "").partition(": ")
         good = "can be used" if offer.missing is None else None
-        yield _check(f"back end {offer.name}", offer.strength, good, ("absent", found, remedy))
+        yield _check(f"back end {offer.name}", offer.strength, good, "absent", found, remedy)
     yield _bpftrace()
     for name, purpose, remedy in (
         ("lttng", "recording ROS 2 with LTTng", "apt install lttng-tools"),
         ("ros2", "shaping ROS 2 applications", "install ROS 2, and source its setup.bash"),
     ):
-        yield _check(name, purpose, shutil.which(name), ("absent", "not found", remedy))
+        yield _check(name, purpose, shutil.which(name), "absent", "not found", remedy)
 
 
 def _bpftrace() -> Check:
     """Whether bpftrace is there and works: without tracefs it finds no trace points."""
-    purpose, environment = "recording ROS 2 without LTTng", tool_environment()
-    path = shutil.which("bpftrace", path=environment["PATH"])
+    name, purpose, environment = "bpftrace", "recording ROS 2 without LTTng", tool_environment()
+    path = shutil.which(name, path=environment["PATH"])
     if path is None:
-        return _check("bpftrace", purpose, None, ("absent", "not found", "apt install bpftrace"))
+        return _check(name, purpose, None, "absent", "not found", "apt install bpftrace")
     if os.geteuid() != 0:
-        lacking: tuple[State, str, str] = ("limited", "needs root", "run as root, with sudo")
-        return _check("bpftrace", purpose, None, lacking)
+        return _check(name, purpose, None, "limited", "needs root", "run as root, with sudo")
     trial = [path, "-e", "BEGIN { exit(); } tracepoint:sched:sched_switch { }"]
     try:
         run = subprocess.run(
             trial, capture_output=True, text=True, check=False, timeout=30, env=environment
         )
+        if run.returncode == 0:
+            return Check(name, "good", path, purpose)
         problems = [line for line in run.stderr.splitlines() if "RLIMIT_MEMLOCK" not in line]
     except subprocess.TimeoutExpired:
-        run, problems = None, ["it did not end within 30 s"]
-    if run is not None and run.returncode == 0:
-        return _check("bpftrace", purpose, path, ("limited", "", ""))
+        problems = ["it did not end within 30 s"]
     remedy = "mount -t tracefs tracefs /sys/kernel/tracing"
     if Path("/sys/kernel/tracing/events").is_dir():
         remedy = "see what bpftrace says: a kernel with BTF and uprobes is needed"
     found = f"does not work: {problems[0] if problems else 'no reason given'}"
-    return _check("bpftrace", purpose, None, ("limited", found, remedy))
-
-
-def _check(name: str, purpose: str, good: str | None, lacking: tuple[State, str, str]) -> Check:
-    """``good`` is what was found, None where it is ``lacking``: state, what was found, remedy."""
-    if good is not None:
-        return Check(name, "good", good, purpose)
-    state, found, remedy = lacking
-    return Check(name, state, found, purpose, remedy)
+    return _check(name, purpose, None, "limited", found, remedy)
 
 
 def _dds() -> Check:
@@ -126,4 +107,13 @@ def _dds() -> Check:
         found, problem = None, str(error)
     remedy = "use Python 3.10 to 3.13 on x86-64, for which a wheel exists"
     purpose = "the live workload and `chainshaper demo`"
-    return _check("Cyclone DDS for Python", purpose, found, ("absent", problem, remedy))
+    return _check("Cyclone DDS for Python", purpose, found, "absent", problem, remedy)
+
+
+def _check(  # noqa: PLR0917 - a check's columns
+    name: str, purpose: str, good: str | None, state: State, found: str, remedy: str
+) -> Check:
+    """``good`` is what was found; None: the check's state, what was found, and the remedy."""
+    if good is not None:
+        return Check(name, "good", good, purpose)
+    return Check(name, state, found, purpose, remedy)

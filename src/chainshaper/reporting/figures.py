@@ -7,31 +7,20 @@ in grey print.
 import io
 import json
 from collections.abc import Sequence
+from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import polars as pl
 
 from chainshaper.planning import BandChoice, publish_slots
 from chainshaper.reporting.latency import comparison_json
-from chainshaper.reporting.plans import sweep_axes, sweep_value
+from chainshaper.reporting.overviews import sweep_axes, sweep_value
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.files import new_file, why_distrusted, write_whole
 from chainshaper.values.safe_text import shown
 from chainshaper.verify.measure import Comparison, Measurement
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-__all__ = [
-    "draw_comparison",
-    "draw_curve",
-    "draw_distribution",
-    "draw_latency",
-    "draw_sweep",
-    "write_comparison",
-]
 
 COLOURS = ("#d95f02", "#1b6ca8", "#4d9221", "#7b3294")
 SIZE_INCHES = (9.0, 4.2)
@@ -74,47 +63,50 @@ def draw_latency(measurements: Sequence[Measurement], path: str | Path) -> Path:
     undisturbed cycle.
     """
     figure, axes = _new_figure()
-    for index, measurement in enumerate(measurements):
+    for measurement, colour in zip(measurements, cycle(COLOURS), strict=False):
         frame = measurement.analysis.traversals.filter("complete")
         cycles = np.arange(len(frame))
         latency = frame["latency_ns"].to_numpy() / 1e6
-        disturbed = frame["disturbed"].to_numpy()
-        colour = COLOURS[index % len(COLOURS)]
-        name = measurement.recording.path.name
-        jitter = measurement.analysis.undisturbed.jitter_ns
+        hit = frame["disturbed"].to_numpy()
+        name, jitter = measurement.recording.path.name, measurement.analysis.undisturbed.jitter_ns
         label = name if jitter is None else f"{name}: jitter {jitter / 1e6:.3f} ms"
-        calm = cycles[~disturbed], latency[~disturbed]
-        axes.plot(*calm, ".", markersize=4, color=colour, label=label)
-        axes.plot(cycles[disturbed], latency[disturbed], "x", markersize=5, color=colour, alpha=0.7)
-    _limit_to_cycle(axes, measurements)
+        axes.plot(cycles[~hit], latency[~hit], ".", markersize=4, color=colour, label=label)
+        axes.plot(cycles[hit], latency[hit], "x", markersize=5, color=colour, alpha=0.7)
     axes.set(xlabel="cycle (crosses: disturbed by the machine)", ylabel="end-to-end latency [ms]")
-    axes.set_title(f"Chain {measurements[0].analysis.chain.spec}", loc="left")
-    axes.legend(loc="lower right")
-    return _save_figure(figure, path)
+    return _save_chain(figure, axes, measurements, path)
 
 
 def draw_distribution(measurements: Sequence[Measurement], path: str | Path) -> Path:
     """Cumulative distribution of the latency over undisturbed cycles, publish slots shaded."""
     figure, axes = _new_figure()
-    for index, measurement in enumerate(measurements):
+    for measurement, colour in zip(measurements, cycle(COLOURS), strict=False):
         frame = measurement.analysis.traversals.filter(pl.col("complete") & ~pl.col("disturbed"))
         latency = np.sort(frame["latency_ns"].to_numpy()) / 1e6
         share = np.arange(1, len(latency) + 1) / max(1, len(latency))
-        axes.step(
-            latency,
-            share,
-            where="post",
-            color=COLOURS[index % len(COLOURS)],
-            label=f"{measurement.recording.path.name} ({len(latency)} cycles)",
-        )
-        if measurement.plan is not None:
-            for number, (start, end) in enumerate(publish_slots(measurement.plan)):
-                label = "publish slot" if number == 0 else None
-                axes.axvspan(start / 1e6, end / 1e6, color="0.8", zorder=0, label=label)
-    _limit_to_cycle(axes, measurements, vertical=False)
+        label = f"{measurement.recording.path.name} ({len(latency)} cycles)"
+        axes.step(latency, share, where="post", color=colour, label=label)
+        slots = () if measurement.plan is None else publish_slots(measurement.plan)
+        for number, (start, end) in enumerate(slots):
+            look = {"color": "0.8", "zorder": 0, "label": None if number else "publish slot"}
+            axes.axvspan(start / 1e6, end / 1e6, **look)
     axes.set(xlabel="end-to-end latency [ms]", ylabel="share of cycles")
+    return _save_chain(figure, axes, measurements, path, vertical=False)
+
+
+def _save_chain(
+    figure: Any,
+    axes: Any,
+    measurements: Sequence[Measurement],
+    path: str | Path,
+    *,
+    vertical: bool = True,
+) -> Path:
+    """Let single cycles that waited for another slot not squeeze all others into a line."""
+    highest = max(measurement.analysis.undisturbed.max_ns or 0 for measurement in measurements)
+    if highest:
+        (axes.set_ylim if vertical else axes.set_xlim)(0, highest / 1e6 * 1.15)
     axes.set_title(f"Chain {measurements[0].analysis.chain.spec}", loc="left")
-    axes.legend(loc="upper left")
+    axes.legend(loc="lower right" if vertical else "upper left")
     return _save_figure(figure, path)
 
 
@@ -130,15 +122,9 @@ def draw_curve(choice: BandChoice, path: str | Path) -> Path:
     bands = [len(placement.slot_ends_ns) for placement in choice.curve]
     means = [placement.mean_ns / 1e6 for placement in choice.curve]
     axes.plot(bands, means, "o-", color=COLOURS[1], label="best placement")
-    axes.plot(
-        len(choice.chosen.slot_ends_ns),
-        choice.chosen.mean_ns / 1e6,
-        "o",
-        markersize=12,
-        fillstyle="none",
-        color=COLOURS[0],
-        label=choice.reason,
-    )
+    chosen = len(choice.chosen.slot_ends_ns), choice.chosen.mean_ns / 1e6
+    look = {"markersize": 12, "fillstyle": "none", "color": COLOURS[0], "label": choice.reason}
+    axes.plot(*chosen, "o", **look)
     axes.set_xticks(bands)
     axes.set(xlabel="number of latency bands", ylabel="average latency, eq. 5 [ms]")
     axes.legend(loc="upper right")
@@ -187,15 +173,6 @@ def _new_figure(panels: int = 1) -> tuple[Any, Any]:
     for one in figure.axes:
         one.grid(alpha=0.3)
     return figure, axes
-
-
-def _limit_to_cycle(
-    axes: "Axes", measurements: Sequence[Measurement], *, vertical: bool = True
-) -> None:
-    """Let single cycles that waited for another slot not squeeze all others into a line."""
-    highest = max(measurement.analysis.undisturbed.max_ns or 0 for measurement in measurements)
-    if highest:
-        (axes.set_ylim if vertical else axes.set_xlim)(0, highest / 1e6 * 1.15)
 
 
 def _save_figure(figure: Any, path: str | Path) -> Path:

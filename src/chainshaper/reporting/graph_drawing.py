@@ -1,51 +1,45 @@
-"""The application graph as a picture: SVG with a layout of ours, or DOT for Graphviz.
+"""The application graph: as plain data, as a table, and as a picture (SVG, or DOT for Graphviz).
 
-Nodes are boxes of callbacks, with topics between them. Arrows run from the callback that publishes
+Nodes are boxes of callbacks, with topics between them; arrows run from the callback that publishes
 a topic to the callbacks that it triggers. A dashed arrow is a message that one callback reads and
 another callback of the node publishes for it (synchronisers, stored messages). An arrow at a node's
 title stands for publications outside its callbacks, or for subscriptions without callback events.
+What every node has for itself (parameter services, /rosout, /parameter_events) is left out of
+tables and pictures unless asked for; in JSON it is marked.
 
 The layout is that of Sugiyama, Tagawa and Toda (1981): edges that close cycles are turned around;
-every box gets a layer (a column), as far left as its predecessors permit; boxes of a column are
-sorted so that few edges cross (barycentres, swept back and forth); heights are chosen so that edges
-run straight, exactly for one column given its neighbours: least squares under the order and the
-gaps between boxes, which is isotonic regression (pool adjacent violators). Edges over several
-columns pass them through places of their own, so that no arrow crosses a box. Parts that are not
-connected are laid out one below the other.
+every box gets a column, as far left as its predecessors permit; columns are sorted so that few
+edges cross (barycentres, swept back and forth); heights are least squares under the order and the
+gaps of a column (isotonic regression), so that edges run straight. Edges over several columns pass
+them through places of their own. Parts that are not connected are laid out one below the other.
 """
 
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from graphlib import TopologicalSorter
-from itertools import accumulate
+from itertools import accumulate, pairwise
 from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from chainshaper.analysis.graph import ApplicationDescription
-from chainshaper.reporting.application_graph import (
-    application_json,
-    callback_text,
-    short_symbol,
-    without_internals,
-)
-from chainshaper.values.application import Callback
+from chainshaper.reporting.tables import Column, ResultTable, words
+from chainshaper.values.application import INTERNAL_TOPICS, Callback
+from chainshaper.values.durations import format_duration
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.recording import lost_text
 from chainshaper.values.safe_text import escape, shown
 
-__all__ = [
-    "ENDINGS",
-    "Box",
-    "Edge",
-    "application_dot",
-    "application_svg",
-    "lay_out",
-    "write_picture",
-]
-
 ENDINGS = (".svg", ".dot", ".json")
+
+_OWN_TOPICS = INTERNAL_TOPICS - {"/clock"}
+_OWN_SERVICES = {"describe_parameters", "get_parameter_types", "get_parameters", "list_parameters"}
+_OWN_SERVICES |= {"get_type_description", "set_parameters", "set_parameters_atomically"}
+_LAMBDA = re.compile(r"\{lambda\(.*?\)#(\d+)\}$")
+_BIND = re.compile(r"std::_Bind<.*?\((\w[\w:]*)::\*")
 
 COLUMN_GAP = 48.0
 ROW_GAP = 22.0
@@ -79,68 +73,153 @@ text { font-family: "DejaVu Sans", Verdana, Helvetica, Arial, sans-serif; font-s
 """
 
 
-@dataclass(frozen=True)
-class Box:
-    """Something to place: its size."""
-
-    width: float
-    height: float
+Point: TypeAlias = tuple[float, float]
 
 
-@dataclass(frozen=True)
-class Edge:
-    """An arrow between two boxes (their numbers), leaving and entering at heights inside them."""
-
-    source: int
-    target: int
-    leaves: float
-    enters: float
+def is_internal(name: str | None) -> bool:
+    """Whether a topic or service is one that every node has for itself."""
+    return name is not None and (name in _OWN_TOPICS or name.rpartition("/")[2] in _OWN_SERVICES)
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Left upper corners of the boxes, way points of the edges, and the size of it all.
+def without_internals(application: ApplicationDescription) -> ApplicationDescription:
+    """The application without what every node has for itself."""
+    graph = application.graph
+    callbacks = tuple(
+        replace(one, publishes=tuple(t for t in one.publishes if not is_internal(t)))
+        for one in graph.callbacks
+        if not is_internal(one.topic)
+    )
+    publishers = {t: nodes for t, nodes in graph.publishers.items() if not is_internal(t)}
+    subscribers = {t: nodes for t, nodes in graph.subscribers.items() if not is_internal(t)}
+    left = replace(graph, callbacks=callbacks, publishers=publishers, subscribers=subscribers)
+    return replace(application, graph=left)
 
-    An edge's way points lead from the right side of its source to the left side of its target.
-    """
 
-    corners: list[tuple[float, float]]
-    routes: list[list[tuple[float, float]]]
-    width: float
-    height: float
+def application_json(application: ApplicationDescription) -> dict[str, Any]:
+    """Nodes, callbacks, topics and services as plain data."""
+    graph = application.graph
+    callbacks = []
+    for one in graph.callbacks:
+        names = ("id", "node", "pid", "kind", "topic", "period_ns", "symbol", "publishes")
+        values = {name: getattr(one, name) for name in (*names, "passes_on")}
+        callbacks.append({**values, "internal": is_internal(one.topic)})
+    topics = []
+    for topic in graph.topics:
+        ends = graph.publishers.get(topic, ()), graph.subscribers.get(topic, ())
+        found = {"name": topic, "publishers": list(ends[0]), "subscribers": list(ends[1])}
+        topics.append({**found, "internal": is_internal(topic)})
+    services: dict[str, dict[str, Any]] = {}
+    for name, role, node, _ in application.services.sort(
+        "service", maintain_order=True
+    ).iter_rows():
+        fresh = {"name": name, "servers": [], "clients": [], "internal": is_internal(name)}
+        services.setdefault(name, fresh)[f"{role}s"].append(node or "")
+    return {
+        "nodes": [{"name": node.name, "pid": node.pid} for node in graph.nodes],
+        "callbacks": callbacks,
+        "topics": topics,
+        "services": list(services.values()),
+        "lost": application.lost,
+        "notes": list(application.notes),
+    }
 
 
-@dataclass
-class _Columns:
-    """The layered graph of one component: vertices are boxes and, behind them, edges' places."""
+def application_table(application: ApplicationDescription) -> ResultTable:
+    """One row per callback, by node."""
+    names = [*words("node"), Column("process"), *words("callback", "publishes", "function")]
+    table = ResultTable("Application", names)
+    for node in sorted(_nodes(application), key=lambda node: (node.name, node.pid)):
+        for one in node.callbacks:
+            cells = callback_text(one), ", ".join(one.publishes), short_symbol(one.symbol)
+            table.add(node.name, str(node.pid), *cells)
+        if not node.callbacks:
+            table.add(node.name, str(node.pid), "", "", "")
+    return table
 
-    layer: dict[int, int]
-    height: dict[int, float]
-    columns: list[list[int]]
-    segments: list[tuple[int, int, float, float]]  # left, right, heights inside them
-    y: dict[int, float] = field(default_factory=dict)
+
+def callback_text(callback: Callback) -> str:
+    """What triggers a callback, in few words."""
+    if callback.kind == "timer":
+        return f"timer {format_duration(callback.period_ns or 0)}"
+    if callback.kind == "unknown":
+        return "not known" if callback.handle else "outside callbacks"
+    return f"{callback.kind} {callback.topic or ''}".rstrip()
+
+
+def short_symbol(symbol: str | None) -> str:
+    """The name of a registered function without its arguments: ``Filter λ1``."""
+    if not symbol:
+        return ""
+    bound = _BIND.match(symbol)
+    if bound is not None:
+        return f"{bound[1]}::…"
+    ending = _LAMBDA.search(symbol)
+    depth, outside = 0, []  # the text outside all <…>, (…) and {…}
+    for character in symbol[: ending.start()] if ending else symbol:
+        depth += character in "<({"
+        if depth == 0:
+            outside.append(character)
+        depth -= character in ">)}"
+    text = re.sub(r"^(void|.* )(?=\S+$)", "", "".join(outside)).removesuffix("::")
+    text = re.sub(r"(\w+)::\1$", r"\1", text)  # a constructor
+    return f"{text} λ{ending[1]}" if ending else text
 
 
 @dataclass(frozen=True)
 class _NodeBox:
+    """A node as it is drawn: a title, and a row for each callback."""
+
     name: str
     pid: int
-    callbacks: tuple[Callback, ...]
+    callbacks: Sequence[Callback]
 
     @property
-    def box(self) -> Box:
+    def box(self) -> "Box":
         widths = [CHARACTER * (len(self.name) + 1) + SMALL * (len(str(self.pid)) + 4)]
         for callback in self.callbacks:
-            widths.append(CHARACTER * len(_text(callback)) + 14)
-            widths.append(SMALL * len(_function(callback)) + 14)
+            trigger, function = _row_texts(callback)
+            widths += [CHARACTER * len(trigger) + 14, SMALL * len(function) + 14]
         return Box(max(widths) + 2 * PAD, TITLE + ROW * len(self.callbacks))
 
-    def height_of(self, number: int | None) -> float:
-        """The middle of a callback's row, or of the title."""
+    def svg(self, corner: Point) -> str:
+        x, y = corner
+        width, height = self.box.width, self.box.height
+        parts = [
+            f'<g transform="translate({x:.1f} {y:.1f})">',
+            f'<rect class="node" width="{width:.1f}" height="{height:.1f}" rx="5"/>',
+            f'<rect class="head" x="1" y="1" width="{width - 2:.1f}" height="{TITLE - 2:.1f}"'
+            ' rx="4"/>',
+            f'<text class="title" x="{PAD}" y="18">{escape(self.name)}</text>',
+            f'<text class="small" x="{width - PAD:.1f}" y="18" text-anchor="end">{self.pid}</text>',
+        ]
         for row, callback in enumerate(self.callbacks):
-            if callback.id == number:
-                return TITLE + ROW * (row + 0.5)
-        return TITLE / 2
+            top, (trigger, function) = TITLE + ROW * row, _row_texts(callback)
+            about = f"{callback.label}\n{callback.symbol}" if callback.symbol else callback.label
+            parts += [
+                f"<g><title>{escape(about)}</title>",
+                f'<line class="line" x1="1" x2="{width - 1:.1f}" y1="{top}" y2="{top}"/>',
+                f'<rect x="{PAD}" y="{top + 9}" width="6" height="18" rx="2"'
+                f' fill="{COLOURS[callback.kind]}"/>',
+                f'<text x="{PAD + 14}" y="{top + 16}">{escape(trigger)}</text>',
+                f'<text class="small" x="{PAD + 14}" y="{top + 29}">{escape(function)}</text></g>',
+            ]
+        return "\n".join([*parts, "</g>"])
+
+
+def _row_texts(callback: Callback) -> tuple[str, str]:
+    """What triggers it, except for a topic (the arrow comes from there); and its function."""
+    trigger = callback.kind if callback.kind == "subscription" else callback_text(callback)
+    function = short_symbol(callback.symbol)
+    return trigger, function if len(function) <= LONGEST else function[: LONGEST - 1] + "…"
+
+
+def _nodes(application: ApplicationDescription) -> list[_NodeBox]:
+    rows: dict[tuple[str, int], list[Callback]] = {
+        (node.name, node.pid): [] for node in application.graph.nodes
+    }
+    for callback in application.graph.callbacks:
+        rows.setdefault((callback.node, callback.pid), []).append(callback)
+    return [_NodeBox(name, pid, own) for (name, pid), own in rows.items()]
 
 
 def application_svg(application: ApplicationDescription) -> str:
@@ -150,40 +229,41 @@ def application_svg(application: ApplicationDescription) -> str:
     arrows = list(_arrows(application, nodes, topics))
     pills = [Box(CHARACTER * len(topic) + 2 * PAD, PILL) for topic in topics]
     layout = lay_out([*(node.box for node in nodes), *pills], [edge for edge, _ in arrows])
-    parts = [_arrow(route, style) for route, (_, style) in zip(layout.routes, arrows, strict=True)]
-    parts += [_node(node, layout.corners[index]) for index, node in enumerate(nodes)]
-    parts += [
-        _topic(topic, layout.corners[len(nodes) + index], pills[index])
-        for index, topic in enumerate(topics)
+    width, height = layout.width + 2 * MARGIN, layout.height + 2 * MARGIN
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height:.0f}"'
+        f' viewBox="{-MARGIN} {-MARGIN} {width:.1f} {height:.1f}">',
+        '<defs><marker id="tip" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="7"'
+        ' markerHeight="7" orient="auto-start-reverse"><path d="M 0 1 L 10 5 L 0 9 z" fill="#555"/>'
+        f"</marker><style>{_STYLE}</style></defs>",
+        f'<rect x="{-MARGIN}" y="{-MARGIN}" width="{width:.1f}" height="{height:.1f}"'
+        ' fill="#fff"/>',
     ]
-    if any(application.lost.values()):
-        text = escape(lost_text(application.lost))
+    parts += [_arrow(route, style) for route, (_, style) in zip(layout.routes, arrows, strict=True)]
+    parts += [node.svg(corner) for node, corner in zip(nodes, layout.corners, strict=False)]
+    for topic, pill, (x, y) in zip(topics, pills, layout.corners[len(nodes) :], strict=True):
         parts.append(
-            f'<text class="small" x="0" y="{layout.height + MARGIN / 2:.1f}">{text}</text>'
+            f'<g transform="translate({x:.1f} {y:.1f})">'
+            f'<rect class="topic" width="{pill.width:.1f}" height="{pill.height:.1f}" rx="13"/>'
+            f'<text x="{pill.width / 2:.1f}" y="17" text-anchor="middle">{escape(topic)}</text></g>'
         )
-    return _document(layout, parts)
-
-
-def _nodes(application: ApplicationDescription) -> list[_NodeBox]:
-    rows: dict[tuple[str, int], list[Callback]] = {
-        (node.name, node.pid): [] for node in application.graph.nodes
-    }
-    for callback in application.graph.callbacks:
-        rows.setdefault((callback.node, callback.pid), []).append(callback)
-    return [_NodeBox(name, pid, tuple(own)) for (name, pid), own in rows.items()]
+    if any(application.lost.values()):
+        y, text = layout.height + MARGIN / 2, escape(lost_text(application.lost))
+        parts.append(f'<text class="small" x="0" y="{y:.1f}">{text}</text>')
+    return "\n".join([*parts, "</svg>", ""])
 
 
 def _arrows(
     application: ApplicationDescription, nodes: list[_NodeBox], topics: list[str]
-) -> Iterator[tuple[Edge, str]]:
+) -> Iterator[tuple["Edge", str]]:
     """Arrows and their classes: callbacks and topics, then titles where no callback is known."""
     graph = application.graph
     place = {topic: len(nodes) + index for index, topic in enumerate(topics)}
     for index, node in enumerate(nodes):
         writes: set[str] = set()
         reads: set[str | None] = set()
-        for callback in node.callbacks:
-            height = node.height_of(callback.id)
+        for row, callback in enumerate(node.callbacks):
+            height = TITLE + ROW * (row + 0.5)
             if callback.kind == "subscription" and callback.topic in place:
                 yield Edge(place[callback.topic], index, PILL / 2, height), "arrow"
                 reads.add(callback.topic)
@@ -198,56 +278,7 @@ def _arrows(
                 yield Edge(place[topic], index, PILL / 2, TITLE / 2), "arrow"
 
 
-def _text(callback: Callback) -> str:
-    """What triggers it, except for a topic: that is where the arrow comes from."""
-    return callback.kind if callback.kind == "subscription" else callback_text(callback)
-
-
-def _explained(callback: Callback) -> str:
-    return f"{callback.label}\n{callback.symbol}" if callback.symbol else callback.label
-
-
-def _function(callback: Callback) -> str:
-    text = short_symbol(callback.symbol)
-    return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
-
-
-def _node(node: _NodeBox, corner: tuple[float, float]) -> str:
-    x, y = corner
-    size = node.box
-    parts = [
-        f'<g transform="translate({x:.1f} {y:.1f})">',
-        f'<rect class="node" width="{size.width:.1f}" height="{size.height:.1f}" rx="5"/>',
-        f'<rect class="head" x="1" y="1" width="{size.width - 2:.1f}" height="{TITLE - 2:.1f}"'
-        ' rx="4"/>',
-        f'<text class="title" x="{PAD}" y="18">{escape(node.name)}</text>',
-        f'<text class="small" x="{size.width - PAD:.1f}" y="18" text-anchor="end">'
-        f"{node.pid}</text>",
-    ]
-    for row, callback in enumerate(node.callbacks):
-        top = TITLE + ROW * row
-        colour = COLOURS[callback.kind]
-        parts += [
-            f"<g><title>{escape(_explained(callback))}</title>",
-            f'<line class="line" x1="1" x2="{size.width - 1:.1f}" y1="{top}" y2="{top}"/>',
-            f'<rect x="{PAD}" y="{top + 9}" width="6" height="18" rx="2" fill="{colour}"/>',
-            f'<text x="{PAD + 14}" y="{top + 16}">{escape(_text(callback))}</text>',
-            f'<text class="small" x="{PAD + 14}" y="{top + 29}">{escape(_function(callback))}'
-            "</text></g>",
-        ]
-    return "\n".join([*parts, "</g>"])
-
-
-def _topic(topic: str, corner: tuple[float, float], size: Box) -> str:
-    x, y = corner
-    return (
-        f'<g transform="translate({x:.1f} {y:.1f})">'
-        f'<rect class="topic" width="{size.width:.1f}" height="{size.height:.1f}" rx="13"/>'
-        f'<text x="{size.width / 2:.1f}" y="17" text-anchor="middle">{escape(topic)}</text></g>'
-    )
-
-
-def _arrow(route: list[tuple[float, float]], style: str) -> str:
+def _arrow(route: list[Point], style: str) -> str:
     """Horizontal ends, curves between the columns; backward arrows turn around at both ends."""
     backwards = route[-1][0] < route[0][0]
     (x, y), *rest = route
@@ -265,55 +296,29 @@ def _arrow(route: list[tuple[float, float]], style: str) -> str:
     return f'<path class="{style}{" back" if backwards else ""}" d="{" ".join(path)}"/>'
 
 
-def _document(layout: Layout, parts: list[str]) -> str:
-    width, height = layout.width + 2 * MARGIN, layout.height + 2 * MARGIN
-    tip = (
-        '<marker id="tip" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="7" markerHeight="7"'
-        ' orient="auto-start-reverse"><path d="M 0 1 L 10 5 L 0 9 z" fill="#555"/></marker>'
-    )
-    return "\n".join(
-        [
-            f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height:.0f}"'
-            f' viewBox="{-MARGIN} {-MARGIN} {width:.1f} {height:.1f}">',
-            f"<defs>{tip}<style>{_STYLE}</style></defs>",
-            f'<rect x="{-MARGIN}" y="{-MARGIN}" width="{width:.1f}" height="{height:.1f}"'
-            ' fill="#fff"/>',
-            *parts,
-            "</svg>",
-            "",
-        ]
-    )
-
-
 def application_dot(application: ApplicationDescription) -> str:
     """The graph in the language of Graphviz: a cluster per node, ellipses for topics."""
     graph = application.graph
     lines = ["digraph application {", "  rankdir=LR;", "  node [fontname=Helvetica, fontsize=11];"]
     if any(application.lost.values()):
         lines.append(f"  label={_quoted(lost_text(application.lost))};")
-    number = {(node.name, node.pid): index for index, node in enumerate(graph.nodes)}
-    for callback in graph.callbacks:
-        number.setdefault((callback.node, callback.pid), len(number))
-    for (name, pid), index in number.items():
+    for index, node in enumerate(_nodes(application)):
         lines.append(f"  subgraph cluster_{index} {{")
-        lines.append(f"    label={_quoted(f'{name} (process {pid})')};")
+        lines.append(f"    label={_quoted(f'{node.name} (process {node.pid})')};")
         lines.append(f'    node_{index} [shape=point, style=invis, label=""];')
-        for callback in graph.callbacks:
-            if (callback.node, callback.pid) == (name, pid):
-                text = callback_text(callback) + "\n" + short_symbol(callback.symbol)
-                label = _quoted(text.strip())
-                lines.append(f"    callback_{callback.id} [shape=box, label={label}];")
+        for one in node.callbacks:
+            label = _quoted(f"{callback_text(one)}\n{short_symbol(one.symbol)}".strip())
+            lines.append(f"    callback_{one.id} [shape=box, label={label}];")
         lines.append("  }")
     lines += [f"  {_quoted(topic)} [shape=ellipse];" for topic in graph.topics]
-    for callback in graph.callbacks:
-        vertex = f"callback_{callback.id}"
-        if callback.kind == "subscription" and callback.topic is not None:
-            lines.append(f"  {_quoted(callback.topic)} -> {vertex};")
-        elif callback.kind in {"service", "client"} and callback.topic is not None:
-            lines.append(f"  {_quoted(callback.topic)} [shape=cds];")
-            lines.append(f"  {_quoted(callback.topic)} -> {vertex};")
-        for topic in callback.publishes:
-            style = " [style=dashed]" if topic in callback.passes_on else ""
+    for one in graph.callbacks:
+        vertex = f"callback_{one.id}"
+        if one.topic is not None and one.kind in {"subscription", "service", "client"}:
+            if one.kind != "subscription":
+                lines.append(f"  {_quoted(one.topic)} [shape=cds];")
+            lines.append(f"  {_quoted(one.topic)} -> {vertex};")
+        for topic in one.publishes:
+            style = " [style=dashed]" if topic in one.passes_on else ""
             lines.append(f"  {vertex} -> {_quoted(topic)}{style};")
     return "\n".join([*lines, "}", ""])
 
@@ -343,36 +348,92 @@ def write_picture(
     return write_whole(path, [text.encode()])
 
 
+class Box(NamedTuple):
+    """Something to place: its size."""
+
+    width: float
+    height: float
+
+
+class Edge(NamedTuple):
+    """An arrow between two boxes (their numbers), leaving and entering at heights inside them."""
+
+    source: int
+    target: int
+    leaves: float
+    enters: float
+
+
+class Layout(NamedTuple):
+    """Left upper corners of the boxes, way points of the edges, and the size of it all.
+
+    An edge's way points lead from the right side of its source to the left side of its target.
+    """
+
+    corners: list[Point]
+    routes: list[list[Point]]
+    width: float
+    height: float
+
+
+@dataclass
+class _Part:
+    """A connected part in columns: vertices are its boxes and, behind them, edges' places."""
+
+    layer: dict[int, int]
+    height: dict[int, float]
+    places: dict[int, list[int]] = field(default_factory=dict)  # of each edge, left to right
+    columns: list[list[int]] = field(default_factory=list)
+    segments: list[tuple[int, int, float, float]] = field(default_factory=list)
+    """Left and right vertex, and the heights inside them."""
+    y: dict[int, float] = field(default_factory=dict)
+
+    def beside(self) -> tuple["Beside", "Beside"]:
+        """The neighbours of each vertex, to its left and to its right."""
+        before: Beside = {vertex: [] for vertex in self.layer}
+        after: Beside = {vertex: [] for vertex in self.layer}
+        for left, right, leaves, enters in self.segments:
+            before[right].append((left, enters, leaves / (self.height[left] + 1)))
+            after[left].append((right, leaves, enters / (self.height[right] + 1)))
+        return before, after
+
+
+Beside: TypeAlias = dict[int, list[tuple[int, float, float]]]
+"""Vertex → neighbour, height of the edge's end inside the vertex, share inside the neighbour."""
+
+
 def lay_out(boxes: Sequence[Box], edges: Sequence[Edge]) -> Layout:
     """Place boxes and edges. Cost is about that of sorting, times the number of sweeps."""
     corners = [(0.0, 0.0)] * len(boxes)
-    routes: list[list[tuple[float, float]]] = [[] for _ in edges]
+    routes: list[list[Point]] = [[] for _ in edges]
     top, width = 0.0, 0.0
     for members in _components(len(boxes), edges):
-        own = [number for number, edge in enumerate(edges) if edge.source in members]
-        chosen = sorted(members)
-        graph, places = _layered(chosen, boxes, [(number, edges[number]) for number in own])
-        _sort_columns(graph)
-        _choose_heights(graph)
-        lefts = _lefts(graph, boxes)
-        lowest = min(graph.y.values())
-        for vertex in chosen:
-            corners[vertex] = (lefts[graph.layer[vertex]][0], graph.y[vertex] - lowest + top)
-        for number in own:
-            edge = edges[number]
-            (x, y), (to_x, to_y) = corners[edge.source], corners[edge.target]
-            start = (x + boxes[edge.source].width, y + edge.leaves)
+        own = {number: edge for number, edge in enumerate(edges) if edge.source in members}
+        part = _layered(sorted(members), boxes, own)
+        _sort_columns(part)
+        _choose_heights(part)
+        sides, left = [], 0.0  # left and right side of every column
+        for column in part.columns:
+            right = left + max((boxes[v].width for v in column if v < len(boxes)), default=0.0)
+            sides.append((left, right))
+            left = right + COLUMN_GAP
+        lowest = min(part.y.values())
+        y = {vertex: height - lowest + top for vertex, height in part.y.items()}
+        for vertex in members:
+            corners[vertex] = (sides[part.layer[vertex]][0], y[vertex])
+        for number, edge in own.items():
+            (from_x, from_y), (to_x, to_y) = corners[edge.source], corners[edge.target]
             between = [
-                (side, graph.y[place] + PLACE_HEIGHT / 2 + top - lowest)
-                for place in places[number]
-                for side in lefts[graph.layer[place]]
+                (side, y[place] + PLACE_HEIGHT / 2)
+                for place in part.places[number]
+                for side in sides[part.layer[place]]
             ]
-            if graph.layer[edge.source] > graph.layer[edge.target]:
+            if part.layer[edge.source] > part.layer[edge.target]:
                 between.reverse()
+            start = (from_x + boxes[edge.source].width, from_y + edge.leaves)
             routes[number] = [start, *between, (to_x, to_y + edge.enters)]
-        below = max(graph.y[v] + graph.height[v] for v in graph.y) - lowest
-        width = max(width, lefts[-1][1])
-        top += below + 2 * ROW_GAP
+        width = max(width, sides[-1][1])
+        top = max(y[vertex] + part.height[vertex] for vertex in y) + 2 * ROW_GAP
     return Layout(corners, routes, width, max(top - 2 * ROW_GAP, 0.0))
 
 
@@ -386,172 +447,133 @@ def _components(count: int, edges: Sequence[Edge]) -> list[set[int]]:
     return sorted(found, key=lambda members: (-len(members), min(members)))
 
 
-def _layered(
-    chosen: list[int], boxes: Sequence[Box], edges: list[tuple[int, Edge]]
-) -> tuple[_Columns, dict[int, list[int]]]:
-    """Columns and the edges' places in those they pass, from left to right."""
-    turned = _turned(chosen, edges)
-    pairs = [(e.target, e.source) if n in turned else (e.source, e.target) for n, e in edges]
-    layer = _layers(chosen, pairs)
-    graph = _Columns(layer, {v: boxes[v].height for v in chosen}, [], [])
-    places: dict[int, list[int]] = {}
-    fresh = len(boxes)
-    for (number, edge), (left, right) in zip(edges, pairs, strict=True):
-        before, leaves = left, edge.enters if number in turned else edge.leaves
-        places[number] = []
-        for column in range(layer[left] + 1, layer[right]):
-            layer[fresh], graph.height[fresh] = column, PLACE_HEIGHT
-            graph.segments.append((before, fresh, leaves, PLACE_HEIGHT / 2))
-            places[number].append(fresh)
-            before, leaves = fresh, PLACE_HEIGHT / 2
-            fresh += 1
-        if left != right:
-            enters = edge.leaves if number in turned else edge.enters
-            graph.segments.append((before, right, leaves, enters))
-    graph.columns = [[] for _ in range(max(layer.values()) + 1)]
-    for vertex, column in layer.items():
-        graph.columns[column].append(vertex)
-    return graph, places
+def _layered(chosen: list[int], boxes: Sequence[Box], edges: Mapping[int, Edge]) -> _Part:
+    """Columns by the longest path from the sources, and places for edges that pass columns.
 
-
-def _turned(chosen: list[int], edges: list[tuple[int, Edge]]) -> set[int]:
-    """Edges that close a cycle, met by a depth-first search that begins at the sources."""
-    onward: dict[int, list[tuple[int, int]]] = {vertex: [] for vertex in chosen}
-    entered = set()
-    for number, edge in edges:
-        onward[edge.source].append((number, edge.target))
-        entered.add(edge.target)
-    turned: set[int] = set()
-    state: dict[int, int] = {}  # 1: on the path, 2: done
-    for start in sorted(chosen, key=lambda vertex: vertex in entered):
-        if start in state:
-            continue
-        state[start] = 1
-        stack = [(start, iter(onward[start]))]
-        while stack:
-            vertex, rest = stack[-1]
-            number, after = next(rest, (-1, -1))
-            if number < 0:
-                state[vertex] = 2
-                stack.pop()
-            elif state.get(after) == 1:
-                turned.add(number)
-            elif after not in state:
-                state[after] = 1
-                stack.append((after, iter(onward[after])))
-    return turned
-
-
-def _layers(chosen: list[int], pairs: list[tuple[int, int]]) -> dict[int, int]:
-    """Longest path from the sources; sources then move right, next to what they feed."""
+    Sources then move right, next to what they feed.
+    """
+    ends = {number: (edge.source, edge.target) for number, edge in edges.items()}
+    for number in _closing_cycles(chosen, edges):
+        ends[number] = ends[number][::-1]
     before: dict[int, set[int]] = {vertex: set() for vertex in chosen}
     onward: dict[int, set[int]] = {vertex: set() for vertex in chosen}
-    for left, right in pairs:
+    for left, right in ends.values():
         if left != right:
             before[right].add(left)
             onward[left].add(right)
-    layer = dict.fromkeys(chosen, 0)
+    layer: dict[int, int] = {}
     for vertex in TopologicalSorter(before).static_order():
         layer[vertex] = max((layer[left] + 1 for left in before[vertex]), default=0)
     for vertex in chosen:
         if onward[vertex] and not before[vertex]:
             layer[vertex] = min(layer[right] for right in onward[vertex]) - 1
-    return layer
+    part = _Part(dict(sorted(layer.items())), {v: boxes[v].height for v in chosen})
+    fresh = len(boxes)
+    for number, (left, right) in ends.items():
+        edge = edges[number]
+        heights = {edge.source: edge.leaves, edge.target: edge.enters}
+        passed = range(layer[left] + 1, layer[right])
+        part.places[number] = list(range(fresh, fresh + len(passed)))
+        fresh += len(passed)
+        part.layer.update(zip(part.places[number], passed, strict=True))
+        part.height.update(dict.fromkeys(part.places[number], PLACE_HEIGHT))
+        heights |= dict.fromkeys(part.places[number], PLACE_HEIGHT / 2)
+        way = [left, *part.places[number], right]
+        if left != right:
+            part.segments += [(a, b, heights[a], heights[b]) for a, b in pairwise(way)]
+    part.columns = [[] for _ in range(max(part.layer.values()) + 1)]
+    for vertex, column in part.layer.items():
+        part.columns[column].append(vertex)
+    return part
 
 
-def _sort_columns(graph: _Columns) -> None:
+def _closing_cycles(chosen: list[int], edges: Mapping[int, Edge]) -> Iterator[int]:
+    """Edges that close a cycle, met by a depth-first search that begins at the sources."""
+    onward: dict[int, list[tuple[int, int]]] = {vertex: [] for vertex in chosen}
+    for number, edge in edges.items():
+        onward[edge.source].append((number, edge.target))
+    entered = {edge.target for edge in edges.values()}
+    on_path: dict[int, bool] = {}  # of those that were met
+    for start in sorted(chosen, key=lambda vertex: vertex in entered):
+        stack = [] if start in on_path else [(start, iter(onward[start]))]
+        on_path.setdefault(start, True)
+        while stack:
+            vertex, rest = stack[-1]
+            number, after = next(rest, (-1, -1))
+            if number < 0:
+                on_path[vertex] = False
+                stack.pop()
+            elif after not in on_path:
+                on_path[after] = True
+                stack.append((after, iter(onward[after])))
+            elif on_path[after]:
+                yield number
+
+
+def _sort_columns(part: _Part) -> None:
     """Order each column by the mean position of its neighbours; the best order seen stays."""
-    before, after = _neighbours(graph)
-    best = [list(column) for column in graph.columns]
-    fewest = _crossings(graph)
+    before, after = part.beside()
+    best, fewest = [list(column) for column in part.columns], _crossings(part)
     for sweep in range(SWEEPS):
         forwards = sweep % 2 == 0
         beside = before if forwards else after
-        columns = graph.columns[1:] if forwards else graph.columns[-2::-1]
-        for column in columns:
-            place = _positions(graph)
-            own = {vertex: index for index, vertex in enumerate(column)}
-            column.sort(
-                key=lambda v: (
-                    sum(place[w] + inside for w, _, inside in beside[v]) / len(beside[v])
-                    if beside[v]
-                    else own[v]
-                )
-            )
-        crossings = _crossings(graph)
+        for column in part.columns[1:] if forwards else part.columns[-2::-1]:
+            place = {v: index for column in part.columns for index, v in enumerate(column)}
+            means = {
+                v: float(np.mean([place[w] + inside for w, _, inside in beside[v]] or [place[v]]))
+                for v in column
+            }
+            column.sort(key=means.__getitem__)
+        crossings = _crossings(part)
         if crossings < fewest:
-            fewest, best = crossings, [list(column) for column in graph.columns]
-    graph.columns = best
+            fewest, best = crossings, [list(column) for column in part.columns]
+    part.columns = best
 
 
-def _positions(graph: _Columns) -> dict[int, float]:
-    return {v: float(index) for column in graph.columns for index, v in enumerate(column)}
-
-
-Beside = dict[int, list[tuple[int, float, float]]]
-
-
-def _neighbours(graph: _Columns) -> tuple[Beside, Beside]:
-    """Vertex → (neighbour, height of the edge's end inside the vertex, share inside the other)."""
-    before: Beside = {vertex: [] for vertex in graph.layer}
-    after: Beside = {vertex: [] for vertex in graph.layer}
-    for left, right, leaves, enters in graph.segments:
-        before[right].append((left, enters, leaves / (graph.height[left] + 1)))
-        after[left].append((right, leaves, enters / (graph.height[right] + 1)))
-    return before, after
-
-
-def _crossings(graph: _Columns) -> int:
+def _crossings(part: _Part) -> int:
     """How many pairs of segments cross: those whose ends are in another order than their begins."""
-    place = _positions(graph)
+    place = {v: index for column in part.columns for index, v in enumerate(column)}
     by_column: dict[int, list[tuple[float, float]]] = {}
-    for left, right, leaves, enters in graph.segments:
+    for left, right, leaves, enters in part.segments:
         ends = (
-            place[left] + leaves / (graph.height[left] + 1),
-            place[right] + enters / (graph.height[right] + 1),
+            place[left] + leaves / (part.height[left] + 1),
+            place[right] + enters / (part.height[right] + 1),
         )
-        by_column.setdefault(graph.layer[left], []).append(ends)
-    total = 0
-    for pairs in by_column.values():
-        ends_at = np.array([end for _, end in sorted(pairs)])
-        total += np.count_nonzero(np.triu(ends_at[:, None] > ends_at))
-    return total
+        by_column.setdefault(part.layer[left], []).append(ends)
+    ends_at = [np.array([end for _, end in sorted(pairs)]) for pairs in by_column.values()]
+    return sum(int(np.count_nonzero(np.triu(at[:, None] > at))) for at in ends_at)
 
 
-def _choose_heights(graph: _Columns) -> None:
+def _choose_heights(part: _Part) -> None:
     """Heights that let edges run straight, column by column, back and forth."""
-    before, after = _neighbours(graph)
-    for column in graph.columns:
-        tops = accumulate((graph.height[vertex] + ROW_GAP for vertex in column), initial=0.0)
-        graph.y.update(zip(column, tops, strict=False))
+    before, after = part.beside()
+    for column in part.columns:
+        tops = accumulate((part.height[vertex] + ROW_GAP for vertex in column), initial=0.0)
+        part.y.update(zip(column, tops, strict=False))
     for sweep in range(SWEEPS):
         last = sweep >= SWEEPS - 4
         forwards = sweep % 2 == 0
-        for column in graph.columns if forwards else reversed(graph.columns):
+        for column in part.columns if forwards else reversed(part.columns):
             wanted, weights = [], []
             for vertex in column:
                 beside = before[vertex] if forwards else after[vertex]
                 beside = before[vertex] + after[vertex] if last or not beside else beside
                 pulls = [
-                    graph.y[w] + share * (graph.height[w] + 1) - inside
-                    for w, inside, share in beside
+                    part.y[w] + share * (part.height[w] + 1) - inside for w, inside, share in beside
                 ]
-                wanted.append(sum(pulls) / len(pulls) if pulls else graph.y[vertex])
+                wanted.append(sum(pulls) / len(pulls) if pulls else part.y[vertex])
                 # Long edges run straight first; what has no neighbour gives way.
-                straight = 4.0 if graph.height[vertex] == PLACE_HEIGHT else 1.0
+                straight = 4.0 if part.height[vertex] == PLACE_HEIGHT else 1.0
                 weights.append(straight * len(pulls) if pulls else 0.01)
-            for vertex, y in zip(column, _apart(graph, column, wanted, weights), strict=True):
-                graph.y[vertex] = y
+            sizes = [part.height[vertex] + ROW_GAP for vertex in column]
+            part.y.update(zip(column, _apart(sizes, wanted, weights), strict=True))
 
 
-def _apart(
-    graph: _Columns, column: list[int], wanted: list[float], weights: list[float]
-) -> list[float]:
+def _apart(sizes: list[float], wanted: list[float], weights: list[float]) -> list[float]:
     """The heights nearest to ``wanted`` that keep order and gaps (isotonic regression).
 
     SciPy has one, too, but takes longer to import than a whole drawing.
     """
-    sizes = (graph.height[vertex] + ROW_GAP for vertex in column)
     offsets = list(accumulate(sizes, initial=0.0))[:-1]
     blocks: list[tuple[float, float, int]] = []  # mean, weight, members
     for want, weight, offset in zip(wanted, weights, offsets, strict=True):
@@ -561,15 +583,5 @@ def _apart(
             mean = (mean * heavy + other * more) / (heavy + more)
             heavy, members = heavy + more, members + joined
         blocks.append((mean, heavy, members))
-    flat = [mean for mean, _, members in blocks for _ in range(members)]
+    flat = (mean for mean, _, members in blocks for _ in range(members))
     return [y + offset for y, offset in zip(flat, offsets, strict=True)]
-
-
-def _lefts(graph: _Columns, boxes: Sequence[Box]) -> list[tuple[float, float]]:
-    """Left and right side of every column."""
-    sides, left = [], 0.0
-    for column in graph.columns:
-        width = max((boxes[v].width for v in column if v < len(boxes)), default=0.0)
-        sides.append((left, left + width))
-        left += width + COLUMN_GAP
-    return sides

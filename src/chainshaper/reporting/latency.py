@@ -25,13 +25,15 @@ from chainshaper.reporting.tables import (
 )
 from chainshaper.values.durations import milliseconds
 from chainshaper.verify.measure import PARTS, Comparison, Measurement, hop_breakdown, part_shares
-from chainshaper.verify.predictions import BandHeld, FigureHeld, PredictionHeld
+from chainshaper.verify.overruns import dropped_text, overruns_text
+from chainshaper.verify.predictions import FigureHeld, PredictionHeld
 
 __all__ = [
     "breakdown_json",
     "breakdown_table",
     "comparison_json",
     "comparison_table",
+    "doubts_text",
     "headline_table",
     "incomplete_table",
     "late_text",
@@ -41,23 +43,38 @@ __all__ = [
     "prediction_table",
 ]
 
-FIGURES = (
-    ("average", "mean_ns"),
-    ("minimum", "min_ns"),
-    ("maximum", "max_ns"),
-    ("jitter (max − min)", "jitter_ns"),
-    ("spread p0.5–p99.5", "spread_ns"),
-)
-"""What tables say of latencies, and the fields of their statistics."""
-
-ALL = frozenset(title for title, _ in FIGURES)
-LATE = frozenset(("came late", "maximum", "jitter (max − min)"))
+LATE = ("came late", "maximum", "jitter (max − min)")
+"""The rows that say what happened to cycles that are called disturbed."""
 
 CONVENTION = (
     "at_start: every output leaves as its slot starts, as a gate does it; at_end: at its slot's"
     " end, eq. 5's convention; from, to: with room for what two samples may differ by, the bounds"
     " of `holds`"
 )
+
+
+def _rows(columns: Sequence[LatencyStatistics | None]) -> dict[str, list[str]]:
+    """Every figure by its title, a cell for each column's statistics."""
+    rows = {
+        title: [ABSENT if one is None else ms(getattr(one, field)) for one in columns]
+        for title, field in (
+            ("average", "mean_ns"),
+            ("minimum", "min_ns"),
+            ("maximum", "max_ns"),
+            ("jitter (max − min)", "jitter_ns"),
+            ("spread p0.5–p99.5", "spread_ns"),
+        )
+    }
+    for title, key in (("median", "50"), ("99th percentile", "99")):
+        rows[title] = [
+            ABSENT if one is None else ms(one.percentiles_ns.get(key)) for one in columns
+        ]
+    rows["cycles"] = [ABSENT if one is None else str(one.count) for one in columns]
+    rows["came late"] = [
+        ABSENT if one is None or one.late is None else f"{one.late} of {one.count}"
+        for one in columns
+    ]
+    return rows
 
 
 def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[str, Any]:
@@ -68,27 +85,23 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
     start and end in ns of the trace clock (wall clock).
     """
     analysis, info = measurement.analysis, measurement.recording.info
-    subscriber = {
-        name: None if found is None else asdict(found)
-        for name, found in (
-            ("subscriber", analysis.subscriber),
-            ("subscriber_undisturbed", analysis.subscriber_undisturbed),
-        )
-    }
+    overruns, dropped = measurement.overruns, measurement.dropped
+    calm, received = analysis.subscriber_undisturbed, analysis.subscriber
     result = {
         "chain": analysis.chain.spec,
         **asdict(analysis.statistics),
         "max_all_ns": analysis.statistics.max_ns,
         "jitter_all_ns": analysis.statistics.jitter_ns,
         "undisturbed": asdict(analysis.undisturbed),
-        **subscriber,
+        "subscriber": None if received is None else asdict(received),
+        "subscriber_undisturbed": None if calm is None else asdict(calm),
         "incomplete_by_reason": analysis.incomplete,
         "silent": analysis.silent,
-        "overruns": None if measurement.overruns is None else sum(measurement.overruns.values()),
-        "overruns_by_policy": measurement.overruns,
+        "overruns": None if overruns is None else sum(overruns.values()),
+        "overruns_by_policy": overruns,
         "into_open_slots": measurement.into_open_slots,
-        "dropped": None if measurement.dropped is None else sum(measurement.dropped.values()),
-        "dropped_by_reason": measurement.dropped,
+        "dropped": None if dropped is None else sum(dropped.values()),
+        "dropped_by_reason": dropped,
         "stalls_watched": measurement.longest_stall_ns is not None,
         "longest_stall_ns": measurement.longest_stall_ns,
         "in_force": None if info.in_force is None else info.in_force.model_dump(),
@@ -98,13 +111,11 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
         "notes": list(analysis.notes),
     }
     if instances:
+        times = (
+            (pl.col(end) + info.clock_offset_ns).alias(f"{end}_ns") for end in ("start", "end")
+        )
         complete = analysis.traversals.filter("complete")
-        result["instances"] = complete.select(
-            (pl.col("start") + info.clock_offset_ns).alias("start_ns"),
-            (pl.col("end") + info.clock_offset_ns).alias("end_ns"),
-            "latency_ns",
-            "disturbed",
-        ).to_dicts()
+        result["instances"] = complete.select(*times, "latency_ns", "disturbed").to_dicts()
     return result
 
 
@@ -127,111 +138,107 @@ def latency_table(measurement: Measurement) -> ResultTable:
     Where the machine was not watched, no cycle is called undisturbed.
     """
     analysis = measurement.analysis
-    columns: list[tuple[str, LatencyStatistics | None]] = [
-        ("all cycles", analysis.statistics),
-        ("undisturbed", analysis.undisturbed),
-        ("at the subscriber", analysis.subscriber),
-        ("…undisturbed", analysis.subscriber_undisturbed),
-    ]
+    columns: dict[str, LatencyStatistics | None] = {
+        "all cycles": analysis.statistics,
+        "undisturbed": analysis.undisturbed,
+        "at the subscriber": analysis.subscriber,
+        "…undisturbed": analysis.subscriber_undisturbed,
+    }
     if measurement.longest_stall_ns is None:
-        columns = columns[::2]
+        columns = dict([*columns.items()][::2])
     title = f"End-to-end latency of {analysis.chain.spec} [ms]"
-    table = ResultTable(title, [*words(""), *figures(*(name for name, _ in columns))])
-    for title, field in FIGURES:
-        table.add(title, *(_figure(statistics, field) for _, statistics in columns))
-    table.add("cycles", *(ABSENT if s is None else str(s.count) for _, s in columns))
-    table.add("came late", *(ABSENT if s is None else count(s.late) for _, s in columns))
-    table.caption = measurement.left_out.text
+    table = ResultTable(title, [*words(""), *figures(*columns)], measurement.left_out.text)
+    for title, cells in _rows([*columns.values()]).items():
+        table.add(title, *cells, detail=title in ("median", "99th percentile"))
     return table
 
 
-def _figure(statistics: LatencyStatistics | None, field: str) -> str:
-    return ms(None if statistics is None else getattr(statistics, field))
+def doubts_text(measurement: Measurement) -> str:
+    """What a measurement leaves in doubt: disturbed, incomplete, late and lost, in one line."""
+    analysis = measurement.analysis
+    parts = [f"{analysis.statistics.disturbed} cycles disturbed by the machine"]
+    if measurement.longest_stall_ns is None:
+        parts = ["stalls of the machine not watched"]
+    if analysis.incomplete:
+        reasons = ", ".join(f"{number} {reason}" for reason, number in analysis.incomplete.items())
+        parts.append(f"incomplete: {reasons}")
+    if measurement.overruns:
+        parts.append(overruns_text(measurement.overruns))
+    if measurement.dropped:
+        parts.append(dropped_text(measurement.dropped))
+    return "; ".join(parts)
 
 
 def comparison_table(comparison: Comparison, names: Sequence[str] = ()) -> ResultTable:
     """The same figures of every recording beside each other, usually before and after shaping.
 
-    ``names`` tell the recordings apart; their folders' names do otherwise.
+    ``names`` tell the recordings apart; their folders' names do otherwise. The terminal has the
+    figures of undisturbed cycles, and of all cycles those that disturbed ones change.
     """
     measurements = comparison.measurements
     analyses = [measurement.analysis for measurement in measurements]
     names = names or [measurement.recording.path.name for measurement in measurements]
-    title = f"End-to-end latency of {comparison.chain} [ms]"
-    table = ResultTable(title, [*words(""), *figures(*names)], _comparison_caption(comparison))
+    table = ResultTable(
+        f"End-to-end latency of {comparison.chain} [ms]", [*words(""), *figures(*names)]
+    )
+
+    def add(title: str, columns: Sequence[LatencyStatistics | None], details: set[str]) -> None:
+        rows = _rows(columns)
+        table.group(title, detail=details == rows.keys())
+        for name, cells in rows.items():
+            table.add(name, *cells, detail=name in details)
+
     # Where the machine was not watched, no cycle is called undisturbed.
     watched = any(measurement.longest_stall_ns is not None for measurement in measurements)
-    places = (
-        ("publication", "undisturbed", "statistics", LATE),
-        ("the subscriber's callback", "subscriber_undisturbed", "subscriber", frozenset[str]()),
-    )
-    for place, calm, every, brief in places:
+    every, calm = {"median", "99th percentile", "cycles"}, {"came late"}
+    titles = set(_rows([]))
+    for place, undisturbed, field, brief in (
+        ("publication", "undisturbed", "statistics", set(LATE)),
+        ("the subscriber's callback", "subscriber_undisturbed", "subscriber", set[str]()),
+    ):
         if watched:
-            table.group(f"at {place}, undisturbed cycles [ms]")
-            _add_statistics(table, [getattr(one, calm) for one in analyses], ALL)
-        shown = brief if watched else ALL | LATE
-        table.group(f"at {place}, all complete cycles [ms]", detail=not shown)
-        _add_statistics(table, [getattr(one, every) for one in analyses], shown)
-    _add_counts(table, measurements)
-    return table
-
-
-def _add_statistics(
-    table: ResultTable, columns: Sequence[LatencyStatistics | None], brief: frozenset[str]
-) -> None:
-    """Rows of one place; those that are not ``brief`` are details."""
-    rows = {title: [_figure(one, field) for one in columns] for title, field in FIGURES}
-    for title, key in (("median", "50"), ("99th percentile", "99")):
-        rows[title] = [
-            ABSENT if one is None else ms(one.percentiles_ns.get(key)) for one in columns
-        ]
-    rows["cycles"] = [ABSENT if one is None else str(one.count) for one in columns]
-    rows["came late"] = [
-        ABSENT if one is None or one.late is None else f"{one.late} of {one.count}"
-        for one in columns
-    ]
-    for title, cells in rows.items():
-        table.add(title, *cells, detail=title not in brief)
-
-
-def _add_counts(table: ResultTable, measurements: Sequence[Measurement]) -> None:
-    statistics = [(m, m.analysis.statistics) for m in measurements]
-    rows = {
-        "complete": [str(s.count) for _, s in statistics],
-        "disturbed by the machine": [
-            "not watched" if m.longest_stall_ns is None else str(s.disturbed) for m, s in statistics
-        ],
-        "incomplete": [counts(m.analysis.incomplete) for m in measurements],
-        "too late for their slot": [counts(m.overruns, "not gated") for m in measurements],
-        "came when it was open": [count(m.into_open_slots, "not gated") for m in measurements],
-        "messages lost at the gate": [counts(m.dropped, "not gated") for m in measurements],
-        "begun without publishing": [str(m.analysis.silent) for m in measurements],
-        "longest stall of the machine [ms]": [ms(m.longest_stall_ns) for m in measurements],
-        "lost while recording": [str(sum(m.recording.info.lost.values())) for m in measurements],
-        "real-time scheduling": [
-            YES_NO.get(m.recording.info.realtime, ABSENT) for m in measurements
-        ],
-    }
+            columns = [getattr(one, undisturbed) for one in analyses]
+            add(f"at {place}, undisturbed cycles [ms]", columns, every | calm)
+        columns = [getattr(one, field) for one in analyses]
+        add(f"at {place}, all complete cycles [ms]", columns, titles - brief if watched else every)
     table.group("cycles")
-    for title, cells in rows.items():
+    for title, cells in _counts(measurements).items():
         table.add(title, *cells, detail=title == "begun without publishing")
-
-
-def _comparison_caption(comparison: Comparison) -> str | None:
-    lines = [
-        f"{measurement.recording.path.name}: {measurement.left_out.text}"
-        for measurement in comparison.measurements
-        if measurement.left_out.text is not None
+    remarks = [
+        f"{m.recording.path.name}: {m.left_out.text}" for m in measurements if m.left_out.text
     ]
-    planned = [m.plan for m in comparison.measurements if m.plan is not None]
+    planned = [m.plan for m in measurements if m.plan is not None]
     if planned:
         predicted = planned[-1].predicted
-        lines.append(
+        remarks.append(
             f"planned: slots {slots_ms(*publish_slots(planned[-1]))}, "
             f"predicted maximum {milliseconds(predicted.max_ns)}, "
             f"jitter at most {milliseconds(predicted.jitter_ns)}"
         )
-    return "\n".join(lines) or None
+    table.caption = "\n".join(remarks) or None
+    return table
+
+
+def _counts(measurements: Sequence[Measurement]) -> dict[str, list[str]]:
+    """What happened to cycles, a cell for each measurement."""
+    rows: dict[str, list[str]] = {}
+    for one in measurements:
+        statistics, info = one.analysis.statistics, one.recording.info
+        watched = one.longest_stall_ns is not None
+        for title, cell in (
+            ("complete", str(statistics.count)),
+            ("disturbed by the machine", str(statistics.disturbed) if watched else "not watched"),
+            ("incomplete", counts(one.analysis.incomplete)),
+            ("too late for their slot", counts(one.overruns, "not gated")),
+            ("came when it was open", count(one.into_open_slots, "not gated")),
+            ("messages lost at the gate", counts(one.dropped, "not gated")),
+            ("begun without publishing", str(one.analysis.silent)),
+            ("longest stall of the machine [ms]", ms(one.longest_stall_ns)),
+            ("lost while recording", str(sum(info.lost.values()))),
+            ("real-time scheduling", YES_NO.get(info.realtime, ABSENT)),
+        ):
+            rows.setdefault(title, []).append(cell)
+    return rows
 
 
 def headline_table(names: Sequence[str], measurements: Sequence[Measurement]) -> ResultTable:
@@ -248,26 +255,22 @@ def headline_table(names: Sequence[str], measurements: Sequence[Measurement]) ->
 def prediction_table(held: PredictionHeld) -> ResultTable:
     """Predicted beside measured: the whole, then band by band."""
     whence = ", from the start of the cycle" if held.counted_from == "cycle" else ""
-    table = ResultTable(
-        f"Prediction and measurement{whence} [ms]",
-        [
-            *words(""),
-            *figures("predicted", "measured"),
-            *words("verdict"),
-            *figures("jitter", "share predicted", "measured"),
-        ],
-    )
+    columns = [*words(""), *figures("predicted", "measured"), *words("verdict")]
+    columns += figures("jitter", "share predicted", "measured")
+    table = ResultTable(f"Prediction and measurement{whence} [ms]", columns)
     for title, figure in (
         ("average", held.mean),
         ("maximum", held.max),
         ("jitter (max − min)", held.jitter),
     ):
         verdict = {True: "as predicted", False: "differs", None: ABSENT}[figure.holds]
-        table.add(title, range_ms(figure), ms(figure.measured_ns), verdict, "", "", "")
+        predicted = " … ".join(dict.fromkeys(map(milliseconds, (figure.from_ns, figure.to_ns))))
+        table.add(title, predicted, ms(figure.measured_ns), verdict, "", "", "")
     table.line()
     for number, band in enumerate(held.bands, start=1):
+        name = band.mode or f"band {number}"
         table.add(
-            band_name(band, number),
+            f"{name}, {band.late} late" if band.mode and band.late else name,
             slots_ms((band.slot_start_ns, band.slot_end_ns)),
             ms(band.mean_ns),
             f"{band.inside} of {band.count} inside" if band.count else "no cycles",
@@ -295,34 +298,20 @@ def late_text(held: PredictionHeld) -> str:
 
 def prediction_json(held: PredictionHeld) -> dict[str, Any]:
     """The same as plain data, integers in nanoseconds."""
+
+    def plain(figure: FigureHeld) -> dict[str, Any]:
+        return {name.removesuffix("_ns"): value for name, value in vars(figure).items()}
+
     return {
         "convention": CONVENTION,
-        "mean_ns": _figure_json(held.mean),
-        "max_ns": _figure_json(held.max),
-        "jitter_ns": _figure_json(held.jitter),
+        "mean_ns": plain(held.mean),
+        "max_ns": plain(held.max),
+        "jitter_ns": plain(held.jitter),
         "bands": [vars(band) for band in held.bands],
         "late": held.late,
         "late_of_all": held.late_of_all,
         "counted_from": held.counted_from,
     }
-
-
-def _figure_json(figure: FigureHeld) -> dict[str, Any]:
-    return {name.removesuffix("_ns"): value for name, value in vars(figure).items()}
-
-
-def band_name(band: BandHeld, number: int) -> str:
-    """``band 2``, or whose it is: ``city, 3 late``."""
-    if band.mode is None:
-        return f"band {number}"
-    return f"{band.mode}, {band.late} late" if band.late else band.mode
-
-
-def range_ms(figure: FigureHeld) -> str:
-    """What a figure was predicted to lie in: the verdict's own bounds."""
-    if figure.from_ns == figure.to_ns:
-        return milliseconds(figure.to_ns)
-    return f"{milliseconds(figure.from_ns)} … {milliseconds(figure.to_ns)}"
 
 
 def breakdown_json(analysis: LatencyAnalysis) -> dict[str, Any]:
@@ -338,11 +327,8 @@ def breakdown_table(analysis: LatencyAnalysis) -> ResultTable:
     cycles = Column("cycles", footer=str(analysis.statistics.count), detail=True)
     columns = [Column("hop", words=True, footer="together"), cycles]
     for part, share in part_shares(frame).items():
-        columns += [
-            Column(f"{part}\nmin", detail=True),
-            *figures(f"{part}\nmean", "max"),
-            Column("share", footer=percent(share)),
-        ]
+        columns += [Column(f"{part}\nmin", detail=True), *figures(f"{part}\nmean", "max")]
+        columns.append(Column("share", footer=percent(share)))
     table = ResultTable("Where it goes, hop by hop [ms]", columns)
     for row in frame.iter_rows(named=True):
         cells = [f"{row['callback']} → {row['topic']}", str(row["count"])]

@@ -1,7 +1,11 @@
 """The report: one HTML page with everything in it that a timing engineer sends to a colleague.
 
 It loads nothing: it works from a disk, in an archive, and without a network. Tables are written
-here; charts are drawn in the page by its script, from data that it carries.
+here; charts are drawn in the page by its script, from data that it carries: small enough for a
+page, exact where it counts. A screen has some thousand columns of pixels. Of many more cycles, the
+chart over time has of every stretch the shortest and the longest, so that no extreme is lost, and
+of the others every n-th, so that their density is not distorted; the histogram counts all cycles
+in bins so fine that they are joined for every drawing.
 
 Nothing that a recording says is trusted. Text is escaped where tables are written; data stands in
 a block that browsers do not execute, with every character escaped that could end it; and the page
@@ -11,17 +15,19 @@ forbids itself, by its content security policy, to run any script but its own an
 import base64
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from string import Template
 from typing import Any
 
+import numpy as np
 import polars as pl
 
 from chainshaper.analysis import DataFlow, callback_statistics, data_flow
-from chainshaper.planning import Plan, dump_plan
+from chainshaper.planning import Plan, dump_plan, publish_slots
+from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.reporting.latency import (
     breakdown_table,
     comparison_table,
@@ -29,21 +35,20 @@ from chainshaper.reporting.latency import (
     incomplete_table,
     prediction_table,
 )
-from chainshaper.reporting.page_data import hop_bars, latency_range, recording_data, slot_bars
-from chainshaper.reporting.plans import plan_table
-from chainshaper.reporting.recordings import (
+from chainshaper.reporting.overviews import (
     callback_table,
     condition_table,
+    plan_table,
     recorded_thread_table,
     stall_table,
 )
-from chainshaper.reporting.tables import ResultTable, figures, ms, words
-from chainshaper.reporting.timeline import Timeline, timeline_of
+from chainshaper.reporting.tables import ResultTable, figures, ms, slots_ms, words
+from chainshaper.reporting.timeline import Timeline, timeline_data, timeline_of
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.safe_text import escape, shown
-from chainshaper.verify.measure import Comparison, Measurement
+from chainshaper.verify.measure import PARTS, Comparison, Measurement, hop_breakdown
 from chainshaper.verify.overruns import overruns_text
 
 __all__ = ["ENDINGS", "report_page", "write_report"]
@@ -51,6 +56,12 @@ __all__ = ["ENDINGS", "report_page", "write_report"]
 ENDINGS = (".html", ".htm")
 LISTED = 50
 """Rows of a list that may be endless."""
+
+POINTS = 4_000
+"""Points of the chart over time, per recording."""
+
+BINS = 10_000
+"""Fine bins over a recording's latencies at most."""
 
 WAITING = '<p class="waiting">This chart is drawn by a script: allow scripts to see it.</p>'
 
@@ -91,40 +102,51 @@ def report_page(measurements: Sequence[Measurement], cycles: Sequence[int] = ())
             raise InputError(
                 f"there is no cycle {cycle}: the recordings have {most} at most, numbered from 0"
             )
+    parts = []
+    plans: dict[str, tuple[list[str], Plan]] = {}
     names = distinct_names([measurement.recording.path for measurement in measurements])
-    parts = [_part(*named) for named in zip(names, measurements, strict=True)]
-    plans = _plans(parts)
-    recordings = [recording_data(one.name, one.measurement, one.timeline, cycles) for one in parts]
+    for name, one in zip(names, measurements, strict=True):
+        flow = data_flow(one.recording.events, one.recording.info.clock_offset_ns)
+        timeline = timeline_of(one.recording, flow, one.analysis, one.plan)
+        parts.append(_Part(name, one, flow, timeline))
+        if one.plan is not None:  # equal plans stand once, under the names of their recordings
+            plans.setdefault(dump_plan(one.plan), ([], one.plan))[0].append(name)
+    of_users = {", ".join(users): plan for users, plan in plans.values()}
+    recordings = [_recording_data(part, cycles) for part in parts]
     times = [time for one in recordings for time in one["points"]["time"][-1:]]
     data = {
         "recordings": recordings,
         "publishSlots": list(dict.fromkeys(slot for one in recordings for slot in one["slots"])),
         "longest": max([1, *times]),
         "range": latency_range(recordings),
-        "bars": {"breakdown": hop_bars(names, measurements)}
-        | {f"slots-{number}": slot_bars(plan) for number, plan in enumerate(plans.values())},
+        "bars": {"breakdown": _hop_bars(parts)}
+        | {f"slots-{number}": _slot_bars(plan) for number, plan in enumerate(of_users.values())},
     }
     folder = resources.files("chainshaper.reporting")
     page, style, script = (
         (folder / name).read_text("utf-8") for name in ("page.html", "page.css", "page.js")
     )
     digest = base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
+    embedded = json.dumps(_safe(data), ensure_ascii=True, separators=(",", ":"))
     return Template(page).substitute(
-        _tables(parts, plans),
+        _tables(parts, of_users),
         **_beside_charts(parts, recordings),
         title=escape(f"End-to-end latency of {measurements[0].analysis.chain.spec}"),
         style=style,
-        data=_embedded(data),
+        # JSON in which nothing can end the block that it stands in.
+        data=embedded.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"),
         script=script,
         digest=digest,
     )
 
 
-def _part(name: str, measurement: Measurement) -> _Part:
-    recording = measurement.recording
-    flow = data_flow(recording.events, recording.info.clock_offset_ns)
-    timeline = timeline_of(recording, flow, measurement.analysis, measurement.plan)
-    return _Part(name, measurement, flow, timeline)
+def _safe(value: Any) -> Any:
+    """Plain data with all its texts as they are shown."""
+    if isinstance(value, str):
+        return shown(value)
+    if isinstance(value, dict):
+        return {key: _safe(one) for key, one in value.items()}
+    return [_safe(one) for one in value] if isinstance(value, list | tuple) else value
 
 
 def distinct_names(paths: Sequence[Path]) -> list[str]:
@@ -137,19 +159,6 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
     return [f"{path} ({number})" for number, path in enumerate(paths, start=1)]
 
 
-def _plans(parts: Sequence[_Part]) -> dict[str, Plan]:
-    """Different plans, each under the names of the recordings it was in force in."""
-    found: list[tuple[Plan, list[str]]] = []
-    for one in parts:
-        plan = one.measurement.plan
-        known = next((users for other, users in found if other == plan), None)
-        if known is not None:
-            known.append(one.name)
-        elif plan is not None:
-            found.append((plan, [one.name]))
-    return {", ".join(users): plan for plan, users in found}
-
-
 def _tables(parts: Sequence[_Part], plans: dict[str, Plan]) -> dict[str, str]:
     """What the page's tables say, by the places that the template has for them."""
     names = [one.name for one in parts]
@@ -157,27 +166,29 @@ def _tables(parts: Sequence[_Part], plans: dict[str, Plan]) -> dict[str, str]:
     compared = Comparison(measurements[0].analysis.chain.spec, tuple(measurements))
     left_out = [(one.name, one.measurement.left_out.text) for one in parts]
     incomplete = incomplete_table(names, measurements)
-    hops = [(one.name, breakdown_table(one.measurement.analysis).html()) for one in parts]
     notes = [(one.name, dict.fromkeys(one.measurement.analysis.notes)) for one in parts]
     items = "".join(f"<li>{escape(f'{name}: {note}')}</li>" for name, own in notes for note in own)
     conditions = condition_table(names, measurements).html(), *map(_recorded_threads, parts)
+    hops = (
+        _paragraph(f"{one.name}, all complete cycles [ms]:")
+        + breakdown_table(one.measurement.analysis).html()
+        for one in parts
+    )
     return {
         "headline": headline_table(names, measurements).html()
         + "".join(_paragraph(f"{name}: {text}.") for name, text in left_out if text),
         "before_and_after": "Before and after" if len(parts) > 1 else "Figures",
         "comparison": comparison_table(compared, names).html(),
-        "predictions": "\n".join(map(_prediction, parts)),
-        "hops": "\n".join(
-            _paragraph(f"{name}, all complete cycles [ms]:") + table for name, table in hops
-        ),
-        "callbacks": "\n".join(map(_callbacks, parts)),
-        "overruns": "\n".join(map(_overruns, parts)),
+        "predictions": _lines(map(_prediction, parts)),
+        "hops": _lines(hops),
+        "callbacks": _lines(map(_callbacks, parts)),
+        "overruns": _lines(map(_overruns, parts)),
         "incomplete": incomplete.html()
         if incomplete.rows
         else _paragraph("Every cycle that began is complete."),
-        "stalls": "\n".join(map(_stalls, parts)),
-        "plans": "\n".join(_plan(number, *one) for number, one in enumerate(plans.items())),
-        "conditions": "\n".join([*conditions, f'<ul class="notes">{items}</ul>']),
+        "stalls": _lines(map(_stalls, parts)),
+        "plans": _lines(_plan(number, *one) for number, one in enumerate(plans.items())),
+        "conditions": _lines([*conditions, f'<ul class="notes">{items}</ul>']),
     }
 
 
@@ -311,16 +322,119 @@ def _details(summary: str, content: str, *, unfolded: bool = False) -> str:
     return f"<details{state}><summary>{escape(summary)}</summary>\n{content}\n</details>"
 
 
-def _embedded(data: dict[str, Any]) -> str:
-    """JSON in which nothing can end the block that it stands in."""
-    text = json.dumps(_safe(data), ensure_ascii=True, separators=(",", ":"))
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+def _lines(texts: Iterable[str]) -> str:
+    return "\n".join(texts)
 
 
-def _safe(value: Any) -> Any:
-    """Plain data with all its texts as they are shown."""
-    if isinstance(value, str):
-        return shown(value)
-    if isinstance(value, dict):
-        return {key: _safe(one) for key, one in value.items()}
-    return [_safe(one) for one in value] if isinstance(value, list | tuple) else value
+def _recording_data(part: _Part, cycles: Sequence[int]) -> dict[str, Any]:
+    """Everything that is drawn of one recording; its timeline has ``cycles`` in any case.
+
+    ``slots`` are publish slots as latencies: under LET they belong to a later cycle.
+    """
+    measurement, plan = part.measurement, part.measurement.plan
+    traversals = measurement.analysis.traversals
+    zero = next(iter(traversals["start"]), 0)
+    delay = 0 if plan is None else cycles_until_output(plan) * plan.cycle_ns
+    slots = () if plan is None else publish_slots(plan)
+    return {
+        "name": part.name,
+        "slots": [(start + delay, end + delay) for start, end in slots],
+        "points": latency_points(traversals, zero),
+        "histogram": latency_histogram(traversals),
+        "timeline": timeline_data(measurement, part.timeline, cycles, zero),
+    }
+
+
+def latency_range(recordings: Sequence[dict[str, Any]]) -> tuple[float, float]:
+    """The range of undisturbed latencies and slots, with a little air."""
+    ends = [end for one in recordings for slot in one["slots"] for end in slot]
+    for histogram in (one["histogram"] for one in recordings if one["histogram"]["bin"]):
+        first, *_, last = histogram["bin"][0], histogram["bin"][-1]
+        ends += [first * histogram["width"], (last + 1) * histogram["width"]]
+    if not ends:
+        return 0, 1e6
+    low, high = min(ends), max(ends)
+    air = max((high - low) * 0.04, high * 1e-4)
+    return 0 if low < 0.25 * high else low - air, high + air
+
+
+def _hop_bars(parts: Sequence[_Part]) -> dict[str, Any]:
+    """Mean communication (pale) and computation (full) of every hop, a row per recording."""
+    rows, longest = [], 1.0
+    for series, one in enumerate(parts):
+        bars, at = [], 0.0
+        breakdown = hop_breakdown(one.measurement.analysis)
+        for number, hop in enumerate(breakdown.iter_rows(named=True)):
+            for part in (part for part in PARTS if hop[f"{part}_ns"] is not None):
+                mean, share = hop[f"{part}_ns"]["mean"], hop[f"{part}_share"]
+                opacity = 0.35 if part == "communication" else 0.8 if number % 2 else 1
+                text = f"{hop['callback']} → {hop['topic']}\n{part} {ms(mean)} ms, {share:.1%}"
+                bars.append((at, at + mean, f"series-{series % 4}", opacity, text))
+                at += mean
+        rows.append((one.name, bars))
+        longest = max(longest, at)
+    label = "mean, from the start of the cycle"
+    return {"label": label, "length": longest * 1.01, "rows": rows}
+
+
+def _slot_bars(plan: Plan) -> dict[str, Any]:
+    """The servers' slots over one cycle, a row per server."""
+    rows = []
+    for server in plan.servers:
+        look = "series-1" if server.slots == publish_slots(plan) else "slot"
+        texts = [f"{server.name}\n{slots_ms(slot)} ms" for slot in server.slots]
+        bars = [(*slot, look, 1, text) for slot, text in zip(server.slots, texts, strict=True)]
+        rows.append((f"{server.name}: core {server.core}, priority {server.priority}", bars))
+    return {"label": "in the cycle", "length": plan.cycle_ns, "zoom": "x", "rows": rows}
+
+
+def latency_points(traversals: pl.DataFrame, zero: int, limit: int = POINTS) -> dict[str, Any]:
+    """Latency over time: ``cycle, time, latency`` of those that are drawn, in order of time.
+
+    ``disturbed`` are their places in these lists. ``of`` says how many complete cycles there are,
+    ``incomplete`` when the others began.
+    """
+    complete = traversals.filter("complete").select("traversal", "start", "latency_ns", "disturbed")
+    drawn = complete
+    if complete.height > limit:
+        stretches = max(1, limit // 8)  # two extremes each of two kinds: half of the points
+        stretch = pl.int_range(pl.len()) * stretches // pl.len()
+        extremes = (
+            complete.with_columns(row=pl.int_range(pl.len()))
+            .group_by(stretch.alias("stretch"), "disturbed")
+            .agg(
+                pl.col("row").get(pl.col("latency_ns").arg_min()).alias("shortest"),
+                pl.col("row").get(pl.col("latency_ns").arg_max()).alias("longest"),
+            )
+        )
+        sample = pl.arange(0, complete.height, -(-2 * complete.height // limit), eager=True)
+        rows = pl.concat([extremes["shortest"], extremes["longest"], sample]).unique().sort()
+        drawn = complete[rows]
+    broken = traversals.filter(~pl.col("complete"))["start"] - zero
+    return {
+        "of": complete.height,
+        "cycle": drawn["traversal"].to_list(),
+        "time": (drawn["start"] - zero).to_list(),
+        "latency": drawn["latency_ns"].to_list(),
+        "disturbed": np.flatnonzero(drawn["disturbed"].to_numpy()).tolist(),
+        "incomplete": broken.gather_every(max(1, -(-len(broken) // limit))).to_list(),
+    }
+
+
+def latency_histogram(traversals: pl.DataFrame, bins: int = BINS) -> dict[str, Any]:
+    """Undisturbed latencies counted in bins [n·width, (n+1)·width) of a width that is 10^k ns.
+
+    ``bin`` are the numbers n of those that are not empty, ``count`` how many are in them, ``total``
+    how many there are.
+    """
+    latencies = traversals.filter(pl.col("complete") & ~pl.col("disturbed"))[
+        "latency_ns"
+    ].to_numpy()
+    if not len(latencies):
+        return {"width": 1, "bin": [], "count": [], "total": 0}
+    width = 1
+    while int(latencies.max()) // width - int(latencies.min()) // width >= bins:
+        width *= 10
+    numbers, counts = np.unique(latencies // width, return_counts=True)
+    counted = {"bin": numbers.tolist(), "count": counts.tolist()}
+    return {"width": width, **counted, "total": len(latencies)}

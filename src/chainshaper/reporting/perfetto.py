@@ -12,8 +12,9 @@ several of one name, which the viewer shows as one. Numbers of fields and enumer
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import chain
 from pathlib import Path
 from typing import TypeAlias
 
@@ -56,6 +57,11 @@ class Slice:
     flows: Sequence[int] = ()
     ends_flows: Sequence[int] = ()
 
+    @property
+    def last(self) -> int:
+        """When it is over."""
+        return self.start if self.end is None else self.end
+
 
 @dataclass(frozen=True)
 class Track:
@@ -87,30 +93,23 @@ def export_perfetto(source: Recording | Measurement, path: str | Path) -> Path:
     tracks = _thread_tracks(recording, flow, timeline)
     if analysis is not None:
         tracks += [_chain_track(analysis), *_gate_tracks(analysis, timeline)]
-    tracks += [*_server_tracks(timeline), *_stall_tracks(timeline)]
-    shown_tracks = [_shown(track) for track in tracks]
-    return write_whole(path, encode_trace(shown_tracks, recording.info.clock_offset_ns))
-
-
-def _shown(track: Track) -> Track:
-    """A track with all its texts as they are shown."""
-    families = [[_shown_slice(one) for one in family] for family in track.families]
-    return replace(track, owner=shown(track.owner), name=shown(track.name), families=families)
-
-
-def _shown_slice(one: Slice) -> Slice:
-    arguments = {
-        name: shown(value) if isinstance(value, str) else value
-        for name, value in one.arguments.items()
-    }
-    return replace(one, name=shown(one.name), arguments=arguments)
+    for (server,), rows in timeline.slots.group_by("server", maintain_order=True):
+        slots = [
+            [Slice(start, end, f"slot {slot + 1}", {"cycle": traversal})]
+            for traversal, _, slot, start, end in rows.iter_rows()
+        ]
+        tracks.append(Track("Servers", str(server), slots))
+    for (core,), rows in timeline.stalls.group_by("core", maintain_order=True):
+        stalls = [[Slice(start, end, "stall")] for _, start, end in rows.iter_rows()]
+        where = "all cores" if core is None else f"core {core}"
+        tracks.append(Track("Stalls of the machine", where, stalls))
+    return write_whole(path, encode_trace(tracks, recording.info.clock_offset_ns))
 
 
 def _thread_tracks(recording: Recording, flow: DataFlow, timeline: Timeline) -> list[Track]:
-    rows: dict[Thread, list[Slice]] = {}
-    for found in (_callbacks(flow, timeline), _messages(flow), _sends(flow)):
-        for thread, one in found:
-            rows.setdefault(thread, []).append(one)
+    rows: dict[Thread, list[list[Slice]]] = {}
+    for thread, one in chain(_callbacks(flow, timeline), _messages(flow)):
+        rows.setdefault(thread, []).append([one])
     known = timeline.threads.select("pid", "tid", "nodes", "about").iter_rows()
     nodes = {(pid, tid): (names, about) for pid, tid, names, about in known}
     comms = {(thread.pid, thread.tid): thread.comm for thread in recording.info.threads}
@@ -119,55 +118,49 @@ def _thread_tracks(recording: Recording, flow: DataFlow, timeline: Timeline) -> 
         name, about = nodes.get(thread, (comms.get(thread, f"thread {thread[1]}"), None))
         owner = recording.info.processes.get(thread[0], name)
         title = f"{name} ({about})" if about else name
-        tracks.append(Track(owner, title, [[one] for one in rows[thread]], thread))
+        tracks.append(Track(owner, title, rows[thread], thread))
     return tracks
 
 
 def _arrows(flow: DataFlow, end: str) -> dict[int, list[int]]:
     """The numbers of the arrows at each ``publication``, or at each ``instance`` that reads."""
-    taken = flow.takes.drop_nulls(["publication", end]).group_by(end).agg("take")
-    return {at: [take + 1 for take in takes] for at, takes in taken.iter_rows()}
+    taken = flow.takes.drop_nulls(["publication", end]).group_by(end).agg(pl.col("take") + 1)
+    return dict(taken.iter_rows())
 
 
 def _callbacks(flow: DataFlow, timeline: Timeline) -> Iterator[tuple[Thread, Slice]]:
-    labels = {callback.id: callback for callback in graph_of(flow).callbacks}
+    callbacks = {callback.id: callback for callback in graph_of(flow).callbacks}
     arrows = _arrows(flow, "instance")
     for row in timeline.slices.iter_rows(named=True):
-        callback = labels[row["callback_id"]]
+        callback, instance = callbacks[row["callback_id"]], row["instance"]
         arguments = {
             "function": callback.symbol,
-            "instance": row["instance"],
+            "instance": instance,
             "execution_ns": row["execution_ns"],
             "end": None if row["ended"] else "not recorded",
         }
-        ending = arrows.get(row["instance"], ())
+        ending = arrows.get(instance, ())
         one = Slice(row["start"], row["end"], callback.label, arguments, ends_flows=ending)
         yield (row["pid"], row["tid"]), one
 
 
 def _messages(flow: DataFlow) -> Iterator[tuple[Thread, Slice]]:
-    """Publications; and takes whose message no callback got: its arrow ends at the take."""
+    """Publications; takes whose message no callback got: its arrow ends at the take; and sends."""
     arrows = _arrows(flow, "publication")
     for row in flow.publications.iter_rows(named=True):
         flows = arrows.get(row["publication"], ())
-        arguments = {
-            "publication": row["publication"],
-            "source_timestamp": row["source_timestamp"],
-            "taken_by": len(flows),
-        }
+        arguments = {"publication": row["publication"], "source_timestamp": row["source_timestamp"]}
+        arguments["taken_by"] = len(flows)
         one = Slice(row["time"], None, f"publish {row['topic']}", arguments, flows=flows)
         yield (row["pid"], row["tid"]), one
     unread = flow.takes.filter(pl.col("publication").is_not_null() & pl.col("instance").is_null())
     for row in unread.iter_rows(named=True):
         one = Slice(row["time"], None, f"take {row['topic']}", ends_flows=[row["take"] + 1])
         yield (row["pid"], row["tid"]), one
-
-
-def _sends(flow: DataFlow) -> Iterator[tuple[Thread, Slice]]:
     for row in events.table(flow.events, "asynchronous_send").iter_rows(named=True):
-        arguments = {"source_timestamp": row["timestamp"]}
         end = row["time"] + (row["duration"] or 0)
-        yield (row["pid"], row["tid"]), Slice(row["time"], end, row["outcome"], arguments)
+        one = Slice(row["time"], end, row["outcome"], {"source_timestamp": row["timestamp"]})
+        yield (row["pid"], row["tid"]), one
 
 
 def _chain_track(analysis: LatencyAnalysis) -> Track:
@@ -194,43 +187,24 @@ def _chain_track(analysis: LatencyAnalysis) -> Track:
 
 def _gate_tracks(analysis: LatencyAnalysis, timeline: Timeline) -> Iterator[Track]:
     """What the shaping nodes retained, from arrival until they let it go (or gave it up)."""
-    node_of = {callback.id: callback.node for callback in analysis.graph.callbacks}
+    nodes = {callback.id: callback.node for callback in analysis.graph.callbacks}
     for (hop,), rows in timeline.holds.group_by("hop", maintain_order=True):
         families = []
         for row in rows.iter_rows(named=True):
             late = None if row["release"] is None else row["let_go"] - row["release"]
-            arguments = {
-                "cycle": row["traversal"],
-                "slot": row["slot"],
-                "planned": row["release"],
-                "behind_plan_ns": late,
-                "overrun": row["overrun"],
-            }
+            arguments = {"cycle": row["traversal"], "slot": row["slot"], "planned": row["release"]}
+            arguments |= {"behind_plan_ns": late, "overrun": row["overrun"]}
             name = "held" if row["overrun"] is None else f"overran: {row['overrun']}"
             families.append([Slice(row["arrival"], row["let_go"], name, arguments)])
-        yield Track("Gate", node_of[analysis.chain.callbacks[hop]], families)
-
-
-def _server_tracks(timeline: Timeline) -> Iterator[Track]:
-    for (server,), rows in timeline.slots.group_by("server", maintain_order=True):
-        slots = [
-            [Slice(start, end, f"slot {slot + 1}", {"cycle": traversal})]
-            for traversal, _, slot, start, end in rows.iter_rows()
-        ]
-        yield Track("Servers", str(server), slots)
-
-
-def _stall_tracks(timeline: Timeline) -> Iterator[Track]:
-    for (core,), rows in timeline.stalls.group_by("core", maintain_order=True):
-        where = "all cores" if core is None else f"core {core}"
-        stalls = [[Slice(start, end, "stall")] for _, start, end in rows.iter_rows()]
-        yield Track("Stalls of the machine", where, stalls)
+        yield Track("Gate", nodes[analysis.chain.callbacks[hop]], families)
 
 
 def encode_trace(tracks: Sequence[Track], clock_offset_ns: int) -> Iterator[bytes]:
     """The file, packet by packet. ``clock_offset_ns`` leads to CLOCK_REALTIME."""
     first = min((one.start for track in tracks for f in track.families for one in f), default=0)
-    yield _packet(_clocks(first, clock_offset_ns))
+    readings = ((TRACE_TIME, first), (REALTIME, first + clock_offset_ns))
+    clocks = (_message(1, _integer(1, clock) + _integer(2, time)) for clock, time in readings)
+    yield _packet(_message(6, b"".join(clocks)))
     owners: dict[str | int, int] = {}
     uuid = 0
     for rank, track in enumerate(tracks):
@@ -238,11 +212,18 @@ def encode_trace(tracks: Sequence[Track], clock_offset_ns: int) -> Iterator[byte
         if key not in owners:
             uuid += 1
             owners[key] = uuid
-            yield _packet(_message(60, _owner(uuid, track)))
+            about = _text(2, track.owner) + _integer(11, EXPLICIT)
+            if track.thread is not None:
+                about = _message(3, _integer(1, track.thread[0]) + _text(6, track.owner))
+            yield _packet(_message(60, _integer(1, uuid) + about))
+        about = _text(2, track.name) + _integer(12, rank)
         for number, lane in enumerate(_lanes(track.families)):
             uuid += 1
-            as_thread = track.thread if number == 0 else None  # a thread has one track of its own
-            yield _packet(_message(60, _row(uuid, owners[key], track.name, rank, as_thread)))
+            row = about
+            if track.thread is not None and number == 0:  # a thread has one track of its own
+                pid, tid = track.thread
+                row = _message(4, _integer(1, pid) + _integer(2, tid) + _text(5, track.name))
+            yield _packet(_message(60, _integer(1, uuid) + _integer(5, owners[key]) + row))
             yield from _events(uuid, lane)
 
 
@@ -250,8 +231,8 @@ def _lanes(families: Sequence[Sequence[Slice]]) -> list[list[Slice]]:
     """Families over as few lanes as they need so that those of a lane do not overlap partly."""
     lanes: list[list[Slice]] = []
     open_until: list[list[int]] = []  # per lane the ends of what is open, outermost first
-    for family in sorted(families, key=lambda f: (f[0].start, -_end(f[0]))):
-        start, end = family[0].start, _end(family[0])
+    for family in sorted(families, key=lambda f: (f[0].start, -f[0].last)):
+        start, end = family[0].start, family[0].last
         for ends in open_until:
             while ends and ends[-1] <= start:
                 ends.pop()
@@ -265,64 +246,29 @@ def _lanes(families: Sequence[Sequence[Slice]]) -> list[list[Slice]]:
     return lanes or [[]]
 
 
-def _end(one: Slice) -> int:
-    return one.start if one.end is None else one.end
-
-
 def _events(uuid: int, lane: list[Slice]) -> Iterator[bytes]:
     """The events of one track in order of time: what begins last ends first."""
     open_until: list[int] = []
     end = _message(11, _integer(9, END) + _integer(11, uuid))
-    for one in sorted(lane, key=lambda s: (s.start, -_end(s))):
+    for one in sorted(lane, key=lambda s: (s.start, -s.last)):
         while open_until and open_until[-1] <= one.start:
             yield _packet(_integer(8, open_until.pop()) + end)
         if one.end is not None:
             open_until.append(one.end)
-        yield _packet(_integer(8, one.start) + _message(11, _beginning(uuid, one)))
+        begin = [_integer(9, INSTANT if one.end is None else BEGIN), _integer(11, uuid)]
+        begin.append(_text(23, one.name))
+        begin += [_argument(*item) for item in one.arguments.items() if item[1] is not None]
+        begin += [_fixed64(47, flow) for flow in one.flows]
+        begin += [_fixed64(48, flow) for flow in one.ends_flows]
+        yield _packet(_integer(8, one.start) + _message(11, b"".join(begin)))
     while open_until:
         yield _packet(_integer(8, open_until.pop()) + end)
-
-
-def _beginning(uuid: int, one: Slice) -> bytes:
-    return b"".join(
-        [
-            _integer(9, INSTANT if one.end is None else BEGIN),
-            _integer(11, uuid),
-            _text(23, one.name),
-            *(_argument(name, value) for name, value in one.arguments.items() if value is not None),
-            *(_fixed64(47, flow) for flow in one.flows),
-            *(_fixed64(48, flow) for flow in one.ends_flows),
-        ]
-    )
 
 
 def _argument(name: str, value: Value) -> bytes:
     if isinstance(value, str):
         return _message(4, _text(10, name) + _text(6, value))
     return _message(4, _text(10, name) + _integer(2 if isinstance(value, bool) else 4, value or 0))
-
-
-def _owner(uuid: int, track: Track) -> bytes:
-    if track.thread is None:
-        return _integer(1, uuid) + _text(2, track.owner) + _integer(11, EXPLICIT)
-    process = _integer(1, track.thread[0]) + _text(6, track.owner)
-    return _integer(1, uuid) + _message(3, process)
-
-
-def _row(uuid: int, owner: int, name: str, rank: int, thread: Thread | None) -> bytes:
-    described = _integer(1, uuid) + _integer(5, owner)
-    if thread is None:
-        return described + _text(2, name) + _integer(12, rank)
-    pid, tid = thread
-    return described + _message(4, _integer(1, pid) + _integer(2, tid) + _text(5, name))
-
-
-def _clocks(now: int, offset: int) -> bytes:
-    """The trace's clock and the wall clock at one instant."""
-    readings = ((TRACE_TIME, now), (REALTIME, now + offset))
-    return _message(
-        6, b"".join(_message(1, _integer(1, clock) + _integer(2, time)) for clock, time in readings)
-    )
 
 
 def _packet(content: bytes) -> bytes:
@@ -335,7 +281,8 @@ def _message(number: int, content: bytes) -> bytes:
 
 @lru_cache(maxsize=4096)  # names come again and again
 def _text(number: int, value: str) -> bytes:
-    return _message(number, value.encode("utf-8", errors="replace"))
+    """A text as it is shown: it may be a name of others."""
+    return _message(number, shown(value).encode("utf-8", errors="replace"))
 
 
 def _integer(number: int, value: int) -> bytes:

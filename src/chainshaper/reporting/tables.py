@@ -6,13 +6,12 @@ control characters on, so on the terminal every text is a `Text`; in HTML every 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from chainshaper.planning.plan import Server
-from chainshaper.values.durations import format_duration, milliseconds
+from chainshaper.values.durations import milliseconds
 from chainshaper.values.safe_text import escape, shown
 
 __all__ = ["ABSENT", "Column", "ResultTable", "figures", "plain", "words"]
@@ -46,9 +45,11 @@ def figures(*titles: str) -> list[Column]:
 
 
 class _Row(NamedTuple):
-    kind: Literal["row", "group", "line"]
+    """A row; a group's title (``cells`` has it alone); or a line (``cells`` is empty)."""
+
     cells: tuple[Cell, ...]
-    detail: bool
+    detail: bool = False
+    title: bool = False
 
 
 @dataclass
@@ -62,15 +63,15 @@ class ResultTable:
 
     def add(self, *cells: Cell, detail: bool = False) -> None:
         """A row: a cell per column."""
-        self.rows.append(_Row("row", cells, detail))
+        self.rows.append(_Row(cells, detail))
 
     def group(self, title: str, *, detail: bool = False) -> None:
         """A title over the rows that follow."""
-        self.rows.append(_Row("group", (title,), detail))
+        self.rows.append(_Row((title,), detail, title=True))
 
     def line(self) -> None:
         """A line between the rows before and behind it, on the terminal."""
-        self.rows.append(_Row("line", (), False))
+        self.rows.append(_Row(()))
 
     def __rich__(self) -> RichTable:
         """The table for the terminal, without details."""
@@ -83,20 +84,16 @@ class ResultTable:
             show_footer=any(column.footer for column in self.columns),
         )
         for title, left, footer, _ in (self.columns[number] for number in used):
-            table.add_column(
-                plain(title),
-                plain(footer),
-                justify="left" if left else "right",
-                overflow="fold" if left else "ellipsis",
-            )
+            justify, overflow = ("left", "fold") if left else ("right", "ellipsis")
+            table.add_column(plain(title), plain(footer), justify=justify, overflow=overflow)  # type: ignore[arg-type]
         indent = ""
-        for kind, cells, detail in self.rows:
-            if kind == "line" or (kind == "group" and not detail):
+        for cells, _, title_only in (row for row in self.rows if not row.detail):
+            if title_only or not cells:
                 table.add_section()
-            if kind == "group" and not detail:
+            if title_only:
                 indent = "  "
-                table.add_row(plain(str(cells[0]), "bold"))
-            elif kind == "row" and not detail:
+                table.add_row(plain(cells[0], "bold"))
+            elif cells:
                 first, *others = (plain(cells[number]) for number in used)
                 table.add_row(Text(indent) + first, *others)
         return table
@@ -104,14 +101,13 @@ class ResultTable:
     def html(self) -> str:
         """The rows as an HTML table, whose first column names them."""
         titles = "".join(
-            f'<th scope="col"{_kind(left or not number)}>{escape(title)}</th>'
-            for number, (title, left, *_) in enumerate(self.columns)
+            f'<th scope="col"{_kind(column.words or not number)}>{escape(column.title)}</th>'
+            for number, column in enumerate(self.columns)
         )
-        rows = [self._row_html(row) for row in self.rows if row.kind != "line"]
+        rows = [row for row in self.rows if row.cells]
         if any(column.footer for column in self.columns):
-            footers = tuple(column.footer for column in self.columns)
-            rows.append(self._row_html(_Row("row", footers, False)))
-        body = "\n".join(rows)
+            rows.append(_Row(tuple(column.footer for column in self.columns)))
+        body = "\n".join(map(self._row_html, rows))
         return (
             f'<div class="scroll"><table>\n<thead><tr>{titles}</tr></thead>\n'
             f"<tbody>\n{body}\n</tbody></table></div>"
@@ -119,7 +115,7 @@ class ResultTable:
 
     def _row_html(self, row: _Row) -> str:
         first, *others = (escape(str(cell)) for cell in row.cells)
-        if row.kind == "group":
+        if row.title:
             width = len(self.columns)
             return f'<tr class="group"><th scope="colgroup" colspan="{width}">{first}</th></tr>'
         cells = "".join(
@@ -171,33 +167,12 @@ def slots_ms(*slots: tuple[int, int]) -> str:
     return " ".join(f"[{milliseconds(start)}, {milliseconds(end)})" for start, end in slots)
 
 
-def thread_nodes(server: Server) -> str:
-    """Whose threads a server lets run."""
-    return ", ".join(
-        thread.node + (" (publisher)" if thread.role == "publisher" else "")
-        for thread in server.threads
-    )
-
-
 def scheduling_text(policy: str, priority: int) -> str:
     """``FIFO 80``; of a class without priorities its name alone."""
     name = policy.removeprefix("SCHED_")
     return f"{name} {priority}" if priority else name
 
 
-def core_ranges(cores: Sequence[int]) -> str:
-    """Cores as the kernel writes them: ``0-3,7``."""
-    runs: list[list[int]] = []
-    for core in cores:
-        if runs and core == runs[-1][-1] + 1:
-            runs[-1][1:] = [core]
-        else:
-            runs.append([core])
-    return ",".join("-".join(map(str, run)) for run in runs)
-
-
-def trigger(callback: Mapping[str, Any]) -> str:
-    """What starts a callback, of a row of callback statistics: ``timer every 100ms``."""
-    period = callback["period_ns"]
-    what = callback["topic"] if period is None else f"every {format_duration(period)}"
-    return f"{callback['kind']} {what or ''}".rstrip()
+def listed(numbers: Sequence[int]) -> str:
+    """``0, 1, 3``."""
+    return ", ".join(map(str, numbers))

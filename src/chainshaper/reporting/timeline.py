@@ -2,21 +2,60 @@
 
 The report's page and the trace for Perfetto show the same things: the threads that ran callbacks,
 the callbacks, the messages between them, the slots of the servers, what the gate retained, and
-stalls of the machine. Times are ns of the event clock throughout.
+stalls of the machine. Times are ns of the event clock throughout; :func:`timeline_data`, what a
+page draws of them, counts from the first cycle's start. It has all cycles of a short recording; of
+a long one the longest and the shortest, the median, those without an end, those that were asked for
+by number, and a sample of the others.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
+import numpy as np
+import numpy.typing as npt
 import polars as pl
 
 from chainshaper.analysis import DataFlow, LatencyAnalysis
+from chainshaper.analysis.disturbance import overlapping
 from chainshaper.analysis.punctuality import lateness_in_cycle
 from chainshaper.planning import Plan
+from chainshaper.reporting.overviews import cores_text
+from chainshaper.reporting.tables import ms, slots_ms
 from chainshaper.values import events
 from chainshaper.values.recording import Recording
+from chainshaper.verify.measure import Measurement
 from chainshaper.verify.predictions import due_of
 
-__all__ = ["Timeline", "timeline_of"]
+__all__ = ["Timeline", "timeline_data", "timeline_of"]
+
+CYCLES = 500
+SLICES = 20_000
+"""How many cycles, and callbacks in them, the page's timeline of one recording has."""
+
+EXTREMES = 20
+"""How many of the longest cycles, and of the shortest, are among them in any case."""
+
+KINDS = ("cycle", "callback", "unended", "held", "slot", "stall")
+CYCLE, CALLBACK, UNENDED, HELD, SLOT, STALL = range(len(KINDS))
+BARS = ("row", "start", "length", "kind", "cycle", "text", "used")
+"""What bars the page's timeline has, and what is said of each."""
+
+FAR = 10**15
+"""Outside every recording: 11 days."""
+
+Bar: TypeAlias = tuple[int, int, int, int, int, str, int | None]
+Windows: TypeAlias = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
+
+_HELD = {
+    "traversal": pl.UInt32(),
+    "hop": pl.UInt8(),
+    **dict.fromkeys(("arrival", "origin", "release", "let_go"), pl.Int64()),
+    "slot": pl.Int32(),
+    "overrun": pl.String(),
+}
+_ORIGINS = {"traversal": pl.UInt32(), "origin": pl.Int64(), "assumed": pl.Boolean()}
+_SLOTS = {"server": pl.String(), "slot": pl.Int32(), "opens": pl.Int64(), "closes": pl.Int64()}
 
 
 @dataclass(frozen=True)
@@ -51,32 +90,37 @@ def timeline_of(
     plan: Plan | None = None,
 ) -> Timeline:
     """The timeline of a recording; cycles and slots are those of ``analysis`` and ``plan``."""
-    slices = _slices(flow)
-    holds = _holds(analysis)
+    times = flow.instances["start"], flow.instances["end"], flow.publications["time"]
+    following = pl.col("start").shift(-1).over("pid", "tid")
+    slices = flow.instances.sort("start", maintain_order=True).select(
+        *("instance", "callback_id", "pid", "tid", "start"),
+        pl.coalesce("end", following, pl.lit(pl.concat(times).max())).alias("end"),
+        pl.col("end").is_not_null().alias("ended"),
+        "execution_ns",
+    )
+    holds = pl.DataFrame(schema=_HELD) if analysis is None else analysis.releases.select(*_HELD)
     origins = _origins(analysis, plan, holds)
+    servers = () if plan is None else plan.servers
+    slots = [(one.name, n, *slot) for one in servers for n, slot in enumerate(one.slots)]
+    # Cycles that two traversals share (the gate counts from its own) are drawn once.
+    cycles = origins.unique("origin", keep="first", maintain_order=True)
+    opened = cycles.join(
+        pl.DataFrame(slots, schema=_SLOTS, orient="row"), how="cross", maintain_order="left_right"
+    )
     stalls = events.table(recording.events, "machine_stall", ["cpu"])
     return Timeline(
         threads=_threads(recording, flow, slices, analysis),
         slices=slices,
         holds=holds,
         origins=origins,
-        slots=_slots(plan, origins),
+        slots=opened.select(
+            *("traversal", "server", "slot"),
+            start=pl.col("origin") + pl.col("opens"),
+            end=pl.col("origin") + pl.col("closes"),
+        ),
         stalls=stalls.select(
             core=pl.col("cpu"), start=pl.col("time"), end=pl.col("time") + pl.col("duration")
         ),
-    )
-
-
-def _slices(flow: DataFlow) -> pl.DataFrame:
-    last = pl.concat(
-        [flow.instances["start"], flow.instances["end"], flow.publications["time"]]
-    ).max()
-    following = pl.col("start").shift(-1).over("pid", "tid")
-    return flow.instances.sort("start", maintain_order=True).select(
-        *("instance", "callback_id", "pid", "tid", "start"),
-        pl.coalesce("end", following, pl.lit(last)).alias("end"),
-        pl.col("end").is_not_null().alias("ended"),
-        "execution_ns",
     )
 
 
@@ -89,38 +133,14 @@ def _threads(
     )
     owners = flow.objects.callbacks.select("callback_id", "node").unique("callback_id")
     about = {
-        (thread.pid, thread.tid): f"{thread.policy} {thread.priority}, "
-        f"core{'s' if len(thread.cores) > 1 else ''} {', '.join(map(str, thread.cores))}"
-        for thread in recording.info.threads
+        (one.pid, one.tid): f"{one.policy} {one.priority}, {cores_text(one.cores)}"
+        for one in recording.info.threads
     }
-    found = (
-        slices.join(owners, on="callback_id", how="left")
-        .group_by("pid", "tid")
-        .agg(
-            pl.col("node").drop_nulls().unique().sort().str.join(", ").alias("nodes"),
-            place.min().alias("place"),
-        )
-        .sort("place", "nodes", "pid", "tid")
-        .drop("place")
-    )
-    texts = [about.get(key) for key in found.select("pid", "tid").iter_rows()]
-    return found.with_columns(pl.Series("about", texts, dtype=pl.String))
-
-
-def _holds(analysis: LatencyAnalysis | None) -> pl.DataFrame:
-    if analysis is None:
-        return pl.DataFrame(schema={"traversal": pl.UInt32(), "hop": pl.UInt8(), **_HELD})
-    return analysis.releases.select("traversal", "hop", *_HELD)
-
-
-_HELD = {
-    "arrival": pl.Int64(),
-    "origin": pl.Int64(),
-    "release": pl.Int64(),
-    "let_go": pl.Int64(),
-    "slot": pl.Int32(),
-    "overrun": pl.String(),
-}
+    nodes = pl.col("node").drop_nulls().unique().sort().str.join(", ")
+    found = slices.join(owners, on="callback_id", how="left").group_by("pid", "tid")
+    rows = found.agg(nodes=nodes, place=place.min()).sort("place", "nodes", "pid", "tid")
+    texts = [about.get(key) for key in rows.select("pid", "tid").iter_rows()]
+    return rows.drop("place").with_columns(pl.Series("about", texts, dtype=pl.String))
 
 
 def _origins(
@@ -132,9 +152,7 @@ def _origins(
     :mod:`chainshaper.analysis.punctuality` takes them.
     """
     if analysis is None or plan is None:
-        return pl.DataFrame(
-            schema={"traversal": pl.UInt32(), "origin": pl.Int64(), "assumed": pl.Boolean()}
-        )
+        return pl.DataFrame(schema=_ORIGINS)
     last = len(analysis.chain.callbacks) - 1
     decided = holds.filter(pl.col("hop") == last).select("traversal", decided="origin")
     rows = analysis.traversals.select("traversal", "start").join(
@@ -144,31 +162,177 @@ def _origins(
     late = lateness_in_cycle(rows["start"], plan.cycle_ns) if from_cycle else 0
     return rows.select(
         "traversal",
-        pl.coalesce("decided", pl.col("start") - pl.lit(late)).alias("origin"),
-        pl.col("decided").is_null().alias("assumed"),
+        origin=pl.coalesce("decided", pl.col("start") - pl.lit(late)),
+        assumed=pl.col("decided").is_null(),
     )
 
 
-def _slots(plan: Plan | None, origins: pl.DataFrame) -> pl.DataFrame:
-    servers = () if plan is None else plan.servers
-    table = pl.DataFrame(
-        [
-            (server.name, number, start, end)
-            for server in servers
-            for number, (start, end) in enumerate(server.slots)
-        ],
-        schema={
-            "server": pl.String(),
-            "slot": pl.Int32(),
-            "opens": pl.Int64(),
-            "closes": pl.Int64(),
-        },
-        orient="row",
+def timeline_data(
+    measurement: Measurement, timeline: Timeline, cycles: Sequence[int], zero: int
+) -> dict[str, Any]:
+    """What the page draws around its cycles, and which of them are worst, median and best.
+
+    ``rows`` are the chain, threads, servers and cores, each with a remark; ``gaps`` are stretches
+    of which the page has nothing. Bars are in the columns of :data:`BARS`: ``kind`` is the number
+    of one of :data:`KINDS`, ``cycle`` -1 where it is of none, ``text`` its number in ``texts``,
+    ``used`` the execution time.
+    """
+    analysis = measurement.analysis
+    chosen = _cycles_in_page(analysis.traversals, timeline.slices.height, cycles)
+    traversals = analysis.traversals.filter(pl.col("traversal").is_in(chosen))
+    windows = _windows(traversals, timeline)
+    stalls = _inside(timeline.stalls.sort("start"), windows)
+    servers = () if measurement.plan is None else measurement.plan.servers
+    rows = [("chain", ""), *timeline.threads.select("nodes", pl.col("about").fill_null("")).rows()]
+    of_server = {one.name: number for number, one in enumerate(servers, start=len(rows))}
+    rows += [(f"server {one.name}", f"core {one.core}, priority {one.priority}") for one in servers]
+    of_core = {core: number for number, core in enumerate(dict.fromkeys(stalls["core"]), len(rows))}
+    rows += [("stalls" if core is None else f"stalls of core {core}", "") for core in of_core]
+
+    threads = timeline.threads.select("pid", "tid").with_row_index("row", offset=1)
+    ran = timeline.slices.select("instance", "pid", "tid").join(threads, on=["pid", "tid"])
+    times = (pl.col(name) - pl.col("begun") for name in ("take", "start", "publish", "end"))
+    hops = (
+        analysis.hops.join(traversals.select("traversal", begun="start"), on="traversal")
+        .join(ran, on="instance", how="left")
+        .sort("traversal", "hop")
+        .select("traversal", "hop", "row", *times)
     )
-    # Cycles that two traversals share (the gate counts from its own) are drawn once.
-    cycles = origins.unique("origin", keep="first", maintain_order=True)
-    return cycles.join(table, how="cross", maintain_order="left_right").select(
-        *("traversal", "server", "slot"),
-        start=pl.col("origin") + pl.col("opens"),
-        end=pl.col("origin") + pl.col("closes"),
+    labels = {callback.id: callback.label for callback in analysis.graph.callbacks}
+    slices = (
+        _inside(timeline.slices, windows)
+        .join(threads, on=["pid", "tid"], maintain_order="left")
+        .with_columns(label=pl.col("callback_id").replace_strict(labels, return_dtype=pl.String))
     )
+    bars = [*_bars(timeline, traversals, slices, hops.drop_nulls("row"), of_server)]
+    for core, start, end in stalls.iter_rows():
+        bars.append((of_core[core], start, end - start, STALL, -1, "the machine stalled", None))
+    texts = {text: number for number, text in enumerate(dict.fromkeys(bar[5] for bar in bars))}
+    table = [(row, at - zero, *rest, texts[text], used) for row, at, *rest, text, used in bars]
+    columns = zip(*table, strict=True) if table else [()] * len(BARS)
+    edges = [-FAR, *(np.column_stack(windows) - zero).ravel().tolist(), FAR]
+    passed = zip(analysis.chain.callbacks, analysis.chain.topics, strict=True)
+    return {
+        "rows": rows,
+        **dict(zip(BARS, map(list, columns), strict=True)),
+        "texts": list(texts),
+        "gaps": list(zip(edges[::2], edges[1::2], strict=True)),
+        "cycles": list(_cycles(traversals, hops, timeline.slots, zero)),
+        "hops": [f"{labels[callback]} → {topic}" for callback, topic in passed],
+        "of": analysis.traversals.height,
+        "chosen": _chosen(analysis.traversals),
+    }
+
+
+def _bars(
+    timeline: Timeline,
+    traversals: pl.DataFrame,
+    slices: pl.DataFrame,
+    hops: pl.DataFrame,
+    of_server: dict[str, int],
+) -> Iterator[Bar]:
+    """Cycles, callbacks, what gates did, and slots: what comes later covers what was before."""
+    columns = ["traversal", "start", "latency_ns", "disturbed"]
+    for cycle, start, latency, hit in traversals.filter("complete").select(columns).iter_rows():
+        text = f"cycle {cycle}{', disturbed by the machine' if hit else ''}"
+        yield 0, start, latency, CYCLE, cycle, text, None
+    columns = ["row", "label", "start", "end", "ended", "execution_ns"]
+    for row, label, start, end, whole, used in slices.select(columns).iter_rows():
+        text = label if whole else f"{label}\nits end was not recorded"
+        yield row, start, end - start, CALLBACK if whole else UNENDED, -1, text, used
+    columns = ["row", "traversal", "arrival", "let_go", "overrun"]
+    held = timeline.holds.join(hops, on=["traversal", "hop"], maintain_order="left")
+    for row, cycle, arrival, let_go, overrun in held.select(columns).iter_rows():
+        text = f"cycle {cycle}: held{f', overran: {overrun}' if overrun else ''}"
+        yield row, arrival, let_go - arrival, HELD, cycle, text, None
+    # A cycle that two traversals share has its slots once, with either of them.
+    shown = timeline.origins.join(traversals.select("traversal"), on="traversal", how="semi")
+    slots = timeline.slots.join(timeline.origins, on="traversal", maintain_order="left").join(
+        shown, on="origin", how="semi", maintain_order="left"
+    )
+    columns = ["server", "traversal", "start", "end", "origin", "assumed"]
+    for server, cycle, start, end, origin, assumed in slots.select(columns).iter_rows():
+        text = f"server {server}, cycle {cycle}\n{slots_ms((start - origin, end - origin))} ms"
+        text += "\nthe cycle's start is not recorded but assumed" if assumed else ""
+        yield of_server[server], start, end - start, SLOT, cycle, text, None
+
+
+def _cycles(
+    traversals: pl.DataFrame, hops: pl.DataFrame, slots: pl.DataFrame, zero: int
+) -> Iterator[dict[str, Any]]:
+    """Each cycle in the page; its hops ``[row, take, start, publish, end]`` count from its start.
+
+    ``length`` is the time that it takes on the timeline, with its servers' slots.
+    """
+    closes = dict(slots.group_by("traversal").agg(pl.col("end").max()).iter_rows())
+    hops_of: dict[int, list[list[int | None]]] = {}
+    for traversal, _, *hop in hops.iter_rows():
+        hops_of.setdefault(traversal, []).append(hop)
+    for row in traversals.iter_rows(named=True):
+        number, start = row["traversal"], row["start"]
+        own = hops_of.get(number, [])
+        state = f"incomplete: {row['reason']} ({row['broken_at']})"
+        about = f"{ms(row['latency_ns'])} ms" if row["complete"] else state
+        about += ", disturbed by the machine" if row["disturbed"] else ""
+        received = 0
+        if row["received"] is not None:
+            received = row["received"] - start
+            about += f"; {ms(received)} ms at the subscriber"
+        about += f"; began {(start - zero) / 1e9:.3f} s after the first"
+        cycle = {"n": number, "start": start - zero, "hops": own, "about": about}
+        if row["complete"]:
+            cycle["latency"] = row["latency_ns"]
+        ends = [time for hop in own for time in hop[2:] if time is not None]
+        ends += [row["latency_ns"] or 0, received, closes.get(number, start) - start]
+        yield {**cycle, "length": max(1000, *ends)}
+
+
+def _chosen(traversals: pl.DataFrame) -> dict[str, int]:
+    """The longest, median and shortest undisturbed cycle; of all complete if all are disturbed."""
+    complete = traversals.filter("complete")
+    calm = complete.filter(~pl.col("disturbed"))
+    ordered = (calm if calm.height else complete).sort("latency_ns", maintain_order=True)
+    numbers = ordered["traversal"].to_list()
+    if not numbers:
+        return {}
+    middle = numbers[(len(numbers) - 1) // 2]
+    return {"longest": numbers[-1], "median": middle, "shortest": numbers[0]}
+
+
+def _cycles_in_page(traversals: pl.DataFrame, slices: int, asked: Sequence[int]) -> list[int]:
+    """All cycles where they are few; else those asked for, extremes, incomplete, and a sample."""
+    per_cycle = max(1.0, slices / max(1, traversals.height))
+    room = max(2 * EXTREMES + 1, min(CYCLES, int(SLICES / per_cycle)))
+    every = traversals["traversal"].to_list()
+    if len(every) <= room:
+        return every
+    known = set(every)
+    ordered = traversals.filter("complete").sort("latency_ns", maintain_order=True)["traversal"]
+    candidates = [
+        *(cycle for cycle in asked if cycle in known),
+        *_chosen(traversals).values(),
+        *ordered.tail(EXTREMES),
+        *ordered.head(EXTREMES),
+        *traversals.filter(~pl.col("complete"))["traversal"].head(EXTREMES),
+        *every[:: max(1, len(every) // room)],
+    ]
+    return sorted(list(dict.fromkeys(candidates))[: room + len(asked)])
+
+
+def _windows(traversals: pl.DataFrame, timeline: Timeline) -> Windows:
+    """From a little before each cycle to a little behind its output's reception; merged."""
+    slots = timeline.slots.group_by("traversal").agg(closes=pl.col("end").max())
+    rows = traversals.join(slots, on="traversal", how="left", maintain_order="left")
+    usual = rows["latency_ns"].median()
+    length = int(usual) if isinstance(usual, float) else 100_000_000
+    ends = pl.max_horizontal("end", "received", "closes", pl.col("start") + length)
+    began = rows["start"].to_numpy() - length // 20
+    ended = rows.select(ends.cum_max() + length // 20).to_series().to_numpy()
+    fresh = np.ones(len(began), dtype=bool)
+    fresh[1:] = began[1:] > ended[:-1]
+    return began[fresh], ended[np.append(fresh[1:], True)[: len(fresh)]]
+
+
+def _inside(slices: pl.DataFrame, windows: Windows) -> pl.DataFrame:
+    start, end = slices["start"].to_numpy(), slices["end"].to_numpy()
+    return slices.filter(pl.Series(overlapping(start, end, *windows), dtype=pl.Boolean))

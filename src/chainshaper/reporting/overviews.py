@@ -1,0 +1,514 @@
+"""What there is, in rows and as plain data: in a recording (events, callbacks, chains, stalls), on
+a machine (abilities, threads), in a plan (slots, bands, figure 7's curve), in force, in a sweep."""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from datetime import datetime, timezone
+from typing import Any
+
+import polars as pl
+
+from chainshaper.analysis import ChainEnumeration
+from chainshaper.enforcement.threads import Allocation, NodeThread, WantedScheduling
+from chainshaper.enforcement.undoing import RunState, ServerState
+from chainshaper.linux.runs import Journal
+from chainshaper.linux.threads import POLICIES
+from chainshaper.planning import BandChoice, Plan, band_predictions
+from chainshaper.planning.plan import slot_text
+from chainshaper.reporting.graph_drawing import short_symbol
+from chainshaper.reporting.tables import (
+    ABSENT,
+    YES_NO,
+    Column,
+    ResultTable,
+    figures,
+    listed,
+    min_mean_max,
+    ms,
+    percent,
+    plain,
+    scheduling_text,
+    slots_ms,
+    words,
+)
+from chainshaper.values.application import ApplicationGraph, Chain
+from chainshaper.values.durations import format_duration, milliseconds
+from chainshaper.values.recording import (
+    INFO_FILE,
+    MachineReport,
+    Recording,
+    StallMeterInfo,
+    ThreadInfo,
+    event_counts,
+    lost_text,
+)
+from chainshaper.verify.measure import Measurement
+
+UNKNOWN = "unknown"
+COLOURS = {"good": "green", "limited": "yellow", "absent": "red"}
+MOST_ROWS = 50
+SWEEP_FIGURES = {
+    "mean_ns": "average",
+    "max_ns": "maximum",
+    "jitter_ns": "jitter",
+    "band_jitter_ns": "jitter\nin a band",
+    "late": "late",
+    "incomplete": "no output",
+}
+
+
+def contents_json(recording: Recording) -> dict[str, Any]:
+    """Counts per event, what was lost, the clock, and the system that was recorded."""
+    info = recording.info
+    notes = list(info.notes)
+    # A recording from before there were checksums; a tracer's trace never has any.
+    if info.checksums is None and (recording.path / INFO_FILE).is_file():
+        notes.append(
+            "this recording has no checksums, so that damage to its files may go unseen:"
+            " `chainshaper convert` writes one that has"
+        )
+    return {
+        "source": info.source,
+        "events": dict(event_counts(recording).iter_rows()),
+        "lost": info.lost,
+        "clock_offset_ns": info.clock_offset_ns,
+        "distribution": info.distribution,
+        "rmw": info.rmw,
+        "hosts": [host for host in info.host.split(", ") if host],
+        "kernel": info.kernel,
+        "processes": {str(pid): name for pid, name in info.processes.items()},
+        "notes": notes,
+    }
+
+
+def contents_table(recording: Recording) -> tuple[ResultTable, ResultTable]:
+    """The system that was recorded, and how often each event happened."""
+    contents = contents_json(recording)
+    system = ResultTable(str(recording.path), words("", ""))
+    system.add("source", contents["source"])
+    system.add("distribution", contents["distribution"] or UNKNOWN)
+    system.add("RMW", contents["rmw"] or UNKNOWN)
+    system.add("hosts", ", ".join(contents["hosts"]) or UNKNOWN)
+    system.add("clock offset", f"{contents['clock_offset_ns']} ns to CLOCK_REALTIME")
+    for pid, name in contents["processes"].items():
+        system.add(f"process {pid}", name)
+    total = f"{sum(contents['events'].values()):,}"
+    columns = [Column("event", words=True, footer="together"), Column("count", footer=total)]
+    events = ResultTable("Events", columns)
+    for name, number in contents["events"].items():
+        events.add(name, f"{number:,}")
+    return system, events
+
+
+def callback_rows(statistics: pl.DataFrame) -> list[dict[str, Any]]:
+    """Callback statistics as plain data: response and execution times in ns."""
+    columns = ("node", "kind", "topic", "period_ns", "pid", "tids", "count")
+    return statistics.select(*columns, "response_ns", "execution_ns").to_dicts()
+
+
+def callback_table(statistics: pl.DataFrame) -> ResultTable:
+    """Every callback: its thread, how often it ran, and its execution and response times.
+
+    Execution times have columns only where there are any. A function's name has a column in the
+    report; on the terminal it stands behind callbacks that nothing else tells apart.
+    """
+    measured = [name for name in ("execution", "response") if statistics[f"{name}_ns"].count()]
+    columns = [*words("node", "callback"), Column("function", words=True, detail=True)]
+    columns += figures("thread", "count")
+    for name in measured:
+        columns += figures(*(f"{name}\n{figure}" for figure in ("min", "mean", "max")))
+    table = ResultTable("Callbacks [ms]", columns)
+    rows = []
+    for row in statistics.to_dicts():
+        period = row["period_ns"]
+        trigger = row["topic"] or "" if period is None else f"every {format_duration(period)}"
+        rows.append((f"{row['kind']} {trigger}".rstrip(), row))
+    alike = Counter((row["pid"], row["node"], trigger) for trigger, row in rows)
+    for trigger, row in rows:
+        symbol = short_symbol(row["symbol"])
+        doubtful = symbol and alike[row["pid"], row["node"], trigger] > 1
+        cells = [f"{trigger} ({symbol})" if doubtful else trigger, symbol, listed(row["tids"])]
+        cells.append(str(row["count"]))
+        times = (cell for name in measured for cell in min_mean_max(row[f"{name}_ns"]))
+        table.add(row["node"] or "", *cells, *times)
+    return table
+
+
+def chains_json(graph: ApplicationGraph, found: ChainEnumeration) -> dict[str, Any]:
+    """``count`` chains (a lower bound unless ``exact``), those listed, and the heaviest."""
+    heaviest = None
+    if found.heaviest is not None:
+        heaviest = {**_chain(graph, found.heaviest), "response_ns": found.heaviest_ns}
+    return {
+        "count": found.count,
+        "exact": found.exact,
+        "complete": found.complete,
+        "heaviest": heaviest,
+        "chains": [_chain(graph, chain) for chain in found.chains],
+    }
+
+
+def _chain(graph: ApplicationGraph, chain: Chain) -> dict[str, Any]:
+    callbacks = {callback.id: callback for callback in graph.callbacks}
+    path = [callbacks[number] for number in chain.callbacks]
+    return {
+        "chain": chain.spec,
+        "nodes": [callback.node for callback in path],
+        "callbacks": [callback.label for callback in path],
+        "topics": list(chain.topics),
+    }
+
+
+def count_text(found: ChainEnumeration) -> str:
+    """How many chains there are, and how many of them are listed."""
+    number = f"{found.count:,} chains" if found.exact else f"at least {found.count:,} chains"
+    return number if found.complete else f"{number}, {len(found.chains)} of them listed"
+
+
+def chain_table(graph: ApplicationGraph, found: ChainEnumeration) -> ResultTable:
+    """One row per chain: where it starts, which topics it passes; the heaviest is marked."""
+    columns = [*words("starts at", "topics"), *figures("heaviest [ms]")]
+    table = ResultTable("Computation chains", columns)
+    for chain in dict.fromkeys(filter(None, (*found.chains, found.heaviest))):
+        row = _chain(graph, chain)
+        heaviest = chain == found.heaviest and found.heaviest_ns is not None
+        weight = milliseconds(found.heaviest_ns or 0) if heaviest else ""
+        table.add(row["callbacks"][0], " → ".join(row["topics"]), weight)
+    return table
+
+
+def threads_json(allocation: Allocation) -> dict[str, Any]:
+    """The threads of a running application, and what is not certain about them."""
+    rows = [
+        {
+            "nodes": list(found.nodes),
+            "nodes_known_by": found.nodes_known_by or None,
+            "pid": found.thread.pid,
+            "tid": found.thread.tid,
+            "comm": found.thread.comm,
+            "role": found.thread.role,
+            "dds_kind": found.thread.kind,
+            "known_by": found.known_by or None,
+            "policy": found.thread.policy,
+            "priority": found.thread.priority,
+            "cores": list(found.thread.cores),
+        }
+        for found in allocation.threads
+    ]
+    return {"threads": rows, "notes": list(allocation.notes)}
+
+
+def threads_table(allocation: Allocation) -> ResultTable:
+    """A row per thread; what is as in the row above is left out."""
+    names = ("node", "pid", "tid", "name", "role", "class", "cores", "known by")
+    table = ResultTable("Threads", words(*names))
+    above: NodeThread | None = None
+    for found in allocation.threads:
+        thread = found.thread
+        first = above is None or above.thread.pid != thread.pid
+        same_nodes = not first and above is not None and above.nodes == found.nodes
+        known_by = [found.known_by or "-"]
+        if first and found.nodes:
+            known_by.append(f"node: {found.nodes_known_by or None}")
+        table.add(
+            "" if same_nodes else ", ".join(found.nodes) or UNKNOWN,
+            str(thread.pid) if first else "",
+            str(thread.tid),
+            thread.comm,
+            f"DDS {thread.kind}" if thread.role == "dds" else thread.role,
+            scheduling_text(thread.policy, thread.priority),
+            core_ranges(thread.cores),
+            "; ".join(known_by),
+        )
+        above = found
+    return table
+
+
+def core_ranges(cores: Sequence[int]) -> str:
+    """Cores as the kernel writes them: ``0-3,7``."""
+    runs: list[list[int]] = []
+    for core in cores:
+        if runs and core == runs[-1][-1] + 1:
+            runs[-1][1:] = [core]
+        else:
+            runs.append([core])
+    return ",".join("-".join(map(str, run)) for run in runs)
+
+
+def machine_json(report: MachineReport) -> dict[str, Any]:
+    """All checks of a machine and its stalls as plain data."""
+    return {
+        "checks": [vars(check) for check in report.checks],
+        "stalls": stall_rows(report.stall_meter, report.stalls),
+        "watched_ns": report.watched_ns,
+        "threshold_ns": report.stall_meter.threshold_ns,
+        "realtime": report.stall_meter.realtime,
+    }
+
+
+def machine_tables(report: MachineReport) -> tuple[ResultTable, ResultTable]:
+    """What the machine can do, and how it stalls."""
+    abilities = ResultTable("This machine", words("", "found", "for", "remedy"))
+    for check in report.checks:
+        found = plain(check.found, COLOURS[check.state])
+        abilities.add(check.name, found, check.needed_for, check.remedy)
+    threshold = format_duration(report.stall_meter.threshold_ns)
+    stalls = stall_table(report.stall_meter, report.stalls)
+    stalls.title = f"Stalls longer than {threshold} in {format_duration(report.watched_ns)}"
+    if not report.stall_meter.realtime:
+        stalls.caption = "taken without SCHED_FIFO: ordinary scheduling is among these stalls"
+    return abilities, stalls
+
+
+def stall_rows(meter: StallMeterInfo, stalls: pl.DataFrame) -> list[dict[str, Any]]:
+    """Per core: stalls seen, of the columns ``cpu, duration``; their total and longest (ns)."""
+    rows = []
+    for core, usual in zip(meter.cores, meter.median_lateness_ns, strict=True):
+        own = stalls.filter(cpu=core)["duration"].to_list()
+        row = {"core": core, "count": len(own), "longest_ns": max(own, default=0)}
+        rows.append({**row, "total_ns": sum(own), "median_wakeup_ns": usual})
+    return rows
+
+
+def stall_table(meter: StallMeterInfo, stalls: pl.DataFrame) -> ResultTable:
+    """Stalls per core, and the longest."""
+    titles = ("stalls", "in all [ms]", "longest [ms]", "usual wake-up [µs]")
+    table = ResultTable("", [*words(""), *figures(*titles)])
+    for row in stall_rows(meter, stalls):
+        times = ms(row["total_ns"]), ms(row["longest_ns"] or None)
+        usual = f"{row['median_wakeup_ns'] / 1e3:.0f}"
+        table.add(f"core {row['core']}", str(row["count"]), *times, usual)
+    return table
+
+
+def condition_table(names: Sequence[str], measurements: Sequence[Measurement]) -> ResultTable:
+    """How each recording was taken, a column for each: what makes its figures believable."""
+    rows: dict[str, list[str]] = {}
+    for one in measurements:
+        info, plan = one.recording.info, one.plan
+        in_force = "none" if plan is None else f"{plan.policy}, for {plan.chain.spec or 'a chain'}"
+        for title, cell in (
+            ("folder", str(one.recording.path)),
+            ("first cycle", _begun(one)),
+            ("source", info.source),
+            ("host", info.host),
+            ("kernel", info.kernel),
+            ("ROS 2 distribution", info.distribution),
+            ("RMW", info.rmw),
+            ("command", " ".join(info.command)),
+            ("real-time scheduling", YES_NO.get(info.realtime)),
+            ("scheduling in force", _scheduling(info.threads)),
+            ("machine watched for stalls", _watched(info.stall_meter)),
+            ("events", f"{event_counts(one.recording)['count'].sum():,}"),
+            ("events lost", lost_text(info.lost).partition(": ")[2]),
+            ("plan in force", in_force),
+        ):
+            rows.setdefault(title, []).append(cell or UNKNOWN)
+    table = ResultTable("", words("", *names))
+    for title, cells in rows.items():
+        table.add(title, *cells)
+    return table
+
+
+def _begun(measurement: Measurement) -> str:
+    """When the first cycle began, and for how long cycles went on beginning."""
+    starts = measurement.analysis.traversals["start"]
+    if not len(starts):
+        return "none"
+    offset = measurement.recording.info.clock_offset_ns
+    first = datetime.fromtimestamp((starts[0] + offset) / 1e9, tz=timezone.utc)
+    lasted = (starts[-1] - starts[0]) / 1e9
+    return f"{first:%Y-%m-%d %H:%M:%S} UTC, {len(starts)} cycles in {lasted:.1f} s"
+
+
+def _scheduling(threads: Iterable[ThreadInfo]) -> str:
+    kinds = Counter((one.role, one.policy, one.priority, one.cores) for one in threads)
+    return "\n".join(
+        f"{role}: {policy} {priority}, {cores_text(cores)} ({number})"
+        for (role, policy, priority, cores), number in sorted(kinds.items())
+    )
+
+
+def cores_text(cores: Sequence[int]) -> str:
+    """``cores 0, 1``."""
+    return f"core{'' if len(cores) == 1 else 's'} {listed(cores)}"
+
+
+def _watched(meter: StallMeterInfo | None) -> str:
+    if meter is None:
+        return "no: disturbed cycles are not known"
+    own = "" if meter.realtime else ", itself open to pre-emption"
+    return (
+        f"every {meter.period_ns / 1e6:g} ms on {cores_text(meter.cores)}{own}; stalls from "
+        f"{meter.threshold_ns / 1e6:g} ms"
+    )
+
+
+def recorded_thread_table(threads: Sequence[ThreadInfo]) -> ResultTable:
+    """The threads of a recorded application, as the kernel reported them."""
+    columns = [*words("node", "thread", "role"), *figures("pid", "tid")]
+    table = ResultTable("", [*columns, *words("scheduling"), *figures("cores")])
+    for one in sorted(threads, key=lambda thread: (thread.node, thread.tid)):
+        where = str(one.pid), str(one.tid), f"{one.policy} {one.priority}"
+        table.add(one.node, one.comm, one.role, *where, listed(one.cores))
+    return table
+
+
+def plan_table(plan: Plan) -> ResultTable:
+    """Servers and slots of a plan."""
+    columns = [*words("server"), *figures("core", "priority"), *words("slots", "threads")]
+    table = ResultTable(f"Plan for {plan.chain.spec or 'a chain'} [ms]", columns)
+    for server in plan.servers:
+        threads = (
+            thread.node + (" (publisher)" if thread.role == "publisher" else "")
+            for thread in server.threads
+        )
+        where = str(server.core), str(server.priority)
+        table.add(server.name, *where, slots_ms(*server.slots), ", ".join(threads))
+    predicted = plan.predicted
+    offset = f", starting {milliseconds(plan.offset_ns)} late" if plan.offset_ns else ""
+    table.caption = (
+        f"cycle {milliseconds(plan.cycle_ns)}{offset}; "
+        f"predicted average {milliseconds(predicted.mean_ns)}, "
+        f"maximum {milliseconds(predicted.max_ns)}, jitter at most "
+        f"{milliseconds(predicted.jitter_ns)}"
+    )
+    return table
+
+
+def bands_table(plan: Plan) -> ResultTable:
+    """What a plan predicts of each latency band."""
+    columns = figures("slot", "share of cycles", "jitter at most")
+    table = ResultTable("Predicted latency bands [ms]", columns)
+    for start, end, share, jitter in band_predictions(plan):
+        table.add(slots_ms((start, end)), percent(share), ms(jitter))
+    return table
+
+
+def choice_table(choice: BandChoice) -> ResultTable:
+    """Figure 7 in rows: the average over the number of bands, and where `auto` stops."""
+    columns = [*figures("bands", "average", "gain"), *words("slots end at")]
+    table = ResultTable("Average over the number of bands [ms]", columns, choice.reason)
+    for before, placement in zip((None, *choice.curve), choice.curve, strict=False):
+        ends = placement.slot_ends_ns
+        table.add(
+            f"{'→ ' if placement is choice.chosen else ''}{len(ends)}",
+            milliseconds(placement.mean_ns),
+            ABSENT if before is None else f"{1 - placement.mean_ns / before.mean_ns:.2%}",
+            " ".join(map(milliseconds, ends)),
+        )
+    return table
+
+
+def choice_json(choice: BandChoice) -> dict[str, Any]:
+    """The same as plain data."""
+    curve = [(len(one.slot_ends_ns), one) for one in choice.curve]
+    return {
+        "curve": [
+            {"bands": bands, "mean_ns": round(one.mean_ns), "bands_ns": list(one.slot_ends_ns)}
+            for bands, one in curve
+        ],
+        "chosen": len(choice.chosen.slot_ends_ns),
+        "reason": choice.reason,
+    }
+
+
+def servers_table(state: RunState) -> ResultTable:
+    """The servers of a run, a row each, with what they have done since they were armed."""
+    columns = words("server", "core", "priority", "slots", "threads", "kept by")
+    columns += figures("slots opened", "late", "worst", "overruns")
+    table = ResultTable(f"{state.plan or 'plan'} in force with {state.back_end}", columns)
+    if state.anchor_ns is not None:
+        table.caption = f"cycles of {format_duration(state.cycle_ns)}"
+        if state.drift_ns is not None:
+            drift = f"{'-' if state.drift_ns < 0 else '+'}{format_duration(abs(state.drift_ns))}"
+            table.caption += f"; the chain begins {drift} from where it did"
+    for server in state.servers:
+        slots = " ".join(map(slot_text, server.slots))
+        cells = [server.name, str(server.core), str(server.priority), slots]
+        cells += [listed(server.threads) or "none", server.kept_by]
+        table.add(*cells, *_counted(server).values())
+    return table
+
+
+def run_line(state: RunState) -> str:
+    """The state of a run in one line, for where there is no terminal."""
+    parts = []
+    for server in state.servers:
+        known = [f"{key} {value}" for key, value in _counted(server).items() if value != "-"]
+        if known:
+            parts.append(f"{server.name}: {', '.join(known)}")
+    return "; ".join(parts) or f"in force with {state.back_end}"
+
+
+def _counted(server: ServerState) -> dict[str, str]:
+    counters = server.counters
+    lateness = counters.longest_lateness_ns
+    values = {
+        "slots": counters.slots,
+        "late": counters.late_entries,
+        "worst": None if lateness is None else format_duration(lateness),
+        "overruns": counters.overruns,
+    }
+    return {name: "-" if value is None else str(value) for name, value in values.items()}
+
+
+def runs_table(runs: Iterable[tuple[Journal, RunState | None]]) -> ResultTable:
+    """Every run on this machine: its plan, back end and owner, and how it is doing."""
+    table = ResultTable("Plans in force", words("run", "plan", "back end", "owner", "state"))
+    for journal, state in runs:
+        plan, back_end = (state.plan, state.back_end) if state else ("not known yet", "")
+        if journal.owner is None:
+            condition = "crashed: `chainshaper release` undoes it"
+        elif state is None:
+            condition = "being set up"
+        else:
+            condition = f"failed: {state.failure}" if state.failure else run_line(state)
+        owner = "gone" if journal.owner is None else str(journal.owner)
+        table.add(journal.path.parent.name, plan, back_end, owner, condition)
+    return table
+
+
+def changes_table(changes: Iterable[WantedScheduling]) -> ResultTable:
+    """What a plan would give to each thread, a row each."""
+    names = ("node", "pid", "tid", "name", "role", "server", "class", "core", "why")
+    table = ResultTable("What threads would get", words(*names))
+    for one in changes:
+        thread, wanted = one.thread.thread, one.wanted
+        scheduling = "as it is"
+        if wanted.priority is not None:
+            scheduling = scheduling_text(POLICIES[wanted.policy], wanted.priority)
+        cores = listed(wanted.cores) if wanted.cores else "as they are"
+        cells = [", ".join(one.thread.nodes), str(thread.pid), str(thread.tid), thread.comm]
+        table.add(*cells, thread.role, one.server or "", scheduling, cores, one.reason)
+    return table
+
+
+def sweep_table(frame: pl.DataFrame) -> ResultTable:
+    """The axes and the most important figures of each point, those of many only for the first."""
+    axes = sweep_axes(frame)
+    names = [name.removesuffix("_ns") for name in (*axes, *SWEEP_FIGURES.values())]
+    table = ResultTable("Simulated end-to-end latency [ms]", figures(*names))
+    for row in frame.head(MOST_ROWS).to_dicts():
+        found = [
+            ms(row[name]) if row[name] is None or name.endswith("_ns") else str(row[name])
+            for name in SWEEP_FIGURES
+        ]
+        if row["error"] is not None:
+            found = ["failed", *([""] * (len(found) - 1))]
+        table.add(*(sweep_value(name, row[name]) for name in axes), *found)
+    if frame.height > MOST_ROWS:
+        table.caption = f"the first {MOST_ROWS} of {frame.height} points"
+    return table
+
+
+def sweep_axes(frame: pl.DataFrame) -> list[str]:
+    """Axes stand before what all sweeps have; a seed that is varied is one of them."""
+    return frame.columns[: frame.columns.index("cycles")]
+
+
+def sweep_value(name: str, value: Any) -> str:
+    """A point's place on an axis."""
+    if value is None:
+        return ABSENT
+    return format_duration(value) if name.endswith("_ns") else str(value)
