@@ -33,7 +33,8 @@ def as_text(case: Case) -> str:
     """A case as the driver reads it; modes are named by their numbers."""
     gate, modes = case.gate, case.gate.modes
     names = [] if modes is None else list(modes.bands)
-    words = [ANCHORS.index(gate.anchor), gate.phase_ns, LATE.index(gate.overrun), gate.due_cycles]
+    words: list[int | str] = [ANCHORS.index(gate.anchor), gate.phase_ns]
+    words += [LATE.index(gate.overrun), gate.due_cycles]
     words += [MESSAGES.index(gate.messages), gate.depth, gate.cycle_ns]
     words += [len(gate.slots), *(bound for slot in gate.slots for bound in slot)]
     words += [len(names)]

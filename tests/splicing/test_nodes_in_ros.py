@@ -62,7 +62,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> Path:
 @pytest.fixture
 def place(kind: NodeKind, request: pytest.FixtureRequest) -> Path | None:
     """Where the package of a kind is built."""
-    return None if kind == "python" else request.getfixturevalue("workspace")  # type: ignore[no-any-return]
+    return None if kind == "python" else request.getfixturevalue("workspace")
 
 
 def written(plan: Plan, kind: NodeKind, folder: Path, log: Path | None = None) -> ShapingProcess:
