@@ -101,8 +101,8 @@ def _event(line: str) -> str:
             arguments.append(f"{kind}_t, {field}_")
             macro = "ctf_integer_hex" if kind == "uint64" else "ctf_integer"
             fields.append(f"{macro}({kind}_t, {field}, {field}_)")
-    given, told = ", ".join(arguments), " ".join(fields)
-    return f"TRACEPOINT_EVENT(ros2, {name}, TP_ARGS({given}), TP_FIELDS({told}))"
+    given, declared = ", ".join(arguments), " ".join(fields)
+    return f"TRACEPOINT_EVENT(ros2, {name}, TP_ARGS({given}), TP_FIELDS({declared}))"
 
 
 def chain_command(program: Path, cycles: int = 40, period_us: int = 10_000) -> tuple[str, ...]:

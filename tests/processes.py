@@ -4,14 +4,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from chainshaper.linux.threads import list_threads
+from chainshaper.linux.threads import list_threads, parents
 
 __all__ = ["children_of", "marked_processes", "real_time_threads", "wait_for"]
 
 
 def children_of(pid: int) -> list[int]:
-    """Processes whose parent is ``pid``, dead ones that nobody has waited for included."""
-    return [child for child in _pids() if _parent(child) == pid]
+    """Processes whose parent is ``pid``, zombies included."""
+    return [child for child, parent in parents().items() if parent == pid]
 
 
 def marked_processes(marker: str) -> dict[int, str]:
@@ -20,11 +20,11 @@ def marked_processes(marker: str) -> dict[int, str]:
     Orphans are found as well: an environment stays when the parent is gone.
     """
     found = {}
-    for pid in _pids():
+    for pid in parents():
         try:
             if marker.encode() in Path(f"/proc/{pid}/environ").read_bytes():
                 found[pid] = Path(f"/proc/{pid}/comm").read_text().strip()
-        except OSError:  # it ended meanwhile, or belongs to somebody else
+        except OSError:  # it ended meanwhile, or is another user's
             continue
     return found
 
@@ -42,14 +42,3 @@ def wait_for(
     while not condition():
         assert time.monotonic() < deadline, f"waited {seconds} s in vain for {what}"
         time.sleep(pause)
-
-
-def _pids() -> list[int]:
-    return [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdigit()]
-
-
-def _parent(pid: int) -> int:
-    try:
-        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
-    except OSError:
-        return -1

@@ -19,12 +19,11 @@ from strangers import NOBODY, named, needs_root, open_folder, strange
 from chainshaper import find_threads
 from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow import apply as applying
-from chainshaper.linux.processes import read_process
+from chainshaper.linux.processes import read_process, run_users, user_of
 from chainshaper.linux.threads import has_ended, list_threads, start_of
-from chainshaper.linux.users import run_users, user_of
 from chainshaper.planning import Plan, save_plan
-from chainshaper.sources.ros import interpreter
-from chainshaper.sources.ros.interpreter import environment_of, own_environment, start_with_rclpy
+from chainshaper.sources import ros
+from chainshaper.sources.ros import environment_of, own_environment, start_with_rclpy
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 
 __all__ = ["open_folder"]
@@ -252,17 +251,17 @@ def test_what_a_stranger_has_run_is_bounded_in_time_and_in_what_it_prints(
     environment, _ = trap(open_folder)
     (open_folder / "evil").write_text("#!/bin/sh\nsleep 600 & echo $!; exec cat /dev/zero\n")
     with strange(["/bin/sleep", "600"], environment) as process:
-        script = start_with_rclpy(environment_of(process.pid), interpreter.__file__)
+        script = start_with_rclpy(environment_of(process.pid), ros.__file__)
         wait_for(script.is_over, "it to have printed all that it may")
         begun = time.monotonic()
         printed, problem = script.end()
         assert time.monotonic() - begun < 10
-        assert len(printed) <= interpreter._MOST_PRINTED
+        assert len(printed) <= ros._MOST_PRINTED
         assert problem is not None
         (open_folder / "evil").write_text("#!/bin/sh\nsleep 601 & echo $! > $0.pid; wait\n")
         (open_folder / "evil.pid").touch()
         (open_folder / "evil.pid").chmod(0o666)
-        script = start_with_rclpy(environment_of(process.pid), interpreter.__file__)
+        script = start_with_rclpy(environment_of(process.pid), ros.__file__)
         pid_file = open_folder / "evil.pid"
         wait_for(lambda: pid_file.read_text().endswith("\n"), "a child of it")
         child = int(pid_file.read_text())
@@ -277,7 +276,7 @@ def test_a_pipe_in_place_of_a_strangers_ros2_delays_nothing(open_folder: Path) -
     os.mkfifo(open_folder / "ros2", 0o777)
     (open_folder / "ros2").chmod(0o777)
     with strange(["/bin/sleep", "600"], {"PATH": f"{open_folder}:/usr/bin:/bin"}) as process:
-        script = start_with_rclpy(environment_of(process.pid), interpreter.__file__)
+        script = start_with_rclpy(environment_of(process.pid), ros.__file__)
         problem = script.end(30)[1]
     assert problem == "ModuleNotFoundError: No module named 'chainshaper'", "Python was found"
 

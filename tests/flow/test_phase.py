@@ -35,7 +35,7 @@ from chainshaper.flow.phase import (
     watch_wake_ups,
 )
 from chainshaper.planning import Plan
-from chainshaper.sources.ros.interpreter import Script
+from chainshaper.sources.ros import Script
 from chainshaper.values.errors import OperationError
 
 TICKING = """

@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -20,6 +22,24 @@ def kind(folder: Path) -> str:
     return (folder / "cgroup.type").read_text().strip()
 
 
+@contextmanager
+def frozen(name: str) -> Iterator[tuple[Path, "subprocess.Popen[bytes]"]]:
+    """A process that is stopped in a group of its own."""
+    with own_cgroup(name) as home:
+        process = subprocess.Popen(["sleep", "60"])
+        (home / "cgroup.procs").write_text(str(process.pid))
+        child = cgroups.make_threaded_child(home, "gated")
+        cgroups.move_thread(process.pid, child)
+        freeze(child)
+        yield child, process
+        assert cgroups.dissolve(child) is None
+
+
+def freeze(child: Path) -> None:
+    (child / "cgroup.freeze").write_text("1")
+    wait_for(lambda: "frozen 1" in (child / "cgroup.events").read_text(), "the freezer")
+
+
 def test_one_thread_stops_while_the_others_of_its_process_run_on(tmp_path: Path) -> None:
     with own_cgroup("one-thread") as home, stamping(tmp_path, 20) as spinner:
         (home / "cgroup.procs").write_text(str(spinner.tid))
@@ -28,8 +48,7 @@ def test_one_thread_stops_while_the_others_of_its_process_run_on(tmp_path: Path)
         assert cgroups.threads_in(child) == (spinner.tid,)
         assert cgroups.cgroup_of(spinner.tid) == child
         assert cgroups.cgroup_of(spinner.other_tid) == home
-        (child / "cgroup.freeze").write_text("1")
-        wait_for(lambda: "frozen 1" in (child / "cgroup.events").read_text(), "the freezer")
+        freeze(child)
 
         stopped, running = cpu_ns(spinner.tid), cpu_ns(spinner.other_tid)
         wait_for(lambda: cpu_ns(spinner.other_tid) > running + 50_000_000, "the other thread")
@@ -80,32 +99,20 @@ def test_children_born_in_the_group_are_put_back_as_well() -> None:
 
 
 def test_a_process_that_is_killed_while_frozen_ends_and_its_group_goes() -> None:
-    with own_cgroup("killed") as home:
-        process = subprocess.Popen(["sleep", "60"])
-        (home / "cgroup.procs").write_text(str(process.pid))
-        child = cgroups.make_threaded_child(home, "gated")
-        cgroups.move_thread(process.pid, child)
-        (child / "cgroup.freeze").write_text("1")
-        wait_for(lambda: "frozen 1" in (child / "cgroup.events").read_text(), "the freezer")
+    with frozen("killed") as (_, process):
         process.kill()
         assert process.wait(timeout=20) == -9
-        assert cgroups.dissolve(child) is None
 
 
-def test_a_zombie_does_not_keep_its_group() -> None:
-    with own_cgroup("zombie") as home:
-        process = subprocess.Popen(["sleep", "60"])
-        (home / "cgroup.procs").write_text(str(process.pid))
-        child = cgroups.make_threaded_child(home, "gated")
-        cgroups.move_thread(process.pid, child)
+def test_a_zombie_does_not_hold_its_group() -> None:
+    with frozen("zombie") as (_, process):
         born = start_of(process.pid, process.pid)
         assert born is not None
         assert not has_ended(process.pid, born)
         process.kill()
         wait_for(lambda: has_ended(process.pid, born), "its end")
-        assert cgroups.dissolve(child) is None
-        process.wait()
-        assert has_ended(process.pid, born)
+    process.wait()
+    assert has_ended(process.pid, born)
 
 
 def test_controllers_that_rule_threads_out_are_named() -> None:
@@ -140,20 +147,18 @@ def test_processes_beneath_the_group_rule_threads_out_and_are_named() -> None:
         (home.parent / "cgroup.procs").write_text(str(pid))
 
 
-def test_a_thread_cannot_join_a_group_of_another_domain() -> None:
+def test_what_the_kernel_refuses_is_said() -> None:
     with own_cgroup("foreign") as home, sleeping() as pid:
         child = cgroups.make_threaded_child(home, "gated")
         with pytest.raises(OperationError, match=rf"thread {pid} cannot be moved.*not supported"):
-            cgroups.move_thread(pid, child)
-        assert cgroups.dissolve(child) is None
-
-
-def test_a_name_that_is_taken_was_left_by_a_run_that_ended_badly() -> None:
-    with own_cgroup("taken") as home:
-        child = cgroups.make_threaded_child(home, "gated")
+            cgroups.move_thread(pid, child)  # it is of another domain
         with pytest.raises(OperationError, match=r"exists already.*chainshaper release"):
             cgroups.make_threaded_child(home, "gated")
         assert child.is_dir()
+        if Path("/proc/2/comm").read_text().strip() == "kthreadd":
+            with pytest.raises(OperationError, match="thread 2 cannot be moved"):
+                cgroups.move_thread(2, child)
+        assert cgroups.dissolve(child) is None
 
 
 def test_threads_that_have_ended_are_told_from_those_that_never_were() -> None:
@@ -166,15 +171,6 @@ def test_threads_that_have_ended_are_told_from_those_that_never_were() -> None:
             cgroups.cgroup_of(process.pid)
         assert start_of(process.pid, process.pid) is None
         assert has_ended(process.pid, 0)
-
-
-def test_a_thread_of_the_kernel_stays_where_it_is() -> None:
-    if Path("/proc/2/comm").read_text().strip() != "kthreadd":
-        pytest.skip("the kernel's threads are not visible in this container")
-    with own_cgroup("kernel") as home:
-        child = cgroups.make_threaded_child(home, "gated")
-        with pytest.raises(OperationError, match="thread 2 cannot be moved"):
-            cgroups.move_thread(2, child)
 
 
 def test_without_the_privilege_the_remedy_is_named() -> None:
@@ -197,21 +193,14 @@ def test_a_machine_without_the_hierarchy_is_told_how_to_mount_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mounts = tmp_path / "mounts"
-    monkeypatch.setattr(cgroups, "MOUNTS", mounts)
-    mounts.write_text("cgroup /sys/fs/cgroup/cpu cgroup rw,cpu 0 0\n")
-    with pytest.raises(PlatformError, match="mount -t cgroup2"):
-        cgroups.mount_point()
-    mounts.write_text("none /with\\040blank cgroup2 rw 0 0\n")
-    assert cgroups.mount_point() == Path("/with blank")
-
-
-def test_a_group_outside_what_is_mounted_here_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    mounts = tmp_path / "mounts"
-    mounts.write_text(f"none {tmp_path} cgroup2 rw 0 0\n")
     with own_cgroup("elsewhere") as home, sleeping() as pid:
         (home / "cgroup.procs").write_text(str(pid))
         monkeypatch.setattr(cgroups, "MOUNTS", mounts)
+        mounts.write_text("cgroup /sys/fs/cgroup/cpu cgroup rw,cpu 0 0\n")
+        with pytest.raises(PlatformError, match="mount -t cgroup2"):
+            cgroups.mount_point()
+        mounts.write_text("none /with\\040blank cgroup2 rw 0 0\n")
+        assert cgroups.mount_point() == Path("/with blank")
+        mounts.write_text(f"none {tmp_path} cgroup2 rw 0 0\n")  # its group is outside of that
         with pytest.raises(PlatformError, match=rf"thread {pid} .*elsewhere-.*container"):
             cgroups.cgroup_of(pid)

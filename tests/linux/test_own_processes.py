@@ -25,6 +25,7 @@ from chainshaper.linux.own_processes import (
     module_command,
     start_command,
 )
+from chainshaper.linux.threads import all_stats
 from chainshaper.values.errors import InputError
 
 SOURCES = Path(chainshaper.__file__).parent
@@ -84,23 +85,21 @@ def test_nothing_of_the_current_folder_or_of_python_variables_runs(module: str, 
     assert not run.stderr or "argv" in run.stderr
 
 
-@pytest.mark.parametrize("verb", ["run", "sweep"])
+@pytest.mark.parametrize(
+    ("verb", "options"),
+    [
+        ("run", "--cycles 3 -o {0}/rec"),
+        ("sweep", "--vary bands=1,2 --cycles 20 --workers 2 -o {0}/out.parquet"),
+    ],
+)
 def test_a_command_that_starts_processes_runs_nothing_of_the_current_folder(
-    verb: str, evil: Path, tmp_path: Path
+    verb: str, options: str, evil: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "application.yaml").write_text(small_chain_text())
-    more = {
-        "run": ["--cycles", "3", "-o", str(tmp_path / "rec")],
-        "sweep": [
-            *("--vary", "bands=1,2", "--cycles", "20", "--workers", "2"),
-            *("-o", str(tmp_path / "out.parquet")),
-        ],
-    }
     program = "import sys; from chainshaper.cli import main; main(sys.argv[1:])"
     command = [sys.executable, "-I", "-c", program, verb, str(tmp_path / "application.yaml")]
-    run = subprocess.run(
-        [*command, *more[verb]], cwd=evil, capture_output=True, text=True, check=False
-    )
+    command += options.format(tmp_path).split()
+    run = subprocess.run(command, cwd=evil, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
     assert marks(evil) == ""
 
@@ -269,10 +268,7 @@ def test_a_command_gets_a_sigint_when_we_are_killed(tmp_path: Path) -> None:
         f"start_command(['sh', '-c', {script!r}])\n"
         "time.sleep(60)"
     )
-    owner = subprocess.Popen(
-        [sys.executable, "-c", program],
-        stdout=subprocess.PIPE,
-    )
+    owner = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE)
     assert owner.stdout is not None
     assert owner.stdout.readline() == b"ready\n"
     owner.kill()
@@ -289,21 +285,15 @@ def test_commands_that_cannot_be_started_are_named_beforehand(tmp_path: Path) ->
         start_command([str(plain)])
 
 
-def test_the_end_of_a_command_in_words() -> None:
-    assert end_in_words(3) == "ended with code 3"
-    assert end_in_words(-11) == "was killed by SIGSEGV"
-    assert end_in_words(-40) == "was killed by signal 40"
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [(3, "ended with code 3"), (-11, "was killed by SIGSEGV"), (-40, "was killed by signal 40")],
+)
+def test_the_end_of_a_command_in_words(code: int, words: str) -> None:
+    assert end_in_words(code) == words
 
 
 def _group(leader: int) -> list[int]:
     """Living processes of a group."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit():
-            try:
-                fields = (entry / "stat").read_text().rpartition(")")[2].split()
-            except OSError:
-                continue
-            if int(fields[2]) == leader and fields[0] != "Z":
-                found.append(int(entry.name))
-    return found
+    stats = ((pid, fields) for pid, fields in all_stats() if fields[0] != b"Z")
+    return [pid for pid, (_, _, group, *_) in stats if int(group) == leader]

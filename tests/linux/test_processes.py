@@ -54,7 +54,7 @@ CASES = {
     "talker --ros-args -r a:=b -- -r __node:=no": (),
     "talker --ros-args -- --ros-args -r __node:=x": ("/x",),
     "sh -c 'talker --ros-args -r __node:=x'": (),
-    # What rcl refuses to start with names nobody.
+    # What rcl refuses to start with names no node.
     "talker --ros-args -r": (),
     "talker --ros-args -r __node:=": (),
     "talker --ros-args -r __node:=/foo/bar": (),

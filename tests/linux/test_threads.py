@@ -57,11 +57,7 @@ def test_threads_of_cyclone_dds_and_fast_dds_are_known_by_name(
 def test_names_of_others_say_nothing(name: str) -> None:
     assert dds_kind(name) is None
     assert role_of(name, is_main=False) == "unknown"
-
-
-def test_the_main_thread_executes_whatever_it_is_called() -> None:
-    assert role_of("gc", is_main=True) == "executor"
-    assert role_of("talker", is_main=True) == "executor"
+    assert role_of(name, is_main=True) == role_of("gc", is_main=True) == "executor"
 
 
 def test_a_process_has_its_main_thread_first_and_named_threads_by_name() -> None:
@@ -116,24 +112,21 @@ def test_a_name_with_brackets_and_spaces_does_not_confuse(tmp_path: Path) -> Non
 
 
 def test_in_a_container_a_thread_has_an_id_of_its_own() -> None:
-    assert innermost_id("Name:\tx\nNSpid:\t4711\t12\t3\n") == 3
-    assert innermost_id("Name:\tx\nNSpid:\t4711\n") == 4711
-    assert innermost_id("Name:\tx\n") is None  # a kernel without pid namespaces
+    assert innermost_id(b"Name:\tx\nNSpid:\t4711\t12\t3\n") == 3
+    assert innermost_id(b"Name:\tx\nNSpid:\t4711\n") == 4711
+    assert innermost_id(b"Name:\tx\n") is None  # a kernel without pid namespaces
 
 
 def _thread(tid: int) -> Thread:
     return Thread(tid, os.getpid(), "recv", "dds", "SCHED_OTHER", 0, (0,))
 
 
-def test_scheduling_a_thread_that_has_ended_is_no_error() -> None:
-    thread = threading.Thread(target=lambda: None)
-    thread.start()
-    thread.join()
-    assert thread.native_id is not None
-    apply_scheduling(_thread(thread.native_id), Scheduling(None, (available_cores()[0],)))
-
-
-def test_what_the_kernel_refuses_names_the_thread() -> None:
+def test_scheduling_a_thread_that_has_ended_is_no_error_and_what_is_refused_is_named() -> None:
+    ended = threading.Thread(target=lambda: None)
+    ended.start()
+    ended.join()
+    assert ended.native_id is not None
+    apply_scheduling(_thread(ended.native_id), Scheduling(None, (available_cores()[0],)))
     thread = _thread(threading.get_native_id())
     with pytest.raises(OperationError, match=rf"thread {thread.tid} \(recv\).*priority 500"):
         apply_scheduling(thread, Scheduling(500, None))
@@ -148,16 +141,10 @@ def test_asking_for_real_time_scheduling_changes_nothing() -> None:
 
 
 def test_a_missing_core_is_named_with_who_wants_it_and_what_there_is() -> None:
-    check_cores({available_cores()[0]: "scheduling.dds"})
-    with pytest.raises(PlatformError) as refused:
-        check_cores({available_cores()[0]: "scheduling.dds", 1023: "node lidar"})
-    text = str(refused.value)
-    assert "core 1023" in text
-    assert "node lidar" in text
-    assert ", ".join(map(str, available_cores())) in text
-
-
-def test_throttling_is_a_share_of_a_core() -> None:
+    core, *_ = cores = available_cores()
+    check_cores({core: "scheduling.dds"})
+    with pytest.raises(PlatformError, match=rf"core 1023, .*lidar.*{', '.join(map(str, cores))}"):
+        check_cores({core: "scheduling.dds", 1023: "node lidar"})
     assert 0.0 < throttle_fraction() <= 1.0
 
 

@@ -8,25 +8,24 @@ import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from traced_program import build, skip_without_bpftrace
+from traced_program import built, skip_without_bpftrace
 
-from chainshaper.sources.ebpf.printing import (
+from chainshaper.sources.ebpf.session import lost_events
+from chainshaper.sources.ebpf.trace_points import (
     FIRST_POINT,
+    FUNCTION_PREFIX,
     HEADER,
     NAME_PLACE,
     RMW_PLACE,
     TEXT_BYTES,
     TEXT_CODE,
     TEXT_LINES,
-    bpftrace_script,
-    lost_events,
-    read_printed,
-)
-from chainshaper.sources.ebpf.trace_points import (
-    FUNCTION_PREFIX,
+    Printed,
     TracePoint,
     TracingLibrary,
+    bpftrace_script,
     installed_libraries,
+    read_printed,
     trace_points,
 )
 from chainshaper.values import events
@@ -35,8 +34,8 @@ from chainshaper.values.errors import InputError
 ALL = frozenset(FUNCTION_PREFIX + event for event in events.FIELDS)
 
 
-def library(version: str | None, path: str = "/opt/ros/any/lib/libtracetools.so") -> TracingLibrary:
-    return TracingLibrary(Path(path), ALL, version)
+def library(version: str | None) -> TracingLibrary:
+    return TracingLibrary(Path("/opt/ros/any/lib/libtracetools.so"), ALL, version)
 
 
 def point(event: str, version: str | None = "8.2.3") -> TracePoint:
@@ -45,14 +44,14 @@ def point(event: str, version: str | None = "8.2.3") -> TracePoint:
 
 
 @pytest.mark.parametrize(
-    ("version", "flags"), [("4.1.1", "-DHUMBLE"), ("7.1.0", "-O2"), ("8.2.3", "-O2")]
+    ("version", "flags"), [("4.1.1", ("-DHUMBLE",)), ("7.1.0", ()), ("8.2.3", ())]
 )
 def test_bpftrace_accepts_the_script_of_every_distribution(
-    version: str, flags: str, tmp_path: Path
+    version: str, flags: tuple[str, ...], tmp_path: Path
 ) -> None:
     skip_without_bpftrace()
-    built = build(tmp_path / "a prefix", flags, version=version)
-    points = trace_points(installed_libraries({"AMENT_PREFIX_PATH": str(built.prefix)}))
+    prefix = built(*flags, version=version).prefix
+    points = trace_points(installed_libraries({"AMENT_PREFIX_PATH": str(prefix)}))
     script = tmp_path / "events.bt"
     script.write_text(bpftrace_script(points, (1, 2), attached=True))
     options = subprocess.run(["bpftrace", "--help"], capture_output=True, text=True, check=False)
@@ -80,13 +79,23 @@ def test_only_exported_functions_get_a_probe() -> None:
     assert bpftrace_script(points).count("uprobe:") == 1
 
 
-def test_limits_hold_for_every_probe_and_follow_what_is_started() -> None:
-    script = bpftrace_script(trace_points([library("8.2.3")]), (17, 18))
+def test_events_are_limited_to_processes_and_what_they_start_or_else_to_users() -> None:
+    points = trace_points([library("8.2.3")])
+
+    def limits(script: str) -> set[str]:
+        probes = [line for line in script.splitlines() if line.startswith("uprobe:")]
+        assert len(probes) == len(points)
+        return {probe.partition(" ")[2] for probe in probes}
+
+    script = bpftrace_script(points, (17, 18), users=(0,))
     assert "@traced[17] = 1;" in script
     assert "tracepoint:sched:sched_process_fork /@traced[pid]/" in script
-    probes = [line for line in script.splitlines() if line.startswith("uprobe:")]
-    assert all(line.endswith("/@traced[pid]/") for line in probes)
-    assert "@traced" not in bpftrace_script(trace_points([library("8.2.3")]))
+    assert "uid" not in script
+    assert limits(script) == {"/@traced[pid]/"}
+    by_user = bpftrace_script(points, users=(1000, 0))
+    assert limits(by_user) == {"/uid == 0 || uid == 1000/"}
+    assert "@traced" not in by_user
+    assert limits(bpftrace_script(points)) == {""}
 
 
 @given(st.text(min_size=1))
@@ -94,7 +103,7 @@ def test_no_path_gets_into_the_script_that_could_end_its_quotes_or_mean_several_
     name: str,
 ) -> None:
     path = f"/opt/{name}/lib/libtracetools.so"
-    (end,) = (one for one in trace_points([library(None, path)]) if one.event == "callback_end")
+    end = TracePoint("callback_end", Path(path), library(None))
     try:
         script = bpftrace_script([end])
     except InputError as error:
@@ -104,13 +113,10 @@ def test_no_path_gets_into_the_script_that_could_end_its_quotes_or_mean_several_
     assert f'uprobe:"{Path(path)}":ros_trace_callback_end\n' in script
 
 
-def test_events_are_limited_to_processes_or_else_to_users() -> None:
-    points = trace_points([library("8.2.3")])
-    by_user = bpftrace_script(points, users=(1000, 0))
-    probes = [line for line in by_user.splitlines() if line.startswith("uprobe:")]
-    assert probes
-    assert all(line.endswith("/uid == 0 || uid == 1000/") for line in probes)
-    assert "uid" not in bpftrace_script(points, (17,), users=(0,))
+def read(folder: Path, points: list[TracePoint], *lines: str, ahead_ns: int = 0) -> Printed:
+    file = folder / "events.txt"
+    file.write_text(HEADER + "\n".join(lines))
+    return read_printed(file, points, ahead_ns)
 
 
 def printed_text(text: bytes, place: int, skipped: int) -> list[str]:
@@ -140,9 +146,7 @@ def test_names_of_any_length_and_alignment_are_put_together_again(
     code = FIRST_POINT
     event = f"{code}\t1000\t7\t7\t0\t21\t22\t23"
     lines = [*reversed(lines), event] if reversed_lines else [event, *lines]
-    file = tmp_path_factory.mktemp("printed") / "events.txt"
-    file.write_text(HEADER + "\n".join(lines) + "\n")
-    printed = read_printed(file, [point("rcl_service_init")], ahead_ns=0)
+    printed = read(tmp_path_factory.mktemp("printed"), [point("rcl_service_init")], *lines, "")
     row = printed.tables["rcl_service_init"].row(0, named=True)
     assert row["service_name"] == name.decode(errors="replace")
     assert (row["service_handle"], row["node_handle"], row["rmw_service_handle"]) == (21, 22, 23)
@@ -155,9 +159,7 @@ def test_a_name_whose_beginning_was_lost_is_unknown_and_a_longer_one_is_cut_and_
     lost = printed_text(b"/a" * 60, 3, 0)[1:]
     long = [line.replace("\t1000\t", "\t2000\t") for line in printed_text(b"/b" * 600, 3, 5)]
     rows = [f"{FIRST_POINT}\t{time}\t7\t7\t0\t21\t22\t23" for time in (1000, 2000)]
-    file = tmp_path / "events.txt"
-    file.write_text(HEADER + "\n".join([*rows, *lost, *long]) + "\n")
-    printed = read_printed(file, [point("rcl_service_init")], ahead_ns=0)
+    printed = read(tmp_path, [point("rcl_service_init")], *rows, *lost, *long, "")
     first, second = printed.tables["rcl_service_init"]["service_name"]
     assert first is None
     assert ("/b" * 600).startswith(second)
@@ -166,18 +168,22 @@ def test_a_name_whose_beginning_was_lost_is_unknown_and_a_longer_one_is_cut_and_
 
 
 def test_lines_of_other_cores_are_sorted_and_bpftraces_own_are_left_out(tmp_path: Path) -> None:
-    code = FIRST_POINT
-    file = tmp_path / "events.txt"
-    file.write_text(
-        f"{HEADER}Attaching 3 probes...\n{code}\t3000\t7\t8\t1\t140737488355327\n"
-        f"Lost 12 events\n{code}\t1000\t7\t7\t0\t5\nLost 30 events\n"
-        '1\t2000\t0\t0\t0\t0\t120\t0\t7\t-81\t\t\t\t\t\tswapper/0\tnode with "\n'
-        "1\t2500\t7\t7\t0\t\t\t\t8\n"
-        f"\n{code}\t40"  # it was killed here
+    printed = read(
+        tmp_path,
+        [point("callback_end")],
+        "Attaching 3 probes...",
+        f"{FIRST_POINT}\t3000\t7\t8\t1\t140737488355327",
+        "Lost 12 events",
+        f"{FIRST_POINT}\t1000\t7\t7\t0\t5",
+        "Lost 30 events",
+        '1\t2000\t0\t0\t0\t0\t120\t0\t7\t-81\t\t\t\t\t\tswapper/0\tnode with "',
+        "1\t2500\t7\t7\t0\t\t\t\t8",
+        "",
+        f"{FIRST_POINT}\t40",  # it was killed here
+        ahead_ns=100,
     )
     other = tmp_path / "said.log"
     other.write_text("Lost 1 events\n")
-    printed = read_printed(file, [point("callback_end")], ahead_ns=100)
     assert printed.tables["callback_end"].rows() == [(900, 7, 7, 0, 5), (2900, 7, 8, 1, 2**47 - 1)]
     switches = printed.tables["sched_switch"]
     assert switches.select("time", "prev_tid", "next_tid", "next_prio").rows() == [
@@ -185,23 +191,19 @@ def test_lines_of_other_cores_are_sorted_and_bpftraces_own_are_left_out(tmp_path
         (2400, None, 8, None),
     ]
     assert switches.row(0, named=True)["next_comm"] == 'node with "'
-    assert lost_events(file, other, tmp_path / "absent") == 43
+    assert lost_events(tmp_path / "events.txt", other, tmp_path / "absent") == 43
 
 
 def test_names_of_handles_come_with_the_event_they_were_read_at(tmp_path: Path) -> None:
     points = [point("rmw_publish"), point("rmw_take")]
     take = f"{FIRST_POINT + 1}\t1000\t7\t7\t0\t77\t78\t79\t1"
     lines = [take, *printed_text(b"/t1", NAME_PLACE, 2), *printed_text(b"rmw_x", RMW_PLACE, 0)]
-    file = tmp_path / "events.txt"
-    file.write_text(HEADER + "\n".join(lines) + "\n")
-    printed = read_printed(file, points, ahead_ns=0)
+    printed = read(tmp_path, points, *lines, "")
     assert printed.handles.rows() == [(7, "rmw_take", 77, "/t1")]
     assert printed.rmw == "rmw_x"
 
 
 def test_a_version_that_is_no_argument_comes_from_the_librarys_package(tmp_path: Path) -> None:
-    file = tmp_path / "events.txt"
-    file.write_text(f"{HEADER}{FIRST_POINT}\t1000\t7\t7\t0\t77\n")
-    printed = read_printed(file, [point("rcl_init")], ahead_ns=0)
+    printed = read(tmp_path, [point("rcl_init")], f"{FIRST_POINT}\t1000\t7\t7\t0\t77", "")
     assert printed.tables["rcl_init"].select("context_handle", "version").rows() == [(77, "8.2.3")]
     assert printed.tables["rcl_init"].schema["version"] == pl.String

@@ -1,17 +1,19 @@
 """LTTng traces as recordings: stories written as a tracer would have, and opened again."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 import pytest
 from command_line import called, json_of, refused
-from ctf_writing import lttng_metadata, write_lttng_trace, write_trace
+from ctf_writing import EventRecord, lttng_metadata, write_lttng_trace, write_packet, write_trace
 from reference import babeltrace
 from story import OFFSET, Story
 
 from chainshaper.analysis import analyse_latency, application_graph, callback_statistics, data_flow
 from chainshaper.sources import open_source
+from chainshaper.sources.lttng.trace import NEXT_HOST
 from chainshaper.values import events
 from chainshaper.values.errors import InputError
 
@@ -44,6 +46,14 @@ def shifted(story: Story, by: int = START) -> dict[str, pl.DataFrame]:
 
 def written(folder: Path, story: Story, **options: Any) -> Path:
     return write_lttng_trace(folder, shifted(story), clock_offset_ns=OFFSET, **options)
+
+
+def switch(story: Story, threads: Mapping[int, tuple[int, int]]) -> None:
+    """Time → from which thread to which the core goes."""
+    for time, (before, after) in threads.items():
+        story.event("sched_switch", time, before, prev_comm=f"thread_{before}", prev_tid=before,
+                    prev_prio=20, prev_state=0, next_comm=f"thread_{after}", next_tid=after,
+                    next_prio=20)  # fmt: skip
 
 
 def test_tables_come_back_as_they_were_written(tmp_path: Path) -> None:
@@ -99,18 +109,9 @@ def test_folders_of_processes_are_merged_by_time(tmp_path: Path) -> None:
 def test_execution_times_from_a_kernel_trace_beside_user_space(tmp_path: Path) -> None:
     """Node b's thread loses its core for 50 of the 200 ns of every instance."""
     story = chain_story(cycles=3)
-    for cycle in range(3):
-        now = 1000 + 1000 * cycle
-        for time, before, after in (
-            (now - 10, 0, 10),
-            (now + 160, 10, 11),
-            (now + 250, 11, 99),
-            (now + 300, 99, 11),
-            (now + 410, 11, 0),
-        ):
-            story.event("sched_switch", time, before, prev_comm=f"thread_{before}",
-                        prev_tid=before, prev_prio=20, prev_state=0,
-                        next_comm=f"thread_{after}", next_tid=after, next_prio=20)  # fmt: skip
+    for now in (1000, 2000, 3000):
+        threads = {now - 10: (0, 10), now + 160: (10, 11), now + 250: (11, 99)}
+        switch(story, {**threads, now + 300: (99, 11), now + 410: (11, 0)})
     trace = written(tmp_path / "trace", story)
     assert (trace / "kernel" / "metadata").is_file()
     execution = {row["node"]: row["execution_ns"] for row in json_of("callbacks", trace)}
@@ -125,21 +126,19 @@ def test_execution_times_from_a_kernel_trace_beside_user_space(tmp_path: Path) -
 
 
 def test_what_the_tracer_dropped_is_in_every_result(tmp_path: Path) -> None:
-    trace = written(tmp_path / "trace", chain_story(), discarded_events=7)
+    trace, recording = (
+        written(tmp_path / "trace", chain_story(), discarded_events=7),
+        tmp_path / "r",
+    )
     lost = {"discarded_events": 7, "lost_packets": 0}
-    assert json_of("info", trace)["lost"] == lost
-    assert json_of("graph", trace)["lost"] == lost
-    assert json_of("chains", trace)["lost"] == lost
-    assert json_of("latency", trace, "--chain", "/x../y")["lost"] == lost
     said = "lost while recording: 7 discarded events"
-    for verb in (("info",), ("graph",), ("callbacks",), ("chains",)):
-        assert said in called(*verb, trace).out
-    assert said in called("latency", trace, "--chain", "/x../y").out
-    assert said in called("callbacks", trace, "--json").err, "its array has no place for it"
-    compared = called("compare", trace, trace, "--chain", "/x../y").out
-    assert "lost while recording" in compared
-    recording = tmp_path / "recording"
     assert said in called("convert", trace, "-o", recording).err
+    verbs = (("info",), ("graph",), ("chains",), ("latency", "--chain", "/x../y"))
+    for verb, *options in verbs:
+        assert json_of(verb, trace, *options)["lost"] == lost
+        assert said in called(verb, trace, *options).out
+    assert said in called("callbacks", trace, "--json").err, "its array has no place for it"
+    assert "lost while recording" in called("compare", trace, trace, "--chain", "/x../y").out
     assert json_of("info", recording)["lost"] == lost
 
 
@@ -157,25 +156,6 @@ def test_tracing_started_after_the_application(tmp_path: Path) -> None:
     assert "tracing has to start before" in refused(2, "latency", trace, "--chain", "/x../y")
 
 
-def test_two_processes_with_nodes_of_one_name(tmp_path: Path) -> None:
-    story = chain_story()
-    other = story.node("/b", 20)
-    reader = story.subscription(other, "/x")
-    story.runs(reader, 1500, 1600, reads=1100)
-    rows = json_of("callbacks", written(tmp_path / "trace", story))
-    counts = {row["pid"]: row["count"] for row in rows if row["node"] == "/b"}
-    assert counts == {11: 5, 20: 1}
-
-
-def test_gids_of_16_bytes(tmp_path: Path) -> None:
-    story = chain_story()
-    gid = [1, 16, *range(14)]
-    story.event("rmw_publisher_init", 0, 10, rmw_publisher_handle=5, gid=gid)
-    recording = open_source(written(tmp_path / "trace", story, gid_length=16))
-    assert recording.events["rmw_publisher_init"]["gid"].to_list() == [gid]
-    assert (recording.info.distribution, recording.info.rmw) == ("kilted", "rmw_cyclonedds_cpp")
-
-
 def test_before_jazzy_publications_carry_no_timestamp(tmp_path: Path) -> None:
     tables = shifted(chain_story())
     published = tables["rmw_publish"]
@@ -187,45 +167,6 @@ def test_before_jazzy_publications_carry_no_timestamp(tmp_path: Path) -> None:
     trace = write_lttng_trace(tmp_path / "trace", tables, clock_offset_ns=OFFSET)
     found = json_of("latency", trace, "--chain", "/x../y")
     assert (found["count"], found["min_ns"], found["max_ns"]) == (5, 300, 300)
-
-
-def test_messages_within_a_process(tmp_path: Path) -> None:
-    """Through a ring buffer: published, enqueued, dequeued, and no event of DDS."""
-    story = Story()
-    node = story.node("/container", 10)
-    timer, reader = story.timer(node), story.subscription(node, "/x")
-    x, y = story.publisher(node, "/x"), story.publisher(node, "/y")
-    rclcpp = story.rows["rclcpp_subscription_init"][0]["subscription"]
-    story.event("rclcpp_construct_ring_buffer", 1, 10, buffer=77, capacity=10)
-    story.event("rclcpp_buffer_to_ipb", 1, 10, buffer=77, ipb=78)
-    story.event("rclcpp_ipb_to_subscription", 2, 10, ipb=78, subscription=rclcpp)
-    for index, now in enumerate((1000, 2000)):
-        story.start(timer, now)
-        story.event("rclcpp_intra_publish", now + 10, 10, publisher_handle=x.handle, message=1)
-        story.event("rclcpp_ring_buffer_enqueue", now + 11, 10, buffer=77, index=index, size=1,
-                    overwritten=0)  # fmt: skip
-        story.end(timer, now + 20)
-        story.event("rclcpp_ring_buffer_dequeue", now + 30, 10, buffer=77, index=index, size=0)
-        story.start(reader, now + 31, intra=1)
-        story.publish(y, now + 40)
-        story.end(reader, now + 50)
-    found = json_of("latency", written(tmp_path / "trace", story), "--chain", "/x../y")
-    assert (found["count"], found["min_ns"], found["max_ns"]) == (2, 40, 40)
-
-
-def test_python_nodes(tmp_path: Path) -> None:
-    """rclpy emits no callback events: its takes and publications are all there is."""
-    story = Story()
-    node, source = story.node("/python", 10), story.node("/source", 11)
-    reader = story.subscription(node, "/x", callbackless=True)
-    x, y = story.publisher(source, "/x"), story.publisher(node, "/y")
-    timer = story.timer(source)
-    for now in (1000, 2000):
-        story.runs(timer, now, now + 20, writes=((x, now + 10),))
-        story.take(reader, now + 50, sent=now + 10)
-        story.publish(y, now + 70)
-    found = json_of("latency", written(tmp_path / "trace", story), "--chain", "/x../y")
-    assert (found["count"], found["max_ns"]) == (2, 70)
 
 
 def test_components_share_a_process(tmp_path: Path) -> None:
@@ -289,14 +230,193 @@ def test_a_trace_without_ros_events_cannot_be_converted(tmp_path: Path) -> None:
     assert not (tmp_path / "recording").exists()
 
 
-def test_nothing_is_overwritten(tmp_path: Path) -> None:
+def test_a_graph_is_written_where_it_can_be(tmp_path: Path) -> None:
+    trace, picture = written(tmp_path / "trace", chain_story()), tmp_path / "graph.svg"
+    picture.write_text("mine")
+    assert "exists already and is not overwritten" in refused(2, "graph", trace, "-o", picture)
+    other = refused(2, "graph", trace, "-o", picture.with_suffix(".png"))
+    assert "ends in .svg or .dot or .json" in other
+    assert picture.read_text() == "mine"
+
+
+def one_event(folder: Path, name: str, kinds: dict[str, str], payload: dict[str, Any]) -> None:
+    """A trace of a single event, of process 10."""
+    text = lttng_metadata({name: kinds}, {"vpid": "s32", "vtid": "s32"})
+    event = EventRecord(name, START, payload, {"vpid": 10, "vtid": 10})
+    write_packet(folder, text, [event])
+
+
+def test_another_providers_events_of_the_same_name_are_not_ours(tmp_path: Path) -> None:
+    one_event(tmp_path / "trace", "mine:callback_start", {"callback": "x64"}, {"callback": 1})
+    recording = open_source(tmp_path / "trace")
+    assert len(recording.events) == 0
+    assert json_of("info", tmp_path / "trace")["events"] == {"mine:callback_start": 1}
+
+
+@pytest.mark.parametrize(
+    ("field", "damaged"),
+    [("topic_name", "x64"), ("publisher_handle", "string"), ("node_handle", "u32[]")],
+)
+def test_fields_of_another_kind_are_said_to_be_unknown(
+    field: str, damaged: str, tmp_path: Path
+) -> None:
+    kinds = {"publisher_handle": "x64", "node_handle": "x64", "rmw_publisher_handle": "x64",
+             "topic_name": "string", "queue_depth": "u64"} | {field: damaged}  # fmt: skip
+    values: dict[str, Any] = {"x64": 7, "u64": 7, "string": "seven", "u32[]": [7]}
+    payload = {name: values[kind] for name, kind in kinds.items()}
+    payload[f"_{field}_length"] = 1
+    one_event(tmp_path / "trace", "ros2:rcl_publisher_init", kinds, payload)
+    said = called("graph", tmp_path / "trace")
+    assert said.code == 0
+    assert f"rcl_publisher_init has no usable field {field}" in said.err
+
+
+def test_events_of_nobody_knows_which_thread_are_counted_and_left_out(tmp_path: Path) -> None:
+    """LTTng without contexts; `ros2 trace` always asks for them."""
+    text = lttng_metadata({"ros2:callback_start": {"callback": "x64"}}, {"procname": "char[17]"})
+    event = EventRecord("ros2:callback_start", START, {"callback": 1}, {"procname": "node"})
+    write_packet(tmp_path / "trace", text, [event, event])
+    for verb in ("callbacks", "graph", "chains"):
+        said = called(verb, tmp_path / "trace")
+        assert said.code == 0
+        assert "2 events say no process or thread and cannot be used" in said.err
+        assert "--type=vpid --type=vtid" in said.err
+    assert json_of("info", tmp_path / "trace")["events"] == {"ros2:callback_start": 2}
+
+
+def test_what_a_conversion_leaves_behind_is_said(tmp_path: Path) -> None:
+    """And `info` goes on to show the events that the trace had, under their full names."""
     trace = written(tmp_path / "trace", chain_story())
-    for name, verb in (("rec", "convert"), ("graph.svg", "graph")):
-        (tmp_path / name).write_text("mine")
-        said = refused(2, verb, trace, "-o", tmp_path / name)
-        assert f"{name} exists already and is not overwritten" in said
-        assert (tmp_path / name).read_text() == "mine"
-    assert "ends in .svg or .dot or .json" in refused(
-        2, "graph", trace, "-o", tmp_path / "graph.png"
-    )
-    assert "no such folder" in refused(2, "graph", trace, "-o", tmp_path / "no" / "graph.svg")
+    one_event(trace / "dds", "dds:write", {"data": "x64"}, {"data": 1})
+    shown = json_of("info", trace)
+    assert shown["events"]["dds:write"] == 1
+    said = called("convert", trace, "-o", tmp_path / "once").err
+    assert "1 events of kinds that chainshaper makes no use of were not kept: dds:write" in said
+    called("convert", tmp_path / "once", "-o", tmp_path / "twice")
+    for name in ("once", "twice"):
+        again = json_of("info", tmp_path / name)
+        assert again["events"] == shown["events"]
+        assert sum("not kept" in note for note in again["notes"]) == 1
+
+
+def container(folder: Path, host: str, names: tuple[str, str], shift: int) -> None:
+    """A container's own trace: its processes are 10 and 11, as in every other container."""
+    tables = {
+        name: frame.with_columns(
+            pl.col(column) + shift
+            for column in ("time", "timestamp", "source_timestamp")
+            if column in frame.columns
+        )
+        for name, frame in shifted(chain_story(names=names)).items()
+    }
+    write_lttng_trace(folder, tables, clock_offset_ns=OFFSET, host=host)
+
+
+def test_containers_with_the_same_process_numbers_are_told_apart(tmp_path: Path) -> None:
+    container(tmp_path / "trace" / "one", "one", ("a", "b"), 0)
+    container(tmp_path / "trace" / "two", "two", ("c", "d"), 120)
+    recording = open_source(tmp_path / "trace")
+    moved = NEXT_HOST + 10
+    assert recording.info.host == "one, two"
+    assert recording.info.processes == {10: "/a", 11: "/b", moved: "/c", moved + 1: "/d"}
+    assert [note for note in recording.info.notes if "host two" in note]
+    graph = application_graph(recording.events)
+    assert {(c.node, c.pid) for c in graph.callbacks} == {
+        ("/a", 10),
+        ("/b", 11),
+        ("/c", moved),
+        ("/d", moved + 1),
+    }
+    for chain in ("/a../b../y", "/c../d../y"):
+        figures = analyse_latency(recording, chain).statistics
+        assert (figures.count, figures.min_ns, figures.max_ns) == (5, 300, 300)
+    together = json_of("info", tmp_path / "trace")["events"]
+    alone = json_of("info", tmp_path / "trace" / "one")["events"]
+    assert together == {name: 2 * count for name, count in alone.items()}
+
+
+def test_hosts_with_different_process_numbers_keep_them(tmp_path: Path) -> None:
+    tables = shifted(chain_story())
+    for pid, host in ((10, "one"), (11, "two")):
+        own = {name: frame.filter(pid=pid) for name, frame in tables.items()}
+        write_lttng_trace(tmp_path / "trace" / host, own, clock_offset_ns=OFFSET, host=host)
+    recording = open_source(tmp_path / "trace")
+    assert recording.info.processes == {10: "/a", 11: "/b"}
+    assert recording.info.notes == ()
+    assert analyse_latency(recording, "/x../y").statistics.count == 5
+
+
+def test_threads_of_a_container_are_not_the_kernels_of_the_same_numbers(tmp_path: Path) -> None:
+    """The kernel's thread 11 runs now and then, never while the container's 11 does."""
+    story = chain_story(cycles=4)
+    for now in range(1000, 5000, 1000):
+        switch(story, {now + 500: (0, 11), now + 600: (11, 0)})
+    rows = json_of("callbacks", written(tmp_path / "trace", story))
+    assert [row["execution_ns"] for row in rows] == [None, None]
+
+
+def test_services_and_their_clients(tmp_path: Path) -> None:
+    """A client asks twice; the server's callback runs twice. The client's own is not traced."""
+    story = Story()
+    server, client = story.node("/server", 10), story.node("/client", 11)
+    story.event("rcl_service_init", 1, 10, service_handle=50, node_handle=server.handle,
+                rmw_service_handle=51, service_name="/add")  # fmt: skip
+    story.event("rclcpp_service_callback_added", 2, 10, service_handle=50, callback=52)
+    story.event("rclcpp_callback_register", 3, 10, callback=52, symbol="Server::add()")
+    story.event("rcl_client_init", 4, 11, client_handle=60, node_handle=client.handle,
+                rmw_client_handle=61, service_name="/add")  # fmt: skip
+    for now in (1000, 2000):
+        story.event("callback_start", now, 10, callback=52, is_intra_process=0)
+        story.event("callback_end", now + 70, 10, callback=52)
+    trace = written(tmp_path / "trace", story)
+    (row,) = json_of("callbacks", trace)
+    assert (row["node"], row["kind"], row["topic"]) == ("/server", "service", "/add")
+    assert (row["count"], row["response_ns"]["max"]) == (2, 70)
+    graph = json_of("graph", trace)
+    assert [(c["node"], c["kind"], c["topic"]) for c in graph["callbacks"]] == [
+        ("/server", "service", "/add"),
+        ("/client", "client", "/add"),
+    ]
+    (service,) = graph["services"]
+    assert (service["servers"], service["clients"]) == (["/server"], ["/client"])
+    assert graph["notes"] == [], "a client is no Python subscription"
+
+
+def test_without_rcl_init_the_fields_tell_the_distribution(tmp_path: Path) -> None:
+    story = chain_story()
+    story.event("rmw_publisher_init", 0, 10, rmw_publisher_handle=1, gid=[1, 16, *[0] * 14])
+    trace = written(tmp_path / "trace", story, gid_length=16)
+    info = json_of("info", trace)
+    assert "ros2:rcl_init" not in info["events"]
+    assert (info["distribution"], info["rmw"]) == ("kilted", "rmw_cyclonedds_cpp")
+    assert json_of("latency", trace, "--chain", "/x../y")["count"] == 5
+
+
+def test_a_callback_in_several_threads_of_one_executor(tmp_path: Path) -> None:
+    """Both threads take a message before either starts the callback; 2 overtakes 1."""
+    story = Story()
+    source, worker = story.node("/source", 10), story.node("/worker", 11)
+    timer, reader = story.timer(source), story.subscription(worker, "/x")
+    x, y = story.publisher(source, "/x"), story.publisher(worker, "/y")
+    story.runs(timer, 1000, 1020, writes=((x, 1010),))
+    story.runs(timer, 1100, 1120, writes=((x, 1110),))
+    story.take(reader, 1200, sent=1010, tid=21)
+    story.take(reader, 1201, sent=1110, tid=22)
+    for thread, start, sent, end in ((22, 1202, 1250, 1300), (21, 1203, 1350, 1400)):
+        story.start(reader, start, thread)
+        story.publish(y, sent, thread)
+        story.end(reader, end, thread)
+    found = json_of("latency", written(tmp_path / "trace", story), "--chain", "/x../y",
+                    "--instances")  # fmt: skip
+    assert [one["latency_ns"] for one in found["instances"]] == [350, 150]
+
+
+def test_messages_within_a_process_that_no_event_shows(tmp_path: Path) -> None:
+    """Before Iron, ring buffers have no events: the callback says that it got its message there."""
+    story = chain_story()
+    container = story.node("/container", 12)
+    inside = story.subscription(container, "/z")
+    story.start(inside, 5000, intra=1)
+    story.end(inside, 5010)
+    (note,) = data_flow(open_source(written(tmp_path / "trace", story)).events).notes
+    assert "1 callback instances got their message within their process" in note

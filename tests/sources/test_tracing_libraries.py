@@ -1,4 +1,4 @@
-"""Finding `libtracetools.so`, and what it exports."""
+"""Finding `libtracetools.so`, and what it exports; functions of callbacks in a program's memory."""
 
 import os
 import shutil
@@ -6,20 +6,25 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from traced_program import build
+from traced_program import built
 
-from chainshaper.sources.ebpf import trace_points as tracing_libraries
-from chainshaper.sources.ebpf.trace_points import (
+from chainshaper.sources.ebpf import trace_points
+from chainshaper.sources.ebpf.functions import (
+    callback_functions,
+    demangled,
     exported_functions,
-    installed_libraries,
-    mapped_libraries,
+    type_argument,
 )
+from chainshaper.sources.ebpf.trace_points import installed_libraries, mapped_libraries
+
+SOURCE = Path(__file__).with_name("callbacks.cpp")
+BOUND = "std::_Bind<void (Relay::*(Relay*"
 
 
-def test_exported_functions_are_those_that_nm_shows(tmp_path: Path) -> None:
+def test_exported_functions_are_those_that_nm_shows() -> None:
     if shutil.which("nm") is None:
         pytest.skip("no nm to compare with")
-    library = build(tmp_path / "prefix").tracetools
+    library = built().tracetools
     run = subprocess.run(
         ["nm", "-D", "--defined-only", str(library)], capture_output=True, text=True, check=True
     )
@@ -29,25 +34,21 @@ def test_exported_functions_are_those_that_nm_shows(tmp_path: Path) -> None:
 
 
 def test_what_is_no_library_exports_nothing(tmp_path: Path) -> None:
-    for content in (b"", b"text", b"\x7fELF\x02\x01", b"\x7fELF\x02\x01" + bytes(200)):
-        file = tmp_path / "file"
+    file, elf = tmp_path / "file", b"\x7fELF\x02\x01"
+    library = built().tracetools.read_bytes()
+    for content in (b"", b"text", elf, elf + bytes(200), library[: len(library) // 2]):
         file.write_bytes(content)
         assert exported_functions(file) == frozenset()
     assert exported_functions(tmp_path / "absent") == frozenset()
 
 
-def test_a_truncated_library_exports_nothing(tmp_path: Path) -> None:
-    library = build(tmp_path / "prefix").tracetools
-    library.write_bytes(library.read_bytes()[: library.stat().st_size // 2])
-    assert exported_functions(library) == frozenset()
-
-
 def test_every_prefix_of_the_environment_is_searched_and_a_file_counts_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    jazzy = build(tmp_path / "jazzy")
-    humble = build(tmp_path / "humble", "-DHUMBLE", version="4.1.1")
-    monkeypatch.setattr(tracing_libraries, "_INSTALLATIONS", tmp_path)  # finds both once more
+    jazzy, humble = built(), built("-DHUMBLE", version="4.1.1")
+    for name, one in (("jazzy", jazzy), ("humble", humble)):
+        (tmp_path / name).symlink_to(one.prefix)
+    monkeypatch.setattr(trace_points, "_INSTALLATIONS", tmp_path)  # finds both once more
     found = installed_libraries(
         {
             "AMENT_PREFIX_PATH": f"{tmp_path}/nothing:{jazzy.prefix}:",
@@ -56,12 +57,12 @@ def test_every_prefix_of_the_environment_is_searched_and_a_file_counts_once(
     )
     assert [(one.path, one.version, one.major) for one in found] == [
         (jazzy.tracetools, "8.2.3", 8),
-        (humble.tracetools, "4.1.1", 4),
+        (tmp_path / "humble/lib/libtracetools.so", "4.1.1", 4),
     ]
 
 
-def test_running_processes_show_the_library_that_they_have_mapped(tmp_path: Path) -> None:
-    program = build(tmp_path / "a prefix")
+def test_running_processes_show_the_library_that_they_have_mapped() -> None:
+    program = built()
     process = program.waiting("chain", "0", "wait")
     found = mapped_libraries([process.pid, os.getpid(), 2**22 + 1])
     process.communicate("go\n", timeout=60)
@@ -75,24 +76,74 @@ def test_a_library_in_a_containers_file_system_is_reached_through_its_process(
     """A mount namespace of its own, in which another folder lies where ours is."""
     if os.geteuid() != 0 or shutil.which("unshare") is None:
         pytest.skip("a mount namespace needs root and unshare")
-    program = build(tmp_path / "inside")
     outside = tmp_path / "outside"
     outside.mkdir()
-    unshared = ("unshare", "--mount", "sh", "-c")
-    command = (f"{outside}/lib/application", "chain", "0", "wait")
-    script = f'mount --bind "{program.prefix}" "{outside}" && exec "$@"'
-    process = subprocess.Popen(
-        [*unshared, script, "sh", *command],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stdout is not None
-    if process.stdout.readline() != "ready\n":
-        pytest.skip("no mount namespace can be made here")
-    found = mapped_libraries([process.pid])
-    inside = Path(f"/proc/{process.pid}/root{outside}/lib/libtracetools.so")
-    assert [one.path for one in found[process.pid]] == [inside]
-    assert found[process.pid][0].version == "8.2.3"
-    assert "ros_trace_callback_end" in found[process.pid][0].functions
-    process.communicate("go\n", timeout=60)
+    script = f'mount --bind "{built().prefix}" "{outside}" && exec "$@"'
+    command = ("unshare", "--mount", "sh", "-c", script, "sh", f"{outside}/lib/application")
+    with subprocess.Popen(
+        [*command, "chain", "0", "wait"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        if process.stdout.readline() != "ready\n":
+            pytest.skip("no mount namespace can be made here")
+        ((library,),) = mapped_libraries([process.pid]).values()
+        assert library.path == Path(f"/proc/{process.pid}/root{outside}/lib/libtracetools.so")
+        assert library.version == "8.2.3"
+        assert "ros_trace_callback_end" in library.functions
+        process.communicate("go\n", timeout=60)
+
+
+def _named(program: Path) -> list[str | None]:
+    """What is found out about each of the program's callbacks."""
+    with subprocess.Popen(
+        [program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as running:
+        assert running.stdout is not None
+        handles = [int(running.stdout.readline()) for _ in range(7)]
+        found = callback_functions((running.pid, handle) for handle in handles)
+        running.communicate()
+    assert callback_functions([(running.pid, handles[0]), (0, 4096)]) == {}, "it has ended"
+    return [found.get((running.pid, handle)) for handle in handles]
+
+
+def test_functions_are_named_as_lttng_would_name_them(tmp_path: Path) -> None:
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("g++ is not installed, so there is no program with callbacks in C++")
+    program = tmp_path / "callbacks"
+    subprocess.run([compiler, "-std=c++17", "-O1", SOURCE, "-o", program], check=True)
+    timer, bound_timer, member, subscription, bound, service, none = _named(program)
+    assert timer == "main::{lambda()#1}"
+    assert bound_timer == member == f"{BOUND}))()>"
+    assert subscription is not None
+    assert subscription.startswith("main::{lambda(std::shared_ptr<std::map<")
+    assert subscription.endswith("#2}")
+    assert bound is not None
+    assert bound.startswith(f"{BOUND}, std::_Placeholder<1>))(std::shared_ptr<std::map<")
+    assert (service, none) == ("void (*)(int)", None)
+    subprocess.run(["strip", "-s", program], check=True)
+    timer, bound_timer, _, subscription, *_ = _named(program)
+    assert (timer, bound_timer, subscription) == ("main::{lambda()#1}", f"{BOUND}))()>", None)
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "argument"),
+    [
+        ("a::B<c<d, e>, f>::g()", 0, "c<d, e>"),
+        ("a::B<c<d, e>, f>::g()", 1, "f"),
+        ("B<void (x<1>, y), z::{lambda(u<v, w>)#1}>", 1, "z::{lambda(u<v, w>)#1}"),
+        ("B<auto (*)(a, b) -> c, d>", 0, "auto (*)(a, b) -> c"),
+        ("B<a>", 1, None),
+        ("plain()", 0, None),
+        (None, 0, None),
+    ],
+)
+def test_an_argument_of_a_template_is_cut_out(
+    name: str | None, number: int, argument: str | None
+) -> None:
+    assert type_argument(name, number) == argument
+
+
+def test_what_is_no_mangled_name_stays_unknown() -> None:
+    assert demangled(b"_Z3fooi") == "foo(int)"
+    assert demangled(b"what?") is None

@@ -5,6 +5,7 @@ import functools
 import os
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from chainshaper.sources.ebpf.session import EbpfTracer
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import RecordingInfo
 
-__all__ = ["Program", "Traced", "build", "skip_without_bpftrace", "skip_without_gcc", "traced"]
+__all__ = ["Program", "Traced", "build", "built", "skip_without_bpftrace", "traced"]
 
 _SOURCES = Path(__file__).parent / "tracetools"
 _PACKAGE = "<package><name>tracetools</name><version>{}</version></package>"
@@ -68,17 +69,22 @@ class Traced:
     printed: list[list[str]]
 
 
-def skip_without_gcc() -> None:
-    if shutil.which("gcc") is None:
-        pytest.skip("no gcc to build the traced program with")
-
-
+@functools.cache
 def skip_without_bpftrace() -> None:
     if shutil.which("bpftrace") is None:
         pytest.skip("bpftrace is not installed")
     if os.geteuid() != 0:
         pytest.skip("tracing with eBPF needs root")
-    _mount_tracefs()
+    # bpftrace finds `tracepoint:sched:sched_switch` there; mounted until the tests end.
+    folder = Path("/sys/kernel/tracing")
+    if not (folder / "events").exists():
+        mount = ["mount", "-t", "tracefs", "tracefs", str(folder)]
+        mounted = subprocess.run(mount, capture_output=True, text=True, check=False)
+        if mounted.returncode:
+            pytest.skip(
+                f"{folder} has no tracefs, and it cannot be mounted: {mounted.stderr.strip()}"
+            )
+        atexit.register(subprocess.run, ["umount", str(folder)], check=False)
     trial = ["bpftrace", "-e", "BEGIN { exit(); } tracepoint:sched:sched_switch { }"]
     run = subprocess.run(trial, capture_output=True, text=True, check=False, timeout=60)
     if run.returncode:
@@ -86,24 +92,17 @@ def skip_without_bpftrace() -> None:
 
 
 @functools.cache
-def _mount_tracefs() -> None:
-    """bpftrace finds `tracepoint:sched:sched_switch` there; mounted until the tests end."""
-    folder = Path("/sys/kernel/tracing")
-    if not (folder / "events").exists():
-        mounted = subprocess.run(
-            ["mount", "-t", "tracefs", "tracefs", str(folder)],
-            capture_output=True, text=True, check=False,
-        )  # fmt: skip
-        if mounted.returncode:
-            pytest.skip(
-                f"{folder} has no tracefs, and it cannot be mounted: {mounted.stderr.strip()}"
-            )
-        atexit.register(subprocess.run, ["umount", str(folder)], check=False)
+def built(*flags: str, version: str = "8.2.3") -> Program:
+    """A program for all tests, in a folder whose name has spaces."""
+    folder = Path(tempfile.mkdtemp(prefix="a prefix of ours "))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return build(folder / "prefix", *flags, version=version)
 
 
 def build(prefix: Path, *flags: str, version: str = "8.2.3") -> Program:
     """Compile library and program; ``version`` is what the library's package says."""
-    skip_without_gcc()
+    if shutil.which("gcc") is None:
+        pytest.skip("no gcc to build the traced program with")
     program = Program(prefix)
     program.tracetools.parent.mkdir(parents=True)
     package = prefix / "share/tracetools/package.xml"

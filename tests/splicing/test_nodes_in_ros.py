@@ -19,8 +19,8 @@ from ros2 import ros2_environment
 from chainshaper.planning import Plan
 from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log
+from chainshaper.sources.ros import own_environment, run_with_rclpy
 from chainshaper.sources.ros import script as ros_script
-from chainshaper.sources.ros.interpreter import own_environment, run_with_rclpy
 from chainshaper.splicing.shaping_process import (
     NodeKind,
     ShapingProcess,

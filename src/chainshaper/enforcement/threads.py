@@ -5,7 +5,7 @@ a recording saw the callbacks that it ran; its name, which DDS implementations c
 executors spin on the main thread, unless the program arranges it otherwise. Which nodes a process
 has, a recording says (also one of an earlier run, where the command line names one of them), or the
 remap rules of its command line; the name of its program is a guess, and called one. Only processes
-of the users that are asked for are nodes (:mod:`chainshaper.linux.users`); those of others that
+of the users that are asked for are nodes (:mod:`chainshaper.linux.processes`); those of others that
 repeat a node's name are named, and left alone.
 
 On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DESIGN section 6):
@@ -38,10 +38,10 @@ from chainshaper.linux.processes import (
     guessed_name,
     named_nodes,
     takes_ros_arguments,
+    user_name,
 )
 from chainshaper.linux.scheduling import Scheduling
 from chainshaper.linux.threads import TICK_NS, Thread, ThreadRole
-from chainshaper.linux.users import user_name
 from chainshaper.planning.plan import Plan, Server, shaping_nodes
 from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.values.errors import InputError, OperationError

@@ -51,10 +51,10 @@ from chainshaper.flow.phase import (
 )
 from chainshaper.flow.threads import LEAD_NS, find_threads, first_thread, server_table, table_of
 from chainshaper.linux.own_processes import end_command, start_command
+from chainshaper.linux.processes import run_users
 from chainshaper.linux.runs import PLAN_FILE, Journal
 from chainshaper.linux.scheduling import available_cores, check_cores
 from chainshaper.linux.threads import list_threads
-from chainshaper.linux.users import run_users
 from chainshaper.planning.overruns import (
     open_until_done,
     publication_warnings,

@@ -26,9 +26,8 @@ from chainshaper.flow.launch_splicing import Splicing, splice_launch_files
 from chainshaper.flow.plan import plan_recording
 from chainshaper.flow.profiling import chain_nodes, profiling_condition
 from chainshaper.flow.record import record_command
-from chainshaper.linux.processes import Process
+from chainshaper.linux.processes import Process, run_users
 from chainshaper.linux.scheduling import may_use_fifo
-from chainshaper.linux.users import run_users
 from chainshaper.planning import Plan, PlanRequest, save_plan
 from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.shaping_process import NodeKind, build_package, check_build_tools

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from chainshaper.planning.plan import Plan, ShapingNode, revised
-from chainshaper.sources.ros.interpreter import own_environment, run_with_rclpy
+from chainshaper.sources.ros import own_environment, run_with_rclpy
 from chainshaper.splicing import redirection
 from chainshaper.splicing.redirection import Redirect
 from chainshaper.splicing.shaping_process import (

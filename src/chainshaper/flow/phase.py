@@ -34,7 +34,7 @@ from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 
 if TYPE_CHECKING:
-    from chainshaper.sources.ros.interpreter import Environment, Script
+    from chainshaper.sources.ros import Environment, Script
 
 
 POLL_NS = 250_000
@@ -315,7 +315,7 @@ def tell_phase(plan: Plan, found: Allocation, phase_ns: int) -> Telling:
         return NO_NODE
     # Who reads what ROS 2 shows reads recordings as well, which is slow to import.
     from chainshaper.sources.ros import script as ros_script
-    from chainshaper.sources.ros.interpreter import start_with_rclpy
+    from chainshaper.sources.ros import start_with_rclpy
 
     try:
         environments = {node: _environment_for(pid) for node, pid in pids.items()}
@@ -331,7 +331,7 @@ def tell_phase(plan: Plan, found: Allocation, phase_ns: int) -> Telling:
 
 def _environment_for(pid: int) -> "Environment":
     """The environment of a node, or ours where nothing of the node's may be run."""
-    from chainshaper.sources.ros.interpreter import environment_of, own_environment
+    from chainshaper.sources.ros import environment_of, own_environment
 
     try:
         return environment_of(pid)

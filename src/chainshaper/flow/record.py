@@ -36,15 +36,15 @@ from chainshaper.linux.processes import (
     descendants,
     find_applications,
     list_processes,
+    run_users,
 )
 from chainshaper.linux.runs import Governed, governing, in_force_throughout
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import parents
-from chainshaper.linux.users import run_users
 from chainshaper.planning import Plan
 from chainshaper.sources import Tracer
 from chainshaper.sources.gate_log import releases_so_far, with_gate_logs
-from chainshaper.sources.ros.interpreter import Environment, ask_graph, environment_of
+from chainshaper.sources.ros import Environment, ask_graph, environment_of
 from chainshaper.values import events
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
@@ -272,7 +272,7 @@ def _look(run: _Run) -> None:
     """Which processes and threads there are, and a node's environment."""
     if run.pids:
         parent_of = parents()
-        family = {pid for one in run.pids for pid in descendants(parent_of, one)} & parent_of.keys()
+        family = descendants(parent_of, *run.pids) & parent_of.keys()
         processes = list_processes(family)
     else:
         everybody = find_applications(list_processes())

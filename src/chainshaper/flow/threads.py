@@ -20,10 +20,10 @@ from chainshaper.linux.processes import (
     descendants,
     find_applications,
     list_processes,
+    run_users,
 )
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.linux.threads import Thread
-from chainshaper.linux.users import run_users
 from chainshaper.planning.overruns import open_until_done, refuse_offset
 from chainshaper.planning.plan import Plan, Server, shaping_nodes
 from chainshaper.values.errors import InputError, OperationError

@@ -1,11 +1,10 @@
 """Control groups of version 2, as far as stopping single threads needs them.
 
-Writing ``1`` to a group's ``cgroup.freeze`` stops every thread in it on its way back to user
-space, and ``0`` lets them go on. A **threaded** group may have some threads of a process while the
-others stay where they are, on one condition: all groups that share a process lie in one *threaded
-domain* (kernel: Documentation/admin-guide/cgroup-v2.rst, "Threads"). So a thread's new group is
-made directly beneath the group in which the thread is now: it keeps every limit, and the way back
-is always up to the parent. Until the child is removed the parent's type reads ``domain threaded``.
+``cgroup.freeze`` stops every thread in a group on its way back to user space. A **threaded** group
+may have some threads of a process while the others stay, if all groups that share a process lie in
+one *threaded domain*: so it is made directly beneath their present one, and keeps every limit.
+
+Upstream: Documentation/admin-guide/cgroup-v2.rst of the kernel, "Threads" and "Mounting".
 """
 
 import contextlib
@@ -19,17 +18,16 @@ from chainshaper.values.errors import OperationError, PlatformError
 
 MOUNTS = Path("/proc/mounts")
 QUICK_MOVES = "favordynmods"
-"""A mount option since Linux 6.0 (Documentation/admin-guide/cgroup-v2.rst, "Mounting").
+"""A mount option since Linux 6.0.
 
 Without it whoever moves a process to another group (a service manager, a container engine) waits
-for a grace period of RCU, which is 10 to 30 ms, and holds meanwhile what freezing needs as well:
-a slot opens so much later. Forks and exits become a little slower with it.
+for a grace period of RCU, 10 to 30 ms, and blocks freezing meanwhile: a slot opens so much later.
+Forks and exits become a little slower with it.
 """
 _BEFORE = "trusted.chainshaper.mount"
 """Attribute of the hierarchy's root: its mount options before a run of ours changed them.
 
-A journal says the same, but may be lost, and the option then looks like another program's. The
-attribute is in the kernel's memory, as the option is, so it lasts as long.
+A journal says the same, but may be lost; the attribute is in the kernel's memory, as the option is.
 """
 _REMOUNT = 32
 _MOUNT_FLAGS = {
@@ -61,6 +59,19 @@ def mount_options() -> str:
     return _mount()[1]
 
 
+def _mount() -> tuple[Path, str]:
+    # Beside version 1 hierarchies it usually stands at /sys/fs/cgroup/unified.
+    for line in MOUNTS.read_text().splitlines():
+        _, folder, kind, options, *_ = line.split()
+        if kind == "cgroup2":
+            return Path(folder.encode().decode("unicode_escape")), options
+    raise PlatformError(
+        "no cgroup v2 hierarchy is mounted here, so threads cannot be frozen: "
+        "`mount -t cgroup2 none /sys/fs/cgroup/unified`, or boot with "
+        "systemd.unified_cgroup_hierarchy=1"
+    )
+
+
 def moves_are_quick() -> bool:
     """Whether the hierarchy is mounted with :data:`QUICK_MOVES`."""
     return QUICK_MOVES in mount_options().split(",")
@@ -78,11 +89,13 @@ def remount(options: str) -> None:
 def options_before_ours() -> str | None:
     """The mount options that a run which begins now has to restore when it ends.
 
-    Those of now; where a run of ours has set :data:`QUICK_MOVES` and not restored yet, those that
-    it found. None: another program has set it, so it stays.
+    Those that a run of ours found, which has not restored them yet. None: another program's stay.
     """
-    options = mount_options()
-    return options if QUICK_MOVES not in options.split(",") else _noted_options()
+    if not moves_are_quick():
+        return mount_options()
+    with contextlib.suppress(OSError):
+        return os.getxattr(mount_point(), _BEFORE).decode()
+    return None
 
 
 def make_moves_quick(before: str) -> None:
@@ -100,30 +113,10 @@ def restore_mount(before: str) -> None:
         os.removexattr(mount_point(), _BEFORE)
 
 
-def _noted_options() -> str | None:
-    with contextlib.suppress(OSError):
-        return os.getxattr(mount_point(), _BEFORE).decode()
-    return None
-
-
-def _mount() -> tuple[Path, str]:
-    # Beside version 1 hierarchies it usually stands at /sys/fs/cgroup/unified.
-    for line in MOUNTS.read_text().splitlines():
-        _, folder, kind, options, *_ = line.split()
-        if kind == "cgroup2":
-            return Path(folder.encode().decode("unicode_escape")), options
-    raise PlatformError(
-        "no cgroup v2 hierarchy is mounted here, so threads cannot be frozen: "
-        "`mount -t cgroup2 none /sys/fs/cgroup/unified`, or boot with "
-        "systemd.unified_cgroup_hierarchy=1"
-    )
-
-
 def cgroup_of(tid: int) -> Path:
-    """The folder of the group in which a thread is.
+    """The folder of a thread's group. Raises OperationError: there is no such thread.
 
-    Raises OperationError: there is no such thread. PlatformError: its group cannot be seen from
-    here.
+    PlatformError: its group cannot be seen from here.
     """
     try:
         lines = Path(f"/proc/{tid}/cgroup").read_text().splitlines()
@@ -144,8 +137,7 @@ def cgroup_of(tid: int) -> Path:
 def make_threaded_child(parent: Path, name: str) -> Path:
     """Make an empty threaded group directly beneath the group of the threads it is for.
 
-    Raises OperationError: the name is taken. PlatformError: the machine or the privileges do not
-    allow it; nothing is left behind.
+    Raises OperationError: the name is taken. PlatformError: machine or privileges do not allow it.
     """
     folder = parent / name
     try:
@@ -156,34 +148,37 @@ def make_threaded_child(parent: Path, name: str) -> Path:
             "`chainshaper release` removes it"
         ) from None
     except OSError as error:
-        reason = os.strerror(error.errno or 0)
-        raise PlatformError(f"no cgroup can be made in {parent} ({reason}): {_REMEDY}") from error
+        raise PlatformError(
+            f"no cgroup can be made in {parent} ({error.strerror}): {_REMEDY}"
+        ) from error
     try:
         (folder / "cgroup.type").write_text("threaded")
     except OSError as error:
         folder.rmdir()
-        raise PlatformError(_why_not_threaded(parent, error)) from error
+        raise PlatformError(
+            f"threads of the cgroup {parent} cannot be frozen one by one"
+            f"{_obstacle(parent) or f' ({error.strerror}): {_REMEDY}'}"
+        ) from error
     return folder
 
 
-def _why_not_threaded(parent: Path, error: OSError) -> str:
+def _obstacle(parent: Path) -> str | None:
     """What stands in the way of threaded groups: the kernel only says EOPNOTSUPP."""
-    begin = f"threads of the cgroup {parent} cannot be frozen one by one"
     controllers = set(_read(parent / "cgroup.subtree_control").split()) - _THREADED_CONTROLLERS
     if controllers:
-        names = ", ".join(sorted(controllers))
         return (
-            f"{begin}: it hands the controllers {names} down to its children, which rules threaded "
-            f"groups out; run the application in a group that does not (its own scope or unit)"
+            f": it hands the controllers {', '.join(sorted(controllers))} down to its children, "
+            "which rules threaded groups out; run the application in a group that does not (its "
+            "own scope or unit)"
         )
     for child in sorted(parent.iterdir()):
         kind = _read(child / "cgroup.type").strip()
         if kind == "domain" and "populated 1" in _read(child / "cgroup.events"):
             return (
-                f"{begin}: its child {child.name} holds processes of its own; run the application "
-                f"in a group without others beneath it (its own scope or unit)"
+                f": its child {child.name} holds processes of its own; run the application in a "
+                "group without others beneath it (its own scope or unit)"
             )
-    return f"{begin} ({os.strerror(error.errno or 0)}): {_REMEDY}"
+    return None
 
 
 def move_thread(tid: int, folder: Path) -> bool:
@@ -194,17 +189,15 @@ def move_thread(tid: int, folder: Path) -> bool:
     """
     try:
         (folder / "cgroup.threads").write_text(str(tid))
+    except ProcessLookupError:
+        return False
     except OSError as error:
-        if error.errno == errno.ESRCH:
-            return False
-        reason = os.strerror(error.errno or 0)
+        refused = f"thread {tid} cannot be moved to the cgroup {folder} ({error.strerror})"
         if error.errno in {errno.EACCES, errno.EPERM, errno.EROFS}:
-            raise PlatformError(
-                f"thread {tid} cannot be moved to {folder} ({reason}): {_REMEDY}"
-            ) from error
+            raise PlatformError(f"{refused}: {_REMEDY}") from error
         raise OperationError(
-            f"thread {tid} cannot be moved to the cgroup {folder} ({reason}): is it a thread of "
-            "the kernel, or has its process been moved to another group meanwhile?"
+            f"{refused}: is it a thread of the kernel, or has its process been moved to another "
+            "group meanwhile?"
         ) from error
     return True
 
@@ -215,15 +208,14 @@ def threads_in(folder: Path) -> tuple[int, ...]:
 
 
 def has_unseen_threads(folder: Path) -> bool:
-    """Whether there are some that cannot be seen from our process namespace."""
+    """Whether there are others."""
     return "0" in _read(folder / "cgroup.threads").split()
 
 
 def dissolve(folder: Path, within_s: float = 1.0) -> str | None:
     """Thaw a group, put its threads back into the parent, remove it; harmless when repeated.
 
-    Returns None, or what is left in a sentence: this is called where nothing must be raised,
-    since the next group waits for its turn.
+    Returns None, or what is left in a sentence: nothing is raised.
     """
     with contextlib.suppress(OSError):
         (folder / "cgroup.freeze").write_text("0")
@@ -253,9 +245,7 @@ def dissolve(folder: Path, within_s: float = 1.0) -> str | None:
 def enter_own_group(name: str) -> bool:
     """Put this process into a group of that name, out of reach of what befalls its present one.
 
-    That is directly beneath the root of the hierarchy, or as near to it as we may; not beneath a
-    group with processes, which could have no threaded children then. False where it has to stay
-    where it is, as in a container: what ends the container ends it, too.
+    False where it has to stay, as in a container: what ends the container ends it, too.
     """
     for folder in _own_groups(name):
         for _ in range(_ATTEMPTS):  # the last to leave may just be removing it
@@ -287,7 +277,10 @@ def remove_own_group(name: str) -> None:
 
 
 def _own_groups(name: str) -> list[Path]:
-    """Where a group of ours may be that is not in reach of our present one, the best first."""
+    """Where a group of ours may be that is not in reach of our present one, the best first.
+
+    Not beneath a group with processes, which could have no threaded children then.
+    """
     try:
         root, own = mount_point(), cgroup_of(os.getpid())
     except (OperationError, PlatformError):

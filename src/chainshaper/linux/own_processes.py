@@ -1,13 +1,11 @@
 """Processes that we start, ours and the user's: how they start, how they end.
 
 A process of ours often has more rights than whoever fills the folder that it is started in. So its
-Python is isolated (``-I``). Of what this drops, it gets back by its place, and only if root and we
-alone can change it: our package, and behind all other folders those of the libraries that it needs.
+Python is isolated (``-I``), and gets back, only if root and we alone can change it, our
+package, and behind all other folders those of the libraries that it needs.
 
 The user's command, such as `ros2 launch …`, gets a session of its own: Ctrl-C then reaches us
-alone. A background job of a script ignores SIGINT, and whatever it starts inherits that, so the
-command starts with the default again. It ends by SIGINT to its whole process group, which `ros2
-launch` and every node understand as the order to shut down; then by SIGTERM, then by SIGKILL.
+alone. It ends by SIGINT to its whole process group, then by SIGTERM, then by SIGKILL.
 """
 
 import contextlib
@@ -19,13 +17,13 @@ import site
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from chainshaper.linux.scheduling import signalled_with_parent
-from chainshaper.linux.threads import read_proc
+from chainshaper.linux.threads import all_stats
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.files import why_distrusted
 
@@ -48,33 +46,27 @@ _START = (
 
 
 def module_command(module: str, libraries: Sequence[str] = ()) -> list[str]:
-    """How a module runs as a process of ours; its arguments go behind.
+    """How a module runs as a process of ours, with ``libraries`` found where this process does.
 
-    ``libraries`` are found where this process finds them. Raises OperationError: others may change
-    the package, and an isolated Python has no other.
+    Raises OperationError: others may change the package, and an isolated Python has no other.
     """
+    own = (*site.getsitepackages(), str(Path(os.__file__).parent))  # where it looks anyway
     package, reason = str(_PACKAGE / "__init__.py"), why_distrusted(_PACKAGE)
     if reason is not None:
-        elsewhere = (*named_folders(), site.getusersitepackages(), str(Path.cwd()))
-        if str(_PACKAGE.parent) in elsewhere:
+        if not package.startswith(own):
             raise OperationError(
                 f"chainshaper's own processes do not run from {_PACKAGE.parent}: {reason}; see "
                 "that only root and you can write there, or install chainshaper elsewhere"
             )
         package = ""  # whoever installed this Python has it find the package, and answers for that
-    folders = os.pathsep.join(dict.fromkeys(_folders_of(libraries)))
-    return [sys.executable, "-I", "-c", _START, package, folders, module]
-
-
-def _folders_of(libraries: Sequence[str]) -> Iterator[str]:
-    """Where libraries are, as far as an isolated Python does not look there, or must not."""
-    own = (*site.getsitepackages(), str(Path(os.__file__).parent))
+    folders = []
     for library in libraries:
         found = importlib.util.find_spec(library)
         if found is not None and found.origin is not None:
             place = Path(found.origin).parents[1 if found.submodule_search_locations else 0]
             if not str(place).startswith(own) and why_distrusted(place) is None:
-                yield str(place)
+                folders.append(str(place))
+    return [sys.executable, "-I", "-c", _START, package, ":".join(dict.fromkeys(folders)), module]
 
 
 def named_folders() -> list[str]:
@@ -94,10 +86,7 @@ def is_installed(tool: str) -> bool:
 
 
 def check_command(command: Sequence[str]) -> None:
-    """See that a command can be started, before anything is done for it.
-
-    Raises InputError: there is no such program, or it may not be executed.
-    """
+    """See that a command can be started. Raises InputError: no such program, or not executable."""
     if shutil.which(command[0]) is not None:
         return
     if Path(command[0]).is_file() and os.sep in command[0]:
@@ -109,14 +98,11 @@ def check_command(command: Sequence[str]) -> None:
 
 
 def start_command(
-    command: Sequence[str],
-    environment: Mapping[str, str] | None = None,
-    stdout: int | None = None,
+    command: Sequence[str], environment: Mapping[str, str] | None = None, stdout: int | None = None
 ) -> subprocess.Popen[bytes]:
-    """Start the command with ``environment`` added to ours.
+    """Start the command with ``environment`` added to ours, printing to the descriptor ``stdout``.
 
-    What it prints goes to the file descriptor ``stdout``, or where ours goes. Should we be killed,
-    it gets a SIGINT as from its terminal. Raises InputError: see :func:`check_command`.
+    Should we be killed, it gets a SIGINT. Raises InputError: as :func:`check_command`.
     OperationError: the kernel refuses to run it.
     """
     check_command(command)
@@ -133,6 +119,7 @@ def start_command(
 
 
 def _as_from_a_terminal(parent: int) -> None:
+    # A background job of a script ignores SIGINT, and whatever it starts inherits that.
     for number in (signal.SIGINT, signal.SIGQUIT):
         signal.signal(number, signal.SIG_DFL)
     signalled_with_parent(parent, signal.SIGINT)
@@ -154,14 +141,8 @@ def _over(started: subprocess.Popen[bytes]) -> bool:
     """Whether it has ended, and no process of its group runs any more (zombies do not)."""
     if started.poll() is None:
         return False
-    for entry in os.scandir("/proc"):
-        if entry.name.isdigit():
-            with contextlib.suppress(OSError):
-                stat = read_proc(f"/proc/{entry.name}/stat")
-                state, _, group = stat[stat.rindex(b")") + 2 :].split()[:3]
-                if int(group) == started.pid and state not in (b"Z", b"X"):
-                    return False
-    return True
+    running = (fields for _, fields in all_stats() if fields[0] not in (b"Z", b"X"))
+    return all(int(group) != started.pid for _, _, group, *_ in running)
 
 
 def end_in_words(code: int) -> str:
@@ -182,8 +163,7 @@ def what_happened(process: "subprocess.Popen[Any]") -> str | None:
         return "ended"
     if state is None:
         return None
-    if state.si_code == os.CLD_STOPPED:
-        return f"was stopped by signal {state.si_status}"
     if state.si_code == os.CLD_EXITED:
         return f"ended with status {state.si_status}"
-    return f"was killed by signal {state.si_status}"
+    done = "stopped" if state.si_code == os.CLD_STOPPED else "killed"
+    return f"was {done} by signal {state.si_status}"

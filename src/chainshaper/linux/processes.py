@@ -1,20 +1,22 @@
-"""Processes that may belong to a ROS 2 or DDS application, and the nodes that they name.
+"""Processes that may belong to a ROS 2 or DDS application, whose they are, and their nodes' names.
 
 A process takes part in DDS when it has a thread that receives or one for timed events, by the names
 of a DDS implementation; where those do not name theirs (Fast DDS before 2.13), a mapped library
-together with further threads has to do. That distinguishes a node from what only carries its
-command line: `ros2 run`, `gdb --args`, or a forked helper.
+together with further threads has to do. What only carries a node's command line has neither.
 
-Users name nodes by remap rules behind `--ros-args`: ``-r __node:=NAME`` and ``-r __ns:=/NAMESPACE``
-hold for every node of the process, ``-r OLD:__node:=NAME`` for its node that would be called OLD
-only. Of rules that apply, the first one counts. What is quoted for a shell is one argument here, so
-a parameter's value that looks like a rule is not taken for one.
+A process is a user's when that user both runs it, by all four of its user ids, and has started its
+program: `sudo`, `su` and every other set-user-ID program carry the command line and the environment
+of another user than the one they run as. Root may start programs for all.
 
-Upstream: rcl, `arguments.c` and `remap.c`, whose tests say which rules are valid.
+Upstream: proc(5), credentials(7), getauxval(3); rcl, `arguments.c` and `remap.c`.
 """
 
+import os
+import pwd
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import struct
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import PurePath
 
@@ -24,12 +26,15 @@ from chainshaper.linux.threads import (
     list_threads,
     parents,
     read_proc,
+    status_field,
 )
-from chainshaper.linux.users import process_folder, user_in
+from chainshaper.values.errors import InputError
 
-_RULE = re.compile(r"(?:([A-Za-z_]\w*):)?__(node|name|ns):=(\S+)", re.ASCII)
-_NAME = re.compile(r"[A-Za-z_]\w*", re.ASCII)
-_NAMESPACE = re.compile(r"/|(/[A-Za-z_]\w*)+", re.ASCII)
+_AT_UID = 11
+_AUXILIARY = struct.Struct("@NN")
+_RULE = re.compile(
+    r"(?:([A-Za-z_]\w*):)?__(?:(?:node|name):=([A-Za-z_]\w*)|ns:=(/|(?:/[A-Za-z_]\w*)+))", re.ASCII
+)
 _WITH_VALUE = frozenset(
     ("-p", "--param", "--params-file", "--log-level", "--log-config-file", "--log-file-name")
 ) | frozenset(("-e", "--enclave"))
@@ -42,18 +47,87 @@ _LIBRARIES_WITHOUT_NAMED_THREADS = (
 )
 
 
+def run_users(named: Collection[str | int] = ()) -> frozenset[int]:
+    """The ids of users whose processes a run takes, by their names or numbers.
+
+    By default who has launched us, also by `sudo`, and root. Raises InputError: no such user.
+    """
+    users = set()
+    for name in named:
+        number = isinstance(name, int) or name.isdecimal()
+        try:
+            users.add(int(name) if number else pwd.getpwnam(str(name)).pw_uid)
+        except KeyError:
+            raise InputError(
+                f"no user is named {name!r} on this machine: give a name of `getent passwd`, or a "
+                "number"
+            ) from None
+    launched = {os.getuid(), os.geteuid(), 0}
+    behind_sudo = os.environ.get("SUDO_UID", "")
+    if os.geteuid() == 0 and behind_sudo.isdecimal():
+        launched.add(int(behind_sudo))
+    return frozenset(users or launched)
+
+
+def user_name(user: int | None) -> str:
+    """What a user is called here; the number where it has no name."""
+    if user is None:
+        return "several users"
+    with suppress(KeyError):
+        return pwd.getpwuid(user).pw_name
+    return str(user)
+
+
+@contextmanager
+def process_folder(pid: int) -> Iterator[int]:
+    """A process's folder in /proc, open: what is read from it is never another process's.
+
+    Raises OSError: there is no such process.
+    """
+    folder = os.open(f"/proc/{pid}", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        yield folder
+    finally:
+        os.close(folder)
+
+
+def user_of(pid: int) -> int | None:
+    """The user whose process this is; None if it is no single user's, or gone."""
+    with suppress(OSError), process_folder(pid) as folder:
+        return user_in(folder)
+    return None
+
+
+def user_in(folder: int) -> int | None:
+    """The same from a process's open folder. Raises OSError: the process has ended."""
+    user, *others = status_field(read_proc("status", folder), "Uid")
+    if any(other != user for other in others):
+        return None
+    try:
+        auxiliary = read_proc("auxv", folder)
+    except OSError:
+        # It may not be looked at. What is root's by its ids may be a set-user-ID program.
+        auxiliary = b""
+    entries = _AUXILIARY.iter_unpack(auxiliary[: len(auxiliary) & -_AUXILIARY.size])
+    # The real user when it began its program: who chose command line and environment.
+    started_by = next((value for kind, value in entries if kind == _AT_UID), None)
+    if started_by is None:
+        return None if user == 0 and os.geteuid() == 0 else user
+    return user if started_by in (user, 0) else None
+
+
 @dataclass(frozen=True)
 class Process:
     """A process at one instant; ``inner_pid`` is its id in its own pid namespace.
 
-    ``user`` is whose it is, None if no single user's (:mod:`.users`).
+    ``user`` is whose it is, None if no single user's; ``participates``: in DDS.
     """
 
     pid: int
     parent: int
     command: tuple[str, ...]
     inner_pid: int
-    participates: bool  # in DDS
+    participates: bool
     threads: tuple[Thread, ...]
     user: int | None = None
 
@@ -72,17 +146,16 @@ def read_process(pid: int) -> Process | None:
             command = read_proc("cmdline", folder)
             if not command:
                 return None
-            status = read_proc("status", folder).decode(errors="replace")
+            status = read_proc("status", folder)
             threads = list_threads(pid)
             # It is the same process still, and the same user's: its id is no other's by now.
             if not threads or user_in(folder) != user:
                 return None
     except OSError:
         return None
-    parent = next(line.split()[1] for line in status.splitlines() if line.startswith("PPid:"))
     return Process(
         pid=pid,
-        parent=int(parent),
+        parent=status_field(status, "PPid")[0],
         command=tuple(command.rstrip(b"\0").decode(errors="replace").split("\0")),
         inner_pid=innermost_id(status) or pid,
         participates=_participates(pid, threads),
@@ -91,23 +164,18 @@ def read_process(pid: int) -> Process | None:
     )
 
 
-def descendants(parent_of: Mapping[int, int], pid: int) -> frozenset[int]:
-    """A process and all its children, theirs and so on; ``parent_of`` maps each to its parent."""
-    family, grown = {pid}, True
-    while grown:
-        more = {child for child, parent in parent_of.items() if parent in family} - family
-        family |= more
-        grown = bool(more)
+def descendants(parent_of: Mapping[int, int], *pids: int) -> frozenset[int]:
+    """Processes and all their children, theirs and so on; ``parent_of`` maps each to its parent."""
+    family, born = set(pids), set(pids)
+    while born:
+        born = {child for child, parent in parent_of.items() if parent in born} - family
+        family |= born
     return frozenset(family)
 
 
 def find_applications(processes: Iterable[Process]) -> tuple[Process, ...]:
     """Those that look like applications of ROS 2 or DDS."""
-    return tuple(
-        process
-        for process in processes
-        if process.participates or takes_ros_arguments(process.command)
-    )
+    return tuple(one for one in processes if one.participates or takes_ros_arguments(one.command))
 
 
 def _participates(pid: int, threads: tuple[Thread, ...]) -> bool:
@@ -127,10 +195,12 @@ def takes_ros_arguments(command: Sequence[str]) -> bool:
 
 
 def named_nodes(command: Sequence[str]) -> tuple[str, ...]:
-    """Full names of the nodes that a command line names, in the order of their rules.
+    """Full names of the nodes that a command line names, in the order of their remap rules.
 
-    A node's own namespace is not known from outside; without a rule it is taken for `/`, which
-    it is unless the program says otherwise.
+    ``__node:=NAME`` and ``__ns:=/NAMESPACE`` hold for every node of the process,
+    ``OLD:__node:=NAME`` for its node that would be called OLD only; of rules that apply, the first
+    one counts. A node's own namespace is not known from outside; without a rule it is taken for
+    `/`, which it is unless the program says otherwise.
 
         >>> named_nodes(["talker", "--ros-args", "-r", "__node:=front", "-r", "__ns:=/lidar"])
         ('/lidar/front',)
@@ -139,25 +209,35 @@ def named_nodes(command: Sequence[str]) -> tuple[str, ...]:
     """
     names: dict[str | None, str] = {}
     namespaces: dict[str | None, str] = {}
-    for owner, what, value in _rules(command):
-        if what == "ns":
-            namespaces.setdefault(owner, value)
-        elif None not in names:
-            names.setdefault(owner, value)  # rules behind one for all nodes never apply
-    found = []
-    for owner, name in names.items():
-        # A rule for all nodes that stands first would apply instead of a node's own behind it.
-        namespace = namespaces.get(None, "/")
-        if owner in namespaces and _first(namespaces, owner):
-            namespace = namespaces[owner]
-        found.append(_full(namespace, name))
-    if None not in names:
-        found += [
-            _full(namespace, owner)
-            for owner, namespace in namespaces.items()
-            if owner is not None and owner not in names and _first(namespaces, owner)
-        ]
+    for owner, name, namespace in _rules(command):
+        if None in (names if name else namespaces):
+            continue  # rules behind one for all nodes never apply
+        if name:
+            names.setdefault(owner, name)
+        else:
+            namespaces.setdefault(owner, namespace)
+    if None not in names:  # nodes of which only the namespace is remapped
+        names |= {owner: owner for owner in namespaces if owner and owner not in names}
+    for_all = namespaces.get(None, "/")
+    found = (f"{namespaces.get(o, for_all).rstrip('/')}/{name}" for o, name in names.items())
     return tuple(dict.fromkeys(found))
+
+
+def _rules(command: Sequence[str]) -> Iterator[tuple[str | None, str, str]]:
+    """Valid rules about names: whose (None: all nodes'), and a name, or else a namespace."""
+    arguments = iter(command)
+    for argument in arguments:
+        if argument != "--ros-args":
+            continue
+        for ros_argument in arguments:
+            if ros_argument == "--":
+                break
+            if ros_argument in _WITH_VALUE:
+                next(arguments, None)
+            elif ros_argument in ("-r", "--remap"):
+                rule = _RULE.fullmatch(next(arguments, ""))
+                if rule is not None:
+                    yield rule[1], rule[2] or "", rule[3] or ""
 
 
 def guessed_name(command: Sequence[str]) -> str | None:
@@ -170,35 +250,3 @@ def guessed_name(command: Sequence[str]) -> str | None:
             stem = PurePath(argument).name.removesuffix(".py")
             return f"/{re.sub(r'[^A-Za-z0-9_]', '_', stem)}" if stem else None
     return None
-
-
-def _first(namespaces: dict[str | None, str], owner: str | None) -> bool:
-    """Whether a node's own namespace rule stands before the rule for all nodes, if there is one."""
-    order = list(namespaces)
-    return None not in namespaces or order.index(owner) <= order.index(None)
-
-
-def _full(namespace: str, name: str) -> str:
-    return f"{namespace.rstrip('/')}/{name}"
-
-
-def _rules(command: Sequence[str]) -> Iterator[tuple[str | None, str, str]]:
-    """Valid rules about names: (node they are for or None, ``node`` or ``ns``, value)."""
-    arguments = iter(command)
-    for argument in arguments:
-        if argument != "--ros-args":
-            continue
-        for ros_argument in arguments:
-            if ros_argument == "--":
-                break
-            if ros_argument in _WITH_VALUE:
-                next(arguments, None)
-            elif ros_argument in ("-r", "--remap"):
-                rule = _RULE.fullmatch(next(arguments, ""))
-                if rule is None:
-                    continue
-                owner, what, value = rule.groups()
-                if what == "ns" and _NAMESPACE.fullmatch(value):
-                    yield owner, "ns", value
-                elif what != "ns" and _NAME.fullmatch(value):
-                    yield owner, "node", value

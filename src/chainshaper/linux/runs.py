@@ -1,13 +1,10 @@
 """Runs on this machine: the journal of what each has changed, and since when it governs whom.
 
 A run has a folder, `/run/chainshaper/RUN` for root, below `$XDG_RUNTIME_DIR` for others, gone when
-the machine boots again, as is all that was changed; a journal elsewhere says by its boot id that it
-is from before. In it are `journal.jsonl`, `run.json`, which the run writes anew every second for
-whoever wants to look, and `plan.json`.
-
-Whatever ends us, SIGKILL included, another process must be able to put things back. So each change
-is one line of JSON, which is on the disk (`fsync`) before the change is made. Each kind of change
-is undone by the module that made it; this one writes and reads the lines.
+the machine boots again, as is all that was changed. In it are `journal.jsonl`, `run.json`, which
+the run writes anew every second, and `plan.json`. Whatever ends us, SIGKILL included, another
+process must be able to put things back: each change is one line of JSON, on the disk (`fsync`)
+before it is made, and undone by the module that made it.
 """
 
 import contextlib
@@ -51,21 +48,22 @@ class Journal:
     def note_all(self, kind: str, changes: Iterable[Mapping[str, Any]]) -> None:
         """Write down changes that are about to be made: plain data that says how to undo each.
 
-        They are on the disk together (one `fsync`), so that many threads take no longer than one.
-        Raises OperationError: they cannot be written; then no change must be made.
+        One `fsync` for all. Raises OperationError: they cannot be written; make no change then.
         """
         lines = b"".join(json.dumps({"kind": kind, **one}).encode() + b"\n" for one in changes)
         try:
             self.keep()
             descriptor = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CLOEXEC)
-            try:
-                size = _remove_cut_off_line(descriptor)
-                if os.write(descriptor, lines) != len(lines):
-                    os.ftruncate(descriptor, size)
+            with os.fdopen(descriptor, "r+b", buffering=0) as file:
+                size = os.fstat(descriptor).st_size
+                if size and os.pread(descriptor, 1, size - 1) != b"\n":
+                    # A crash, or a full disk, has cut a line off.
+                    size = os.pread(descriptor, size, 0).rfind(b"\n") + 1
+                    file.truncate(size)
+                if file.write(lines) != len(lines):
+                    file.truncate(size)
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
+                os.fsync(file)
         except OSError as error:
             raise OperationError(
                 f"{self.path}: what was there before cannot be written down ({error.strerror}), so "
@@ -75,8 +73,7 @@ class Journal:
     def entries(self, kind: str | None = None) -> tuple[Mapping[str, Any], ...]:
         """All that was noted, oldest first; a ``kind`` alone if one is given.
 
-        Left out are a last line that a crash cut off (what it speaks of was never done), and lines
-        that are not a journal's. Raises OperationError: the file cannot be read.
+        What a crash cut off was never done, and is left out. Raises OperationError: unreadable.
         """
         entries = (_entry(line) for line in self._lines())
         return tuple(one for one in entries if one and kind in (None, one["kind"]))
@@ -139,10 +136,8 @@ class Journal:
     def owner(self) -> int | None:
         """The process that opened it and still lives; None when it is gone."""
         opened = self.read(OPENED, process_of)
-        if not opened or self.outdated:
-            return None
-        pid, started = opened[0]
-        return None if has_ended(pid, started) else pid
+        gone = not opened or self.outdated or has_ended(*opened[0])
+        return None if gone else opened[0][0]
 
     def _lines(self) -> list[str]:
         try:
@@ -249,13 +244,12 @@ def journals_folder() -> Path:
         return Path("/run/chainshaper")
     if unit := os.environ.get("RUNTIME_DIRECTORY"):  # RuntimeDirectory= of a systemd unit
         return Path(unit.split(":")[0])
-    session = os.environ.get("XDG_RUNTIME_DIR")
-    if not session:
-        raise PlatformError(
-            "$XDG_RUNTIME_DIR is not set, so there is no place for the journal of changes: name "
-            "a folder for it, or run in a login session"
-        )
-    return Path(session) / "chainshaper"
+    if session := os.environ.get("XDG_RUNTIME_DIR"):
+        return Path(session) / "chainshaper"
+    raise PlatformError(
+        "$XDG_RUNTIME_DIR is not set, so there is no place for the journal of changes: name "
+        "a folder for it, or run in a login session"
+    )
 
 
 def find_journals(folder: str | Path | None = None) -> tuple[Journal, ...]:
@@ -275,15 +269,6 @@ def discard_journal(journal: Journal) -> None:
         journal.path.parent.rmdir()
 
 
-def _remove_cut_off_line(descriptor: int) -> int:
-    """Cut off what a crash, or a full disk, has left of a line; the length of what is left."""
-    size = os.fstat(descriptor).st_size
-    if size and os.pread(descriptor, 1, size - 1) != b"\n":
-        size = os.pread(descriptor, size, 0).rfind(b"\n") + 1
-        os.ftruncate(descriptor, size)
-    return size
-
-
 def boot_id() -> str:
     return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
@@ -292,8 +277,7 @@ def boot_id() -> str:
 def locked(folder: Path, waiting: Callable[[float], None]) -> Iterator[None]:
     """Inside, no other process has this folder locked.
 
-    ``waiting`` is called with the seconds waited so far, again and again; it may raise. Raises
-    OSError: there is no such folder, or it may not be opened.
+    ``waiting`` is called with the seconds waited so far, again and again; it may raise.
     """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -323,10 +307,9 @@ def holder_of(folder: Path) -> int | None:
 
 @dataclass(frozen=True)
 class Governed:
-    """A run that governs processes, as it was seen last (ns of CLOCK_MONOTONIC).
+    """A run that governs processes, as it was seen last, at ``seen_ns`` (CLOCK_MONOTONIC).
 
-    In force from ``since_ns`` on, where its first whole cycle starts, and seen so at ``seen_ns``;
-    ``until_ns`` is when it ended (None: it has not been seen to).
+    In force from its first whole cycle on; ``until_ns``: when it ended (None: not seen to).
     """
 
     run: str
@@ -342,10 +325,9 @@ def governing(
     before: Collection[Governed] = (),
     folder: Path | None = None,
 ) -> tuple[Governed, ...]:
-    """The runs that govern threads of these processes, those of an earlier look included.
+    """The runs that govern threads of these processes, those seen ``before`` included.
 
-    To be asked now and then, since a run that is over leaves nothing behind: one that has gone is
-    over since the last look. ``folder`` is where runs have their folders.
+    To be asked now and then: a run that has gone is over since the last look.
     """
     found = {one.run: one for one in before}
     living = set()
@@ -355,15 +337,15 @@ def governing(
             if state is None or journal.owner is None:
                 continue
             with contextlib.suppress(KeyError, TypeError, ValueError):  # not as a run writes it
-                tids = [int(tid) for server in state["servers"] for tid in server["threads"]]
-                known = name in found
-                if state["in_force_ns"] is not None and (known or _own(pids, tids)):
-                    plan_file = journal.path.with_name(PLAN_FILE)
-                    plan = found[name].plan if known else _plain(plan_file)
-                    found[name] = Governed(
-                        name, state["in_force_ns"], now_ns, state.get("ended_ns"), plan
-                    )
-                    living.add(name)
+                since, known = state["in_force_ns"], name in found
+                tids = (int(tid) for server in state["servers"] for tid in server["threads"])
+                threads = (thread for tid in tids if (thread := find_thread(tid)) is not None)
+                if since is None or not (known or any(one.pid in pids for one in threads)):
+                    continue
+                plan_file = journal.path.with_name(PLAN_FILE)
+                plan = found[name].plan if known else _plain(plan_file)
+                found[name] = Governed(name, since, now_ns, state.get("ended_ns"), plan)
+                living.add(name)
     return tuple(
         one if one.run in living or one.until_ns is not None else replace(one, until_ns=one.seen_ns)
         for one in found.values()
@@ -378,20 +360,11 @@ def in_force_throughout(runs: Collection[Governed]) -> Governed | None:
     if not runs:
         return None
     latest = max(runs, key=lambda one: one.since_ns)
-    others = [
-        one
-        for one in runs
-        if one is not latest and (one.until_ns is None or one.until_ns > latest.since_ns)
-    ]
-    ends = [one.until_ns for one in (latest, *others) if one.until_ns is not None]
-    plan = None if others else latest.plan
+    together = [one for one in runs if one.until_ns is None or one.until_ns > latest.since_ns]
+    together = [latest, *(one for one in together if one is not latest)]
+    ends = [one.until_ns for one in together if one.until_ns is not None]
+    plan = latest.plan if len(together) == 1 else None
     return replace(latest, until_ns=min(ends, default=None), plan=plan)
-
-
-def _own(pids: Collection[int], tids: Collection[int]) -> bool:
-    """Whether one of the threads is of one of the processes."""
-    found = (find_thread(tid) for tid in tids)
-    return any(thread is not None and thread.pid in pids for thread in found)
 
 
 def _plain(path: Path) -> dict[str, Any] | None:

@@ -1,9 +1,7 @@
 """How threads are scheduled: what this process may have, and setting and restoring any thread's.
 
-A thread's scheduling has three **aspects**, which the kernel keeps and changes apart from each
-other: its class (policy, priority and the flag that children start without it), its nice value,
-and its cores. SCHED_FIFO needs CAP_SYS_NICE or an RLIMIT_RTPRIO, locked memory CAP_IPC_LOCK or an
-RLIMIT_MEMLOCK.
+A thread's scheduling has three **aspects**, which the kernel changes apart from each other: its
+class (policy, priority and the flag that children start without it), its nice value, its cores.
 """
 
 import ctypes
@@ -25,16 +23,14 @@ ASPECTS: tuple[Aspect, ...] = ("scheduling_class", "nice", "cores")
 _libc = ctypes.CDLL(None, use_errno=True)
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _PR_SET_PDEATHSIG, _PR_SET_NAME = 1, 15
-_THROTTLE_RUNTIME = Path("/proc/sys/kernel/sched_rt_runtime_us")
-_THROTTLE_PERIOD = Path("/proc/sys/kernel/sched_rt_period_us")
+_THROTTLE = "/proc/sys/kernel/sched_rt_{}_us"
 
 
 @dataclass(frozen=True)
 class Scheduling:
     """What a thread should get; what is None is left alone.
 
-    ``priority`` is that of SCHED_FIFO or, with ``takes_turns``, of SCHED_RR, under which threads
-    of one priority share their time; 0 is an ordinary thread's, of SCHED_OTHER.
+    ``priority`` is that of SCHED_FIFO or, with ``takes_turns``, of SCHED_RR; 0 of SCHED_OTHER.
     """
 
     priority: int | None
@@ -59,7 +55,7 @@ class SchedulingClass:
 
 @dataclass(frozen=True)
 class SchedulingState:
-    """All that the kernel keeps about how a thread is scheduled, SCHED_DEADLINE's numbers apart."""
+    """All that the kernel has on how a thread is scheduled, SCHED_DEADLINE's numbers apart."""
 
     scheduling_class: SchedulingClass
     nice: int
@@ -69,12 +65,9 @@ class SchedulingState:
 def state_of(tid: int) -> SchedulingState:
     """How a thread is scheduled now. Raises ProcessLookupError: it has ended."""
     policy = os.sched_getscheduler(tid)
+    priority = os.sched_getparam(tid).sched_priority
     return SchedulingState(
-        SchedulingClass(
-            policy=policy & ~RESET_ON_FORK,
-            priority=os.sched_getparam(tid).sched_priority,
-            reset_on_fork=bool(policy & RESET_ON_FORK),
-        ),
+        SchedulingClass(policy & ~RESET_ON_FORK, priority, bool(policy & RESET_ON_FORK)),
         nice=os.getpriority(os.PRIO_PROCESS, tid),
         cores=tuple(sorted(os.sched_getaffinity(tid))),
     )
@@ -171,22 +164,17 @@ def available_cores() -> tuple[int, ...]:
 
 
 def check_cores(cores: dict[int, str]) -> None:
-    """Refuse cores that this machine or process does not have.
-
-    ``cores`` maps each core to what asked for it, for the message. Raises PlatformError: a core is
-    not available.
-    """
+    """Refuse cores (→ what asked for them) that are not available. Raises PlatformError."""
     available = available_cores()
-    for core, user in sorted(cores.items()):
-        if core not in available:
-            raise PlatformError(
-                f"core {core}, which {user} asks for, is not available: this process may use "
-                f"{', '.join(map(str, available))}; name one of those"
-            )
+    for core in sorted(cores.keys() - set(available)):
+        raise PlatformError(
+            f"core {core}, which {cores[core]} asks for, is not available: this process may use "
+            f"{', '.join(map(str, available))}; name one of those"
+        )
 
 
 def lock_memory() -> bool:
-    """Keep all pages of this process in memory, now and later; False when not permitted."""
+    """Lock all pages of this process in memory, now and later; False when not permitted."""
     return bool(_libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) == 0)
 
 
@@ -212,8 +200,9 @@ def set_thread_name(name: str) -> None:
 def throttle_fraction() -> float:
     """Share of a core that SCHED_FIFO may use before the kernel stops it; 1.0 is no limit."""
     try:
-        runtime = int(_THROTTLE_RUNTIME.read_text())
-        period = int(_THROTTLE_PERIOD.read_text())
+        runtime, period = (
+            int(Path(_THROTTLE.format(n)).read_text()) for n in ("runtime", "period")
+        )
     except (OSError, ValueError):
         return 1.0
     return 1.0 if runtime < 0 else runtime / period

@@ -1,17 +1,16 @@
 """Threads as the kernel shows them, and what their names say.
 
-A thread is identified by its id *and* the time at which it started: ids are used again.
+A thread is identified by its id *and* its start: ids are used again. Cyclone DDS has always named
+its threads, Fast DDS does from 2.13 on (ROS 2 Jazzy); others carry the name of their process.
 
-An unmodified process shows little more of a thread than its name. Cyclone DDS has always named its
-threads, Fast DDS does from 2.13 on (ROS 2 Jazzy); before that they carry the name of their process.
-The kernel cuts names to 15 bytes, so what may be longer is compared by its beginning.
-
-Upstream: proc(5); Cyclone DDS, `check_thread_properties` in `ddsi_init.c`, and the names given to
-`ddsi_create_thread`; Fast DDS documentation, "Concurrency and multithreading".
+Upstream: proc(5); Cyclone DDS, `ddsi_create_thread`; Fast DDS, "Concurrency and multithreading".
 """
 
 import functools
 import os
+import re
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -48,56 +47,39 @@ DdsKind: TypeAlias = Literal[
     "housekeeping",
 ]
 
-_NAMES: dict[str, DdsKind] = {
-    # Cyclone DDS 0.10 and 11. `event`: heartbeats, retransmissions, discovery announcements.
-    "recv": "receive",
-    "recvUC": "receive",
-    "recvMC": "receive",
-    "tev": "event",
-    "gc": "garbage collection",
-    "lease": "lease",
-    "dq.builtins": "discovery",
-    "sendq": "transmit",
-    "fsm": "connection",
-    "debmon": "housekeeping",
-    "threadmon": "housekeeping",
-    # Fast DDS
-    "dds.tcp_accept": "connection",
-    "dds.tcp_keep": "connection",
-    "dds.shm.wdog": "housekeeping",
-    "dds.log": "housekeeping",
-}
-_PREFIXES: tuple[tuple[str, DdsKind], ...] = (
-    # Cyclone DDS: per channel, `user` unless the configuration defines others.
-    ("dq.", "delivery"),
-    ("xmit.", "transmit"),
-    ("tev.", "event"),
-    # Fast DDS: per participant, port, reader.
-    ("dds.asyn.", "asynchronous publisher"),
-    ("dds.udp.", "receive"),
-    ("dds.tcp.", "receive"),
-    ("dds.shm.", "receive"),
-    ("dds.dsha.", "receive"),
-    ("dds.ev.", "event"),
-    ("dds.ds_ev.", "discovery"),
-    ("dds.tls.", "discovery"),
-    ("dds.", "housekeeping"),
+_DDS_NAMES: tuple[tuple[str, DdsKind], ...] = (  # the first that matches a whole name counts
+    # Cyclone DDS 0.10 and 11; per channel, `user` unless the configuration defines others.
+    (r"recv(UC|MC)?", "receive"),
+    (r"dq\.builtins", "discovery"),
+    (r"dq\..*", "delivery"),
+    (r"sendq|xmit\..*", "transmit"),
+    (r"tev(\..*)?", "event"),  # heartbeats, retransmissions, discovery announcements
+    (r"gc", "garbage collection"),
+    (r"lease", "lease"),
+    (r"fsm", "connection"),
+    (r"debmon|threadmon", "housekeeping"),
+    # Fast DDS; per participant, port or reader.
+    (r"dds\.asyn\..*", "asynchronous publisher"),
+    (r"dds\.tcp_(accept|keep)", "connection"),
+    (r"dds\.shm\.wdog", "housekeeping"),
+    (r"dds\.(udp|tcp|shm|dsha)\..*", "receive"),
+    (r"dds\.ev\..*", "event"),
+    (r"dds\.(ds_ev|tls)\..*", "discovery"),
+    (r"dds\..*", "housekeeping"),
 )
 
 
 @functools.lru_cache(maxsize=1024)
 def dds_kind(comm: str) -> DdsKind | None:
     """What a DDS thread of this name does; None when it is no DDS thread's name."""
-    if comm in _NAMES:
-        return _NAMES[comm]
-    return next((kind for prefix, kind in _PREFIXES if comm.startswith(prefix)), None)
+    found = (kind for name, kind in _DDS_NAMES if re.fullmatch(name, comm, re.DOTALL))
+    return next(found, None)
 
 
 def role_of(comm: str, is_main: bool) -> ThreadRole:
     """The role of a thread of a node's process, as far as its name shows.
 
-    Executors spin on the main thread unless a program arranges it otherwise, and no program
-    renames its main thread to a DDS thread's name.
+    Executors spin on the main thread, unless a program arranges it otherwise.
     """
     if is_main:
         return "executor"
@@ -112,8 +94,7 @@ class Thread:
     """A thread as the kernel shows it at one instant.
 
     ``started`` counts clock ticks (:data:`TICK_NS`) since the machine booted. ``inner_tid`` is
-    the id that the thread has for itself: in a container, tracers record that one. ``role`` and
-    ``kind`` are what its name and place say.
+    its id in its own pid namespace: in a container, tracers record that one.
     """
 
     tid: int
@@ -137,7 +118,7 @@ def list_threads(pid: int) -> tuple[Thread, ...]:
     """The threads of a process, main thread first; empty when the process is gone."""
     try:
         tids = [int(name) for name in os.listdir(f"/proc/{pid}/task")]  # noqa: PTH208 - quicker
-        inner_pid = innermost_id(read_proc(f"/proc/{pid}/status").decode(errors="replace"))
+        inner_pid = innermost_id(read_proc(f"/proc/{pid}/status"))
     except OSError:
         return ()
     tids.sort(key=lambda tid: (tid != pid, tid))
@@ -148,10 +129,10 @@ def list_threads(pid: int) -> tuple[Thread, ...]:
 def find_thread(tid: int) -> Thread | None:
     """The thread with this id, None when there is none."""
     try:
-        status = read_proc(f"/proc/{tid}/status").decode(errors="replace")
+        status = read_proc(f"/proc/{tid}/status")
     except OSError:
         return None
-    pid = int(next(line.split()[1] for line in status.splitlines() if line.startswith("Tgid:")))
+    pid = status_field(status, "Tgid")[0]
     return _thread(pid, tid, innermost_id(status) if pid == tid else None)
 
 
@@ -162,11 +143,11 @@ def _thread(pid: int, tid: int, inner_pid: int | None) -> Thread | None:
     """
     folder = f"/proc/{pid}/task/{tid}"
     try:
-        comm, fields = _stat(folder)
+        comm, fields = read_stat(folder)
         cores = tuple(sorted(os.sched_getaffinity(tid)))
         inner_tid = tid
         if inner_pid != pid:  # in a pid namespace of its own
-            inner_tid = innermost_id(read_proc(f"{folder}/status").decode(errors="replace")) or tid
+            inner_tid = innermost_id(read_proc(f"{folder}/status")) or tid
     except OSError:
         return None
     policy = int(fields[38])
@@ -184,33 +165,26 @@ def _thread(pid: int, tid: int, inner_pid: int | None) -> Thread | None:
     )
 
 
+def all_stats() -> Iterator[tuple[int, list[bytes]]]:
+    """All processes with the fields of :func:`read_stat`, by id."""
+    for pid in sorted(int(name) for name in os.listdir("/proc") if name.isdigit()):  # noqa: PTH208
+        with suppress(OSError):  # it ended meanwhile
+            yield pid, read_stat(f"/proc/{pid}")[1]
+
+
 def parents() -> dict[int, int]:
     """All processes with their parents, by id."""
-    found = {}
-    for pid in sorted(int(name) for name in os.listdir("/proc") if name.isdigit()):  # noqa: PTH208
-        try:
-            found[pid] = int(_stat(f"/proc/{pid}")[1][1])
-        except OSError:
-            continue  # it ended meanwhile
-    return found
+    return {pid: int(fields[1]) for pid, fields in all_stats()}
 
 
 def read_proc(path: str, folder: int | None = None) -> bytes:
-    """A whole file of /proc; ``folder`` is an open one that ``path`` begins in.
-
-    Raises OSError: what it is about has ended, or belongs to another user.
-    """
+    """A whole file of /proc, or of an open ``folder`` in it. Raises OSError: gone, or forbidden."""
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC, dir_fd=folder)
-    try:
-        content = b""
-        while part := os.read(descriptor, 1 << 16):
-            content += part
-    finally:
-        os.close(descriptor)
-    return content
+    with os.fdopen(descriptor, "rb", buffering=0) as file:
+        return file.readall()
 
 
-def _stat(folder: str) -> tuple[str, list[bytes]]:
+def read_stat(folder: str) -> tuple[str, list[bytes]]:
     """A task's name, and the fields of /proc/…/stat from its state on (proc(5), the third)."""
     stat = read_proc(f"{folder}/stat")
     name_end = stat.rindex(b")")  # a name may contain spaces and brackets
@@ -218,17 +192,23 @@ def _stat(folder: str) -> tuple[str, list[bytes]]:
     return name.decode(errors="replace"), stat[name_end + 1 :].split()
 
 
-def innermost_id(status: str) -> int | None:
+def status_field(status: bytes, name: str, base: int = 10) -> list[int]:
+    """The numbers of one line of /proc/…/status, empty where it has no such line."""
+    start = f"{name}:".encode()
+    line = next((line for line in status.splitlines() if line.startswith(start)), b"")
+    return [int(number, base) for number in line.split()[1:]]
+
+
+def innermost_id(status: bytes) -> int | None:
     """A task's id in its own pid namespace: the last number of `NSpid:` in /proc/…/status."""
-    line = next((line for line in status.splitlines() if line.startswith("NSpid:")), "")
-    numbers = line.split()[1:]
-    return int(numbers[-1]) if numbers else None
+    numbers = status_field(status, "NSpid")
+    return numbers[-1] if numbers else None
 
 
 def start_of(pid: int, tid: int) -> int | None:
     """When a thread started, in clock ticks since the machine booted; None if there is none."""
     try:
-        return int(_stat(f"/proc/{pid}/task/{tid}")[1][19])
+        return int(read_stat(f"/proc/{pid}/task/{tid}")[1][19])
     except OSError:
         return None
 
@@ -236,7 +216,7 @@ def start_of(pid: int, tid: int) -> int | None:
 def has_ended(tid: int, started: int) -> bool:
     """Whether the thread that started then is gone, or a zombie."""
     try:
-        fields = _stat(f"/proc/{tid}")[1]
+        fields = read_stat(f"/proc/{tid}")[1]
     except OSError:
         return True
     return int(fields[19]) != started or fields[0] in {b"Z", b"X"}
@@ -255,10 +235,9 @@ def open_process(pid: int, started: int) -> int | None:
 
 
 def foreign_realtime_processes() -> tuple[str, ...]:
-    """Real-time threads of other user processes, as ``comm (pid)``: they spoil measurements.
+    """Other processes with real-time threads, as ``comm (pid)``: they spoil measurements.
 
-    Kernel threads (which have no executable), our own children and what enforces a plan are not
-    among them.
+    Our own children and what enforces a plan are not among them.
     """
     found = []
     for pid, parent in parents().items():
@@ -271,6 +250,5 @@ def foreign_realtime_processes() -> tuple[str, ...]:
         if os.getpid() in (pid, parent) or not command or enforces:
             continue
         realtime = [t for t in list_threads(pid) if t.policy in ("SCHED_FIFO", "SCHED_RR")]
-        if realtime:
-            found.append(f"{realtime[0].comm} ({pid})")
+        found += [f"{thread.comm} ({pid})" for thread in realtime[:1]]
     return tuple(sorted(found))

@@ -17,23 +17,20 @@ __all__ = ["Tracer", "open_source"]
 
 
 def open_source(
-    *paths: str | Path,
-    progress: Callable[[float, str], None] | None = None,
-    overview: bool = False,
+    *paths: str | Path, progress: Callable[[float, str], None] | None = None, overview: bool = False
 ) -> Recording:
     """Open a recording folder, or an LTTng trace (CTF 1.8): one folder, or several of one trace.
 
-    ``overview`` is for who wants to know what is in it only: a trace's callbacks and messages are
-    then not decoded before they are used. ``progress`` gets the share that is done, from 0 to 1,
-    and what is being done.
-
-    Raises:
-        InputError: there is nothing that can be read.
+    ``overview``: a trace's callbacks and messages are not decoded before they are used.
+    ``progress`` gets the share that is done, from 0 to 1, and what is being done.
+    Raises InputError: there is nothing that can be read.
     """
     if not paths:
         raise InputError("no recording given: name a recording's or a trace's folder")
     folders = [Path(path) for path in paths]
-    if len(folders) == 1 and not _is_trace(folders[0]):
+    is_recording = [(folder / INFO_FILE).exists() for folder in folders]
+    metadata = (path for folder in folders for path in folder.rglob("metadata"))
+    if len(folders) == 1 and (is_recording[0] or not any(path.is_file() for path in metadata)):
         return open_recording(folders[0])
     for folder in folders:
         if (folder / INFO_FILE).is_file():
@@ -44,13 +41,6 @@ def open_source(
     return open_lttng_trace(folders, progress, overview=overview)
 
 
-def _is_trace(folder: Path) -> bool:
-    """Whether there are CTF metadata in the folder or below it, and no recording in it."""
-    if (folder / INFO_FILE).exists() or not folder.is_dir():
-        return False
-    return any(path.is_file() for path in folder.rglob("metadata"))
-
-
 class Tracer(Protocol):
     """A way of recording events, made for one run.
 
@@ -59,50 +49,26 @@ class Tracer(Protocol):
 
     It gets a folder of its own, empty and on the disk of the recording, whose content becomes the
     recording's `trace/`; the application's command (empty: it runs already), and the processes to
-    attach to (empty: those that the command starts; both empty: all that run). The application
-    itself (starting and ending it, its threads, its QoS) is :mod:`chainshaper.flow.record`'s.
+    attach to (empty: those that the command starts; both empty: all that run).
     """
 
     def start(self) -> Mapping[str, str]:
         """Begin; tracing is on when this returns. What to add to the application's environment.
 
-        Raises:
-            PlatformError: the machine lacks the tracer or a privilege; names the remedy.
-            OperationError: it does not start.
+        Raises PlatformError: the machine lacks the tracer or a privilege. OperationError: else.
         """
-        ...
 
     def failure(self) -> str | None:
         """Why nothing is traced any more, as half a sentence; None while all is well.
 
-        Asked every few seconds while the application runs, so also the place to look after
-        losses. A failure ends the run; what was traced until then is recorded with it as a note.
+        Asked every few seconds, so also the place to look after losses. A failure ends the run.
         """
-        ...
 
     def stop(self) -> None:
-        """End tracing; everything is on disk when this returns.
-
-        Raises:
-            OperationError: it cannot be ended in order; `remove` is still called.
-        """
-        ...
+        """End tracing; everything is on disk when this returns. Raises OperationError."""
 
     def remove(self) -> None:
-        """Leave nothing of ours behind: sessions, daemons, processes.
-
-        Called however the run ends, also when `start` failed halfway, and perhaps twice.
-        """
-        ...
+        """Leave nothing of ours behind, however the run ended; perhaps called twice."""
 
     def recording(self) -> tuple[EventTables, RecordingInfo]:
-        """The events, and what they tell, from the folder; called after `stop` and `remove`.
-
-        A tracer fills in what it knows: ``source``, ``clock_offset_ns``, ``distribution``,
-        ``rmw``, ``processes``, ``lost``, ``notes``, ``trace_events``. Command, threads, endpoints
-        and scheduling are added to that.
-
-        Raises:
-            OperationError: what was traced cannot be read.
-        """
-        ...
+        """The events, and what they tell, after `stop` and `remove`. Raises OperationError."""

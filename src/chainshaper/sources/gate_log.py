@@ -18,31 +18,26 @@ from chainshaper.values.errors import InputError
 
 _LATER = ("dropped", "lost", "row")
 """Columns that logs have since messages may wait at a gate."""
+_TYPES = {
+    **events.COMMON_COLUMNS,
+    **events.FIELDS["gate_release"],
+    **events.OPTIONAL_FIELDS["gate_release"],
+}
 
 
 def read_gate_log(path: str | Path) -> pl.DataFrame:
-    """The event table ``gate_release`` of a shaping node's log, sorted by time.
+    """The event table ``gate_release`` of a shaping node's log, and of ``….1``, sorted by time.
 
-    The file before it, ``….1``, is a part of it. ``callback`` is null: a node does not know its
-    callback's handle. A last line that is not whole, as of a node before there was a writer of its
-    own, is left out.
-
-    Raises:
-        InputError: no such file, or it is no shaping node's log.
+    ``callback`` is null: a node does not know its callback's handle. A last line that is not whole
+    is left out. Raises InputError: no such file, or it is no shaping node's log.
     """
     path = Path(path)
     before = path.with_name(f"{path.name}.1")
-    parts = [before, path] if path.exists() or not before.exists() else [before]
-    tables = [_read_part(part) for part in parts if part is path or part.exists()]
-    return pl.concat(tables).sort("time", maintain_order=True)
+    parts = [one for one in (before, path) if one.exists()] or [path]
+    return pl.concat([_read_part(part) for part in parts]).sort("time", maintain_order=True)
 
 
 def _read_part(path: Path) -> pl.DataFrame:
-    types = {
-        **events.COMMON_COLUMNS,
-        **events.FIELDS["gate_release"],
-        **events.OPTIONAL_FIELDS["gate_release"],
-    }
     try:
         text = path.read_bytes()
     except OSError as error:
@@ -55,11 +50,11 @@ def _read_part(path: Path) -> pl.DataFrame:
             "columns: name the file that the parameter `log` of the node names"
         )
     try:
-        table = pl.read_csv(whole, schema={name: types[name] for name in names})
+        table = pl.read_csv(whole, schema={name: _TYPES[name] for name in names})
     except pl.exceptions.PolarsError as error:
         raise InputError(f"{path}: a line is not as a shaping node writes it: {error}") from error
-    unknown = [pl.lit(None, dtype=types[n]).alias(n) for n in types.keys() - set(names)]
-    return table.with_columns(unknown).select(*types)
+    unknown = [pl.lit(None, dtype=_TYPES[n]).alias(n) for n in _TYPES.keys() - set(names)]
+    return table.with_columns(unknown).select(*_TYPES)
 
 
 def rows_missing(releases: pl.DataFrame) -> tuple[int, int]:
@@ -67,12 +62,10 @@ def rows_missing(releases: pl.DataFrame) -> tuple[int, int]:
 
     Rows are numbered from 1 since a node started; logs of before are taken to be whole.
     """
-    removed = unwritten = 0
-    numbered = releases.drop_nulls("row")
-    spans = numbered.group_by("pid").agg(first=pl.min("row"), last=pl.max("row"), there=pl.len())
-    for _, first, last, there in spans.iter_rows():
-        removed += first - 1
-        unwritten += last - first + 1 - there
+    first, last = pl.min("row"), pl.max("row")
+    spans = releases.drop_nulls("row").group_by("pid")
+    counts = spans.agg(removed=first - 1, unwritten=last - first + 1 - pl.len().cast(pl.Int64))
+    removed, unwritten = counts.select("removed", "unwritten").sum().row(0)
     return removed, unwritten
 
 
@@ -89,41 +82,34 @@ def releases_so_far(logs: Iterable[Path]) -> npt.NDArray[np.int64]:
 def with_gate_logs(
     tables: events.EventTables, logs: Sequence[Path], since_ns: int, until_ns: int
 ) -> tuple[events.EventTables, tuple[str, ...]]:
-    """Event tables with `gate_release` from the logs of shaping nodes, and which are not there.
+    """Event tables with `gate_release` and stalls from the logs of shaping nodes; and notes.
 
-    A node writes its log for as long as it runs. Of that, the cycles count that began at
-    ``since_ns`` or later, and whose message was let go before ``until_ns``: those are in the other
-    tables too (both CLOCK_MONOTONIC).
-
-    Raises:
-        InputError: a file is no shaping node's log.
+    Of what a node has written, the cycles count that began at ``since_ns`` or later, and whose
+    message was let go before ``until_ns`` (CLOCK_MONOTONIC). Raises InputError: no such log.
     """
     there = [log for log in logs if log.is_file()]
-    missing = tuple(
+    notes = tuple(
         f"the shaping node's log {log} is not there: it has let nothing through, or did not start."
         for log in logs
         if log not in there
     )
     if not there:
-        return tables, missing
+        return tables, notes
     releases = pl.concat([read_gate_log(log) for log in there]).sort("time", maintain_order=True)
     removed, unwritten = rows_missing(releases)
     if removed:
-        missing += (
+        notes += (
             f"{removed} rows of shaping nodes' logs were removed to make room for newer ones.",
         )
     if unwritten:
-        missing += (
+        notes += (
             f"{unwritten} rows of shaping nodes' logs could not be written: what became of those "
             "messages is not known. See to room on the disk.",
         )
     releases = releases.filter(pl.col("origin") >= since_ns, pl.col("time") < until_ns)
-    stalls = pl.concat([events.table(tables, "machine_stall"), _stalls(releases)], how="diagonal")
+    seen = releases.filter(pl.col("stalled") >= STALL_NS).select(
+        "pid", "tid", "cpu", time="release", duration="stalled"
+    )
+    stalls = pl.concat([events.table(tables, "machine_stall"), seen], how="diagonal")
     stalls = stalls.sort("time", maintain_order=True)
-    return {**tables, "gate_release": releases, "machine_stall": stalls}, missing
-
-
-def _stalls(releases: pl.DataFrame) -> pl.DataFrame:
-    """The rows of `machine_stall` that gates saw: each watches the clock at its releases."""
-    seen = releases.filter(pl.col("stalled") >= STALL_NS)
-    return seen.select("pid", "tid", "cpu", time="release", duration="stalled")
+    return {**tables, "gate_release": releases, "machine_stall": stalls}, notes

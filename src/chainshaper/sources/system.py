@@ -1,22 +1,10 @@
 """What the events of a trace tell about the system it was taken on: distribution, RMW, processes.
 
-Three kinds of evidence tell the distribution: CARET's `caret_init` says it; `rcl_init` carries the
-version of tracetools, and every distribution released another one; without it (tracing began later)
-the fields of the events do: `rmw_publish` has a source timestamp since Jazzy, a gid 16 bytes
-instead of 24 since Kilted, intra-process events came with Iron. Declared fields prove presence;
-what a session did not enable proves nothing.
-
-The RMW is known from CARET's `rmw_implementation`, from the gids of publishers and subscriptions,
-which begin with the DDS vendor's number (RTPS 2.5, section 9.3.1.5: guidPrefix[0:2] = vendorId), or
-from the names of threads.
-
 Upstream: changelogs of tracetools; https://www.dds-foundation.org/dds-rtps-vendor-and-product-ids/.
 """
 
 import re
 from collections.abc import Iterable, Mapping
-
-import polars as pl
 
 from chainshaper.values.events import NODE_NAME, EventTables
 
@@ -27,42 +15,39 @@ _RELEASES = {  # Versions of tracetools below these belong to the distribution.
     **{"jazzy": (8, 3), "kilted": (8, 7), "lyrical": (8, 11)},
 }
 _LATER = "rolling"
-
 _VENDORS = {
     (0x01, 0x01): "rmw_connextdds",
     (0x01, 0x0F): "rmw_fastrtps_cpp",
     (0x01, 0x10): "rmw_cyclonedds_cpp",
     (0x01, 0x16): "rmw_gurumdds_cpp",
 }
-_THREADS = (
-    (re.compile(r"recvUC|recvMC|dq\.builtins|dq\.user|xmit\.user"), "rmw_cyclonedds_cpp"),
-    (re.compile(r"dds\.(asyn|ev|udp|shm|tcp)"), "rmw_fastrtps_cpp"),
-)
+_THREADS = {
+    "rmw_cyclonedds_cpp": re.compile(r"recvUC|recvMC|dq\.builtins|dq\.user|xmit\.user"),
+    "rmw_fastrtps_cpp": re.compile(r"dds\.(asyn|ev|udp|shm|tcp)"),
+}
 
 
 def distribution_of(tables: EventTables, fields: Mapping[str, Mapping[str, int]]) -> str | None:
     """The ROS 2 distribution as `ROS_DISTRO` has it (``jazzy``), None if nothing tells.
 
-    ``tables`` are those of the objects' creation; ``fields`` the declared events' fields, with
-    the length of those that are arrays (0: no array).
+    ``fields`` are the declared events' fields, with the length of arrays. CARET's `caret_init`
+    says it, or `rcl_init` by the version of tracetools. Else declared fields prove it:
+    `rmw_publish` has a source timestamp since Jazzy, a gid 16 bytes instead of 24 since Kilted,
+    intra-process events came with Iron.
     """
     said = _first(tables, "caret_init", "distribution")
     if said is not None:
         return said
-    version_text = _first(tables, "rcl_init", "version")
-    if version_text is not None:
-        found = re.match(r"(\d+)\.(\d+)", version_text)
-        if found is not None:
-            version = int(found[1]), int(found[2])
-            return next((name for name, below in _RELEASES.items() if version < below), _LATER)
-    if "rmw_publish" not in fields:
-        return None
-    if "timestamp" in fields["rmw_publish"]:
+    found = re.match(r"(\d+)\.(\d+)", _first(tables, "rcl_init", "version") or "")
+    if found is not None:
+        version = int(found[1]), int(found[2])
+        return next((name for name, below in _RELEASES.items() if version < below), _LATER)
+    if "timestamp" in fields.get("rmw_publish", ()):
         length = fields.get("rmw_publisher_init", {}).get("gid", 0)
         return {24: "jazzy", 16: "kilted"}.get(length)
-    if "rclcpp_intra_publish" in fields and "rclcpp_ring_buffer_enqueue" in fields:
+    if fields.keys() >= {"rmw_publish", "rclcpp_intra_publish", "rclcpp_ring_buffer_enqueue"}:
         return "iron"
-    return "humble" if "rclcpp_executor_execute" in fields else None
+    return "humble" if fields.keys() >= {"rmw_publish", "rclcpp_executor_execute"} else None
 
 
 def _first(tables: EventTables, event: str, field: str) -> str | None:
@@ -74,28 +59,28 @@ def _first(tables: EventTables, event: str, field: str) -> str | None:
 
 
 def rmw_of_gids(tables: EventTables) -> str | None:
-    """The RMW from CARET's event, or from the vendor in the endpoints' gids."""
+    """The RMW from CARET's event, or from the endpoints' gids.
+
+    These begin with the DDS vendor's number (RTPS 2.5, 9.3.1.5: guidPrefix[0:2] = vendorId).
+    """
     named = _first(tables, "rmw_implementation", "rmw_impl")
     if named is not None:
         return named
     for event in ("rmw_publisher_init", "rmw_subscription_init"):
         endpoints = tables.get(event)
-        if endpoints is None or not endpoints.height or "gid" not in endpoints.columns:
-            continue
-        vendors = {tuple(gid[:2]) for gid in endpoints["gid"].drop_nulls().head(1000)}
-        names = {_VENDORS.get(vendor) for vendor in vendors}
-        if len(names) == 1:
-            return names.pop()
+        if endpoints is not None and endpoints.height and "gid" in endpoints.columns:
+            gids = endpoints["gid"].drop_nulls().head(1000)
+            names = {_VENDORS.get(tuple(gid[:2])) for gid in gids}
+            if len(names) == 1:
+                return names.pop()
     return None
 
 
 def rmw_of_threads(names: Iterable[str]) -> str | None:
     """The RMW from the names of threads; Fast DDS names its own from 2.13 on."""
     known = list(names)
-    for pattern, rmw in _THREADS:
-        if any(pattern.match(name) for name in known):
-            return rmw
-    return None
+    matching = (rmw for rmw, pattern in _THREADS.items() if any(map(pattern.match, known)))
+    return next(matching, None)
 
 
 def processes_of(tables: EventTables, commands: Mapping[int, str]) -> dict[int, str]:
@@ -104,7 +89,6 @@ def processes_of(tables: EventTables, commands: Mapping[int, str]) -> dict[int, 
     nodes = tables.get("rcl_node_init")
     if nodes is not None and nodes.height:
         named = nodes.select("pid", node=NODE_NAME).drop_nulls()
-        names = pl.col("node").unique(maintain_order=True)
-        grouped = named.group_by("pid", maintain_order=True).agg(names)
-        processes |= {pid: ", ".join(names) for pid, names in grouped.iter_rows()}
+        for pid, node in named.unique(maintain_order=True).group_by("pid").agg("node").iter_rows():
+            processes[pid] = ", ".join(node)
     return dict(sorted(processes.items()))

@@ -1,5 +1,6 @@
 /* The trace points of ros2_tracing with their signatures: Jazzy's (tracetools 8.2), or Humble's
-   (4.1) with -DHUMBLE. TRACE_POINT is what stands behind each: a body, or nothing. */
+   (4.1) with -DHUMBLE. TRACE_POINT is what stands behind each: a body, or nothing. With -DFEW a
+   library exports the two of callbacks only, whose probes are set sooner. */
 
 #include <stdbool.h>
 #include <stddef.h>
@@ -10,6 +11,13 @@
 #endif
 
 #ifndef DISABLED
+void ros_trace_callback_start(const void *callback, const bool is_intra_process) TRACE_POINT
+void ros_trace_callback_end(const void *callback) TRACE_POINT
+#ifdef FEW
+#undef TRACE_POINT
+#define TRACE_POINT {}
+#pragma GCC visibility push(hidden)
+#endif
 void ros_trace_rcl_init(const void *context_handle) TRACE_POINT
 void ros_trace_rcl_node_init(const void *node_handle, const void *rmw_handle,
     const char *node_name, const char *node_namespace) TRACE_POINT
@@ -43,8 +51,6 @@ void ros_trace_rclcpp_timer_callback_added(const void *timer_handle,
 void ros_trace_rclcpp_timer_link_node(const void *timer_handle, const void *node_handle) TRACE_POINT
 void ros_trace_rclcpp_callback_register(const void *callback,
     const char *function_symbol) TRACE_POINT
-void ros_trace_callback_start(const void *callback, const bool is_intra_process) TRACE_POINT
-void ros_trace_callback_end(const void *callback) TRACE_POINT
 void ros_trace_rcl_lifecycle_state_machine_init(const void *node_handle,
     const void *state_machine) TRACE_POINT
 void ros_trace_rcl_lifecycle_transition(const void *state_machine, const char *start_label,
@@ -66,5 +72,8 @@ void ros_trace_rclcpp_ring_buffer_enqueue(const void *buffer, const uint64_t ind
 void ros_trace_rclcpp_ring_buffer_dequeue(const void *buffer, const uint64_t index,
     const uint64_t size) TRACE_POINT
 void ros_trace_rclcpp_ring_buffer_clear(const void *buffer) TRACE_POINT
+#endif
+#ifdef FEW
+#pragma GCC visibility pop
 #endif
 #endif

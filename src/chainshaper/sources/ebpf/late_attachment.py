@@ -1,25 +1,10 @@
 """Who exists in an application that ran before tracing began, as far as it can be found out.
 
 Objects say who they are when they are created. For those created before, the same tables are filled
-with what is known otherwise, so that the analysis does with it what it always does:
+with what is known otherwise; `docs/record_ebpf.md` says how. What is not certain is left open.
 
-* **Topics**: what a tracer read from the objects behind the handles of `rmw_publish`, `rmw_take`
-  and `rcl_publish`. This is certain.
-* **Subscriptions' callbacks**: an executor takes a message and at once starts the callback that it
-  is for, on the same thread. A callback that nearly always starts like that is its subscription's.
-* **Timers**: callbacks that start without a message, at regular distances. Services' callbacks
-  rarely are regular, and stay unknown, like everything that gets its messages within its process.
-* **Nodes**: no event that is repeated names one. DDS discovery shows which nodes publish and
-  subscribe which topics: a topic that one node only publishes tells whose publisher it is, and
-  which node lives in that process. The command line of a process names nodes (remap rules, which
-  `ros2 launch` makes). Where several nodes have a topic (`/rosout`), it is the one that is known to
-  live in that process. A timer belongs to its process's only node, or to that of the publisher it
-  uses. What is not certain is left open.
-
-All are taken to exist from the beginning of the recording. Their handles are the real ones where
-events carry them, and addresses of other things of the same object where not; nodes are numbered
-from 1, where no object's address can be. This is about rclcpp: rclpy emits no callback events, its
-endpoints are found all the same.
+Handles are the real ones where events carry them, and addresses of other things of the same object
+where not; nodes are numbered from 1, where no object's address can be.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -54,23 +39,22 @@ _KINDS = ("publisher", "subscription")
 def with_found_objects(
     tables: events.EventTables, handles: pl.DataFrame, began_ns: int
 ) -> tuple[events.EventTables, tuple[str, ...]]:
-    """Add publishers, subscriptions and callbacks that were there at ``began_ns``.
+    """Add publishers, subscriptions and callbacks that were there at ``began_ns``; and a note.
 
-    ``handles`` has the columns ``pid, event, handle, topic``, as
-    :class:`~chainshaper.sources.ebpf.printing.Printed` has them.
-
-    Returns:
-        The tables, and in words what was found and how.
+    ``handles`` has the columns ``pid, event, handle, topic``.
     """
     handles = handles.filter(pl.col("topic").str.starts_with("/"))  # others are the RMW's own
     publishers = _publishers(tables, handles)
     known = events.table(tables, "rcl_subscription_init")
     subscriptions = _of(handles, "rmw_take", "rmw_subscription_handle", known)
     starts = _unregistered_starts(tables)
-    readers = _readers(starts).join(
-        subscriptions.select("pid", "rmw_subscription_handle"),
-        on=["pid", "rmw_subscription_handle"],
-        how="semi",
+    usual = pl.col("taken").drop_nulls().mode().first().alias("rmw_subscription_handle")
+    share = (pl.col("taken") == usual).fill_null(False).mean()
+    readers = (
+        starts.group_by(_CALLBACK)
+        .agg(usual, share=share)
+        .filter(pl.col("share") >= _NEARLY_ALWAYS)
+        .join(subscriptions, on=["pid", "rmw_subscription_handle"], how="semi")
     )
     timers = _timers(starts.join(readers, on=_CALLBACK, how="anti"))
     handle = pl.col("rmw_subscription_handle").alias("subscription_handle")
@@ -101,8 +85,7 @@ def with_functions(
 ) -> events.EventTables:
     """Add what `rclcpp_callback_register` would have shown: (process, callback) → its function.
 
-    Callbacks were registered when they were added, or before ``began_ns``. What the event itself
-    shows, as on Humble, stays.
+    What the event itself shows, as on Humble, stays.
     """
     named = pl.DataFrame(
         [(*callback, symbol) for callback, symbol in functions.items()],
@@ -119,10 +102,7 @@ def with_functions(
 def added_rows(
     tables: events.EventTables, rows: Mapping[str, pl.DataFrame], began_ns: int
 ) -> dict[str, pl.DataFrame]:
-    """The tables with new rows, as events of ``began_ns`` where no ``time`` says otherwise.
-
-    Tables that get none are left out.
-    """
+    """The tables that get new rows, as events of ``began_ns`` where no ``time`` says otherwise."""
     added = {}
     for name, found in rows.items():
         if found.height:
@@ -141,6 +121,11 @@ def _of(handles: pl.DataFrame, event: str, column: str, known: pl.DataFrame) -> 
     return found.join(known, on=["pid", column], how="anti")
 
 
+def _threads_rows(*marks: pl.DataFrame) -> pl.DataFrame:
+    """Rows of several events by time: what one thread did follows each other."""
+    return pl.concat(marks, how="diagonal").sort("time", maintain_order=True)
+
+
 def _publishers(tables: events.EventTables, handles: pl.DataFrame) -> pl.DataFrame:
     """``pid, publisher_handle, rmw_publisher_handle, topic_name`` of those created before.
 
@@ -149,14 +134,12 @@ def _publishers(tables: events.EventTables, handles: pl.DataFrame) -> pl.DataFra
     key = ["pid", "rmw_publisher_handle"]
     known = events.table(tables, "rcl_publisher_init")
     published = events.table(tables, "rcl_publish")
-    written = events.table(tables, "rmw_publish", [key[1], "timestamp"])
-    marks = [
-        published.select(*_THREAD, "message", "publisher_handle"),
-        written.select(*_THREAD, "message", key[1]),
-    ]
+    written = events.table(tables, "rmw_publish", key[1:])
     both = (
-        pl.concat(marks, how="diagonal")
-        .sort("time", maintain_order=True)
+        _threads_rows(
+            published.select(*_THREAD, "message", "publisher_handle"),
+            written.select(*_THREAD, "message", key[1]),
+        )
         .with_columns(pl.col("publisher_handle").shift(1).over("pid", "tid", "message"))
         .drop_nulls([key[1], "publisher_handle"])
         .group_by(key)
@@ -170,18 +153,15 @@ def _publishers(tables: events.EventTables, handles: pl.DataFrame) -> pl.DataFra
 def _unregistered_starts(tables: events.EventTables) -> pl.DataFrame:
     """Starts of callbacks that were never registered: ``time, pid, callback, taken``.
 
-    ``taken`` is the subscription from which the thread had just taken a message, null if it did
-    something else before.
+    ``taken``: the subscription from which the thread had just taken a message, null if none.
     """
     takes = events.table(tables, "rmw_take", ["taken"]).filter(pl.col("taken").fill_null(1) != 0)
     starts = events.table(tables, "callback_start", ["is_intra_process"])
-    marks = [
+    rows = _threads_rows(
         takes.select(*_THREAD, handle="rmw_subscription_handle"),
         starts.select(*_THREAD, "callback", "is_intra_process"),
         events.table(tables, "callback_end").select(*_THREAD),
-    ]
-    rows = pl.concat(marks, how="diagonal").sort("time", maintain_order=True)
-    rows = rows.with_columns(taken=pl.col("handle").shift(1).over("pid", "tid"))
+    ).with_columns(taken=pl.col("handle").shift(1).over("pid", "tid"))
     registered = [events.table(tables, name).select(_CALLBACK) for name in ADDED]
     return (
         rows.drop_nulls("callback")
@@ -189,21 +169,6 @@ def _unregistered_starts(tables: events.EventTables) -> pl.DataFrame:
         .join(pl.concat(registered), on=_CALLBACK, how="anti")
         .select("time", *_CALLBACK, "taken")
     )
-
-
-def _readers(starts: pl.DataFrame) -> pl.DataFrame:
-    """``pid, callback, rmw_subscription_handle`` of callbacks that start with what was taken."""
-    usual = starts.group_by(_CALLBACK).agg(
-        pl.col("taken").drop_nulls().mode().first().alias("rmw_subscription_handle"),
-        pl.len().alias("starts"),
-    )
-    with_it = pl.col("taken") == pl.col("rmw_subscription_handle")
-    share = (
-        starts.join(usual, on=_CALLBACK)
-        .group_by([*_CALLBACK, "rmw_subscription_handle"])
-        .agg(with_it.fill_null(False).mean().alias("share"))
-    )
-    return share.filter(pl.col("share") >= _NEARLY_ALWAYS).drop("share")
 
 
 def _timers(starts: pl.DataFrame) -> pl.DataFrame:
@@ -231,20 +196,19 @@ def with_found_nodes(
     endpoints: Sequence[EndpointInfo],
     processes: Iterable[Process],
 ) -> tuple[events.EventTables, RecordingInfo]:
-    """Give publishers, subscriptions and timers without a node theirs, as far as it is certain.
+    """Give publishers, subscriptions and timers without a node theirs, where it is certain.
 
-    ``endpoints`` are those of DDS discovery. Names of processes change with the tables, and what
-    stays unknown becomes a note. Nothing changes where every endpoint has its node.
+    ``endpoints`` are those of DDS discovery: a topic that one node only publishes says whose
+    publisher it is, and which node lives in that process. What stays unknown becomes a note.
     """
-    nameless = {kind: _nameless(tables, kind) for kind in _KINDS}
-    began = min((t for rows in nameless.values() for t in rows["time"]), default=None)
-    if began is None:
+    created = {kind: events.table(tables, f"rcl_{kind}_init") for kind in _KINDS}
+    nameless = pl.concat(
+        rows.filter(pl.col("node_handle").is_null()).select("time", *_endpoint(kind))
+        for kind, rows in created.items()
+    )
+    if nameless.is_empty():
         return tables, info
-    wanted = [
-        (kind, pid, topic)
-        for kind, rows in nameless.items()
-        for pid, topic in rows.select("pid", "topic_name").iter_rows()
-    ]
+    wanted = list(nameless.drop("time").iter_rows())
     named = {one.pid: named_nodes(one.command) for one in processes}
     owners, nodes_of = _owners(wanted, endpoints, named)
     numbers = {
@@ -253,18 +217,20 @@ def with_found_nodes(
         for number, node in enumerate(sorted(nodes), 1)
     }
     changed: dict[str, pl.DataFrame] = dict(tables)
-    for kind in _KINDS:
-        created = events.table(tables, f"rcl_{kind}_init")
-        keys = [(kind, *key) for key in created.select("pid", "topic_name").iter_rows()]
+    for kind, rows in created.items():
+        keys = rows.select(*_endpoint(kind)).iter_rows()
         found = [numbers[key[1], owners[key]] if key in owners else None for key in keys]
         if any(found):
             node = pl.col("node_handle").fill_null(pl.Series(found, dtype=pl.UInt64))
-            changed[f"rcl_{kind}_init"] = created.with_columns(node)
-    new = {
-        "rcl_node_init": _node_rows(numbers),
-        "rclcpp_timer_link_node": _timer_links(changed, nodes_of, numbers),
-    }
-    changed |= added_rows(changed, new, began)
+            changed[f"rcl_{kind}_init"] = rows.with_columns(node)
+    parts = [(*key, number, *key[1].rsplit("/", 1)) for key, number in numbers.items()]
+    types = {"pid": pl.Int32, "node": pl.String, "node_handle": pl.UInt64}
+    types |= {"namespace": pl.String, "node_name": pl.String}
+    nodes = pl.DataFrame(parts, schema=types, orient="row").with_columns(
+        pl.col("namespace").replace("", "/")
+    )
+    new = {"rcl_node_init": nodes, "rclcpp_timer_link_node": _timer_links(changed, nodes)}
+    changed |= added_rows(changed, new, min(nameless["time"]))
     names = processes_of(changed, info.processes)
     notes = info.notes
     if unknown := sorted({key[2] for key in wanted if key not in owners} - INTERNAL_TOPICS):
@@ -275,13 +241,12 @@ def with_found_nodes(
     return changed, info.model_copy(update={"processes": names, "notes": notes})
 
 
-def _nameless(tables: events.EventTables, kind: str) -> pl.DataFrame:
-    endpoints = events.table(tables, f"rcl_{kind}_init")
-    return endpoints.filter(pl.col("node_handle").is_null()).select("time", "pid", "topic_name")
+def _endpoint(kind: str) -> tuple[pl.Expr, ...]:
+    return pl.lit(kind).alias("kind"), pl.col("pid"), pl.col("topic_name")
 
 
 def _owners(
-    wanted: Iterable[tuple[str, int, str]],
+    wanted: Sequence[tuple[str, int, str]],
     endpoints: Iterable[EndpointInfo],
     named: Mapping[int, Sequence[str]],
 ) -> tuple[dict[tuple[str, int, str], str], dict[int, set[str]]]:
@@ -289,7 +254,6 @@ def _owners(
     candidates: dict[tuple[str, str], set[str]] = {}
     for one in endpoints:
         candidates.setdefault((one.kind, one.topic), set()).add(one.node)
-    wanted = list(wanted)
     nodes_of = {pid: set(named.get(pid, ())) for _, pid, _ in wanted}
     for kind, pid, topic in wanted:
         found = candidates.get((kind, topic), set())
@@ -305,55 +269,31 @@ def _owners(
     return owners, nodes_of
 
 
-def _node_rows(numbers: Mapping[tuple[int, str], int]) -> pl.DataFrame:
-    rows = []
-    for (pid, node), handle in numbers.items():
-        namespace, name = node.rsplit("/", 1)
-        rows.append((pid, handle, namespace or "/", name))
-    types = {**events.COMMON_COLUMNS, **events.FIELDS["rcl_node_init"]}
-    columns = ("pid", "node_handle", "namespace", "node_name")
-    return pl.DataFrame(rows, schema={name: types[name] for name in columns}, orient="row")
-
-
-def _timer_links(
-    tables: events.EventTables,
-    nodes_of: Mapping[int, set[str]],
-    numbers: Mapping[tuple[int, str], int],
-) -> pl.DataFrame:
-    """``pid, timer_handle, node_handle`` of timers that no event links to a node."""
+def _timer_links(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
+    """``pid, timer_handle, node_handle`` of timers that no event links to one of the ``nodes``."""
     timers = events.table(tables, "rclcpp_timer_callback_added").join(
         events.table(tables, "rclcpp_timer_link_node"), on=["pid", "timer_handle"], how="anti"
     )
-    only = [
-        (pid, numbers[pid, node])
-        for pid, nodes in nodes_of.items()
-        for node in nodes
-        if len(nodes) == 1
-    ]
-    alone = pl.DataFrame(only, schema={"pid": pl.Int32, "alone": pl.UInt64}, orient="row")
+    alone = nodes.select("pid", alone="node_handle").unique("pid", keep="none")
+    started = events.table(tables, "callback_start")
+    ended = events.table(tables, "callback_end").with_columns(callback=pl.lit(0, pl.UInt64))
+    published = events.table(tables, "rcl_publish").select(*_THREAD, "publisher_handle")
+    created = events.table(tables, "rcl_publisher_init")
+    owners = created.select("pid", "publisher_handle", "node_handle").drop_nulls()
+    publishing = (  # whose publishers callbacks use, mostly
+        _threads_rows(
+            started.select(*_THREAD, "callback"), ended.select(*_THREAD, "callback"), published
+        )
+        .with_columns(pl.col("callback").forward_fill().over("pid", "tid"))
+        .drop_nulls(["publisher_handle", "callback"])
+        .filter(pl.col("callback") != 0)
+        .join(owners, on=["pid", "publisher_handle"])
+        .group_by(_CALLBACK)
+        .agg(pl.col("node_handle").mode().first())
+    )
     return (
         timers.join(alone, on="pid", how="left")
-        .join(_publishing(tables), on=["pid", "callback"], how="left")
+        .join(publishing, on=_CALLBACK, how="left")
         .select("pid", "timer_handle", node_handle=pl.coalesce("alone", "node_handle"))
         .drop_nulls("node_handle")
-    )
-
-
-def _publishing(tables: events.EventTables) -> pl.DataFrame:
-    """``pid, callback, node_handle``: whose publishers callbacks use, mostly."""
-    no_callback = pl.lit(0, pl.UInt64).alias("callback")
-    marks = [
-        events.table(tables, "callback_start").select(*_THREAD, "callback"),
-        events.table(tables, "callback_end").select(*_THREAD, no_callback),
-        events.table(tables, "rcl_publish").select(*_THREAD, "publisher_handle"),
-    ]
-    created = events.table(tables, "rcl_publisher_init")
-    owners = created.select("pid", "publisher_handle", "node_handle")
-    rows = pl.concat(marks, how="diagonal").sort("time", maintain_order=True)
-    rows = rows.with_columns(pl.col("callback").forward_fill().over("pid", "tid"))
-    inside = rows.drop_nulls(["publisher_handle", "callback"]).filter(pl.col("callback") != 0)
-    return (
-        inside.join(owners.drop_nulls(), on=["pid", "publisher_handle"])
-        .group_by("pid", "callback")
-        .agg(pl.col("node_handle").mode().first())
     )

@@ -1,22 +1,19 @@
 """Tracing with eBPF: uprobes on the library that every ROS 2 node has, set by bpftrace.
 
-No LTTng and no session daemon are needed, only bpftrace and the privilege to use it. Uprobes belong
-to a file, so they are there before the first process maps it, and they reach processes that run
-already. What they cost a thread, and what cannot be seen by them, is in `docs/record_ebpf.md`.
-
-bpftrace writes into a file, and we read it when all is over. It says on its own output when all
-probes are in place. Probes are set, and removed, one after the other: what comes before the last
-one was set or after the first one was removed is left out, because instances and messages would
-be incomplete there.
+Uprobes belong to a file, so they are there before the first process maps it, and they reach
+processes that run already (`docs/record_ebpf.md`). Probes are set, and removed, one after the
+other: what comes before the last one was set or after the first one was removed is left out.
 
 Upstream: bpftrace(8); `src/bpftrace.cpp` of bpftrace 0.17 to 0.26.
 """
 
+import mmap
 import os
+import re
 import signal
 import subprocess
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -26,27 +23,22 @@ import polars as pl
 
 from chainshaper.gate.decision import clock_offset
 from chainshaper.linux.own_processes import is_installed, tool_environment
-from chainshaper.linux.processes import descendants
+from chainshaper.linux.processes import descendants, run_users, user_name, user_of
 from chainshaper.linux.scheduling import signalled_with_parent
-from chainshaper.linux.threads import parents
-from chainshaper.linux.users import run_users, user_name, user_of
-from chainshaper.sources.ebpf.callback_functions import callback_functions
+from chainshaper.linux.threads import parents, read_proc, read_stat, status_field
+from chainshaper.sources.ebpf.functions import callback_functions, open_regular
 from chainshaper.sources.ebpf.late_attachment import ADDED, with_found_objects, with_functions
-from chainshaper.sources.ebpf.printing import (
+from chainshaper.sources.ebpf.trace_points import (
     HEADER,
+    LIBRARY,
     TEXT_BYTES,
     Printed,
-    bpftrace_script,
-    lost_events,
-    read_printed,
-)
-from chainshaper.sources.ebpf.trace_points import (
-    LIBRARY,
     TracePoint,
     TracingLibrary,
+    bpftrace_script,
     installed_libraries,
     mapped_libraries,
-    open_regular,
+    read_printed,
     trace_points,
 )
 from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids
@@ -55,24 +47,24 @@ from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import RecordingInfo
 
-__all__ = ["EbpfTracer"]
+__all__ = ["EbpfTracer", "lost_events"]
 
-_SCRIPT, _EVENTS, _SAID = "events.bt", "events.txt", "bpftrace.log"
 _ATTACHED = "__BPFTRACE_NOTIFY_PROBES_ATTACHED"
+_PAGES = "BPFTRACE_PERF_RB_PAGES"
 _SETTINGS = {
     _ATTACHED: "1",
-    "BPFTRACE_PERF_RB_PAGES": "1024",  # 4 MiB (a core, before 0.21): some 50,000 events
+    _PAGES: "1024",  # 4 MiB (a core, before 0.21): some 50,000 events
     "BPFTRACE_MAP_KEYS_MAX": "65536",  # until 0.18; its name since then:
     "BPFTRACE_MAX_MAP_KEYS": "65536",
     "BPFTRACE_MAX_PROBES": "4096",
     "BPFTRACE_MAX_BPF_PROGS": "4096",
     "BPFTRACE_CACHE_USER_SYMBOLS": "0",
 }
+_LOST = re.compile(rb"^Lost (\d+) events", re.MULTILINE)
 _NICE = 10
 _SHORTEST_SUSPENSION_NS = 1_000_000
-_START_S = 120.0
-_READ_S = 10.0
-_STOP_S = 60.0
+_START_S, _READ_S, _STOP_S = 120.0, 10.0, 60.0
+_LOOK_S = 0.02
 _CAP_SYS_ADMIN, _CAP_PERFMON, _CAP_BPF = 21, 38, 39
 _FIRST_PID_NAMESPACE = "pid:[4026531836]"  # linux/proc_ns.h: PROC_PID_INIT_INO
 
@@ -87,7 +79,9 @@ class EbpfTracer:
         pids: Sequence[int],
         users: Collection[int] | None = None,
     ) -> None:
-        self._folder = folder.absolute()
+        self._script, self._events, self._said = (
+            folder.absolute() / name for name in ("events.bt", "events.txt", "bpftrace.log")
+        )
         self._attached = not command
         self._pids = tuple(pids)
         self._users = run_users() if users is None else users
@@ -111,30 +105,33 @@ class EbpfTracer:
                 "bpftrace`; 0.17 or later), or record with `--source lttng`"
             )
         self._points = trace_points(self._libraries())
-        script = bpftrace_script(
-            self._by_descriptor(), self._traced(), users=self._users, attached=self._attached
-        )
-        (self._folder / _SCRIPT).write_text(script)
-        self._clock_offset_ns, self._ahead_ns = clock_offset(), _boot_time_ahead()
-        self._bpftrace = self._launched()
-        self._wait_until_attached(self._bpftrace)
-        self._began_ns = time.monotonic_ns()
-        return {}
-
-    def _by_descriptor(self) -> tuple[TracePoint, ...]:
-        """The trace points in their files as we have them open, whatever the files are called.
-
-        A path is text that whoever owns a folder chooses, and what it leads to may change.
-        """
+        traced = self._traced()
         for file in dict.fromkeys(point.file for point in self._points):
             try:
                 self._open[file] = open_regular(file)
             except OSError as error:
                 raise OperationError(f"{file}: cannot be traced: {error}") from error
-        ours = f"/proc/{os.getpid()}/fd"
-        return tuple(
-            replace(point, file=Path(f"{ours}/{self._open[point.file]}")) for point in self._points
-        )
+        # A path is text that whoever owns a folder chooses, and what it leads to may change.
+        ours = Path(f"/proc/{os.getpid()}/fd")
+        points = [replace(one, file=ours / str(self._open[one.file])) for one in self._points]
+        script = bpftrace_script(points, traced, users=self._users, attached=self._attached)
+        self._script.write_text(script)
+        self._clock_offset_ns, self._ahead_ns = clock_offset(), _boot_time_ahead()
+        with self._events.open("wb") as printed, self._said.open("wb") as said:
+            printed.write(HEADER.encode())
+            printed.flush()
+            self._bpftrace = subprocess.Popen(
+                ["bpftrace", "-B", "full", str(self._script)],
+                env={**_SETTINGS, **tool_environment()},
+                stdin=subprocess.DEVNULL,
+                stdout=printed,
+                stderr=said,
+                start_new_session=True,  # Ctrl-C is ours to react to
+                preexec_fn=partial(_in_the_background, os.getpid()),  # noqa: PLW1509
+            )
+        self._wait_until_attached(self._bpftrace)
+        self._began_ns = time.monotonic_ns()
+        return {}
 
     def failure(self) -> str | None:
         """Look whether bpftrace is there."""
@@ -143,7 +140,7 @@ class EbpfTracer:
         return f"bpftrace ended with code {self._bpftrace.returncode}: {self._complaint()}"
 
     def stop(self) -> None:
-        """Have bpftrace remove its probes and write down what it holds."""
+        """Have bpftrace remove its probes and write down what it has."""
         if self._bpftrace is None or self._ended_ns is not None:
             return
         self._ended_ns = time.monotonic_ns()
@@ -152,7 +149,12 @@ class EbpfTracer:
                 "the machine was suspended during the recording: times after that are too late by "
                 "as long as it slept."
             )
-        _wait_until_idle(self._bpftrace.pid)
+        bpftrace, until = f"/proc/{self._bpftrace.pid}", time.monotonic() + _READ_S
+        with suppress(OSError):  # it has ended
+            time.sleep(_LOOK_S)
+            # It sleeps when it has read all: the rest it would throw away.
+            while read_stat(bpftrace)[1][0] == b"R" and time.monotonic() < until:
+                time.sleep(_LOOK_S)
         self._bpftrace.send_signal(signal.SIGINT)
         try:
             self._bpftrace.wait(_STOP_S)
@@ -162,7 +164,7 @@ class EbpfTracer:
                 "is killed: the last events are missing"
             ) from None
         with suppress(OSError, pl.exceptions.PolarsError):  # `recording` says what is wrong
-            self._printed = self._read()
+            self._printed = read_printed(self._events, self._points, self._ahead_ns)
             # As long as the application runs: its memory tells.
             callbacks = _callbacks(self._printed.tables)
             self._functions = callback_functions(
@@ -179,66 +181,49 @@ class EbpfTracer:
 
     def recording(self) -> tuple[EventTables, RecordingInfo]:
         """The events that bpftrace printed, and what is known of a system that ran already."""
-        output = self._folder / _EVENTS
         try:
-            printed = self._printed or self._read()
-            lost = lost_events(output, self._folder / _SAID)
+            printed = self._printed or read_printed(self._events, self._points, self._ahead_ns)
+            lost = lost_events(self._events, self._said)
         except (OSError, pl.exceptions.PolarsError) as error:
             raise OperationError(
-                f"{output}: what bpftrace wrote cannot be read: {error}"
+                f"{self._events}: what bpftrace wrote cannot be read: {error}"
             ) from error
-        tables: EventTables = self._whole(printed.tables)
+        ended = self._ended_ns or time.monotonic_ns()
+        in_place = pl.col("time").is_between(self._began_ns, ended)  # all probes, that is
+        whole = {name: table.filter(in_place) for name, table in printed.tables.items()}
+        tables: EventTables = {name: table for name, table in whole.items() if table.height}
         notes = [*self._notes, *self._about(tables, printed, lost)]
         if self._attached:
             tables, found = with_found_objects(tables, printed.handles, self._began_ns)
             notes += found
         tables = with_functions(tables, self._functions, self._began_ns)
+        # Process → the name of its main thread as `sched_switch` has it.
+        switches = events.table(tables, "sched_switch").select("next_tid", "next_comm")
+        names = dict(switches.unique("next_tid", keep="last").iter_rows())
+        emitting = (table["pid"] for name, table in tables.items() if name != "sched_switch")
+        commands = {pid: names.get(pid) or "" for pids in emitting for pid in pids.unique()}
         # What `rcl_init` would say of the library's version, whether or not it was traced.
-        versions = [point.version for point in self._points[:1]]
+        versions = [point.library.version for point in self._points[:1]]
         info = RecordingInfo(
             source="ebpf",
             distribution=distribution_of({"rcl_init": pl.DataFrame({"version": versions})}, {}),
             rmw=printed.rmw or rmw_of_gids(tables),
             clock_offset_ns=self._clock_offset_ns,
-            processes=processes_of(tables, _commands(tables)),
+            processes=processes_of(tables, commands),
             lost={"lost_events": lost},
             notes=tuple(notes),
         )
         return tables, info
 
-    def _read(self) -> Printed:
-        return read_printed(self._folder / _EVENTS, self._points, self._ahead_ns)
-
     def _libraries(self) -> tuple[TracingLibrary, ...]:
         """The libraries to set probes on; at least one that exports trace points."""
-        if not self._attached:
-            libraries = installed_libraries(os.environ)
-            if not libraries:
-                raise PlatformError(
-                    f"no {LIBRARY} in AMENT_PREFIX_PATH, LD_LIBRARY_PATH or /opt/ros: set ROS 2 up "
-                    "first (`source /opt/ros/DISTRIBUTION/setup.bash`); an application in a "
-                    "container is started first, then attached to (no COMMAND)"
-                )
-        else:
-            family = _family(self._pids)
-            pids = (pid for pid in parents() if pid in family or user_of(pid) in self._users)
-            mapped = mapped_libraries(pids)
-            unsuited = [pid for pid in self._pids if not _family((pid,)) & mapped.keys()]
-            if unsuited:
-                raise InputError(
-                    f"process {', '.join(map(str, unsuited))} neither uses {LIBRARY}, as every "
-                    "ROS 2 node does, nor has started one that does: give processes of nodes "
-                    "(`chainshaper threads` lists them)"
-                )
-            if self._pids:
-                mapped = {pid: mapped[pid] for pid in family & mapped.keys()}
-            libraries = tuple(dict.fromkeys(one for found in mapped.values() for one in found))
-            if not libraries:
-                raise OperationError(
-                    f"no process of {', '.join(map(user_name, sorted(self._users)))} uses "
-                    f"{LIBRARY}, so there is no ROS 2 node to attach to: start the application "
-                    "first, give the COMMAND that does behind `--`, or name who runs it (--user)"
-                )
+        libraries = self._mapped() if self._attached else installed_libraries(os.environ)
+        if not libraries:
+            raise PlatformError(
+                f"no {LIBRARY} in AMENT_PREFIX_PATH, LD_LIBRARY_PATH or /opt/ros: set ROS 2 up "
+                "first (`source /opt/ros/DISTRIBUTION/setup.bash`); an application in a "
+                "container is started first, then attached to (no COMMAND)"
+            )
         if not trace_points(libraries):
             paths = ", ".join(str(library.path) for library in libraries)
             raise PlatformError(
@@ -247,12 +232,34 @@ class EbpfTracer:
             )
         return libraries
 
+    def _mapped(self) -> tuple[TracingLibrary, ...]:
+        """The libraries that the processes to attach to have mapped; at least one."""
+        parent_of = parents()
+        family = descendants(parent_of, *self._pids)
+        mapped = mapped_libraries(
+            pid for pid in parent_of if pid in family or user_of(pid) in self._users
+        )
+        unsuited = [pid for pid in self._pids if not descendants(parent_of, pid) & mapped.keys()]
+        if unsuited:
+            raise InputError(
+                f"process {', '.join(map(str, unsuited))} neither uses {LIBRARY}, as every "
+                "ROS 2 node does, nor has started one that does: give processes of nodes "
+                "(`chainshaper threads` lists them)"
+            )
+        wanted = family if self._pids else mapped.keys()
+        libraries = dict.fromkeys(one for pid in mapped if pid in wanted for one in mapped[pid])
+        if not libraries:
+            raise OperationError(
+                f"no process of {', '.join(map(user_name, sorted(self._users)))} uses "
+                f"{LIBRARY}, so there is no ROS 2 node to attach to: start the application "
+                "first, give the COMMAND that does behind `--`, or name who runs it (--user)"
+            )
+        return tuple(libraries)
+
     def _traced(self) -> tuple[int, ...]:
         """The processes that events are limited to, with all that they start; empty: to none."""
         if self._attached and not self._pids:
             return ()
-        # What we start is ours: the application, which does not run yet.
-        wanted = self._pids or (os.getpid(),)
         if Path("/proc/self/ns/pid").readlink() != Path(_FIRST_PID_NAMESPACE):
             self._notes.append(
                 "inside a container bpftrace cannot tell which process is which: everything of "
@@ -260,29 +267,13 @@ class EbpfTracer:
                 "the machine's process numbers."
             )
             return ()
-        return tuple(sorted(_family(wanted)))
-
-    def _launched(self) -> "subprocess.Popen[bytes]":
-        command = ["bpftrace", "-B", "full", str(self._folder / _SCRIPT)]
-        with (
-            (self._folder / _EVENTS).open("wb") as printed,
-            (self._folder / _SAID).open("wb") as said,
-        ):
-            printed.write(HEADER.encode())
-            printed.flush()
-            return subprocess.Popen(
-                command,
-                env={**_SETTINGS, **tool_environment()},
-                stdin=subprocess.DEVNULL,
-                stdout=printed,
-                stderr=said,
-                start_new_session=True,  # Ctrl-C is ours to react to
-                preexec_fn=partial(_in_the_background, os.getpid()),  # noqa: PLW1509
-            )
+        # What we start is ours: the application, which does not run yet.
+        return tuple(sorted(descendants(parents(), *(self._pids or (os.getpid(),)))))
 
     def _wait_until_attached(self, bpftrace: "subprocess.Popen[bytes]") -> None:
         until = time.monotonic() + _START_S
-        while not self._has_attached():
+        files = (self._said, self._events)  # it says so on its standard output since 0.23
+        while not any(_ATTACHED.encode() in file.read_bytes() for file in files):
             if bpftrace.poll() is not None:
                 raise PlatformError(
                     f"bpftrace cannot trace here: {self._complaint()}; it needs a kernel with BPF, "
@@ -293,59 +284,54 @@ class EbpfTracer:
                 raise OperationError(
                     f"bpftrace did not set its probes within {_START_S:.0f} s: {self._complaint()}"
                 )
-            time.sleep(0.02)
-
-    def _has_attached(self) -> bool:
-        """Whether bpftrace says so; to its standard output since 0.23."""
-        files = (self._folder / _SAID, self._folder / _EVENTS)
-        return any(_ATTACHED.encode() in file.read_bytes() for file in files)
+            time.sleep(_LOOK_S)
 
     def _complaint(self) -> str:
         """What bpftrace says is wrong, in one line."""
-        said = (self._folder / _SAID).read_text(errors="replace").splitlines()
+        said = self._said.read_text(errors="replace").splitlines()
         lines = [line.strip() for line in said if line.strip() and _ATTACHED not in line]
         wrong = [line for line in lines if "ERROR" in line and "RLIMIT_MEMLOCK" not in line]
         return "; ".join(wrong or lines[-1:]).replace("ERROR: ", "") or "it does not say why"
 
-    def _whole(self, tables: Mapping[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
-        """The tables without what happened while not all probes were in place."""
-        ended = self._ended_ns or time.monotonic_ns()
-        in_place = pl.col("time").is_between(self._began_ns, ended)
-        within = {name: table.filter(in_place) for name, table in tables.items()}
-        return {name: table for name, table in within.items() if table.height}
-
-    def _about(self, tables: EventTables, printed: Printed, lost: int) -> list[str]:
+    def _about(self, tables: EventTables, printed: Printed, lost: int) -> Iterator[str]:
         """What a reader of the tables must know."""
-        notes = []
         if not tables:
             libraries = dict.fromkeys(str(point.file) for point in self._points)
-            notes.append(
-                f"no event was traced: nothing that ran has called {', '.join(libraries)}."
-            )
-        if "rclcpp_callback_register" not in tables and (
-            unknown := set(_callbacks(tables)) - self._functions.keys()
-        ):
-            notes.append(
+            yield f"no event was traced: nothing that ran has called {', '.join(libraries)}."
+        unknown = set(_callbacks(tables)) - self._functions.keys()
+        if unknown and "rclcpp_callback_register" not in tables:
+            yield (
                 f"{len(unknown)} callbacks' functions have no name: the application had ended, or"
                 " its files were stripped."
             )
         if lost:
-            pages = os.environ.get("BPFTRACE_PERF_RB_PAGES", _SETTINGS["BPFTRACE_PERF_RB_PAGES"])
-            notes.append(
+            pages = os.environ.get(_PAGES, _SETTINGS[_PAGES])
+            yield (
                 f"{lost} events were lost: bpftrace could not keep up. Record again with larger "
-                f"buffers (environment variable BPFTRACE_PERF_RB_PAGES, a power of two above "
-                f"{pages}), or leave it a core that is less busy."
+                f"buffers (environment variable {_PAGES}, a power of two above {pages}), or leave "
+                "it a core that is less busy."
             )
         if printed.cut_names:
-            notes.append(f"{printed.cut_names} names are longer than {TEXT_BYTES} bytes and cut.")
-        return notes
+            yield f"{printed.cut_names} names are longer than {TEXT_BYTES} bytes and cut."
+
+
+def lost_events(*paths: Path) -> int:
+    """How many events bpftrace says it has lost, in what it wrote into these files."""
+    count = 0
+    for path in paths:
+        if path.is_file() and path.stat().st_size:
+            with (
+                path.open("rb") as stream,
+                mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as said,
+            ):
+                count += sum(int(found[1]) for found in _LOST.finditer(said))
+    return count
 
 
 def _in_the_background(parent_pid: int) -> None:
     """Have a new process end with its parent, and disturb the threads little that it watches.
 
-    Every event wakes it. If it pre-empted the thread then, as ordinary processes do, these were two
-    switches, thus two events, and so on: ten times as many events as there were to be recorded.
+    Every event wakes it: if it pre-empted the thread then, these were two more events, and so on.
     """
     signalled_with_parent(parent_pid, signal.SIGINT)
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
@@ -358,33 +344,11 @@ def _callbacks(tables: EventTables) -> Iterator[tuple[int, int]]:
         yield from events.table(tables, name).select("pid", "callback").unique().iter_rows()
 
 
-def _family(pids: Iterable[int]) -> set[int]:
-    """These processes, and all that they have started."""
-    parent_of = parents()
-    return set().union(*(descendants(parent_of, pid) for pid in pids))
-
-
-def _wait_until_idle(bpftrace: int) -> None:
-    """Wait until bpftrace has printed all that there was: then it sleeps.
-
-    What it has not read when it is asked to end, it throws away.
-    """
-    until = time.monotonic() + _READ_S
-    with suppress(OSError):  # it has ended
-        while time.monotonic() < until:
-            time.sleep(0.02)
-            state = Path(f"/proc/{bpftrace}/stat").read_text().rpartition(")")[2].split()[0]
-            if state != "R":
-                return
-
-
 def _check_privileges() -> None:
     """bpftrace would say it as well, but not what else can be done."""
-    status = Path("/proc/self/status").read_text()
-    line = next(line for line in status.splitlines() if line.startswith("CapEff:"))
-    held = int(line.split()[1], 16)
-    enough = all(held >> capability & 1 for capability in (_CAP_BPF, _CAP_PERFMON))
-    if not (enough or held >> _CAP_SYS_ADMIN & 1):
+    (own,) = status_field(read_proc("/proc/self/status"), "CapEff", base=16)
+    enough = all(own >> capability & 1 for capability in (_CAP_BPF, _CAP_PERFMON))
+    if not (enough or own >> _CAP_SYS_ADMIN & 1):
         raise PlatformError(
             "tracing with eBPF needs root, or bpftrace 0.25 and the capabilities CAP_BPF, "
             "CAP_PERFMON, CAP_DAC_READ_SEARCH and CAP_DAC_OVERRIDE: start the application as "
@@ -396,8 +360,7 @@ def _check_privileges() -> None:
 def _boot_time_ahead() -> int:
     """CLOCK_BOOTTIME minus CLOCK_MONOTONIC in ns: how long the machine has been suspended.
 
-    The narrowest of several brackets counts, because we may be pre-empted within one. Suspensions
-    are longer than a millisecond; without one the two are the same clock.
+    The narrowest of several brackets counts; without a suspension the clocks are the same.
     """
     brackets = []
     for _ in range(10):
@@ -407,13 +370,3 @@ def _boot_time_ahead() -> int:
         brackets.append((after - before, boot_time - (before + after) // 2))
     _, ahead = min(brackets)
     return ahead if ahead > _SHORTEST_SUSPENSION_NS else 0
-
-
-def _commands(tables: EventTables) -> dict[int, str]:
-    """Process → the name of its main thread as `sched_switch` has it, empty if unknown."""
-    switches = events.table(tables, "sched_switch").select("next_tid", "next_comm")
-    names = dict(switches.unique("next_tid", keep="last").iter_rows())
-    pids = {
-        pid for name, t in tables.items() if name != "sched_switch" for pid in t["pid"].unique()
-    }
-    return {pid: names.get(pid) or "" for pid in sorted(pids)}

@@ -1,30 +1,31 @@
-"""The trace points of `libtracetools.so` as C functions: which libraries export which of them.
+"""The trace points of `libtracetools.so`: where they are, the script that prints them, the tables.
 
-Every ROS 2 build with tracing compiled in calls `ros_trace_<event>(arguments…)` of that library,
-whether or not LTTng is there. The arguments are the fields of the event's table
-(:mod:`chainshaper.values.events`) in the same order, with these exceptions:
+Every ROS 2 build with tracing compiled in calls `ros_trace_<event>(arguments…)` of that library;
+:attr:`TracePoint.arguments` says with what. bpftrace sets uprobes there, and prints lines of
+numbers, separated by tabs and in no order:
 
-* `rcl_init` has no version among them: that is the library's own, from its `package.xml`;
-* `rclcpp_publish` has the publisher's address before the message's, mostly null, and no column;
-* `rmw_publish` had the message only, before tracetools 8 (Humble and Iron).
+    code  time  pid  tid  cpu  value 0 … value 9  [prev_comm  next_comm]
 
-`rclcpp_callback_register` is not called from Iron on, except under an LTTng session.
+* The code says which of the trace points it is, :data:`FIRST_POINT` being the first one.
+* A number or a flag is one value, a gid two: its first 16 bytes, those that mean anything.
+* A text is printed as the eight-byte words it lies in, in lines of its own (:data:`TEXT_CODE`):
+  16 × the argument's place + the line's number, how many bytes before the text the first word
+  begins, and eight words. So a name may be of any length and contain anything, unlike with `str()`.
+  Aligned words never reach into a page without the text.
+* `sched_switch` (:data:`SWITCH_CODE`) is printed where a thread that has emitted events goes or
+  comes; it came unseen before the first one, so a line stands there that says nothing of who went.
 
-An application to be started finds the library as the dynamic linker will: below the prefixes of the
-environment that ROS 2's set-up files make. Applications that run already have mapped it; what they
-mapped is reached through `/proc/PID/root` where they run in a container. The same file found twice
-counts once, because uprobes belong to the file. Distributions differ in what they trace, so what a
-library exports is read from its symbol table.
+The handles of `rmw_publish` and `rmw_take` are the addresses of structures that begin with the
+addresses of the RMW's name, of its data and of the topic's name. Before tracetools 8 the former is
+found from `rcl_publish`'s `rcl_publisher_t`. bpftrace runs as root, so nothing stands in its script
+that a stranger may have written: events, which we know, numbers, and paths of plain characters.
 
-Upstream: ros2_tracing, `tracetools/include/tracetools/tracetools.h`, tags 4.1.1 to 8.10.1;
-elf(5); proc(5).
+Upstream: `tracetools/tracetools.h` of ros2_tracing, tags 4.1.1 to 8.10.1; bpftrace 0.17 to 0.26;
+rmw, `rmw/types.h`; rcl, `publisher_impl.h` (Humble, Iron).
 """
 
-import os
 import re
-import stat
-import struct
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,15 +33,46 @@ from typing import Literal, TypeAlias
 
 import polars as pl
 
+from chainshaper.sources.ebpf.functions import exported_functions, mapped_regions, read_regular
 from chainshaper.values import events
+from chainshaper.values.errors import InputError
 
 FUNCTION_PREFIX = "ros_trace_"
 LIBRARY = "libtracetools.so"
 _INSTALLATIONS = Path("/opt/ros")
 _VERSION = re.compile(r"<version>\s*((\d{1,9})(?!\d)[^<\s]{0,99})\s*</version>")
-_LONGEST, _LONGEST_PACKAGE = 512 << 20, 1 << 20  # bytes
-_SYMTAB, _DYNSYM, _FUNCTION, _LOAD = 2, 11, 2, 1  # elf.h: SHT_…, STT_FUNC, PT_LOAD
-_UNREADABLE = (OSError, LookupError, struct.error, ValueError)
+_LONGEST_PACKAGE = 1 << 20  # bytes
+
+CODE = ("code", "time", "pid", "tid", "cpu")
+VALUES = tuple(f"value_{number}" for number in range(10))
+_SCHEMA: dict[str, pl.DataType] = {
+    **dict.fromkeys((*CODE, *VALUES), pl.Int64()),
+    **dict.fromkeys(("prev_comm", "next_comm"), pl.String()),
+}
+HEADER = "\t".join(_SCHEMA) + "\n"
+"""What the file begins with that bpftrace prints into: lines may have fewer columns, not more."""
+
+TEXT_CODE, SWITCH_CODE, FIRST_POINT = 0, 1, 2
+TEXT_LINES = 8
+"""Lines that one text may take, of 64 bytes each."""
+TEXT_BYTES = 64 * TEXT_LINES - 8
+"""What is printed of a text at least."""
+NAME_PLACE, RMW_PLACE = 8, 9
+"""Places, beyond any argument's, of the topic's and the RMW's name of a handle."""
+
+_PLAIN = re.compile(r"[A-Za-z0-9/._+ -]+")
+_TOPIC_NAME_AT = 16  # in rmw_publisher_t and rmw_subscription_t, on 64-bit machines
+_RMW_HANDLE_AT_HUMBLE, _RMW_HANDLE_AT_IRON = 240, 248  # in rcl_publisher_impl_t
+
+_SWITCH = {  # column of `sched_switch` → the kernel's name, in the order of printing
+    "prev_tid": "prev_pid",
+    "prev_prio": "prev_prio",
+    "prev_state": "prev_state",
+    "next_tid": "next_pid",
+    "next_prio": "next_prio",
+}
+_Kind: TypeAlias = Literal["number", "flag", "text", "gid"]
+_KINDS: Mapping[object, _Kind] = {pl.String: "text", pl.List: "gid", pl.Int32: "flag"}
 
 
 @dataclass(frozen=True)
@@ -68,199 +100,307 @@ class Argument:
 
     column: str
     place: int
-    kind: Literal["number", "flag", "text", "gid"]
+    kind: _Kind
+
+    @property
+    def values(self) -> tuple[str, ...]:
+        """How bpftrace gets the values that are printed in the event's own line."""
+        given = f"arg{self.place}"
+        return {
+            "number": (given,),
+            "flag": (f"{given} & 0xff",),  # the upper bytes of a register with a bool are undefined
+            "gid": (f"*(uint64 *){given}", f"*(uint64 *)({given} + 8)"),
+            "text": (),
+        }[self.kind]
 
 
 @dataclass(frozen=True)
 class TracePoint:
-    """One event's function in one library, which is ``file`` of this ``version`` (None: unknown).
-
-    ``handles_at_rmw`` is whether `rmw_publish` of this version names its publisher.
-    """
+    """One event's function in one library, which is traced as ``file``."""
 
     event: str
     file: Path
-    arguments: tuple[Argument, ...]
-    version: str | None
-    handles_at_rmw: bool
+    library: TracingLibrary
 
+    @property
+    def arguments(self) -> tuple[Argument, ...]:
+        columns: tuple[str | None, ...] = tuple(events.FIELDS[self.event])
+        if self.event == "rcl_init":  # the version is the library's own, from its `package.xml`
+            columns = ("context_handle",)
+        elif self.event == "rclcpp_publish":  # the publisher's address, mostly null, comes first
+            columns = (None, "message")
+        elif self.event == "rmw_publish" and not self.library.handles_at_rmw:
+            columns = ("message",)
+        types = events.FIELDS[self.event]
+        return tuple(
+            Argument(column, place, _KINDS.get(types[column].base_type(), "number"))
+            for place, column in enumerate(columns)
+            if column is not None
+        )
 
-_Known: TypeAlias = dict[tuple[int, int], TracingLibrary]
-"""Libraries by device and inode."""
+    @property
+    def handle(self) -> str | None:
+        """The address of the `rmw_publisher_t` or `rmw_subscription_t` that the event is about."""
+        at_rmw = self.library.handles_at_rmw
+        if self.event == "rmw_take" or (self.event == "rmw_publish" and at_rmw):
+            return "arg0"
+        if self.event == "rcl_publish" and not at_rmw:
+            at = _RMW_HANDLE_AT_HUMBLE if self.library.major == 4 else _RMW_HANDLE_AT_IRON
+            return f"*(uint64 *)(*(uint64 *)arg0 + {at})"
+        return None
 
 
 def trace_points(libraries: Sequence[TracingLibrary]) -> tuple[TracePoint, ...]:
     """All trace points that the libraries export and a table is for, in the tables' order."""
     return tuple(
-        TracePoint(
-            event=event,
-            file=library.path,
-            arguments=_arguments(event, library),
-            version=library.version,
-            handles_at_rmw=library.handles_at_rmw,
-        )
+        TracePoint(event, library.path, library)
         for event in events.FIELDS
         for library in libraries
         if FUNCTION_PREFIX + event in library.functions
     )
 
 
-def _arguments(event: str, library: TracingLibrary) -> tuple[Argument, ...]:
-    columns: tuple[str | None, ...] = tuple(events.FIELDS[event])
-    if event == "rcl_init":
-        columns = ("context_handle",)
-    elif event == "rclcpp_publish":
-        columns = (None, "message")
-    elif event == "rmw_publish" and not library.handles_at_rmw:
-        columns = ("message",)
-    found = []
-    for place, column in enumerate(columns):
-        match events.FIELDS[event].get(column or ""):
-            case pl.String():
-                found.append(Argument(str(column), place, "text"))
-            case pl.List():
-                found.append(Argument(str(column), place, "gid"))
-            case pl.Int32():
-                found.append(Argument(str(column), place, "flag"))
-            case pl.DataType():
-                found.append(Argument(str(column), place, "number"))
-    return tuple(found)
-
-
 def installed_libraries(environment: Mapping[str, str]) -> tuple[TracingLibrary, ...]:
-    """The libraries that a command started with this environment can find.
-
-    All below `/opt/ros` are among them: the command may be a script that sets up its ROS 2 itself.
-    """
+    """The libraries that a command with this environment can find, and all below `/opt/ros`."""
     prefixes = environment.get("AMENT_PREFIX_PATH", "").split(":")
     folders = [Path(prefix) / "lib" for prefix in prefixes if prefix]
     folders += [Path(entry) for entry in environment.get("LD_LIBRARY_PATH", "").split(":") if entry]
     folders += sorted(_INSTALLATIONS.glob("*/lib"))
-    known: _Known = {}
-    for folder in folders:
-        if (folder / LIBRARY).is_file():
-            _library((folder / LIBRARY).absolute(), known)
-    return tuple(known.values())
+    files = (folder / LIBRARY for folder in folders)
+    return tuple(dict.fromkeys(_found([file.absolute() for file in files if file.is_file()], {})))
 
 
 def mapped_libraries(pids: Iterable[int]) -> dict[int, tuple[TracingLibrary, ...]]:
     """Process → the libraries that it has mapped; only those that have one."""
-    known: _Known = {}
-    found = {pid: tuple(_library(path, known) for path in _mapped(pid)) for pid in pids}
+    known: dict[tuple[int, int], TracingLibrary] = {}
+    found = {pid: tuple(_found(_mapped(pid), known)) for pid in pids}
     return {pid: libraries for pid, libraries in found.items() if libraries}
 
 
 def _mapped(pid: int) -> Iterator[Path]:
     """Files of that name which a process has mapped, by paths that lead there from here."""
     with suppress(OSError):  # it is gone, or another user's
-        maps = Path(f"/proc/{pid}/maps").read_text(errors="replace")
-        paths = {line.split(maxsplit=5)[5] for line in maps.splitlines() if f"/{LIBRARY}" in line}
-        for mapped in sorted(paths):
-            inside = Path(f"/proc/{pid}/root{mapped}")
-            if not inside.is_file():
-                continue  # replaced since: its new contents are not what runs
-            outside = Path(mapped)
-            yield outside if outside.is_file() and outside.samefile(inside) else inside
+        for mapped in sorted(
+            {one.path for one in mapped_regions(pid) if f"/{LIBRARY}" in one.path}
+        ):
+            inside = Path(f"/proc/{pid}/root{mapped}")  # as a container has it
+            if inside.is_file():  # else replaced since: its new contents are not what runs
+                outside = Path(mapped)
+                yield outside if outside.is_file() and outside.samefile(inside) else inside
 
 
-def _library(path: Path, known: _Known) -> TracingLibrary:
-    status = path.stat()
-    key = status.st_dev, status.st_ino
-    if key not in known:
-        known[key] = TracingLibrary(path, exported_functions(path), _version(path))
-    return known[key]
+def _found(
+    paths: Iterable[Path], known: dict[tuple[int, int], TracingLibrary]
+) -> Iterator[TracingLibrary]:
+    """The libraries at some paths; ``known`` has them by device and inode, as uprobes do."""
+    for path in paths:
+        status = path.stat()
+        key = status.st_dev, status.st_ino
+        if key not in known:
+            known[key] = TracingLibrary(path, exported_functions(path), _version(path))
+        yield known[key]
 
 
 def _version(library: Path) -> str | None:
     """The version of tracetools, as its package says beside the library."""
     for folder in library.parents[1:3]:  # `lib`, or `lib/x86_64-linux-gnu`, is in the prefix
         with suppress(OSError):
-            package = folder / "share/tracetools/package.xml"
-            text = _read_regular(package, _LONGEST_PACKAGE).decode(errors="replace")
-            found = _VERSION.search(text)
-            if found is not None:
+            package = read_regular(folder / "share/tracetools/package.xml", _LONGEST_PACKAGE)
+            if found := _VERSION.search(package.decode(errors="replace")):
                 return found[1]
     return None
 
 
-def open_regular(path: Path) -> int:
-    """Open a file at a path that a process of the application has named: no pipe, no device.
+def bpftrace_script(
+    points: Sequence[TracePoint],
+    traced: Iterable[int] = (),
+    *,
+    users: Collection[int] = (),
+    attached: bool = False,
+) -> str:
+    """The script for some trace points.
 
-    Raises:
-        OSError: it is no ordinary file, or cannot be read.
+    Events are limited to the ``traced`` processes and all that they start, else to those of
+    ``users``; empty: to none. ``attached``: names of handles that were created before are read.
+    Raises InputError: a file's path is not of plain characters.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise OSError(f"{path} is no ordinary file")
-    return descriptor
+    limits = [f"@traced[{pid}] = 1;" for pid in traced]
+    theirs = " || ".join(f"uid == {user}" for user in sorted(users))
+    restriction = " /@traced[pid]/" if limits else f" /{theirs}/" if theirs else ""
+    maps = ["@running"]
+    probes: list[tuple[str, Iterable[str]]] = []
+    if limits:
+        maps.append("@traced")
+        probes.append(("BEGIN", limits))
+        # `pid` is the parent here; a new thread's number is no process's, and does no harm.
+        fork = "tracepoint:sched:sched_process_fork /@traced[pid]/"
+        probes.append((fork, ["@traced[args->child_pid] = 1;"]))
+    for code, point in enumerate(points, FIRST_POINT):
+        if not _PLAIN.fullmatch(str(point.file)):
+            raise InputError(
+                f"{str(point.file)!r}: a path with such characters is not written into a script "
+                "that root runs: rename it, or give the file open, as /proc/PID/fd/N"
+            )
+        function = f'uprobe:"{point.file}":{FUNCTION_PREFIX}{point.event}{restriction}'
+        probes.append((function, _statements(point, code, attached)))
+    if attached and any(point.handle for point in points):
+        maps.append("@named")
+    template = "\\t%lld" * len(_SWITCH) + "\\t" * (len(VALUES) - len(_SWITCH)) + "\\t%s\\t%s"
+    values = [f"args->{name}" for name in (*_SWITCH.values(), "prev_comm", "next_comm")]
+    involved = "@running[args->prev_pid] || @running[args->next_pid]"
+    switch = f"tracepoint:sched:sched_switch /{involved}/"
+    probes.append((switch, [_printf(SWITCH_CODE, values, template, now="nsecs")]))
+    probes.append(("END", [f"clear({name});" for name in maps]))
+    blocks = ((probe, "\n".join(f"  {one}" for one in statements)) for probe, statements in probes)
+    return "\n".join(f"{probe}\n{{\n{body}\n}}\n" for probe, body in blocks)
 
 
-def _read_regular(path: Path, longest: int = _LONGEST) -> bytes:
-    with open(open_regular(path), "rb") as file:
-        content = file.read(longest + 1)
-    if len(content) > longest:
-        raise OSError(f"{path} has more than {longest} bytes")
-    return content
+def _statements(point: TracePoint, code: int, attached: bool) -> Iterator[str]:
+    yield "$now = nsecs;"
+    came = _printf(SWITCH_CODE, ["tid"], "\\t" * 4 + "%d")
+    yield f"if (@running[tid] == 0) {{ @running[tid] = 1; {came} }}"
+    yield _printf(code, [value for argument in point.arguments for value in argument.values])
+    for argument in point.arguments:
+        if argument.kind == "text":
+            yield from _text(f"arg{argument.place}", argument.place)
+    if attached and point.handle is not None:
+        yield f"$handle = {point.handle};"
+        yield "if (@named[pid, $handle] == 0) {"
+        yield "@named[pid, $handle] = 1;"
+        yield from _text(f"*(uint64 *)($handle + {_TOPIC_NAME_AT})", NAME_PLACE)
+        yield from _text("*(uint64 *)$handle", RMW_PLACE)
+        yield "}"
 
 
-def exported_functions(path: Path) -> frozenset[str]:
-    """The functions in an ELF-64 file's dynamic symbol table; none if it is no such file."""
-    try:
-        return frozenset(name for _, name in _functions(_read_regular(path), (_DYNSYM,)))
-    except _UNREADABLE:
-        return frozenset()
+def _printf(code: int, values: Sequence[str], template: str = "", now: str = "$now") -> str:
+    """Print a line of values, which are numbers unless a ``template`` says otherwise."""
+    columns = template or "\\t%lld" * len(values)
+    arguments = ", ".join((now, "pid", "tid", "cpu", *values))
+    return f'printf("{code}\\t%lld\\t%d\\t%d\\t%d{columns}\\n", {arguments});'
 
 
-def function_offsets(path: Path) -> dict[int, str]:
-    """Where functions begin in a file, in bytes, and their names; also of those not exported."""
-    try:
-        content = _read_regular(path)
-        loaded = list(_segments(content))
-        return {
-            address - memory + offset: name
-            for address, name in _functions(content, (_DYNSYM, _SYMTAB))
-            for offset, memory, size in loaded
-            if memory <= address < memory + size
-        }
-    except _UNREADABLE:
-        return {}
+def _text(address: str, place: int) -> Iterator[str]:
+    """Print the words of a text until one that ends with a null byte, or for long enough."""
+    words = [f"*(uint64 *)($word + {at})" for at in range(0, 64, 8)]
+    yield f"$text = {address};"
+    yield "$word = $text & ~7;"
+    yield "$line = 0;"
+    yield f"while ($line < {TEXT_LINES}) {{"
+    yield "  " + _printf(TEXT_CODE, [f"{16 * place} + $line", "$text & 7", *words])
+    yield f"  if (*(uint8 *)($word + 63) == 0) {{ $line = {TEXT_LINES}; }}"
+    yield "  $word = $word + 64;"
+    yield "  $line = $line + 1;"
+    yield "}"
 
 
-def _order(content: bytes) -> str:
-    if content[:5] != b"\x7fELF\x02":
-        raise ValueError("no ELF-64 file")
-    return {1: "<", 2: ">"}[content[5]]
+@dataclass(frozen=True)
+class Printed:
+    """The output of one run; times are ns of CLOCK_MONOTONIC.
+
+    ``handles`` are the names of handles that were in use when tracing began, ``pid, event, handle,
+    topic``; ``rmw`` is from such a one. ``cut_names``: how many were longer than what is printed.
+    """
+
+    tables: dict[str, pl.DataFrame]
+    handles: pl.DataFrame
+    rmw: str | None
+    cut_names: int
 
 
-def _segments(content: bytes) -> Iterator[tuple[int, int, int]]:
-    """What is loaded: place in the file, address, and length there."""
-    order = _order(content)
-    (begin,) = struct.unpack_from(f"{order}Q", content, 32)
-    size, count = struct.unpack_from(f"{order}HH", content, 54)
-    for number in range(count):
-        kind, _, offset, address, _, length, _, _ = struct.unpack_from(
-            f"{order}IIQQQQQQ", content, begin + size * number
-        )
-        if kind == _LOAD:
-            yield offset, address, length
+def read_printed(path: Path, points: Sequence[TracePoint], ahead_ns: int) -> Printed:
+    """Read what the script of these trace points printed, behind :data:`HEADER`.
+
+    ``ahead_ns`` is CLOCK_BOOTTIME, which bpftrace reads, minus CLOCK_MONOTONIC.
+    """
+    lines = pl.read_csv(
+        path,
+        separator="\t",
+        quote_char=None,
+        schema=_SCHEMA,
+        truncate_ragged_lines=True,
+        ignore_errors=True,
+        encoding="utf8-lossy",
+    )
+    with path.open("rb") as stream:
+        stream.seek(-1, 2)
+        if stream.read() != b"\n":  # bpftrace was killed while it wrote
+            lines = lines.head(-1)
+    lines = lines.drop_nulls(CODE)  # bpftrace's own have no number in front
+    lines = lines.with_columns(pl.col("time") - ahead_ns)
+    texts = _texts(lines.filter(code=TEXT_CODE))
+    parts: dict[str, list[pl.DataFrame]] = {}
+    for code, point in enumerate(points, FIRST_POINT):
+        rows = lines.filter(code=code)
+        if rows.height:
+            parts.setdefault(point.event, []).append(_table(rows, point, texts))
+    switches = lines.filter(code=SWITCH_CODE)
+    if switches.height:
+        columns = dict(zip(VALUES, _SWITCH, strict=False))
+        parts["sched_switch"] = [_typed(switches.rename(columns), "sched_switch")]
+    tables = {
+        event: pl.concat(tables, how="diagonal").sort("time", maintain_order=True)
+        for event, tables in parts.items()
+    }
+    event_of = {code: point.event for code, point in enumerate(points, FIRST_POINT)}
+    named = texts.filter(place=NAME_PLACE).select("time", "tid", topic="text")
+    handles = lines.filter(pl.col("code").is_in(list(event_of))).join(named, on=["time", "tid"])
+    event = pl.col("code").replace_strict(event_of, return_dtype=pl.String)
+    handle = pl.col(VALUES[0]).cast(pl.UInt64)
+    handles = handles.with_columns(pl.col("pid").cast(pl.Int32), event=event, handle=handle)
+    rmw = texts.filter(place=RMW_PLACE)["text"]
+    return Printed(
+        tables,
+        handles.select("pid", "event", "handle", "topic").unique(maintain_order=True),
+        rmw[0] if len(rmw) else None,
+        int(texts["cut"].sum()),
+    )
 
 
-def _functions(content: bytes, tables: tuple[int, ...]) -> Iterator[tuple[int, str]]:
-    """Addresses and names of the functions that a file's symbol tables define."""
-    order = _order(content)
-    (sections_at,) = struct.unpack_from(f"{order}Q", content, 40)
-    size, count = struct.unpack_from(f"{order}HH", content, 58)
-    sections = [
-        struct.unpack_from(f"{order}IIQQQQIIQQ", content, sections_at + size * number)
-        for number in range(count)
-    ]
-    for _, kind, _, _, start, length, names, *_ in sections:
-        if kind not in tables:
-            continue
-        names_at = sections[names][4]
-        for at in range(start, start + length, 24):
-            name, info, _, section, address = struct.unpack_from(f"{order}IBBHQ", content, at)
-            if info & 0xF == _FUNCTION and section:  # of section 0: imported, not defined
-                begin = names_at + name
-                yield address, content[begin : content.index(b"\0", begin)].decode()
+def _texts(lines: pl.DataFrame) -> pl.DataFrame:
+    """``time, tid, place, text, cut``: the texts, put together from their words."""
+    key = ["time", "tid", "place", "line"]
+    lines = lines.with_columns(place=pl.col(VALUES[0]) // 16, line=pl.col(VALUES[0]) % 16)
+    lines = lines.sort(key)
+    words = lines.select(VALUES[2:]).fill_null(0).to_numpy().astype("<i8")
+    parts: dict[tuple[int, ...], bytes] = {}
+    rows = lines.select(*key, VALUES[1]).iter_rows()
+    for part, (*where, line, skipped) in zip(words, rows, strict=True):
+        thread = tuple(where)
+        before = parts.get(thread, b"")
+        here = line * part.nbytes - (skipped if line else 0)
+        if b"\0" not in before and here == len(before):  # else it has ended, or a line was lost
+            parts[thread] = before + part.tobytes()[0 if line else skipped :]
+    texts = ((thread, *part.partition(b"\0")) for thread, part in parts.items())
+    return pl.DataFrame(
+        [(*thread, text.decode(errors="replace"), not end) for thread, text, end, _ in texts],
+        schema={**dict.fromkeys(key[:3], pl.Int64), "text": pl.String, "cut": pl.Boolean},
+        orient="row",
+    )
+
+
+def _table(rows: pl.DataFrame, point: TracePoint, texts: pl.DataFrame) -> pl.DataFrame:
+    """The table of one trace point's rows."""
+    values = iter(VALUES)
+    for argument in point.arguments:
+        column = argument.column
+        if argument.kind == "text":
+            own = texts.filter(place=argument.place).select(
+                "time", "tid", pl.col("text").alias(column)
+            )
+            rows = rows.join(own, on=["time", "tid"], how="left")
+        elif argument.kind == "gid":
+            words = rows.select(next(values), next(values)).to_numpy().astype("<i8")
+            gids = [list(one.tobytes()) for one in words]
+            rows = rows.with_columns(pl.Series(column, gids, dtype=pl.List(pl.UInt8)))
+        else:
+            rows = rows.with_columns(pl.col(next(values)).alias(column))
+    if point.event == "rcl_init":
+        rows = rows.with_columns(version=pl.lit(point.library.version, dtype=pl.String))
+    return _typed(rows, point.event)
+
+
+def _typed(rows: pl.DataFrame, event: str) -> pl.DataFrame:
+    """The event's columns that there are, with their types."""
+    types = {**events.COMMON_COLUMNS, **events.FIELDS[event]}
+    known = {column: kind for column, kind in types.items() if column in rows.columns}
+    return rows.select(pl.col(column).cast(kind) for column, kind in known.items())

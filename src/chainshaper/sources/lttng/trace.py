@@ -1,24 +1,15 @@
 """LTTng traces as recordings: the folders that `ros2 trace` writes.
 
-Events keep their names without the provider (``ros2:callback_start`` → ``callback_start``) and get
-the columns and types of :mod:`chainshaper.values.events`; events that no table is for are left
-out. A trace may declare other events of the same name (another provider's), other types (a narrower
-integer), and fewer fields: older distributions do, and so does damaged metadata. Integers are
-widened; a field that is absent, or of a kind that no cast brings right, becomes a column of nulls,
-which the analysis takes for "not known", and a note says so unless that is how a distribution is.
+Events lose their provider (``ros2:callback_start`` → ``callback_start``) and get the columns and
+types of :mod:`chainshaper.values.events`; events that no table is for are left out. Integers are
+widened; a field that a trace does not declare, or of a kind that no cast brings right, becomes a
+column of nulls, and a note says so unless that is how a distribution is.
 
 Tables are decoded in groups that are used together, because one pass over a trace costs nearly the
-same for one table as for twenty: those of the objects' creation, of callbacks and of messages at
-once, since every analysis needs them (an overview only creation); what the upper layers say about
-the same messages, `sched_switch` and the executor's at their first use.
-
-Times stay what the tracer wrote, ns of CLOCK_MONOTONIC. Process numbers do too, with one exception:
-containers number their processes independently of each other, so folders of several hosts are
-read host by host, and where two of them use the same number, the later host's are moved
-(:data:`NEXT_HOST`).
-
-CARET keeps the events of an application's start and emits them again when tracing begins; those
-carry ``init_timestamp``, the time at which they really happened, and are put there.
+same for one table as for twenty. Containers number their processes independently of each other:
+folders of several hosts are read host by host, and where two of them use the same number, the later
+host's are moved (:data:`NEXT_HOST`). CARET emits the events of an application's start again when
+tracing begins; those carry ``init_timestamp``, when they really happened, and are put there.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,16 +22,7 @@ from typing import TypeAlias
 import polars as pl
 
 from chainshaper.sources.ctf import CtfTrace, Events, count_events, open_trace, read_events
-from chainshaper.sources.ctf.types import (
-    ArrayType,
-    EnumType,
-    IntegerType,
-    SequenceType,
-    StringType,
-    StructType,
-    Type,
-    field_name,
-)
+from chainshaper.sources.ctf import types as ctf
 from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids, rmw_of_threads
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
@@ -55,7 +37,6 @@ Progress: TypeAlias = Callable[[float, str], None]
 NEXT_HOST = 10_000_000
 """Added to the process and thread numbers of the next host; Linux goes up to 4,194,304."""
 
-_PROVIDERS = ("ros2", "ros2_caret")
 _CARET_INIT = "caret_init"
 """An event that is read with the creation, but is no table of ours."""
 _EXECUTOR = frozenset(name for name in events.FIELDS if name.startswith("rclcpp_executor_"))
@@ -65,45 +46,42 @@ _MESSAGES = frozenset(events.FIELDS) - _EXECUTOR - _SWITCHES - CREATION - _UPPER
 _GROUPS = (CREATION, _MESSAGES, _UPPER_LAYERS, _EXECUTOR, _SWITCHES)
 _WHO_RUNS = ("callback_start", "rmw_publish", "rmw_take", "rclcpp_publish")
 
-_DeclaredFields: TypeAlias = Mapping[str, Mapping[str, Type]]
-"""Table → the fields that the trace declares for its event."""
-
 
 def open_lttng_trace(
     paths: Sequence[str | Path], progress: Progress | None = None, *, overview: bool = False
 ) -> Recording:
     """Open the LTTng trace in ``paths``: folders of one recording, searched recursively.
 
-    Kernel and user space, users (per-uid) and processes (per-pid) have a folder each; all are
-    merged by time. ``overview`` leaves callbacks and messages undecoded until their first use;
-    ``progress`` hears about this, and about decoding later on.
+    ``overview`` leaves callbacks and messages undecoded until their first use.
 
-    Raises:
-        InputError: no trace there, metadata that cannot be understood, or traces taken by
-            different clocks (other machines, other boots), whose times cannot be compared.
+    Raises InputError: no trace there, metadata that cannot be understood, or traces taken by
+    different clocks (other machines, other boots), whose times cannot be compared.
     """
     progress = progress or (lambda _, __: None)
     progress(0.0, "opening the trace (the first time on a machine, its decoder is compiled)")
     with _as_our_errors():
         trace = open_trace(*paths)
-    _refuse_different_clocks(trace)
+    first = trace.folders[0]
+    for folder in trace.folders[1:]:
+        if None not in (clocks := {first.clock.uuid, folder.clock.uuid}) and len(clocks) == 2:
+            raise InputError(
+                f"{folder.path} was taken by another clock than {first.path} (another machine, or "
+                "another boot of this one): their times cannot be compared; give the folders of "
+                "one recording"
+            )
     tables = TraceTables(trace, progress, overview)
     creation = tables.creation()
-    of_folders = [folder.declared.env for folder in trace.folders]
-    hosts = sorted({str(env.get("hostname", "")) for env in of_folders})
-    kernels = (env.get("kernel_release") for env in of_folders)
+    hosts = sorted({_fact(folder.declared.env, "hostname") for folder in trace.folders})
+    kernels = (_fact(folder.declared.env, "kernel_release") for folder in trace.folders)
     info = RecordingInfo(
         source="lttng",
         host=", ".join(host for host in hosts if host),
-        kernel=next((str(release) for release in kernels if release), "unknown"),
+        kernel=next((release for release in kernels if release), "unknown"),
         distribution=distribution_of(creation, tables.field_lengths()),
         rmw=rmw_of_gids(creation) or rmw_of_threads(tables.thread_names()),
         clock_offset_ns=trace.clock_offset_ns,
         processes=processes_of(creation, tables.commands()),
-        lost={
-            "discarded_events": trace.discarded_events,
-            "lost_packets": trace.lost_packets,
-        },
+        lost={"discarded_events": trace.discarded_events, "lost_packets": trace.lost_packets},
         notes=(*trace.warnings, *tables.notes()),
     )
     return Recording(Path(paths[0]), info, tables)
@@ -122,27 +100,17 @@ def _as_our_errors() -> Iterator[None]:
         raise OperationError(f"the trace cannot be read: {error}") from error
 
 
-def _refuse_different_clocks(trace: CtfTrace) -> None:
-    first = trace.folders[0]
-    for folder in trace.folders[1:]:
-        clocks = {first.clock.uuid, folder.clock.uuid}
-        if None not in clocks and len(clocks) == 2:
-            raise InputError(
-                f"{folder.path} was taken by another clock than {first.path} (another machine, or "
-                "another boot of this one): their times cannot be compared; give the folders of "
-                "one recording"
-            )
+def _fact(environment: Mapping[str, object], name: str) -> str:
+    return str(environment.get(name) or "")
 
 
 class TraceTables(Mapping[str, pl.DataFrame]):
-    """The event tables of an open trace, decoded at first use.
+    """The event tables of an open trace that happened, decoded at first use.
 
-    ``counts`` are the events per full name, provider included. Only events that happened are in
-    the mapping.
+    ``counts`` are the events per full name, provider included.
     """
 
     def __init__(self, trace: CtfTrace, progress: Progress, overview: bool) -> None:
-        self._trace = trace
         self._hosts = _by_host(trace)
         self._fields = _declared_fields(trace)
         self._progress = progress
@@ -175,11 +143,8 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         tables = [self._read[name] for name in CREATION if name in self._read]
         if not any(self._counted(name) for name in ("rcl_node_init", "rcl_init")):
             tables += [self[name] for name in _WHO_RUNS if name in self]
-        return {
-            pid: self._names.get(pid, "")
-            for table in tables
-            for pid in table["pid"].unique().drop_nulls().to_list()
-        }
+        pids = {pid for table in tables for pid in table["pid"].unique().drop_nulls()}
+        return {pid: self._names.get(pid, "") for pid in pids}
 
     def thread_names(self) -> set[str]:
         """Names of threads that the tracer recorded, the kernel's view included."""
@@ -191,7 +156,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
     def field_lengths(self) -> dict[str, dict[str, int]]:
         """Event → its declared fields, with the length of those that are arrays (0: no array)."""
         return {
-            name: {f: t.length if isinstance(t, ArrayType) else 0 for f, t in fields.items()}
+            name: {f: t.length if isinstance(t, ctf.ArrayType) else 0 for f, t in fields.items()}
             for name, fields in self._fields.items()
         }
 
@@ -215,30 +180,48 @@ class TraceTables(Mapping[str, pl.DataFrame]):
     def _counted(self, name: str) -> int:
         return sum(self.counts.get(source, 0) for source in self._sources.get(name, ()))
 
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> Iterator[str]:
         """What a reader of the tables must know: damage, absent fields, numbers that were moved."""
-        notes = [*self.warnings, *_missing_fields(self._fields, set(self))]
-        notes += [
-            f"processes and threads of host {host} have {by} added to their numbers, which another "
-            "host's processes have as well."
-            for host, by in self._moved.items()
-            if by
-        ]
+        yield from self.warnings
+        for name in sorted(set(self) & self._fields.keys()):
+            missing = [
+                field
+                for field, kind in events.FIELDS[name].items()
+                if field not in events.VERSION_FIELDS.get(name, ())
+                and not _castable(_decoded_type(self._fields[name].get(field)), kind)
+            ]
+            if missing:
+                yield (
+                    f"the trace's {name} has no usable field {', '.join(missing)}: what depends on "
+                    "it cannot be known."
+                )
+        for host, by in self._moved.items():
+            if by:
+                yield (
+                    f"processes and threads of host {host} have {by} added to their numbers, which "
+                    "another host's processes have as well."
+                )
         if self._anonymous:
-            notes.append(
+            yield (
                 f"{self._anonymous} events say no process or thread and cannot be used: record "
                 "with `ros2 trace`, or `lttng add-context --userspace --type=vpid --type=vtid`."
             )
-        return tuple(notes)
 
     def _decode(self, group: frozenset[str]) -> None:
         parts: dict[str, list[pl.DataFrame]] = {}
+        wanted = [full for name in group for full in self._sources.get(name, ())]
         first, nameless = not self.counts, not self._names
         for place, (host, trace) in enumerate(self._hosts.items()):
-            found = self._decoded(trace, group, place)
+            self._report(place, 0.0)
+            with _as_our_errors():
+                found = read_events(
+                    trace,
+                    wanted,
+                    nameless=[full for full in wanted if table_name(full) not in CREATION],
+                    progress=lambda share, place=place: self._report(place, share),  # type: ignore[misc]
+                )
             if first:
-                self._take_stock(trace, found)
-                self._settle_numbers(host, found)
+                self._take_stock(host, trace, found)
             if nameless:
                 self._note_names(host, trace, found)
             for name in group:
@@ -250,34 +233,29 @@ class TraceTables(Mapping[str, pl.DataFrame]):
                         table = table.with_columns(pl.col("pid", "tid") + moved)
                     parts.setdefault(name, []).append(table)
         for name, tables in parts.items():
-            self._read[name] = tables[0] if len(tables) == 1 else _merged(tables)
+            table = tables[0]
+            if len(tables) > 1:  # several providers'; CARET's copy of an event is not another
+                table = pl.concat(tables, how="diagonal_relaxed").sort("time", maintain_order=True)
+                table = table.unique(maintain_order=True) if table.height else table
+            self._read[name] = table
 
-    def _decoded(self, trace: CtfTrace, group: frozenset[str], place: int) -> Events:
-        wanted = [full for name in group for full in self._sources.get(name, ())]
-        what, hosts = "decoding events", len(self._hosts)
-        self._progress(place / hosts, what)
-        with _as_our_errors():
-            return read_events(
-                trace,
-                wanted,
-                nameless=[full for full in wanted if table_name(full) not in CREATION],
-                progress=lambda share: self._progress((place + share) / hosts, what),
-            )
+    def _report(self, place: int, share: float) -> None:
+        self._progress((place + share) / len(self._hosts), "decoding events")
 
-    def _take_stock(self, trace: CtfTrace, found: Events) -> None:
-        """Counts of all events, those of streams included of which no event is wanted."""
+    def _take_stock(self, host: str, trace: CtfTrace, found: Events) -> None:
+        """Count all events, those of streams included of which no event is wanted.
+
+        The host's process numbers are moved out of the way if another host has one of them.
+        """
         with _as_our_errors():
             others = count_events(replace(trace, streams=found.unread))
         for name, count in found.counts.items():
             self.counts[name] = self.counts.get(name, 0) + count + others.get(name, 0)
         self.warnings += found.warnings
-
-    def _settle_numbers(self, host: str, found: Events) -> None:
-        """Move the host's process numbers out of the way if another host has one of them."""
         self._moved[host] = 0
         if len(self._hosts) > 1:
             known = [frame for frame in found.values() if frame.schema["pid"].is_integer()]
-            pids = {pid for frame in known for pid in frame["pid"].unique().drop_nulls().to_list()}
+            pids = {pid for frame in known for pid in frame["pid"].unique().drop_nulls()}
             if pids & self._pids:
                 self._moved[host] = max(self._moved.values()) + NEXT_HOST
             self._pids |= pids
@@ -295,10 +273,9 @@ class TraceTables(Mapping[str, pl.DataFrame]):
 def _by_host(trace: CtfTrace) -> dict[str, CtfTrace]:
     """The trace in parts, one per host whose processes were traced.
 
-    The kernel's folder goes with its own host, or with the first one: containers run on its
-    kernel, but their threads have other numbers there.
+    The kernel's folder goes with its own host, or with the first one.
     """
-    hosts = [str(folder.declared.env.get("hostname", "")) for folder in trace.folders]
+    hosts = [_fact(folder.declared.env, "hostname") for folder in trace.folders]
     kernel = [folder.declared.env.get("domain") == "kernel" for folder in trace.folders]
     traced = list(dict.fromkeys(h for h, k in zip(hosts, kernel, strict=True) if not k))
     if len(traced) < 2:
@@ -326,57 +303,39 @@ def _process_names(frames: Mapping[str, pl.DataFrame]) -> dict[int, str]:
 def table_name(event: str) -> str | None:
     """The table that an event belongs to: ``ros2:callback_start`` → ``callback_start``.
 
-    None for events that no table is for, and for another provider's event of the same name. The
-    kernel's events have no provider.
+    None for others, and another provider's event of the same name; the kernel's have no provider.
     """
     provider, _, name = event.rpartition(":")
-    if name == "sched_switch":
-        return None if provider else name
-    known = provider in _PROVIDERS and (name in events.FIELDS or name == _CARET_INIT)
-    return name if known else None
+    of_kernel = name == "sched_switch"
+    known = name in events.FIELDS or name == _CARET_INIT
+    return name if known and provider in (("",) if of_kernel else ("ros2", "ros2_caret")) else None
 
 
-def _declared_fields(trace: CtfTrace) -> dict[str, dict[str, Type]]:
-    """The fields of every event of the trace that a table is for."""
-    declared: dict[str, dict[str, Type]] = {}
+def _declared_fields(trace: CtfTrace) -> dict[str, dict[str, ctf.Type]]:
+    """Table → the fields that the trace declares for its event."""
+    declared: dict[str, dict[str, ctf.Type]] = {}
     for folder in trace.folders:
         for stream in folder.declared.streams.values():
             for event in stream.events.values():
                 name = table_name(event.name)
                 if name is not None:
-                    kind = event.fields or StructType()
-                    fields = {field_name(f.name): f.type for f in kind.fields}
+                    kind = event.fields or ctf.StructType()
+                    fields = {ctf.field_name(f.name): f.type for f in kind.fields}
                     declared.setdefault(name, {}).update(fields)
     return declared
 
 
-def _missing_fields(declared: _DeclaredFields, happened: set[str]) -> list[str]:
-    """In words, which fields of events that happened are absent, or of a kind without use."""
-    notes = []
-    for name in sorted(happened & declared.keys()):
-        fields = declared[name]
-        missing = [
-            field
-            for field, wanted in events.FIELDS[name].items()
-            if field not in events.VERSION_FIELDS.get(name, ())
-            and not (field in fields and _castable(_decoded_type(fields[field]), wanted))
-        ]
-        if missing:
-            notes.append(
-                f"the trace's {name} has no usable field {', '.join(missing)}: what depends on "
-                "it cannot be known."
-            )
-    return notes
-
-
-def _decoded_type(declared: Type) -> pl.DataType | None:
+def _decoded_type(declared: ctf.Type | None) -> pl.DataType | None:
     """What the values of a declared field become, of the kinds that a table has."""
     match declared:
-        case IntegerType() | EnumType():
+        case ctf.IntegerType() | ctf.EnumType():
             return pl.Int64()
-        case StringType():
+        case ctf.StringType():
             return pl.String()
-        case ArrayType(element=IntegerType() as one) | SequenceType(element=IntegerType() as one):
+        case (
+            ctf.ArrayType(element=ctf.IntegerType() as one)
+            | ctf.SequenceType(element=ctf.IntegerType() as one)
+        ):
             text = one.encoding != "none" and one.size == one.align == 8
             return pl.String() if text else pl.List(pl.Int64())
     return None
@@ -409,9 +368,3 @@ def _event_table(frame: pl.DataFrame, name: str, clock_offset_ns: int) -> pl.Dat
     # `sched_switch` names its threads itself.
     nameless = name != "sched_switch" and (table["pid"].null_count() or table["tid"].null_count())
     return table.drop_nulls(["pid", "tid"]) if nameless else table
-
-
-def _merged(parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
-    """Several providers' events of one name, by time; CARET's copy of an event is not another."""
-    together = pl.concat(parts, how="diagonal_relaxed").sort("time", maintain_order=True)
-    return together.unique(maintain_order=True) if together.height else together

@@ -1,1 +1,248 @@
-"""What an application's own ROS 2 tells while it runs: graph, QoS, parameters."""
+"""Asking an application's own ROS 2 while it runs, by a script of ours (:mod:`.script`).
+
+The Python that has `rclpy` is seldom ours, and domain and RMW are those of the application's nodes.
+An environment says which programs and libraries are loaded: who wrote it chooses what runs. So this
+is the one place where something is run that was found through another process, even the
+interpreter, and it runs with that process's user's rights, without capabilities or a way to get
+any, in that environment and a session of its own, with no files of ours but the script and what it
+may print into, for a limited time, or not at all. What it prints is a stranger's word.
+"""
+
+import ctypes
+import fcntl
+import json
+import os
+import pwd
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from chainshaper.linux.processes import process_folder, user_in, user_name
+from chainshaper.linux.scheduling import signalled_with_parent
+from chainshaper.linux.threads import read_proc
+from chainshaper.sources.ros import script as ros_script
+from chainshaper.values.errors import OperationError
+from chainshaper.values.recording import EndpointInfo
+
+_NOT_FOR_US = ("LD_PRELOAD",)
+"""What is loaded into the nodes for tracing shall not trace us."""
+
+_WITH_ITS_PYTHON = """
+set -f
+if ros2=$(command -v ros2) && IFS= read -r first < "$ros2"; then
+    case $first in "#!"*) exec ${first#??} - "$@" ;; esac
+fi
+exec python3 - "$@"
+"""
+"""The Python that the environment's `ros2` runs with: another one cannot load `rclpy`."""
+
+_MOST_PRINTED = 8 << 20
+_LOOKS = 6
+_SAME_PLACES = ("ns/user", "ns/mnt", "root")
+_PR_SET_NO_NEW_PRIVS, _CAPABILITY_VERSION_3 = 38, 0x20080522
+_PATIENCE_S, _START_S = 10, 20
+"""How long discovery may take, and Python and RMW to load beside it."""
+_NAME = re.compile(r"[!-~]{0,255}/[!-~]{1,255}")
+_LARGEST = 1 << 63
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+@dataclass(frozen=True)
+class Environment:
+    """An environment, and the user whose rights whatever is found through it gets."""
+
+    variables: Mapping[str, str]
+    user: int
+
+
+@dataclass(frozen=True)
+class Script:
+    """A script that runs, with the files of what it has ``printed`` and ``said`` on its errors."""
+
+    process: "subprocess.Popen[bytes]"
+    printed: int
+    said: int
+
+    def is_over(self) -> bool:
+        """Look whether it has ended."""
+        return self.process.poll() is not None
+
+    def end(self, within_s: float = 0.0) -> tuple[str, str | None]:
+        """Wait for its end, once, and end all of its session's group when that takes longer.
+
+        Returns what it printed, and why it failed, if it did.
+        """
+        problem = None
+        try:
+            code = self.process.wait(within_s)
+        except subprocess.TimeoutExpired:
+            problem = f"ROS 2 did not answer within {within_s:g} s"
+            os.killpg(self.process.pid, signal.SIGKILL)  # it has not been waited for: still its id
+            code = self.process.wait()
+        printed, said = _content(self.printed), _content(self.said)
+        if problem is None and code != 0:
+            last = next((line for line in reversed(said.splitlines()) if line.strip()), "")
+            problem = last.strip() or f"the script ended with code {code}"
+        return ("" if problem else printed), problem
+
+
+def environment_of(pid: int) -> Environment:
+    """The environment of a process, as it has it now.
+
+    Raises OperationError: it has ended, may not be read, is no single user's, or in a container.
+    """
+    try:
+        with process_folder(pid) as folder:
+            for _ in range(_LOOKS):
+                user = user_in(folder)
+                if user is not None:
+                    break
+                time.sleep(0.01)  # it may be about to become another program
+            content = read_proc("environ", folder).decode(errors="surrogateescape")
+            elsewhere = any(
+                os.readlink(place, dir_fd=folder) != str(Path("/proc/self", place).readlink())
+                for place in _SAME_PLACES
+            )
+            same = user_in(folder) == user  # nor has it become another program meanwhile
+    except OSError as error:
+        raise OperationError(
+            f"the environment of process {pid} cannot be read: {error.strerror}"
+        ) from error
+    if user is None or not same:
+        raise OperationError(
+            f"process {pid} was started by another user than runs it, so nothing that its "
+            "environment names is run"
+        )
+    if elsewhere:
+        raise OperationError(
+            f"process {pid} is in a container or a namespace of its own, so nothing that its "
+            "environment names is run here: run chainshaper in there"
+        )
+    _becoming(user)
+    pairs = (entry.partition("=") for entry in content.split("\0") if "=" in entry)
+    return Environment({name: value for name, _, value in pairs if name}, user)
+
+
+def own_environment() -> Environment:
+    """The environment that we were started with ourselves."""
+    return Environment(dict(os.environ), os.geteuid())
+
+
+def run_with_rclpy(
+    environment: Environment, script: str, *arguments: str, within_s: float
+) -> tuple[str, str | None]:
+    """Run a script file in an environment; what it printed, and why it failed, if it did."""
+    try:
+        return start_with_rclpy(environment, script, *arguments).end(within_s)
+    except OperationError as error:
+        return "", str(error)
+
+
+def start_with_rclpy(environment: Environment, script: str, *arguments: str) -> Script:
+    """Start a script file in an environment, as the user whose it is.
+
+    Raises OperationError: we may not become that user, or nothing can be started.
+    """
+    as_user = _becoming(environment.user)
+    variables = {n: text for n, text in environment.variables.items() if n not in _NOT_FOR_US}
+    printed, said = _bounded_file(), _bounded_file()
+    try:
+        with Path(script).open("rb") as source:  # that user may not reach the file itself
+            process = subprocess.Popen(
+                ["/bin/sh", "-c", _WITH_ITS_PYTHON, "sh", *arguments],
+                env=variables,
+                cwd="/",
+                stdin=source,
+                stdout=printed,
+                stderr=said,
+                start_new_session=True,
+                preexec_fn=partial(_confine, os.getpid()),  # noqa: PLW1509 - a few system calls
+                **as_user,
+            )
+    except OSError as error:
+        os.close(printed)
+        os.close(said)
+        raise OperationError(
+            f"no script of user {user_name(environment.user)} can be started: {error.strerror}"
+        ) from error
+    return Script(process, printed, said)
+
+
+def _becoming(user: int) -> dict[str, Any]:
+    """What has `subprocess` start a process as a user with its groups; nothing if we are that."""
+    if user == os.geteuid():
+        return {}
+    try:
+        known = pwd.getpwuid(user)
+    except KeyError:
+        raise OperationError(
+            f"user {user} of the application is not in this machine's user database, so its groups "
+            "are not known and nothing is run as it"
+        ) from None
+    if os.geteuid() != 0:
+        raise OperationError(
+            f"the application is user {known.pw_name}'s, and what its environment names is run by "
+            "that user only: run chainshaper as that user, or as root"
+        )
+    groups = os.getgrouplist(known.pw_name, known.pw_gid)
+    return {"user": user, "group": known.pw_gid, "extra_groups": groups}
+
+
+def _confine(parent: int) -> None:
+    """Take from a new process what it has beyond its user's rights; it ends with us."""
+    _libc.prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
+    if os.getuid() != 0:
+        header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
+        if _libc.capset(header, (ctypes.c_uint32 * 6)()):
+            os._exit(126)
+    signalled_with_parent(parent, signal.SIGKILL)
+
+
+def _bounded_file() -> int:
+    """A file in memory that cannot grow beyond :data:`_MOST_PRINTED`."""
+    descriptor = os.memfd_create("chainshaper", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    os.ftruncate(descriptor, _MOST_PRINTED)
+    fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_GROW | fcntl.F_SEAL_SHRINK)
+    return descriptor
+
+
+def _content(descriptor: int) -> str:
+    """What was written into such a file, which is closed."""
+    content = os.pread(descriptor, _MOST_PRINTED, 0)
+    with suppress(OSError):
+        os.close(descriptor)
+    return content.rstrip(b"\0").decode(errors="replace")
+
+
+def ask_graph(environment: Environment) -> tuple[tuple[EndpointInfo, ...], str | None]:
+    """All endpoints of the ROS graph of a node with this environment, and why there are none.
+
+    Types and QoS travel in DDS discovery only, which one participant learns in a few seconds. DDS
+    without its security plug-ins does not prove who is in the graph: the answer is bounded and
+    checked in its form, and believed in names, types and QoS only.
+    """
+    asked = (ros_script.__file__, "graph", str(_PATIENCE_S))
+    said, problem = run_with_rclpy(environment, *asked, within_s=_PATIENCE_S + _START_S)
+    if problem is not None:
+        return (), problem
+    try:
+        # Libraries may have printed something before.
+        found = json.loads(said[said.index('{"endpoints"') :])["endpoints"]
+        endpoints = (EndpointInfo.model_validate(one) for one in found)
+        return tuple(one for one in endpoints if _is_ros(one)), None
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        return (), str(error)
+
+
+def _is_ros(one: EndpointInfo) -> bool:
+    """Whether an endpoint's names and numbers are such as ROS 2 has; others are no endpoints."""
+    values = one.model_dump(exclude_none=True).values()
+    names = all(_NAME.fullmatch(name) for name in (one.node, one.topic, one.type) if name)
+    return names and all(value < _LARGEST for value in values if isinstance(value, int))

@@ -3,9 +3,8 @@
     python3 script.py graph [SECONDS]
     python3 script.py parameter NAME VALUE NODE...
 
-This file is run, not imported: by the interpreter that has `rclpy`, in the environment of the
-application, where nothing of ours may be installed. So it needs nothing but `rclpy` (Humble or
-later).
+This file is run, not imported: by the interpreter that has `rclpy` (Humble or later), where nothing
+of ours may be installed.
 
 `graph` prints one JSON object: ``endpoints``, one per publisher and subscription of each topic with
 type and QoS, two of a kind included. Discovery is over when nothing new has appeared for two
@@ -13,10 +12,10 @@ seconds, or after SECONDS (10). Durations are ns; null where the application set
 does not tell.
 
 `parameter` sets an integer parameter. It ends with an error that names each node which has no such
-parameter, refuses the value, or does not answer in time; all of them together have five seconds.
-Who answers is whoever offers the service under the node's name: DDS does not prove who that is
-without its security plug-ins (SROS 2). All that offer it are asked, the node among them; where
-there are several (rclpy counts them since Jazzy), an answer says nothing, and that is an error.
+parameter, refuses the value, or does not answer; all together have five seconds. Who answers is
+whoever offers the service under the node's name: DDS does not prove who that is without its
+security plug-ins (SROS 2). Where several offer it (rclpy counts them since Jazzy), an answer says
+nothing, and that is an error.
 """
 
 import importlib
@@ -33,15 +32,6 @@ QUIET_S, LOOK_S = 2.0, 0.2
 ANSWER_S, SPIN_S = 5.0, 0.05
 INFINITE_NS = 1 << 62
 """Durations beyond are no durations: RMW_DURATION_INFINITE, and what RMWs make of it."""
-
-
-def main() -> None:
-    """Join the graph, do what is asked, leave."""
-    what, *arguments = sys.argv[1:]
-    if what == "graph":
-        print_graph(*(float(seconds) for seconds in arguments))
-    else:
-        set_parameter(*arguments)
 
 
 @contextmanager
@@ -73,38 +63,38 @@ def print_graph(patience: float = 10.0) -> None:
 
 def endpoints(node: Any) -> list[dict[str, Any]]:
     """All publishers and subscriptions that ``node`` knows of, its own left out."""
-    found = []
-    for topic, _ in node.get_topic_names_and_types():
+    return [
+        as_json(topic, kind, info)
+        for topic, _ in node.get_topic_names_and_types()
         for kind, infos in (
             ("publisher", node.get_publishers_info_by_topic(topic)),
             ("subscription", node.get_subscriptions_info_by_topic(topic)),
-        ):
-            found += [_as_json(topic, kind, info) for info in infos if info.node_name != SNAPSHOT]
-    return found
+        )
+        for info in infos
+        if info.node_name != SNAPSHOT
+    ]
 
 
-def _as_json(topic: str, kind: str, info: Any) -> dict[str, Any]:
+def as_json(topic: str, kind: str, info: Any) -> dict[str, Any]:
+    """An endpoint as the recording's `EndpointInfo` has it."""
     qos = info.qos_profile
-    words = ("reliability", "durability", "history", "liveliness")
-    durations = {
-        "deadline_ns": qos.deadline,
-        "lifespan_ns": qos.lifespan,
-        "liveliness_lease_ns": qos.liveliness_lease_duration,
-    }
-    return {
+    found = {
         "node": info.node_namespace.rstrip("/") + "/" + info.node_name,
         "topic": topic,
         "kind": kind,
         "type": info.topic_type,
         "depth": qos.depth,
-        **{word: getattr(qos, word).name.lower() for word in words},
-        **{name: _nanoseconds(duration) for name, duration in durations.items()},
     }
-
-
-def _nanoseconds(duration: Any) -> "int | None":
-    nanoseconds = int(duration.nanoseconds)
-    return nanoseconds if 0 < nanoseconds < INFINITE_NS else None
+    for word in ("reliability", "durability", "history", "liveliness"):
+        found[word] = getattr(qos, word).name.lower()
+    for name, duration in (
+        ("deadline_ns", qos.deadline),
+        ("lifespan_ns", qos.lifespan),
+        ("liveliness_lease_ns", qos.liveliness_lease_duration),
+    ):
+        nanoseconds = int(duration.nanoseconds)
+        found[name] = nanoseconds if 0 < nanoseconds < INFINITE_NS else None
+    return found
 
 
 def set_parameter(name: str, value: str, *nodes: str) -> None:
@@ -126,13 +116,13 @@ def set_parameter(name: str, value: str, *nodes: str) -> None:
                 break
         count = getattr(node, "count_services", lambda _: 1)
         offered = {one: count(f"{one}/set_parameters") for one in nodes}
-    asked = [_problem(one, name, answers.get(one), offered[one]) for one in nodes]
-    problems = [problem for problem in asked if problem is not None]
-    if problems:
-        sys.exit("; ".join(problems))
+    asked = [problem(one, name, answers.get(one), offered[one]) for one in nodes]
+    if any(asked):
+        sys.exit("; ".join(filter(None, asked)))
 
 
-def _problem(node: str, name: str, answer: Any, offered: int) -> "str | None":
+def problem(node: str, name: str, answer: Any, offered: int) -> "str | None":
+    """Why a node's parameter is not what it was set to, as far as the answer says."""
     if offered > 1:
         return f"{offered} participants answer for {node}, so none of them is believed"
     if answer is None:
@@ -146,4 +136,7 @@ def _problem(node: str, name: str, answer: Any, offered: int) -> "str | None":
 
 
 if __name__ == "__main__":
-    main()
+    if sys.argv[1] == "graph":
+        print_graph(*(float(seconds) for seconds in sys.argv[2:]))
+    else:
+        set_parameter(*sys.argv[2:])

@@ -1,4 +1,4 @@
-"""Asking the ROS graph, in the environment and with the interpreter of the application."""
+"""Asking an application's ROS 2, with its Python and in its environment; rclpy is a stand-in."""
 
 import os
 import subprocess
@@ -8,13 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper.sources.ros.interpreter import Environment, ask_graph, environment_of
+from chainshaper.sources.ros import Environment, ask_graph, environment_of, run_with_rclpy, script
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import EndpointInfo
 
 RCLPY = '''
-"""As much of rclpy 7.1 (Jazzy) as is used, telling what two nodes over Cyclone DDS told."""
-import enum, os, types
+"""As much of rclpy 7.1 (Jazzy) as is used, saying what two nodes over Cyclone DDS said.
+
+SERVERS of a node's parameter service are there.
+"""
+import enum, os, sys, types
 
 WORDS = "RELIABLE BEST_EFFORT VOLATILE TRANSIENT_LOCAL KEEP_LAST UNKNOWN AUTOMATIC"
 Words = enum.Enum("Words", WORDS)
@@ -44,8 +47,32 @@ class Node:
     def get_subscriptions_info_by_topic(self, topic):
         return [endpoint("node2", "/front", "BEST_EFFORT", "TRANSIENT_LOCAL", "UNKNOWN", 0,
                          Duration(100_000_000), Duration(0))]
+    def create_client(self, service, name):
+        ready = int(os.environ["SERVERS"]) > 0
+        return types.SimpleNamespace(service_is_ready=lambda: ready, call_async=lambda _: Answer())
     def destroy_node(self):
         pass
+
+class Parameter:
+    Type = enum.Enum("Type", "INTEGER")
+    def __init__(self, *_):
+        pass
+    def to_parameter_msg(self):
+        return None
+
+class SetParameters:
+    @staticmethod
+    def Request(parameters):
+        return parameters
+
+class Answer:
+    def done(self):
+        return True
+    def result(self):
+        return types.SimpleNamespace(results=[types.SimpleNamespace(successful=True)])
+
+if os.environ.get("COUNTS") == "1":
+    Node.count_services = lambda self, name: int(os.environ["SERVERS"])
 
 def init(args):
     print("a library says something first")
@@ -55,8 +82,12 @@ def init(args):
 def create_node(name, enable_rosout, start_parameter_services):
     return Node()
 
-def shutdown():
+def spin_once(node, timeout_sec):
     pass
+
+shutdown = lambda: None
+for name in ("rclpy.parameter", "rcl_interfaces", "rcl_interfaces.srv"):
+    sys.modules[name] = sys.modules[__name__]
 '''
 
 
@@ -78,29 +109,13 @@ def application(tmp_path: Path) -> Environment:
 def test_types_and_qos_of_every_endpoint_are_told(application: Environment) -> None:
     found, problem = ask_graph(application)
     assert problem is None
-    publisher = EndpointInfo(
-        node="/node1",
-        topic="/t1",
-        kind="publisher",
-        type="sensor_msgs/msg/Image",
-        reliability="reliable",
-        durability="volatile",
-        history="keep_last",
-        depth=10,
-        liveliness="automatic",
-    )
-    subscription = EndpointInfo(
-        node="/front/node2",
-        topic="/t1",
-        kind="subscription",
-        type="sensor_msgs/msg/Image",
-        reliability="best_effort",
-        durability="transient_local",
-        history="unknown",
-        depth=0,
-        deadline_ns=100_000_000,
-        liveliness="automatic",
-    )
+    common = {"topic": "/t1", "type": "sensor_msgs/msg/Image", "liveliness": "automatic"}
+    reliable = {"reliability": "reliable", "durability": "volatile", "history": "keep_last"}
+    latched = {"reliability": "best_effort", "durability": "transient_local", "history": "unknown"}
+    one = {**common, **reliable, "node": "/node1", "kind": "publisher", "depth": 10}
+    other = {**common, **latched, "node": "/front/node2", "kind": "subscription", "depth": 0}
+    publisher = EndpointInfo.model_validate(one)
+    subscription = EndpointInfo.model_validate({**other, "deadline_ns": 100_000_000})
     assert found == (publisher, publisher, subscription)  # two publishers stay two
 
 
@@ -162,3 +177,20 @@ def test_the_environment_of_a_process_is_what_it_was_started_with() -> None:
     with pytest.raises(OperationError, match="cannot be read: No such file"):
         environment_of(process.pid)
     assert environment_of(os.getpid()).variables["PATH"]
+
+
+@pytest.mark.parametrize(
+    ("servers", "counts", "problem"),
+    [
+        ("1", "1", None),
+        ("1", "0", None),  # before Jazzy nothing counts them
+        ("2", "1", "2 participants answer for /shaper, so none of them is believed"),
+    ],
+)
+def test_an_answer_is_believed_where_one_participant_can_have_given_it(
+    servers: str, counts: str, problem: str | None, application: Environment
+) -> None:
+    variables = {**application.variables, "SERVERS": servers, "COUNTS": counts}
+    environment = replace(application, variables=variables)
+    arguments = ("parameter", "phase_ns", "7", "/shaper")
+    assert run_with_rclpy(environment, script.__file__, *arguments, within_s=30)[1] == problem

@@ -1,0 +1,244 @@
+"""Functions: those that a library exports, and those that a process's callbacks are.
+
+With LTTng `rclcpp_callback_register` says which function a callback is, with uprobes no event does.
+But a callback's handle is an address, and what stands around it tells (64 bits, GCC's library):
+
+* that of a timer is a member of `rclcpp::WallTimer<F, …>` or `GenericTimer<F, …>`, which begins
+  with the address of its class's table, which leads to the class's name, stripped or not;
+* that of a subscription or service begins with a `std::function`, which has the address of
+  `std::_Function_handler<…, F>::_M_invoke`. Files name it unless they were stripped.
+
+Upstream: elf(5); Itanium C++ ABI, 2.5.2 and 2.9.5; libstdc++, `bits/std_function.h`.
+"""
+
+import ctypes
+import os
+import stat
+import struct
+from bisect import bisect
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from itertools import groupby
+from operator import itemgetter
+from pathlib import Path
+from typing import NamedTuple
+
+from chainshaper.linux.threads import read_proc
+
+__all__ = [
+    "callback_functions",
+    "demangled",
+    "exported_functions",
+    "function_offsets",
+    "mapped_regions",
+    "read_regular",
+    "type_argument",
+]
+
+_LONGEST_FILE = 512 << 20
+_SYMTAB, _DYNSYM, _FUNCTION, _LOAD = 2, 11, 2, 1  # elf.h: SHT_…, STT_FUNC, PT_LOAD
+_NO_ELF = (OSError, LookupError, struct.error, ValueError)
+_TIMERS = ("rclcpp::WallTimer<", "rclcpp::GenericTimer<")
+_INVOKER = "_ZNSt17_Function_handlerI"
+_BEFORE, _BEHIND = 64, 16
+"""Words before and behind a callback's address that are looked at."""
+_SHORTEST_NAME, _LONGEST_NAME = 3, 16_384
+
+
+def open_regular(path: Path) -> int:
+    """Open a file that a process of the application has named. Raises OSError: no ordinary one."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(f"{path} is no ordinary file")
+    return descriptor
+
+
+def read_regular(path: Path, longest: int = _LONGEST_FILE) -> bytes:
+    """The content of such a file. Raises OSError: also if it is longer."""
+    with os.fdopen(open_regular(path), "rb") as file:
+        content = file.read(longest + 1)
+    if len(content) > longest:
+        raise OSError(f"{path} has more than {longest} bytes")
+    return content
+
+
+def exported_functions(path: Path) -> frozenset[str]:
+    """The functions in an ELF-64 file's dynamic symbol table; none if it is no such file."""
+    try:
+        return frozenset(name for _, name in _functions(read_regular(path), (_DYNSYM,)))
+    except _NO_ELF:
+        return frozenset()
+
+
+def function_offsets(path: Path) -> dict[int, str]:
+    """Where functions begin in a file, in bytes, and their names; also of those not exported."""
+    try:
+        content = read_regular(path)
+        loaded = [s[2:6] for s in _entries(content, 32, 54, "IIQQQQQQ") if s[0] == _LOAD]
+        return {
+            address - memory + offset: name
+            for address, name in _functions(content, (_DYNSYM, _SYMTAB))
+            for offset, memory, _, size in loaded
+            if memory <= address < memory + size
+        }
+    except _NO_ELF:
+        return {}
+
+
+def _entries(content: bytes, at: int, count_at: int, layout: str) -> Iterator[tuple[int, ...]]:
+    """The table of which the file's header says at these places where it is, and how long."""
+    if content[:5] != b"\x7fELF\x02":
+        raise ValueError("no ELF-64 file")
+    order = {1: "<", 2: ">"}[content[5]]
+    (begin,) = struct.unpack_from(f"{order}Q", content, at)
+    size, count = struct.unpack_from(f"{order}HH", content, count_at)
+    for number in range(count):
+        yield struct.unpack_from(order + layout, content, begin + size * number)
+
+
+def _functions(content: bytes, tables: tuple[int, ...]) -> Iterator[tuple[int, str]]:
+    """Addresses and names of the functions that a file's symbol tables define."""
+    sections = list(_entries(content, 40, 58, "IIQQQQIIQQ"))
+    layout = {1: "<IBBHQ", 2: ">IBBHQ"}[content[5]]
+    for _, kind, _, _, start, length, names, *_ in sections:
+        for at in range(start, start + length, 24) if kind in tables else ():
+            name, info, _, section, address = struct.unpack_from(layout, content, at)
+            if info & 0xF == _FUNCTION and section:  # of section 0: imported, not defined
+                begin = sections[names][4] + name
+                yield address, content[begin : content.index(b"\0", begin)].decode()
+
+
+class Region(NamedTuple):
+    """Memory that a file is mapped to; ``offset`` is where in the file it begins."""
+
+    start: int
+    end: int
+    offset: int
+    executable: bool
+    path: str
+
+
+def mapped_regions(pid: int) -> Iterator[Region]:
+    """The regions of a process's memory, by address. Raises OSError: gone, or another user's."""
+    for line in read_proc(f"/proc/{pid}/maps").decode(errors="replace").splitlines():
+        span, rights, offset, _, _, *path = line.split(maxsplit=5)
+        if path and path[0].startswith("/"):
+            start, end = (int(bound, 16) for bound in span.split("-"))
+            yield Region(start, end, int(offset, 16), "x" in rights, path[0])
+
+
+class _Process:
+    """A process that runs: its memory, and the functions that callbacks in it are.
+
+    ``invokers`` are those that were found in files so far: path → offset → mangled name.
+    """
+
+    def __init__(self, pid: int, memory: int, invokers: dict[str, dict[int, str]]) -> None:
+        self.pid, self.memory, self.invokers = pid, memory, invokers
+        self.regions = list(mapped_regions(pid))
+
+    def words(self, address: int, count: int) -> tuple[int, ...]:
+        """Eight-byte words; raises OSError where nothing is mapped."""
+        data = os.pread(self.memory, 8 * count, address)
+        return struct.unpack_from(f"={len(data) // 8}Q", data)
+
+    def region(self, address: int) -> Region | None:
+        number = bisect(self.regions, address, key=lambda one: one.start) - 1
+        found = self.regions[number] if number >= 0 else None
+        return found if found is not None and address < found.end else None
+
+    def class_of(self, table: int) -> str | None:
+        """The class whose table of virtual functions begins at an address, if one does."""
+        with suppress(OSError, struct.error, ValueError):
+            address = table - 8  # leads to what the class is, whose name is the second thing there
+            for ahead in (0, 8):
+                region = self.region(address + ahead)
+                if region is None or region.executable:
+                    return None
+                (address,) = self.words(address + ahead, 1)
+            if self.region(address) is not None:
+                name = os.pread(self.memory, _LONGEST_NAME, address).partition(b"\0")[0]
+                return demangled(name.removeprefix(b"*"))  # marks names that no other file may use
+        return None
+
+    def timer(self, callback: int) -> str | None:
+        """The function of the timer whose member this is: the object before it says what it is."""
+        with suppress(OSError):
+            for word in reversed(self.words(callback - 8 * _BEFORE, _BEFORE)):
+                name = self.class_of(word)
+                if name is not None:
+                    return type_argument(name, 0) if name.startswith(_TIMERS) else None
+        return None
+
+    def function(self, callback: int) -> str | None:
+        """The function in the `std::function` behind this address."""
+        with suppress(OSError):
+            for word in self.words(callback, _BEHIND):
+                region = self.region(word)
+                if region is None or not region.executable:
+                    continue
+                if region.path not in self.invokers:
+                    # In a container the path leads elsewhere from here.
+                    functions = function_offsets(Path(f"/proc/{self.pid}/root{region.path}"))
+                    self.invokers[region.path] = {
+                        offset: name
+                        for offset, name in functions.items()
+                        if name.startswith(_INVOKER) and "9_M_invoke" in name
+                    }
+                mangled = self.invokers[region.path].get(word - region.start + region.offset)
+                if mangled is not None:
+                    return type_argument(demangled(mangled.encode()), 1)
+        return None
+
+
+def callback_functions(callbacks: Iterable[tuple[int, int]]) -> dict[tuple[int, int], str]:
+    """(Process, callback) → the type of its function, where it is known and the process runs."""
+    invokers: dict[str, dict[int, str]] = {}
+    found: dict[tuple[int, int], str] = {}
+    for pid, handles in groupby(sorted(set(callbacks)), key=itemgetter(0)):
+        with suppress(OSError), Path(f"/proc/{pid}/mem").open("rb") as memory:
+            process = _Process(pid, memory.fileno(), invokers)
+            for _, address in handles:
+                name = process.timer(address)
+                if name is None or name.startswith("std::function<"):
+                    name = process.function(address)
+                if name is not None:
+                    found[pid, address] = name
+    return found
+
+
+def demangled(name: bytes) -> str | None:
+    """A function or class as C++ writes it; None if that is no name, or libstdc++ is not there."""
+    if len(name) < _SHORTEST_NAME:  # built-in types have such
+        return None
+    try:
+        library, libc = ctypes.CDLL("libstdc++.so.6"), ctypes.CDLL(None)
+    except OSError:
+        return None
+    library.__cxa_demangle.restype = ctypes.c_void_p
+    text = library.__cxa_demangle(name, None, None, None)
+    if not text:
+        return None
+    try:
+        return ctypes.string_at(text).decode(errors="replace")
+    finally:
+        libc.free(ctypes.c_void_p(text))
+
+
+def type_argument(name: str | None, number: int) -> str | None:
+    """An argument of the first template in a name: 0 of ``a::B<c<d, e>, f>::g`` is ``c<d, e>``."""
+    if name is None or "<" not in name:
+        return None
+    arguments, depth = [""], 0
+    for character in name[name.index("<") :].replace("->", "→"):
+        depth -= character in ">)]}"
+        if depth == 0 and character == ">":
+            break
+        if character == "," and depth == 1:
+            arguments.append("")
+        elif depth:
+            arguments[-1] += character
+        depth += character in "<([{"
+    arguments = [one.strip().replace("→", "->") for one in arguments]
+    return arguments[number] if number < len(arguments) else None
