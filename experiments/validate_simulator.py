@@ -21,12 +21,13 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import polars as pl
 
 from chainshaper import load_application, open_recording, run_application, simulate
 from chainshaper.analysis import analyse_latency
-from chainshaper.analysis.disturbance import ordinary_pace, relative_pace
 from chainshaper.simulation.samples import measured_costs
+from chainshaper.values import events
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application
 
@@ -70,6 +71,39 @@ def by_cycle(recording: Recording, period_ns: int) -> pl.DataFrame:
         "latency_ns",
         "disturbed",
     )
+
+
+def ordinary_pace(tables: events.EventTables) -> dict[int, float]:
+    """The median CPU time of a wake-up on each core that was watched (ns)."""
+    frame = events.table(tables, "machine_pace", ["cpu"])
+    medians = frame.group_by("cpu").median().select("cpu", "cpu_time").iter_rows()
+    return {core: median for core, median in medians if median}
+
+
+def relative_pace(
+    tables: events.EventTables,
+    start: npt.NDArray[np.int64],
+    end: npt.NDArray[np.int64],
+    ordinary: Mapping[int, float],
+) -> npt.NDArray[np.float64]:
+    """Per core of ``ordinary`` a row: the mean pace in each window [start, end) of ``start``.
+
+    Not a number where the core was not watched. A window begins with the stretch of wake-ups that
+    was under way.
+    """
+    frame = events.table(tables, "machine_pace", ["cpu"]).sort("time")
+    rows = []
+    for core, usual in ordinary.items():
+        time, cpu_time = (
+            frame.filter(cpu=core)[column].to_numpy() for column in ("time", "cpu_time")
+        )
+        first = np.maximum(np.searchsorted(time, start, side="right") - 1, 0)
+        behind = np.searchsorted(time, end, side="left")
+        total = np.concatenate(([0], np.cumsum(cpu_time)))
+        count = behind - first
+        used = np.where(count > 0, total[behind] - total[np.minimum(first, behind)], np.nan)
+        rows.append(used / np.maximum(count, 1) / usual)
+    return np.array(rows).reshape(len(ordinary), len(start))
 
 
 def off_pace(

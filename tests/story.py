@@ -148,6 +148,15 @@ class Story:
         if end is not None:
             self.end(callback, end, tid)
 
+    def gate(
+        self, callback: Callback, /, sent: int, arrival: int, release: int | None, **fields: Any
+    ) -> None:
+        """A gate's decision about the message sent at ``sent``; ``fields`` differ from usual."""
+        usual: dict[str, Any] = {"slot": 0, "cycles_waited": 0, "anchor": "stamp", "overrun": None}
+        known: dict[str, Any] = {"callback": callback.handle, "source_timestamp": sent + OFFSET}
+        known |= {"arrival": arrival, "release": release, **usual, **fields}
+        self.event("gate_release", release or arrival, callback.pid, **known)
+
     def tables(self) -> dict[str, pl.DataFrame]:
         """The event tables, each sorted by time; events at one time keep the order of telling."""
         found = {}

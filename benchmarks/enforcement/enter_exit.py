@@ -31,7 +31,7 @@ from chainshaper.enforcement.freezer import Freezer
 from chainshaper.enforcement.servers import BackEnd, ReservationServer, ServerTable
 from chainshaper.linux.runs import discard_journal, open_journal
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
-from chainshaper.workload.stall_watch import measure_stalls
+from chainshaper.workload.stall_meter import measure_stalls
 
 MS = 1_000_000
 CORE, OTHER_CORE = available_cores()[-1], available_cores()[0]

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from story import OFFSET, Story
+from story import Story
 
 from chainshaper.analysis import data_flow, disturbed, find_chain, graph_of, traverse
-from chainshaper.analysis.disturbance import overlapping, stalled_within
-from chainshaper.analysis.punctuality import Due, with_punctuality
+from chainshaper.analysis.disturbance import Due, overlapping, stalled_within, with_punctuality
 
 
 def one_traversal(
@@ -30,20 +29,8 @@ def one_traversal(
     story.runs(timer, 1_000, 1_200, writes=((t1, 1_100),))
     story.runs(hold, 2_000, end + 100, reads=1_100, writes=((out, end),))
     if release is not None:
-        story.event(
-            "gate_release",
-            release,
-            2,
-            callback=hold.handle,
-            source_timestamp=1_100 + OFFSET,
-            arrival=arrival,
-            origin=1_300,
-            release=release,
-            slot=0,
-            cycles_waited=int(overran),
-            anchor="stamp",
-            overrun="wait" if overran else None,
-        )
+        waited = {"cycles_waited": 1, "overrun": "wait"} if overran else {}
+        story.gate(hold, 1_100, arrival, release, origin=1_300, **waited)
     for time, duration in stalls:
         story.event("machine_stall", time, 9, duration=duration)
     flow = data_flow(story.tables())

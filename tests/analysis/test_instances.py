@@ -1,14 +1,18 @@
 """Callback instances: pairing starts with ends, and CPU time."""
 
-from collections.abc import Iterator
+import itertools
+from collections import Counter
+from typing import Any
 
 import polars as pl
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from story import Callback, Story
 
 from chainshaper.analysis import callback_instances, data_flow, resolve_objects
-from chainshaper.analysis.instances import cpu_time
+from chainshaper.analysis.flow import cpu_time
+from chainshaper.analysis.matching import ends_of_starts
 
 
 def instances(story: Story) -> pl.DataFrame:
@@ -20,14 +24,14 @@ def pairs(story: Story) -> list[tuple[int, int, int | None]]:
     return list(instances(story).select("tid", "start", "end").iter_rows())
 
 
-def one_timer(story: Story, pid: int = 1) -> Callback:
-    return story.timer(story.node(f"/node{pid}", pid))
+def one_timer(story: Story) -> Callback:
+    return story.timer(story.node("/node1", 1))
 
 
 def test_overlapping_instances_of_processes_and_threads() -> None:
     # Three threads run the same handle at the same time: two of process 1, one of process 2.
     story = Story()
-    first = one_timer(story, 1)
+    first = one_timer(story)
     other = story.timer(story.node("/b", pid=2), handle=first.handle)
     story.start(first, 10, tid=11)
     story.start(other, 11)
@@ -38,92 +42,110 @@ def test_overlapping_instances_of_processes_and_threads() -> None:
     assert pairs(story) == [(11, 10, 30), (2, 11, 40), (12, 12, 20)]
 
 
-def test_lost_end_and_unfinished_and_lost_start() -> None:
-    # 5: an end whose start was before the recording; 10: its end was lost; 50: still running.
+@pytest.mark.parametrize(
+    ("happenings", "expected"),
+    [
+        # An end whose start was before the recording; a lost end; one that is still running.
+        ("e5 s10 s30 e40 s50", [(1, 10, None), (1, 30, 40), (1, 50, None)]),
+        # As a saturated simulation has them: every end is the next start.
+        ("s0 e10 s10 e20 s20 e30", [(1, 0, 10), (1, 10, 20), (1, 20, 30)]),
+        ("s10 e10 s20 e20", [(1, 10, 10), (1, 20, 20)]),  # they take no time
+    ],
+)
+def test_lost_events_and_equal_times(
+    happenings: str, expected: list[tuple[int, int, int | None]]
+) -> None:
     story = Story()
     timer = one_timer(story)
-    story.end(timer, 5)
-    story.start(timer, 10)
-    story.start(timer, 30)
-    story.end(timer, 40)
-    story.start(timer, 50)
-    assert pairs(story) == [(1, 10, None), (1, 30, 40), (1, 50, None)]
+    for one in happenings.split():
+        (story.start if one[0] == "s" else story.end)(timer, int(one[1:]))
+    assert pairs(story) == expected
 
 
-def test_back_to_back_instances_share_an_instant() -> None:
-    # As a saturated simulation has them: every end is the next start.
-    story = Story()
-    timer = one_timer(story)
-    for start in (0, 10, 20):
-        story.runs(timer, start, start + 10)
-    assert pairs(story) == [(1, 0, 10), (1, 10, 20), (1, 20, 30)]
+Happenings = list[tuple[int, int, int]]
 
 
-def test_instances_that_take_no_time() -> None:
-    story = Story()
-    timer = one_timer(story)
-    for start in (10, 20):
-        story.runs(timer, start, start)
-    assert pairs(story) == [(1, 10, 10), (1, 20, 20)]
+def by_definition(starts: Happenings, ends: Happenings) -> list[int]:
+    """For every start the next event of its thread and callback, if that is an end."""
+    result = [-1] * len(starts)
+    for key in {event[:2] for event in (*starts, *ends)}:
+        own = [(t, 0, i) for i, (*k, t) in enumerate(starts) if tuple(k) == key]
+        own += [(t, 1, i) for i, (*k, t) in enumerate(ends) if tuple(k) == key]
+        ordered: list[tuple[int, int, int]] = []
+        for moment in sorted({t for t, _, _ in own}):
+            now = [event for event in own if event[0] == moment]
+            is_open = sum(1 if kind == 0 else -1 for _, kind, _ in ordered) > 0
+            ordered += sorted(now, key=lambda e: (e[1] == 0) == is_open)
+        for (_, kind, row), (_, after, end) in itertools.pairwise(ordered):
+            if (kind, after) == (0, 1):
+                result[row] = end
+    return result
 
 
-def test_nested_callbacks_are_paired_by_their_own_handle() -> None:
-    story = Story()
-    node = story.node("/a", pid=1)
-    outer, inner = story.timer(node), story.timer(node, period=5)
-    story.start(outer, 10)
-    story.runs(inner, 20, 30)
-    story.end(outer, 40)
-    assert pairs(story) == [(1, 10, 40), (1, 20, 30)]
+def paired(starts: Happenings, ends: Happenings) -> list[int]:
+    types = {"tid": pl.Int32, "callback": pl.UInt64, "time": pl.Int64}
+    tables = (
+        pl.DataFrame(rows, types, orient="row").with_columns(pid=pl.lit(7, pl.Int32))
+        for rows in (starts, ends)
+    )
+    return list(ends_of_starts(*tables).cast(pl.Int64).fill_null(-1))
+
+
+HAPPENINGS = st.lists(
+    st.tuples(st.integers(0, 1), st.integers(0, 2), st.integers(0, 12)), max_size=40
+).map(lambda rows: sorted(rows, key=lambda row: row[2]))
+
+
+@settings(max_examples=150, deadline=None)
+@given(HAPPENINGS, HAPPENINGS)
+def test_pairing_agrees_with_its_definition(starts: Happenings, ends: Happenings) -> None:
+    """Lost starts, lost ends, equal times: whatever a trace may hold."""
+    assert paired(starts, ends) == by_definition(starts, ends)
+
+
+def test_more_callbacks_than_the_table_was_made_for() -> None:
+    starts = [(1, callback, 2 * callback) for callback in range(5000)]
+    ends = [(1, callback, 2 * callback + 1) for callback in range(5000)]
+    assert paired(starts, ends) == list(range(5000))
 
 
 def test_execution_time_from_thread_time() -> None:
     # 30 ns passed, of which the thread ran 12.
     story = Story()
-    timer = one_timer(story)
-    callback = timer.handle
+    callback = one_timer(story).handle
     story.event("callback_start", 10, 1, callback=callback, is_intra_process=0, thread_time=100)
     story.event("callback_end", 40, 1, callback=callback, thread_time=112)
     assert instances(story)["execution_ns"].to_list() == [12]
 
 
-def switch(story: Story, time: int, prev: int, following: int, cpu: int = 0) -> None:
-    story.event(
-        "sched_switch",
-        time,
-        0,
-        prev_comm="",
-        prev_tid=prev,
-        prev_prio=0,
-        prev_state=0,
-        next_comm="",
-        next_tid=following,
-        next_prio=0,
-    )
+def switch(story: Story, time: int, prev: int, following: int) -> None:
+    unused: Any = {
+        "prev_comm": "",
+        "prev_prio": 0,
+        "prev_state": 0,
+        "next_comm": "",
+        "next_prio": 0,
+    }
+    story.event("sched_switch", time, 0, prev_tid=prev, next_tid=following, **unused)
 
 
-def test_execution_time_from_sched_switch() -> None:
-    # Thread 1 runs [5, 20), is pre-empted by 99 until 32, runs on to 50. The instance lasts
-    # from 10 to 40: 10 before the pre-emption, 8 after it.
+@pytest.mark.parametrize(
+    ("switches", "used"),
+    [
+        # Thread 1 runs [5, 20), is pre-empted by 99 until 32, runs on to 50. The instance lasts
+        # from 10 to 40: 10 before the pre-emption, 8 after it.
+        ([(5, 0, 1), (20, 1, 99), (32, 99, 1), (50, 1, 0)], 18),
+        # sched_switch begins at 0; thread 1 is switched out at 20: it has run until then.
+        ([(0, 98, 99), (20, 1, 0), (30, 0, 1)], 20),
+    ],
+)
+def test_execution_time_from_sched_switch(switches: list[tuple[int, int, int]], used: int) -> None:
     story = Story()
     timer = one_timer(story)
-    switch(story, 5, 0, 1)
-    switch(story, 20, 1, 99)
-    switch(story, 32, 99, 1)
-    switch(story, 50, 1, 0)
+    for one in switches:
+        switch(story, *one)
     story.runs(timer, 10, 40)
-    assert instances(story)["execution_ns"].to_list() == [18]
-
-
-def test_a_thread_that_ran_since_before_the_recording() -> None:
-    # sched_switch begins at 0; thread 1 is switched out at 20: it has run until then.
-    story = Story()
-    timer = one_timer(story)
-    switch(story, 0, 98, 99, cpu=1)
-    switch(story, 20, 1, 0)
-    switch(story, 30, 0, 1)
-    story.runs(timer, 10, 40)
-    assert instances(story)["execution_ns"].to_list() == [20]
+    assert instances(story)["execution_ns"].to_list() == [used]
 
 
 def test_execution_time_unknown_without_an_end_or_switches() -> None:
@@ -137,46 +159,6 @@ def test_execution_time_unknown_without_an_end_or_switches() -> None:
     assert "execution times cannot be known" in data_flow(story.tables()).notes[0]
 
 
-KEY = st.tuples(st.integers(1, 2), st.integers(1, 2), st.integers(0, 1))
-EVENTS = st.lists(st.tuples(KEY, st.booleans()), max_size=60)
-
-
-def paired_by_hand(
-    happenings: list[tuple[tuple[int, int, int], bool]],
-) -> Iterator[tuple[int, ...]]:
-    """Start → end of the same key if the next event of that key is an end."""
-    for index, (key, is_start) in enumerate(happenings):
-        if is_start:
-            following = next(
-                ((i, s) for i, (k, s) in enumerate(happenings[index + 1 :], index + 1) if k == key),
-                None,
-            )
-            end = -1 if following is None or following[1] else following[0]
-            yield (*key[:2], index, end)
-
-
-@settings(max_examples=40, deadline=None)
-@given(EVENTS)
-def test_pairing_agrees_with_the_obvious_loop(
-    happenings: list[tuple[tuple[int, int, int], bool]],
-) -> None:
-    story = Story()
-    timers = {}
-    for pid in (1, 2):
-        node = story.node(f"/n{pid}", pid, time=-1)
-        for which in (0, 1):
-            timers[pid, which] = story.timer(node, period=which + 1, time=-1, handle=0x10 + which)
-    for time, ((pid, tid, which), is_start) in enumerate(happenings):
-        (story.start if is_start else story.end)(timers[pid, which], time, tid)
-    found = [
-        (pid, tid, start, -1 if end is None else end)
-        for pid, tid, start, end in instances(story)
-        .select("pid", "tid", "start", "end")
-        .iter_rows()
-    ]
-    assert found == list(paired_by_hand(happenings))
-
-
 @settings(max_examples=40, deadline=None)
 @given(
     st.lists(st.integers(0, 3), min_size=1, max_size=40),
@@ -188,22 +170,15 @@ def test_cpu_time_agrees_with_counting_nanoseconds(
     # `running[t]` is the thread that has the core in [t, t + 1); 0 is the idle thread.
     story = Story()
     switch(story, 0, 0, running[0])
-    for time in range(1, len(running)):
-        if running[time] != running[time - 1]:
-            switch(story, time, running[time - 1], running[time])
-    frame = pl.DataFrame(
-        {
-            "tid": [tid for tid in (1, 2, 3) for _ in spans],
-            "start": [min(span) for span in spans] * 3,
-            "end": [max(span) for span in spans] * 3,
-        },
-        schema={"tid": pl.Int32, "start": pl.Int64, "end": pl.Int64},
-    )
-    extended = running + [running[-1]] * 41  # nobody switched afterwards
-    for (tid, start, end), used in zip(
-        frame.iter_rows(), cpu_time(story.tables(), frame), strict=True
-    ):
+    for time, (before, after) in enumerate(itertools.pairwise(running), 1):
+        if before != after:
+            switch(story, time, before, after)
+    rows = [(tid, min(span), max(span)) for tid in (1, 2, 3) for span in spans]
+    types = {"tid": pl.Int32, "start": pl.Int64, "end": pl.Int64}
+    found = cpu_time(story.tables(), pl.DataFrame(rows, types, orient="row"))
+    extended = running + [running[-1]] * 41  # nothing switched afterwards
+    for (tid, start, end), used in zip(rows, found, strict=True):
         if used is not None:
-            assert used == sum(thread == tid for thread in extended[start:end])
+            assert used == Counter(extended[start:end])[tid]
         else:  # the thread had not run by the time the span began
             assert tid not in running[: start + 1]

@@ -1,6 +1,8 @@
 """Who exists: handles reused, recreated, shared, missing."""
 
-import polars as pl
+from collections.abc import Callable
+
+import pytest
 from story import Story
 
 from chainshaper.analysis import application_graph, callback_instances, resolve_objects
@@ -12,10 +14,8 @@ def labels(story: Story) -> list[str]:
 
 def instances_by_callback(story: Story) -> dict[int, list[int]]:
     tables = story.tables()
-    objects = resolve_objects(tables)
-    instances = callback_instances(tables, objects.callbacks)
-    grouped = instances.group_by("callback_id", maintain_order=True).agg("start")
-    return dict(grouped.iter_rows())
+    instances = callback_instances(tables, resolve_objects(tables).callbacks)
+    return dict(instances.group_by("callback_id", maintain_order=True).agg("start").iter_rows())
 
 
 def test_names_kinds_and_topics() -> None:
@@ -33,53 +33,70 @@ def test_names_kinds_and_topics() -> None:
     assert [node.name for node in graph.nodes] == ["/front/filter"]
 
 
-def test_the_same_handle_in_two_processes() -> None:
-    story = Story()
-    story.subscription(story.node("/a", pid=1), "/x", handle=0xBEEF)
-    story.subscription(story.node("/b", pid=2), "/y", handle=0xBEEF)
-    assert labels(story) == ["/a ← /x", "/b ← /y"]
+def _two_processes(story: Story) -> None:
+    for start, (name, pid, topic) in ((20, ("/a", 1, "/x")), (50, ("/b", 2, "/y"))):
+        callback = story.subscription(story.node(name, pid=pid), topic, handle=0xBEEF)
+        story.runs(callback, start, start + 10)
 
 
-def test_a_handle_reused_in_time_by_another_object() -> None:
-    story = Story()
+def _another_object(story: Story) -> None:
     node = story.node("/a", pid=1)
-    first = story.subscription(node, "/x", time=10, handle=0xBEEF)
-    story.runs(first, 20, 30)
-    second = story.timer(node, time=40, handle=0xBEEF)
-    story.runs(second, 50, 60)
-    assert labels(story) == ["/a ← /x", "/a every 100ns"]
-    assert instances_by_callback(story) == {0: [20], 1: [50]}
+    story.runs(story.subscription(node, "/x", time=10, handle=0xBEEF), 20, 30)
+    story.runs(story.timer(node, time=40, handle=0xBEEF), 50, 60)
 
 
-def test_a_process_number_reused_by_a_second_process() -> None:
-    # The second process has the same number, node handle and callback handle.
-    story = Story()
+def _second_process(story: Story) -> None:
+    """The second process has the same number, node handle and callback handle."""
     first = story.subscription(story.node("/a", 1, time=0, handle=8), "/x", 1, handle=0xBEEF)
     story.runs(first, 20, 30)
     again = story.subscription(story.node("/b", 1, time=40, handle=8), "/x", 41, handle=0xBEEF)
     story.runs(again, 50, 60)
-    assert labels(story) == ["/a ← /x", "/b ← /x"]
-    assert instances_by_callback(story) == {0: [20], 1: [50]}
 
 
-def test_a_subscription_recreated_at_another_address_is_one_callback() -> None:
-    story = Story()
+def _recreated(story: Story) -> None:
     node = story.node("/a", pid=1)
     story.runs(story.subscription(node, "/x", time=10), 20, 30)
     story.runs(story.subscription(node, "/x", time=40), 50, 60)
-    assert labels(story) == ["/a ← /x"]
-    assert instances_by_callback(story) == {0: [20, 50]}
 
 
-def test_two_timers_with_one_period_stay_two() -> None:
-    # Both are in use at the same time, though node, period and even symbol agree.
-    story = Story()
+def _two_timers(story: Story) -> None:
+    """Both are in use at the same time, though node, period and even symbol agree."""
     node = story.node("/a", pid=1)
     one, two = (story.timer(node, time=10, symbol="A::tick()") for _ in range(2))
     for start in (100, 200):
         story.runs(one, start, start + 5)
         story.runs(two, start + 10, start + 15)
-    assert instances_by_callback(story) == {0: [100, 200], 1: [110, 210]}
+
+
+def _before_registration(story: Story) -> None:
+    story.event("callback_start", 5, 1, callback=0xBEEF, is_intra_process=0)
+    story.event("callback_end", 8, 1, callback=0xBEEF)
+    later = story.subscription(story.node("/a", pid=1, time=10), "/x", 20, handle=0xBEEF)
+    story.runs(later, 30, 40)
+
+
+@pytest.mark.parametrize(
+    ("tell", "callbacks", "starts"),
+    [
+        (_two_processes, ["/a ← /x", "/b ← /y"], {0: [20], 1: [50]}),
+        (_another_object, ["/a ← /x", "/a every 100ns"], {0: [20], 1: [50]}),
+        (_second_process, ["/a ← /x", "/b ← /x"], {0: [20], 1: [50]}),
+        (_recreated, ["/a ← /x"], {0: [20, 50]}),
+        (_two_timers, ["/a every 100ns"] * 2, {0: [100, 200], 1: [110, 210]}),
+        (
+            _before_registration,
+            ["unknown (process 1) callback 0xbeef", "/a ← /x"],
+            {0: [5], 1: [30]},
+        ),
+    ],
+)
+def test_whose_a_handle_is_depends_on_process_and_time(
+    tell: Callable[[Story], None], callbacks: list[str], starts: dict[int, list[int]]
+) -> None:
+    story = Story()
+    tell(story)
+    assert labels(story) == callbacks
+    assert instances_by_callback(story) == starts
 
 
 def test_symbol_of_a_later_user_of_the_address_is_not_taken() -> None:
@@ -95,22 +112,11 @@ def test_tracing_started_late_leaves_callbacks_unknown_and_says_so() -> None:
     story = Story()
     story.event("callback_start", 5, 9, callback=0xABC, is_intra_process=0)
     story.event("callback_end", 8, 9, callback=0xABC)
-    graph = application_graph(story.tables())
-    (callback,) = graph.callbacks
+    (callback,) = application_graph(story.tables()).callbacks
     assert (callback.kind, callback.handle, callback.topic) == ("unknown", 0xABC, None)
     assert callback.label == "unknown (process 9) callback 0xabc"
     (note,) = resolve_objects(story.tables()).notes
     assert "tracing started after the application" in note
-
-
-def test_a_handle_used_before_it_is_registered_is_somebody_elses() -> None:
-    story = Story()
-    story.event("callback_start", 5, 1, callback=0xBEEF, is_intra_process=0)
-    story.event("callback_end", 8, 1, callback=0xBEEF)
-    later = story.subscription(story.node("/a", pid=1, time=10), "/x", 20, handle=0xBEEF)
-    story.runs(later, 30, 40)
-    assert labels(story) == ["unknown (process 1) callback 0xbeef", "/a ← /x"]
-    assert instances_by_callback(story) == {0: [5], 1: [30]}
 
 
 def test_lost_init_events_leave_what_is_known() -> None:
@@ -120,26 +126,13 @@ def test_lost_init_events_leave_what_is_known() -> None:
     story.event("rclcpp_subscription_callback_added", 2, 1, subscription=6, callback=7)
     story.event("callback_start", 3, 1, callback=7, is_intra_process=0)
     (callback,) = application_graph(story.tables()).callbacks
-    assert (callback.kind, callback.topic, callback.node) == (
-        "subscription",
-        None,
-        "unknown (process 1)",
-    )
+    found = (callback.kind, callback.topic, callback.node)
+    assert found == ("subscription", None, "unknown (process 1)")
 
 
 def test_publisher_created_before_its_node_as_rosout_is() -> None:
     story = Story()
-    story.event(
-        "rcl_publisher_init",
-        5,
-        1,
-        publisher_handle=1,
-        node_handle=8,
-        rmw_publisher_handle=2,
-        topic_name="/rosout",
-        queue_depth=1,
-    )
-    story.node("/a", pid=1, time=6, handle=8)
+    story.publisher(story.node("/a", pid=1, time=6, handle=8), "/rosout", time=5)
     assert application_graph(story.tables()).publishers == {"/rosout": ("/a",)}
 
 
@@ -161,4 +154,4 @@ def test_python_nodes_have_assumed_instances() -> None:
 def test_empty_tables_are_an_empty_application() -> None:
     graph = application_graph({})
     assert (graph.nodes, graph.callbacks, graph.topics) == ((), (), ())
-    assert isinstance(callback_instances({}, resolve_objects({}).callbacks), pl.DataFrame)
+    assert callback_instances({}, resolve_objects({}).callbacks).height == 0

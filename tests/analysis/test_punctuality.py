@@ -1,12 +1,16 @@
 """When outputs were due, and which came late: stories whose every instant is known by hand."""
 
+from dataclasses import replace
 from typing import Any
 
+import polars as pl
 import pytest
 from story import OFFSET, Story
 
-from chainshaper.analysis import LatencyAnalysis, analyse_latency
-from chainshaper.analysis.punctuality import Due
+from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
+from chainshaper.analysis.disturbance import Due
+from chainshaper.analysis.messages import gate_decisions
+from chainshaper.values.recording import Recording
 
 PERIOD = 1_000
 
@@ -26,16 +30,8 @@ def _chain(
         story.runs(timer, start, start + 60, writes=((raw, start + 50),))
         story.runs(hold, start + 100, end + 10, reads=start + 50, writes=((out, end),), tid=number)
         if gated is not None:
-            usual = {"slot": 0, "cycles_waited": 0, "anchor": "stamp", "overrun": None}
-            found = {"arrival": start + 100, "origin": start, "release": end, **gated[number]}
-            story.event(
-                "gate_release",
-                end,
-                2,
-                callback=hold.handle,
-                source_timestamp=start + 50 + OFFSET,
-                **{**usual, **found},
-            )
+            found = {"origin": start, "arrival": start + 100, "release": end, **gated[number]}
+            story.gate(hold, start + 50, **found)
     return story
 
 
@@ -45,82 +41,68 @@ def _analysed(story: Story, due: Due | None = None) -> LatencyAnalysis:
     return found
 
 
-def _late(story: Story, due: Due | None = None) -> list[bool | None]:
-    return _analysed(story, due).traversals["late"].to_list()
-
-
 SLOT = Due(PERIOD, slots=((300, 310),))
 OUTPUTS = [(1_000, 1_300), (2_000, 2_315), (3_000, 4_300)]
+CYCLE = replace(SLOT, from_cycle=True)
+LET = Due(PERIOD, cycles=1, slots=((0, 10),))
+MODES = Due(PERIOD, slots=((200, 210), (300, 310)), last_slot={"fast": 0, "slow": 1})
+# In its slot; in it but published behind it; a period later; at once, behind the slot.
+BEHIND: list[dict[str, Any]] = [
+    {},
+    {"release": 2_300},
+    {"overrun": "wait", "cycles_waited": 1, "arrival": 3_350},
+    {"overrun": "publish", "arrival": 5_400, "slot": None},
+]
+# The gate takes the third for an output of the cycle that it arrives in, and in time.
+BY_CYCLE: list[dict[str, Any]] = [
+    {"anchor": "cycle", "origin": 980},
+    {"anchor": "cycle", "origin": 2_010, "release": 2_310},
+    {"anchor": "cycle", "origin": 4_000, "arrival": 4_020},
+]
+OF_MODES: list[dict[str, Any]] = [
+    {"mode": "slow", "slot": 1},
+    {"mode": "fast", "overrun": "publish", "slot": None},
+]
+A_CYCLE_LATER: list[dict[str, Any]] = [
+    {"cycles_waited": 1},
+    {"cycles_waited": 2, "overrun": "wait"},
+]
 
 
-def test_what_a_gate_let_go_behind_its_slot_is_late() -> None:
-    """In its slot; in it but published behind it; a period later; at once, behind the slot."""
-    outputs = [*OUTPUTS, (5_000, 5_400)]
-    gated: list[dict[str, Any]] = [
-        {},
-        {"release": 2_300},
-        {"overrun": "wait", "cycles_waited": 1, "arrival": 3_350},
-        {"overrun": "publish", "arrival": 5_400, "slot": None},
-    ]
-    found = _analysed(_chain(outputs, gated), SLOT)
-    assert found.traversals["late"].to_list() == [False, True, True, True]
-    assert found.traversals["place_ns"].to_list() == [300, 315, 1_300, 400]
-    assert found.traversals["due_at"].to_list() == [1_300, 2_300, 3_300, 5_300]
-    assert (found.statistics.late, found.undisturbed.late) == (3, 3)
-    # Without the plan the gate's own word remains, and when others were due.
-    found = _analysed(_chain(outputs, gated))
-    assert found.traversals["late"].to_list() == [False, False, True, True]
-    assert found.traversals["due_at"].to_list() == [1_300, 2_300, 3_300, 5_300]
-
-
-def test_with_the_anchor_cycle_the_cycle_counts_in_which_the_chain_began() -> None:
-    """The gate takes the third for an output of the cycle that it arrives in, and in time."""
-    cycle = Due(PERIOD, slots=((300, 310),), from_cycle=True)
-    gated = [
-        {"anchor": "cycle", "origin": 980},
-        {"anchor": "cycle", "origin": 2_010, "release": 2_310},
-        {"anchor": "cycle", "origin": 4_000, "arrival": 4_020},
-    ]
-    outputs = [(1_000, 1_280), (2_000, 2_312), (3_000, 4_300)]
-    found = _analysed(_chain(outputs, gated), cycle)
-    assert found.traversals["place_ns"].to_list() == [300, 302, 1_300]
-    assert found.traversals["late"].to_list() == [False, False, True]
-    assert found.traversals["due_at"].to_list() == [1_280, 2_310, 3_300]
-
-
-def test_under_let_an_output_is_due_a_cycle_later() -> None:
-    let = Due(PERIOD, cycles=1, slots=((0, 10),))
-    gated: list[dict[str, Any]] = [{"cycles_waited": 1}, {"cycles_waited": 2, "overrun": "wait"}]
-    assert _late(_chain([(1_000, 2_000), (2_000, 4_000)], gated), let) == [False, True]
-    assert _late(_chain([(1_000, 2_000), (2_000, 4_000)]), let) == [False, True], "without a gate"
-
-
-def test_a_mode_has_a_slot_of_its_own() -> None:
-    modes = Due(PERIOD, slots=((200, 210), (300, 310)), last_slot={"fast": 0, "slow": 1})
-    outputs = [(1_000, 1_300), (2_000, 2_300)]
-    gated: list[dict[str, Any]] = [
-        {"mode": "slow", "slot": 1},
-        {"mode": "fast", "overrun": "publish", "slot": None},
-    ]
-    found = _analysed(_chain(outputs, gated), modes)
-    assert found.traversals["late"].to_list() == [False, True]
-    assert found.traversals["due_at"].to_list() == [1_300, 2_200]
+FIVE = [*OUTPUTS, (5_000, 5_400)]
+TWO = [(1_000, 2_000), (2_000, 4_000)]
 
 
 @pytest.mark.parametrize(
-    ("due", "late"),
+    ("told", "due", "late", "places", "due_at"),
     [
-        (None, [False, False, True]),  # a period behind the chain's start
-        (Due(2 * PERIOD), [False, False, False]),
-        (Due(PERIOD, slots=((300, 310),)), [False, False, True]),  # the cycle, where no gate spoke
+        ((FIVE, BEHIND), SLOT, "-LLL", [300, 315, 1_300, 400], [1_300, 2_300, 3_300, 5_300]),
+        # Without the plan the gate's own word remains, and when others were due.
+        ((FIVE, BEHIND), None, "--LL", None, [1_300, 2_300, 3_300, 5_300]),
+        (
+            ([(1_000, 1_280), (2_000, 2_312), (3_000, 4_300)], BY_CYCLE),
+            *(CYCLE, "--L", [300, 302, 1_300], [1_280, 2_310, 3_300]),
+        ),
+        ((TWO, A_CYCLE_LATER), LET, "-L", None, None),
+        ((TWO,), LET, "-L", None, None),
+        (([(1_000, 1_300), (2_000, 2_300)], OF_MODES), MODES, "-L", None, [1_300, 2_200]),
+        ((OUTPUTS,), None, "--L", None, None),  # a period behind the chain's start
+        ((OUTPUTS,), Due(2 * PERIOD), "---", None, None),
+        ((OUTPUTS,), SLOT, "--L", None, None),  # the cycle, where no gate spoke
     ],
 )
-def test_without_a_gate_an_output_is_due_within_its_cycle(
-    due: Due | None, late: list[bool]
+def test_an_output_is_late_behind_its_slot_or_cycle(
+    told: tuple[Any, ...],
+    due: Due | None,
+    late: str,
+    places: list[int] | None,
+    due_at: list[int] | None,
 ) -> None:
-    story = _chain(OUTPUTS)
-    assert _late(story, due) == late
-    assert _analysed(story, due).statistics.late == sum(late)
+    found = _analysed(_chain(*told), due)
+    assert found.traversals["late"].to_list() == [one == "L" for one in late]
+    assert places in (None, found.traversals["place_ns"].to_list())
+    assert due_at in (None, found.traversals["due_at"].to_list())
+    assert found.statistics.late == found.undisturbed.late == late.count("L")
 
 
 def test_nothing_says_when_an_output_was_due_where_no_timer_starts_the_chain() -> None:
@@ -137,26 +119,16 @@ def test_nothing_says_when_an_output_was_due_where_no_timer_starts_the_chain() -
 
 def test_a_late_output_waits_through_a_stall_and_is_not_excused() -> None:
     """The third leaves a period late, and the machine stalls while it waits for that."""
-    gated: list[dict[str, Any]] = [{}, {}, {"overrun": "wait", "cycles_waited": 1}]
-    story = _chain([(s * 1_000_000, e * 1_000_000) for s, e in OUTPUTS], None, PERIOD * 1_000_000)
+    outputs = [(s * 1_000_000, e * 1_000_000) for s, e in OUTPUTS]
     due = Due(PERIOD * 1_000_000, slots=((300_000_000, 310_000_000),))
-    story.event("machine_stall", 3_600_000_000, 9, cpu=1, duration=400_000_000)
-    found = _analysed(story, due)
+    gated: list[dict[str, Any]] = [{}, {}, {"overrun": "wait", "cycles_waited": 1}]
+    stall = {"cpu": 1, "duration": 400_000_000}
+    without, behind = (_chain(outputs, one, PERIOD * 1_000_000) for one in (None, gated))
+    for story in (without, behind):
+        story.event("machine_stall", 3_600_000_000, 9, **stall)
+    found = _analysed(without, due)
     assert found.statistics.disturbed == 1, "without a gate the cycle's end bounds it"
-    for number, (start, end) in enumerate(OUTPUTS):
-        story.event(
-            "gate_release",
-            end * 1_000_000,
-            2,
-            callback=None,
-            source_timestamp=start * 1_000_000 + 50 + OFFSET,
-            arrival=start * 1_000_000 + 100,
-            origin=start * 1_000_000,
-            release=end * 1_000_000,
-            anchor="stamp",
-            **{"slot": 0, "cycles_waited": 0, "overrun": None, **gated[number]},
-        )
-    found = _analysed(story, due)
+    found = _analysed(behind, due)
     assert (found.statistics.disturbed, found.statistics.late, found.undisturbed.late) == (0, 2, 2)
     assert found.statistics.max_ns == found.undisturbed.max_ns == 1_300_000_000
 
@@ -177,19 +149,9 @@ def _two_gates(same_process: bool, named: bool) -> Story:
             two, start + 250, start + 410, reads=start + 200, writes=((out, start + 400),), tid=9
         )
         for gate, sent, arrival, release in ((one, 50, 100, 200), (two, 200, 250, 400)):
-            story.event(
-                "gate_release",
-                start + release,
-                gate.pid,
-                callback=gate.handle if named else None,
-                source_timestamp=start + sent + OFFSET,
-                arrival=start + arrival,
-                origin=start,
-                release=start + release,
-                slot=0,
-                cycles_waited=0,
-                anchor="stamp",
-                overrun=None,
+            nameless = {} if named else {"callback": None}
+            story.gate(
+                gate, start + sent, start + arrival, start + release, origin=start, **nameless
             )
     return story
 
@@ -209,7 +171,7 @@ def test_each_hop_finds_the_decision_of_its_own_gate(same_process: bool, named: 
 def test_of_equal_stamps_the_decision_is_meant_that_was_made_there() -> None:
     """A clock that stands still stamps two messages alike, and both go through one gate."""
     story = _chain([(1_000, 1_300), (2_000, 2_300)], [{}, {}])
-    for table in ("rmw_publish", "rmw_take", "rmw_take_with_info", "gate_release"):
+    for table in ("rmw_publish", "rmw_take", "gate_release"):
         for row in story.rows.get(table, []):
             for name in ("timestamp", "source_timestamp"):
                 if row.get(name) in {1_050 + OFFSET, 2_050 + OFFSET}:
@@ -218,3 +180,103 @@ def test_of_equal_stamps_the_decision_is_meant_that_was_made_there() -> None:
     arrivals = dict(found.releases.select("traversal", "arrival").rows())
     starts = dict(found.hops.filter(found.hops["hop"] == 1).select("traversal", "start").rows())
     assert arrivals == starts
+
+
+def test_a_shaping_node_that_knows_no_handles_is_told_by_its_process(shaped: Recording) -> None:
+    """What a node in ROS 2 notes of itself: the same rows, but for the handle."""
+    releases = shaped.events["gate_release"]
+    nameless = releases.with_columns(callback=pl.lit(None, dtype=releases.schema["callback"]))
+    without = {**shaped.events, "gate_release": nameless}
+
+    flow = data_flow(shaped.events, shaped.info.clock_offset_ns)
+    one, other = (gate_decisions(tables, flow.objects) for tables in (shaped.events, without))
+    assert one.height == releases.height > 0
+    assert one.drop("callback").equals(other.drop("callback"))
+
+    known = analyse_latency(shaped.events, "/t1../t3", clock_offset_ns=shaped.info.clock_offset_ns)
+    found = analyse_latency(without, "/t1../t3", clock_offset_ns=shaped.info.clock_offset_ns)
+    assert known.traversals.equals(found.traversals)
+
+
+# -- when asynchronous messages left, and what was withheld --
+
+
+def _sent_by_thread(outcomes: tuple[str | None, ...]) -> Story:
+    """A timer publishes at 100, 200, …; its publisher thread deals with that 60 later."""
+    story = Story()
+    node = story.node("/n", 1)
+    timer, t1 = story.timer(node), story.publisher(node, "/t1")
+    story.rows["rcl_publisher_init"][0]["asynchronous"] = 1
+    listener = story.subscription(story.node("/listener", 2), "/t1")
+    for number, outcome in enumerate(outcomes, start=1):
+        at = 100 * number
+        story.runs(timer, at - 10, at + 5, writes=((t1, at),))
+        if outcome is not None:
+            sent = {"rmw_publisher_handle": t1.rmw_handle, "timestamp": at + OFFSET}
+            story.event("asynchronous_send", at + 60, 1, 11, **sent, outcome=outcome, duration=3)
+        if outcome == "sent":
+            story.runs(listener, at + 70, at + 75, reads=at)
+    return story
+
+
+def test_the_latency_ends_when_the_message_was_sent() -> None:
+    found = analyse_latency(_sent_by_thread(("sent", "sent")).tables(), "/n../t1", OFFSET)
+    assert found.traversals["latency_ns"].to_list() == [70, 70]
+    assert found.traversals["reception_ns"].to_list() == [80, 80]
+    (first, _) = found.hops.select("publish", "end", "computation_ns").rows()
+    assert first == (160, 105, 70), "it left when its callback instance had ended"
+
+
+def test_a_message_that_was_not_sent_has_no_latency() -> None:
+    story = _sent_by_thread(("sent", "expired", "overwritten", None))
+    found = analyse_latency(story.tables(), "/n../t1", OFFSET)
+    assert found.traversals["latency_ns"].to_list() == [70, None, None, None]
+    assert found.traversals["reason"].to_list() == [None, "discarded", "discarded", "not sent"]
+    assert found.traversals["broken_at"].to_list() == [None, "/t1", "/t1", "/t1"]
+    assert found.incomplete == {"discarded": 2, "not sent": 1}
+
+
+@pytest.mark.parametrize(
+    ("asynchronous", "latencies"), [(1, [None, None]), (0, [10, 10]), (None, [10, 10])]
+)
+def test_a_thread_that_never_ran_sent_nothing_and_without_one_publishing_is_sending(
+    asynchronous: int | None, latencies: list[int | None]
+) -> None:
+    story = _sent_by_thread((None, None))
+    story.rows["rcl_publisher_init"][0]["asynchronous"] = asynchronous
+    found = analyse_latency(story.tables(), "/n../t1", OFFSET)
+    assert found.traversals["latency_ns"].to_list() == latencies
+    assert found.incomplete == ({"not sent": 2} if asynchronous else {})
+
+
+def test_inside_a_chain_waiting_for_the_thread_belongs_to_the_hop_that_publishes() -> None:
+    story = _sent_by_thread(("sent", "expired"))
+    relay = story.node("/relay", 3)
+    callback, t2 = story.subscription(relay, "/t1"), story.publisher(relay, "/t2")
+    story.runs(callback, 180, 190, reads=100, writes=((t2, 185),))
+    found = analyse_latency(story.tables(), "/t1../t2", OFFSET)
+    assert found.traversals["latency_ns"].to_list() == [95, None]
+    assert found.traversals["reason"].to_list() == [None, "discarded"]
+    assert found.traversals["broken_at"].to_list() == [None, "/t1"]
+    hops = found.hops.filter(pl.col("traversal") == 0)
+    assert hops["computation_ns"].to_list() == [70, 5]
+    assert hops["communication_ns"].to_list() == [None, 20]
+
+
+def test_what_a_gate_discarded_is_not_lost() -> None:
+    story = Story()
+    source, gate = story.node("/source", 1), story.node("/gate", 2)
+    timer, t1 = story.timer(source), story.publisher(source, "/tmp")
+    hold, out = story.subscription(gate, "/tmp"), story.publisher(gate, "/t1")
+    for start, released in ((1_000, 1_060), (1_100, None), (1_200, 1_260)):
+        story.runs(timer, start, start + 20, writes=((t1, start + 10),))
+        writes = () if released is None else ((out, released),)
+        story.runs(hold, start + 30, start + 65, reads=start + 10, writes=writes)
+        discarded = {} if released else {"slot": None, "overrun": "discard"}
+        story.gate(hold, start + 10, start + 31, released, origin=start, **discarded)
+    # An instance that published nothing, of whose message the gate says nothing.
+    story.runs(timer, 1_300, 1_320, writes=((t1, 1_310),))
+    story.runs(hold, 1_330, 1_365, reads=1_310)
+    found = analyse_latency(story.tables(), "/tmp../t1", OFFSET)
+    assert found.traversals["latency_ns"].to_list() == [60, None, 60, None]
+    assert found.incomplete == {"discarded": 1, "not published": 1}

@@ -4,12 +4,7 @@ import polars as pl
 import pytest
 from reference_traces import TRACES, reference_trace
 
-from chainshaper.analysis import (
-    analyse_latency,
-    application_graph,
-    callback_statistics,
-    data_flow,
-)
+from chainshaper.analysis import analyse_latency, application_graph, callback_statistics, data_flow
 from chainshaper.analysis.matching import first_after
 
 
@@ -37,10 +32,7 @@ def test_publications_and_their_takes(name: str) -> None:
     flow = data_flow(trace.tables, trace.clock_offset_ns)
     read = flow.takes.drop_nulls("publication").select("publication").unique()
     counted = {
-        topic: [
-            published.height,
-            published.join(read, on="publication", how="semi").height,
-        ]
+        topic: [published.height, published.join(read, on="publication", how="semi").height]
         for topic in trace.truth["published_and_taken"]
         for published in [flow.publications.filter(topic=topic).drop_nulls("source_timestamp")]
     }

@@ -58,26 +58,21 @@ def circular(one: int, other: int, cycle: int = CYCLE) -> int:
     return abs((one - other + cycle // 2) % cycle - cycle // 2)
 
 
-def test_what_comes_in_every_cycle_is_told_from_what_comes_now_and_then() -> None:
-    wake_ups = np.array([1020, 1030, 1090, 1120, 1131, 1220, 1229, 1320])
-    phase = find_phase(wake_ups, 100, 4)
-    assert phase is not None
-    assert phase.at_ns == 20
-    assert phase.wake_ups == 4
-
-
-def test_of_two_regular_places_the_one_after_the_longer_rest_is_the_beginning() -> None:
-    """A thread that is pre-empted at 30 % of the cycle begins at 10 % nevertheless."""
-    wake_ups = np.array([cycle * CYCLE + place * MS for cycle in range(10) for place in (10, 30)])
-    phase = find_phase(wake_ups, CYCLE, 10)
-    assert phase is not None
-    assert phase.at_ns == 10 * MS
-
-
-def test_wake_ups_all_over_the_cycle_have_no_phase() -> None:
-    steps = np.arange(12) * (CYCLE + 7 * MS)
-    assert find_phase(steps, CYCLE, 12) is None
-    assert find_phase(np.array([], dtype=np.int64), CYCLE, 12) is None
+@pytest.mark.parametrize(
+    ("wake_ups", "cycle", "cycles", "at"),
+    [
+        ([1020, 1030, 1090, 1120, 1131, 1220, 1229, 1320], 100, 4, 20),
+        # A thread that is pre-empted at 30 % of the cycle begins at 10 % nevertheless.
+        ([n * CYCLE + place * MS for n in range(10) for place in (10, 30)], CYCLE, 10, 10 * MS),
+        ([n * (CYCLE + 7 * MS) for n in range(12)], CYCLE, 12, None),  # all over the cycle
+        ([], CYCLE, 12, None),
+    ],
+)
+def test_the_beginning_comes_in_every_cycle_after_the_longest_rest(
+    wake_ups: list[int], cycle: int, cycles: int, at: int | None
+) -> None:
+    phase = find_phase(np.array(wake_ups, dtype=np.int64), cycle, cycles)
+    assert (phase and phase.at_ns) == at
 
 
 @given(
@@ -97,36 +92,39 @@ def test_a_timer_is_found_wherever_it_lies_and_whatever_else_wakes_its_thread(
     assert circular(phase.at_ns, at) <= 2 * MS
 
 
+@contextmanager
+def running(body: str, *arguments: object) -> Iterator[tuple[int, str]]:
+    """A Python program: its process id and the first line that it prints."""
+    command = [sys.executable, "-c", body, *map(str, arguments)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            yield process.pid, process.stdout.readline()
+        finally:
+            process.kill()
+
+
 def test_a_process_that_ticks_is_measured() -> None:
     """The reference is the phase that it was given; half a slot's lead is the tolerance."""
     period, first = 50 * MS, 17 * MS
-    with subprocess.Popen(
-        [sys.executable, "-c", TICKING, str(period), str(first)], stdout=subprocess.PIPE
-    ) as process:
-        try:
-            assert process.stdout is not None
-            process.stdout.readline()
-            phase = measure_phase(process.pid, process.pid, period)
-        finally:
-            process.kill()
+    with running(TICKING, period, first) as (pid, _):
+        phase = measure_phase(pid, pid, period)
     assert circular(phase.at_ns, first, period) < period // 10
 
 
-def test_a_thread_that_ends_meanwhile_is_said_so() -> None:
-    with (
-        subprocess.Popen([sys.executable, "-c", "import time; time.sleep(0.2)"]) as process,
-        pytest.raises(OperationError, match=r"ended while its phase was measured"),
-    ):
-        measure_phase(process.pid, process.pid, CYCLE)
-
-
-def test_a_thread_that_never_wakes_has_no_phase_and_the_remedy_is_named() -> None:
-    with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"]) as process:
-        try:
-            with pytest.raises(OperationError, match=r"does not wake up once .*--phase"):
-                measure_phase(process.pid, process.pid, 10 * MS)
-        finally:
-            process.kill()
+@pytest.mark.parametrize(
+    ("lasts", "cycle", "words"),
+    [
+        (0.2, CYCLE, "ended while its phase was measured"),
+        (60, 10 * MS, r"does not wake up once .*--phase"),
+    ],
+)
+def test_a_thread_that_ends_or_never_wakes_has_no_phase(
+    lasts: float, cycle: int, words: str
+) -> None:
+    body = f"import time; print(flush=True); time.sleep({lasts})"
+    with running(body) as (pid, _), pytest.raises(OperationError, match=words):
+        measure_phase(pid, pid, cycle)
 
 
 def test_being_stopped_at_a_slots_end_is_no_beginning() -> None:
@@ -162,21 +160,16 @@ def test_wake_ups_without_work_can_be_left_out_and_others_not_looked_for() -> No
         "    while number % 5 == 0 and time.thread_time_ns() - used < 12_000_000:\n"
         "        pass\n"
     )
-    with subprocess.Popen([sys.executable, "-c", body], stdout=subprocess.PIPE) as process:
-        try:
-            assert process.stdout is not None
-            begins = int(process.stdout.readline())
-            every = watch_wake_ups(process.pid, process.pid, 1200 * MS)
-            working = watch_wake_ups(process.pid, process.pid, 1200 * MS, least_ns=MS)
-            closes = begins + 70 * MS  # and opens 100 ms later, 30 ms before it works
+    with running(body) as (pid, printed):
+        every = watch_wake_ups(pid, pid, 800 * MS)
+        working = watch_wake_ups(pid, pid, 1200 * MS, least_ns=MS)
+        closes = int(printed) + 70 * MS  # and opens 100 ms later, 30 ms before it works
 
-            def until_then(now_ns: int) -> int:
-                place = (now_ns - closes) % (200 * MS)
-                return 0 if place > 100 * MS else 100 * MS - place
+        def until_then(now_ns: int) -> int:
+            place = (now_ns - closes) % (200 * MS)
+            return 0 if place > 100 * MS else 100 * MS - place
 
-            some = watch_wake_ups(process.pid, process.pid, 1200 * MS, rest_ns=until_then)
-        finally:
-            process.kill()
+        some = watch_wake_ups(pid, pid, 800 * MS, rest_ns=until_then)
     assert len(some) > 0
     assert ((some - closes) % (200 * MS) > 99 * MS).all()
     assert len(working) >= 3

@@ -18,12 +18,7 @@ SLOT_NS = 10 * MS
 
 
 def _plan() -> Plan:
-    return small_chain_plan(
-        5 * MS,
-        19 * MS,
-        publication="asynchronous",
-        publish_slot_ns=SLOT_NS,
-    )
+    return small_chain_plan(5 * MS, 19 * MS, publication="asynchronous", publish_slot_ns=SLOT_NS)
 
 
 def _burning_meanwhile(application: Application) -> Application:
@@ -41,7 +36,7 @@ def test_the_publisher_waits_for_its_slot_and_its_executor_does_not(tmp_path: Pa
     plan = _plan()
     ((_, server, _),) = publisher_servers(plan)
     recording = calm_run(
-        lambda place: shape_application(application, plan, place / "rec", cycles=60), tmp_path
+        lambda place: shape_application(application, plan, place / "rec", cycles=40), tmp_path
     )
 
     measured = measure_latency(recording)
@@ -49,7 +44,7 @@ def test_the_publisher_waits_for_its_slot_and_its_executor_does_not(tmp_path: Pa
     # Latency counts from the first callback, which starts a little after its cycle does.
     start, end = server.slots[0]
     in_slot = undisturbed.filter(pl.col("latency_ns").is_between(start - MS, end))
-    assert undisturbed.height > 20
+    assert undisturbed.height > 10
     assert in_slot.height > 0.9 * undisturbed.height
 
     # The executor of the same process ran while its publisher was held back.

@@ -1,6 +1,8 @@
 """The gate: its decisions against the live one's, and what it does to messages and time."""
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -17,15 +19,15 @@ from chainshaper.gate.decision import Gate, Modes, Overrun, missed, release_of
 from chainshaper.planning import PlanRequest
 from chainshaper.simulation import layout as at
 from chainshaper.simulation import simulate_latencies
-from chainshaper.simulation.gate_kernel import decide, missed_slot, switch_mode
+from chainshaper.simulation.arrays import Rows, _add_gate
+from chainshaper.simulation.callbacks import decide, missed_slot, switch_mode
+from chainshaper.simulation.layout import G, X
 from chainshaper.values import events
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application
 from chainshaper.workload.event_log import WORDS
 
-BEGIN = 1_500_000_000
 NAMES = ("city", "highway", "parking")
-PLACE = 100  # of the gate's row in an array that holds nothing else
 
 
 @st.composite
@@ -51,26 +53,13 @@ def gates(draw: st.DrawFn) -> Gate:
     )
 
 
-def as_array(gate: Gate) -> at.Int64s:
-    """The gate as the engine has it."""
-    memory = np.full(1000, at.NONE, dtype=np.int64)
-    slots, bands, changes = 200, 300, 400
-    row = memory[PLACE:]
-    row[at.G_SLOTS], row[at.G_SLOTS_END] = slots, slots + 2 * len(gate.slots)
-    memory[slots : slots + 2 * len(gate.slots)] = np.array(gate.slots).ravel()
-    row[at.G_CYCLE], row[at.G_PHASE] = gate.cycle_ns, gate.phase_ns
-    row[at.G_STAMPED] = gate.anchor == "stamp"
-    row[at.G_OVERRUN] = WORDS["overrun"].index(gate.overrun)
-    row[at.G_DUE], row[at.G_CHANGED], row[at.G_CHANGES] = gate.due_cycles, 0, changes
-    if gate.modes is not None:
-        row[at.G_LATE] = WORDS["overrun"].index(gate.modes.late)
-        row[at.G_DEFAULT], row[at.G_BANDS] = NAMES.index(gate.modes.default), bands
-        memory[bands : bands + 3] = [gate.modes.bands.get(name, at.NONE) for name in NAMES]
-    return memory
-
-
-def word(number: int, words: tuple[str, ...]) -> str | None:
-    return None if number == at.NONE else words[number]
+def as_array(gate: Gate) -> tuple[at.Int64s, int]:
+    """The gate as the engine has it: an array, and where its row stands there."""
+    some: Any = SimpleNamespace
+    described = some(gate=some(**vars(gate), spin_ns=0, pause_ns=0))
+    rows = Rows([0] * X.COLUMNS)
+    place = _add_gate(rows, some(modes=NAMES), described, some(anchor_ns=gate.phase_ns))
+    return np.array(rows, dtype=np.int64), place
 
 
 @given(
@@ -83,33 +72,31 @@ def word(number: int, words: tuple[str, ...]) -> str | None:
 def test_the_compiled_gate_decides_as_the_live_one(
     gate: Gate, arrival: int, age: int, announced: list[tuple[int, str]], late_by: int
 ) -> None:
-    memory = as_array(gate)
+    memory, place = as_array(gate)
     changes: list[tuple[int, str]] = []
     current = None if gate.modes is None else gate.modes.default
     for time, name in sorted(announced, key=lambda change: change[0]):
         if gate.modes is None:
             continue
-        memory[at.X_NOW] = time
-        switch_mode(memory, PLACE, NAMES.index(name))
+        memory[X.NOW] = time
+        switch_mode(memory, place, NAMES.index(name))
         if name in gate.modes.bands and name != current:
             changes.append((time, name))
             current = name
     expected = release_of(gate, arrival, arrival - age, changes)
-    decide(memory, PLACE, arrival, arrival - age)
-    row = memory[PLACE:]
-    at_ns = None if row[at.G_AT] == at.NONE else int(row[at.G_AT])
-    slot = None if row[at.G_SLOT] == at.NONE else int(row[at.G_SLOT])
-    found = (at_ns, int(row[at.G_ORIGIN]), slot, int(row[at.G_CYCLES]))
-    assert found == (expected.at_ns, expected.origin_ns, expected.slot, expected.cycles_waited)
-    assert word(1 - row[at.G_BY_STAMP], WORDS["anchor"]) == expected.anchor
-    assert word(row[at.G_TREATED], WORDS["overrun"]) == expected.overrun
-    assert word(row[at.G_MODE], NAMES) == expected.mode
-    memory[at.X_NOW] = arrival + late_by
+    decide(memory, place, arrival, arrival - age)
+    found = {column: None if (n := int(memory[place + column])) == at.NONE else n for column in G}
+    assert (found[G.AT], found[G.ORIGIN]) == (expected.at_ns, expected.origin_ns)
+    assert (found[G.SLOT], found[G.CYCLES]) == (expected.slot, expected.cycles_waited)
+    assert found[G.BY_STAMP] == (expected.anchor == "stamp")
+    assert found[G.TREATED] == (expected.overrun and WORDS["overrun"].index(expected.overrun))
+    assert found[G.MODE] == (expected.mode and NAMES.index(expected.mode))
+    memory[X.NOW] = arrival + late_by
     policy = gate.overrun
     if gate.modes is not None and gate.modes.late != "next-slot":
         policy = gate.modes.late
     over = policy == "discard" and missed(gate, expected, arrival + late_by)
-    assert missed_slot(memory, PLACE) == over
+    assert missed_slot(memory, place) == over
 
 
 def as_application(case: Case) -> Application:
@@ -163,6 +150,12 @@ def test_the_simulated_gate_does_what_the_table_says(tmp_path: Path, case: Case)
     assert not sent
 
 
+def published(recording: Recording, node: str) -> list[float]:
+    (pid,) = (pid for pid, name in recording.info.processes.items() if name == node)
+    times = recording.events["rmw_publish"].filter(pid=pid)["time"]
+    return [(time - begin_of(recording)) / 1e6 for time in times]
+
+
 CHAIN = """
 chain: /in../out
 nodes:
@@ -179,7 +172,7 @@ nodes:
 
 
 @pytest.mark.parametrize(
-    ("execution", "policy", "published"),
+    ("execution", "policy", "leaves"),
     [
         ("10ms", "wait", 30),  # early: held
         ("35ms", "wait", 35),  # in its slot: at once
@@ -189,16 +182,13 @@ nodes:
     ],
 )
 def test_a_gate_holds_messages_until_their_slot_and_treats_overruns(
-    tmp_path: Path, execution: str, policy: str, published: float | None
+    tmp_path: Path, execution: str, policy: str, leaves: float | None
 ) -> None:
     text = CHAIN.replace("EXECUTION", execution).replace("POLICY", policy)
     recording = simulated(tmp_path, application(text))
-    table = recording.events["rmw_publish"]
-    gates_own = recording.events["gate_release"]
-    out = table.filter(pl.col("pid") == gates_own["pid"][0])["time"]
-    found = [(time - BEGIN) / 1e6 for time in out if time < BEGIN + 100_000_000]
-    assert found == ([] if published is None else [published])
-    assert (gates_own["release"].null_count() > 0) == (published is None)
+    found = [time for time in published(recording, "/shaper") if time < 100]
+    assert found == ([] if leaves is None else [leaves])
+    assert (recording.events["gate_release"]["release"].null_count() > 0) == (leaves is None)
 
 
 def test_a_gate_watches_the_clock_before_its_slot_and_pauses_behind_it(tmp_path: Path) -> None:
@@ -252,12 +242,6 @@ nodes:
     core: 2
     callbacks: [{subscription: /in, execution: {constant: 7ms}, publishes: [/right]}]
 """
-
-
-def published(recording: Recording, node: str) -> list[float]:
-    (pid,) = (pid for pid, name in recording.info.processes.items() if name == node)
-    times = recording.events["rmw_publish"].filter(pid=pid)["time"]
-    return [(time - begin_of(recording)) / 1e6 for time in times]
 
 
 def test_every_sink_of_a_plan_has_its_shaping_node(tmp_path: Path) -> None:

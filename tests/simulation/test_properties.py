@@ -9,8 +9,8 @@ import numpy as np
 import yaml
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from schedules import application
-from test_servers import MS, plan
+from schedules import MS, application
+from test_schedules import plan
 
 from chainshaper.analysis import data_flow
 from chainshaper.planning.plan import Server, Thread
@@ -20,7 +20,7 @@ from chainshaper.values import events
 from chainshaper.values.recording import Recording
 
 SETTINGS = settings(
-    max_examples=15,
+    max_examples=12,
     deadline=None,
     phases=(Phase.explicit, Phase.generate),  # a failure says enough; shrinking takes minutes
     suppress_health_check=[HealthCheck.too_slow],
@@ -97,9 +97,12 @@ def recorded(description: dict[str, Any], servers: tuple[Server, ...] = ()) -> R
     return Recording(recording.path, recording.info, loaded)
 
 
-def stretches(recording: Recording) -> dict[int, list[tuple[int, int, int]]]:
+Stretches = dict[int, list[tuple[int, int, int]]]
+
+
+def stretches(recording: Recording) -> Stretches:
     """Per core what ran there: (thread, from, to)."""
-    found: dict[int, list[tuple[int, int, int]]] = {}
+    found: Stretches = {}
     for (core,), table in events.table(recording.events, "sched_switch").group_by("cpu"):
         rows = table.sort("time", maintain_order=True).select("time", "prev_tid", "next_tid").rows()
         own = []
@@ -113,57 +116,50 @@ def stretches(recording: Recording) -> dict[int, list[tuple[int, int, int]]]:
 
 @SETTINGS
 @given(descriptions())
-def test_a_core_runs_one_thread_and_a_thread_runs_on_its_core(description: dict[str, Any]) -> None:
+def test_every_schedule_conserves_work_and_the_order_of_messages(
+    description: dict[str, Any],
+) -> None:
     recording = recorded(description)
+    by_core = stretches(recording)
+    _check_cores(recording, by_core)
+    _check_work(recording, by_core)
+    _check_messages(recording)
+    again = recorded(description)
+    assert recording.events.keys() == again.events.keys()
+    assert all(recording.events[name].equals(again.events[name]) for name in again.events)
+
+
+def _check_cores(recording: Recording, by_core: Stretches) -> None:
+    """A core runs one thread at a time, and a thread runs on its core."""
     homes = {thread.tid: thread.cores for thread in recording.info.threads}
-    for core, own in stretches(recording).items():
-        for (_, _, end), (_, start, _) in pairwise(own):
-            assert end <= start
+    for core, own in by_core.items():
+        assert all(end <= start for (_, _, end), (_, start, _) in pairwise(own))
         assert all(homes[tid] == (core,) for tid, _, _ in own)
 
 
-def covered(own: list[tuple[int, int, int]], start: int, end: int) -> list[tuple[int, int]]:
-    """(thread, time) for all that ran between two instants."""
-    return [
-        (tid, min(end, to) - max(start, since))
-        for tid, since, to in own
-        if min(end, to) > max(start, since)
-    ]
-
-
-def instances(recording: Recording) -> list[tuple[int, int, int, int]]:
-    """Callback instances: thread, start, end, CPU time."""
-    frame = data_flow(recording.events).instances.drop_nulls(["end", "execution_ns"])
-    return frame.select("tid", "start", "end", "execution_ns").rows()
-
-
-@SETTINGS
-@given(descriptions())
-def test_work_is_conserved(description: dict[str, Any]) -> None:
+def _check_work(recording: Recording, by_core: Stretches) -> None:
     """From a callback's start to its end its core runs it, or what is as urgent at least.
 
     And the time for which it ran is the CPU time that it says it used.
     """
-    recording = recorded(description)
-    priority = {thread.tid: thread.priority for thread in recording.info.threads}
-    home = {thread.tid: thread.cores[0] for thread in recording.info.threads}
-    by_core = stretches(recording)
-    for tid, start, end, used in instances(recording):
-        own = by_core.get(home[tid], [])
+    threads = {thread.tid: thread for thread in recording.info.threads}
+    frame = data_flow(recording.events).instances.drop_nulls(["end", "execution_ns"])
+    for tid, start, end, used in frame.select("tid", "start", "end", "execution_ns").iter_rows():
+        own = by_core.get(threads[tid].cores[0], [])
         if not own or start < own[0][1] or end > own[-1][2]:
             continue  # only partly recorded
-        meanwhile = covered(own, start, end)
+        meanwhile = [
+            (runner, min(end, to) - max(start, since))
+            for runner, since, to in own
+            if min(end, to) > max(start, since)
+        ]
         assert sum(time for _, time in meanwhile) == end - start
-        assert all(priority[runner] >= priority[tid] for runner, _ in meanwhile)
+        assert all(threads[one].priority >= threads[tid].priority for one, _ in meanwhile)
         assert sum(time for runner, time in meanwhile if runner == tid) == used
 
 
-@SETTINGS
-@given(descriptions())
-def test_messages_come_after_their_publication_in_its_order_and_once(
-    description: dict[str, Any],
-) -> None:
-    recording = recorded(description)
+def _check_messages(recording: Recording) -> None:
+    """Messages come after their publication, in its order, and once."""
     published = events.table(recording.events, "rmw_publish")
     stamps = set(published["timestamp"].to_list())
     taken = events.table(recording.events, "rmw_take").filter(taken=1)
@@ -181,26 +177,14 @@ def test_messages_come_after_their_publication_in_its_order_and_once(
 def test_threads_of_a_server_never_run_outside_its_slots(
     description: dict[str, Any], first: int, length: int
 ) -> None:
-    name = "node1"
-    core = description["nodes"][name]["core"]
-    slot = (first * MS, (first + length) * MS)
-    server = Server(
-        name="s", core=core, priority=1, slots=(slot,), threads=(Thread(node=f"/{name}"),)
-    )
-    recording = recorded(description, (server,))
-    tid = next(t.tid for t in recording.info.threads if t.node == f"/{name}")
+    core, slot = description["nodes"]["node1"]["core"], (first * MS, (first + length) * MS)
+    thread = Thread(node="/node1")
+    governed = Server(name="s", core=core, priority=1, slots=(slot,), threads=(thread,))
+    recording = recorded(description, (governed,))
+    tid = next(t.tid for t in recording.info.threads if t.node == "/node1")
     for own in stretches(recording).values():
         for runner, start, end in own:
-            if runner != tid or start == end:
-                continue
-            begin = (start - START_NS) % (PERIOD_MS * MS)
-            assert slot[0] <= begin
-            assert begin + (end - start) <= slot[1]
-
-
-@SETTINGS
-@given(descriptions())
-def test_a_seed_determines_everything(description: dict[str, Any]) -> None:
-    one, two = recorded(description), recorded(description)
-    assert one.events.keys() == two.events.keys()
-    assert all(one.events[name].equals(two.events[name]) for name in one.events)
+            if runner == tid and start < end:
+                begin = (start - START_NS) % (PERIOD_MS * MS)
+                assert slot[0] <= begin
+                assert begin + (end - start) <= slot[1]

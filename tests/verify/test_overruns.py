@@ -1,14 +1,14 @@
 """Outputs that missed their slot: counted by what was done about them, recorded live."""
 
-import json
 import os
 import re
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -31,45 +31,39 @@ from chainshaper.verify.overruns import (
     overruns_in,
     overruns_text,
 )
-from chainshaper.workload.live import Enforcement, StartedNodes
+from chainshaper.workload.live import StartedNodes
 
 MS = 1_000_000
 
 
-def _too_early() -> Plan:
-    """A publish slot in the midst of the small chain's latencies: every other output overruns."""
-    return small_chain_plan(
-        4 * MS,
-        6 * MS,
-    )
+def _too_early(overrun: str = "wait", until_ns: int | None = None, **changes: Any) -> Plan:
+    """A publish slot in the midst of the small chain's latencies; the chain itself may run on.
 
-
-def _shaped(folder: Path, overrun: str) -> Recording:
-    return _calm(folder, revised(_too_early(), overrun=overrun))
-
-
-def _calm(folder: Path, plan: Plan, enforcement: Enforcement | None = None) -> Recording:
-    """The small chain shaped for 24 cycles, on a machine that mostly leaves it alone."""
-    application = small_chain(folder)
-
-    def shape(place: Path) -> Recording:
-        return shape_application(
-            application, plan, place / "rec", cycles=24, enforcement=enforcement
-        )
-
-    return calm_run(shape, folder)
+    Until ``until_ns``: 1 ms later.
+    """
+    plan = small_chain_plan(4 * MS, 6 * MS)
+    chain, output = plan.servers
+    ((start, end),) = output.slots
+    slots = ((0, PERIOD_NS),), ((start, until_ns or end),)
+    servers = [
+        one.model_copy(update={"slots": own})
+        for one, own in zip((chain, output), slots, strict=True)
+    ]
+    return revised(plan, servers=tuple(servers), overrun=overrun, **changes)
 
 
 def test_discarded_outputs_are_not_published_and_not_lost(tmp_path: Path) -> None:
-    recording = _shaped(tmp_path, "discard")
+    plan = _too_early("discard")
+    recording = simulate(small_chain(tmp_path), tmp_path / "rec", plan, cycles=24)
     measured = measure_latency(recording)
     releases = recording.events["gate_release"]
     discarded = releases.filter(pl.col("overrun") == "discard")
-    assert 0 < discarded.height < releases.height
-    assert measured.overruns == {"discard": discarded.height}
-    assert discarded["release"].null_count() == discarded["slot"].null_count() == discarded.height
-    assert measured.analysis.incomplete == {"discarded": discarded.height}
-    assert measured.analysis.statistics.count == releases.height - discarded.height
+    count = discarded.height
+    assert 0 < count < releases.height
+    assert measured.overruns == {"discard": count}
+    assert discarded["release"].null_count() == discarded["slot"].null_count() == count
+    assert measured.analysis.incomplete == {"discarded": count}
+    assert measured.analysis.statistics.count == releases.height - count
     # Nothing was let go outside the slot of its own cycle.
     let_go = releases.filter(pl.col("release").is_not_null())
     ((start, end),) = publish_slots(_too_early())
@@ -79,10 +73,20 @@ def test_discarded_outputs_are_not_published_and_not_lost(tmp_path: Path) -> Non
     # What was let go as the slot ended leaves a moment later, and is late.
     at_the_end = measured.analysis.traversals.filter(pl.col("latency_ns") >= end - MS // 10)
     assert measured.held.late <= at_the_end.height
+    # It is reported wherever the latency is.
+    said = overruns_text({"discard": count})
+    assert said in " ".join(called("latency", recording.path).out.split())
+    values = json_of("latency", recording.path)
+    assert (values["overruns"], values["overruns_by_policy"]) == (count, {"discard": count})
+    compared = ("compare", recording.path, recording.path)
+    assert f"{count} ({count} discard)" in called(*compared).out
+    both = json_of(*compared)["recordings"]
+    assert [one["overruns_by_policy"] for one in both] == [{"discard": count}] * 2
 
 
 def test_outputs_published_at_once_wait_for_nothing(tmp_path: Path) -> None:
-    recording = _shaped(tmp_path, "publish")
+    plan = _too_early("publish")
+    recording = simulate(small_chain(tmp_path), tmp_path / "rec", plan, cycles=24)
     measured = measure_latency(recording)
     late = recording.events["gate_release"].filter(pl.col("overrun").is_not_null())
     assert measured.overruns == {"publish": late.height}
@@ -95,14 +99,9 @@ def test_outputs_published_at_once_wait_for_nothing(tmp_path: Path) -> None:
 
 
 def test_what_comes_into_an_open_slot_leaves_at_once_and_is_counted(tmp_path: Path) -> None:
-    early = _too_early()
-    ((start, _),) = publish_slots(early)
-    wide = tuple(
-        server.model_copy(update={"slots": ((server.slots[0][0], PERIOD_NS),)})
-        for server in early.servers
-    )
-    plan = revised(early, servers=wide)
-    recording = _calm(tmp_path, plan)
+    plan = _too_early(until_ns=PERIOD_NS)
+    ((start, _),) = publish_slots(plan)
+    recording = simulate(small_chain(tmp_path), tmp_path / "rec", plan, cycles=24)
     releases = recording.events["gate_release"]
     behind = releases["arrival"] - releases["origin"] - start
     measured = measure_latency(recording)
@@ -114,35 +113,26 @@ def test_what_comes_into_an_open_slot_leaves_at_once_and_is_counted(tmp_path: Pa
     assert json_of("latency", recording.path)["into_open_slots"] == measured.into_open_slots
 
 
-def test_what_was_done_is_reported_wherever_the_latency_is(tmp_path: Path) -> None:
-    plan_file, output = tmp_path / "plan.yaml", tmp_path / "rec"
-    application = tmp_path / "small_chain.yaml"
-    small_chain(tmp_path)
-    latencies = tmp_path / "latencies.txt"
+def test_the_plan_says_what_is_done_about_overruns_and_the_live_run_reports_it(
+    tmp_path: Path,
+) -> None:
+    latencies, plan_file = tmp_path / "latencies.txt", tmp_path / "plan.yaml"
     latencies.write_text("4ms\n6ms\n")
-    made = called(
-        "plan", "--latencies", latencies, "--period", "50ms", "--overrun", "discard", "--json"
-    )
-    assert json.loads(made.out)["overrun"] == "discard"
-    save_plan(revised(_too_early(), overrun="discard"), plan_file)
-    shaped = called("shape", application, plan_file, "-o", output, "--cycles", "24")
+    made = json_of("plan", "--latencies", latencies, "--period", "50ms", "--overrun", "discard")
+    assert made["overrun"] == "discard"
+    save_plan(_too_early("discard"), plan_file)
+    small_chain(tmp_path)
+    output, described = tmp_path / "rec", tmp_path / "small_chain.yaml"
+    shaped = called("shape", described, plan_file, "-o", output, "--cycles", "12")
     assert shaped.code == 0, shaped
-    count = (measure_latency(output).overruns or {})["discard"]
-    said = overruns_text({"discard": count})
-    assert said in shaped.err
-    assert said in called("latency", output).out
-    values = json_of("latency", output)
-    assert (values["overruns"], values["overruns_by_policy"]) == (count, {"discard": count})
-    assert f"{count} ({count} discard)" in called("compare", output, output).out
-    both = json_of("compare", output, output)["recordings"]
-    assert [one["overruns_by_policy"] for one in both] == [{"discard": count}] * 2
+    assert overruns_text(measure_latency(output).overruns or {}) in shaped.err
 
 
 def test_what_a_gate_lost_is_shown_wherever_recordings_are_compared(tmp_path: Path) -> None:
     """An overrun that waits meets the output of the next cycle, which takes its place."""
     application = small_chain(tmp_path)
     profile = simulate(application, tmp_path / "profile", cycles=24)
-    plan = revised(_too_early(), overrun="wait", messages="newest")
+    plan = _too_early(messages="newest")
     shaped = simulate(application, tmp_path / "shaped", plan, cycles=24)
     count = (dropped_in(shaped) or {})["replaced"]
     assert dropped_in(shaped) == {"replaced": count}
@@ -160,18 +150,41 @@ def test_what_a_gate_lost_is_shown_wherever_recordings_are_compared(tmp_path: Pa
     assert f"{count} ({count} replaced)" in page.read_text()
 
 
+AROUND = "2 went around the shaping node, which was not there"
+LOST = "lost at the gate"
+
+
 @pytest.mark.parametrize(
-    ("dropped", "said"),
+    ("text", "counts", "said"),
     [
-        ({"overflowed": 1}, "1 message was lost at the gate (1 overflowed)"),
+        (dropped_text, {"overflowed": 1}, f"1 message was {LOST} (1 overflowed)"),
         (
+            dropped_text,
             {"surplus": 2, "lost by DDS": 1},
-            "3 messages were lost at the gate (2 surplus, 1 lost by DDS)",
+            f"3 messages were {LOST} (2 surplus, 1 lost by DDS)",
+        ),
+        (
+            overruns_text,
+            {"discard": 2, "publish": 3},
+            "5 outputs were too late for their slot (2 discarded, 3 published at once)",
+        ),
+        (overruns_text, {"bypass": 2}, AROUND),
+        (
+            overruns_text,
+            {"wait": 1, "bypass": 2},
+            f"1 output was too late for its slot (1 waited for the next slot); {AROUND}",
+        ),
+        (
+            overruns_text,
+            {"silence": 3},
+            "3 were not published, since the shaping node was not there",
         ),
     ],
 )
-def test_losses_in_words(dropped: dict[str, int], said: str) -> None:
-    assert dropped_text(dropped) == said
+def test_counts_in_words(
+    text: Callable[[dict[str, int]], str], counts: dict[str, int], said: str
+) -> None:
+    assert text(counts) == said
 
 
 def test_an_unshaped_recording_has_no_overruns(unshaped: Recording) -> None:
@@ -222,20 +235,6 @@ def test_of_a_gated_publisher_what_was_not_sent_was_discarded(unshaped: Recordin
     assert overruns_in(gated, plan, late) == {"wait": 1, "discard": 2}
 
 
-@pytest.mark.parametrize(
-    ("overruns", "said"),
-    [
-        ({"wait": 1}, "1 output was too late for its slot (1 waited for the next slot)"),
-        (
-            {"discard": 2, "publish": 3},
-            "5 outputs were too late for their slot (2 discarded, 3 published at once)",
-        ),
-    ],
-)
-def test_overruns_in_words(overruns: dict[str, int], said: str) -> None:
-    assert overruns_text(overruns) == said
-
-
 @contextmanager
 def _stopped_once(nodes: StartedNodes) -> Iterator[None]:
     """/second stands still from the start of cycle 15 on, for more than two periods."""
@@ -256,22 +255,21 @@ def test_a_late_output_is_not_hidden_by_a_stall_after_it_was_due(
     tmp_path: Path, plan: Plan
 ) -> None:
     """A node is stopped; the machine is said to stall while its output waits."""
-    recording = _calm(tmp_path, plan, _stopped_once)
+    application = small_chain(tmp_path)
+
+    def shape(place: Path) -> Recording:
+        output = place / "rec"
+        return shape_application(application, plan, output, cycles=24, enforcement=_stopped_once)
+
+    recording = calm_run(shape, tmp_path)
     cycles = measure_latency(recording).analysis.traversals
     stopped = cycles.filter("late").row(0, named=True)
     assert stopped["latency_ns"] > PERIOD_NS
     ((opens, _),) = publish_slots(plan)
     assert abs(stopped["due_at"] - stopped["start"] - opens) < 2 * MS
-    stall = pl.DataFrame(
-        {
-            "time": [stopped["due_at"] + 2 * MS],
-            "pid": [1],
-            "tid": [1],
-            "cpu": [1],
-            "duration": [15 * MS],
-        },
-        schema_overrides={"pid": pl.Int32, "tid": pl.Int32, "cpu": pl.Int32},
-    )
+    fields = {"time": stopped["due_at"] + 2 * MS, "cpu": 1, "duration": 15 * MS}
+    whole = dict.fromkeys(("pid", "tid", "cpu"), pl.Int32)
+    stall = pl.DataFrame({"pid": 1, "tid": 1, **fields}, schema_overrides=whole)
     stalled = replace(recording, events={**recording.events, "machine_stall": stall})
     found = measure_latency(stalled).analysis
     (same,) = found.traversals.filter(found.traversals["start"] == stopped["start"]).rows(
@@ -288,12 +286,3 @@ def test_a_late_output_is_not_hidden_by_a_stall_after_it_was_due(
     measured = measure_latency(recording)
     assert measured.held is not None
     assert (measured.held.late_of_all, measured.held.cycles) == (late, values["count"])
-
-
-def test_what_went_around_the_shaping_node_is_said_apart() -> None:
-    around = "2 went around the shaping node, which was not there"
-    assert overruns_text({"bypass": 2}) == around
-    assert overruns_text({"wait": 1, "bypass": 2}) == (
-        f"1 output was too late for its slot (1 waited for the next slot); {around}"
-    )
-    assert "3 were not published" in overruns_text({"silence": 3})

@@ -43,16 +43,6 @@ class Wire:
         )
 
 
-def test_the_history_keeps_the_last_messages() -> None:
-    wire = Wire(depth=2)
-    for number in range(1, 5):
-        wire.writer.keep(bytes([number]), number)
-    for _ in range(4):
-        wire.writer.send_next()
-    assert wire.sent == [b"\3", b"\4"]
-    assert wire.noted == [(1, "overwritten"), (2, "overwritten"), (3, "sent"), (4, "sent")]
-
-
 def test_a_message_older_than_its_lifespan_is_not_sent() -> None:
     wire = Wire(depth=10, lifespan_ns=1_000_000_000)
     now = time.time_ns()
@@ -79,25 +69,25 @@ def test_every_message_has_one_outcome_and_order_is_kept(depth: int, steps: list
     assert wire.sent == sorted(wire.sent)
     overwritten = sum(outcome == "overwritten" for _, outcome in wire.noted)
     assert len(wire.sent) == published - overwritten
+    kept = [stamp for stamp, outcome in wire.noted if outcome == "sent"]
+    assert kept[-depth:] == list(range(1, published + 1))[-depth:], "the last ones stay"
 
 
 def test_one_thread_sends_for_all_writers() -> None:
     senders: set[int] = set()
-    sent: list[str] = []
+    sent: list[tuple[bytes, int]] = []
 
-    def writer(name: str) -> AsynchronousWriter:
-        def write(payload: bytes, source_timestamp: int) -> None:
-            senders.add(threading.get_native_id())
-            sent.append(f"{name}{source_timestamp}")
+    def write(payload: bytes, source_timestamp: int) -> None:
+        senders.add(threading.get_native_id())
+        sent.append((payload, source_timestamp))
 
-        return AsynchronousWriter(write, 10, None, lambda *_: None)
-
-    thread, first, second = PublisherThread(), writer("a"), writer("b")
-    for number in range(3):
-        thread.publish(first, b"", number)
-        thread.publish(second, b"", number)
+    thread = PublisherThread()
+    writers = {name: AsynchronousWriter(write, 10, None, lambda *_: None) for name in (b"a", b"b")}
+    expected = [(name, number) for number in range(3) for name in writers]
+    for name, number in expected:
+        thread.publish(writers[name], name, number)
     wait_for(lambda: len(sent) == 6, "six messages")
-    assert sent == ["a0", "b0", "a1", "b1", "a2", "b2"]
+    assert sent == expected
     assert len(senders) == 1
     assert threading.get_native_id() not in senders
 
@@ -178,36 +168,30 @@ def test_a_gated_publisher_thread_shapes_the_latency_and_stops_nobody_else(tmp_p
     assert _usual_response(after) < 0.25 * closed
 
 
-def test_a_publisher_that_is_stopped_for_long_loses_the_oldest_and_nothing_waits_for_it(
-    tmp_path: Path,
+@pytest.mark.parametrize(
+    ("quality", "outcome", "longest_periods"),
+    [
+        ({"depth": 3}, "overwritten", 3),  # the newest stay
+        ({"depth": 20, "lifespan_ns": 2 * PERIOD_NS}, "expired", 4),
+    ],
+)
+def test_a_publisher_that_is_stopped_for_long_loses_messages_and_the_executor_goes_on(
+    tmp_path: Path, quality: dict[str, object], outcome: str, longest_periods: int
 ) -> None:
-    """The thread runs in every tenth cycle only, with a history of three."""
+    """The thread runs in every tenth cycle only."""
     need_threaded_cgroups()
     gating = freezing_publisher_of("/third", SLOT, 10 * PERIOD_NS)
-    recording = run_application(
-        _asynchronous(tmp_path, depth=3), tmp_path / "rec", cycles=30, enforcement=gating
-    )
+    application = _asynchronous(tmp_path, **quality)
+    recording = run_application(application, tmp_path / "rec", cycles=20, enforcement=gating)
     analysis = measure_latency(recording).analysis
     outcomes = _outcomes(recording)
-    assert outcomes["sent"] < outcomes["overwritten"]
+    assert set(outcomes) == {"sent", outcome}
+    assert outcomes["sent"] < outcomes[outcome]
     # Messages of the warm-up, which is not recorded, have an outcome, too.
-    assert 0 < analysis.incomplete["discarded"] <= outcomes["overwritten"]
-    assert analysis.traversals.height == 30, "the executor went on"
-    kept = analysis.traversals.filter("complete")["latency_ns"]
-    assert (kept < 3 * PERIOD_NS).all(), "the newest are kept"
-
-
-def test_what_outlived_its_lifespan_is_not_sent(tmp_path: Path) -> None:
-    need_threaded_cgroups()
-    gating = freezing_publisher_of("/third", SLOT, 10 * PERIOD_NS)
-    application = _asynchronous(tmp_path, depth=20, lifespan_ns=2 * PERIOD_NS)
-    recording = run_application(application, tmp_path / "rec", cycles=30, enforcement=gating)
-    outcomes = _outcomes(recording)
-    assert set(outcomes) == {"sent", "expired"}
-    assert outcomes["expired"] > outcomes["sent"]
-    analysis = measure_latency(recording).analysis
-    assert 0 < analysis.incomplete["discarded"] <= outcomes["expired"]
-    assert (analysis.traversals.filter("complete")["latency_ns"] < 4 * PERIOD_NS).all()
+    assert 0 < analysis.incomplete["discarded"] <= outcomes[outcome]
+    assert analysis.traversals.height == 20, "the executor went on"
+    latencies = analysis.traversals.filter("complete")["latency_ns"]
+    assert (latencies < longest_periods * PERIOD_NS).all()
 
 
 def test_a_run_that_is_given_up_while_a_thread_is_frozen_leaves_nothing(tmp_path: Path) -> None:

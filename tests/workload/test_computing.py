@@ -11,6 +11,7 @@ from chainshaper import run_application, simulate
 from chainshaper.analysis import analyse_latency
 from chainshaper.simulation.samples import with_recorded_times
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.recording import Recording
 from chainshaper.workload import dds
 from chainshaper.workload.description import Application, load_application
 from chainshaper.workload.executor import computing, load_function
@@ -75,10 +76,10 @@ def _application(folder: Path, monkeypatch: pytest.MonkeyPatch, **change: str) -
 
 def test_a_data_message_is_the_message_that_topics_carry() -> None:
     data = bytes(range(37))
-    template = dds.message_template(len(data))
-    template[32 : 32 + len(data)] = data
+    header = dds.Header(dds.Time(12, 345_678_901), "")
+    serialized = dds.Stamped(header, 0, list(data)).serialize()  # type: ignore[arg-type]
     message = dds.data_message(data, 12_345_678_901)
-    assert message == dds.stamp_message(template, 12_345_678_901)
+    assert message == serialized + bytes(-len(serialized) % 4)
     assert bytes(dds.data_of(message)) == data
 
 
@@ -92,10 +93,16 @@ def test_megabytes_are_computed_on_and_what_returns_nothing_publishes_nothing(
     analysis = analyse_latency(recording, application.chain)
     # Three in four of the squares begin the chain with a message; the first five cycles warm up.
     assert analysis.statistics.count == 9
+    totals = recording.events["rclcpp_publish"].filter(pid=_pid(recording, "/total"))
+    assert totals.height == 9, "one a set"
     with pytest.raises(InputError, match=r"node source computes sums:numbers.*--execution-times"):
         simulate(application, tmp_path / "simulated")
     simulated = simulate(with_recorded_times(application, recording), tmp_path / "sim", cycles=10)
     assert analyse_latency(simulated, application.chain).statistics.count == 10
+
+
+def _pid(recording: Recording, node: str) -> int:
+    return next(pid for pid, name in recording.info.processes.items() if name == node)
 
 
 def test_a_function_that_fails_ends_the_run_with_its_name(

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 import yaml
-from description_mistakes import MISTAKES, RIGHT
 from hypothesis import given
 from hypothesis import strategies as st
 from small_chain import NODES, small_chain, small_chain_text
@@ -18,53 +17,47 @@ from chainshaper.workload.description import (
     load_application,
 )
 
-
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_named_once_with_line_key_reason_and_remedy(
-    mistake: str, tmp_path: Path
-) -> None:
-    right, wrong, line, key, reason, remedy = MISTAKES[mistake]
-    assert RIGHT.count(right) == 1, "the test itself is wrong"
-    path = tmp_path / "robot.yaml"
-    path.write_text(RIGHT.replace(right, wrong))
-
-    with pytest.raises(InputError) as refused:
-        load_application(path)
-    said = str(refused.value)
-    named = [each for each in said.splitlines() if f"{key}: " in each]
-    assert len(named) == 1, said
-    assert named[0].startswith(f"{path}:{line}: {key}: ")
-    assert reason in named[0]
-    assert remedy in named[0]
+_TABLE = yaml.safe_load(Path(__file__).with_name("description_mistakes.yaml").read_text())
+RIGHT: str = _TABLE["right"]
 
 
-def _refusal(path: Path) -> str:
+def _refusal(path: Path, content: str | bytes = "") -> str:
+    """What is said about a file, with this content if there is one."""
+    if content:
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
     with pytest.raises(InputError) as refused:
         load_application(path)
     return str(refused.value)
 
 
+@pytest.mark.parametrize("mistake", _TABLE["mistakes"].values(), ids=_TABLE["mistakes"])
+def test_a_mistake_is_named_once_with_line_key_reason_and_remedy(
+    mistake: tuple[str, str, int, str, str, str], tmp_path: Path
+) -> None:
+    right, wrong, line, key, reason, remedy = mistake
+    assert RIGHT.count(right) == 1, "the test itself is wrong"
+    path = tmp_path / "robot.yaml"
+    said = _refusal(path, RIGHT.replace(right, wrong))
+    (named,) = (each for each in said.splitlines() if f"{key}: " in each)
+    assert named.startswith(f"{path}:{line}: {key}: ")
+    assert reason in named and remedy in named
+
+
 def test_every_mistake_is_said_at_once(tmp_path: Path) -> None:
     path = tmp_path / "robot.yaml"
-    path.write_text(RIGHT.replace("50ms", "50").replace("core: 1,", "core: x,"))
-    places = [line.split(": ")[0] for line in _refusal(path).splitlines()]
-    assert places == [f"{path}:4", f"{path}:9"]
+    said = _refusal(path, RIGHT.replace("50ms", "50").replace("core: 1,", "core: x,"))
+    assert [line.split(": ")[0] for line in said.splitlines()] == [f"{path}:4", f"{path}:9"]
 
 
 def test_topics_in_a_circle_are_shown(tmp_path: Path) -> None:
     path = tmp_path / "robot.yaml"
     circle = "  back:\n    callbacks:\n      - {subscription: /command, publishes: [/scan]}\n"
-    path.write_text(RIGHT.replace("topics:\n", circle + "topics:\n"))
-    said = _refusal(path)
+    said = _refusal(path, RIGHT.replace("topics:\n", circle + "topics:\n"))
     assert said.startswith(f"{path}:6: nodes: the topics form a cycle")
     assert "/command → /scan → /command" in said or "/scan → /command → /scan" in said
     assert "break it at one of these topics" in said
-
-
-def test_a_node_that_hears_itself_is_a_circle(tmp_path: Path) -> None:
-    path = tmp_path / "robot.yaml"
-    path.write_text(RIGHT.replace("publishes: [/command]", "publishes: [/command, /scan]"))
-    assert "/scan → /scan" in _refusal(path)
+    itself = RIGHT.replace("publishes: [/command]", "publishes: [/command, /scan]")
+    assert "/scan → /scan" in _refusal(path, itself)
 
 
 @pytest.mark.parametrize(
@@ -87,8 +80,8 @@ def test_a_node_that_hears_itself_is_a_circle(tmp_path: Path) -> None:
 )
 def test_files_that_are_no_descriptions(content: bytes, said: str, tmp_path: Path) -> None:
     path = tmp_path / "robot.yaml"
-    path.write_bytes(content)
-    text = _refusal(path)
+    path.touch()
+    text = _refusal(path, content)
     assert text.startswith(f"{path}")
     assert said in text
     assert "\n" not in text, "one message"

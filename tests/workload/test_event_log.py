@@ -1,6 +1,5 @@
 """The event log: what a process records is what the tables have, and arrives whole."""
 
-import io
 import json
 import sys
 from array import array
@@ -17,11 +16,10 @@ from chainshaper.workload.event_log import (
     WORDS,
     EventLog,
     number_of,
-    send_events,
 )
+from chainshaper.workload.launcher import send_events
 from chainshaper.workload.live import ProcessLog, event_tables
-from chainshaper.workload.stall_meter import NO_PACE
-from chainshaper.workload.stall_watch import meter_tables
+from chainshaper.workload.stall_meter import NO_PACE, meter_tables
 
 
 def _process(log: EventLog, pid: int = 100, core: int | None = 1) -> ProcessLog:
@@ -33,7 +31,7 @@ def _types(name: str, fields: tuple[str, ...]) -> dict[str, pl.DataType]:
     return {**events.COMMON_COLUMNS, **{field: known[field] for field in known if field in fields}}
 
 
-@pytest.mark.parametrize(("name", "fields"), LAYOUT)
+@pytest.mark.parametrize(("name", "fields"), LAYOUT.items())
 def test_every_event_is_read_back_as_it_was_recorded(name: str, fields: tuple[str, ...]) -> None:
     log = EventLog()
     values = dict(zip(fields, range(1, len(fields) + 1), strict=True))
@@ -54,7 +52,7 @@ def test_every_event_is_read_back_as_it_was_recorded(name: str, fields: tuple[st
 
 
 def test_the_layout_says_what_the_event_tables_say() -> None:
-    for name, fields in LAYOUT:
+    for name, fields in LAYOUT.items():
         known = {**events.FIELDS[name], **events.OPTIONAL_FIELDS.get(name, {})}
         assert set(events.FIELDS[name]) <= set(fields) <= {*known, *events.COMMON_COLUMNS}, name
         assert 2 + len(fields) <= WIDTH, name
@@ -73,19 +71,14 @@ def test_a_discarded_message_has_no_release_and_no_slot() -> None:
     ]
 
 
-def test_what_another_thread_did_keeps_its_number() -> None:
+def test_another_threads_number_and_the_largest_numbers_fit() -> None:
     log = EventLog()
     log.point("asynchronous_send")(9, 123, 1, 2, number_of("outcome", "sent"), 5)
-    log.point("callback_end")(10, 1, 0)
+    log.point("rmw_take")(2**62, 0x55D0_0000_0100, 2**47, 2**62, 1)
     tables = event_tables([_process(log)], from_ns=0)
     assert tables["asynchronous_send"]["tid"].to_list() == [123]
-    assert tables["callback_end"]["tid"].to_list() == [100]
-
-
-def test_the_largest_numbers_fit() -> None:
-    log = EventLog()
-    log.point("rmw_take")(2**62, 0x55D0_0000_0100, 2**47, 2**62, 1)
-    (row,) = event_tables([_process(log)], from_ns=0)["rmw_take"].to_dicts()
+    (row,) = tables["rmw_take"].to_dicts()
+    assert row["tid"] == 100
     assert row["time"] == row["source_timestamp"] == 2**62
     assert row["message"] == 2**47
 
@@ -112,12 +105,8 @@ def test_several_processes_are_merged_by_time() -> None:
             log.point("callback_end")(time, 5, 0)
         logs.append(_process(log, pid=pid, core=pid))
     table = event_tables(logs, from_ns=0)["callback_end"]
-    assert table.select("time", "pid", "cpu").rows() == [
-        (10, 1, 1),
-        (20, 2, 2),
-        (30, 2, 2),
-        (40, 1, 1),
-    ]
+    merged = [(10, 1, 1), (20, 2, 2), (30, 2, 2), (40, 1, 1)]
+    assert table.select("time", "pid", "cpu").rows() == merged
 
 
 def test_a_process_that_recorded_nothing_is_no_problem() -> None:
@@ -142,40 +131,30 @@ def test_stalls_come_from_meters_and_gates() -> None:
         assert table.schema == events.empty(name).schema
 
 
-class _Interrupted(io.RawIOBase):
-    """A pipe whose writer is stopped again and again: each write takes a part only."""
+class _Interrupted:
+    """Standard output without a buffer, whose writer is stopped again and again.
+
+    Text goes through; of bytes, each write takes a part only.
+    """
 
     def __init__(self) -> None:
-        self.received = b""
+        self.received, self.buffer = b"", self
 
-    def writable(self) -> bool:
-        return True
-
-    def write(self, data: object) -> int:
-        part = bytes(data)[:7]  # type: ignore[call-overload]
+    def write(self, data: str | memoryview) -> int:
+        part = data.encode() if isinstance(data, str) else bytes(data)[:7]
         self.received += part
         return len(part)
 
-
-class _Unbuffered:
-    """Standard output as PYTHONUNBUFFERED makes it: text goes through, bytes have no buffer."""
-
-    def __init__(self, pipe: _Interrupted) -> None:
-        self.buffer = pipe
-
-    def write(self, text: str) -> None:
-        self.buffer.received += text.encode()
-
     def flush(self) -> None:
-        self.buffer.flush()
+        pass
 
 
 def test_events_arrive_whole_when_the_writer_is_frozen_in_the_middle(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    pipe, events = _Interrupted(), bytes(range(256)) * 3
-    monkeypatch.setattr(sys, "stdout", _Unbuffered(pipe))
+    output, events = _Interrupted(), bytes(range(256)) * 3
+    monkeypatch.setattr(sys, "stdout", output)
     send_events(events, objects=[])
-    line, _, rest = pipe.received.partition(b"\n")
+    line, _, rest = output.received.partition(b"\n")
     assert json.loads(line) == {"bytes": len(events), "objects": []}
     assert rest == events

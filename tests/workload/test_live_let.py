@@ -18,9 +18,9 @@ from chainshaper.workload.description import Application
 def test_let_per_callback_has_no_jitter_of_a_period(tmp_path: Path) -> None:
     """The slot of /t1 comes behind the end of fast callbacks, in the same cycle."""
     application = small_chain(tmp_path)
-    profile = run_application(application, tmp_path / "profile", cycles=20)
+    profile = run_application(application, tmp_path / "profile", cycles=12)
     plan = plan_recording(profile, request=PlanRequest(policy="let-per-callback"))
-    shaped = shape_application(application, plan, tmp_path / "shaped", cycles=30)
+    shaped = shape_application(application, plan, tmp_path / "shaped", cycles=20)
 
     releases = shaped.events["gate_release"].filter(pl.col("overrun").is_null())
     held = releases.select("pid", "cycles_waited", since=pl.col("release") - pl.col("origin"))
@@ -30,7 +30,7 @@ def test_let_per_callback_has_no_jitter_of_a_period(tmp_path: Path) -> None:
     # A thread that woke behind its slot is an overrun, and later by whole cycles.
     assert latencies.min() >= 3 * PERIOD_NS  # type: ignore[operator]
     assert (latencies < 3.5 * PERIOD_NS).sum() >= 0.8 * latencies.len()
-    simulated = simulate(application, tmp_path / "simulated", plan, cycles=30)
+    simulated = simulate(application, tmp_path / "simulated", plan, cycles=20)
     assert measure_latency(simulated).analysis.statistics.jitter_ns == 0
 
 
@@ -68,7 +68,7 @@ def test_what_comes_in_comes_out_or_is_counted(
     tmp_path: Path, messages: str, depth: int, lost: set[str]
 ) -> None:
     application = application_of(messages, depth)
-    recording = run_application(application, tmp_path / "recording", cycles=200)
+    recording = run_application(application, tmp_path / "recording", cycles=100)
 
     def timestamps(node: str) -> set[int]:
         (pid,) = (pid for pid, name in recording.info.processes.items() if name == node)

@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from calm_runs import calm_run
-from numpy.typing import NDArray
 from processes import children_of, real_time_threads
 from small_chain import DDS_CORE, EXECUTOR_CORE, NODES, PERIOD_NS, small_chain, small_chain_text
 
@@ -19,7 +17,7 @@ from chainshaper.planning.plan import revised
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import Recording, ThreadInfo
 from chainshaper.workload import live
-from chainshaper.workload.description import Application, load_application
+from chainshaper.workload.description import load_application
 from chainshaper.workload.execution import ExecutionTimes
 
 CYCLES = 12
@@ -38,19 +36,11 @@ def ordinary(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 @pytest.fixture(scope="module")
-def privileged(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+def privileged(unshaped: Recording) -> Recording:
     """A run with real-time scheduling."""
     if not may_use_fifo():
         pytest.skip("SCHED_FIFO is not permitted here")
-    folder = tmp_path_factory.mktemp("privileged")
-    application = small_chain(folder)
-    before = _own_state()
-    recording = calm_run(
-        lambda place: run_application(application, place / "rec", cycles=CYCLES, realtime=True),
-        folder,
-    )
-    assert _own_state() == before, "the caller is not as it was"
-    return recording
+    return unshaped
 
 
 def _own_state() -> tuple[object, ...]:
@@ -101,6 +91,8 @@ def test_every_traversal_is_complete(run: str, request: pytest.FixtureRequest) -
     assert statistics.count == _count_of(recording, "callback_start")["/first"]
     assert statistics.min_ns is not None
     assert statistics.min_ns >= 3_000_000, "three callbacks of 1 ms and more"
+    for pid in {thread.pid for thread in recording.info.threads}:
+        assert not Path(f"/proc/{pid}").exists(), "a process is left"
 
 
 def _threads(recording: Recording, role: str) -> list[ThreadInfo]:
@@ -124,6 +116,9 @@ def test_threads_are_allocated_as_described(privileged: Recording) -> None:
     assert {thread.cores for thread in meters} == {(DDS_CORE,), (EXECUTOR_CORE,)}
     assert {(thread.policy, thread.priority) for thread in meters} == {("SCHED_FIFO", 98)}
     assert privileged.info.realtime is True
+    meter = privileged.info.stall_meter
+    assert meter is not None and meter.realtime and meter.wakeups > CYCLES
+    assert meter.cores == tuple(sorted({DDS_CORE, EXECUTOR_CORE}))
 
 
 def test_without_privileges_threads_have_their_cores_and_the_recording_says_so(
@@ -134,13 +129,7 @@ def test_without_privileges_threads_have_their_cores_and_the_recording_says_so(
     assert {t.cores for t in _threads(ordinary, "dds")} == {(DDS_CORE,)}
     assert ordinary.info.realtime is False
     assert any("without real-time scheduling" in note for note in ordinary.info.notes)
-
-
-@pytest.mark.parametrize("run", ["ordinary", "privileged"])
-def test_no_process_is_left(run: str, request: pytest.FixtureRequest) -> None:
-    recording: Recording = request.getfixturevalue(run)
-    for pid in {thread.pid for thread in recording.info.threads}:
-        assert not Path(f"/proc/{pid}").exists()
+    assert ordinary.info.stall_meter is None, "ordinary scheduling would look like stalls"
 
 
 def test_the_recording_says_what_ran(ordinary: Recording) -> None:
@@ -154,46 +143,20 @@ def test_the_recording_says_what_ran(ordinary: Recording) -> None:
 
 
 @needs_fifo
-def test_the_machine_is_watched_by_sleepers_that_nothing_pre_empts(
-    privileged: Recording, ordinary: Recording
-) -> None:
-    meter = privileged.info.stall_meter
-    assert meter is not None
-    assert meter.cores == tuple(sorted({DDS_CORE, EXECUTOR_CORE}))
-    assert meter.wakeups > CYCLES
-    assert meter.realtime
-    assert ordinary.info.stall_meter is None, "ordinary scheduling would look like stalls"
-
-
-@needs_fifo
-def test_the_seed_determines_the_execution_times(privileged: Recording) -> None:
-    """Each instance spends what its place in the sequence says, and little more."""
-    for index, node in enumerate(("/first", "/second", "/third")):
-        (pid,) = (pid for pid, name in privileged.info.processes.items() if name == node)
+def test_the_seed_determines_the_execution_times(privileged: Recording, shaped: Recording) -> None:
+    """Each instance spends what its place in the sequence says, and little more, shaped or not."""
+    for node in ("/first", "/second", "/third"):
         drawn = ExecutionTimes({"uniform_ns": (1_000_000, 4_000_000)}, 7, node, 0)
         expected = np.array([drawn.next() for _ in range(live.WARM_UP_CYCLES + CYCLES)])
-        spent = _cpu_time(privileged, pid)
-        excess = spent - expected[live.WARM_UP_CYCLES :]
-        assert (excess >= 0).all(), f"node {index} computed for less than was drawn"
-        assert np.median(excess) < 500_000, "that is not the drawn sequence"
-
-
-@needs_fifo
-def test_a_shaped_run_spends_the_same_times(privileged: Recording, shaped: Recording) -> None:
-    for node in ("/first", "/second", "/third"):
-        spent = []
         for recording in (privileged, shaped):
             (pid,) = (pid for pid, name in recording.info.processes.items() if name == node)
-            spent.append(_cpu_time(recording, pid))
-        assert np.median(np.abs(spent[0] - spent[1])) < 500_000
-
-
-def _cpu_time(recording: Recording, pid: int) -> NDArray[np.int64]:
-    start, end = (
-        recording.events[name].filter(pl.col("pid") == pid)["thread_time"]
-        for name in ("callback_start", "callback_end")
-    )
-    return np.array((end - start).to_list(), dtype=np.int64)
+            start, end = (
+                recording.events[name].filter(pid=pid)["thread_time"].to_numpy()
+                for name in ("callback_start", "callback_end")
+            )
+            excess = (end - start) - expected[live.WARM_UP_CYCLES :]
+            assert (excess >= 0).all(), f"{node} computed for less than was drawn"
+            assert np.median(excess) < 500_000, "that is not the drawn sequence"
 
 
 def _check_releases(recording: Recording, plan: Plan) -> pl.DataFrame:
@@ -255,26 +218,19 @@ def test_asynchronous_publication_has_a_thread_of_its_own(tmp_path: Path) -> Non
 
 def test_what_cannot_run_is_refused_before_anything_starts(tmp_path: Path) -> None:
     application = small_chain(tmp_path)
-    started: list[float] = []
+    elsewhere = tmp_path / "elsewhere.yaml"
+    elsewhere.write_text(small_chain_text().replace("  first:\n", "  first:\n    core: 1023\n"))
 
     def report(share: float, what: str) -> None:
-        started.append(share)
+        pytest.fail(f"{what} began")
 
     with pytest.raises(InputError, match="0 cycles cannot be recorded"):
         run_application(application, tmp_path / "rec", cycles=0, progress=report)
     with pytest.raises(InputError, match="exists already"):
         run_application(application, tmp_path, progress=report)
     with pytest.raises(PlatformError, match="core 1023, which node first asks for"):
-        run_application(_elsewhere(tmp_path), tmp_path / "rec", progress=report)
-    assert started == []
+        run_application(load_application(elsewhere), tmp_path / "rec", progress=report)
     assert not (tmp_path / "rec").exists()
-
-
-def _elsewhere(folder: Path) -> Application:
-    path = folder / "elsewhere.yaml"
-    text = small_chain_text().replace("  first:\n", "  first:\n    core: 1023\n")
-    path.write_text(text)
-    return load_application(path)
 
 
 def test_a_caller_that_gives_up_leaves_nothing(tmp_path: Path) -> None:

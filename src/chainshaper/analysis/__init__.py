@@ -1,8 +1,7 @@
 """Events → application graph, callback instances, end-to-end latencies, statistics.
 
-    tables ─► objects ─► instances ┐
-                      └► messages ─┴► flow ─► graph ─► chains
-                                        └──► traversals ─► disturbance ─► latency, statistics
+    tables ─► objects ─► messages ─► flow ─► graph ─► chains
+                                       └──► traversals ─► disturbance ─► latency
 
 Nothing here knows where the events came from: LTTng, eBPF, the live workload and the simulator
 write the same tables (:mod:`chainshaper.values.events`). :func:`analyse_latency` does all of it for
@@ -14,12 +13,10 @@ from chainshaper.analysis.chains import (
     enumerate_chains,
     find_chain,
     load_named_paths,
-    parse_chain,
 )
 from chainshaper.analysis.disturbance import disturbed
-from chainshaper.analysis.flow import DataFlow, data_flow
+from chainshaper.analysis.flow import DataFlow, callback_instances, data_flow
 from chainshaper.analysis.graph import application_graph, graph_of
-from chainshaper.analysis.instances import callback_instances
 from chainshaper.analysis.latency import (
     LatencyAnalysis,
     LatencyStatistics,
@@ -27,33 +24,10 @@ from chainshaper.analysis.latency import (
     callback_statistics,
     latency_statistics,
 )
-from chainshaper.analysis.messages import publications, takes
-from chainshaper.analysis.objects import Objects, resolve_objects
-from chainshaper.analysis.traversals import REASONS, Traversals, reception, traverse
+from chainshaper.analysis.objects import resolve_objects
+from chainshaper.analysis.traversals import REASONS, traverse
 
-__all__ = [
-    "REASONS",
-    "ChainEnumeration",
-    "DataFlow",
-    "LatencyAnalysis",
-    "LatencyStatistics",
-    "Objects",
-    "Traversals",
-    "analyse_latency",
-    "application_graph",
-    "callback_instances",
-    "callback_statistics",
-    "data_flow",
-    "disturbed",
-    "enumerate_chains",
-    "find_chain",
-    "graph_of",
-    "latency_statistics",
-    "load_named_paths",
-    "parse_chain",
-    "publications",
-    "reception",
-    "resolve_objects",
-    "takes",
-    "traverse",
-]
+__all__ = ["REASONS", "ChainEnumeration", "DataFlow", "LatencyAnalysis", "LatencyStatistics"]
+__all__ += ["analyse_latency", "application_graph", "callback_instances", "callback_statistics"]
+__all__ += ["data_flow", "disturbed", "enumerate_chains", "find_chain", "graph_of"]
+__all__ += ["latency_statistics", "load_named_paths", "resolve_objects", "traverse"]

@@ -1,61 +1,59 @@
 """Computation chains: finding the one that a person means, and listing those there are.
 
-A chain is written ``FIRST..LAST``, with more way points where several paths match. Way points
-are topics or nodes. A chain that begins with a topic starts at the callback that publishes it,
-and every chain ends with the publication of its last topic (paper, section 2.3); a chain that
-ends with a node ends with what that node publishes, or, if it publishes nothing, with the topic
-that it subscribes to. CARET's ``named_paths`` are read as well (upstream: tier4/caret_analyze,
-`architecture.yaml`; only the paths, the rest comes from the recording).
+A chain is written ``FIRST..LAST``, with more way points (topics or nodes) where several paths
+match. One that begins with a topic starts at the callback that publishes it, and every chain ends
+with the publication of its last topic (paper, section 2.3): of a last node that is the topic it
+publishes, or, if it publishes nothing, the one it subscribes to.
+
+The number of simple paths grows exponentially with cycles and fan-in, and counting them is #P-hard.
+Without cycles every step forward leads to an end, so listing needs no search. With cycles the
+shortest paths are listed first; if they are few, a search backwards from the ends at every step
+avoids dead ends; both have a budget. Counting and the heaviest path come from dynamic programming
+over the edges that lead forwards in one order of the vertices: exact without cycles, else a bound.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
+from itertools import count as counting
+from itertools import islice
 from pathlib import Path
+from typing import TypeAlias
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
-from chainshaper.analysis.paths import Path as GraphPath
-from chainshaper.analysis.paths import PathSearch, Stage, Vertex
-from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Callback, Chain
+from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Chain
 from chainshaper.values.errors import InputError
 from chainshaper.values.yaml_file import PlainData, compose, read_text
 
-__all__ = [
-    "ChainEnumeration",
-    "close_names",
-    "enumerate_chains",
-    "find_chain",
-    "load_named_paths",
-    "parse_chain",
-]
+HANDFUL = 5  # so many names or paths a message lists
+STEPS = 100_000  # for short paths where there are cycles, about 1 µs each
+SEARCHES = 100  # backwards, for all paths then, about 1 ms each
+CLOSE = 0.6  # likeness (0 to 1) from which a name is worth mentioning
+WORSE = 0.15  # how much less alike than the best one a name may be
 
-MOST = 3
-CLOSE = 0.6
-"""Likeness (0 to 1) from which a name is worth mentioning."""
-
-WORSE = 0.15
-"""How much less alike than the best one a name may be."""
+Vertex: TypeAlias = int | str  # a callback's id, or a topic's name
+State: TypeAlias = tuple[Vertex, int]  # a vertex, and how many way points have been met with it
+GraphPath: TypeAlias = tuple[Vertex, ...]
 
 
 def close_names(name: str, names: Iterable[str]) -> list[str]:
     """Up to three of ``names`` that are like ``name``, the likeliest first."""
     scores = {other: _likeness(name, other) for other in names}
-    best = max(scores.values(), default=0.0)
-    close = [n for n, score in scores.items() if score >= max(CLOSE, best - WORSE)]
-    return sorted(close, key=lambda other: (-scores[other], other))[:MOST]
+    least = max(CLOSE, max(scores.values(), default=0.0) - WORSE)
+    close = [other for other, score in scores.items() if score >= least]
+    return sorted(close, key=lambda other: (-scores[other], other))[:3]
 
 
 def _likeness(first: str, second: str) -> float:
     a, b = (text.lower().strip("/") for text in (first, second))
-    whole = SequenceMatcher(None, a, b, autojunk=False).ratio()
     last_a, last_b = a.rpartition("/")[2], b.rpartition("/")[2]
-    last = 0.95 * SequenceMatcher(None, last_a, last_b, autojunk=False).ratio()
-    contains = 0.9 if min(len(a), len(b)) > 2 and (a in b or b in a) else 0.0
-    return max(whole, last, contains)
-
-
-HANDFUL = 5
+    return max(
+        SequenceMatcher(None, a, b, autojunk=False).ratio(),
+        0.95 * SequenceMatcher(None, last_a, last_b, autojunk=False).ratio(),
+        0.9 if min(len(a), len(b)) > 2 and (a in b or b in a) else 0.0,
+    )
 
 
 def parse_chain(text: str) -> tuple[str, ...]:
@@ -79,30 +77,12 @@ def parse_chain(text: str) -> tuple[str, ...]:
     return waypoints
 
 
-def find_chain(graph: ApplicationGraph, spec: str) -> Chain:
-    """The one chain of ``graph`` that ``spec`` means.
-
-    Raises:
-        InputError: a topic or node that does not exist, no path, only a cyclic one, or several.
-    """
-    search, stages = _search(graph, spec, parse_chain(spec))
-    listing = search.listed(HANDFUL + 1)
-    chains = list(dict.fromkeys(_chain(spec, path) for path in listing.paths))
-    if not chains:
-        raise InputError(_no_path(graph, spec, search, stages))
-    if len(chains) > 1 or not listing.complete:
-        raise InputError(_ambiguous(graph, spec, chains, listing.complete))
-    return chains[0]
-
-
 @dataclass(frozen=True)
 class ChainEnumeration:
     """The chains between two places of a graph.
 
     ``chains`` are all of them if ``complete``, else the first ones found. ``count`` says how many
-    there are; where the graph between the two places has cycles, it is only a lower bound (not
-    ``exact``): the chains that never step back in one order of callbacks and topics, or those
-    met while listing if they are more. ``heaviest`` has the largest sum of mean response times
+    there are (not ``exact``: at least). ``heaviest`` has the largest sum of mean response times
     (``heaviest_ns``) among the counted and the listed chains; None without response times.
     """
 
@@ -112,6 +92,22 @@ class ChainEnumeration:
     exact: bool
     heaviest: Chain | None
     heaviest_ns: float | None
+
+
+def find_chain(graph: ApplicationGraph, spec: str) -> Chain:
+    """The one chain of ``graph`` that ``spec`` means.
+
+    Raises:
+        InputError: a topic or node that does not exist, no path, only a cyclic one, or several.
+    """
+    search = _Search(graph, spec, parse_chain(spec))
+    paths, complete, _ = search.listed(HANDFUL + 1)
+    chains = list(dict.fromkeys(_chain(spec, path) for path in paths))
+    if not chains:
+        raise InputError(search.why_no_path())
+    if len(chains) > 1 or not complete:
+        raise InputError(_ambiguous(graph, spec, chains, complete))
+    return chains[0]
 
 
 def enumerate_chains(
@@ -125,20 +121,20 @@ def enumerate_chains(
 
     Without ``start`` chains begin at callbacks that no other callback of the application
     triggers, without ``end`` they end with topics from which no callback goes on. ``response_ns``
-    is the mean response time by callback id. Never hangs, see :mod:`~chainshaper.analysis.paths`.
+    is the mean response time by callback id. Never hangs: the search has a budget.
 
     Raises:
         InputError: ``start`` or ``end`` does not exist, or nothing leads from one to the other.
     """
-    waypoints = tuple(name for name in (start, end) if name is not None)
+    waypoints = [name for name in (start, end) if name is not None]
     spec = f"{start or ''}..{end or ''}"
-    search, stages = _search(graph, spec, waypoints, start is None, end is None)
+    search = _Search(graph, spec, waypoints, any_start=start is None, any_end=end is None)
     weights = response_ns or {}
     count, heaviest_path, heaviest_ns = search.counted(weights)
-    listing = search.listed(limit)
-    if not listing.paths and waypoints:
-        raise InputError(_no_path(graph, spec, search, stages))
-    chains = tuple(dict.fromkeys(_chain(None, path) for path in listing.paths))
+    paths, complete, met = search.listed(limit)
+    if not paths and waypoints:
+        raise InputError(search.why_no_path())
+    chains = tuple(dict.fromkeys(_chain(None, path) for path in paths))
     heaviest = _chain(None, heaviest_path) if heaviest_path and weights else None
     for chain in chains if weights else ():
         weight = sum(weights.get(callback, 0.0) for callback in chain.callbacks)
@@ -146,72 +142,33 @@ def enumerate_chains(
             heaviest, heaviest_ns = chain, weight
     return ChainEnumeration(
         chains=chains,
-        complete=listing.complete,
-        count=len(chains) if listing.complete else max(count, listing.count),
-        exact=listing.complete or not search.cyclic,
+        complete=complete,
+        count=len(chains) if complete else max(count, met),
+        exact=complete or not search.cyclic,
         heaviest=heaviest,
         heaviest_ns=heaviest_ns if heaviest else None,
     )
 
 
-def _search(
-    graph: ApplicationGraph,
-    spec: str,
-    waypoints: Sequence[str],
-    any_start: bool = False,
-    any_end: bool = False,
-) -> tuple[PathSearch, tuple[Stage, ...]]:
-    stages = tuple(_stage(graph, spec, name) for name in waypoints)
-    starts = _sources(graph) if any_start else _start_callbacks(graph, spec, stages[0])
-    if any_start:  # every source is as good as a first way point
-        stages = (Stage("any source", frozenset[Vertex](starts)), *stages)
-    going_on = {
-        callback.topic
-        for callback in graph.callbacks
-        if callback.kind == "subscription" and set(callback.publishes) - INTERNAL_TOPICS
-    }
-    last = len(stages)
-    ends_with_topic = not any_end and all(isinstance(v, str) for v in stages[-1].vertices)
-
-    def accepts(state: tuple[Vertex, int], callback: Callback | None) -> bool:
-        vertex, met = state
-        if met < last:
-            return False
-        if any_end:
-            return callback is None and vertex not in going_on
-        if ends_with_topic:
-            return vertex in stages[-1].vertices
-        # The last way point is a node: its callback was met, then comes the topic it publishes.
-        return callback is None or not callback.publishes
-
-    return PathSearch(graph, frozenset(starts), stages, accepts), stages
+def _chain(spec: str | None, path: GraphPath) -> Chain:
+    callbacks = tuple(vertex for vertex in path if isinstance(vertex, int))
+    topics = tuple(vertex for vertex in path if isinstance(vertex, str))
+    return Chain("..".join(topics) if spec is None else spec, callbacks[: len(topics)], topics)
 
 
-def _stage(graph: ApplicationGraph, spec: str, name: str) -> Stage:
-    """What a way point stands for: a topic, or all callbacks of a node."""
-    nodes: dict[str, set[int]] = {node.name: set() for node in graph.nodes}
-    topics = set(graph.topics)
-    for callback in graph.callbacks:
-        nodes.setdefault(callback.node, set()).add(callback.id)
-        topics.update(callback.publishes)
-    for candidate in (name, f"/{name}"):
-        if candidate in topics:
-            return Stage(candidate, frozenset[Vertex]((candidate,)))
-        if candidate in nodes:
-            return Stage(candidate, frozenset[Vertex](nodes[candidate]))
-    if not topics:
-        raise InputError(
-            f"chain {spec!r}: the recording shows no topics at all; tracing has to start before "
-            "the application does"
-        )
-    close = close_names(name, topics | nodes.keys())
-    hint = (
-        f"did you mean {' or '.join(close)}?"
-        if close
-        else f"the names there are: {_some(topics - INTERNAL_TOPICS or topics)}; "
-        "`chainshaper graph` shows all of them"
-    )
-    raise InputError(f"chain {spec!r}: no topic or node is called {name}; {hint}")
+def _ambiguous(graph: ApplicationGraph, spec: str, chains: Sequence[Chain], complete: bool) -> str:
+    more = "" if complete and len(chains) <= HANDFUL else "at least "
+    lines = [f"chain {spec!r}: {more}{len(chains)} paths match; add a way point:"]
+    callbacks = {callback.id: callback for callback in graph.callbacks}
+    shown = chains[:HANDFUL]
+    passed = [(*chain.topics, *(callbacks[c].node for c in chain.callbacks)) for chain in shown]
+    for chain, names in zip(shown, passed, strict=True):
+        others = {name for other in passed if other is not names for name in other}
+        own = next((name for name in names if name not in others), None)
+        remedy = f"  (only this one passes {own})" if own else ""
+        way = " → ".join((callbacks[chain.callbacks[0]].label, *chain.topics))
+        lines.append(f"  {way}{remedy}")
+    return "\n".join(lines)
 
 
 def _some(names: Iterable[str]) -> str:
@@ -220,121 +177,347 @@ def _some(names: Iterable[str]) -> str:
     return ", ".join(listed[:HANDFUL]) + (", ..." if len(listed) > HANDFUL else "")
 
 
-def _start_callbacks(graph: ApplicationGraph, spec: str, first: Stage) -> set[int]:
-    vertices = first.vertices
-    if not any(isinstance(vertex, str) for vertex in vertices):
-        return {vertex for vertex in vertices if isinstance(vertex, int)}
-    starts = {
-        callback.id
-        for callback in graph.callbacks
-        if vertices & (set(callback.publishes) - set(callback.passes_on))
-    }
-    if not starts:
-        writers = ", ".join(graph.publishers.get(first.name, ())) or "no node in the recording"
-        raise InputError(
-            f"chain {spec!r}: no callback was seen to publish {first.name} (its publisher: "
-            f"{writers}); begin the chain at a topic that a callback publishes"
+class _Spent(Exception):  # noqa: N818 - it ends a search, and is no error
+    """The budget of a search is used up."""
+
+
+class _Search:
+    """All paths of a graph from a start through the way points ``stages`` to an end.
+
+    A path alternates between callbacks and topics. One that starts before the first stage must go
+    there at once (a chain that begins with a topic starts at the callback that publishes it).
+    Only states between a start and an end are in ``successors``, the nearest to an end first.
+    """
+
+    def __init__(
+        self,
+        graph: ApplicationGraph,
+        spec: str,
+        waypoints: Sequence[str],
+        *,
+        any_start: bool = False,
+        any_end: bool = False,
+    ) -> None:
+        self.graph, self.spec, self.any_end = graph, spec, any_end
+        self.callbacks = {callback.id: callback for callback in graph.callbacks}
+        self.stages = [self._stage(name) for name in waypoints]
+        starts = self._sources() if any_start else self._starts(*self.stages[0])
+        if any_start:  # every source is as good as a first way point
+            self.stages.insert(0, ("any source", frozenset[Vertex](starts)))
+        listening = [c for c in graph.callbacks if c.kind == "subscription"]
+        self.going_on = {c.topic for c in listening if set(c.publishes) - INTERNAL_TOPICS}
+        self.subscribers: dict[Vertex, list[int]] = {}
+        for callback in listening:
+            if callback.topic is not None:
+                self.subscribers.setdefault(callback.topic, []).append(callback.id)
+        self.ignored = INTERNAL_TOPICS.difference(*(vertices for _, vertices in self.stages))
+        roots = [self._enter(start, 0) for start in sorted(starts)]
+        reached: dict[State, tuple[State, ...]] = {}
+        waiting = list(roots)
+        while waiting:
+            state = waiting.pop()
+            if state not in reached:
+                reached[state] = () if self._is_end(state) else tuple(self._step(state))
+                waiting.extend(reached[state])
+        self.furthest = max((met for _, met in reached), default=0)
+        self.reached = {vertex for vertex, met in reached if met == self.furthest}
+        self.ends = {state for state in reached if self._is_end(state)}
+        self.distance = _distances(reached, self.ends)
+        self.successors = {s: self._useful(reached[s]) for s in reached if s in self.distance}
+        self.roots = self._useful(roots)
+        self.edges: dict[Vertex, list[Vertex]] = {}
+        for (vertex, _), following in self.successors.items():
+            self.edges.setdefault(vertex, []).extend(after for after, _ in following)
+        self.order = _depth_first_order(self.edges, [vertex for vertex, _ in self.roots])
+        self.cyclic = any(
+            self.order[after] >= self.order[vertex]
+            for vertex, onward in self.edges.items()
+            for after in onward
         )
-    return starts
 
+    def _stage(self, name: str) -> tuple[str, frozenset[Vertex]]:
+        """What a way point stands for: a topic, or all callbacks of a node."""
+        nodes: dict[str, set[int]] = {node.name: set() for node in self.graph.nodes}
+        topics = set(self.graph.topics)
+        for callback in self.graph.callbacks:
+            nodes.setdefault(callback.node, set()).add(callback.id)
+            topics.update(callback.publishes)
+        for candidate in (name, f"/{name}"):
+            if candidate in topics:
+                return candidate, frozenset[Vertex]((candidate,))
+            if candidate in nodes:
+                return candidate, frozenset[Vertex](nodes[candidate])
+        if not topics:
+            raise InputError(
+                f"chain {self.spec!r}: the recording shows no topics at all; tracing has to start "
+                "before the application does"
+            )
+        close = close_names(name, topics | nodes.keys())
+        hint = (
+            f"did you mean {' or '.join(close)}?"
+            if close
+            else f"the names there are: {_some(topics - INTERNAL_TOPICS or topics)}; "
+            "`chainshaper graph` shows all of them"
+        )
+        raise InputError(f"chain {self.spec!r}: no topic or node is called {name}; {hint}")
 
-def _sources(graph: ApplicationGraph) -> set[int]:
-    """Publishing callbacks that no callback's publication triggers."""
-    published = {topic for callback in graph.callbacks for topic in callback.publishes}
-    return {
-        callback.id
-        for callback in graph.callbacks
-        if set(callback.publishes) - INTERNAL_TOPICS
-        and not (callback.kind == "subscription" and callback.topic in published)
-    }
+    def _starts(self, name: str, vertices: frozenset[Vertex]) -> set[int]:
+        if not any(isinstance(vertex, str) for vertex in vertices):
+            return {vertex for vertex in vertices if isinstance(vertex, int)}
+        starts = {
+            one.id
+            for one in self.graph.callbacks
+            if vertices & (set(one.publishes) - set(one.passes_on))
+        }
+        if not starts:
+            writers = ", ".join(self.graph.publishers.get(name, ())) or "no node in the recording"
+            raise InputError(
+                f"chain {self.spec!r}: no callback was seen to publish {name} (its publisher: "
+                f"{writers}); begin the chain at a topic that a callback publishes"
+            )
+        return starts
 
+    def _sources(self) -> set[int]:
+        """Publishing callbacks that no callback's publication triggers."""
+        published = {topic for callback in self.graph.callbacks for topic in callback.publishes}
+        return {
+            callback.id
+            for callback in self.graph.callbacks
+            if set(callback.publishes) - INTERNAL_TOPICS
+            and not (callback.kind == "subscription" and callback.topic in published)
+        }
 
-def _chain(spec: str | None, path: GraphPath) -> Chain:
-    callbacks = tuple(vertex for vertex in path if isinstance(vertex, int))
-    topics = tuple(vertex for vertex in path if isinstance(vertex, str))
-    written = spec if spec is not None else "..".join(topics)
-    return Chain(written, callbacks[: len(topics)], topics)
+    def _is_end(self, state: State) -> bool:
+        vertex, met = state
+        if met < len(self.stages):
+            return False
+        callback = self.callbacks[vertex] if isinstance(vertex, int) else None
+        if self.any_end:
+            return callback is None and vertex not in self.going_on
+        _, last = self.stages[-1]
+        if all(isinstance(one, str) for one in last):
+            return vertex in last
+        # The last way point is a node: its callback was met, then comes the topic it publishes.
+        return callback is None or not callback.publishes
 
+    def _enter(self, vertex: Vertex, met: int) -> State:
+        here = met < len(self.stages) and vertex in self.stages[met][1]
+        return (vertex, met + 1 if here else met)
 
-def _no_path(
-    graph: ApplicationGraph, spec: str, search: PathSearch, stages: tuple[Stage, ...]
-) -> str:
-    if search.roots:
+    def _step(self, state: State) -> Iterator[State]:
+        vertex, met = state
+        following: Sequence[Vertex] = self.subscribers.get(vertex, ())
+        if isinstance(vertex, int):
+            following = self.callbacks[vertex].publishes
+        for after in following:
+            entered = self._enter(after, met)
+            if after not in self.ignored and (met > 0 or entered[1] > 0):
+                yield entered
+
+    def _useful(self, states: Iterable[State]) -> tuple[State, ...]:
+        distance = self.distance
+        return tuple(sorted((s for s in states if s in distance), key=distance.__getitem__))
+
+    def why_no_path(self) -> str:
+        """Why there is no path, for a message."""
+        if self.roots:
+            return (
+                f"chain {self.spec!r}: it can only be closed by passing the same callback or topic "
+                "twice; a cyclic chain has no end-to-end latency, give its way points in the order "
+                "of the data"
+            )
+        met = self.furthest
+        from_name = self.stages[max(met - 1, 0)][0]
+        topics = sorted(vertex for vertex in self.reached if isinstance(vertex, str))
+        heard = {c.topic for c in self.graph.callbacks if c.kind == "subscription" and c.publishes}
+        stops = [topic for topic in topics if topic not in heard] or topics
+        if not met or not stops:
+            return f"chain {self.spec!r}: no callback of {from_name} publishes anything"
+        goal = self.stages[min(met, len(self.stages) - 1)][0]
         return (
-            f"chain {spec!r}: it can only be closed by passing the same callback or topic twice; "
-            "a cyclic chain has no end-to-end latency, give its way points in the order of the "
-            "data"
+            f"chain {self.spec!r}: no path leads from {from_name} to {goal}; from there the data "
+            f"gets as far as {_some(stops)}"
         )
-    met = search.furthest
-    if not met:
-        return f"chain {spec!r}: no callback of {stages[0].name} publishes anything"
-    reached = sorted(vertex for vertex in search.reached if isinstance(vertex, str))
-    going_on = {c.topic for c in graph.callbacks if c.kind == "subscription" and c.publishes}
-    stops = [topic for topic in reached if topic not in going_on] or reached
-    if not stops:
-        return f"chain {spec!r}: no callback of {stages[met - 1].name} publishes anything"
-    goal = stages[min(met, len(stages) - 1)].name
-    return (
-        f"chain {spec!r}: no path leads from {stages[met - 1].name} to {goal}; from there the data "
-        f"gets as far as {_some(stops)}"
-    )
+
+    def listed(self, limit: int) -> tuple[tuple[GraphPath, ...], bool, int]:
+        """Up to ``limit`` paths, whether they are all, and how many were met on the way.
+
+        Where there are cycles, the shortest ones come first.
+        """
+        if not self.cyclic:
+            paths = tuple(islice(self._walked(lambda states, _: states), limit + 1))
+            return paths[:limit], len(paths) <= limit, min(len(paths), limit)
+        shortest, count, complete = self._by_length(limit)
+        if complete or len(shortest) == limit:
+            return tuple(shortest), complete and count == len(shortest), count
+        others, complete = self._without_dead_ends(limit)
+        paths = tuple(dict.fromkeys((*shortest, *others)))
+        return paths[:limit], complete, max(count, len(paths))
+
+    def _walked(
+        self, onward: Callable[[Sequence[State], Mapping[Vertex, None]], Iterable[State]]
+    ) -> Iterator[GraphPath]:
+        """Paths, depth first. ``onward`` chooses from the next states, given the path so far."""
+        for root in self.roots:
+            path: dict[Vertex, None] = {}
+            stack = [iter(onward((root,), path))]
+            while stack:
+                state = next(stack[-1], None)
+                if state is None:
+                    stack.pop()
+                    if path:
+                        path.popitem()
+                elif state in self.ends:
+                    yield (*path, state[0])
+                else:
+                    path[state[0]] = None
+                    stack.append(iter(onward(self.successors[state], path)))
+
+    def _by_length(self, limit: int) -> tuple[list[GraphPath], int, bool]:
+        """The shortest paths: up to ``limit`` of them, how many were met, whether that is all.
+
+        Iterative deepening: no step is taken from which the nearest end is too far for the bound.
+        """
+        found: list[GraphPath] = []
+        count, steps, beyond = 0, counting(1), True
+        before, bound = 0, min((self.distance[root] for root in self.roots), default=0)
+
+        def near_enough(states: Sequence[State], path: Mapping[Vertex, None]) -> Iterator[State]:
+            nonlocal beyond
+            for state in states:
+                if next(steps) == STEPS:
+                    raise _Spent
+                if state[0] in path:
+                    continue
+                if len(path) + self.distance[state] <= bound:
+                    yield state
+                else:
+                    beyond = True
+
+        try:
+            while beyond:
+                beyond = False
+                for path in self._walked(near_enough):
+                    if len(path) - 1 > before:
+                        count += 1
+                        found += [path] * (len(found) < limit)
+                before, bound = bound, bound + 2  # a hop is a callback and a topic
+        except _Spent:
+            return found, count, False
+        return found, count, True
+
+    def _without_dead_ends(self, limit: int) -> tuple[list[GraphPath], bool]:
+        """Up to ``limit`` paths, and whether that is all.
+
+        Every step goes where an end can still be reached without meeting the path again.
+        """
+        found: list[GraphPath] = []
+        searches = counting()
+
+        def leading_on(states: Sequence[State], path: Mapping[Vertex, None]) -> Sequence[State]:
+            if not path:
+                return states
+            if next(searches) == SEARCHES:
+                raise _Spent
+            free = {s: f for s, f in self.successors.items() if s[0] not in path}
+            useful = _distances(free, {end for end in self.ends if end in free})
+            return sorted((s for s in states if s in useful), key=useful.__getitem__)
+
+        try:
+            for path in self._walked(leading_on):
+                if len(found) == limit:
+                    return found, False
+                found.append(path)
+        except _Spent:
+            return found, False
+        return found, True
+
+    def counted(self, weights: Mapping[int, float]) -> tuple[int, GraphPath, float]:
+        """Number of paths, the heaviest of them, and its weight (the sum over its callbacks).
+
+        If ``cyclic``, of those that never step back in the order of a depth-first search.
+        """
+        order = self.order
+        best: dict[State, tuple[int, float, State | None]] = {}
+        for state in sorted(self.successors, key=lambda s: (order[s[0]], -s[1])):
+            vertex = state[0]
+            own = weights.get(vertex, 0.0) if isinstance(vertex, int) else 0.0
+            count, weight, chosen = (1, 0.0, None) if state in self.ends else (0, -1.0, None)
+            for after in self.successors[state]:
+                if after in best and order[after[0]] < order[vertex]:
+                    paths, below, _ = best[after]
+                    count += paths
+                    if paths and below > weight:
+                        weight, chosen = below, after
+            best[state] = (count, own + weight, chosen)
+        roots = [root for root in self.roots if best[root][0]]
+        if not roots:
+            return 0, (), 0.0
+        first = max(roots, key=lambda root: best[root][1])
+        heaviest: list[Vertex] = []
+        at: State | None = first
+        while at is not None:
+            heaviest.append(at[0])
+            at = best[at][2]
+        return sum(best[root][0] for root in roots), tuple(heaviest), best[first][1]
 
 
-def _ambiguous(graph: ApplicationGraph, spec: str, chains: Sequence[Chain], complete: bool) -> str:
-    shown = chains[:HANDFUL]
-    more = "" if complete and len(chains) <= HANDFUL else "at least "
-    lines = [f"chain {spec!r}: {more}{len(chains)} paths match; add a way point:"]
-    callbacks = {callback.id: callback for callback in graph.callbacks}
-    for chain in shown:
-        others = [other for other in shown if other is not chain]
-        telling = next(
-            (t for t in chain.topics if all(t not in other.topics for other in others)), None
-        ) or next(
-            (
-                callbacks[c].node
-                for c in chain.callbacks
-                if all(
-                    callbacks[c].node not in {callbacks[o].node for o in other.callbacks}
-                    for other in others
-                )
-            ),
-            None,
-        )
-        remedy = f"  (only this one passes {telling})" if telling else ""
-        names = [callbacks[chain.callbacks[0]].label, *chain.topics]
-        lines.append(f"  {' → '.join(names)}{remedy}")
-    return "\n".join(lines)
+def _distances(successors: Mapping[State, tuple[State, ...]], ends: set[State]) -> dict[State, int]:
+    """Steps from every state to the nearest end, for those from which one can be reached."""
+    before: dict[State, list[State]] = {}
+    for state, following in successors.items():
+        for after in following:
+            before.setdefault(after, []).append(state)
+    distance = dict.fromkeys(ends, 0)
+    waiting = deque(ends)
+    while waiting:
+        state = waiting.popleft()
+        for previous in before.get(state, ()):
+            if previous not in distance:
+                distance[previous] = distance[state] + 1
+                waiting.append(previous)
+    return distance
 
 
-UNDEFINED = {None, "UNDEFINED"}
+def _depth_first_order(
+    edges: Mapping[Vertex, Sequence[Vertex]], roots: Sequence[Vertex]
+) -> dict[Vertex, int]:
+    """Vertices ranked as a depth-first search leaves them; all edges lead forwards if they can."""
+    rank: dict[Vertex, int] = {}
+    entered: set[Vertex] = set()
+    stack: list[tuple[Vertex | None, Iterator[Vertex]]] = [(None, iter(roots))]
+    while stack:
+        vertex, rest = stack[-1]
+        after = next((v for v in rest if v not in entered), None)
+        if after is not None:
+            entered.add(after)
+            stack.append((after, iter(edges.get(after, ()))))
+        else:
+            stack.pop()
+            if vertex is not None:
+                rank[vertex] = len(rank)
+    return rank
 
 
 class _PathNode(BaseModel):
-    model_config = ConfigDict(frozen=True)
-
     node_name: str
     publish_topic_name: str | None = None
 
 
 class _NamedPath(BaseModel):
-    model_config = ConfigDict(frozen=True)
-
     path_name: str
     node_chain: tuple[_PathNode, ...] = Field(min_length=1)
 
 
 class _Architecture(BaseModel):
-    model_config = ConfigDict(frozen=True)
-
     named_paths: tuple[_NamedPath, ...]
 
 
 def load_named_paths(file: str | Path) -> dict[str, str]:
     """The named paths of a CARET architecture file: path name → chain as we write it.
 
-    Each node of a path becomes a way point together with the topic it publishes. A last node
-    that publishes nothing ends the chain with the topic it subscribes to, which is what the node
-    before it publishes.
+    Each node of a path becomes a way point together with the topic it publishes. A last node that
+    publishes nothing ends the chain with the topic it subscribes to.
 
     Raises:
         InputError: not readable, not YAML, no ``named_paths``, a path without nodes.
@@ -349,14 +532,13 @@ def load_named_paths(file: str | Path) -> dict[str, str]:
             f"{plain.problems(error, _Architecture)}; chains are read from the `named_paths` of a"
             " CARET architecture file, each with its `path_name` and `node_chain`"
         ) from error
-    return {path.path_name: _way_points(path) for path in architecture.named_paths}
-
-
-def _way_points(path: _NamedPath) -> str:
-    waypoints: list[str] = []
-    for place, node in enumerate(path.node_chain):
-        if node.publish_topic_name not in UNDEFINED:
-            waypoints += [node.node_name, str(node.publish_topic_name)]
-        elif place < len(path.node_chain) - 1:
-            waypoints.append(node.node_name)
-    return "..".join(waypoints)
+    chains = {}
+    for named in architecture.named_paths:
+        points: list[str | None] = []
+        for node in named.node_chain:
+            topic = node.publish_topic_name
+            points += [node.node_name, None if topic == "UNDEFINED" else topic]
+        if points[-1] is None:
+            points.pop(-2)
+        chains[named.path_name] = "..".join(point for point in points if point is not None)
+    return chains

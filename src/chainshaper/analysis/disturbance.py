@@ -1,111 +1,154 @@
-"""Which traversals the machine itself disturbed.
+"""When each output was due, which came late, and which traversals the machine itself disturbed.
 
-Virtual machines and firmware stop all threads of a core now and then, for up to several ms. A
-sleeper at the highest priority, run beside the application, sees it: a row of `machine_stall`
-says that on core ``cpu`` no thread ran from ``time`` for ``duration``. A latency measured across a
-stall says something about the machine, not about the application.
+Where a gate decided, its row (`gate_release`) says from which instant the slots count, and what
+became of an output that overran. Where no gate decided, an output is due in the cycle that the
+plan says, and without a plan within a period of the chain's start. With the anchor `cycle` a gate
+takes an output for one of the cycle that it arrives in; the traversal knows better: a chain that
+began in an earlier cycle is late by whole cycles.
 
-A cycle is disturbed by stalls **before the moment at which its output was due** (`due_at` of
-:mod:`~chainshaper.analysis.punctuality`), and by no other: what happens to an output that is late
-already, and waits for a later slot, is no excuse for it. Whether it was late plays no part:
+A sleeper at the highest priority sees the machine stop: a row of `machine_stall` says that on core
+``cpu`` no thread ran from ``time`` for ``duration``. A cycle is disturbed by stalls **before the
+moment at which its output was due**, and by no other:
 
 * **At two instants** any stall disturbs what a gate lets go: where the origin is taken (between the
   traversal's start and the anchor's origin), and around the moment at which the output was due.
 * **In between** stalls add up, on one core, within [start, due]. Without a gate they disturb from
-  ``COMPUTING_THRESHOLD_NS`` in all. A gate absorbs what the plan's margin ε has room for, whatever
-  the cycle's own latency: only more than that disturbs.
+  ``COMPUTING_THRESHOLD_NS`` in all; a gate absorbs what the plan's margin ε has room for.
 * A traversal that began before its disturbed predecessor was computed may have queued behind it,
   and counts as disturbed with it, unless the plan has them overlap (logical execution time).
-
-A core can also run without a stall, and yet at half its **pace**: a neighbour of a virtual machine
-uses the same hardware, caches are cold, the clock is throttled. Each wake-up of the stall meter is
-the same work; `machine_pace` says what CPU time it took. A pace is relative to an ordinary one: 2
-means that everything takes twice as long.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
 
 from chainshaper.analysis.flow import DataFlow
+from chainshaper.analysis.messages import gated_hops
+from chainshaper.analysis.traversals import Traversals
 from chainshaper.gate.decision import STALL_NS
 from chainshaper.values import events
-from chainshaper.values.events import EventTables
 
-__all__ = [
-    "COMPUTING_THRESHOLD_NS",
-    "disturbed",
-    "ordinary_pace",
-    "overlapping",
-    "relative_pace",
-    "stalled_after",
-    "stalled_within",
-]
+WAKE_UP_NS = 250_000
 
-
-def ordinary_pace(tables: EventTables) -> dict[int, float]:
-    """The median CPU time of a wake-up on each core that was watched (ns)."""
-    frame = events.table(tables, "machine_pace", ["cpu"])
-    medians = frame.group_by("cpu").median().select("cpu", "cpu_time").iter_rows()
-    return {core: median for core, median in medians if median}
-
-
-def relative_pace(
-    tables: EventTables,
-    start: npt.NDArray[np.int64],
-    end: npt.NDArray[np.int64],
-    ordinary: Mapping[int, float],
-) -> npt.NDArray[np.float64]:
-    """Per core of ``ordinary`` a row: the mean pace in each window [start, end) of ``start``.
-
-    Not a number where the core was not watched. A window begins with the stretch of wake-ups that
-    was under way.
-    """
-    frame = events.table(tables, "machine_pace", ["cpu"]).sort("time")
-    rows = []
-    for core, usual in ordinary.items():
-        time, cpu_time = (
-            frame.filter(cpu=core)[column].to_numpy() for column in ("time", "cpu_time")
-        )
-        first = np.maximum(np.searchsorted(time, start, side="right") - 1, 0)
-        behind = np.searchsorted(time, end, side="left")
-        total = np.concatenate(([0], np.cumsum(cpu_time)))
-        count = behind - first
-        used = np.where(count > 0, total[behind] - total[np.minimum(first, behind)], np.nan)
-        rows.append(used / np.maximum(count, 1) / usual)
-    return np.array(rows).reshape(len(ordinary), len(start))
-
-
-WAKING_NS = 200_000
-"""A gate wakes up and publishes within this time of a release: a stall this shortly before or
-behind the release moves the output."""
-
-COMPUTING_THRESHOLD_NS = 1_000_000
-"""A chain that computes for tens of milliseconds is hardly changed by less than this."""
+WAKING_NS = 200_000  # a gate wakes up and publishes within this time of a release
+COMPUTING_THRESHOLD_NS = 1_000_000  # less hardly changes a chain that computes for tens of ms
 
 Times = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class _Stalls:
-    """Stalls as intervals [began, ended) on cores."""
+class Due:
+    """When a plan has the outputs of a chain, those on a topic, leave (ns).
 
-    began: Times
-    ended: Times
-    core: Times
+    ``output`` None: the plan is for any chain. An output leaves in one of ``slots``, ``cycles``
+    cycles after the one in which its chain began; with ``slots`` empty at any time of that cycle.
+    ``last_slot`` is the place of the last slot that is open to a mode, where the plan has modes.
+    ``from_cycle``: slots count from the start of the cycle, else from the chain's own start.
+    ``margin_ns`` is ε, what a gate absorbs in every cycle.
+    """
 
-    @classmethod
-    def of(cls, flow: DataFlow, threshold_ns: int) -> "_Stalls":
-        table = events.table(flow.events, "machine_stall", ["cpu"]).filter(
-            pl.col("duration") >= threshold_ns
-        )
-        began = table["time"].to_numpy()
-        core = table["cpu"].fill_null(-1).cast(pl.Int64).to_numpy()
-        return cls(began, began + table["duration"].to_numpy(), core)
+    cycle_ns: int
+    cycles: int = 0
+    slots: tuple[tuple[int, int], ...] = ()
+    last_slot: Mapping[str, int] = field(default_factory=dict)
+    from_cycle: bool = False
+    margin_ns: int = 0
+    output: str | None = None
+
+
+def with_punctuality(
+    flow: DataFlow, traversals: Traversals, due: Due | None
+) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """The frame of traversals with more columns, and all decisions of gates about them.
+
+    * ``place_ns``: where the output left, from the instant that the slots count from.
+    * ``due_at``: when it should have left; of several slots the one it was let go in. Where no gate
+      decided it is when it left, or the end of the cycle that it was due in, if that came first.
+    * ``late``: whether it left behind the last slot it was due in, or the cycle (null: nothing says
+      when it was due).
+    * ``origin``: from when the gate counted (null: no gate decided); ``computed_at``: when the
+      chain was done, at the gate's door or with the publication.
+
+    The decisions are those of :func:`~chainshaper.analysis.messages.gated_hops`.
+    """
+    hops, chain = traversals.hops, traversals.chain
+    releases = gated_hops(flow.events, flow.objects, hops, 0 if due is None else due.cycles)
+    decided = releases.filter(pl.col("hop") == len(chain.callbacks) - 1).drop("hop")
+    frame = traversals.frame.join(decided, on="traversal", how="left", maintain_order="left")
+    start, end, counted_from = pl.col("start"), pl.col("end"), pl.col("origin")
+    # The period of the timer that starts the chain stands for the cycle of a plan.
+    first = flow.objects.callbacks.filter(pl.col("callback_id") == chain.callbacks[0])
+    period: int | None = first["period_ns"].max()  # type: ignore[assignment]
+    cycle_ns = period if due is None else due.cycle_ns
+    limit = pl.lit(cycle_ns if due is None else (due.cycles + 1) * due.cycle_ns, dtype=pl.Int64)
+    began = start
+    if due is not None and due.from_cycle:
+        began = start - pl.lit(lateness_in_cycle(frame["start"], due.cycle_ns))
+    gated = counted_from.is_not_null()
+    origin = counted_from - _cycles_behind(cycle_ns)
+    opens, closes = _last_slot(frame, due)
+    place = end - pl.when(gated).then(origin).otherwise(began)
+    overran = pl.col("overrun").is_not_null() | (origin < counted_from)
+    late = pl.when(gated).then(overran | (place >= closes).fill_null(False))
+    due_at = pl.when(gated).then(pl.min_horizontal("release", origin + opens))
+    bound = pl.lit(None, dtype=pl.Int64) if due is None else began + limit
+    return frame.select(
+        *traversals.frame.columns,
+        place_ns=place,
+        due_at=due_at.otherwise(pl.min_horizontal("end", bound)),
+        late=late.otherwise(place >= limit) & end.is_not_null(),
+        origin="origin",
+        computed_at=pl.coalesce("arrival", "end"),
+    ), releases
+
+
+def lateness_in_cycle(starts: pl.Series, cycle_ns: int) -> pl.Series:
+    """How long after the start of the cycle each chain began (ns).
+
+    When cycles started is not recorded. The beginning behind the widest part of the cycle that has
+    none stands for it, which came a wake-up after the start.
+    """
+    places = (starts % cycle_ns).sort()
+    if not len(places):
+        return starts
+    gaps = places.diff().fill_null(places[0] + cycle_ns - places[-1])
+    earliest: int = places[gaps.arg_max() or 0]
+    behind: pl.Series = starts - (earliest - WAKE_UP_NS)
+    return pl.select(behind % cycle_ns).to_series()
+
+
+def _cycles_behind(cycle_ns: int | None) -> pl.Expr:
+    """How long before the gate's cycle the one began in which the chain did: whole cycles (ns).
+
+    A chain may begin a little before its cycle does, by a tenth of it at most.
+    """
+    if cycle_ns is None:
+        return pl.lit(0, dtype=pl.Int64)
+    before = pl.col("origin") - pl.col("start") - cycle_ns // 10
+    whole = ((before + cycle_ns - 1) // cycle_ns).clip(lower_bound=0) * cycle_ns
+    return pl.when(pl.col("anchor") == "cycle").then(whole).otherwise(0)
+
+
+def _last_slot(frame: pl.DataFrame, due: Due | None) -> tuple[pl.Expr, pl.Expr]:
+    """Start and end of the last slot that is open to each output, from the slots' origin on.
+
+    Without a plan the latest place at which one in time was let go stands for the start.
+    """
+    if due is None or not due.slots:
+        in_time = frame.filter(pl.col("overrun").is_null() & (pl.col("cycles_waited") == 0))
+        latest = (in_time["release"] - in_time["origin"]).max()
+        return pl.lit(latest, dtype=pl.Int64), pl.lit(None, dtype=pl.Int64)
+    last = pl.lit(len(due.slots) - 1)
+    for mode, slot in due.last_slot.items():
+        last = pl.when(pl.col("mode") == mode).then(slot).otherwise(last)
+    delay = due.cycles * due.cycle_ns
+    sides = (pl.Series([s + delay for s in side]) for side in zip(*due.slots, strict=True))
+    opens, closes = (pl.lit(side).gather(last) for side in sides)
+    return opens, closes
 
 
 def disturbed(
@@ -119,39 +162,41 @@ def disturbed(
 ) -> Mask:
     """A mask over the rows of ``frame``; incomplete traversals are never marked.
 
-    ``frame`` is that of :func:`~chainshaper.analysis.punctuality.with_punctuality`, ``margin_ns``
-    the margin of the plan in force.
+    ``frame`` is that of :func:`with_punctuality`, ``margin_ns`` the margin of the plan in force.
     """
-    stalls = _Stalls.of(flow, threshold_ns)
-    if not len(stalls.began):
-        return np.zeros(frame.height, dtype=np.bool_)
+    began, ended, core = _stalls(flow, threshold_ns)
     complete, gated = frame["complete"].to_numpy(), frame["origin"].is_not_null().to_numpy()
     start, due, origin, computed = (
         frame[name].fill_null(frame["start"]).to_numpy()
         for name in ("start", "due_at", "origin", "computed_at")
     )
-    first, last = np.minimum(start, origin), np.maximum(start, origin)
-    at_instants = overlapping(first, last, stalls.began, stalls.ended)
-    at_instants |= overlapping(due - waking_ns, due + waking_ns, stalls.began, stalls.ended)
-    lost = stalled_within(start, due, stalls.began, stalls.ended, stalls.core)
+    at_instants = overlapping(np.minimum(start, origin), np.maximum(start, origin), began, ended)
+    at_instants |= overlapping(due - waking_ns, due + waking_ns, began, ended)
+    lost = stalled_within(start, due, began, ended, core)
     most = np.where(gated, max(computing_threshold_ns, margin_ns + 1), computing_threshold_ns)
     hit = complete & ((gated & at_instants) | (lost >= most))
     # A predecessor that was to be out later than the next began is not waited for.
-    following = np.append(start[1:], np.iinfo(np.int64).max) if len(start) else start
+    following = np.append(start[1:], np.iinfo(np.int64).max)[: len(start)]
     busy_until = np.where(gated & (due > following), start, computed)
     return complete & (hit | _queued_behind(hit, start, busy_until, complete))
 
 
 def stalled_after(flow: DataFlow, start: Times, end: Times, threshold_ns: int = STALL_NS) -> Mask:
     """Which windows [start, end] any stall meets: a delivery that the machine disturbed."""
-    stalls = _Stalls.of(flow, threshold_ns)
-    return overlapping(start, end, stalls.began, stalls.ended)
+    began, ended, _ = _stalls(flow, threshold_ns)
+    return overlapping(start, end, began, ended)
+
+
+def _stalls(flow: DataFlow, threshold_ns: int) -> tuple[Times, Times, Times]:
+    """Stalls from a length on: when they began and ended, and their cores (−1: not known)."""
+    table = events.table(flow.events, "machine_stall", ["cpu"])
+    table = table.filter(pl.col("duration") >= threshold_ns)
+    core = table["cpu"].fill_null(-1).cast(pl.Int64).to_numpy()
+    return table["time"].to_numpy(), (table["time"] + table["duration"]).to_numpy(), core
 
 
 def _queued_behind(hit: Mask, start: Times, busy_until: Times, may_queue: Mask) -> Mask:
     """Traversals, in order of start, linked to a disturbed one by predecessors still computed."""
-    if not len(start):
-        return hit
     linked = np.zeros(len(start), dtype=np.bool_)
     linked[1:] = may_queue[1:] & (start[1:] < np.maximum.accumulate(busy_until)[:-1])
     position = np.arange(len(start))
@@ -163,33 +208,28 @@ def _queued_behind(hit: Mask, start: Times, busy_until: Times, may_queue: Mask) 
 def stalled_within(start: Times, end: Times, began: Times, ended: Times, core: Times) -> Times:
     """Per window [start, end] the time lost in it to stalls of one core, the worst one (ns).
 
-    Stalls of one core do not overlap, so what they took up to an instant is a running sum plus
-    the part of the stall that the instant lies in; a window's share is a difference of two.
+    Stalls of one core do not overlap: what they took up to an instant is linear between their
+    beginnings and ends, and a window's share is a difference of two.
     """
     worst = np.zeros(len(start), dtype=np.int64)
     for one in np.unique(core):
-        mine = core == one
-        order = np.argsort(began[mine], kind="stable")
-        first, length = began[mine][order], (ended - began)[mine][order]
-        total = np.concatenate(([0], np.cumsum(length)))
-
-        def lost_until(
-            instant: Times, first: Times = first, length: Times = length, total: Times = total
-        ) -> Times:
+        order = np.argsort(began[core == one], kind="stable")
+        first, last = began[core == one][order], ended[core == one][order]
+        total = np.concatenate(([0], np.cumsum(last - first)))
+        lost = []
+        for instant in (start, end):
             index = np.searchsorted(first, instant, side="right")
             before = np.maximum(index - 1, 0)
-            part = np.minimum(instant - first[before], length[before])
-            return np.asarray(total[before] + np.where(index > 0, part, 0), dtype=np.int64)
-
-        worst = np.maximum(worst, lost_until(end) - lost_until(start))
+            part = np.minimum(instant, last[before]) - first[before]
+            lost.append(total[before] + np.where(index > 0, part, 0))
+        worst = np.maximum(worst, lost[1] - lost[0])
     return worst
 
 
-def overlapping(start: Times, end: Times, began: Times, ended: Times) -> npt.NDArray[np.bool_]:
+def overlapping(start: Times, end: Times, began: Times, ended: Times) -> Mask:
     """Whether each closed window [start, end] meets any of the intervals [began, ended).
 
-    Of all intervals those that begin in time for the window, minus those that are over before
-    it: both are counted in sorted arrays, so the cost is (windows + intervals) · log.
+    Of all intervals those that begin in time for the window, minus those that are over before it.
     """
     begun_by_end = np.searchsorted(np.sort(began), end, side="right")
     over_by_start = np.searchsorted(np.sort(ended), start, side="right")

@@ -1,27 +1,32 @@
-"""From events to the data flow: which instance took which message and published which.
+"""From events to the data flow: callback instances, the messages they took, those they published.
 
 This is the step that everything about chains builds on: it joins objects, callback instances,
 publications and takes into four frames that refer to each other by number. It costs a fixed
 number of sorts and joins, however many events there are.
+
+An instance runs from `callback_start` to `callback_end` of the same callback on the same thread
+(paper, section 2.4). Some work has no callback event, but its messages prove it. Such instances
+are assumed (``assumed``, no ``end``, no response time):
+
+* A Python node (rclpy), or one that takes from a wait set, has no callback events. An instance of
+  its subscription begins with each take. What its thread publishes for the same node until its
+  next take counts as that instance's output.
+* A driver's own thread, a player of recorded data, a Python timer or the callback of a service's
+  client publishes outside all callbacks that events show. A topic that its node publishes only
+  like this gets a callback of kind ``unknown``, with the handle 0 and one instance per
+  publication, so that chains can begin there.
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import polars as pl
 
-from chainshaper.analysis.departures import with_departures
-from chainshaper.analysis.instances import (
-    callback_instances,
-    with_assumed_readers,
-    with_assumed_writers,
-)
-from chainshaper.analysis.matching import by_number, latest_before
-from chainshaper.analysis.messages import link_takes, publications, takes
-from chainshaper.analysis.objects import Objects, resolve_objects
+from chainshaper.analysis.matching import by_number, ends_of_starts, latest_before
+from chainshaper.analysis.messages import link_takes, publications, takes, with_departures
+from chainshaper.analysis.objects import CALLBACK_SCHEMA, Objects, resolve_objects
 from chainshaper.values import events
-
-__all__ = ["DataFlow", "data_flow"]
+from chainshaper.values.application import INTERNAL_TOPICS
 
 
 @dataclass(frozen=True)
@@ -29,12 +34,11 @@ class DataFlow:
     """A recording, resolved.
 
     * ``objects``: who exists, see :class:`~chainshaper.analysis.objects.Objects`.
-    * ``instances``: see :func:`~chainshaper.analysis.instances.callback_instances`, with those
-      that no event shows added (:mod:`~chainshaper.analysis.instances`). An instance's number is
-      its row.
+    * ``instances``: see :func:`callback_instances`, with those that no event shows added. An
+      instance's number is its row.
     * ``publications``: see :func:`~chainshaper.analysis.messages.publications`, with the
       ``instance`` in which each was published and its ``callback_id`` (null: outside callbacks),
-      and when it was ``sent`` (:mod:`~chainshaper.analysis.departures`).
+      and when it was ``sent`` (null: it never was).
     * ``takes``: see :func:`~chainshaper.analysis.messages.takes`, with the ``publication`` that
       was read and the ``instance`` that got the message (null: none did).
     * ``events``: the tables all this came from.
@@ -52,8 +56,7 @@ class DataFlow:
 def data_flow(tables: events.EventTables, clock_offset_ns: int = 0) -> DataFlow:
     """Resolve a recording's events.
 
-    ``clock_offset_ns`` is what to add to event times for CLOCK_REALTIME; recordings carry it. It
-    matters only for traces from before Jazzy (:mod:`~chainshaper.analysis.messages`).
+    ``clock_offset_ns``, to add to event times for CLOCK_REALTIME, matters only before Jazzy.
     """
     objects = resolve_objects(tables)
     with ThreadPoolExecutor(max_workers=1) as beside:  # instances and messages meet only below
@@ -62,38 +65,135 @@ def data_flow(tables: events.EventTables, clock_offset_ns: int = 0) -> DataFlow:
         published = publications(tables, objects)
         taken = link_takes(tables, taken, published, clock_offset_ns)
         instances = running.result()
-    instances, taken = with_assumed_readers(instances, taken, objects)
+    instances, taken = _with_assumed_readers(instances, taken, objects)
     taken = _consumed(taken, instances)
     published = _published_in(published, instances, objects)
-    objects, instances, published = with_assumed_writers(objects, instances, published)
+    objects, instances, published = _with_assumed_writers(objects, instances, published)
     published = with_departures(published, tables, objects)
-    notes = (
-        *objects.notes,
-        *_about_execution_times(tables, instances),
-        *_about_messages_within_processes(tables, instances),
+    notes = list(objects.notes)
+    if "sched_switch" in tables and instances.height and not instances["execution_ns"].count():
+        notes.append(
+            "sched_switch was recorded, but shows none of the application's threads (inside a "
+            "container threads have other numbers): execution times cannot be known."
+        )
+    within = int(instances["intra_process"].sum())
+    if within and not events.table(tables, "rclcpp_ring_buffer_dequeue").height:
+        notes.append(
+            f"{within} callback instances got their message within their process, of which no "
+            "other event tells (before Iron, or not enabled): chains cannot be followed through "
+            "them."
+        )
+    return DataFlow(objects, instances, published, taken, tables, tuple(notes))
+
+
+def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFrame:
+    """All instances of all callbacks, one row each, sorted by start.
+
+    ``callbacks`` is the frame of :class:`~chainshaper.analysis.objects.Objects`. The result has
+
+    * ``instance``: numbered from 0 in order of start; ``callback_id``; ``pid``, ``tid``;
+    * ``start``, ``end``: ns of the event clock; ``end`` is null when it was lost, or the instance
+      was still running (:func:`~chainshaper.analysis.matching.ends_of_starts`);
+    * ``execution_ns``: CPU time (paper: e), from the ``thread_time`` columns where the source
+      has them, else from `sched_switch` (:func:`cpu_time`), else null;
+    * ``intra_process``: whether its message came through a ring buffer;
+    * ``assumed``: always false here.
+    """
+    starts = events.table(tables, "callback_start", ["is_intra_process"])
+    ends = events.table(tables, "callback_end")
+    row = ends_of_starts(starts, ends)
+    owners = callbacks.filter(pl.col("observed")).select(
+        "callback_id", "pid", callback="handle", registered="valid_from"
     )
-    return DataFlow(objects, instances, published, taken, tables, notes)
-
-
-def _about_execution_times(tables: events.EventTables, instances: pl.DataFrame) -> tuple[str, ...]:
-    if "sched_switch" not in tables or instances["execution_ns"].count() or not instances.height:
-        return ()
-    return (
-        "sched_switch was recorded, but shows none of the application's threads (inside a "
-        "container threads have other numbers): execution times cannot be known.",
+    started = starts.select("pid", "callback", "time")  # in order of time, and stays so
+    used = pl.lit(None, dtype=pl.Int64)
+    if "thread_time" in starts.columns and "thread_time" in ends.columns:
+        spent = ends["thread_time"].gather(row) - starts["thread_time"]
+        used = pl.lit(spent.set(spent < 0, None))
+    frame = starts.select(
+        latest_before(started, owners, ["pid", "callback"], "time", "registered")["callback_id"],
+        *("pid", "tid"),
+        start="time",
+        end=ends["time"].gather(row),
+        execution_ns=used,
+        intra_process=pl.col("is_intra_process").fill_null(0) != 0,
+        assumed=pl.lit(False),
     )
+    if frame["callback_id"].null_count():
+        frame = frame.drop_nulls("callback_id")
+    if frame["execution_ns"].null_count() == frame.height and "sched_switch" in tables:
+        frame = _plausible(frame.with_columns(execution_ns=cpu_time(tables, frame)))
+    return frame.with_row_index("instance")
 
 
-def _about_messages_within_processes(
-    tables: events.EventTables, instances: pl.DataFrame
-) -> tuple[str, ...]:
-    count = int(instances["intra_process"].sum())
-    if not count or events.table(tables, "rclcpp_ring_buffer_dequeue").height:
-        return ()
-    return (
-        f"{count} callback instances got their message within their process, of which no other "
-        "event tells (before Iron, or not enabled): chains cannot be followed through them.",
+def cpu_time(tables: events.EventTables, spans: pl.DataFrame) -> pl.Series:
+    """CPU time of thread ``tid`` between ``start`` and ``end`` of every row, from `sched_switch`.
+
+    Exact: what the thread had accumulated at its last switch plus, if that switched it in, the time
+    since. A thread whose first switch takes it off its core is taken to have run since the
+    recording began. Null without an end, and for threads that never appear in `sched_switch`.
+    """
+    curve = _running_time(tables)
+    rows = spans.select("tid", "start", "end").with_row_index("row")
+    for edge in ("start", "end"):
+        rows = latest_before(rows, curve, ["tid"], edge, "switched")
+        since = pl.when("running").then(pl.col(edge) - pl.col("switched")).otherwise(0)
+        rows = rows.with_columns((pl.col("used") + since).alias(f"used_at_{edge}"))
+        rows = rows.drop("switched", "used", "running")
+    used = pl.col("used_at_end") - pl.col("used_at_start")
+    return rows.sort("row").select(execution_ns=used).to_series()
+
+
+def _plausible(frame: pl.DataFrame) -> pl.DataFrame:
+    """``execution_ns`` without what cannot be: a callback that ran used its core.
+
+    Where most instances of a thread used none, `sched_switch` speaks of another thread with the
+    same number (the trace was taken inside a container); where single ones did, switches were lost.
+    """
+    used, thread = pl.col("execution_ns"), ["pid", "tid"]
+    never = (used == 0) & (pl.col("end") > pl.col("start"))
+    stranger = never.sum().over(thread) * 2 > used.count().over(thread)
+    return frame.with_columns(pl.when(~(never | stranger)).then(used).alias("execution_ns"))
+
+
+def _running_time(tables: events.EventTables) -> pl.DataFrame:
+    """``tid, switched, used, running``: CPU time used by each thread at each of its switches."""
+    switches = events.table(tables, "sched_switch")
+    changes = pl.concat(
+        [
+            switches.select(tid="prev_tid", switched="time", running=pl.lit(False)),
+            switches.select(tid="next_tid", switched="time", running=pl.lit(True)),
+        ]
+    ).filter(pl.col("tid") != 0)  # 0 is every core's idle thread
+    changes = changes.sort("tid", "switched", "running", maintain_order=True)
+    first = changes.unique("tid", keep="first", maintain_order=True).filter(~pl.col("running"))
+    began = pl.lit(switches["time"].min(), dtype=pl.Int64)
+    ran_from_start = first.with_columns(switched=began, running=pl.lit(True))
+    changes = pl.concat([ran_from_start, changes]).sort("tid", "switched", maintain_order=True)
+    elapsed = (pl.col("switched") - pl.col("switched").shift(1)).over("tid")
+    ran = pl.when(pl.col("running").shift(1).over("tid")).then(elapsed).otherwise(0)
+    return changes.with_columns(used=ran.fill_null(0).cum_sum().over("tid"))
+
+
+def _with_assumed_readers(
+    instances: pl.DataFrame, taken: pl.DataFrame, objects: Objects
+) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Add an instance for every take of a subscription that has no callback events.
+
+    Returns the instances, renumbered in order of start, and the takes with ``assumed_instance``.
+    """
+    silent = objects.callbacks.filter(~pl.col("observed")).select("callback_id").unique()
+    assumed = taken.join(silent, on="callback_id", how="semi").select(
+        *("callback_id", "pid", "tid", "take", "intra_process"),
+        start="time",
+        assumed=pl.lit(True),
     )
+    if assumed.is_empty():
+        return instances, taken.with_columns(assumed_instance=pl.lit(None, dtype=pl.UInt32))
+    every = pl.concat([instances.drop("instance"), assumed], how="diagonal_relaxed")
+    every = every.sort("start", maintain_order=True).with_row_index("instance")
+    of_take = by_number(every.drop_nulls("take"), "take", "instance", taken.height)
+    return every.select(instances.columns), taken.with_columns(assumed_instance=of_take)
 
 
 def _consumed(taken: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
@@ -103,23 +203,17 @@ def _consumed(taken: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
     latest message taken for it, and a message is read by one instance.
     """
     key = ["tid", "callback_id"]
-    read = []
     for through_buffer in (False, True):
         same = pl.col("intra_process") == through_buffer
         began = instances.filter(same & ~pl.col("assumed")).select(*key, "instance", "start")
         got = taken.filter(same).select(*key, "take", took="time")
         if began.height and got.height:
-            read.append(latest_before(began, got, key, "start", "took").select("take", "instance"))
-    if not read:
-        return taken.rename({"assumed_instance": "instance"})
-    first = pl.concat(read).filter(pl.col("take").is_not_null())
-    # In order of start: of several instances after one take the first had it, so it comes last.
-    first = first.reverse()
-    return taken.with_columns(
-        pl.coalesce("assumed_instance", by_number(first, "take", "instance", taken.height)).alias(
-            "instance"
-        )
-    ).drop("assumed_instance")
+            read = latest_before(began, got, key, "start", "took").drop_nulls("take")
+            # In order of start: of several instances after one take the first had it, so it
+            # comes last.
+            of_take = by_number(read.reverse(), "take", "instance", taken.height)
+            taken = taken.with_columns(assumed_instance=pl.coalesce("assumed_instance", of_take))
+    return taken.rename({"assumed_instance": "instance"})
 
 
 def _published_in(
@@ -128,46 +222,94 @@ def _published_in(
     """Add ``instance`` and ``callback_id``: the innermost instance running on the thread then.
 
     An instance without an end is taken to run until the thread's next instance. A publication in
-    the very nanosecond in which one instance ends and the next begins, as simulators have it, is
-    the first one's. Where a callback runs others inside itself (it spins an executor), what it
-    publishes after them is its own: the search is repeated among the instances that contain
-    others, once per level of nesting.
+    the nanosecond in which one instance ends and the next begins is the first one's. Where a
+    callback runs others inside itself (it spins an executor), what it publishes after them is its
+    own: the search is repeated among the instances that contain others, per level of nesting.
     """
     nodes = objects.callbacks.unique("callback_id", maintain_order=True)
     nodes = nodes.select("callback_id", owner=pl.col("node").cast(published.schema["node"]))
-    running = instances.join(nodes, on="callback_id", how="left", maintain_order="left").select(
-        "pid", "tid", "instance", "callback_id", "start", "end", "assumed", "owner"
-    )
-    rest = published.select("publication", "time", "pid", "tid", "node")
-    found = [_within(rest, running, strictly=True)]
-    rest = _without(rest, found[0], published.height)
-    while running.height and rest.height:
-        found.append(_within(rest, running, strictly=False))
-        rest = _without(rest, found[-1], published.height)
-        running = running.sort("start", maintain_order=True)
-        inner_start = pl.col("start").shift(-1).over("pid", "tid")
-        inner_end = pl.col("end").shift(-1).over("pid", "tid")
-        contains = (inner_start < pl.col("end")) & (inner_end <= pl.col("end")).fill_null(True)
-        running = running.filter(contains.fill_null(False))
-    inside = pl.concat(found)
-    return published.with_columns(
-        by_number(inside, "publication", column, published.height)
-        for column in ("instance", "callback_id")
-    )
-
-
-def _without(rest: pl.DataFrame, found: pl.DataFrame, height: int) -> pl.DataFrame:
-    """The publications of ``rest`` that are not among ``found``; both in their numbers."""
-    hit = by_number(found.select("publication", hit=pl.lit(True)), "publication", "hit", height)
-    return rest.filter(hit.gather(rest["publication"]).is_null())
-
-
-def _within(published: pl.DataFrame, running: pl.DataFrame, *, strictly: bool) -> pl.DataFrame:
-    """The publications that the latest instance started before them includes."""
-    key = ["pid", "tid"]
-    joined = latest_before(published, running, key, "time", "start", strictly=strictly)
+    running = instances.join(nodes, on="callback_id", how="left", maintain_order="left")
+    running = running.drop("execution_ns", "intra_process")
+    key, columns = ["pid", "tid"], ["publication", "instance", "callback_id"]
     inside = (pl.col("end").is_null() | (pl.col("time") <= pl.col("end"))) & (
         ~pl.col("assumed") | (pl.col("owner") == pl.col("node"))
     )
-    hit = joined.filter(inside.fill_null(False) & pl.col("instance").is_not_null())
-    return hit.select("publication", "instance", "callback_id")
+    rest, found, strictly = published.select("publication", "time", *key, "node"), [], True
+    while True:
+        hit = latest_before(rest, running, key, "time", "start", strictly=strictly)
+        hit = hit.filter(inside.fill_null(False) & pl.col("instance").is_not_null())
+        found.append(hit.select(columns))
+        hits = by_number(hit, "publication", "instance", published.height)
+        rest = rest.filter(hits.gather(rest["publication"]).is_null())
+        if not strictly:  # the second search is among all instances again
+            running = running.sort("start", maintain_order=True)
+            inner_start, inner_end = (pl.col(n).shift(-1).over(key) for n in ("start", "end"))
+            ends_within = (inner_end <= pl.col("end")).fill_null(True)
+            contains = (inner_start < pl.col("end")) & ends_within
+            running = running.filter(contains.fill_null(False))
+        if not (running.height and rest.height):
+            break
+        strictly = False
+    every = pl.concat(found)
+    return published.with_columns(
+        by_number(every, "publication", column, published.height) for column in columns[1:]
+    )
+
+
+def _with_assumed_writers(
+    objects: Objects, instances: pl.DataFrame, published: pl.DataFrame
+) -> tuple[Objects, pl.DataFrame, pl.DataFrame]:
+    """Add a callback, and instances, for topics published only outside callbacks.
+
+    Returns the objects, the instances (the new ones last) and the publications with them.
+    """
+    key = ["pid", "node", "topic"]
+    # By publisher first: one number per row to group by instead of three.
+    of_publisher = published.group_by("publisher").agg(
+        pl.col(key).first(), inside=pl.col("instance").count(), valid_from=pl.col("time").min()
+    )
+    writers = of_publisher.group_by(key).agg(pl.col("inside").sum(), pl.col("valid_from").min())
+    internal = pl.col("topic").cast(pl.String).is_in(sorted(INTERNAL_TOPICS))
+    outside = writers.filter((pl.col("inside") == 0) & ~internal & pl.col("node").is_not_null())
+    if outside.is_empty():
+        return objects, instances, published
+    last: int | None = objects.callbacks.select(pl.col("callback_id").max()).item()
+    outside = outside.sort("valid_from", "topic").with_row_index(
+        "callback_id", offset=0 if last is None else last + 1
+    )
+    own = outside.select(*key, "callback_id")
+    assumed = published.drop("instance", "callback_id").join(own, on=key, maintain_order="left")
+    assumed = assumed.with_row_index("instance", offset=instances.height)
+    more = assumed.select(
+        *("instance", "callback_id", "pid", "tid"),
+        start="time",
+        intra_process=pl.lit(False),
+        assumed=pl.lit(True),
+    )
+    published = published.with_columns(
+        pl.coalesce(column, by_number(assumed, "publication", column, published.height))
+        for column in ("instance", "callback_id")
+    )
+    every = pl.concat([instances, more], how="diagonal").select(instances.columns)
+    return _with_callbacks(objects, outside), every, published
+
+
+def _with_callbacks(objects: Objects, outside: pl.DataFrame) -> Objects:
+    """The objects with callbacks ``pid, node, topic, valid_from, callback_id`` outside events."""
+    new = outside.select(
+        *("pid", "valid_from", "callback_id"),
+        node=pl.col("node").cast(pl.String),
+        kind=pl.lit("unknown"),
+        handle=pl.lit(0, dtype=pl.UInt64),
+        observed=pl.lit(False),
+    )
+    callbacks = pl.concat([objects.callbacks, new], how="diagonal_relaxed").select(
+        pl.col(name).cast(type_) for name, type_ in CALLBACK_SCHEMA.items()
+    )
+    notes = (
+        f"{node} publishes {topic} outside its callbacks (from a thread of its own, from Python, "
+        "or from a service client's callback): a chain that begins there is measured from the "
+        "publication."
+        for node, topic in outside.select("node", "topic").iter_rows()
+    )
+    return replace(objects, callbacks=callbacks, notes=(*objects.notes, *notes))

@@ -1,23 +1,20 @@
 """The application graph of a recording: callbacks connected by topics (paper, section 2.1).
 
-A callback is connected to a topic that its instances publish. Some messages, however, are read
-in one callback and published in another of the same node:
+A callback is connected to a topic that its instances publish. Some messages are read in one
+callback and published in another of the same node:
 
 * **Synchronising callbacks** (message_filters) read in one instance and publish in that of the
-  input which completes the set. The library emits no events of its own. A subscription callback
-  is taken to be such an input of topic X when another subscription callback of its node publishes
-  X, subscribes to another topic, and it either is registered by message_filters (its symbol says
-  so) or publishes nothing itself.
-* **Stored messages**: a subscription callback that publishes nothing, in a node whose
-  subscription callbacks publish nothing at all, but whose timers do, is taken to store the
-  message for the timers.
+  input which completes the set; no event says so. A subscription callback is taken to be such an
+  input of topic X when another subscription callback of its node publishes X, subscribes to another
+  topic, and it either is registered by message_filters (its symbol says so) or publishes nothing.
+* **Stored messages**: a subscription callback in a node whose subscription callbacks publish
+  nothing at all, but whose timers do, is taken to store the message for the timers.
 
-Both are inferences, so they are marked: such topics stand in ``Callback.publishes`` (the chain
-goes on there) and also in ``Callback.passes_on``.
+Both are inferences: such topics stand in ``Callback.publishes`` and also in ``passes_on``.
 """
 
-from dataclasses import dataclass
-from typing import Any
+from collections import defaultdict
+from dataclasses import dataclass, replace
 
 import polars as pl
 
@@ -27,16 +24,6 @@ from chainshaper.analysis.objects import named_nodes
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Callback, Node
 
-__all__ = [
-    "INTERNAL_TOPICS",
-    "MESSAGE_FILTER",
-    "ApplicationDescription",
-    "application_graph",
-    "goes_on_elsewhere",
-    "graph_of",
-    "services",
-]
-
 MESSAGE_FILTER = "message_filters::"
 """What the symbols of callbacks that message_filters registered contain."""
 
@@ -44,102 +31,62 @@ MESSAGE_FILTER = "message_filters::"
 def application_graph(tables: events.EventTables) -> ApplicationGraph:
     """The graph of callbacks and topics that the events of a recording show.
 
-    Callback ids are those of the analysis frames. See the module's description for the topics
-    that a callback is said to publish.
+    Callback ids are those of the analysis frames.
     """
     return graph_of(data_flow(tables))
 
 
 def graph_of(flow: DataFlow) -> ApplicationGraph:
     """The application graph of a recording whose data flow is known already."""
-    callbacks = flow.objects.callbacks.unique("callback_id", maintain_order=True)
-    callbacks = callbacks.sort("callback_id")
-    writes = _direct(flow)
-    passed = _passed_on(callbacks, writes)
+    pairs = flow.publications.lazy().select("callback_id", "topic").drop_nulls().unique()
+    writes = defaultdict[int, set[str]](set)
+    for callback_id, topic in pairs.collect().iter_rows():
+        writes[callback_id].add(topic)
+    known = flow.objects.callbacks.unique("callback_id", keep="first", maintain_order=True)
+    known = known.sort("callback_id").rename({"callback_id": "id"})
+    known = known.select("kind", "node", "pid", "handle", "topic", "period_ns", "symbol", "id")
+    callbacks = [
+        Callback(**row, publishes=tuple(sorted(writes[row["id"]])))
+        for row in known.iter_rows(named=True)
+    ]
+    of_node = defaultdict[tuple[int, str], list[Callback]](list)
+    for callback in callbacks:
+        if callback.kind != "unknown":
+            of_node[callback.pid, callback.node].append(callback)
+    nodes = flow.objects.nodes.select("node", "pid").unique(maintain_order=True)
     return ApplicationGraph(
-        nodes=tuple(
-            Node(name, pid)
-            for name, pid in flow.objects.nodes.select("node", "pid")
-            .unique(maintain_order=True)
-            .iter_rows()
-        ),
-        callbacks=tuple(
-            Callback(
-                id=row["callback_id"],
-                kind=row["kind"],
-                node=row["node"],
-                pid=row["pid"],
-                handle=row["handle"],
-                topic=row["topic"],
-                period_ns=row["period_ns"],
-                symbol=row["symbol"],
-                publishes=tuple(
-                    sorted({*writes.get(row["callback_id"], ()), *passed[row["callback_id"]]})
-                ),
-                passes_on=tuple(sorted(passed[row["callback_id"]])),
-            )
-            for row in callbacks.iter_rows(named=True)
-        ),
+        nodes=tuple(Node(name, pid) for name, pid in nodes.iter_rows()),
+        callbacks=tuple(_with_passed_on(one, of_node[one.pid, one.node]) for one in callbacks),
         publishers=_by_topic(flow.objects.publishers),
         subscribers=_by_topic(flow.objects.subscriptions),
     )
 
 
-def _direct(flow: DataFlow) -> dict[int, set[str]]:
-    """Callback id → topics published inside its instances."""
-    pairs = (
-        flow.publications.lazy()
-        .drop_nulls(["callback_id", "topic"])
-        .select("callback_id", "topic")
-        .unique()
-        .collect()
-    )
-    writes: dict[int, set[str]] = {}
-    for callback_id, topic in pairs.iter_rows():
-        writes.setdefault(callback_id, set()).add(topic)
-    return writes
+def _with_passed_on(callback: Callback, siblings: list[Callback]) -> Callback:
+    """The callback with the topics that a sibling of its node publishes for it."""
+    if callback.kind != "subscription" or callback.topic in {None, *INTERNAL_TOPICS}:
+        return callback
+    own = set(callback.publishes) - INTERNAL_TOPICS
+    filtered = MESSAGE_FILTER in (callback.symbol or "")
+    passed: set[str] = set()
+    if not _outputs(siblings, "subscription"):
+        passed = _outputs(siblings, "timer")
+    elif filtered or not own:  # no callback synchronises a topic with itself
+        others = [one for one in siblings if one.topic != callback.topic]
+        passed = _outputs(others, "subscription") - own
+    publishes = tuple(sorted({*callback.publishes, *passed}))
+    return replace(callback, publishes=publishes, passes_on=tuple(sorted(passed)))
 
 
-def _passed_on(callbacks: pl.DataFrame, writes: dict[int, set[str]]) -> dict[int, set[str]]:
-    """Callback id → topics that a sibling of its node publishes for it."""
-    passed: dict[int, set[str]] = {number: set() for number in callbacks["callback_id"]}
-    known = callbacks.filter(pl.col("kind") != "unknown")
-    for group in known.partition_by("pid", "node", maintain_order=True):
-        rows = list(group.iter_rows(named=True))
-        outputs = {
-            kind: {
-                row["callback_id"]: writes.get(row["callback_id"], set()) - INTERNAL_TOPICS
-                for row in rows
-                if row["kind"] == kind
-            }
-            for kind in ("subscription", "timer")
-        }
-        by_inputs = set().union(*outputs["subscription"].values())
-        by_timers = set().union(*outputs["timer"].values())
-        for row in rows:
-            if row["kind"] != "subscription" or row["topic"] in {None, *INTERNAL_TOPICS}:
-                continue
-            own = outputs["subscription"][row["callback_id"]]
-            filtered = MESSAGE_FILTER in (row["symbol"] or "")
-            if by_inputs and (filtered or not own):
-                passed[row["callback_id"]] = _of_other_topics(row, rows, outputs) - own
-            elif not by_inputs:
-                passed[row["callback_id"]] = by_timers
-    return passed
-
-
-def _of_other_topics(
-    row: dict[str, Any], rows: list[dict[str, Any]], outputs: dict[str, dict[int, set[str]]]
-) -> set[str]:
-    """What subscriptions to other topics publish: no callback synchronises a topic with itself."""
-    siblings = [other for other in rows if other["topic"] != row["topic"]]
-    return set().union(*(outputs["subscription"].get(o["callback_id"], ()) for o in siblings))
+def _outputs(callbacks: list[Callback], kind: str) -> set[str]:
+    topics = {topic for one in callbacks if one.kind == kind for topic in one.publishes}
+    return topics - INTERNAL_TOPICS
 
 
 def _by_topic(endpoints: pl.DataFrame) -> dict[str, tuple[str, ...]]:
     """Topic → names of the nodes that have such an endpoint."""
-    named = endpoints.drop_nulls(["topic", "node"]).select("topic", "node").unique()
-    grouped = named.sort("topic", "node").group_by("topic", maintain_order=True).agg("node")
+    named = endpoints.select("topic", "node").drop_nulls().unique().sort("topic", "node")
+    grouped = named.group_by("topic", maintain_order=True).agg("node")
     return {topic: tuple(nodes) for topic, nodes in grouped.iter_rows()}
 
 
@@ -185,9 +132,8 @@ def services(tables: events.EventTables) -> pl.DataFrame:
     nodes = named_nodes(tables).rename({"handle": "node_handle", "valid_from": "created"})
     found = []
     for role, name in (("server", "rcl_service_init"), ("client", "rcl_client_init")):
-        ends = events.table(tables, name).select(
-            "time", "pid", "node_handle", service="service_name", role=pl.lit(role)
-        )
+        ends = events.table(tables, name)
         joined = latest_before(ends, nodes, ["pid", "node_handle"], "time", "created")
-        found.append(joined.select("service", "role", "node", "pid"))
-    return pl.concat(found).unique().sort("service", "role", "node", "pid")
+        found.append(joined.select("node", "pid", service="service_name", role=pl.lit(role)))
+    columns = ["service", "role", "node", "pid"]
+    return pl.concat(found).select(columns).unique().sort(columns)

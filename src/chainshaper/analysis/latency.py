@@ -1,7 +1,4 @@
-"""The end-to-end latencies of one chain in a recording, and the figures about them and callbacks.
-
-:func:`analyse_latency` is the whole analysis in one call.
-"""
+"""The end-to-end latencies of one chain in a recording, figures about them and about callbacks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,23 +8,13 @@ import numpy.typing as npt
 import polars as pl
 
 from chainshaper.analysis.chains import find_chain
-from chainshaper.analysis.disturbance import disturbed, stalled_after
+from chainshaper.analysis.disturbance import Due, disturbed, stalled_after, with_punctuality
 from chainshaper.analysis.flow import DataFlow, data_flow
 from chainshaper.analysis.graph import graph_of
-from chainshaper.analysis.punctuality import Due, with_punctuality
 from chainshaper.analysis.traversals import reception, traverse
 from chainshaper.values import events
 from chainshaper.values.application import ApplicationGraph, Chain
 from chainshaper.values.recording import Recording
-
-__all__ = [
-    "PERCENTILES",
-    "LatencyAnalysis",
-    "LatencyStatistics",
-    "analyse_latency",
-    "callback_statistics",
-    "latency_statistics",
-]
 
 PERCENTILES: tuple[float, ...] = (0.5, 1, 5, 25, 50, 75, 95, 99, 99.5)
 
@@ -39,9 +26,8 @@ class LatencyStatistics:
     ``count`` latencies were measured; ``incomplete`` traversals have none; ``disturbed`` of
     ``count`` were hit by a stall of the machine; ``late`` of them came behind the slot or cycle
     they were due in (None: when they were due is not known). ``jitter_ns`` is max − min (paper: J),
-    ``spread_ns`` p99.5 − p0.5. ``percentiles_ns`` has the keys 0.5, 1, 5, 25, 50, 75, 95, 99 and
-    99.5 as text; they interpolate linearly between the two nearest values (NumPy's default),
-    then are rounded.
+    ``spread_ns`` p99.5 − p0.5. ``percentiles_ns`` has :data:`PERCENTILES` as text for keys; they
+    interpolate linearly between the two nearest values, then are rounded.
     """
 
     count: int
@@ -72,19 +58,16 @@ def latency_statistics(
         return LatencyStatistics(0, incomplete, hit, None, None, None, None, None, {}, late)
     values = np.percentile(sample, PERCENTILES)
     percentiles = {f"{p:g}": round(float(v)) for p, v in zip(PERCENTILES, values, strict=True)}
-    low, high = int(sample.min()), int(sample.max())
-    return LatencyStatistics(
-        count=len(sample),
-        incomplete=incomplete,
-        disturbed=hit,
-        min_ns=low,
-        mean_ns=round(int(sample.sum()) / len(sample)),
-        max_ns=high,
-        jitter_ns=high - low,
-        spread_ns=percentiles["99.5"] - percentiles["0.5"],
-        percentiles_ns=percentiles,
-        late=late,
-    )
+    low, high, mean = int(sample.min()), int(sample.max()), round(int(sample.sum()) / len(sample))
+    spread = percentiles["99.5"] - percentiles["0.5"]
+    figures = (low, mean, high, high - low, spread, percentiles)
+    return LatencyStatistics(len(sample), incomplete, hit, *figures, late)
+
+
+def summary(column: str, values: pl.Expr) -> pl.Expr:
+    """Times as a struct ``{min, mean, max}`` called ``column``; null where there are none."""
+    figures = pl.struct(min=values.min(), mean=values.mean(), max=values.max())
+    return pl.when(values.count() > 0).then(figures).alias(column)
 
 
 def callback_statistics(flow: DataFlow) -> pl.DataFrame:
@@ -95,42 +78,40 @@ def callback_statistics(flow: DataFlow) -> pl.DataFrame:
     floats), null where no instance has such a time. ``period_ns`` is the timer's own period.
     """
     about = flow.objects.callbacks.unique("callback_id", maintain_order=True)
-    response = pl.col("end") - pl.col("start")
-    seen = flow.instances.filter(~pl.col("assumed"))
-    figures = seen.group_by("callback_id").agg(
-        pl.col("tid").unique().sort().alias("tids"),
-        pl.len().alias("count"),
-        pl.col("end").null_count().alias("unfinished"),
-        _summary(response).alias("response_ns"),
-        _summary(pl.col("execution_ns")).alias("execution_ns"),
+    figures = (
+        flow.instances.filter(~pl.col("assumed"))
+        .group_by("callback_id")
+        .agg(
+            summary("response_ns", pl.col("end") - pl.col("start")),
+            summary("execution_ns", pl.col("execution_ns")),
+            tids=pl.col("tid").unique().sort(),
+            count=pl.len(),
+            unfinished=pl.col("end").null_count(),
+        )
     )
-    joined = about.join(figures, on="callback_id", how="inner").sort("callback_id")
-    columns = ["callback_id", "node", "kind", "topic", "period_ns", "symbol", "pid"]
-    times = [
-        pl.when(pl.col(name).struct.field("min").is_not_null()).then(pl.col(name)).alias(name)
-        for name in ("response_ns", "execution_ns")
-    ]
-    return joined.select(*columns, "tids", "count", "unfinished", *times)
-
-
-def _summary(values: pl.Expr) -> pl.Expr:
-    return pl.struct(min=values.min(), mean=values.mean(), max=values.max())
+    return (
+        about.join(figures, on="callback_id")
+        .sort("callback_id")
+        .select(
+            *("callback_id", "node", "kind", "topic", "period_ns", "symbol", "pid"),
+            *("tids", "count", "unfinished", "response_ns", "execution_ns"),
+        )
+    )
 
 
 @dataclass(frozen=True)
 class LatencyAnalysis:
     """The end-to-end latency of one chain in one recording.
 
-    ``traversals`` is the frame of :class:`~chainshaper.analysis.traversals.Traversals` with the
-    columns ``place_ns``, ``due_at``, ``late`` (see
-    :func:`~chainshaper.analysis.punctuality.with_punctuality`), ``disturbed``, ``received``,
-    ``reception_ns`` (latency to the subscriber's `callback_start`) and ``reception_disturbed``
-    (also by a stall between the two) added, ``hops`` its frame of hops, ``releases`` what gates
-    decided about them (:func:`~chainshaper.analysis.departures.gated_hops`). ``statistics`` are
+    ``traversals`` is the frame of :class:`~chainshaper.analysis.traversals.Traversals` with
+    ``place_ns``, ``due_at``, ``late`` (:func:`~.disturbance.with_punctuality`), ``disturbed``,
+    ``received``, ``reception_ns`` (latency to the subscriber's `callback_start`) and
+    ``reception_disturbed`` (also by a stall between the two), ``hops`` its frame of hops,
+    ``releases`` what gates decided about them (:func:`~.messages.gated_hops`). ``statistics`` are
     over all complete traversals, ``undisturbed`` over those that the machine did not disturb;
     ``subscriber`` and ``subscriber_undisturbed`` are the same of ``reception_ns`` (None: no node
-    subscribes to the output in this recording). ``incomplete`` counts traversals without an end by
-    reason, ``silent`` instances of the first callback that began none.
+    subscribes to the output). ``incomplete`` counts traversals without an end by reason, ``silent``
+    instances of the first callback that began none.
     """
 
     chain: Chain
@@ -158,85 +139,70 @@ def analyse_latency(
 ) -> LatencyAnalysis:
     """Every traversal of ``chain`` in a recording, with statistics.
 
-    ``source`` is a recording, its event tables, or its data flow where several chains are
-    analysed. ``clock_offset_ns`` (event clock to CLOCK_REALTIME) is taken from a recording and
-    needed for tables from before Jazzy. ``subscriber`` names the node whose reception is
-    reported. ``due`` is when a plan has outputs leave; those of other chains are passed over.
-    ``between`` leaves out traversals that did not begin, and end, between two instants (ns).
+    ``clock_offset_ns`` (event clock to CLOCK_REALTIME) is taken from a recording and needed for
+    tables from before Jazzy. ``subscriber`` names the node whose reception is reported. ``due`` is
+    when a plan has outputs leave; those of other chains are passed over. ``between`` leaves out
+    traversals that did not begin, and end, between two instants (ns).
 
     Raises:
-        InputError: the chain is not in the recording, see
-            :func:`~chainshaper.analysis.chains.find_chain`.
+        InputError: the chain is not in the recording, see :func:`~.chains.find_chain`.
     """
     notes: tuple[str, ...] = ()
-    if isinstance(source, DataFlow):
-        flow = source
-    elif isinstance(source, Recording):
-        offset = source.info.clock_offset_ns if clock_offset_ns is None else clock_offset_ns
-        flow = data_flow(source.events, offset)
-        notes = source.info.notes
-    else:
-        flow = data_flow(source, clock_offset_ns or 0)
+    if isinstance(source, Recording):
+        notes, info = source.info.notes, source.info
+        clock_offset_ns = info.clock_offset_ns if clock_offset_ns is None else clock_offset_ns
+        source = source.events
+    flow = source if isinstance(source, DataFlow) else data_flow(source, clock_offset_ns or 0)
     graph = graph_of(flow)
     if isinstance(chain, str):
         chain = find_chain(graph, chain)
     found = traverse(flow, chain, graph)
-    received = reception(flow, found, graph, subscriber)
     own = next((one for one in due if one.output in {None, chain.topics[-1]}), None)
     judged, releases = with_punctuality(flow, found, own)
-    hit = disturbed(flow, judged, 0 if own is None else own.margin_ns)
+    hit = pl.Series(disturbed(flow, judged, 0 if own is None else own.margin_ns))
+    received = reception(flow, found, graph, subscriber)
+    sent, arrived = judged["end"].fill_null(0), received["received"].fill_null(-1)
+    on_its_way = pl.Series(stalled_after(flow, sent.to_numpy(), arrived.to_numpy()))
     frame = judged.drop("origin", "computed_at").with_columns(
-        received["received"], received["reception_ns"], disturbed=hit
+        *(received["received"], received["reception_ns"]),
+        disturbed=hit,
+        reception_disturbed=hit | on_its_way,
     )
-    on_its_way = stalled_after(
-        flow, frame["end"].fill_null(0).to_numpy(), frame["received"].fill_null(-1).to_numpy()
-    )
-    frame = frame.with_columns(reception_disturbed=pl.col("disturbed") | pl.Series(on_its_way))
     hops = found.hops
     if between is not None:
-        frame = frame.filter(_within(*between))
+        since_ns, until_ns = between
+        ended = pl.max_horizontal("start", "end")
+        before = pl.lit(True) if until_ns is None else ended < until_ns
+        frame = frame.filter((pl.col("start") >= since_ns) & before)
         hops, releases = (t.join(frame, on="traversal", how="semi") for t in (hops, releases))
     reasons = frame.select("reason").drop_nulls().group_by("reason").len().sort("reason")
-    measured = frame.select(
-        "latency_ns", "reception_ns", "late", "disturbed", "reception_disturbed"
+    calm, calmly_received = (
+        frame.filter(~pl.col(column)) for column in ("disturbed", "reception_disturbed")
     )
+    read = frame["reception_ns"].count() > 0
     return LatencyAnalysis(
         chain=chain,
         graph=graph,
         traversals=frame,
         hops=hops,
         releases=releases,
-        statistics=_statistics(measured, "latency_ns"),
-        undisturbed=_statistics(measured.filter(~pl.col("disturbed")), "latency_ns"),
-        subscriber=_subscriber(measured, measured),
-        subscriber_undisturbed=_subscriber(
-            measured, measured.filter(~pl.col("reception_disturbed"))
-        ),
+        statistics=_statistics(frame, "latency_ns"),
+        undisturbed=_statistics(calm, "latency_ns"),
+        subscriber=_statistics(frame, "reception_ns") if read else None,
+        subscriber_undisturbed=_statistics(calmly_received, "reception_ns") if read else None,
         incomplete=dict(reasons.iter_rows()),
         silent=found.silent,
         notes=(*notes, *flow.notes, *found.notes),
     )
 
 
-def _within(since_ns: int, until_ns: int | None) -> pl.Expr:
-    ended = pl.max_horizontal("start", "end")
-    return (pl.col("start") >= since_ns) & (True if until_ns is None else ended < until_ns)
-
-
-def _statistics(
-    frame: pl.DataFrame, column: str, disturbed_by: str = "disturbed"
-) -> LatencyStatistics:
-    measured = frame.select(column, "late", disturbed_by).drop_nulls(column)
+def _statistics(frame: pl.DataFrame, column: str) -> LatencyStatistics:
+    measured = frame.drop_nulls(column)
     known = measured["late"].count() or not measured.height
+    hit = "disturbed" if column == "latency_ns" else "reception_disturbed"
     return latency_statistics(
         measured[column].to_numpy(),
-        measured[disturbed_by].to_numpy(),
+        measured[hit].to_numpy(),
         incomplete=frame.height - measured.height,
         late=int(measured["late"].sum()) if known else None,
     )
-
-
-def _subscriber(frame: pl.DataFrame, chosen: pl.DataFrame) -> LatencyStatistics | None:
-    if not frame["reception_ns"].count():
-        return None
-    return _statistics(chosen, "reception_ns", "reception_disturbed")

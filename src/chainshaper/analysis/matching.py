@@ -1,23 +1,16 @@
 """Matching events to events by time: the joins that the rest of the analysis is built from.
 
 An event rarely names what it belongs to. It carries an address, which means whatever was last
-created there, or it belongs to whatever its thread was doing at that moment. Both questions are
-"the latest row before this one with the same key" (or the next after it): an asof join.
+created there, or it belongs to whatever its thread was doing then: "the latest row before this one
+with the same key" (or the next after it), an asof join. Events come sorted by time, so one compiled
+walk over both tables that remembers the latest row of each key is enough: some ten ns a row.
 
-Events come sorted by time, so one compiled walk over both tables that remembers the latest row of
-each key is enough. Keys are few (threads, handles) and times many: a lookup stays in the nearest
-cache, and a row costs some ten nanoseconds. Columns are read where they lie
-(:mod:`chainshaper.values.compiled.memory`). A key is a table of three rows (address, bytes per
-value), of which unused ones have 0 bytes. The table of keys has ``slots`` rows, a power of two, of
-(three numbers, whether it is taken, the latest row), and one more whose first number counts them.
-
-The same walk pairs `callback_end` with `callback_start`: an instance ends with the next event of
-the same callback on the same thread, if that is an end. Clocks tick coarsely and simulators
-exactly, so an instance may begin in the nanosecond in which the one before ended (end first), or
-last no time at all (start first): it is the former when one was open before that nanosecond.
+Columns are read where they lie. A key is a table of three rows (address, bytes per value); unused
+ones have 0 bytes. The table of keys has ``slots`` rows, a power of two, of (three numbers, whether
+it is taken, the latest row), and one more whose first number counts them.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal
 
@@ -28,25 +21,8 @@ import polars as pl
 from chainshaper.values.compiled import kernel
 from chainshaper.values.compiled.memory import compiled, get, load_half, load_word, put, store_word
 
-__all__ = [
-    "KEY_ROW",
-    "Keys",
-    "by_number",
-    "first_after",
-    "grows",
-    "in_order",
-    "key_table",
-    "latest_before",
-    "nearest",
-    "place_of",
-    "walk",
-    "walk_pairs",
-]
-
 _walk = kernel("chainshaper.analysis.matching", "walk")
-_FIRST_SLOTS = 1024
-_MOST_KEYS = 3
-_NONE = 0xFFFFFFFF
+_walk_pairs = kernel("chainshaper.analysis.matching", "walk_pairs")
 
 
 def _asof(
@@ -62,22 +38,32 @@ def _asof(
     """``left`` with the columns of the matching row of ``right``, else nulls.
 
     That is the latest one at or before it (``latest_before``), or the first one at or after it
-    (``first_after``). ``by`` are the key columns that both have (none: time alone decides),
-    ``left_on`` and ``right_on`` their time columns. Of rows of ``right`` with the same time the
-    last counts, or the first; ``strictly`` leaves out rows at the very time of the left one. The
-    result is sorted by ``left_on`` and also has ``right_on``. Rows of ``right`` without a time or
+    (``first_after``). ``by`` are up to three key columns of integers that both have (none: time
+    alone decides), ``left_on`` and ``right_on`` their time columns. Of rows of ``right`` with the
+    same time the last counts, or the first; ``strictly`` leaves out rows at the very time of the
+    left one. The result is sorted by ``left_on`` and also has ``right_on``. Rows without a time or
     key match nothing.
     """
-    right = right.drop_nulls([*by, right_on])
-    left, right = _in_order(left, left_on), _in_order(right, right_on)
-    keys = Keys.of(left, by), Keys.of(right, by)
-    if keys[0] is None or keys[1] is None or any(left.schema[k] != right.schema[k] for k in by):
-        strategy: Literal["backward", "forward"] = "backward" if step > 0 else "forward"
-        return _by_polars(left, right, by, left_on, right_on, strategy=strategy, strictly=strictly)
-    index = _rows((left[left_on], keys[0]), (right[right_on], keys[1]), step, strictly=strictly)
+    right = _sorted(right.drop_nulls([*by, right_on]), right_on)
+    left = _sorted(left, left_on)
+    timeless = left[left_on].null_count()  # sorted, they come first
+    known = left.slice(timeless)
+    (keys, _own), (others, _its) = _keys(known, by), _keys(right, by)
+    at, times = _as_array(known[left_on]), _as_array(right[right_on])
+    found = np.empty(len(at), np.uint32)
+
+    def walk_over(slots: int, table: npt.NDArray[np.int64]) -> int:
+        return _walk(
+            keys.ctypes.data, at.ctypes.data, len(at), others.ctypes.data, times.ctypes.data,
+            len(times), step, strictly, found.ctypes.data, table.ctypes.data, slots,
+        )  # fmt: skip
+
+    index = _rows(found) if _with_room(walk_over) else pl.Series(found)
     for key in by:
-        if left[key].null_count():
-            index = index.set(left[key].is_null(), None)
+        if known[key].null_count():
+            index = index.set(known[key].is_null(), None)
+    if timeless:
+        index = pl.repeat(None, timeless, dtype=pl.UInt32, eager=True).append(index)
     columns = right.drop(by).select(pl.all().gather(index))
     return left.hstack(columns.rename({n: f"{n}_right" for n in columns.columns if n in left}))
 
@@ -93,115 +79,79 @@ def nearest(
 
     For two events of one constructor whose order differs between versions of a library.
     """
-    right = right.drop_nulls([*by, right_on])
-    return _by_polars(left, right, by, left_on, right_on, strategy="nearest", strictly=False)
-
-
-def _rows(
-    left: tuple[pl.Series, "Keys"],
-    right: tuple[pl.Series, "Keys"],
-    step: int,
-    *,
-    strictly: bool,
-) -> pl.Series:
-    """For every row of ``left`` that of ``right`` which matches it, or null; both in order."""
-    (at, left_keys), (times, right_keys) = left, right
-    timeless = at.null_count()  # sorted, they come first, and match nothing
-    own, its, keys = _as_array(at[timeless:]), _as_array(times), left_keys.beyond(timeless)
-    found = np.empty(len(own), np.uint32)
-    slots, missing = _FIRST_SLOTS, -1
-    while missing < 0:
-        table = key_table(slots)
-        missing = _walk(
-            keys.ctypes.data, own.ctypes.data, len(own), right_keys.table.ctypes.data,
-            its.ctypes.data, len(its), step, strictly, found.ctypes.data, table.ctypes.data, slots,
-        )  # fmt: skip
-        slots *= 8
-    index = pl.Series(found)
-    if missing:
-        index = index.set(index == _NONE, None)
-    if timeless:
-        index = pl.repeat(None, timeless, dtype=pl.UInt32, eager=True).append(index)
-    return index
-
-
-def _by_polars(
-    left: pl.DataFrame,
-    right: pl.DataFrame,
-    by: list[str],
-    left_on: str,
-    right_on: str,
-    *,
-    strategy: Literal["backward", "forward", "nearest"],
-    strictly: bool,
-) -> pl.DataFrame:
-    return _in_order(left, left_on).join_asof(
-        _in_order(right, right_on),
+    return _sorted(left, left_on).join_asof(
+        _sorted(right.drop_nulls([*by, right_on]), right_on),
         left_on=left_on,
         right_on=right_on,
-        by=by or None,
-        strategy=strategy,
-        allow_exact_matches=not strictly,
+        by=by,
+        strategy="nearest",
         coalesce=False,
         check_sortedness=False,  # both are sorted; Polars cannot check it within groups
     )
 
 
-def key_table(slots: int) -> npt.NDArray[np.int64]:
-    """An empty table of keys, as compiled walks want it (:mod:`~chainshaper.analysis.matching`)."""
-    return np.zeros((slots + 1, 5), np.int64)
+def ends_of_starts(starts: pl.DataFrame, ends: pl.DataFrame) -> pl.Series:
+    """For every row of `callback_start` the row of its `callback_end`, null for none.
 
-
-@dataclass(frozen=True)
-class Keys:
-    """Key columns as compiled walks read them: where they lie, without a copy.
-
-    ``table`` has a row (address, bytes per value) for each, ``columns`` keep the memory alive.
+    Both are sorted by time. An instance ends with the next event of the same callback on the same
+    thread, if that is an end. It may begin in the nanosecond in which the one before ended (end
+    first), or last no time at all (start first): the former when one was open before.
     """
+    (keys, _own), (others, _its) = (_keys(t, ["pid", "tid", "callback"]) for t in (starts, ends))
+    began, ended = _as_array(starts["time"]), _as_array(ends["time"])
+    found = np.empty(len(began), np.uint32)
 
-    table: npt.NDArray[np.int64]
-    columns: tuple[npt.NDArray[Any], ...]
+    def walk_over(slots: int, table: npt.NDArray[np.int64]) -> int:
+        found.fill(NONE)
+        states = np.zeros((slots, 4), np.int64)
+        return _walk_pairs(
+            keys.ctypes.data, began.ctypes.data, len(began), others.ctypes.data, ended.ctypes.data,
+            len(ended), found.ctypes.data, table.ctypes.data, states.ctypes.data, slots,
+        )  # fmt: skip
 
-    @classmethod
-    def of(cls, frame: pl.DataFrame, by: list[str]) -> "Keys | None":
-        """The keys of a frame; None where they are not up to three columns of integers."""
-        columns = []
-        for key in by:
-            column = frame[key].to_physical()
-            if not column.dtype.is_integer() or len(by) > _MOST_KEYS:
-                return None
-            values = _as_array(column)
-            columns.append(values if values.itemsize >= 4 else values.astype(np.uint32))
-        table = np.zeros((_MOST_KEYS, 2), np.int64)
-        for row, values in zip(table, columns, strict=False):
-            row[:] = values.ctypes.data, values.itemsize
-        return cls(table, tuple(columns))
+    _with_room(walk_over)
+    return _rows(found)
 
-    def beyond(self, rows: int) -> npt.NDArray[np.int64]:
-        """The table without the first ``rows`` rows of the frame."""
-        table: npt.NDArray[np.int64] = self.table.copy()
-        table[:, 0] += rows * table[:, 1]
-        return table
+
+def _with_room(walk_over: Callable[[int, npt.NDArray[np.int64]], int]) -> int:
+    """What a compiled walk returns, given an empty table that has room for all keys."""
+    slots, result = 1024, FULL
+    while result == FULL:
+        result = walk_over(slots, np.zeros((slots + 1, 5), np.int64))
+        slots *= 8
+    return result
+
+
+def _rows(found: npt.NDArray[np.uint32]) -> pl.Series:
+    index = pl.Series(found)
+    return index.set(index == NONE, None) if (found == NONE).any() else index
+
+
+def _keys(
+    frame: pl.DataFrame, by: list[str]
+) -> tuple[npt.NDArray[np.int64], list[npt.NDArray[Any]]]:
+    """Key columns as compiled walks read them, and what has to stay alive meanwhile."""
+    columns = [_as_array(frame[key].to_physical()) for key in by]
+    columns = [values if values.itemsize >= 4 else values.astype(np.uint32) for values in columns]
+    table = np.zeros((3, 2), np.int64)
+    for row, values in zip(table, columns, strict=False):
+        row[:] = values.ctypes.data, values.itemsize
+    return table, columns
 
 
 def _as_array(column: pl.Series) -> npt.NDArray[Any]:
     """A column of integers as an array, nulls as 0; a copy only where there are any."""
-    if column.null_count():
-        column = column.fill_null(0)
-    values: npt.NDArray[Any] = column.rechunk().to_numpy()
+    values: npt.NDArray[Any] = column.fill_null(0).rechunk().to_numpy()
     return values
 
 
-def _in_order(frame: pl.DataFrame, time: str) -> pl.DataFrame:
+def _sorted(frame: pl.DataFrame, time: str) -> pl.DataFrame:
     # Events come sorted, and looking costs far less time and memory than sorting again.
     return frame if frame[time].is_sorted() else frame.sort(time, maintain_order=True)
 
 
 def in_order(frame: pl.DataFrame, time: str, *ties: str, nulls_last: bool = False) -> pl.DataFrame:
-    """``frame`` sorted by ``time`` and, where times are equal, by ``ties``; else as it was.
-
-    Looking whether all times grow costs a fraction of what sorting by several columns does.
-    """
+    """``frame`` sorted by ``time`` and ``ties``, if not all times grow: looking is cheap."""
     if grows(frame[time]):
         return frame
     return frame.sort(time, *ties, nulls_last=nulls_last, maintain_order=True)
@@ -215,8 +165,7 @@ def grows(times: pl.Series) -> bool:
 def by_number(rows: pl.DataFrame, number: str, column: str, height: int) -> pl.Series:
     """``column`` of ``rows`` laid out by their ``number``: a series of ``height``, null elsewhere.
 
-    What a left join on a frame's own row numbers gives, without copying the frame. Of several rows
-    with one number the last counts.
+    A left join on a frame's own row numbers. Of several rows with one number the last counts.
     """
     values = pl.repeat(None, height, dtype=rows.schema[column], eager=True).alias(column)
     return values.scatter(rows[number], rows[column])
@@ -227,11 +176,15 @@ def by_number(rows: pl.DataFrame, number: str, column: str, height: int) -> pl.S
 # Kernels take many numbers rather than objects, which are slow to pass.
 # ruff: noqa: PLR0917
 
-
 KEY_ROW = 8 * 5
 LATEST = 4
-NONE = np.uint64(0xFFFFFFFF)
+NONE = 0xFFFFFFFF
 FULL = -1
+
+STATE_ROW = 8 * 4
+# What is known per key: 1 + the open start, or 0; starts minus ends; the moment of its latest
+# event, and whether it was open before that.
+OPEN, DEPTH, MOMENT, WAS_OPEN = 0, 1, 2, 3
 
 
 @compiled(inline=True)
@@ -279,10 +232,8 @@ def place_of(table, slots, columns, row, add):
 def walk(left, at, count, right, times, others, step, strictly, found, table, slots):
     """Fill ``found`` (uint32) with the row of ``right`` that matches each row of ``left``.
 
-    That is the last one at or before it (``step`` 1), or the first one at or after it (``step``
-    −1: the walk begins at the end). ``at`` and ``times`` (int64, ns) ascend, ``left`` and ``right``
-    are their keys. Returns how many rows have none, which NONE stands for, or FULL where ``slots``
-    are too few for all keys.
+    ``step`` −1 walks from the end. ``at`` and ``times`` (int64, ns) ascend, ``left`` and ``right``
+    are their keys. Returns how many rows have none (NONE), or FULL: ``slots`` are too few.
     """
     row, other = (0, 0) if step > 0 else (count - 1, others - 1)
     missing = 0
@@ -296,7 +247,7 @@ def walk(left, at, count, right, times, others, step, strictly, found, table, sl
             other += step
         place = place_of(table, slots, left, row, 0)
         if place == 0:
-            store_word(found + 4 * row, NONE)
+            store_word(found + 4 * row, np.uint64(NONE))
             missing += 1
         else:
             store_word(found + 4 * row, np.uint64(get(place, LATEST)))
@@ -304,49 +255,12 @@ def walk(left, at, count, right, times, others, step, strictly, found, table, sl
     return missing
 
 
-# mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
-
-# Kernels take many numbers rather than objects, which are slow to pass.
-# ruff: noqa: PLR0917
-
-
-# What is kept per key: 1 + the open start, or 0; starts minus ends; the moment of its latest end,
-# and whether it was open before that.
-OPEN, DEPTH, MOMENT, WAS_OPEN = 0, 1, 2, 3
-STATE_ROW = 8 * 4
-
-
-@compiled(inline=True)
-def end_at(place, moment, early, row, found):
-    """Note an end: the ``early`` ones close what was open before this moment, others the rest."""
-    if get(place, MOMENT) != moment:
-        put(place, MOMENT, moment)
-        put(place, WAS_OPEN, np.int64(1) if get(place, DEPTH) > 0 else np.int64(0))
-    if get(place, WAS_OPEN) == early:
-        if get(place, OPEN) > 0:
-            store_word(found + 4 * (get(place, OPEN) - 1), np.uint64(row))
-        put(place, OPEN, np.int64(0))
-        put(place, DEPTH, get(place, DEPTH) - 1)
-
-
-@compiled()
-def walk_ends(ends, first, last, moment, early, found, table, states, slots):
-    """Note the ends [first, last) of a moment; 0, or FULL."""
-    for row in range(first, last):
-        key = place_of(table, slots, ends, row, np.int64(1))
-        if key == 0:
-            return np.int64(FULL)
-        end_at(states + (key - table) // KEY_ROW * STATE_ROW, moment, early, row, found)
-    return np.int64(0)
-
-
 @compiled()
 def walk_pairs(starts, began, start_count, ends, ended, end_count, found, table, states, slots):
     """For every start write the row of its end to ``found`` (uint32; other rows are left alone).
 
-    ``starts`` and ``ends`` are keys as in :mod:`~chainshaper.analysis.matching`, ``began`` and
-    ``ended`` their ascending times; ``states`` has four zeros for each of the ``slots``. Returns
-    0, or FULL where those are too few for all keys.
+    ``starts`` and ``ends`` are keys, ``began`` and ``ended`` their ascending times; ``states`` has
+    four zeros for each of the ``slots``. Returns 0, or FULL: they are too few.
     """
     i = j = moment = np.int64(0)
     while i < start_count or j < end_count:
@@ -360,18 +274,23 @@ def walk_pairs(starts, began, start_count, ends, ended, end_count, found, table,
             next_j += 1
         moment += 1
         # First the ends of what was open before this moment, then starts, then other ends.
-        status = walk_ends(ends, j, next_j, moment, np.int64(1), found, table, states, slots)
-        if status < 0:
-            return status
-        for row in range(i, next_i):
-            key = place_of(table, slots, starts, row, np.int64(1))
-            if key == 0:
-                return np.int64(FULL)
-            place = states + (key - table) // KEY_ROW * STATE_ROW
-            put(place, OPEN, row + 1)
-            put(place, DEPTH, get(place, DEPTH) + 1)
-        status = walk_ends(ends, j, next_j, moment, np.int64(0), found, table, states, slots)
-        if status < 0:
-            return status
+        for part in range(3):
+            columns, first, last = (starts, i, next_i) if part == 1 else (ends, j, next_j)
+            for row in range(first, last):
+                key = place_of(table, slots, columns, row, np.int64(1))
+                if key == 0:
+                    return np.int64(FULL)
+                place = states + (key - table) // KEY_ROW * STATE_ROW
+                if get(place, MOMENT) != moment:
+                    put(place, MOMENT, moment)
+                    put(place, WAS_OPEN, np.int64(1) if get(place, DEPTH) > 0 else np.int64(0))
+                if part == 1:
+                    put(place, OPEN, row + 1)
+                    put(place, DEPTH, get(place, DEPTH) + 1)
+                elif (get(place, WAS_OPEN) == 1) == (part == 0):
+                    if get(place, OPEN) > 0:
+                        store_word(found + 4 * (get(place, OPEN) - 1), np.uint64(row))
+                    put(place, OPEN, np.int64(0))
+                    put(place, DEPTH, get(place, DEPTH) - 1)
         i, j = next_i, next_j
     return np.int64(0)

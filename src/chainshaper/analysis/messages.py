@@ -15,25 +15,20 @@ of ROS 2 show different halves of that:
   before a ring buffer's enqueue on the same thread, the take is the dequeue of the same place in
   the same buffer.
 
-Publications and takes under handles that were never initialised are left out
-(:mod:`~chainshaper.analysis.objects`).
+Publishing and leaving are two things where a thread of its own sends for the executor: the
+`rmw_publish` of an asynchronous publisher is recorded when the message is handed over;
+`asynchronous_send` says when, and whether, it was sent. A gate's decision about a message
+(`gate_release`) is found by its callback and the message's source timestamp.
 """
 
 import polars as pl
 
-from chainshaper.analysis.matching import (
-    by_number,
-    first_after,
-    grows,
-    in_order,
-    latest_before,
-)
+from chainshaper.analysis.matching import by_number, first_after, grows, in_order, latest_before
 from chainshaper.analysis.objects import Objects
 from chainshaper.values import events
 
-__all__ = ["link_takes", "overwritten_in", "publications", "takes"]
-
 _PUBLISHER = ["publisher", "node", "topic"]
+_NO_TIME = pl.lit(None, dtype=pl.Int64)
 
 
 def publications(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
@@ -47,23 +42,18 @@ def publications(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     written = _written(tables, objects)
     handed = _handed_over(tables, objects)
     if not handed.height:
-        written = written.with_columns(intra_time=pl.lit(None, dtype=pl.Int64))
-        return in_order(written, "time", "pid", "tid").with_row_index("publication")
-    # One publish() may do both, ring buffers first: the next write by the same publisher on the
-    # same thread is the same message.
-    both = latest_before(
-        written.with_row_index("row"), handed, ["pid", "tid", "publisher"], "time", "intra_time"
-    )
-    first = both.drop_nulls("handed").group_by("handed").agg(pl.col("row").min())
-    both = both.join(first, on=["handed", "row"], how="left", maintain_order="left")
-    merged = both.join(first.select("row", is_first=pl.lit(True)), on="row", how="left")
-    merged = merged.with_columns(pl.when("is_first").then("intra_time").alias("intra_time"))
-    alone = handed.join(first, on="handed", how="anti")
-    columns = ["time", "pid", "tid", *_PUBLISHER, "source_timestamp", "intra_time"]
-    alone = alone.with_columns(
-        time=pl.col("intra_time"), source_timestamp=pl.lit(None, dtype=pl.Int64)
-    )
-    every = pl.concat([merged.select(columns), alone.select(columns)])
+        every = written.with_columns(intra_time=_NO_TIME)
+    else:
+        # One publish() may do both, ring buffers first: the next write by the same publisher on
+        # the same thread is the same message.
+        both = latest_before(written, handed, ["pid", "tid", "publisher"], "time", "intra_time")
+        first = pl.col("handed").is_first_distinct() & pl.col("handed").is_not_null()
+        both = both.with_columns(pl.when(first).then("intra_time"))
+        alone = handed.join(both.drop_nulls("intra_time"), on="handed", how="anti").with_columns(
+            time="intra_time", source_timestamp=_NO_TIME
+        )
+        columns = [*written.columns, "intra_time"]
+        every = pl.concat([both.select(columns), alone.select(columns)])
     return in_order(every, "time", "pid", "tid").with_row_index("publication")
 
 
@@ -73,73 +63,64 @@ def _written(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     by_rmw = objects.publishers.select(
         "pid", *_PUBLISHER, rmw_publisher_handle="rmw_handle", created="valid_from"
     )
-    by_rcl = objects.publishers.select(
-        "pid", *_PUBLISHER, publisher_handle="handle", created="valid_from"
-    )
-    named = writes.filter(pl.col("rmw_publisher_handle").is_not_null())
-    nameless = writes.filter(pl.col("rmw_publisher_handle").is_null())
-    found = [latest_before(named, by_rmw, ["pid", "rmw_publisher_handle"], "time", "created")]
-    if nameless.height:
-        nameless = _with_rcl_publisher(tables, nameless)
-        found.append(
-            latest_before(nameless, by_rcl, ["pid", "publisher_handle"], "time", "created")
-        )
+    nameless = pl.col("rmw_publisher_handle").is_null()
+    known = writes.filter(~nameless)
+    found = [latest_before(known, by_rmw, ["pid", "rmw_publisher_handle"], "time", "created")]
+    if known.height < writes.height:
+        # The publisher is that of the rcl_publish of the same message just before. Addresses of
+        # messages repeat, so a rcl_publish counts for the first write after it only.
+        message = ["pid", "tid", "message"]
+        published = events.table(tables, "rcl_publish").with_row_index("rcl")
+        published = published.select(*message, "rcl", "publisher_handle", published="time")
+        rows = latest_before(writes.filter(nameless), published, message, "time", "published")
+        again = pl.col("rcl") == pl.col("rcl").shift(1).over(message)
+        rows = rows.with_columns(pl.when(~again.fill_null(False)).then("publisher_handle"))
+        by_rcl = _by_rcl_handle(objects)
+        found.append(latest_before(rows, by_rcl, ["pid", "publisher_handle"], "time", "created"))
     columns = ["time", "pid", "tid", *_PUBLISHER, "source_timestamp"]
     every = pl.concat([frame.select(columns) for frame in found])
     return every.drop_nulls("publisher") if every["publisher"].null_count() else every
 
 
+def _by_rcl_handle(objects: Objects) -> pl.DataFrame:
+    return objects.publishers.select(
+        "pid", *_PUBLISHER, publisher_handle="handle", created="valid_from"
+    )
+
+
 def _writes(tables: events.EventTables) -> pl.DataFrame:
     """The event that stands for writing to DDS in this recording, with what it says."""
-    no_handle = pl.lit(None, dtype=pl.UInt64).alias("rmw_publisher_handle")
-    for name in ("rmw_publish", "dds_write", "rcl_publish"):
-        writes = events.table(tables, name)
-        if writes.height:
-            break
+    names = ("rmw_publish", "dds_write", "rcl_publish")
+    name = next((name for name in names if events.table(tables, name).height), names[-1])
     if name == "rmw_publish":
         writes = events.table(tables, name, ["rmw_publisher_handle", "timestamp"])
         stamp = pl.when(pl.col("timestamp") > 0).then("timestamp")  # 0: not supported by the RMW
-        writes = writes.with_columns(stamp.alias("source_timestamp"))
+        writes = writes.with_columns(source_timestamp=stamp)
     else:
-        unknown = pl.lit(None, dtype=pl.Int64).alias("source_timestamp")
-        writes = writes.with_columns(unknown, no_handle)
+        no_handle = pl.lit(None, dtype=pl.UInt64)
+        writes = events.table(tables, name).with_columns(
+            source_timestamp=_NO_TIME, rmw_publisher_handle=no_handle
+        )
     bound = events.table(tables, "dds_bind_addr_to_stamp")
     if bound.height:
+        message = ["pid", "tid", "message"]
         bound = bound.select("pid", "tid", "source_stamp", message="addr", bound="time")
-        writes = first_after(writes, bound, ["pid", "tid", "message"], "time", "bound")
+        writes = first_after(writes, bound, message, "time", "bound")
         # A later write of the same address has a better claim to the stamp after it.
-        mine = pl.col("bound") == pl.col("bound").shift(-1).over("pid", "tid", "message")
-        stamp = pl.when(~mine.fill_null(False)).then("source_stamp")
+        other = pl.col("bound") == pl.col("bound").shift(-1).over(message)
+        stamp = pl.when(~other.fill_null(False)).then("source_stamp")
         writes = writes.with_columns(pl.coalesce("source_timestamp", stamp))
     return writes.select(
         "time", "pid", "tid", "message", "rmw_publisher_handle", "source_timestamp"
     )
 
 
-def _with_rcl_publisher(tables: events.EventTables, writes: pl.DataFrame) -> pl.DataFrame:
-    """Add ``publisher_handle`` of the `rcl_publish` of the same message just before each write.
-
-    Addresses of messages repeat, so a `rcl_publish` counts for the first write after it only.
-    """
-    published = (
-        events.table(tables, "rcl_publish")
-        .select("pid", "tid", "message", "publisher_handle", published="time")
-        .with_row_index("rcl")
-    )
-    found = latest_before(writes, published, ["pid", "tid", "message"], "time", "published")
-    again = pl.col("rcl") == pl.col("rcl").shift(1).over("pid", "tid", "message")
-    own = ~again.fill_null(False)
-    return found.with_columns(pl.when(own).then("publisher_handle").alias("publisher_handle"))
-
-
 def _handed_over(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     """Messages given to ring buffers: ``handed, intra_time, pid, tid, publisher, node, topic``."""
-    by_rcl = objects.publishers.select(
-        "pid", *_PUBLISHER, publisher_handle="handle", created="valid_from"
-    )
     handed = events.table(tables, "rclcpp_intra_publish").select(
         "pid", "tid", "publisher_handle", intra_time="time"
     )
+    by_rcl = _by_rcl_handle(objects)
     found = latest_before(handed, by_rcl, ["pid", "publisher_handle"], "intra_time", "created")
     found = found.drop_nulls("publisher").with_row_index("handed")
     return found.select("handed", "intra_time", "pid", "tid", *_PUBLISHER)
@@ -153,81 +134,46 @@ def takes(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     and for those the ``buffer`` and ``index`` the message lay in. A take that found nothing
     (``taken`` = 0) carries no message and is left out.
     """
-    owner = objects.callbacks.drop_nulls("subscription").select("subscription", "callback_id")
-    owner = owner.unique("subscription", maintain_order=True)
-    subscriptions = objects.subscriptions.join(owner, on="subscription", how="left").select(
-        "pid", "callback_id", "node", "topic", "rmw_handle", created="valid_from"
-    )
+    types = {name: objects.subscriptions.schema[name] for name in ("node", "topic")}
+    callbacks = objects.callbacks.cast(types)  # type: ignore[arg-type]
+    owner = callbacks.drop_nulls("subscription").unique("subscription", maintain_order=True)
+    subscriptions = objects.subscriptions.join(
+        owner.select("subscription", "callback_id"), on="subscription", how="left"
+    ).with_columns(created="valid_from", rmw_subscription_handle="rmw_handle")
+    columns = ["callback_id", "node", "topic"]
     taken = events.table(tables, "rmw_take", ["taken"])
     if (taken["taken"] == 0).any():
         taken = taken.filter(pl.col("taken").fill_null(1) != 0)
-    from_dds = latest_before(
-        taken.rename({"rmw_subscription_handle": "rmw_handle"}),
-        subscriptions,
-        ["pid", "rmw_handle"],
-        "time",
-        "created",
-    )
-    parts = [from_dds.drop_nulls("topic") if from_dds["topic"].null_count() else from_dds]
+    key = ["pid", "rmw_subscription_handle"]
+    from_dds = subscriptions.select(*key, *columns, "created")
+    parts = [latest_before(taken, from_dds, key, "time", "created")]
     if taken.is_empty():
-        parts.append(_dispatched(tables, objects))
-    parts.append(_dequeued(tables, objects))
-    parts = [part for part in parts if part.height] or parts[:1]
-    every = pl.concat(
-        [
-            part.select(
-                "time",
-                "pid",
-                "tid",
-                "callback_id",
-                "node",
-                "topic",
-                pl.when(pl.col("source_timestamp") > 0).then("source_timestamp"),
-                *(
-                    pl.col(name) if name in part.columns else pl.lit(None, pl.UInt64).alias(name)
-                    for name in ("buffer", "index")
-                ),
-            )
-            for part in parts
-        ]
-    )
-    every = in_order(every, "time", "pid", "tid").with_row_index("take")
-    return every.with_columns(pl.col("buffer").is_not_null().alias("intra_process"))
-
-
-def _dispatched(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
-    owners = _with_enums(objects.callbacks, objects).select(
-        "pid", "callback_id", "node", "topic", callback="handle", created="valid_from"
-    )
-    dispatched = events.table(tables, "dispatch_subscription_callback").rename(
-        {"source_stamp": "source_timestamp"}
-    )
-    found = latest_before(dispatched, owners, ["pid", "callback"], "time", "created")
-    return found.drop_nulls("topic")
-
-
-def _with_enums(callbacks: pl.DataFrame, objects: Objects) -> pl.DataFrame:
-    types = objects.subscriptions.schema
-    return callbacks.with_columns(pl.col(name).cast(types[name]) for name in ("node", "topic"))
-
-
-def _dequeued(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
-    owner = objects.callbacks.unique("callback_id", maintain_order=True)
-    owner = _with_enums(owner, objects).select("callback_id", "node", "topic")
-    buffers = objects.buffers.rename({"valid_from": "created"})
+        owners = callbacks.select("pid", *columns, callback="handle", created="valid_from")
+        dispatched = events.table(tables, "dispatch_subscription_callback")
+        dispatched = dispatched.rename({"source_stamp": "source_timestamp"})
+        parts.append(latest_before(dispatched, owners, ["pid", "callback"], "time", "created"))
+    owners = callbacks.unique("callback_id", maintain_order=True).select(columns)
+    buffers = objects.buffers.join(owners, on="callback_id", how="left")
     dequeued = events.table(tables, "rclcpp_ring_buffer_dequeue")
-    found = latest_before(dequeued, buffers, ["pid", "buffer"], "time", "created")
-    found = found.drop_nulls("callback_id").join(
-        owner, on="callback_id", how="left", maintain_order="left"
-    )
-    return found.with_columns(source_timestamp=pl.lit(None, dtype=pl.Int64))
+    dequeued = latest_before(dequeued, buffers, ["pid", "buffer"], "time", "valid_from")
+    parts.append(dequeued.drop_nulls("callback_id").with_columns(source_timestamp=_NO_TIME))
+    nowhere = pl.lit(None, dtype=pl.UInt64)
+    parts = [
+        part.select(
+            *("time", "pid", "tid", *columns),
+            pl.when(pl.col("source_timestamp") > 0).then("source_timestamp"),
+            *(pl.col(n) if n in part.columns else nowhere.alias(n) for n in ("buffer", "index")),
+        )
+        for part in parts
+    ]
+    every = pl.concat([part for part in parts if part.height] or parts[:1])
+    every = every.drop_nulls("topic") if every["topic"].null_count() else every
+    every = in_order(every, "time", "pid", "tid").with_row_index("take")
+    return every.with_columns(intra_process=pl.col("buffer").is_not_null())
 
 
 def link_takes(
-    tables: events.EventTables,
-    taken: pl.DataFrame,
-    published: pl.DataFrame,
-    clock_offset_ns: int,
+    tables: events.EventTables, taken: pl.DataFrame, published: pl.DataFrame, clock_offset_ns: int
 ) -> pl.DataFrame:
     """``taken`` with a column ``publication``: which publication each take read (null: unknown).
 
@@ -236,19 +182,22 @@ def link_takes(
     """
     found = _with_same_stamp(taken, published)
     linked = taken.with_columns(by_number(found, "take", "publication", taken.height))
-    stampless = published.filter(
-        pl.col("source_timestamp").is_null()
-        & (pl.col("intra_time").is_null() | (pl.col("time") > pl.col("intra_time")))
-    ).select("topic", guess="publication", published="time")
+    columns = linked.columns
+    through_buffer = pl.col("intra_time").is_not_null() & (pl.col("time") <= pl.col("intra_time"))
+    stampless = published.filter(pl.col("source_timestamp").is_null() & ~through_buffer)
     if stampless.height:
+        stampless = stampless.select("topic", guess="publication", published="time")
         rows = linked.with_columns(sent=pl.col("source_timestamp") - clock_offset_ns)
         rows = latest_before(rows, stampless, ["topic"], "sent", "published")
         # A subscription gets a message once: a second take of it read one whose events were lost.
         again = pl.col("guess") == pl.col("guess").shift(1).over("pid", "node", "callback_id")
         guess = pl.when(~again.fill_null(False)).then("guess")
-        linked = rows.with_columns(pl.coalesce("publication", guess)).sort("take")
-        linked = linked.select([*taken.columns, "publication"])
-    return _link_through_buffers(tables, linked, published)
+        linked = rows.with_columns(pl.coalesce("publication", guess)).sort("take").select(columns)
+    if taken["intra_process"].any():
+        stored = _enqueued(tables, published)
+        rows = latest_before(linked, stored, ["pid", "buffer", "index"], "time", "enqueued")
+        linked = rows.with_columns(pl.coalesce("publication", "stored")).sort("take")
+    return linked.select(columns)
 
 
 def _with_same_stamp(taken: pl.DataFrame, published: pl.DataFrame) -> pl.DataFrame:
@@ -259,27 +208,13 @@ def _with_same_stamp(taken: pl.DataFrame, published: pl.DataFrame) -> pl.DataFra
     """
     stamp = "source_timestamp"
     wanted = taken.select("topic", stamp, "take")
-    if wanted[stamp].null_count():
-        wanted = wanted.drop_nulls(stamp)
+    wanted = wanted.drop_nulls(stamp) if wanted[stamp].null_count() else wanted
     stamped = published.select("topic", "publication", stamped=stamp)
-    if stamped["stamped"].null_count():
-        stamped = stamped.drop_nulls("stamped")
+    stamped = stamped.drop_nulls("stamped") if stamped["stamped"].null_count() else stamped
     if not grows(stamped["stamped"]):  # among equals the first comes last
         stamped = stamped.reverse().sort("stamped", maintain_order=True)
     found = latest_before(wanted, stamped, ["topic"], stamp, "stamped")
     return found.filter(pl.col(stamp) == pl.col("stamped")).select("take", "publication")
-
-
-def _link_through_buffers(
-    tables: events.EventTables, taken: pl.DataFrame, published: pl.DataFrame
-) -> pl.DataFrame:
-    if not taken["intra_process"].any():
-        return taken
-    stored = _enqueued(tables, published)
-    found = latest_before(taken, stored, ["pid", "buffer", "index"], "time", "enqueued")
-    return (
-        found.with_columns(pl.coalesce("publication", "stored")).sort("take").select(taken.columns)
-    )
 
 
 def _enqueued(tables: events.EventTables, published: pl.DataFrame) -> pl.DataFrame:
@@ -292,29 +227,116 @@ def _enqueued(tables: events.EventTables, published: pl.DataFrame) -> pl.DataFra
         "pid", "tid", "intra_time", stored="publication"
     )
     put = events.table(tables, "rclcpp_ring_buffer_enqueue", ["overwritten"]).select(
-        "pid", "tid", "buffer", "index", "overwritten", enqueued="time"
+        *("pid", "tid", "buffer", "index"),
+        enqueued="time",
+        overwrites=pl.col("overwritten").fill_null(0) != 0,
     )
-    found = latest_before(put, handed, ["pid", "tid"], "enqueued", "intra_time")
-    return found.select(
-        "pid",
-        "buffer",
-        "index",
-        "enqueued",
-        "stored",
-        pl.col("overwritten").fill_null(0).ne(0).alias("overwrites"),
-    )
+    return latest_before(put, handed, ["pid", "tid"], "enqueued", "intra_time")
 
 
 def overwritten_in(
     tables: events.EventTables, published: pl.DataFrame, buffers: pl.DataFrame, callback_id: int
 ) -> pl.Series:
     """Publications that were overwritten in the ring buffers of one subscription's callback."""
-    stored = latest_before(
-        _enqueued(tables, published),
-        buffers.rename({"valid_from": "created"}),
-        ["pid", "buffer"],
-        "enqueued",
-        "created",
-    ).filter(pl.col("callback_id") == callback_id)
+    stored = _enqueued(tables, published)
+    stored = latest_before(stored, buffers, ["pid", "buffer"], "enqueued", "valid_from")
+    stored = stored.filter(pl.col("callback_id") == callback_id)
     next_overwrites = pl.col("overwrites").shift(-1).over("pid", "buffer", "index")
     return stored.filter(next_overwrites.fill_null(False))["stored"].drop_nulls()
+
+
+def with_departures(
+    published: pl.DataFrame, tables: events.EventTables, objects: Objects
+) -> pl.DataFrame:
+    """``published`` with a column ``sent``: when each message left (null: it never did)."""
+    created = events.table(tables, "rcl_publisher_init", ["asynchronous"])
+    created = created.filter(pl.col("asynchronous").fill_null(0) != 0)
+    if not created.height:
+        return published.with_columns(sent=pl.col("time"))
+    asynchronous = objects.publishers.join(
+        created.select("pid", rmw_handle="rmw_publisher_handle"), on=["pid", "rmw_handle"]
+    )
+    ours = published["publisher"].is_in(asynchronous["publisher"].implode())
+    sent = _sends(published, tables, objects).filter(pl.col("outcome") == "sent")
+    left = by_number(sent, "publication", "time", published.height)
+    return published.with_columns(sent=pl.when(ours).then(left).otherwise("time"))
+
+
+def why_not_sent(
+    published: pl.DataFrame, tables: events.EventTables, objects: Objects
+) -> pl.Series:
+    """Per publication the reason why it was not sent; only of use for those without ``sent``."""
+    sends = _sends(published, tables, objects).with_columns(reason=pl.lit("discarded"))
+    return by_number(sends, "publication", "reason", published.height).fill_null("not sent")
+
+
+def _sends(published: pl.DataFrame, tables: events.EventTables, objects: Objects) -> pl.DataFrame:
+    """``publication, time, outcome`` of what publisher threads dealt with."""
+    publishers = objects.publishers.select("pid", "publisher", rmw_publisher_handle="rmw_handle")
+    sends = events.table(tables, "asynchronous_send").rename({"timestamp": "source_timestamp"})
+    sends = sends.join(publishers, on=["pid", "rmw_publisher_handle"])
+    stamped = published.select("publication", "publisher", "source_timestamp")
+    return sends.join(stamped, on=["publisher", "source_timestamp"])
+
+
+def discarded_instances(
+    taken: pl.DataFrame, tables: events.EventTables, objects: Objects, instances: int
+) -> pl.Series:
+    """Per callback instance whether it was a gate's that discarded its message (else null)."""
+    key = ["callback_id", "source_timestamp"]
+    discarded = gate_decisions(tables, objects).filter(pl.col("release").is_null())
+    found = taken.drop_nulls("instance").join(discarded, on=key, how="semi")
+    found = found.with_columns(discarded=pl.lit(True))
+    return by_number(found, "instance", "discarded", instances)
+
+
+def gate_decisions(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
+    """The table `gate_release` with the ``callback_id`` of each gate.
+
+    A shaping node in ROS 2 does not know its callback's handle. A decision of its is there once for
+    each subscription of its process; which one took the message, the source timestamp tells.
+    """
+    decisions = events.table(tables, "gate_release", ["mode"])
+    key = ["pid", "callback"]
+    callbacks = objects.callbacks.with_columns(callback="handle")
+    handles = callbacks.select(*key, "callback_id").unique()
+    known = decisions.join(handles, on=key, maintain_order="left")
+    nameless = decisions.join(handles, on=key, how="anti", maintain_order="left")
+    if not nameless.height:
+        return known
+    listening = callbacks.filter(pl.col("kind") == "subscription").select("pid", "callback_id")
+    unknown = nameless.join(listening.unique(), on="pid", maintain_order="left")
+    return pl.concat([known, unknown.select(known.columns)])
+
+
+def with_overrun(decisions: pl.DataFrame, due_cycles: int = 0) -> pl.DataFrame:
+    """Decisions with the column ``overrun``, which older recordings lack.
+
+    Without it a message overran when it left in a later cycle than ``due_cycles`` after its own.
+    """
+    if "overrun" in decisions.columns:
+        return decisions
+    late = pl.col("cycles_waited") > due_cycles
+    return decisions.with_columns(overrun=pl.when(late).then(pl.lit("wait")))
+
+
+def gated_hops(
+    tables: events.EventTables, objects: Objects, hops: pl.DataFrame, due_cycles: int = 0
+) -> pl.DataFrame:
+    """What gates decided about the messages of a chain: one row per hop whose callback is a gate.
+
+    ``traversal, hop, arrival, origin, release, let_go, slot, cycles_waited, anchor, overrun, mode``
+    of `gate_release`, sorted; ``let_go`` is when it really did. Several messages may have the same
+    source timestamp (writers stamp in microseconds, a simulated clock stands still): then the
+    decision is meant whose ``arrival`` is nearest to the start of the callback.
+    """
+    key = ["callback_id", "source_timestamp"]
+    decided = with_overrun(gate_decisions(tables, objects), due_cycles).with_columns(let_go="time")
+    reached = hops.select("traversal", "hop", "start", *key).drop_nulls(key)
+    found = reached.join(decided, on=key)
+    apart = (pl.col("arrival") - pl.col("start")).abs()
+    found = found.sort("traversal", "hop", apart, maintain_order=True)
+    return found.unique(["traversal", "hop"], keep="first", maintain_order=True).select(
+        *("traversal", "hop", "arrival", "origin", "release", "let_go", "slot"),
+        *("cycles_waited", "anchor", "overrun", "mode"),
+    )

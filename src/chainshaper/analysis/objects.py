@@ -2,17 +2,9 @@
 
 Events name objects by handles: addresses that are unique only within one process, and only until
 they are freed. So a handle is looked up as (process, handle, time): the object created there last,
-at or before the event. A subscription that is destroyed and created again gets another address,
-one with intra-process communication has two at once: in a graph and in statistics each is one
-callback, with one ``callback_id`` (:func:`numbered`). Two timers of one node with the same period
-are two, however alike they look.
-
-Handles that were never initialised belong to no object: `ros_discovery_info` is published and
-taken under such (Cyclone DDS), as is everything that existed before tracing began. ``notes`` says
-in words what cannot be known because of that.
-
-Upstream: ros2_tracing, `tracetools/include/tracetools/tracetools.h`; the order of the events is
-that of rclcpp's constructors.
+at or before the event. Handles that were never initialised belong to no object:
+`ros_discovery_info` is published and taken under such (Cyclone DDS), as is everything that existed
+before tracing began. The order of the events is that of rclcpp's constructors (ros2_tracing).
 """
 
 from dataclasses import dataclass
@@ -21,14 +13,6 @@ import polars as pl
 
 from chainshaper.analysis.matching import first_after, latest_before, nearest
 from chainshaper.values import events
-
-__all__ = [
-    "CALLBACK_SCHEMA",
-    "Objects",
-    "named_nodes",
-    "numbered",
-    "resolve_objects",
-]
 
 CALLBACK_SCHEMA: dict[str, pl.DataType] = {
     "callback_id": pl.UInt32(),
@@ -51,16 +35,14 @@ class Objects:
     """The objects of a recording, one frame per kind; times are ns of the event clock.
 
     * ``nodes``: ``pid, handle, valid_from, node`` (name with namespace, ``/front/filter``).
-    * ``publishers``: ``publisher, pid, handle, rmw_handle, valid_from, node, topic``.
-    * ``subscriptions``: ``subscription, pid, handle, rmw_handle, valid_from, node, topic``.
-      In these two, and in everything joined from them, names are of type ``Enum``.
+    * ``publishers``: ``publisher, pid, handle, rmw_handle, valid_from, node, topic``, and
+      ``subscriptions`` likewise. In these two, and in everything joined from them, names are of
+      type ``Enum``: millions of rows carry them as numbers.
     * ``callbacks``: :data:`CALLBACK_SCHEMA`, one row per *registration*, the address
       (``pid, handle``) under which a callback ran from ``valid_from`` until that address was
-      registered again (``valid_to``, null: never). ``callback_id`` numbers callbacks from 0; one
-      that was recreated, or that also has an intra-process twin, has several registrations.
-      ``kind`` is timer, subscription, service, client or unknown, ``topic`` the topic or the
-      service's name. ``observed`` is false for what emits no callback events: subscriptions of
-      rclpy, whose instances are assumed from what they take and publish, and all clients.
+      registered again (``valid_to``, null: never). ``callback_id`` numbers callbacks from 0
+      (:func:`numbered`). ``topic`` is the topic or the service's name. ``observed`` is false for
+      what emits no callback events: subscriptions of rclpy, and all clients.
     * ``buffers``: ``pid, buffer, valid_from, callback_id``: intra-process ring buffers.
     * ``notes``: what cannot be known from this recording, in plain words.
     """
@@ -78,20 +60,23 @@ def resolve_objects(tables: events.EventTables) -> Objects:
     nodes = named_nodes(tables)
     publishers = _endpoints(tables, nodes, "publisher")
     subscriptions = _endpoints(tables, nodes, "subscription")
-    registered = pl.concat(
-        [
-            _subscription_callbacks(tables, subscriptions),
-            _timer_callbacks(tables, nodes),
-            _service_callbacks(tables, nodes),
-        ],
-        how="diagonal_relaxed",
-    )
-    registered = _with_symbols(tables, registered)
-    strangers = _unregistered(tables, registered)
-    silent = [_callbackless(tables, subscriptions, registered), _client_callbacks(tables, nodes)]
-    callbacks = pl.concat([registered, strangers, *silent], how="diagonal_relaxed")
+    found = [
+        _subscription_callbacks(tables, subscriptions),
+        _timer_callbacks(tables, nodes),
+        _service_callbacks(tables, nodes),
+    ]
+    registered = _with_symbols(tables, pl.concat(found, how="diagonal_relaxed"))
+    others = [
+        _unregistered(tables, registered),
+        _callbackless(tables, subscriptions, registered),
+        _client_callbacks(tables, nodes),
+    ]
+    callbacks = pl.concat([registered, *others], how="diagonal_relaxed")
     callbacks = numbered(tables, callbacks)
-    names = _name_types(publishers, subscriptions, callbacks)
+    names = []
+    for column in ("node", "topic"):
+        known = [frame[column].cast(pl.String) for frame in (publishers, subscriptions, callbacks)]
+        names.append(pl.col(column).cast(pl.Enum(pl.concat(known).drop_nulls().unique().sort())))
     return Objects(
         nodes=nodes,
         publishers=publishers.with_columns(names),
@@ -102,27 +87,10 @@ def resolve_objects(tables: events.EventTables) -> Objects:
     )
 
 
-def _name_types(*owners: pl.DataFrame) -> list[pl.Expr]:
-    """Casts of node and topic to ``Enum``: millions of rows carry them as numbers, not as text."""
-    casts = []
-    for column in ("node", "topic"):
-        names = pl.concat([owner[column].cast(pl.String) for owner in owners])
-        casts.append(pl.col(column).cast(pl.Enum(names.drop_nulls().unique().sort())))
-    return casts
-
-
 def named_nodes(tables: events.EventTables) -> pl.DataFrame:
     """The frame ``nodes`` of :class:`Objects`."""
-    return (
-        events.table(tables, "rcl_node_init")
-        .select(
-            "pid",
-            pl.col("node_handle").alias("handle"),
-            pl.col("time").alias("valid_from"),
-            events.NODE_NAME.alias("node"),
-        )
-        .drop_nulls("handle")
-    )
+    created = events.table(tables, "rcl_node_init").drop_nulls("node_handle")
+    return created.select("pid", handle="node_handle", valid_from="time", node=events.NODE_NAME)
 
 
 def _with_node(objects: pl.DataFrame, nodes: pl.DataFrame, at: str) -> pl.DataFrame:
@@ -133,27 +101,27 @@ def _with_node(objects: pl.DataFrame, nodes: pl.DataFrame, at: str) -> pl.DataFr
     """
     of_node = nodes.select("pid", "node", node_handle="handle", node_from="valid_from")
     found = latest_before(objects, of_node, ["pid", "node_handle"], at, "node_from")
-    later = first_after(
-        found.drop("node", "node_from"), of_node, ["pid", "node_handle"], at, "node_from"
-    )
-    return found.with_columns(pl.col("node").fill_null(later["node"])).drop("node_from")
+    later = first_after(objects, of_node, ["pid", "node_handle"], at, "node_from")
+    return found.with_columns(pl.col("node").fill_null(later["node"]))
 
 
 def _endpoints(tables: events.EventTables, nodes: pl.DataFrame, kind: str) -> pl.DataFrame:
-    created = (
-        events.table(tables, f"rcl_{kind}_init")
-        .select(
-            "pid",
-            "node_handle",
-            pl.col(f"{kind}_handle").alias("handle"),
-            pl.col(f"rmw_{kind}_handle").alias("rmw_handle"),
-            pl.col("time").alias("valid_from"),
-            pl.col("topic_name").alias("topic"),
-        )
-        .with_row_index(kind)
+    created = events.table(tables, f"rcl_{kind}_init").select(
+        "pid",
+        "node_handle",
+        handle=f"{kind}_handle",
+        rmw_handle=f"rmw_{kind}_handle",
+        valid_from="time",
+        topic="topic_name",
     )
     columns = [kind, "pid", "handle", "rmw_handle", "valid_from", "node", "topic"]
-    return _with_node(created, nodes, "valid_from").select(columns)
+    return _with_node(created.with_row_index(kind), nodes, "valid_from").select(columns)
+
+
+def _added(tables: events.EventTables, kind: str, owner: str) -> pl.DataFrame:
+    """Callbacks that were given to objects of a kind: ``pid, handle, valid_from`` and the owner."""
+    added = events.table(tables, f"rclcpp_{kind}_callback_added")
+    return added.select("pid", owner, handle="callback", valid_from="time")
 
 
 def _subscription_callbacks(
@@ -164,19 +132,18 @@ def _subscription_callbacks(
     The object is matched to the nearest `rclcpp_subscription_init`: for an intra-process twin
     that event comes just after `callback_added`, for all others just before.
     """
-    added = events.table(tables, "rclcpp_subscription_callback_added").select(
-        "pid", "subscription", pl.col("callback").alias("handle"), valid_from="time"
-    )
     objects = events.table(tables, "rclcpp_subscription_init").select(
-        "pid", "subscription", "subscription_handle", created="time"
+        "pid", "subscription", rcl_handle="subscription_handle", created="time"
     )
+    added = _added(tables, "subscription", "subscription")
     joined = nearest(added, objects, ["pid", "subscription"], "valid_from", "created")
-    joined = joined.drop("subscription").rename({"subscription_handle": "rcl_handle"})
     rcl = subscriptions.select(
         "pid", "subscription", "node", "topic", rcl_handle="handle", rcl_from="valid_from"
     )
     # Both constructors ran after rcl_subscription_init; without `created` there is no rcl handle.
-    joined = joined.with_columns(pl.max_horizontal("created", "valid_from").alias("known"))
+    joined = joined.drop("subscription").with_columns(
+        known=pl.max_horizontal("created", "valid_from")
+    )
     joined = latest_before(joined, rcl, ["pid", "rcl_handle"], "known", "rcl_from")
     return joined.select(
         "pid", "handle", "valid_from", "node", "topic", "subscription", kind=pl.lit("subscription")
@@ -185,40 +152,33 @@ def _subscription_callbacks(
 
 def _timer_callbacks(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
     """Callback ← timer (its period before, its node after `rclcpp_timer_callback_added`)."""
-    added = events.table(tables, "rclcpp_timer_callback_added").select(
-        "pid", "timer_handle", pl.col("callback").alias("handle"), valid_from="time"
-    )
+    timer = ["pid", "timer_handle"]
     created = events.table(tables, "rcl_timer_init").select(
-        "pid", "timer_handle", pl.col("period").alias("period_ns"), created="time"
+        *timer, period_ns="period", created="time"
     )
     linked = events.table(tables, "rclcpp_timer_link_node").select(
-        "pid", "timer_handle", "node_handle", linked="time"
+        *timer, "node_handle", linked="time"
     )
-    joined = latest_before(added, created, ["pid", "timer_handle"], "valid_from", "created")
-    joined = first_after(joined, linked, ["pid", "timer_handle"], "valid_from", "linked")
+    added = _added(tables, "timer", "timer_handle")
+    joined = latest_before(added, created, timer, "valid_from", "created")
+    joined = first_after(joined, linked, timer, "valid_from", "linked")
     # `joined` is sorted by valid_from: a link made after the address was used again is another's.
-    next_use = pl.col("valid_from").shift(-1).over("pid", "timer_handle")
+    next_use = pl.col("valid_from").shift(-1).over(timer)
     own = next_use.is_null() | (pl.col("linked") < next_use)
     joined = joined.with_columns(
-        pl.when(own).then("node_handle").alias("node_handle"),
-        pl.max_horizontal("linked", "valid_from").alias("at"),
+        pl.when(own).then("node_handle"), at=pl.max_horizontal("linked", "valid_from")
     )
     joined = _with_node(joined, nodes, "at")
     return joined.select("pid", "handle", "valid_from", "node", "period_ns", kind=pl.lit("timer"))
 
 
 def _service_callbacks(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
-    added = events.table(tables, "rclcpp_service_callback_added").select(
-        "pid", "service_handle", pl.col("callback").alias("handle"), valid_from="time"
-    )
+    service = ["pid", "service_handle"]
     created = events.table(tables, "rcl_service_init").select(
-        "pid",
-        "service_handle",
-        "node_handle",
-        pl.col("service_name").alias("topic"),
-        created="time",
+        *service, "node_handle", topic="service_name", created="time"
     )
-    joined = latest_before(added, created, ["pid", "service_handle"], "valid_from", "created")
+    added = _added(tables, "service", "service_handle")
+    joined = latest_before(added, created, service, "valid_from", "created")
     joined = _with_node(joined, nodes, "valid_from")
     return joined.select("pid", "handle", "valid_from", "node", "topic", kind=pl.lit("service"))
 
@@ -226,20 +186,10 @@ def _service_callbacks(tables: events.EventTables, nodes: pl.DataFrame) -> pl.Da
 def _client_callbacks(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
     """Clients of services: they exist, but no version of rclcpp says when their callback runs."""
     created = events.table(tables, "rcl_client_init").select(
-        "pid",
-        "node_handle",
-        pl.col("client_handle").alias("handle"),
-        pl.col("time").alias("valid_from"),
-        pl.col("service_name").alias("topic"),
+        "pid", "node_handle", handle="client_handle", valid_from="time", topic="service_name"
     )
-    joined = _with_node(created, nodes, "valid_from")
-    return joined.select(
-        "pid",
-        "handle",
-        "valid_from",
-        "node",
-        "topic",
-        valid_to=pl.lit(None, dtype=pl.Int64),
+    return _with_node(created, nodes, "valid_from").select(
+        *("pid", "handle", "valid_from", "node", "topic"),
         kind=pl.lit("client"),
         observed=pl.lit(False),
     )
@@ -248,11 +198,10 @@ def _client_callbacks(tables: events.EventTables, nodes: pl.DataFrame) -> pl.Dat
 def _with_symbols(tables: events.EventTables, registered: pl.DataFrame) -> pl.DataFrame:
     """Add ``valid_to``, ``observed`` and the ``symbol`` registered while the handle was valid."""
     registered = registered.sort("valid_from", maintain_order=True).with_columns(
-        pl.col("valid_from").shift(-1).over("pid", "handle").alias("valid_to"),
-        observed=pl.lit(True),
+        valid_to=pl.col("valid_from").shift(-1).over("pid", "handle"), observed=pl.lit(True)
     )
     symbols = events.table(tables, "rclcpp_callback_register").select(
-        "pid", "symbol", pl.col("callback").alias("handle"), named="time"
+        "pid", "symbol", handle="callback", named="time"
     )
     joined = first_after(registered, symbols, ["pid", "handle"], "valid_from", "named")
     in_time = pl.col("valid_to").is_null() | (pl.col("named") < pl.col("valid_to"))
@@ -261,22 +210,20 @@ def _with_symbols(tables: events.EventTables, registered: pl.DataFrame) -> pl.Da
 
 def _unregistered(tables: events.EventTables, registered: pl.DataFrame) -> pl.DataFrame:
     """Callbacks that ran before (or without) a registration: tracing started after them."""
-    known = registered.group_by("pid", "handle").agg(pl.col("valid_from").min().alias("known"))
-    started = (
-        events.table(tables, "callback_start")
-        .lazy()
-        .select("pid", "time", pl.col("callback").alias("handle"))
-    )
-    first = started.group_by("pid", "handle").agg(pl.col("time").min().alias("valid_from"))
-    joined = first.collect().join(known, on=["pid", "handle"], how="left")
-    early = joined.filter(pl.col("known").is_null() | (pl.col("valid_from") < pl.col("known")))
-    return early.sort("valid_from", "pid", "handle").select(
-        "pid",
-        "handle",
-        "valid_from",
-        valid_to="known",
-        kind=pl.lit("unknown"),
-        observed=pl.lit(True),
+    key = ["pid", "handle"]
+    known = registered.group_by(key).agg(valid_to=pl.col("valid_from").min())
+    started = events.table(tables, "callback_start").lazy().select("pid", "time", handle="callback")
+    first = started.group_by(key).agg(valid_from=pl.col("time").min()).collect()
+    first = first.join(known, on=key, how="left")
+    early = pl.col("valid_to").is_null() | (pl.col("valid_from") < pl.col("valid_to"))
+    return (
+        first.filter(early)
+        .sort("valid_from", *key)
+        .select(
+            *("pid", "handle", "valid_from", "valid_to"),
+            kind=pl.lit("unknown"),
+            observed=pl.lit(True),
+        )
     )
 
 
@@ -285,21 +232,10 @@ def _callbackless(
 ) -> pl.DataFrame:
     """Subscriptions that take messages but have no callback in the trace: rclpy, wait sets."""
     bare = subscriptions.join(registered.drop_nulls("subscription"), on="subscription", how="anti")
-    takes = (
-        events.table(tables, "rmw_take")
-        .lazy()
-        .select("pid", pl.col("rmw_subscription_handle").alias("rmw_handle"))
-        .unique()
-        .collect()
-    )
-    return bare.join(takes, on=["pid", "rmw_handle"], how="semi").select(
-        "pid",
-        "handle",
-        "valid_from",
-        "node",
-        "topic",
-        "subscription",
-        valid_to=pl.lit(None, dtype=pl.Int64),
+    takes = events.table(tables, "rmw_take").lazy()
+    takes = takes.select("pid", rmw_handle="rmw_subscription_handle").unique()
+    return bare.join(takes.collect(), on=["pid", "rmw_handle"], how="semi").select(
+        *("pid", "handle", "valid_from", "node", "topic", "subscription"),
         kind=pl.lit("subscription"),
         observed=pl.lit(False),
     )
@@ -313,19 +249,12 @@ def _buffers(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFram
     owners = events.table(tables, "rclcpp_ipb_to_subscription").select(
         "pid", "ipb", "subscription", owned="time"
     )
-    added = events.table(tables, "rclcpp_subscription_callback_added").select(
-        "pid", "subscription", pl.col("callback").alias("handle"), added="time"
-    )
-    joined = first_after(buffers, owners, ["pid", "ipb"], "valid_from", "owned")
-    joined = nearest(
-        joined.drop_nulls("owned"), added, ["pid", "subscription"], "owned", "added"
-    ).drop_nulls("added")
+    added = _added(tables, "subscription", "subscription").rename({"valid_from": "added"})
     ids = callbacks.select("pid", "handle", "callback_id", registered="valid_from")
+    owned = first_after(buffers, owners, ["pid", "ipb"], "valid_from", "owned").drop_nulls("owned")
+    joined = nearest(owned, added, ["pid", "subscription"], "owned", "added").drop_nulls("added")
     joined = latest_before(joined, ids, ["pid", "handle"], "added", "registered")
     return joined.select("pid", "buffer", "valid_from", "callback_id").sort("valid_from")
-
-
-_CREATION = ("rcl_node_init", "rcl_publisher_init", "rcl_subscription_init")
 
 
 def _notes(tables: events.EventTables, callbacks: pl.DataFrame) -> tuple[str, ...]:
@@ -338,22 +267,27 @@ def _notes(tables: events.EventTables, callbacks: pl.DataFrame) -> tuple[str, ..
             "tracing started after the application, or their events were lost; their node, kind "
             "and topic cannot be known. Start tracing first to see them."
         )
-    created = {name: events.table(tables, name).height for name in _CREATION}
-    running = events.table(tables, "rmw_take").height + events.table(tables, "rmw_publish").height
-    if running and not (created["rcl_publisher_init"] or created["rcl_subscription_init"]):
-        notes.append(
-            "no publisher or subscription was created during the recording: the topics of "
-            "messages cannot be known, so no chain can be followed."
-        )
-    elif running and not created["rcl_node_init"]:
-        notes.append("no node was created during the recording: names of nodes cannot be known.")
+
+    def some(*names: str) -> bool:
+        return any(events.table(tables, name).height for name in names)
+
+    if some("rmw_take", "rmw_publish"):
+        if not some("rcl_publisher_init", "rcl_subscription_init"):
+            notes.append(
+                "no publisher or subscription was created during the recording: the topics of "
+                "messages cannot be known, so no chain can be followed."
+            )
+        elif not some("rcl_node_init"):
+            notes.append(
+                "no node was created during the recording: names of nodes cannot be known."
+            )
     silent = callbacks.filter(~pl.col("observed") & (pl.col("kind") == "subscription"))
-    for node, topic in silent.select("node", "topic").iter_rows():
-        notes.append(
-            f"{node} takes {topic} without callback events (a Python node, or a wait set): its "
-            "response times cannot be known; what its thread publishes until its next take is "
-            "counted as its output."
-        )
+    notes += [
+        f"{node} takes {topic} without callback events (a Python node, or a wait set): its "
+        "response times cannot be known; what its thread publishes until its next take is "
+        "counted as its output."
+        for node, topic in silent.select("node", "topic").iter_rows()
+    ]
     return tuple(notes)
 
 
@@ -370,26 +304,23 @@ def numbered(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFram
     )
     identity = ["pid", "kind", "node", "topic", "period_ns", "symbol"]
     last_start = _last_starts(tables, callbacks, identity)
-    latest: dict[tuple[object, ...], tuple[int, int]] = {}  # identity → (id, row) seen last
+    latest: dict[tuple[object, ...], tuple[int, int]] = {}  # identity → (id, time it was done)
     of_subscription: dict[int, int] = {}
     ids: list[int] = []
     count = 0
+    never = 1 << 63
     columns = [*identity, "subscription", "valid_from", "valid_to", "named"]
     for row, values in enumerate(callbacks.select(columns).iter_rows()):
-        *key, subscription, valid_from, _, named = values
-        found = of_subscription.get(subscription)
-        if found is None and named and tuple(key) in latest:
-            previous, at = latest[tuple(key)]
-            freed = callbacks["valid_to"][at]
-            ended = last_start.get(at)
-            if (freed is not None and freed <= valid_from) or (
-                ended is not None and ended < valid_from
-            ):
-                found = previous
-        number = count if found is None else found
-        count = max(count, number + 1)
+        *key, subscription, valid_from, valid_to, named = values
+        number = of_subscription.get(subscription)
+        if number is None and named:
+            previous, done = latest.get(tuple(key), (0, never))
+            number = previous if done <= valid_from else None
+        if number is None:
+            number, count = count, count + 1
         ids.append(number)
-        latest[tuple(key)] = (number, row)
+        freed = never if valid_to is None else valid_to
+        latest[tuple(key)] = number, min(freed, last_start.get(row, never) + 1)
         if subscription is not None:
             of_subscription.setdefault(subscription, number)
     return callbacks.drop("named").with_columns(pl.Series("callback_id", ids, dtype=pl.UInt32))
@@ -402,10 +333,9 @@ def _last_starts(
     alike = callbacks.with_row_index("row").filter(pl.len().over(identity) > 1)
     if alike.is_empty():
         return {}
-    handles = alike.select("pid", callback="handle").unique()
-    starts = events.table(tables, "callback_start").select("time", "pid", "callback")
-    starts = starts.join(handles, on=["pid", "callback"], how="semi")
     owner = alike.select("row", "valid_from", "pid", callback="handle")
+    starts = events.table(tables, "callback_start").select("time", "pid", "callback")
+    starts = starts.join(owner.select("pid", "callback"), on=["pid", "callback"], how="semi")
     found = latest_before(starts, owner, ["pid", "callback"], "time", "valid_from")
     last = found.drop_nulls("row").group_by("row").agg(pl.col("time").max())
     return dict(last.select("row", "time").iter_rows())

@@ -23,7 +23,7 @@ __all__ = ["examine_machine"]
 
 def examine_machine(watch_ns: int = 5_000_000_000) -> MachineReport:
     """Examine this machine; the stalls take ``watch_ns``."""
-    from chainshaper.workload.stall_watch import measure_stalls
+    from chainshaper.workload.stall_meter import measure_stalls
 
     realtime = may_use_fifo()
     stalls, meter = measure_stalls(available_cores(), watch_ns, realtime)

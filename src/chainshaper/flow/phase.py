@@ -2,16 +2,13 @@
 
 Servers' cycles must be anchored to the chain (DESIGN section 6): the slot of its server has to open
 just after its timer. The timer wakes the executor of the chain's first node, which the kernel
-counts: the third number of `/proc/PID/task/TID/schedstat` is how often a thread was put on a core
-(sched-stats.rst), the second for how long it was ready before that. The wake-ups that come once in
-every cycle at the same place are the timer's; of several such places the one after the longest rest
-is where the chain begins.
+counts: the third number of `/proc/PID/task/TID/schedstat` is how often a thread was put on a core,
+the second for how long it was ready before that. The wake-ups that come once in every cycle at the
+same place are the timer's; of several such places the one after the longest rest is the beginning.
 
-Outputs without a stamp (a `geometry_msgs/Twist`, say) are released by the cycle, whose beginning no
-message carries: shaping nodes in ROS 2 get it as a parameter. That takes ROS 2 a second or two, in
-a process of its own, as the user of the nodes' processes and in one's environment; as whom we may
-not run, in ours. Which participant answers under a node's name, DDS does not prove without its
-security plug-ins; two that do are noticed.
+Outputs without a stamp are released by the cycle, whose beginning no message carries: shaping nodes
+in ROS 2 get it as a parameter. That takes ROS 2 a second or two, in a process of its own, as the
+user of the nodes' processes and in one's environment; as whom we may not run, in ours.
 """
 
 import contextlib
@@ -39,14 +36,9 @@ if TYPE_CHECKING:
 
 POLL_NS = 250_000
 WATCHER_PRIORITY = 95
-TO_STOP_NS = 20_000
-"""Stopping and continuing a thread that waits for something wakes it for 5 to 7 us of its time; an
-executor that finds its timer expired needs tens."""
-
-SEEN_IN = 0.8
-"""A place counts when wake-ups come there in this share of the cycles."""
-_PATIENCE_S = 20
-"""ROS 2 has started and found the nodes by then, however busy the machine is, or never will."""
+TO_STOP_NS = 20_000  # stopping and continuing a thread takes 5 to 7 us of its time, a timer tens
+SEEN_IN = 0.8  # a place counts when wake-ups come there in this share of the cycles
+_PATIENCE_S = 20  # ROS 2 has found the nodes by then, however busy the machine is, or never will
 
 
 @dataclass(frozen=True)
@@ -97,10 +89,9 @@ def watch_wake_ups(
 ) -> npt.NDArray[np.int64]:
     """When a thread became ready to run, each time it did (ns of CLOCK_MONOTONIC).
 
-    A wake-up is known to lie between two looks, and the later of them is taken, minus the time that
-    the thread had to wait for its core. Those after which it ran for less than ``least_ns`` are
-    left out. ``rest_ns`` says at any time for how long not to look. Raises OperationError: the
-    thread has ended.
+    That is the later of two looks, minus the time that the thread waited for its core. Wake-ups
+    after which it ran for less than ``least_ns`` are left out. ``rest_ns`` says at any time for how
+    long not to look. Raises OperationError: the thread has ended.
     """
     # When it woke up (0: a rest begins, or the end), and how long it had run by then.
     found: list[tuple[int, int]] = []
@@ -142,8 +133,6 @@ def find_phase(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> P
 
     None when there is no place that has some in four of five cycles.
     """
-    if not len(wake_ups):
-        return None
     width = max(1, cycle_ns // 50)
     places = np.sort(wake_ups % cycle_ns)
     # A circle has no first place: the first two turns of it have every neighbour.
@@ -151,8 +140,7 @@ def find_phase(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> P
     best: Phase | None = None
     longest_rest = -1
     for number, place in enumerate(places):
-        last = int(np.searchsorted(turned, place + width, side="right"))
-        here = turned[number:last]
+        here = turned[number : int(np.searchsorted(turned, place + width, side="right"))]
         inside = (wake_ups - place) % cycle_ns <= width
         seen = len(np.unique((wake_ups[inside] - place) // cycle_ns))
         before = turned[number - 1 + len(places)] - cycle_ns
@@ -160,10 +148,8 @@ def find_phase(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> P
         if seen >= SEEN_IN * cycles and rest > longest_rest:
             longest_rest = rest
             # The first of each cycle: what follows it is the same thread going on.
-            firsts = here[: max(1, seen)]
-            at = int(np.median(firsts)) % cycle_ns
-            spread = int(np.percentile(firsts, 90) - np.percentile(firsts, 10))
-            best = Phase(at, spread, len(here), cycles)
+            low, at, high = np.percentile(here[: max(1, seen)], (10, 50, 90))
+            best = Phase(int(at) % cycle_ns, int(high - low), len(here), cycles)
     return best
 
 
@@ -185,22 +171,16 @@ def find_drift(
     if slots:
         places = (wake_ups - expected_ns) % cycle_ns
         wake_ups = wake_ups[np.any([(s <= places) & (places < e) for s, e in slots], axis=0)]
-    phase = find_phase(wake_ups, cycle_ns, cycles)
-    if phase is None:
-        return None
-    half = cycle_ns // 2
-    return (phase.at_ns - expected_ns + half) % cycle_ns - half
+    phase, half = find_phase(wake_ups, cycle_ns, cycles), cycle_ns // 2
+    return None if phase is None else (phase.at_ns - expected_ns + half) % cycle_ns - half
 
 
 class DriftWatch:
     """Looks every ten seconds, in a thread of its own, where a thread begins its cycles now.
 
-    ``latest_ns`` is how far that is from ``expected_ns`` (None: not seen yet). Held back by a
-    server, a thread begins with its slot; once its timer expires inside the slot, it begins so
-    much later, and that is the drift. Where nothing holds it, its beginning is seen to move.
-    Looking takes a tenth of a core: it is done on ``cores``, if there are any, since it would delay
-    what runs in slots, and only ``NEAR`` where the thread began last, since it would also delay
-    what is delivered. A thread that is not seen there any more is looked for in the whole cycle.
+    ``latest_ns`` is how far that is from ``expected_ns`` (None: not seen yet). Looking takes a
+    tenth of a core: it is done on ``cores``, if there are any, and only ``NEAR`` where the thread
+    began last. A thread that is not seen there any more is looked for in the whole cycle.
     """
 
     EVERY_S = 10.0
@@ -232,8 +212,7 @@ class DriftWatch:
                 time.sleep(self.EVERY_S)
                 drift = self._look(near_ns)
                 near_ns = None if drift is None else self._expected_ns + drift
-                if drift is not None:
-                    self.latest_ns = drift
+                self.latest_ns = self.latest_ns if drift is None else drift
 
     def _look(self, near_ns: int | None) -> int | None:
         """The drift, if the thread was seen; near where it was expected, None: anywhere."""
@@ -243,13 +222,11 @@ class DriftWatch:
             place = (now_ns - (near_ns or 0) + near) % cycle_ns
             return 0 if near_ns is None or place < 2 * near else cycle_ns - place
 
+        least_ns, cycles = TO_STOP_NS if self._slots else 0, self.CYCLES
         seen = watch_wake_ups(
-            *self._thread,
-            self.CYCLES * cycle_ns,
-            least_ns=TO_STOP_NS if self._slots else 0,
-            rest_ns=until_near,
+            *self._thread, cycles * cycle_ns, least_ns=least_ns, rest_ns=until_near
         )
-        return find_drift(seen, cycle_ns, self.CYCLES, self._expected_ns, self._slots)
+        return find_drift(seen, cycle_ns, cycles, self._expected_ns, self._slots)
 
 
 @contextlib.contextmanager
@@ -265,7 +242,7 @@ def _undisturbed() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Telling:
-    """Nodes that a process of ours is sending the phase, since ``begun`` (s of CLOCK_MONOTONIC).
+    """Nodes that get the phase by a script, since ``begun`` (s of CLOCK_MONOTONIC).
 
     ``script`` is None where no node is to get it, or it was ``refused``.
     """
@@ -300,17 +277,12 @@ NO_NODE = Telling((), None, 0.0)
 
 
 def tell_phase(plan: Plan, found: Allocation, phase_ns: int) -> Telling:
-    """Begin to set ``phase_ns`` of a plan's shaping nodes, as far as they are ROS 2's.
+    """Begin to give a plan's shaping nodes in ROS 2 where the chain begins in every cycle.
 
-    ``phase_ns`` is where the chain begins in every cycle, on CLOCK_MONOTONIC. The nodes of a chain
-    are in one domain: any of them has the environment in which all are found.
+    The nodes of a chain are in one domain: any of them has the environment in which all are found.
     """
-    pids = {
-        node: one.thread.pid
-        for node in (one.thread.node for one in shaping_nodes(plan))
-        for one in found.threads
-        if node in one.nodes
-    }
+    names = [node.thread.node for node in shaping_nodes(plan)]
+    pids = {node: one.thread.pid for node in names for one in found.threads if node in one.nodes}
     if not pids:
         return NO_NODE
     # Who reads what ROS 2 shows reads recordings as well, which is slow to import.
@@ -344,11 +316,3 @@ def _environment_for(pid: int) -> "Environment":
 
 def _is_ros(environment: "Environment") -> bool:
     return "AMENT_PREFIX_PATH" in environment.variables
-
-
-def moved_text(drift_ns: int) -> str:
-    """What to say when nodes get the phase again."""
-    return (
-        f"the chain's beginning has moved by {format_duration(drift_ns)} since the plan was put in "
-        "force; shaping nodes get it, and outputs without a stamp follow from the next cycle"
-    )

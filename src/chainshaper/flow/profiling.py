@@ -23,7 +23,7 @@ from chainshaper.enforcement.threads import (
     allocate,
     scheduling_around,
 )
-from chainshaper.flow.recorded_threads import recorded_processes
+from chainshaper.flow.threads import recorded_processes
 from chainshaper.linux.processes import Process
 from chainshaper.linux.runs import Journal
 from chainshaper.linux.scheduling import available_cores, check_cores, may_use_fifo

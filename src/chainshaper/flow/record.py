@@ -4,11 +4,9 @@
                                         ─► types and QoS asked for ─► application ends ─► recording
 
 Tracing begins first, because an object emits its name once, when it is created. Types and QoS are
-asked for when tracing is over: discovery costs every node some time. What the tracer wrote is kept
-with the recording, as `trace/`.
-
-Whatever ends the run, the application, a duration or Ctrl-C, its recording is whole; nothing is
-left running, nor changed.
+asked for when tracing is over: discovery costs every node some time. What the tracer wrote stays
+with the recording, as `trace/`. Whatever ends the run, its recording is whole; nothing is left
+running, nor changed.
 """
 
 import platform
@@ -23,13 +21,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeAlias
 
-from chainshaper.enforcement.threads import strangers_text
+from chainshaper.analysis.objects import resolve_objects
+from chainshaper.enforcement.threads import allocate, strangers_text
 from chainshaper.flow.exploration import with_trace_events
-from chainshaper.flow.recorded_threads import (
-    known_endpoints,
-    recorded_threads_of,
-    scheduled_in_real_time,
-)
+from chainshaper.flow.threads import recorded_processes
 from chainshaper.linux.own_processes import check_command, end_command, end_in_words, start_command
 from chainshaper.linux.processes import (
     Process,
@@ -48,18 +43,16 @@ from chainshaper.sources.ros import Environment, ask_graph, environment_of
 from chainshaper.values import events
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
-from chainshaper.values.events import EventTables
 from chainshaper.values.files import open_to_all
 from chainshaper.values.recording import (
     EndpointInfo,
     InForceInfo,
     Recording,
+    ThreadInfo,
     refuse_existing,
     write_recording,
 )
-from chainshaper.workload.stall_watch import StallWatch, far_from, stalls_watched
-
-__all__ = ["Recorded", "Scheduling", "record_command"]
+from chainshaper.workload.stall_meter import StallWatch, far_from, stalls_watched
 
 Scheduling: TypeAlias = AbstractContextManager[Callable[[Sequence[Process]], bool]]
 """Changes how the application's threads run for as long as its context lasts.
@@ -69,13 +62,10 @@ is as it shall be; events from before that are left out of the tables.
 """
 
 TRACE_FOLDER = "trace"
-SPARE_DISK = 64 << 20
-"""A run ends when its disk has no more than that (bytes): there is more to be written."""
-
+SPARE_DISK = 64 << 20  # a run ends when its disk has no more (bytes): there is more to be written
 _STEP_S = 0.1
 _FIRST_LOOK_NS = 500_000_000
-_LONGEST_PAUSE_NS = 5_000_000_000
-"""Looking costs the machine some milliseconds: the longer a run lasts, the rarer it is."""
+_LONGEST_PAUSE_NS = 5_000_000_000  # looking takes some ms: the longer a run lasts, the rarer it is
 
 
 @dataclass(frozen=True)
@@ -88,7 +78,7 @@ class Recorded:
 
 @dataclass
 class _Run:
-    """What there is to keep together while an application is recorded, and what was seen of it.
+    """An application that is recorded, and what was seen of it.
 
     ``environment`` is a node's. ``in_force_ns`` is when the scheduling that was asked for was,
     ``governed`` are plans that others put in force meanwhile (`chainshaper apply`).
@@ -139,14 +129,13 @@ def record_command(
 ) -> Recorded:
     """Record an application until it ends, ``duration_ns`` are over, or ``stop`` is set.
 
-    ``command`` is started, and ended with the recording. Without one, eBPF attaches to ``pids``
-    and their descendants, or to all that ``users`` run (names or numbers; default: who launched
-    us, and root). ``buffer`` is the size of LTTng's buffer of a core in bytes. ``chain`` is noted
-    as the chain of interest, ``plan`` as the plan in force; ``gate_logs`` are where its shaping
-    nodes note what they do. ``watch_stalls`` has a sleeper on every core notice when the machine
-    stands still, which takes some 2 % of it. What the command prints goes to the file descriptor
-    ``command_stdout``, if that is given. ``progress`` gets the share that is done, as far as
-    that is known, and what is being done.
+    ``command`` is started, and ended with the recording; it prints to ``command_stdout``. Without
+    one, eBPF attaches to ``pids`` and their descendants, or to all that ``users`` run (names or
+    numbers; default: who launched us, and root). ``buffer`` is the size of LTTng's buffer of a core
+    in bytes. ``chain`` is noted as the chain of interest, ``plan`` as the plan in force;
+    ``gate_logs`` are where its shaping nodes note what they do. ``watch_stalls`` has a sleeper on
+    every core notice when the machine stands still (2 % of it). ``progress`` gets the share that is
+    done, as far as that is known, and what is being done.
 
     Raises:
         InputError: ``output`` exists, there is no such command or process, or no such source.
@@ -157,7 +146,11 @@ def record_command(
     output, taken = refuse_existing(output), run_users(users)
     if command:
         check_command(command)
-    folder = _work_folder(output)
+    parent = output.absolute().parent
+    try:
+        folder = Path(tempfile.mkdtemp(prefix=f".{output.name}.tracing-", dir=parent))
+    except OSError as error:
+        raise OperationError(f"{parent}: no trace can be written there: {error}") from error
     try:
         tracer = _tracer(source, folder, command, pids, buffer, users=taken)
         stop = stop or threading.Event()
@@ -174,14 +167,6 @@ def record_command(
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return Recorded(recording, run.exit_code)
-
-
-def _work_folder(output: Path) -> Path:
-    parent = output.absolute().parent
-    try:
-        return Path(tempfile.mkdtemp(prefix=f".{output.name}.tracing-", dir=parent))
-    except OSError as error:
-        raise OperationError(f"{parent}: no trace can be written there: {error}") from error
 
 
 def _tracer(
@@ -237,7 +222,12 @@ def _trace(
         if run.exit_code:
             lasted = format_duration(round(run.ended_ns - run.begun_ns, -8))
             run.notes += (f"the command {end_in_words(run.exit_code)} after {lasted}.",)
-        _ask_for_qos(run)
+        if run.exit_code is not None:  # types and QoS of all topics are asked of what still runs
+            run.no_qos_because = "the application had ended by itself"
+        elif run.environment is None:
+            run.no_qos_because = run.no_environment_because
+        else:
+            run.endpoints, run.no_qos_because = ask_graph(run.environment)
 
 
 def _watch(run: _Run) -> None:
@@ -250,7 +240,9 @@ def _watch(run: _Run) -> None:
             return
         over = run.stop.is_set() or (run.duration_ns is not None and lasted >= run.duration_ns)
         if over or lasted >= next_look - run.begun_ns:
-            failure = run.tracer.failure() or _full_disk(run.folder)
+            failure = run.tracer.failure()
+            if failure is None and shutil.disk_usage(run.folder).free < SPARE_DISK:
+                failure = f"the disk of {run.folder.parent} is full"
             _look(run)
             if failure is not None:
                 run.notes += (f"tracing ended before the application did: {failure}.",)
@@ -261,11 +253,6 @@ def _watch(run: _Run) -> None:
         share = 0.0 if run.duration_ns is None else lasted / run.duration_ns
         run.progress(min(1.0, share), "recording; Ctrl-C ends it")
         run.stop.wait(_STEP_S)
-
-
-def _full_disk(folder: Path) -> str | None:
-    free = shutil.disk_usage(folder).free
-    return f"the disk of {folder.parent} is full" if free < SPARE_DISK else None
 
 
 def _look(run: _Run) -> None:
@@ -293,16 +280,6 @@ def _look(run: _Run) -> None:
         run.in_force_ns = run.stalls.begin(far_from(releases_so_far(run.gate_logs)))
 
 
-def _ask_for_qos(run: _Run) -> None:
-    """Types and QoS of all topics, while the application is still there."""
-    if run.exit_code is not None:
-        run.no_qos_because = "the application had ended by itself"
-    elif run.environment is None:
-        run.no_qos_because = run.no_environment_because
-    else:
-        run.endpoints, run.no_qos_because = ask_graph(run.environment)
-
-
 def _written(
     output: Path, run: _Run, command: Sequence[str], chain: str | None, plan: Plan | None
 ) -> Recording:
@@ -317,13 +294,20 @@ def _written(
 
         tables, info = with_found_nodes(tables, info, run.endpoints, run.processes)
     recording = Recording(output, info, tables)
-    threads = recorded_threads_of(run.processes, recording)
-    notes = (*info.notes, *run.notes, *((run.strangers,) if run.strangers else ()))
+    threads = _recorded_threads(run.processes, recording)
+    notes = [*info.notes, *run.notes, *filter(None, [run.strangers])]
     if run.no_qos_because is not None:
-        notes += (f"types and QoS of topics could not be asked for: {run.no_qos_because}.",)
+        notes.append(f"types and QoS of topics could not be asked for: {run.no_qos_because}.")
     if run.schedule is not None:
-        tables, note = _from_in_force(tables, run)
-        notes += (note,)
+        if run.in_force_ns is None:
+            raise OperationError(
+                "the run was over before the threads had the scheduling it was to be recorded with"
+            )
+        tables = events.happened(tables, since_ns)
+        lasted = format_duration(round(since_ns - run.begun_ns, -8))
+        notes.append(f"the first {lasted} were left out: the scheduling was not in force yet.")
+    policies = {thread.policy for thread in threads if thread.role == "executor"}
+    in_real_time = policies <= {"SCHED_FIFO", "SCHED_RR"} if policies else None
     variables = {} if run.environment is None else run.environment.variables
     facts = {
         "kernel": platform.release(),
@@ -331,13 +315,13 @@ def _written(
         "rmw": variables.get("RMW_IMPLEMENTATION") or info.rmw,
         "command": tuple(command),
         "threads": threads,
-        "endpoints": known_endpoints(tables, run.endpoints),
-        "realtime": True if run.schedule is not None else scheduled_in_real_time(threads),
+        "endpoints": _known_endpoints(tables, run.endpoints),
+        "realtime": True if run.schedule is not None else in_real_time,
         "stall_meter": run.stalls.info,
         "chain": chain,
         "plan": None if plan is None else plan.model_dump(mode="json"),
         "in_force": None if plan is None else InForceInfo(since_ns=since_ns),
-        "notes": notes,
+        "notes": tuple(notes),
     }
     if plan is None and (governed := in_force_throughout(run.governed)) is not None:
         facts["plan"] = governed.plan
@@ -345,16 +329,60 @@ def _written(
     return write_recording(output, tables, with_trace_events(recording).model_copy(update=facts))
 
 
-def _from_in_force(tables: EventTables, run: _Run) -> tuple[EventTables, str]:
-    """The events of what happened under the scheduling, and those of all objects' creation."""
-    since = run.in_force_ns
-    if since is None:
-        raise OperationError(
-            "the run was over before the threads had the scheduling it was to be recorded with"
+def _recorded_threads(processes: Sequence[Process], recording: Recording) -> tuple[ThreadInfo, ...]:
+    """The threads of the nodes among ``processes``, numbered as in the recording.
+
+    Nodes are the processes that the recording saw one in; where it saw none, those that take part
+    in DDS. A thread that works for several nodes (a component container's) is given to none.
+    """
+    recorded, _ = recorded_processes(recording)
+    pids = {seen.pid for seen in recorded}
+    nodes = [one for one in processes if one.inner_pid in pids]
+    nodes = nodes or [one for one in processes if one.participates]
+    inner_pids = {process.pid: process.inner_pid for process in nodes}
+    return tuple(
+        ThreadInfo(
+            tid=found.thread.inner_tid,
+            pid=inner_pids[found.thread.pid],
+            comm=found.thread.comm,
+            node=found.nodes[0] if len(found.nodes) == 1 else "",
+            role=found.thread.role,
+            policy=found.thread.policy,
+            priority=found.thread.priority,
+            cores=found.thread.cores,
         )
-    kept = events.happened(tables, since)
-    lasted = format_duration(round(since - run.begun_ns, -8))
-    return kept, f"the first {lasted} were left out: the scheduling was not in force yet."
+        for found in allocate(nodes, recorded, among=processes).threads
+    )
+
+
+def _known_endpoints(
+    tables: events.EventTables, asked: Sequence[EndpointInfo]
+) -> tuple[EndpointInfo, ...]:
+    """The graph's endpoints with their depths from the trace, then those that only it saw.
+
+    Several of one node, topic and kind are taken in the order in which they were created.
+    """
+    objects = resolve_objects(tables)
+    traced: list[EndpointInfo] = []
+    for kind, owners in (
+        ("publisher", objects.publishers),
+        ("subscription", objects.subscriptions),
+    ):
+        created = events.table(tables, f"rcl_{kind}_init", ["queue_depth"]).select(
+            "pid", handle=f"{kind}_handle", valid_from="time", depth="queue_depth"
+        )
+        rows = owners.join(created, on=["pid", "handle", "valid_from"]).sort("valid_from")
+        rows = rows.drop_nulls(["node", "topic"]).select("node", "topic", "depth")
+        traced += [EndpointInfo.model_validate({"kind": kind, **one}) for one in rows.to_dicts()]
+    found = []
+    for one in asked:
+        same = [t for t in traced if (t.node, t.topic, t.kind) == (one.node, one.topic, one.kind)]
+        depth = one.depth or None  # 0: not known
+        if same:
+            traced.remove(same[0])
+            depth = depth or same[0].depth
+        found.append(one.model_copy(update={"depth": depth}))
+    return (*found, *traced)
 
 
 def _what_is_left(run: _Run, output: Path) -> str:

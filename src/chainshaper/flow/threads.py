@@ -2,28 +2,32 @@
 
 The functions behind `chainshaper threads` and `chainshaper apply --dry-run`; nothing is changed.
 What /proc shows is joined with what a recording of the same processes saw, as far as they are still
-the same.
+the same. Tracers number processes and threads as these do themselves, in their own pid namespace.
+Which nodes a process has, its creation events say; which threads execute, the callbacks they ran.
 """
 
+import platform
+import time
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from chainshaper.enforcement import threads as allocation
 from chainshaper.enforcement.back_ends import choose_back_end
 from chainshaper.enforcement.litmus import litmus_commands
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
-from chainshaper.enforcement.threads import Allocation, RecordedProcess, WantedScheduling, allocate
-from chainshaper.flow.phase import measure_phase
-from chainshaper.linux.processes import (
-    Process,
-    descendants,
-    find_applications,
-    list_processes,
-    run_users,
+from chainshaper.enforcement.threads import (
+    Allocation,
+    RecordedProcess,
+    RecordedThread,
+    WantedScheduling,
+    allocate,
 )
+from chainshaper.flow.phase import measure_phase
+from chainshaper.linux.processes import descendants, find_applications, list_processes, run_users
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.linux.threads import Thread
+from chainshaper.linux.threads import Thread, ThreadRole
 from chainshaper.planning.overruns import open_until_done, refuse_offset
 from chainshaper.planning.plan import Plan, Server, shaping_nodes
 from chainshaper.values.errors import InputError, OperationError
@@ -34,6 +38,8 @@ if TYPE_CHECKING:
 
 LEAD_NS = 2_000_000
 """The cycle starts so long after the chain's timer expires (DESIGN section 6)."""
+
+_KNOWN_ROLES = ("executor", "publisher", "dds")
 
 
 def find_threads(
@@ -47,9 +53,9 @@ def find_threads(
 
     ``where`` is a process, which stands for its descendants too; a plan, for the nodes of its
     servers; or None for all that looks like an application of ROS 2 or DDS. ``recording`` is one
-    of the processes that still run, if there is one; who looks often gives what it says about them,
-    ``recorded``, instead. Only processes of ``users`` (names or numbers; default: who launched us,
-    and root) are nodes; a process that is asked for is, whoever runs it.
+    of the processes that still run; who looks often gives what it says, ``recorded``, instead. Only
+    processes of ``users`` (names or numbers; default: who launched us, and root) are nodes; a
+    process that is asked for is, whoever runs it.
 
     Raises:
         InputError: there is no such process, or no such user.
@@ -58,9 +64,6 @@ def find_threads(
     notes: tuple[str, ...] = ()
     strangers = None
     if recording is not None:
-        # Reading events is slow to import: only who has a recording pays for it.
-        from chainshaper.flow.recorded_threads import recorded_processes
-
         recorded, notes = recorded_processes(recording)
     if isinstance(where, int):
         family = descendants({process.pid: process.parent for process in processes}, where)
@@ -70,18 +73,27 @@ def find_threads(
         taken |= {process.user for process in chosen if process.user is not None}
     else:
         found = allocate(find_applications(processes), recorded, processes, taken)
-        servers = () if where is None else where.servers
-        nodes = {thread.node: server.name for server in servers for thread in server.threads}
-        gates = () if where is None else shaping_nodes(where)
-        # Receivers need not run.
-        hosted = None if where is None else nodes.keys() | {r for g in gates for r in g.receivers}
+        running = defaultdict[int, set[str]](set)
+        for one in found.threads:
+            running[one.thread.pid].update(one.nodes)
+        servers: tuple[Server, ...] = ()
+        hosted = None
+        if where is not None:  # receivers need not run
+            gates, servers = shaping_nodes(where), where.servers
+            hosted = {receiver for gate in gates for receiver in gate.receivers}
+            hosted |= {thread.node for server in servers for thread in server.threads}
         chosen = tuple(
             process
             for process in processes
-            if process.user in taken and _hosts(process, found, hosted)
+            if process.user in taken
+            and (
+                running[process.pid] & hosted
+                if hosted is not None
+                else running[process.pid] or process.participates
+            )
         )
         strangers = allocation.strangers_text(processes, taken, hosted)
-        notes += _missing(found, nodes)
+        notes += _missing(set().union(*running.values()), servers)
         if where is None and not chosen:
             notes += ("no process looks like an application of ROS 2 or DDS",)
     found = allocate(chosen, recorded, processes, taken)
@@ -91,22 +103,61 @@ def find_threads(
     return replace(found, notes=notes, strangers=strangers)
 
 
-def _hosts(process: Process, found: Allocation, nodes: Collection[str] | None) -> bool:
-    """Whether a process has one of these nodes; if None, any node, or takes part in DDS."""
-    own = {node for one in found.threads if one.thread.pid == process.pid for node in one.nodes}
-    if nodes is None:
-        return bool(own) or process.participates
-    return not own.isdisjoint(nodes)
-
-
-def _missing(found: Allocation, nodes: dict[str, str]) -> tuple[str, ...]:
-    running = {node for one in found.threads for node in one.nodes}
+def _missing(running: set[str], servers: Iterable[Server]) -> tuple[str, ...]:
+    nodes = {thread.node: server.name for server in servers for thread in server.threads}
     return tuple(
         f"node {node} of server {server} is not running, or cannot be recognised; running: "
         f"{', '.join(sorted(running)) or 'no node'}"
         for node, server in nodes.items()
         if node not in running
     )
+
+
+def recorded_processes(
+    recording: "Recording",
+) -> tuple[tuple[RecordedProcess, ...], tuple[str, ...]]:
+    """The processes of a recording, and why it says nothing about this machine, if that is so."""
+    import polars as pl  # only who has a recording pays for this
+
+    from chainshaper.analysis import callback_statistics, data_flow
+    from chainshaper.values import events
+
+    info, tables = recording.info, recording.events
+    if platform.node() not in info.host.split(", "):
+        return (), (
+            f"{recording.path} was taken on {info.host or 'an unknown machine'}, so its "
+            f"thread ids say nothing about {platform.node()}",
+        )
+    names = ("rcl_node_init", "callback_start")
+    seen = pl.concat(events.table(tables, name).select("pid", "time") for name in names)
+    last = seen.drop_nulls().group_by("pid").agg(pl.col("time").max())
+    last_seen: dict[int, int] = dict(last.iter_rows())
+    if any(instant > time.monotonic_ns() for instant in last_seen.values()):
+        return (), (
+            f"{recording.path} is from before this machine booted, so its thread ids say nothing",
+        )
+    nodes: dict[int, list[str]] = {}
+    created = events.table(tables, "rcl_node_init").select("pid", node=events.NODE_NAME)
+    for pid, node in created.unique(maintain_order=True).iter_rows():
+        nodes.setdefault(pid, []).append(node)
+    threads = defaultdict[int, dict[int, RecordedThread]](dict)
+    for one in info.threads:
+        if one.role in _KNOWN_ROLES:
+            own = (one.node,) if one.node else ()
+            role = cast(ThreadRole, one.role)
+            threads[one.pid][one.tid] = RecordedThread(one.tid, role, own)
+            nodes.setdefault(one.pid, list(own))
+    ran = callback_statistics(data_flow(tables, info.clock_offset_ns)).drop_nulls("node")
+    executors = ran.explode("tids").group_by("pid", "tids", maintain_order=True)
+    of_thread = executors.agg(pl.col("node").unique(maintain_order=True))
+    for pid, tid, own in of_thread.iter_rows():
+        threads[pid][tid] = RecordedThread(tid, "executor", tuple(own))
+    found = (
+        RecordedProcess(pid, tuple(own), tuple(threads[pid].values()), last_seen[pid])
+        for pid, own in nodes.items()
+        if pid in last_seen
+    )
+    return tuple(found), ()
 
 
 @dataclass(frozen=True)
@@ -156,8 +207,7 @@ def planned_changes(
         members = {s.name: [f"TID:{t.node}" for t in s.threads] for s in plan.servers}
         notes += ("slots are counted from a beginning that is measured when the chain runs",)
     anchor = 0 if phase_ns is None else phase_ns + LEAD_NS
-    commands = litmus_commands(table, members, anchor)
-    return Changes("litmus", "asked for", (), commands, notes)
+    return Changes("litmus", "asked for", (), litmus_commands(table, members, anchor), notes)
 
 
 def server_table(plan: Plan) -> ServerTable:
@@ -166,11 +216,7 @@ def server_table(plan: Plan) -> ServerTable:
     Raises OperationError: there are none.
     """
     gated_by_themselves = {node.thread for node in shaping_nodes(plan)}
-    servers = [
-        server
-        for server in plan.servers
-        if any(thread not in gated_by_themselves for thread in server.threads)
-    ]
+    servers = [s for s in plan.servers if set(s.threads) - gated_by_themselves]
     if not servers:
         raise OperationError(
             "the plan's servers name no threads of the application, so there is nothing to apply: "

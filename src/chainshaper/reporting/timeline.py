@@ -17,8 +17,7 @@ import numpy.typing as npt
 import polars as pl
 
 from chainshaper.analysis import DataFlow, LatencyAnalysis
-from chainshaper.analysis.disturbance import overlapping
-from chainshaper.analysis.punctuality import lateness_in_cycle
+from chainshaper.analysis.disturbance import lateness_in_cycle, overlapping
 from chainshaper.planning import Plan
 from chainshaper.reporting.overviews import cores_text
 from chainshaper.reporting.tables import ms, slots_ms
@@ -149,7 +148,7 @@ def _origins(
     """The gate says from when it counted; else the chain's stamp, or where cycles seem to start.
 
     Cycles of which the recording says nothing are taken to start as
-    :mod:`chainshaper.analysis.punctuality` takes them.
+    :mod:`chainshaper.analysis.disturbance` takes them.
     """
     if analysis is None or plan is None:
         return pl.DataFrame(schema=_ORIGINS)

@@ -1,35 +1,46 @@
-"""What is simulated: an application in words (:class:`System`), then in the engine's arrays.
+"""What is simulated: an application in words (:class:`System`), then in the engine's array.
 
-The words are plain values between the description, which people write, and the arrays, which the
-engine runs on. Their order is that of the arrays' rows, so a row's number in the engine's log
+The words are plain values between the description, which people write, and the array, which the
+engine runs on. Their order is that of the array's rows, so a row's number in the engine's log
 leads back to a name.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from chainshaper.analysis.chains import find_chain
 from chainshaper.planning.plan import Plan, Server, Thread, shaping_nodes
 from chainshaper.simulation import layout as at
-from chainshaper.simulation.layout import FOREVER, NONE, Int64s, Memory, refer_to_places
+from chainshaper.simulation.layout import NONE, A, C, D, E, G, H, I, Int64s, M, P, R, S, T, X
 from chainshaper.values.application import ApplicationGraph, Callback, Chain, Node
 from chainshaper.values.errors import InputError
+from chainshaper.values.recording import ThreadInfo
 from chainshaper.workload.description import Application, CallbackDescription, ExecutionTime
 from chainshaper.workload.event_log import WORDS
 from chainshaper.workload.execution import BLOCK, blocks
-from chainshaper.workload.live import Timing, node_name
-
-__all__ = ["Streams", "System", "build_machine", "build_system"]
+from chainshaper.workload.live import WARM_UP_CYCLES, Timing, node_name
 
 FIRST_PID = 1000
-ORDERS = {
-    "single-threaded": ("timer", "subscription", "service", "client"),
-    "static": ("subscription", "timer", "client", "service"),
-    "events": ("timer", "subscription", "service", "client"),
-}
-"""The order in which executors look at what is ready (rclcpp's Jazzy)."""
+ROLES = ("executor", "publisher", "dds")
+KINDS = ("timer", "subscription", "service", "client")
+STATIC_ORDER = ("subscription", "timer", "client", "service")
+"""The orders in which executors look at what is ready, the static one and others (Jazzy)."""
+
+AHEAD = 16 * BLOCK
+"""So many values of every stream are drawn beforehand."""
+
+FIRST_COST = 1 << 20
+"""Costs are numbered from here, callbacks of a node from 0: no two draw the same sequence."""
+
+LOG_ENTRIES = 1 << 17
+POOL = 4096
+"""Messages under way, besides those in histories."""
+
+BEST_EFFORT = 1000
+COSTS = ("wake_up", "take", "publish", "receive", "delivery")  # in the order of their columns
 
 
 @dataclass(frozen=True)
@@ -50,8 +61,7 @@ class Entity:
     listens: bool = False
 
 
-@dataclass(frozen=True)
-class Publisher:
+class Publisher(NamedTuple):
     """One callback's publisher of a topic."""
 
     process: int
@@ -59,49 +69,47 @@ class Publisher:
     asynchronous: bool
 
 
-@dataclass(frozen=True)
-class SimulatedThread:
-    """A thread; ``role`` is executor, publisher or dds."""
-
-    process: int
-    tid: int
-    role: str
-    core: int
-    priority: int
-
-
-@dataclass(frozen=True)
-class Process:
-    """A node's process."""
+class Process(NamedTuple):
+    """A node's process; ``key`` is the node's name in the description."""
 
     node: str
-    key: str  # the node's name in the description
+    key: str
     pid: int
 
 
 @dataclass(frozen=True)
 class System:
-    """An application with everything that runs in it, numbered as in the engine's arrays.
+    """An application with everything that runs in it, numbered as in the engine's array.
 
+    ``servers`` has the server of each thread that is in one, ``cores`` the numbers of the cores.
     ``readers`` are the entities that each topic's messages reach. ``chain`` has its callbacks by
     entity; it is empty where it is not followed.
     """
 
     application: Application
     processes: tuple[Process, ...]
-    threads: tuple[SimulatedThread, ...]
+    threads: tuple[ThreadInfo, ...]
+    servers: Mapping[int, Server]
+    cores: tuple[int, ...]
     entities: tuple[Entity, ...]
     publishers: tuple[Publisher, ...]
     readers: Mapping[str, tuple[int, ...]]
     chain: Chain
     modes: tuple[str, ...]
 
+    def depth(self, topic: str) -> int:
+        """How many messages of a topic a history has."""
+        return self.application.topic(topic).depth
 
-def build_system(application: Application, *, follow_chain: bool) -> System:
+
+def build_system(
+    application: Application, plan: Plan | None = None, *, follow_chain: bool
+) -> System:
     """Everything that runs in an application; ``follow_chain`` if its chain has to be known.
 
     Raises:
-        InputError: the application's chain is not one path through it.
+        InputError: the application's chain is not one path through it, or a server of the plan
+            has a thread that the application does not have.
     """
     processes = tuple(
         Process(node_name(key), key, FIRST_PID + 10 * number)
@@ -109,34 +117,37 @@ def build_system(application: Application, *, follow_chain: bool) -> System:
     )
     entities: list[Entity] = []
     publishers: list[Publisher] = []
+    order = STATIC_ORDER if application.simulation.executor == "static" else KINDS
     for number, process in enumerate(processes):
         own = list(_entities(application, number, process.key, publishers))
-        order = ORDERS[application.simulation.executor]
         entities += sorted(own, key=lambda entity: order.index(entity.kind))
     readers: dict[str, tuple[int, ...]] = {}
     for number, entity in enumerate(entities):
         if entity.topic is not None:
             readers[entity.topic] = (*readers.get(entity.topic, ()), number)
-    announced = {mode: 0 for _, cb in application.callbacks() for mode in cb.announces}
-    known = {
-        mode: 0
-        for _, cb in application.callbacks()
-        if cb.gate is not None and cb.gate.modes is not None
-        for mode in cb.gate.modes.bands
-    }
+    described = [callback for _, callback in application.callbacks()]
+    announced = [mode for callback in described for mode in callback.announces]
+    gates = [callback.gate for callback in described if callback.gate is not None]
+    known = [mode for gate in gates if gate.modes is not None for mode in gate.modes.bands]
+    threads = list(_threads(application, processes, publishers))
+    servers = {} if plan is None else _servers(plan, threads)
+    cores = sorted({thread.cores[0] for thread in threads})
+    for number, server in servers.items():
+        threads[number] = threads[number].model_copy(update={"cores": (server.core,)})
+    chain = Chain(application.chain, (), ())
+    if follow_chain:
+        chain = find_chain(_graph(processes, entities, publishers), application.chain)
     return System(
         application=application,
         processes=processes,
-        threads=tuple(_threads(application, processes, publishers)),
+        threads=tuple(threads),
+        servers=servers,
+        cores=tuple(dict.fromkeys([*cores, *(server.core for server in servers.values())])),
         entities=tuple(entities),
         publishers=tuple(publishers),
         readers=readers,
-        chain=(
-            find_chain(_graph(processes, entities, publishers), application.chain)
-            if follow_chain
-            else Chain(application.chain, (), ())
-        ),
-        modes=tuple(announced | known),
+        chain=chain,
+        modes=tuple(dict.fromkeys(announced + known)),
     )
 
 
@@ -161,21 +172,55 @@ def _entities(
 
 
 def _threads(
-    application: Application, processes: tuple[Process, ...], publishers: list[Publisher]
-) -> Iterator[SimulatedThread]:
+    application: Application, processes: Sequence[Process], publishers: Sequence[Publisher]
+) -> Iterator[ThreadInfo]:
     for number, process in enumerate(processes):
-        executor = application.scheduling_of(process.key)
-        yield SimulatedThread(number, process.pid, "executor", executor.core, executor.priority)
+        own, dds = (
+            application.scheduling_of(process.key),
+            application.dds_scheduling_of(process.key),
+        )
+        named = process.node.strip("/").replace("/", ".")[:15]
+        wanted = [("executor", named, own.core, own.priority)]
         if any(p.asynchronous for p in publishers if p.process == number):
-            priority = max(1, executor.priority - 1)  # as the live workload has it
-            yield SimulatedThread(number, process.pid + 1, "publisher", executor.core, priority)
+            below = max(1, own.priority - 1)  # as the live workload has it
+            wanted.append(("publisher", "dds.publisher", own.core, below))
         if application.simulation.receive is not None:
             dds = application.dds_scheduling_of(process.key)
-            yield SimulatedThread(number, process.pid + 2, "dds", dds.core, dds.priority)
+            wanted.append(("dds", "dds.dds", dds.core, dds.priority))
+        for role, comm, core, priority in wanted:
+            yield ThreadInfo(
+                tid=process.pid + ROLES.index(role),
+                pid=process.pid,
+                comm=comm,
+                node=process.node,
+                role=role,
+                policy="SCHED_FIFO",
+                priority=priority,
+                cores=(core,),
+            )
+
+
+def _servers(plan: Plan, threads: Sequence[ThreadInfo]) -> dict[int, Server]:
+    """The server of each thread that is in one."""
+    numbers = {
+        Thread(node=thread.node, role=thread.role): number  # type: ignore[arg-type]
+        for number, thread in enumerate(threads)
+        if thread.role != "dds"
+    }
+    found: dict[int, Server] = {}
+    for server in plan.servers:
+        for thread in server.threads:
+            if thread not in numbers:
+                raise InputError(
+                    f"server {server.name!r} of the plan holds the {thread.role} of {thread.node},"
+                    " which the application does not have: plan again from a recording of it"
+                )
+            found[numbers[thread]] = server
+    return found
 
 
 def _graph(
-    processes: tuple[Process, ...], entities: list[Entity], publishers: list[Publisher]
+    processes: Sequence[Process], entities: Sequence[Entity], publishers: Sequence[Publisher]
 ) -> ApplicationGraph:
     callbacks = [
         Callback(
@@ -203,11 +248,23 @@ def _graph(
     return ApplicationGraph(nodes, tuple(callbacks), writers, readers)
 
 
-AHEAD = 16 * BLOCK
-"""So many values of every stream are drawn beforehand."""
+class Rows(list[int]):
+    """The beginning of the engine's array while it is made."""
 
-FIRST_COST = 1 << 20
-"""Costs are numbered from here, callbacks of a node from 0: no two draw the same sequence."""
+    def add(self, count: int, columns: int, fill: int = 0) -> range:
+        """Room for so many rows; their places."""
+        first = len(self)
+        self.extend([fill] * (count * columns))
+        return range(first, len(self), columns)
+
+    def put(self, values: Sequence[int]) -> tuple[int, int]:
+        """Some values; where they begin and end."""
+        self.extend(values)
+        return len(self) - len(values), len(self)
+
+    def ring(self, depth: int) -> int:
+        """A ring for so many messages; its place."""
+        return self.put([NONE] * depth)[0]
 
 
 class Streams:
@@ -217,412 +274,324 @@ class Streams:
     node's full name and the callback's place in it. So does a cost's; constants need no drawing.
     """
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, rows: Rows) -> None:
         self._seed = seed
-        self._constants: list[int] = []
-        self._sources: list[Iterator[Int64s] | None] = []
+        self._rows = rows
+        self._drawn: list[tuple[int, Iterator[Int64s]]] = []
+        self._first = 0
 
-    def callback(self, times: ExecutionTime, node: str, index: int) -> int:
-        """The number of a stream of execution times (ns)."""
+    def add(self, times: ExecutionTime, node: str, index: int) -> int:
+        """The place of a new stream of CPU times or delays (ns)."""
         constant = times.constant_ns
-        values = (
-            None if constant is not None else blocks(times.model_dump(), self._seed, node, index)
-        )
-        self._sources.append(values)
-        self._constants.append(at.NONE if constant is None else constant)
-        return len(self._sources) - 1
+        place, _ = self._rows.put([NONE if constant is None else constant, 0, 0])
+        if constant is None:
+            source = blocks(times.model_dump(), self._seed, node, index)
+            self._drawn.append((place, source))
+        return place
 
-    def cost(self, times: ExecutionTime, node: str, number: int) -> int:
-        """The number of a stream of costs or delays (ns)."""
-        return self.callback(times, node, FIRST_COST + number)
+    def settle(self, first: int) -> int:
+        """What is drawn stands from that place on; where it ends."""
+        self._first = first
+        for number, (row, _) in enumerate(self._drawn):
+            end = first + (number + 1) * AHEAD
+            self._rows[row + D.NEXT], self._rows[row + D.LIMIT] = end, end - at.RESERVE
+        return first + len(self._drawn) * AHEAD
 
-    def __len__(self) -> int:
-        return len(self._sources)
-
-    def rows(self) -> Int64s:
-        """The streams' rows of the engine's array, before any value is drawn."""
-        rows = np.zeros((len(self), at.STREAM_COLUMNS), dtype=np.int64)
-        rows[:, at.D_CONSTANT] = self._constants
-        return rows
-
-    def fill(self, memory: Memory) -> None:
+    def fill(self, m: Int64s) -> None:
         """Draw for all streams that run short (all, the first time)."""
-        first, rows, draws = memory.place("draws", 0), memory["streams"], memory["draws"]
-        for stream, source in enumerate(self._sources):
-            row, begin = rows[stream], first + stream * AHEAD
-            if source is None or (row[at.D_NEXT] and row[at.D_NEXT] < row[at.D_LIMIT] - BLOCK):
+        for number, (row, source) in enumerate(self._drawn):
+            begin = self._first + number * AHEAD
+            if m[row + D.NEXT] < m[row + D.LIMIT] - BLOCK:
                 continue
-            used = (int(row[at.D_NEXT]) - begin) // BLOCK * BLOCK if row[at.D_NEXT] else AHEAD
-            values = draws[stream]
+            used = (int(m[row + D.NEXT]) - begin) // BLOCK * BLOCK
+            values = m[begin : begin + AHEAD]
             values[: AHEAD - used] = values[used:].copy()
             for place in range(AHEAD - used, AHEAD, BLOCK):
                 values[place : place + BLOCK] = next(source)
-            row[at.D_NEXT] = row[at.D_NEXT] - used if row[at.D_NEXT] else begin
-            row[at.D_LIMIT] = begin + AHEAD - at.RESERVE
+            m[row + D.NEXT] -= used
 
 
-LOG_ENTRIES = 1 << 17
-POOL = 4096
-"""Messages under way, besides those in histories."""
+@dataclass(frozen=True)
+class Machine:
+    """The engine's array, and what is read of it: latencies and the log."""
 
-BEST_EFFORT = 1000
-KINDS = ("timer", "subscription", "service", "client")
-EXECUTORS = ("single-threaded", "static", "events")
-COSTS = ("wake_up", "take", "publish", "receive", "delivery")
+    array: Int64s
+    streams: Streams
+    latencies: Int64s
+    logs: tuple[Int64s, ...]
+
+    def entries(self, kind: int) -> Int64s:
+        """The log's entries of a kind: a row of times, one of threads, and one for each field."""
+        return self.logs[kind][:, : self._counts()[kind]]
+
+    def forget_entries(self) -> None:
+        """The log is empty again."""
+        self._counts()[:] = 0
+
+    def _counts(self) -> Int64s:
+        first = self.array[X.LOGS] + A.COUNT
+        return self.array[first : first + len(self.logs) * A.COLUMNS : A.COLUMNS]
 
 
 def build_machine(
     system: System,
     plan: Plan | None,
     timing: Timing,
-    streams: Streams,
     *,
     events: bool,
     switches: bool,
     latencies: int,
-    warm_up: int,
-) -> tuple[Memory, tuple[int, ...]]:
-    """The arrays of a system before anything has happened, and the numbers of its cores.
+) -> Machine:
+    """The array of a system before anything has happened.
 
     ``events`` and ``switches`` say what is logged, ``latencies`` for how many instances of the
-    chain the latency is noted, behind the first ``warm_up`` ones.
-
-    Raises:
-        InputError: a server of the plan holds a thread that the system does not have.
+    chain the latency is noted, behind those of the warm-up.
     """
-    places = {core: row for row, core in enumerate(sorted({t.core for t in system.threads}))}
-    servers = _assigned(system, plan)
-    for server in servers.values():
-        places.setdefault(server.core, len(places))
-    rings: list[int] = []
-
-    def ring(depth: int) -> int:
-        rings.extend([NONE] * depth)
-        return len(rings) - depth
-
-    cores, core_threads, boundaries, threads = _cores(system, plan, servers, places, timing)
-    _describe_threads(system, threads, streams)
-    gates, slots, bands, gate_rows = _gates(system, timing)
-    synchronisers, inputs, synchroniser_rows = _synchronisers(system, ring)
-    entities = _entity_rows(system, timing, streams, {**gate_rows, **synchroniser_rows}, ring)
-    publishers, readers, announced = _publishers(system)
-    unsent = sum(system.application.topic(p.topic).depth for p in system.publishers)
-    pool = POOL + len(rings) + unsent + at.RESERVE
-    heap = pool + len(entities) + len(threads) + at.RESERVE
+    rows = Rows([0] * X.COLUMNS)
+    streams = Streams(system.application.seed, rows)
+    cores = rows.add(len(system.cores), C.COLUMNS)
+    threads = rows.add(len(system.threads), T.COLUMNS, NONE)
+    entities = rows.add(len(system.entities), E.COLUMNS)
+    publishers = rows.add(len(system.publishers), P.COLUMNS)
+    _fill_cores(rows, system, (cores, threads), plan, timing)
+    _fill_threads(rows, system, threads, entities, streams)
+    _fill_entities(rows, system, (threads, entities, publishers), timing, streams)
+    _fill_publishers(rows, system, publishers, entities)
+    histories = sum(rows[entity + E.DEPTH] for entity in entities)
+    synchronised = (e.topic for e in system.entities if e.described.synchronises)
+    waiting = histories + sum(system.depth(topic or "") for topic in synchronised)
+    unsent = sum(system.depth(publisher.topic) for publisher in system.publishers)
+    pool = POOL + waiting + unsent + at.RESERVE
     entries = LOG_ENTRIES if events else 0
-    areas = {
-        "control": np.zeros((1, at.CONTROL_COLUMNS), dtype=np.int64),
-        "threads": threads,
-        "entities": entities,
-        "publishers": publishers,
-        "readers": readers,
-        "gates": gates,
-        "synchronisers": synchronisers,
-        "inputs": inputs,
-        "cores": cores,
-        "core_threads": core_threads,
-        "boundaries": boundaries,
-        "slots": slots,
-        "bands": bands,
-        "changes": np.zeros((len(gates) * at.CHANGES_KEPT, 2), dtype=np.int64),
-        "announced": announced,
-        "rings": np.full((len(rings), 1), NONE, dtype=np.int64),
-        "streams": streams.rows(),
-        "draws": np.zeros((len(streams), AHEAD), dtype=np.int64),
-        "messages": np.full((pool, at.MESSAGE_COLUMNS), NONE, dtype=np.int64),
-        "heap": np.zeros((heap, at.HEAP_COLUMNS), dtype=np.int64),
-        "counts": np.zeros((at.LOG_KINDS, at.LOG_COLUMNS), dtype=np.int64),
-        **{
-            f"log {kind}": np.zeros((fields, entries), dtype=np.int64)
-            for kind, fields in enumerate(at.LOG_FIELDS)
-        },
-        "latencies": np.full((1, latencies), NONE, dtype=np.int64),
-    }
-    memory = Memory(areas)
-    refer_to_places(memory)
-    control = memory["control"][0]
+    logs = rows.add(len(at.LOG_FIELDS), A.COLUMNS)
+    first_message = streams.settle(len(rows))
+    heap = first_message + pool * M.COLUMNS
+    heap_end = heap + (pool + len(entities) + len(threads) + at.RESERVE) * H.COLUMNS
+    end = heap_end
+    for log, fields in zip(logs, at.LOG_FIELDS, strict=True):
+        rows[log + A.FIRST], rows[log + A.STRIDE] = end, entries
+        end += fields * entries
     described = system.application.simulation
-    control[at.X_UNUSED] = pool
-    control[at.X_STOP] = timing.stop_ns
-    control[at.X_LAST_TIMER] = timing.last_timer_ns
-    control[at.X_RECORD_FROM] = timing.record_from_ns
-    control[at.X_LOGGING] = events
-    control[at.X_SWITCHES] = switches
-    control[at.X_SWITCH_COST] = described.context_switch_ns
-    control[at.X_PREEMPTION_COST] = described.preemption_ns
-    control[at.X_QUANTUM] = described.quantum_ns
-    control[at.X_AWAY] = round(1e6 * described.interrupts / (1 - described.interrupts))
-    control[at.X_CYCLE] = plan.cycle_ns if plan is not None else 0
-    control[at.X_WARM_UP] = warm_up
-    expiries = sorted(
-        (int(entities[row, at.E_DUE]), row)
-        for row, entity in enumerate(system.entities)
-        if entity.kind == "timer"
+    for column, value in {
+        X.CORES: cores.start,
+        X.CORES_END: cores.stop,
+        X.HEAP_LIMIT: heap_end - at.RESERVE * H.COLUMNS,
+        X.HEAP: heap,
+        X.LOGS: logs.start,
+        X.LATENCIES: end,
+        X.LATENCIES_END: end + latencies,
+        X.FREE: first_message,
+        X.UNUSED: pool,
+        X.STOP: timing.stop_ns,
+        X.LAST_TIMER: timing.last_timer_ns,
+        X.RECORD_FROM: timing.record_from_ns,
+        X.LOGGING: events,
+        X.SWITCHES: switches,
+        X.SWITCH_COST: described.context_switch_ns,
+        X.PREEMPTION_COST: described.preemption_ns,
+        X.QUANTUM: described.quantum_ns,
+        X.AWAY: round(1e6 * described.interrupts / (1 - described.interrupts)),
+        X.CYCLE: plan.cycle_ns if plan is not None else 0,
+        X.WARM_UP: WARM_UP_CYCLES,
+    }.items():
+        rows[column] = value
+    m = np.zeros(end + latencies, dtype=np.int64)
+    m[: len(rows)] = rows
+    m[end:] = NONE
+    messages = m[first_message:heap].reshape(-1, M.COLUMNS)
+    messages[:] = NONE
+    messages[:-1, M.NEXT] = range(first_message + M.COLUMNS, heap, M.COLUMNS)
+    timers = zip(entities, system.entities, strict=True)
+    expiries = sorted((rows[place + E.DUE], place) for place, e in timers if e.kind == "timer")
+    for order, (due, place) in enumerate(expiries):  # in order, they are a heap
+        first = heap + order * H.COLUMNS
+        m[first : first + H.COLUMNS] = due, order, at.EXPIRY, place
+    m[X.COUNTER], m[X.HEAP_END] = len(expiries), heap + len(expiries) * H.COLUMNS
+    streams.fill(m)
+    views = tuple(
+        m[rows[log + A.FIRST] :][: fields * entries].reshape(fields, entries)
+        for log, fields in zip(logs, at.LOG_FIELDS, strict=True)
     )
-    for order, (due, row) in enumerate(expiries):  # in order, they are a heap
-        memory["heap"][order] = due, order, at.EXPIRY, memory.place("entities", row)
-    control[at.X_COUNTER] = len(expiries)
-    control[at.X_HEAP_END] = memory.place("heap", len(expiries))
-    streams.fill(memory)
-    return memory, tuple(places)
+    return Machine(m, streams, m[end:], views)
 
 
-def _rows(rows: Sequence[Sequence[int]], columns: int) -> Int64s:
-    return np.array(rows, dtype=np.int64).reshape(-1, columns)
-
-
-def _assigned(system: System, plan: Plan | None) -> dict[int, Server]:
-    """The server of each thread that is in one."""
-    if plan is None:
-        return {}
-    threads = {
-        Thread(node=system.processes[t.process].node, role=t.role): number  # type: ignore[arg-type]
-        for number, t in enumerate(system.threads)
-        if t.role != "dds"
-    }
-    found: dict[int, Server] = {}
-    for server in plan.servers:
-        for thread in server.threads:
-            if thread not in threads:
-                raise InputError(
-                    f"server {server.name!r} of the plan holds the {thread.role} of {thread.node},"
-                    " which the application does not have: plan again from a recording of it"
-                )
-            found[threads[thread]] = server
-    return found
-
-
-def _cores(
-    system: System,
-    plan: Plan | None,
-    servers: dict[int, Server],
-    places: dict[int, int],
-    timing: Timing,
-) -> tuple[Int64s, Int64s, Int64s, Int64s]:
-    """``cores``, ``core_threads``, ``boundaries``, and ``threads`` with core, rank and server."""
-    threads = np.full((len(system.threads), at.THREAD_COLUMNS), NONE, dtype=np.int64)
-    threads[:, at.T_ROW] = np.arange(len(threads))
-    cores = np.zeros((len(places), at.CORE_COLUMNS), dtype=np.int64)
-    boundaries: list[tuple[int, int]] = []
-    for number, thread in enumerate(system.threads):
-        server = servers.get(number)
-        threads[number, at.T_CORE] = places[thread.core if server is None else server.core]
-        threads[number, at.T_RANK] = BEST_EFFORT - thread.priority
-    core_threads: list[int] = []
-    for core, place in places.items():
-        own = [] if plan is None else [s for s in plan.servers if s.core == core]
-        ranked = sorted((s for s in own if s in servers.values()), key=lambda s: s.priority)
-        for number, server in servers.items():
+def _fill_cores(
+    rows: Rows, system: System, areas: tuple[range, range], plan: Plan | None, timing: Timing
+) -> None:
+    """The cores, and the core, rank and server of each thread."""
+    cores, threads = areas
+    for thread, info in zip(threads, system.threads, strict=True):
+        rows[thread + T.CORE] = cores[system.cores.index(info.cores[0])]
+        rows[thread + T.RANK] = BEST_EFFORT - info.priority
+    for place, core in zip(cores, system.cores, strict=True):
+        own = [] if plan is None else [server for server in plan.servers if server.core == core]
+        used = [server for server in own if server in system.servers.values()]
+        ranked = sorted(used, key=lambda server: server.priority)
+        for number, server in system.servers.items():
             if server in ranked:
                 bit = ranked.index(server)
-                threads[number, at.T_SERVER] = bit
-                threads[number, at.T_RANK] = bit - len(ranked)
-        mine = [n for n in range(len(threads)) if threads[n, at.T_CORE] == place]
-        row = cores[place]
-        row[at.C_FIRST], row[at.C_END] = len(core_threads), len(core_threads) + len(mine)
-        core_threads += mine
-        row[at.C_RUNNING], row[at.C_LAST] = NONE, NONE
-        row[at.C_UNTIL], row[at.C_BOUNDARY], row[at.C_DIRTY] = FOREVER, FOREVER, 1
-        if plan is not None and ranked:
-            table = _slot_table(plan, ranked)
-            row[at.C_TABLE], row[at.C_TABLE_END] = len(boundaries), len(boundaries) + len(table)
-            boundaries += table
-            _enter_table(row, table, timing.start_ns, timing.anchor_ns + plan.offset_ns, plan)
-    return cores, _rows([[n] for n in core_threads], 1), _rows(boundaries, 2), threads
+                rows[threads[number] + T.SERVER] = bit
+                rows[threads[number] + T.RANK] = bit - len(ranked)
+        mine = [thread for thread in threads if rows[thread + T.CORE] == place]
+        rows[place + C.FIRST], rows[place + C.END] = rows.put(mine)
+        rows[place + C.RUNNING], rows[place + C.LAST] = NONE, NONE
+        rows[place + C.UNTIL], rows[place + C.BOUNDARY] = at.FOREVER, at.FOREVER
+        rows[place + C.DIRTY] = 1
+        if plan is None or not ranked:
+            continue
+        table = _slot_table(plan, ranked)
+        first, end = rows.put([number for pair in table for number in pair])
+        rows[place + C.TABLE], rows[place + C.TABLE_END] = first, end
+        # The run starts anywhere in a cycle.
+        elapsed = (timing.start_ns - timing.anchor_ns - plan.offset_ns) % plan.cycle_ns
+        current = max(number for number, (offset, _) in enumerate(table) if offset <= elapsed)
+        following = (current + 1) % len(table)
+        rows[place + C.MASK], rows[place + C.NEXT] = table[current][1], first + 2 * following
+        until = table[following][0] + (plan.cycle_ns if following <= current else 0)
+        rows[place + C.BOUNDARY] = timing.start_ns - elapsed + until
 
 
 def _slot_table(plan: Plan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
     """Rows (offset in the cycle, mask of the servers that are open from then on)."""
-    # A shaping node holds its messages itself: its thread needs no slot to run in.
+    # A shaping node times its messages itself: its thread needs no slot to run in.
     shaping = {node.thread for node in shaping_nodes(plan)}
     slots = [
         server.slots if shaping.isdisjoint(server.threads) else ((0, plan.cycle_ns),)
         for server in ranked
     ]
     offsets = {0} | {instant for own in slots for slot in own for instant in slot}
-    return [
-        (
-            offset,
-            sum(
-                1 << bit
-                for bit, own in enumerate(slots)
-                if any(start <= offset < end for start, end in own)
-            ),
-        )
-        for offset in sorted(offsets)
-        if offset < plan.cycle_ns
-    ]
+    table = []
+    for offset in sorted(offset for offset in offsets if offset < plan.cycle_ns):
+        is_open = [any(start <= offset < end for start, end in own) for own in slots]
+        table.append((offset, sum(1 << bit for bit, one in enumerate(is_open) if one)))
+    return table
 
 
-def _enter_table(
-    row: Int64s, table: Sequence[tuple[int, int]], start: int, anchor: int, plan: Plan
+def _fill_threads(
+    rows: Rows, system: System, threads: range, entities: range, streams: Streams
 ) -> None:
-    """The state of a core's table at the start of the run, which is anywhere in a cycle."""
-    elapsed = (start - anchor) % plan.cycle_ns
-    current = max(number for number, (offset, _) in enumerate(table) if offset <= elapsed)
-    row[at.C_MASK] = table[current][1]
-    following = (current + 1) % len(table)
-    row[at.C_NEXT] = row[at.C_TABLE] + following
-    offset = table[following][0] + (plan.cycle_ns if following <= current else 0)
-    row[at.C_BOUNDARY] = start - elapsed + offset
-
-
-def _describe_threads(system: System, threads: Int64s, streams: Streams) -> None:
     described = system.application.simulation
-    for number, thread in enumerate(system.threads):
-        node = system.processes[thread.process].node
-        row = threads[number]
-        columns = (at.T_WAKE, at.T_TAKE, at.T_PUBLISH, at.T_RECEIVE, at.T_DELIVERY)
-        for place, (name, column) in enumerate(zip(COSTS, columns, strict=True)):
-            times = getattr(described, name)
-            if times is not None:
-                offset = len(COSTS) * ("executor", "publisher", "dds").index(thread.role)
-                row[column] = streams.cost(times, node, offset + place)
-        row[at.T_RUNNABLE], row[at.T_LEFT], row[at.T_SEQUENCE] = 0, 0, 0
-        row[at.T_PREEMPTED], row[at.T_USED] = 0, 0
-        if thread.role == "executor":
-            mine = [n for n, e in enumerate(system.entities) if e.process == thread.process]
-            row[at.T_KIND] = EXECUTORS.index(described.executor)
-            row[at.T_FIRST], row[at.T_END] = mine[0], mine[-1] + 1
-            row[at.T_STEP] = at.COLLECT
-            row[at.T_PUBLISHER_THREAD] = _sibling(system, thread, "publisher")
-            row[at.T_DDS_THREAD] = _sibling(system, thread, "dds")
-        else:
-            sends = thread.role == "publisher"
-            row[at.T_KIND] = at.PUBLISHER if sends else at.DDS
-            row[at.T_STEP] = at.SEND if sends else at.RECEIVE
-
-
-def _sibling(system: System, thread: SimulatedThread, role: str) -> int:
-    same = [
-        n for n, t in enumerate(system.threads) if t.process == thread.process and t.role == role
-    ]
-    return same[0] if same else NONE
-
-
-def _gates(
-    system: System, timing: Timing
-) -> tuple[Int64s, Int64s, Int64s, dict[tuple[int, int], int]]:
-    """``gates``, ``slots``, ``bands``, and the gate's row by (process, callback's place)."""
-    gates: list[list[int]] = []
-    slots: list[tuple[int, int]] = []
-    bands: list[int] = []
-    rows: dict[tuple[int, int], int] = {}
-    for entity in system.entities:
-        gate = entity.described.gate
-        if gate is None or entity.listens:
+    named = zip(threads, system.threads, strict=True)
+    places = {(info.pid, info.role): place for place, info in named}
+    for number, (thread, info) in enumerate(zip(threads, system.threads, strict=True)):
+        for column in (T.RUNNABLE, T.LEFT, T.SEQUENCE, T.PREEMPTED, T.USED):
+            rows[thread + column] = 0
+        rows[thread + T.ROW] = number
+        offset = FIRST_COST + len(COSTS) * ROLES.index(info.role)
+        for place, name in enumerate(COSTS):
+            if (times := getattr(described, name)) is not None:
+                stream = streams.add(times, info.node, offset + place)
+                rows[thread + T.WAKE + place] = stream
+        if info.role != "executor":
+            sends = info.role == "publisher"
+            rows[thread + T.KIND] = at.PUBLISHER if sends else at.DDS
+            rows[thread + T.STEP] = at.SEND if sends else at.RECEIVE
             continue
-        rows[entity.process, entity.index] = len(gates)
-        row = [NONE] * at.GATE_COLUMNS
-        row[at.G_SLOTS], row[at.G_SLOTS_END] = len(slots), len(slots) + len(gate.slots)
-        slots += gate.slots
-        row[at.G_CYCLE], row[at.G_STAMPED] = gate.cycle_ns, int(gate.anchor == "stamp")
-        row[at.G_OVERRUN] = WORDS["overrun"].index(gate.overrun)
-        row[at.G_DUE], row[at.G_SPIN], row[at.G_PAUSE] = (
-            gate.due_cycles,
-            gate.spin_ns,
-            gate.pause_ns,
-        )
-        row[at.G_PHASE], row[at.G_CHANGED] = timing.anchor_ns, 0
-        row[at.G_CHANGES] = len(gates) * at.CHANGES_KEPT
-        row[at.G_MESSAGES] = WORDS["messages"].index(gate.messages)
-        if gate.modes is not None:
-            row[at.G_LATE] = WORDS["overrun"].index(gate.modes.late)
-            row[at.G_DEFAULT], row[at.G_BANDS] = system.modes.index(gate.modes.default), len(bands)
-            bands += [gate.modes.bands.get(mode, NONE) for mode in system.modes]
-        gates.append(row)
-    return _rows(gates, at.GATE_COLUMNS), _rows(slots, 2), _rows([[b] for b in bands], 1), rows
+        kinds = {"static": at.STATIC, "events": at.EVENTS}
+        rows[thread + T.KIND] = kinds.get(described.executor, at.SINGLE_THREADED)
+        pids = [system.processes[entity.process].pid for entity in system.entities]
+        rows[thread + T.FIRST] = entities[pids.index(info.pid)]
+        rows[thread + T.END] = rows[thread + T.FIRST] + pids.count(info.pid) * E.COLUMNS
+        rows[thread + T.STEP] = at.COLLECT
+        rows[thread + T.PUBLISHER_THREAD] = places.get((info.pid, "publisher"), NONE)
+        rows[thread + T.DDS_THREAD] = places.get((info.pid, "dds"), NONE)
 
 
-def _synchronisers(
-    system: System, ring: Callable[[int], int]
-) -> tuple[Int64s, Int64s, dict[tuple[int, int], int]]:
-    """``synchronisers``, ``inputs``, and the row by (process, callback's place)."""
-    synchronisers: list[list[int]] = []
-    inputs: list[list[int]] = []
-    rows: dict[tuple[int, int], int] = {}
-    for number, entity in enumerate(system.entities):
-        if not entity.described.synchronises:
-            continue
-        key = (entity.process, entity.index)
-        if key not in rows:
-            rows[key] = len(synchronisers)
-            synchronisers.append([len(inputs), len(inputs) + len(entity.described.synchronises)])
-        depth = system.application.topic(entity.topic or "").depth
-        inputs.append([int(number in system.chain.callbacks), ring(depth), depth, 0, 0])
-    return _rows(synchronisers, at.SYNCHRONISER_COLUMNS), _rows(inputs, at.INPUT_COLUMNS), rows
-
-
-def _entity_rows(
-    system: System,
-    timing: Timing,
-    streams: Streams,
-    bodies: dict[tuple[int, int], int],
-    ring: Callable[[int], int],
-) -> Int64s:
-    entities = np.zeros((len(system.entities), at.ENTITY_COLUMNS), dtype=np.int64)
-    executors = {t.process: n for n, t in enumerate(system.threads) if t.role == "executor"}
-    executions: dict[tuple[int, int], int] = {}  # inputs of a synchroniser execute the same
-    for number, entity in enumerate(system.entities):
-        row, described = entities[number], entity.described
-        process, callback = system.processes[entity.process], (entity.process, entity.index)
+def _fill_entities(
+    rows: Rows, system: System, areas: tuple[range, ...], timing: Timing, streams: Streams
+) -> None:
+    threads, entities, publishers = areas
+    named = zip(threads, system.threads, strict=True)
+    executors = {info.pid: place for place, info in named if info.role == "executor"}
+    # What inputs of a synchroniser share, and a gate with its listener: stream, gate or inputs.
+    executions: dict[tuple[int, int], int] = {}
+    bodies: dict[tuple[int, int], int] = {}
+    for number, (row, entity) in enumerate(zip(entities, system.entities, strict=True)):
+        described, process = entity.described, system.processes[entity.process]
+        callback, gate = (entity.process, entity.index), entity.described.gate
+        on_chain = number in system.chain.callbacks
         if callback not in executions:
-            executions[callback] = streams.callback(described.execution, process.node, entity.index)
-        row[at.E_ROW] = number
-        row[at.E_THREAD] = executors[entity.process]
-        row[at.E_KIND] = KINDS.index(entity.kind)
-        row[at.E_BODY] = _body(entity)
-        row[at.E_BODY_ROW] = bodies.get(callback, NONE)
-        row[at.E_INPUT] = entity.number
-        row[at.E_EXECUTION] = executions[callback]
-        row[at.E_PUBLISHERS] = entity.publishers[0] if entity.publishers else 0
-        row[at.E_PUBLISHERS_END] = row[at.E_PUBLISHERS] + len(entity.publishers)
-        row[at.E_STARTS_CHAIN] = number in system.chain.callbacks[:1]
-        row[at.E_ON_CHAIN] = number in system.chain.callbacks[1:]
-        row[at.E_LIFESPAN] = NONE
+            executions[callback] = streams.add(described.execution, process.node, entity.index)
+        body = at.COMPUTE
+        if gate is not None:
+            body = at.MODE_LISTENER if entity.listens else at.GATE
+            if callback not in bodies:
+                bodies[callback] = _add_gate(rows, system, described, timing)
+        elif described.synchronises:
+            body = at.SYNCHRONISE
+            if callback not in bodies:
+                inputs = rows.add(len(described.synchronises), I.COLUMNS)
+                bodies[callback] = rows.put([inputs.start, inputs.stop])[0]
+            depth = system.depth(entity.topic or "")
+            first = rows[bodies[callback] + S.FIRST] + entity.number * I.COLUMNS
+            rows[first : first + I.COLUMNS] = [on_chain, rows.ring(depth), depth, 0, 0]
+        rows[row + E.ROW], rows[row + E.THREAD] = number, executors[process.pid]
+        rows[row + E.KIND], rows[row + E.INPUT] = KINDS.index(entity.kind), entity.number
+        rows[row + E.BODY], rows[row + E.BODY_ROW] = body, bodies.get(callback, NONE)
+        rows[row + E.EXECUTION] = executions[callback]
+        if entity.publishers:
+            rows[row + E.PUBLISHERS] = publishers[entity.publishers[0]]
+            rows[row + E.PUBLISHERS_END] = publishers[entity.publishers[-1]] + P.COLUMNS
+        rows[row + E.STARTS_CHAIN] = number in system.chain.callbacks[:1]
+        rows[row + E.ON_CHAIN] = number in system.chain.callbacks[1:]
+        rows[row + E.LIFESPAN] = NONE
         if entity.topic is None:
             drift = system.application.simulation.drift.get(process.key, 0)
             period = described.timer_ns or 0
-            row[at.E_PERIOD] = max(1, round(period * (1 - drift / 1_000_000)))
-            row[at.E_DUE] = timing.start_ns + described.phase_ns
+            rows[row + E.PERIOD] = max(1, round(period * (1 - drift / 1_000_000)))
+            rows[row + E.DUE] = timing.start_ns + described.phase_ns
         else:
             topic = system.application.topic(entity.topic)
-            gate = described.gate
             depth = topic.depth if gate is None or entity.listens else gate.depth
-            row[at.E_HISTORY], row[at.E_DEPTH] = ring(depth), depth
+            rows[row + E.HISTORY], rows[row + E.DEPTH] = rows.ring(depth), depth
             if topic.lifespan_ns is not None:
-                row[at.E_LIFESPAN] = topic.lifespan_ns
-    return entities
+                rows[row + E.LIFESPAN] = topic.lifespan_ns
 
 
-def _body(entity: Entity) -> int:
-    if entity.listens:
-        return at.MODE_LISTENER
-    if entity.described.gate is not None:
-        return at.GATE
-    return at.SYNCHRONISE if entity.described.synchronises else at.COMPUTE
+def _add_gate(rows: Rows, system: System, described: CallbackDescription, timing: Timing) -> int:
+    gate, number_of = described.gate, WORDS["overrun"].index
+    assert gate is not None  # noqa: S101 - the caller has seen it
+    slots, slots_end = rows.put([instant for slot in gate.slots for instant in slot])
+    (row,) = rows.add(1, at.GATE_COLUMNS, NONE)
+    for column, value in {
+        G.SLOTS: slots,
+        G.SLOTS_END: slots_end,
+        G.CYCLE: gate.cycle_ns,
+        G.STAMPED: int(gate.anchor == "stamp"),
+        G.OVERRUN: number_of(gate.overrun),
+        G.DUE: gate.due_cycles,
+        G.SPIN: gate.spin_ns,
+        G.PAUSE: gate.pause_ns,
+        G.MESSAGES: WORDS["messages"].index(gate.messages),
+        G.PHASE: timing.anchor_ns,
+        G.CHANGED: 0,
+        G.CHANGES: rows.add(at.CHANGES_KEPT, 2).start,
+    }.items():
+        rows[row + column] = value
+    if gate.modes is not None:
+        rows[row + G.LATE] = number_of(gate.modes.late)
+        rows[row + G.DEFAULT] = system.modes.index(gate.modes.default)
+        bands, _ = rows.put([gate.modes.bands.get(mode, NONE) for mode in system.modes])
+        rows[row + G.BANDS] = bands
+    return row
 
 
-def _publishers(system: System) -> tuple[Int64s, Int64s, Int64s]:
-    """``publishers``, ``readers``, ``announced``."""
-    rows = np.zeros((len(system.publishers), at.PUBLISHER_COLUMNS), dtype=np.int64)
-    readers: list[tuple[int, int]] = []
-    announced: list[int] = []
+def _fill_publishers(rows: Rows, system: System, publishers: range, entities: range) -> None:
     owner = {p: entity for entity in system.entities for p in entity.publishers}
-    chain = system.chain
-    ends = [(system.entities[c].publishers, chain.topics[-1]) for c in chain.callbacks[-1:]]
-    for number, publisher in enumerate(system.publishers):
-        row, topic = rows[number], system.application.topic(publisher.topic)
+    ends: tuple[int, ...] = ()
+    if system.chain.callbacks:
+        ends = system.entities[system.chain.callbacks[-1]].publishers
+    for number, (row, publisher) in enumerate(zip(publishers, system.publishers, strict=True)):
+        topic = system.application.topic(publisher.topic)
         reached = system.readers.get(publisher.topic, ())
-        row[at.P_ROW] = number
-        row[at.P_FIRST], row[at.P_END] = len(readers), len(readers) + len(reached)
-        readers += [(entity, 0) for entity in reached]
-        row[at.P_ASYNCHRONOUS], row[at.P_DEPTH] = publisher.asynchronous, topic.depth
-        row[at.P_LIFESPAN] = NONE if topic.lifespan_ns is None else topic.lifespan_ns
-        row[at.P_ENDS_CHAIN] = any(
-            number in own and publisher.topic == topic for own, topic in ends
-        )
-        modes = owner[number].described.announces
-        row[at.P_MODES], row[at.P_MODES_COUNT] = len(announced), len(modes)
-        announced += [system.modes.index(mode) for mode in modes]
-    return rows, _rows(readers, at.READER_COLUMNS), _rows([[m] for m in announced], 1)
+        readers = rows.add(len(reached), R.COLUMNS)
+        for reader, entity in zip(readers, reached, strict=True):
+            rows[reader + R.ENTITY] = entities[entity]
+        modes = [system.modes.index(mode) for mode in owner[number].described.announces]
+        rows[row + P.ROW] = number
+        rows[row + P.FIRST], rows[row + P.END] = readers.start, readers.stop
+        rows[row + P.ASYNCHRONOUS], rows[row + P.DEPTH] = publisher.asynchronous, topic.depth
+        rows[row + P.LIFESPAN] = NONE if topic.lifespan_ns is None else topic.lifespan_ns
+        rows[row + P.ENDS_CHAIN] = number in ends and publisher.topic == system.chain.topics[-1]
+        rows[row + P.MODES], _ = rows.put(modes)
+        rows[row + P.MODES_COUNT] = len(modes)

@@ -1,6 +1,6 @@
 """What happens in the compiled engine: queues, how messages travel, and what callbacks do.
 
-Everything is of a fixed size. Where something runs short, `X_PAUSED` says what, and the engine is
+Everything is of a fixed size. Where something runs short, `X.PAUSED` says what, and the engine is
 left at the next safe place; limits leave enough in reserve for what happens until then.
 
 A publication reaches every reader of its topic after a delay, in order (DDS delivers the messages
@@ -10,119 +10,87 @@ publisher hands its message to the publisher thread of its process, whose histor
 are not sent yet; see :mod:`chainshaper.workload.executor`.
 
 A callback has started when :func:`begin_body` is called. Its functions leave in its thread's row
-how much CPU time it needs next and what follows (`T_LEFT`, `T_STEP`), or let the thread wait.
+how much CPU time it needs next and what follows (`T.LEFT`, `T.STEP`), or let the thread wait.
+
+The gate's decisions are `Queue` of :mod:`chainshaper.gate.decision` once more, because the engine
+cannot call Python; tests hold the two against each other, on random gates and messages and on
+`tests/gate_conformance.yaml`.
 """
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
 
+from chainshaper.gate.decision import MAX_AGE_CYCLES, MAX_FUTURE_NS
 from chainshaper.simulation import layout as at
-from chainshaper.simulation.gate_kernel import (
-    decide,
-    drop,
-    left,
-    missed_slot,
-    replaces,
-    switch_mode,
-)
+from chainshaper.simulation.layout import NONE, A, C, D, E, G, H, I, M, P, Q, R, S, T, X
 from chainshaper.values.compiled.memory import compiled
-
-__all__ = [
-    "append",
-    "arrive",
-    "begin_body",
-    "deliver",
-    "draw",
-    "drop_expired",
-    "free_message",
-    "go_on_publishing",
-    "log",
-    "mark_event",
-    "pass_gate",
-    "pop_event",
-    "pop_head",
-    "push_event",
-    "send",
-    "take_oldest",
-    "wake",
-]
 
 
 @compiled()
 def draw(m, stream):
     """The next value of a stream."""
-    constant = m[stream + at.D_CONSTANT]
-    if constant != at.NONE:
+    constant = m[stream + D.CONSTANT]
+    if constant != NONE:
         return constant
-    place = m[stream + at.D_NEXT]
-    m[stream + at.D_NEXT] = place + 1
-    if place >= m[stream + at.D_LIMIT]:
-        m[at.X_PAUSED] = at.MORE_DRAWS
+    place = m[stream + D.NEXT]
+    m[stream + D.NEXT] = place + 1
+    if place >= m[stream + D.LIMIT]:
+        m[X.PAUSED] = at.MORE_DRAWS
     return m[place]
 
 
 @compiled()
-def begin_entry(m, kind, time, thread):
-    """Begin an entry of the log with time and thread; where it stands (NONE: not recorded)."""
-    if m[at.X_LOGGING] == 0 or time < m[at.X_RECORD_FROM]:
-        return at.NONE
-    area = m[at.X_LOGS] + kind * at.LOG_COLUMNS
-    count, stride = m[area + at.A_COUNT], m[area + at.A_STRIDE]
-    m[area + at.A_COUNT] = count + 1
+def log(m, kind, time, thread, fields):
+    """An entry of the log, if it is of the recorded time."""
+    if m[X.LOGGING] == 0 or time < m[X.RECORD_FROM]:
+        return
+    area = m[X.LOGS] + kind * A.COLUMNS
+    count, stride = m[area + A.COUNT], m[area + A.STRIDE]
+    m[area + A.COUNT] = count + 1
     if count + at.RESERVE >= stride:
-        m[at.X_PAUSED] = at.LOG_FULL
-    place = m[area + at.A_FIRST] + count
+        m[X.PAUSED] = at.LOG_FULL
+    place = m[area + A.FIRST] + count
     m[place] = time
-    m[place + stride] = at.NONE if thread == at.NONE else m[thread + at.T_ROW]
-    return place
-
-
-@compiled()
-def log(m, kind, thread, fields):
-    """An entry of the log about what happens now."""
-    place = begin_entry(m, kind, m[at.X_NOW], thread)
-    if place != at.NONE:
-        stride = m[m[at.X_LOGS] + kind * at.LOG_COLUMNS + at.A_STRIDE]
-        place += 2 * stride
-        for field in range(len(fields)):
-            m[place + field * stride] = fields[field]
+    m[place + stride] = NONE if thread == NONE else m[thread + T.ROW]
+    for field in range(len(fields)):
+        m[place + (2 + field) * stride] = fields[field]
 
 
 @compiled()
 def push_event(m, time, kind, row):
     """Something will happen; of what happens at one time, the first pushed comes first."""
-    place = m[at.X_HEAP_END]
-    m[at.X_HEAP_END] = place + at.HEAP_COLUMNS
-    order = m[at.X_COUNTER]
-    m[at.X_COUNTER] = order + 1
-    heap = m[at.X_HEAP]
+    place = m[X.HEAP_END]
+    m[X.HEAP_END] = place + H.COLUMNS
+    order = m[X.COUNTER]
+    m[X.COUNTER] = order + 1
+    heap = m[X.HEAP]
     while place > heap:
-        above = heap + (((place - heap) // at.HEAP_COLUMNS - 1) >> 1) * at.HEAP_COLUMNS
-        if m[above + at.H_TIME] <= time:
+        above = heap + (((place - heap) // H.COLUMNS - 1) >> 1) * H.COLUMNS
+        if m[above + H.TIME] <= time:
             break
         _move(m, above, place)
         place = above
-    m[place + at.H_TIME] = time
-    m[place + at.H_ORDER] = order
-    m[place + at.H_KIND] = kind
-    m[place + at.H_ROW] = row
-    if m[at.X_HEAP_END] >= m[at.X_HEAP_LIMIT]:
-        m[at.X_PAUSED] = at.MESSAGES_FULL
+    m[place + H.TIME] = time
+    m[place + H.ORDER] = order
+    m[place + H.KIND] = kind
+    m[place + H.ROW] = row
+    if m[X.HEAP_END] >= m[X.HEAP_LIMIT]:
+        m[X.PAUSED] = at.MESSAGES_FULL
 
 
 @compiled()
 def pop_event(m):
     """Kind and row of the next event."""
-    heap = m[at.X_HEAP]
-    kind, row = m[heap + at.H_KIND], m[heap + at.H_ROW]
-    last = m[at.X_HEAP_END] - at.HEAP_COLUMNS
-    m[at.X_HEAP_END] = last
+    heap = m[X.HEAP]
+    kind, row = m[heap + H.KIND], m[heap + H.ROW]
+    last = m[X.HEAP_END] - H.COLUMNS
+    m[X.HEAP_END] = last
     place = heap
     while True:
-        below = 2 * place - heap + at.HEAP_COLUMNS
+        below = 2 * place - heap + H.COLUMNS
         if below >= last:
             break
-        if below + at.HEAP_COLUMNS < last and _earlier(m, below + at.HEAP_COLUMNS, below):
-            below += at.HEAP_COLUMNS
+        if below + H.COLUMNS < last and _earlier(m, below + H.COLUMNS, below):
+            below += H.COLUMNS
         if _earlier(m, last, below):
             break
         _move(m, below, place)
@@ -133,84 +101,90 @@ def pop_event(m):
 
 @compiled()
 def _move(m, source, target):
-    for column in range(at.HEAP_COLUMNS):
+    for column in range(H.COLUMNS):
         m[target + column] = m[source + column]
 
 
 @compiled()
 def _earlier(m, one, other):
-    if m[one + at.H_TIME] != m[other + at.H_TIME]:
-        return m[one + at.H_TIME] < m[other + at.H_TIME]
-    return m[one + at.H_ORDER] < m[other + at.H_ORDER]
+    if m[one + H.TIME] != m[other + H.TIME]:
+        return m[one + H.TIME] < m[other + H.TIME]
+    return m[one + H.ORDER] < m[other + H.ORDER]
 
 
 @compiled()
 def new_message(m):
     """An unused row of the pool."""
-    message = m[at.X_FREE]
-    m[at.X_FREE] = m[message + at.M_NEXT]
-    m[message + at.M_NEXT] = at.NONE
-    m[at.X_UNUSED] -= 1
-    if m[at.X_UNUSED] <= at.RESERVE:
-        m[at.X_PAUSED] = at.MESSAGES_FULL
+    message = m[X.FREE]
+    m[X.FREE] = m[message + M.NEXT]
+    m[message + M.NEXT] = NONE
+    m[X.UNUSED] -= 1
+    if m[X.UNUSED] <= at.RESERVE:
+        m[X.PAUSED] = at.MESSAGES_FULL
     return message
 
 
 @compiled()
 def free_message(m, message):
     """Give a row back to the pool."""
-    m[message + at.M_NEXT] = m[at.X_FREE]
-    m[at.X_FREE] = message
-    m[at.X_UNUSED] += 1
+    m[message + M.NEXT] = m[X.FREE]
+    m[X.FREE] = message
+    m[X.UNUSED] += 1
+
+
+@compiled()
+def _copy(m, source, target):
+    for field in range(M.PUBLISHER, M.ARRIVAL):
+        m[target + field] = m[source + field]
 
 
 @compiled()
 def append(m, thread, message):
     """A message goes to the end of a thread's queue."""
-    m[message + at.M_NEXT] = at.NONE
-    if m[thread + at.T_HEAD] == at.NONE:
-        m[thread + at.T_HEAD] = message
+    m[message + M.NEXT] = NONE
+    if m[thread + T.HEAD] == NONE:
+        m[thread + T.HEAD] = message
     else:
-        m[m[thread + at.T_TAIL] + at.M_NEXT] = message
-    m[thread + at.T_TAIL] = message
+        m[m[thread + T.TAIL] + M.NEXT] = message
+    m[thread + T.TAIL] = message
 
 
 @compiled()
 def pop_head(m, thread):
     """The first message of a thread's queue."""
-    message = m[thread + at.T_HEAD]
-    m[thread + at.T_HEAD] = m[message + at.M_NEXT]
+    message = m[thread + T.HEAD]
+    m[thread + T.HEAD] = m[message + M.NEXT]
     return message
 
 
 @compiled()
 def put_newest(m, ring, message):
     """A message goes to the end of a ring; the oldest one of a full ring is gone."""
-    if m[ring + at.Q_WAITING] == m[ring + at.Q_DEPTH]:
+    if m[ring + Q.WAITING] == m[ring + Q.DEPTH]:
         free_message(m, take_oldest(m, ring))
-    place = (m[ring + at.Q_HEAD] + m[ring + at.Q_WAITING]) % m[ring + at.Q_DEPTH]
-    m[m[ring + at.Q_PLACES] + place] = message
-    m[ring + at.Q_WAITING] += 1
+    place = (m[ring + Q.HEAD] + m[ring + Q.WAITING]) % m[ring + Q.DEPTH]
+    m[m[ring + Q.PLACES] + place] = message
+    m[ring + Q.WAITING] += 1
 
 
 @compiled()
 def take_oldest(m, ring):
     """The oldest message of a ring that is not empty, taken out."""
-    message = m[m[ring + at.Q_PLACES] + m[ring + at.Q_HEAD]]
-    m[ring + at.Q_HEAD] = (m[ring + at.Q_HEAD] + 1) % m[ring + at.Q_DEPTH]
-    m[ring + at.Q_WAITING] -= 1
+    message = m[m[ring + Q.PLACES] + m[ring + Q.HEAD]]
+    m[ring + Q.HEAD] = (m[ring + Q.HEAD] + 1) % m[ring + Q.DEPTH]
+    m[ring + Q.WAITING] -= 1
     return message
 
 
 @compiled()
 def drop_expired(m, entity):
     """Forget messages that have waited in a history for longer than their lifespan."""
-    lifespan = m[entity + at.E_LIFESPAN]
-    while lifespan != at.NONE and m[entity + at.E_WAITING] > 0:
-        message = m[m[entity + at.E_HISTORY] + m[entity + at.E_HEAD]]
-        if m[at.X_NOW] - m[message + at.M_ARRIVAL] <= lifespan:
+    lifespan = m[entity + E.LIFESPAN]
+    while lifespan != NONE and m[entity + E.WAITING] > 0:
+        message = m[m[entity + E.HISTORY] + m[entity + E.HEAD]]
+        if m[X.NOW] - m[message + M.ARRIVAL] <= lifespan:
             return
-        free_message(m, take_oldest(m, entity + at.E_HISTORY))
+        free_message(m, take_oldest(m, entity + E.HISTORY))
 
 
 ADDRESSES = 64
@@ -222,50 +196,80 @@ FIRST_ADDRESS, APART = 0x7F00_0000_0000, 0x480
 @compiled()
 def wake(m, thread):
     """A thread that waits becomes runnable, at the end of the queue of its rank."""
-    m[thread + at.T_RUNNABLE] = 1
-    m[thread + at.T_LEFT] += draw(m, m[thread + at.T_WAKE])
-    m[thread + at.T_SEQUENCE] = m[at.X_COUNTER]
-    m[at.X_COUNTER] += 1
-    m[m[thread + at.T_CORE] + at.C_DIRTY] = 1
+    m[thread + T.RUNNABLE] = 1
+    m[thread + T.LEFT] += draw(m, m[thread + T.WAKE])
+    m[thread + T.SEQUENCE] = m[X.COUNTER]
+    m[X.COUNTER] += 1
+    m[m[thread + T.CORE] + C.DIRTY] = 1
+
+
+@compiled()
+def wake_waiting(m, thread, step):
+    """Wake a thread if it waits, with that step as its next one."""
+    if m[thread + T.RUNNABLE] == 0 and m[thread + T.STEP] == step:
+        wake(m, thread)
 
 
 @compiled()
 def publish(m, thread, publisher):
     """The executor publishes: what it passes on stands in its thread's row."""
-    now, published = m[at.X_NOW], m[publisher + at.P_PUBLISHED]
-    m[publisher + at.P_PUBLISHED] += 1
-    address = FIRST_ADDRESS + (m[publisher + at.P_ROW] * ADDRESSES + published % ADDRESSES) * APART
-    log(m, at.L_PUBLISH, thread, (m[publisher + at.P_ROW], address))
+    now, published = m[X.NOW], m[publisher + P.PUBLISHED]
+    m[publisher + P.PUBLISHED] += 1
+    address = FIRST_ADDRESS + (m[publisher + P.ROW] * ADDRESSES + published % ADDRESSES) * APART
+    log(m, at.L_PUBLISH, now, thread, (m[publisher + P.ROW], address))
     message = new_message(m)
-    m[message + at.M_PUBLISHER], m[message + at.M_SOURCE] = publisher, now
-    m[message + at.M_ADDRESS], m[message + at.M_ORIGIN] = address, m[thread + at.T_ORIGIN]
-    m[message + at.M_START] = m[thread + at.T_START]
-    m[message + at.M_NUMBER] = m[thread + at.T_NUMBER]
-    m[message + at.M_MODE] = at.NONE
-    if m[publisher + at.P_MODES_COUNT] > 0:
-        m[message + at.M_MODE] = m[
-            m[publisher + at.P_MODES] + published % m[publisher + at.P_MODES_COUNT]
-        ]
-    if m[publisher + at.P_ASYNCHRONOUS] == 1:
-        _hand_over(m, m[thread + at.T_PUBLISHER_THREAD], message)
+    for field in range(M.COLUMNS - M.SOURCE):
+        m[message + M.SOURCE + field] = m[thread + T.SOURCE + field]
+    m[message + M.PUBLISHER], m[message + M.ADDRESS] = publisher, address
+    m[message + M.SOURCE], m[message + M.MODE] = now, NONE
+    modes = m[publisher + P.MODES_COUNT]
+    if modes > 0:
+        m[message + M.MODE] = m[m[publisher + P.MODES] + published % modes]
+    if m[publisher + P.ASYNCHRONOUS] == 1:
+        _hand_over(m, m[thread + T.PUBLISHER_THREAD], message)
     else:
         send(m, thread, message)
 
 
 @compiled()
+def _hand_over(m, thread, message):
+    """Put a message into its asynchronous writer's history, which has the last ones."""
+    publisher = m[message + M.PUBLISHER]
+    if m[publisher + P.UNSENT] < m[publisher + P.DEPTH]:
+        m[publisher + P.UNSENT] += 1
+        append(m, thread, message)
+    else:
+        # All of this writer's move up by one place; the oldest one's is gone.
+        place = m[thread + T.HEAD]
+        while m[place + M.PUBLISHER] != publisher:
+            place = m[place + M.NEXT]
+        lost = (m[publisher + P.ROW], m[place + M.SOURCE], at.OVERWRITTEN, 0)
+        log(m, at.L_SEND, m[X.NOW], thread, lost)
+        following = m[place + M.NEXT]
+        while following != NONE:
+            if m[following + M.PUBLISHER] == publisher:
+                _copy(m, following, place)
+                place = following
+            following = m[following + M.NEXT]
+        _copy(m, message, place)
+        free_message(m, message)
+    wake_waiting(m, thread, at.SEND)
+
+
+@compiled()
 def send(m, thread, message):
     """A message leaves now, sent by a thread; it is free afterwards, readers get copies."""
-    publisher, now = m[message + at.M_PUBLISHER], m[at.X_NOW]
-    if m[publisher + at.P_ENDS_CHAIN] == 1 and m[message + at.M_START] != at.NONE:
-        noted = m[at.X_LATENCIES] + m[message + at.M_NUMBER] - m[at.X_WARM_UP]
-        if m[at.X_LATENCIES] <= noted < m[at.X_LATENCIES_END] and m[noted] == at.NONE:
-            m[noted] = now - m[message + at.M_START]
-    for reader in range(m[publisher + at.P_FIRST], m[publisher + at.P_END], at.READER_COLUMNS):
+    publisher, now = m[message + M.PUBLISHER], m[X.NOW]
+    if m[publisher + P.ENDS_CHAIN] == 1 and m[message + M.START] != NONE:
+        noted = m[X.LATENCIES] + m[message + M.NUMBER] - m[X.WARM_UP]
+        if m[X.LATENCIES] <= noted < m[X.LATENCIES_END] and m[noted] == NONE:
+            m[noted] = now - m[message + M.START]
+    for reader in range(m[publisher + P.FIRST], m[publisher + P.END], R.COLUMNS):
         copy = new_message(m)
         _copy(m, message, copy)
-        m[copy + at.M_ENTITY] = m[reader + at.R_ENTITY]
-        arrival = max(now + draw(m, m[thread + at.T_DELIVERY]), m[reader + at.R_LAST])
-        m[reader + at.R_LAST] = arrival
+        m[copy + M.ENTITY] = m[reader + R.ENTITY]
+        arrival = max(now + draw(m, m[thread + T.DELIVERY]), m[reader + R.LAST])
+        m[reader + R.LAST] = arrival
         if arrival == now:
             deliver(m, copy)
         else:
@@ -276,198 +280,78 @@ def send(m, thread, message):
 @compiled()
 def deliver(m, message):
     """A message reaches its reader's process, where a DDS thread may have to work for it."""
-    receiver = m[m[m[message + at.M_ENTITY] + at.E_THREAD] + at.T_DDS_THREAD]
-    if receiver == at.NONE:
+    receiver = m[m[m[message + M.ENTITY] + E.THREAD] + T.DDS_THREAD]
+    if receiver == NONE:
         arrive(m, message)
         return
     append(m, receiver, message)
-    if m[receiver + at.T_RUNNABLE] == 0 and m[receiver + at.T_STEP] == at.RECEIVE:
-        wake(m, receiver)
+    wake_waiting(m, receiver, at.RECEIVE)
 
 
 @compiled()
 def arrive(m, message):
     """A message enters its reader's history, and wakes the executor if it waits for work."""
-    entity = m[message + at.M_ENTITY]
-    m[message + at.M_ARRIVAL] = m[at.X_NOW]
-    overwrites = m[entity + at.E_WAITING] == m[entity + at.E_DEPTH]
-    if overwrites and m[entity + at.E_BODY] == at.GATE:
-        _note_overflow(m, entity)
-    put_newest(m, entity + at.E_HISTORY, message)
-    thread = m[entity + at.E_THREAD]
+    entity, now = m[message + M.ENTITY], m[X.NOW]
+    m[message + M.ARRIVAL] = now
+    thread = m[entity + E.THREAD]
+    overwrites = m[entity + E.WAITING] == m[entity + E.DEPTH]
+    if overwrites and m[entity + E.BODY] == at.GATE:
+        oldest = m[m[entity + E.HISTORY] + m[entity + E.HEAD]]
+        about = (m[entity + E.ROW], m[oldest + M.SOURCE], m[oldest + M.ARRIVAL])
+        anchor = 1 - m[m[entity + E.BODY_ROW] + G.STAMPED]
+        never = (m[oldest + M.ORIGIN], NONE, NONE, 0, anchor, NONE, NONE, at.OVERFLOWED)
+        log(m, at.L_RELEASE, now, thread, (*about, *never))
+    put_newest(m, entity + E.HISTORY, message)
     # The event of the message that was overwritten is still in the queue, for this one to use.
-    if m[thread + at.T_KIND] == at.EVENTS and not overwrites:
+    if m[thread + T.KIND] == at.EVENTS and not overwrites:
         mark_event(m, thread, entity)
-    if m[thread + at.T_RUNNABLE] == 0 and m[thread + at.T_STEP] == at.COLLECT:
-        wake(m, thread)
-
-
-@compiled()
-def _note_overflow(m, entity):
-    """A gate has no room any more for the oldest message that waits there."""
-    gate = m[entity + at.E_BODY_ROW]
-    oldest = m[m[entity + at.E_HISTORY] + m[entity + at.E_HEAD]]
-    came, origin = m[oldest + at.M_ARRIVAL], m[oldest + at.M_ORIGIN]
-    about = (m[entity + at.E_ROW], m[oldest + at.M_SOURCE])
-    decision = (came, at.NONE, origin, at.NONE, 0, m[gate + at.G_STAMPED], at.NONE, at.NONE)
-    log(m, at.L_RELEASE, m[entity + at.E_THREAD], (*about, *decision, at.OVERFLOWED))
+    wake_waiting(m, thread, at.COLLECT)
 
 
 @compiled()
 def mark_event(m, thread, entity):
     """An entity of an events executor has something to execute: to the end of its queue."""
     event = new_message(m)
-    m[event + at.M_ENTITY] = entity
+    m[event + M.ENTITY] = entity
     append(m, thread, event)
-
-
-@compiled()
-def _hand_over(m, thread, message):
-    """Put a message into its asynchronous writer's history, which keeps the last ones."""
-    publisher = m[message + at.M_PUBLISHER]
-    if m[publisher + at.P_HELD] < m[publisher + at.P_DEPTH]:
-        m[publisher + at.P_HELD] += 1
-        append(m, thread, message)
-    else:
-        # All of this writer's move up by one place; the oldest one's is gone.
-        place = m[thread + at.T_HEAD]
-        while m[place + at.M_PUBLISHER] != publisher:
-            place = m[place + at.M_NEXT]
-        entry = (m[publisher + at.P_ROW], m[place + at.M_SOURCE], at.OVERWRITTEN, 0)
-        log(m, at.L_SEND, thread, entry)
-        following = m[place + at.M_NEXT]
-        while following != at.NONE:
-            if m[following + at.M_PUBLISHER] == publisher:
-                _copy(m, following, place)
-                place = following
-            following = m[following + at.M_NEXT]
-        _copy(m, message, place)
-        free_message(m, message)
-    if m[thread + at.T_RUNNABLE] == 0 and m[thread + at.T_STEP] == at.SEND:
-        wake(m, thread)
-
-
-@compiled()
-def _copy(m, source, target):
-    for field in range(at.M_PUBLISHER, at.M_ARRIVAL):
-        m[target + field] = m[source + field]
 
 
 @compiled()
 def begin_body(m, thread):
     """Begin the callback of the thread's entity; false if it has ended already."""
-    entity = m[thread + at.T_ENTITY]
-    body = m[entity + at.E_BODY]
-    m[thread + at.T_PUBLICATION] = m[entity + at.E_PUBLISHERS]
-    m[thread + at.T_STEP] = at.PUBLISH
+    entity = m[thread + T.ENTITY]
+    body = m[entity + E.BODY]
+    m[thread + T.PUBLICATION] = m[entity + E.PUBLISHERS]
+    m[thread + T.STEP] = at.PUBLISH
     if body == at.GATE:
-        return _hold(m, thread)
+        return _enter_gate(m, thread)
     if body == at.MODE_LISTENER:
-        switch_mode(m, m[entity + at.E_BODY_ROW], m[thread + at.T_MODE])
+        switch_mode(m, m[entity + E.BODY_ROW], m[thread + T.MODE])
         return _end(m, thread)
     if body == at.SYNCHRONISE and not _complete(m, thread):
         return _end(m, thread)
-    execution = draw(m, m[entity + at.E_EXECUTION])
-    m[thread + at.T_LEFT] = execution + execution * m[at.X_AWAY] // 1_000_000
+    execution = draw(m, m[entity + E.EXECUTION])
+    m[thread + T.LEFT] = execution + execution * m[X.AWAY] // 1_000_000
     return True
 
 
 @compiled()
 def go_on_publishing(m, thread):
     """Publish on the next topic; false if all have been served and the callback has ended."""
-    publisher = m[thread + at.T_PUBLICATION]
-    if publisher == m[m[thread + at.T_ENTITY] + at.E_PUBLISHERS_END]:
+    publisher = m[thread + T.PUBLICATION]
+    if publisher == m[m[thread + T.ENTITY] + E.PUBLISHERS_END]:
         return _end(m, thread)
-    m[thread + at.T_PUBLICATION] += at.PUBLISHER_COLUMNS
+    m[thread + T.PUBLICATION] += P.COLUMNS
     publish(m, thread, publisher)
-    m[thread + at.T_LEFT] = draw(m, m[thread + at.T_PUBLISH])
+    m[thread + T.LEFT] = draw(m, m[thread + T.PUBLISH])
     return True
 
 
 @compiled()
-def sleep(m, thread, until):
-    """A thread waits for an instant, whatever else happens."""
-    m[thread + at.T_RUNNABLE] = 0
-    m[m[thread + at.T_CORE] + at.C_DIRTY] = 1
-    push_event(m, until, at.SLEEP_OVER, thread)
-
-
-@compiled()
-def pass_gate(m, thread):
-    """A thread of a gate goes on: awake, watching the clock, having published or paused.
-
-    False if the callback has ended.
-    """
-    entity, now = m[thread + at.T_ENTITY], m[at.X_NOW]
-    gate = m[entity + at.E_BODY_ROW]
-    if m[thread + at.T_STEP] == at.GATE_WAKE:
-        if m[thread + at.T_BEGAN] == at.NONE:  # it has just woken
-            m[thread + at.T_BEGAN] = now
-            _look(m, entity, gate)
-            if m[gate + at.G_AT] == at.NONE:
-                return _released(m, thread)
-        if now < m[gate + at.G_AT]:
-            m[thread + at.T_LEFT] = m[gate + at.G_AT] - now  # watching the clock
-            return True
-        m[thread + at.T_BEGAN] = now
-        if missed_slot(m, gate):
-            drop(m, gate, at.DISCARDED)
-            m[gate + at.G_TREATED] = at.DISCARD
-            return _released(m, thread)
-        left(m, gate)
-        m[thread + at.T_STEP] = at.GATE_PUBLISHED
-        publish(m, thread, m[entity + at.E_PUBLISHERS])
-        m[thread + at.T_LEFT] = draw(m, m[thread + at.T_PUBLISH])
-        return True
-    # Another message that waits already must not become late by the pause.
-    published = m[thread + at.T_STEP] == at.GATE_PUBLISHED
-    if published and m[gate + at.G_PAUSE] > 0 and m[entity + at.E_WAITING] == 0:
-        m[thread + at.T_STEP] = at.GATE_PAUSED
-        sleep(m, thread, now + m[gate + at.G_PAUSE])
-        return True
-    return _released(m, thread)
-
-
-@compiled()
-def _hold(m, thread):
-    gate, now = m[m[thread + at.T_ENTITY] + at.E_BODY_ROW], m[at.X_NOW]
-    decide(m, gate, m[thread + at.T_CAME], m[thread + at.T_ORIGIN])
-    m[thread + at.T_BEGAN] = now
-    if m[gate + at.G_AT] == at.NONE:
-        return _released(m, thread)
-    m[thread + at.T_STEP], m[thread + at.T_BEGAN] = at.GATE_WAKE, at.NONE
-    if m[gate + at.G_AT] - m[gate + at.G_SPIN] > now:
-        sleep(m, thread, m[gate + at.G_AT] - m[gate + at.G_SPIN])
-    return True
-
-
-@compiled()
-def _look(m, entity, gate):
-    """What has come meanwhile may leave for the one at the gate, or leave no room for it."""
-    if m[entity + at.E_WAITING] == m[entity + at.E_DEPTH]:
-        drop(m, gate, at.OVERFLOWED)
-        return
-    for number in range(m[entity + at.E_WAITING]):
-        place = (m[entity + at.E_HEAD] + number) % m[entity + at.E_DEPTH]
-        message = m[m[entity + at.E_HISTORY] + place]
-        if replaces(m, gate, m[message + at.M_ARRIVAL], m[message + at.M_ORIGIN]):
-            drop(m, gate, at.REPLACED)
-            return
-
-
-@compiled()
-def _released(m, thread):
-    entity = m[thread + at.T_ENTITY]
-    gate = m[entity + at.E_BODY_ROW]
-    m[gate + at.G_FREE] = m[at.X_NOW]
-    place = begin_entry(m, at.L_RELEASE, m[thread + at.T_BEGAN], thread)
-    if place != at.NONE:
-        stride = m[m[at.X_LOGS] + at.L_RELEASE * at.LOG_COLUMNS + at.A_STRIDE]
-        m[place + 2 * stride] = m[entity + at.E_ROW]
-        m[place + 3 * stride] = m[thread + at.T_SOURCE]
-        for field in range(at.G_OTHER - at.G_ARRIVAL):
-            m[place + (4 + field) * stride] = m[gate + at.G_ARRIVAL + field]
-    return _end(m, thread)
+def _end(m, thread):
+    ended = (m[m[thread + T.ENTITY] + E.ROW], m[thread + T.USED])
+    log(m, at.L_END, m[X.NOW], thread, ended)
+    return False
 
 
 @compiled()
@@ -476,31 +360,254 @@ def _complete(m, thread):
 
     The oldest message of every input makes a set. Its stamp is that of the first input.
     """
-    entity = m[thread + at.T_ENTITY]
-    synchroniser = m[entity + at.E_BODY_ROW]
-    first, end = m[synchroniser + at.S_FIRST], m[synchroniser + at.S_END]
-    mine = first + m[entity + at.E_INPUT] * at.INPUT_COLUMNS
+    entity = m[thread + T.ENTITY]
+    synchroniser = m[entity + E.BODY_ROW]
+    first, end = m[synchroniser + S.FIRST], m[synchroniser + S.END]
+    mine = first + m[entity + E.INPUT] * I.COLUMNS
     message = new_message(m)
-    m[message + at.M_ORIGIN] = m[thread + at.T_ORIGIN]
-    m[message + at.M_START] = m[thread + at.T_START]
-    m[message + at.M_NUMBER] = m[thread + at.T_NUMBER]
-    put_newest(m, mine + at.I_RING, message)
-    for source in range(first, end, at.INPUT_COLUMNS):
-        if m[source + at.I_WAITING] == 0:
+    for field in range(M.COLUMNS - M.SOURCE):
+        m[message + M.SOURCE + field] = m[thread + T.SOURCE + field]
+    put_newest(m, mine + I.RING, message)
+    for source in range(first, end, I.COLUMNS):
+        if m[source + I.WAITING] == 0:
             return False
-    m[thread + at.T_START] = at.NONE
-    for source in range(first, end, at.INPUT_COLUMNS):
-        message = take_oldest(m, source + at.I_RING)
+    m[thread + T.START] = NONE
+    for source in range(first, end, I.COLUMNS):
+        message = take_oldest(m, source + I.RING)
         if source == first:
-            m[thread + at.T_ORIGIN] = m[message + at.M_ORIGIN]
-        if m[source + at.I_ON_CHAIN] == 1:
-            m[thread + at.T_START] = m[message + at.M_START]
-            m[thread + at.T_NUMBER] = m[message + at.M_NUMBER]
+            m[thread + T.ORIGIN] = m[message + M.ORIGIN]
+        if m[source + I.ON_CHAIN] == 1:
+            m[thread + T.START] = m[message + M.START]
+            m[thread + T.NUMBER] = m[message + M.NUMBER]
         free_message(m, message)
     return True
 
 
 @compiled()
-def _end(m, thread):
-    log(m, at.L_END, thread, (m[m[thread + at.T_ENTITY] + at.E_ROW], m[thread + at.T_USED]))
-    return False
+def _sleep(m, thread, until):
+    """A thread waits for an instant, whatever else happens."""
+    m[thread + T.RUNNABLE] = 0
+    m[m[thread + T.CORE] + C.DIRTY] = 1
+    push_event(m, until, at.SLEEP_OVER, thread)
+
+
+@compiled()
+def _enter_gate(m, thread):
+    gate, now = m[m[thread + T.ENTITY] + E.BODY_ROW], m[X.NOW]
+    decide(m, gate, m[thread + T.ARRIVAL], m[thread + T.ORIGIN])
+    m[thread + T.BEGAN] = now
+    if m[gate + G.AT] == NONE:
+        return _leave_gate(m, thread)
+    m[thread + T.STEP], m[thread + T.BEGAN] = at.GATE_WAKE, NONE
+    if m[gate + G.AT] - m[gate + G.SPIN] > now:
+        _sleep(m, thread, m[gate + G.AT] - m[gate + G.SPIN])
+    return True
+
+
+@compiled()
+def pass_gate(m, thread):
+    """A thread of a gate goes on: awake, watching the clock, having published or paused.
+
+    False if the callback has ended.
+    """
+    entity, now = m[thread + T.ENTITY], m[X.NOW]
+    gate = m[entity + E.BODY_ROW]
+    if m[thread + T.STEP] == at.GATE_WAKE:
+        if m[thread + T.BEGAN] == NONE:  # it has just woken
+            m[thread + T.BEGAN] = now
+            _look(m, entity, gate)
+            if m[gate + G.AT] == NONE:
+                return _leave_gate(m, thread)
+        if now < m[gate + G.AT]:
+            m[thread + T.LEFT] = m[gate + G.AT] - now  # watching the clock
+            return True
+        m[thread + T.BEGAN] = now
+        if missed_slot(m, gate):
+            drop(m, gate, at.DISCARDED)
+            m[gate + G.TREATED] = at.DISCARD
+            return _leave_gate(m, thread)
+        if m[gate + G.SLOT] != NONE:
+            m[gate + G.LEFT] = m[gate + G.LEAVING]
+        m[thread + T.STEP] = at.GATE_PUBLISHED
+        publish(m, thread, m[entity + E.PUBLISHERS])
+        m[thread + T.LEFT] = draw(m, m[thread + T.PUBLISH])
+        return True
+    # Another message that waits already must not become late by the pause.
+    published = m[thread + T.STEP] == at.GATE_PUBLISHED
+    if published and m[gate + G.PAUSE] > 0 and m[entity + E.WAITING] == 0:
+        m[thread + T.STEP] = at.GATE_PAUSED
+        _sleep(m, thread, now + m[gate + G.PAUSE])
+        return True
+    return _leave_gate(m, thread)
+
+
+@compiled()
+def _look(m, entity, gate):
+    """What has come meanwhile may leave for the one at the gate, or leave no room for it."""
+    if m[entity + E.WAITING] == m[entity + E.DEPTH]:
+        drop(m, gate, at.OVERFLOWED)
+        return
+    for number in range(m[entity + E.WAITING]):
+        place = (m[entity + E.HEAD] + number) % m[entity + E.DEPTH]
+        message = m[m[entity + E.HISTORY] + place]
+        if _replaces(m, gate, m[message + M.ARRIVAL], m[message + M.ORIGIN]):
+            drop(m, gate, at.REPLACED)
+            return
+
+
+@compiled()
+def _leave_gate(m, thread):
+    entity = m[thread + T.ENTITY]
+    gate = m[entity + E.BODY_ROW]
+    m[gate + G.FREE] = m[X.NOW]
+    about = (m[entity + E.ROW], m[thread + T.SOURCE], m[gate + G.ARRIVAL])
+    leaves = (m[gate + G.ORIGIN], m[gate + G.AT], m[gate + G.SLOT], m[gate + G.CYCLES])
+    why = (1 - m[gate + G.BY_STAMP], m[gate + G.TREATED], m[gate + G.MODE], m[gate + G.DROPPED])
+    log(m, at.L_RELEASE, m[thread + T.BEGAN], thread, (*about, *leaves, *why))
+    return _end(m, thread)
+
+
+@compiled()
+def decide(m, gate, arrival, stamp):
+    """When the message whose turn it is may leave, and why, as `Queue.decide`."""
+    ready = max(arrival, m[gate + G.FREE])
+    _release(m, gate, gate, arrival, stamp, ready)
+    if m[gate + G.BY_STAMP] == 1:
+        m[gate + G.PHASE] = m[gate + G.ORIGIN] % m[gate + G.CYCLE]
+    in_order = m[gate + G.MESSAGES] == at.ALL_IN_ORDER
+    if m[gate + G.AT] == NONE or m[gate + G.SLOT] == NONE or in_order:
+        return
+    left = m[gate + G.LEFT]
+    if left != NONE and _same_cycle(m, gate, _start(m, gate, gate), left):
+        if m[gate + G.MESSAGES] == at.FIRST:
+            drop(m, gate, at.SURPLUS)
+            return
+        last_end = m[m[gate + G.SLOTS_END] - 1]
+        _release(m, gate, gate, arrival, stamp, max(ready, left + last_end))
+        if m[gate + G.AT] == NONE:
+            return
+        if m[gate + G.SLOT] == NONE:
+            m[gate + G.AT] = ready
+            return
+    start, leaving = _start(m, gate, gate), m[gate + G.LEAVING]
+    if leaving == NONE or not _same_cycle(m, gate, start, leaving):
+        m[gate + G.LEAVING] = start
+
+
+@compiled()
+def drop(m, gate, why):
+    """The message never leaves."""
+    m[gate + G.AT] = m[gate + G.SLOT] = NONE
+    m[gate + G.DROPPED] = why
+
+
+@compiled()
+def _replaces(m, gate, arrival, stamp):
+    """Whether a message that waits would leave for the one at the gate, as `Queue.replaced`."""
+    if m[gate + G.MESSAGES] != at.NEWEST or m[gate + G.SLOT] == NONE:
+        return False
+    other = gate + G.OTHER - G.ARRIVAL
+    _release(m, gate, other, arrival, stamp, m[X.NOW])
+    if m[other + G.SLOT] == NONE or m[gate + G.LEAVING] == NONE:
+        return False
+    return _same_cycle(m, gate, _start(m, gate, other), m[gate + G.LEAVING])
+
+
+@compiled()
+def _start(m, gate, row):
+    return m[row + G.ORIGIN] + m[row + G.CYCLES] * m[gate + G.CYCLE]
+
+
+@compiled()
+def _same_cycle(m, gate, start, other):
+    return 2 * abs(start - other) < m[gate + G.CYCLE]
+
+
+@compiled()
+def _release(m, gate, row, arrival, stamp, ready):  # noqa: PLR0917 - as `release_of`
+    """What `release_of` decides, into the fields from G.ARRIVAL on, counted from ``row``."""
+    age = arrival - stamp
+    cycle_ns = m[gate + G.CYCLE]
+    due = m[gate + G.DUE]
+    max_age = (MAX_AGE_CYCLES + due) * cycle_ns
+    stamped = m[gate + G.STAMPED] == 1 and age >= -MAX_FUTURE_NS and age <= max_age
+    origin = stamp if stamped else arrival - (arrival - m[gate + G.PHASE]) % cycle_ns
+    if not stamped:
+        due = min(due, 1)
+    mode = _mode_at(m, gate, origin)
+    first, last, policy = _open_to(m, gate, mode)
+    ready = max(arrival, ready)
+    cycle = max(0, (ready - origin) // cycle_ns)
+    due_from = origin + due * cycle_ns
+    overran = ready >= due_from + m[last - 1]
+    m[row + G.ARRIVAL], m[row + G.ORIGIN], m[row + G.MODE] = arrival, origin, mode
+    m[row + G.BY_STAMP], m[row + G.TREATED] = stamped, NONE
+    m[row + G.SLOT], m[row + G.CYCLES], m[row + G.DROPPED] = NONE, cycle, NONE
+    if overran and policy != at.WAIT:
+        m[row + G.TREATED], m[row + G.AT] = policy, ready
+        if policy != at.PUBLISH_LATE:
+            m[row + G.AT], m[row + G.DROPPED] = NONE, at.DISCARDED
+        return
+    if overran:
+        m[row + G.TREATED] = at.WAIT
+    elif mode != NONE and ready >= due_from + m[first + 1]:
+        m[row + G.TREATED] = at.NEXT_SLOT
+    m[row + G.CYCLES] = max(due, cycle)
+    while True:
+        start = origin + m[row + G.CYCLES] * cycle_ns
+        for slot in range(first, last, 2):
+            if ready < start + m[slot + 1]:
+                m[row + G.AT] = max(ready, start + m[slot])
+                m[row + G.SLOT] = (slot - m[gate + G.SLOTS]) // 2
+                return
+        m[row + G.CYCLES] += 1
+
+
+@compiled()
+def missed_slot(m, gate):
+    """Whether the message has to be discarded because its slot is over by now."""
+    _, _, policy = _open_to(m, gate, m[gate + G.MODE])
+    slot = m[gate + G.SLOT]
+    if policy != at.DISCARD or slot == NONE:
+        return False
+    return m[X.NOW] >= _start(m, gate, gate) + m[m[gate + G.SLOTS] + 2 * slot + 1]
+
+
+@compiled()
+def switch_mode(m, gate, mode):
+    """A mode is announced; one that the gate does not know, or has already, changes nothing."""
+    if mode == NONE or m[m[gate + G.BANDS] + mode] == NONE:
+        return
+    count, changes = m[gate + G.CHANGED], m[gate + G.CHANGES]
+    current = m[gate + G.DEFAULT]
+    if count:
+        current = m[changes + 2 * ((count - 1) % at.CHANGES_KEPT) + 1]
+    if mode != current:
+        place = changes + 2 * (count % at.CHANGES_KEPT)
+        m[place], m[place + 1] = m[X.NOW], mode
+        m[gate + G.CHANGED] = count + 1
+
+
+@compiled()
+def _mode_at(m, gate, origin):
+    mode = m[gate + G.DEFAULT]
+    if mode == NONE:
+        return mode
+    count, changes = m[gate + G.CHANGED], m[gate + G.CHANGES]
+    for number in range(count - 1, max(-1, count - 1 - at.CHANGES_KEPT), -1):
+        place = changes + 2 * (number % at.CHANGES_KEPT)
+        if m[place] <= origin:
+            return m[place + 1]
+    return mode
+
+
+@compiled()
+def _open_to(m, gate, mode):
+    """Where the slots open to a mode begin and end, and what is done behind them."""
+    first, last = m[gate + G.SLOTS], m[gate + G.SLOTS_END]
+    if mode == NONE:
+        return first, last, m[gate + G.OVERRUN]
+    band = first + 2 * m[m[gate + G.BANDS] + mode]
+    if m[gate + G.LATE] == at.NEXT_SLOT:
+        return band, last, m[gate + G.OVERRUN]
+    return band, band + 2, m[gate + G.LATE]

@@ -22,25 +22,9 @@ order in which their executor looks at them.
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
 
+from chainshaper.simulation import callbacks
 from chainshaper.simulation import layout as at
-from chainshaper.simulation.callbacks import (
-    arrive,
-    begin_body,
-    deliver,
-    draw,
-    drop_expired,
-    free_message,
-    go_on_publishing,
-    log,
-    mark_event,
-    pass_gate,
-    pop_event,
-    pop_head,
-    push_event,
-    send,
-    take_oldest,
-    wake,
-)
+from chainshaper.simulation.layout import NONE, C, E, H, M, P, T, X
 from chainshaper.values.compiled.memory import compiled, table_at
 
 __all__ = ["run"]
@@ -49,8 +33,8 @@ __all__ = ["run"]
 @compiled()
 def advance(m, thread):
     """Go on with a running thread that needs no more CPU time for its step."""
-    while m[thread + at.T_RUNNABLE] == 1 and m[thread + at.T_LEFT] == 0:
-        step = m[thread + at.T_STEP]
+    while m[thread + T.RUNNABLE] == 1 and m[thread + T.LEFT] == 0:
+        step = m[thread + T.STEP]
         if step >= at.SEND:
             _work_for_executor(m, thread)
         elif step == at.COLLECT:
@@ -59,9 +43,9 @@ def advance(m, thread):
             if step == at.TAKE:
                 goes_on = _take(m, thread)
             elif step == at.PUBLISH:
-                goes_on = go_on_publishing(m, thread)
+                goes_on = callbacks.go_on_publishing(m, thread)
             else:
-                goes_on = pass_gate(m, thread)
+                goes_on = callbacks.pass_gate(m, thread)
             if not goes_on:
                 _choose(m, thread)
 
@@ -69,230 +53,214 @@ def advance(m, thread):
 @compiled()
 def expire(m, entity):
     """A timer's time has come: its executor sees it in its next snapshot, or gets an event."""
-    thread = m[entity + at.E_THREAD]
-    if m[thread + at.T_KIND] == at.EVENTS:
-        mark_event(m, thread, entity)
+    thread = m[entity + E.THREAD]
+    if m[thread + T.KIND] == at.EVENTS:
+        callbacks.mark_event(m, thread, entity)
         _call_timer(m, entity)
-    if m[thread + at.T_RUNNABLE] == 0 and m[thread + at.T_STEP] == at.COLLECT:
-        wake(m, thread)
+    callbacks.wake_waiting(m, thread, at.COLLECT)
 
 
 @compiled()
 def _call_timer(m, entity):
     """Move on to the first expiry that is not over yet, as `rcl_timer_call` does."""
-    now = m[at.X_NOW]
-    m[entity + at.E_DUE] += m[entity + at.E_PERIOD]
-    if m[entity + at.E_DUE] < now:
-        period = m[entity + at.E_PERIOD]
-        m[entity + at.E_DUE] += -(-(now - m[entity + at.E_DUE]) // period) * period
-    if m[entity + at.E_DUE] <= m[at.X_LAST_TIMER]:
-        push_event(m, m[entity + at.E_DUE], at.EXPIRY, entity)
+    now = m[X.NOW]
+    m[entity + E.DUE] += m[entity + E.PERIOD]
+    if m[entity + E.DUE] < now:
+        period = m[entity + E.PERIOD]
+        m[entity + E.DUE] += -(-(now - m[entity + E.DUE]) // period) * period
+    if m[entity + E.DUE] <= m[X.LAST_TIMER]:
+        callbacks.push_event(m, m[entity + E.DUE], at.EXPIRY, entity)
 
 
 @compiled()
 def _ready(m, entity):
-    if m[entity + at.E_KIND] == at.TIMER:
-        return m[entity + at.E_DUE] <= min(m[at.X_NOW], m[at.X_LAST_TIMER])
-    if m[entity + at.E_LIFESPAN] != at.NONE:
-        drop_expired(m, entity)
-    return m[entity + at.E_WAITING] > 0
+    if m[entity + E.KIND] == at.TIMER:
+        return m[entity + E.DUE] <= min(m[X.NOW], m[X.LAST_TIMER])
+    if m[entity + E.LIFESPAN] != NONE:
+        callbacks.drop_expired(m, entity)
+    return m[entity + E.WAITING] > 0
 
 
 @compiled()
 def _collect(m, thread):
     """Fill the wait set and take a snapshot of what is ready; wait if nothing is."""
-    if m[thread + at.T_KIND] == at.EVENTS:
-        if m[thread + at.T_HEAD] == at.NONE:
-            _wait(m, thread)
-            return
-    else:
-        any_ready = False
-        for entity in range(m[thread + at.T_FIRST], m[thread + at.T_END], at.ENTITY_COLUMNS):
+    any_ready = m[thread + T.KIND] == at.EVENTS and m[thread + T.HEAD] != NONE
+    if m[thread + T.KIND] != at.EVENTS:
+        for entity in range(m[thread + T.FIRST], m[thread + T.END], E.COLUMNS):
             ready = _ready(m, entity)
-            m[entity + at.E_READY] = ready
+            m[entity + E.READY] = ready
             any_ready |= ready
-        if not any_ready:
-            _wait(m, thread)
-            return
-    _choose(m, thread)
+    if any_ready:
+        _choose(m, thread)
+    else:
+        _wait(m, thread)
 
 
 @compiled()
 def _wait(m, thread):
-    m[thread + at.T_RUNNABLE] = 0
-    m[m[thread + at.T_CORE] + at.C_DIRTY] = 1
+    m[thread + T.RUNNABLE] = 0
+    m[m[thread + T.CORE] + C.DIRTY] = 1
 
 
 @compiled()
 def _choose(m, thread):
     """The next of the snapshot is executed; if there is none left, a new one is taken."""
-    chosen = at.NONE
-    if m[thread + at.T_KIND] == at.EVENTS:
-        if m[thread + at.T_HEAD] != at.NONE:
-            event = pop_head(m, thread)
-            chosen = m[event + at.M_ENTITY]
-            free_message(m, event)
+    chosen, kind = NONE, m[thread + T.KIND]
+    if kind == at.EVENTS:
+        if m[thread + T.HEAD] != NONE:
+            event = callbacks.pop_head(m, thread)
+            chosen = m[event + M.ENTITY]
+            callbacks.free_message(m, event)
     else:
-        for entity in range(m[thread + at.T_FIRST], m[thread + at.T_END], at.ENTITY_COLUMNS):
-            if m[entity + at.E_READY] == 1:
-                chosen = entity
-                break
-    if chosen == at.NONE:
+        for entity in range(m[thread + T.FIRST], m[thread + T.END], E.COLUMNS):
+            if m[entity + E.READY] == 1:
+                if chosen == NONE:
+                    chosen = entity
+                    m[entity + E.READY] = 0
+                elif kind == at.STATIC:  # one callback per wait set
+                    m[entity + E.READY] = 0
+                else:
+                    break
+    if chosen == NONE:
         _refill(m, thread)
         return
-    if m[thread + at.T_KIND] == at.STATIC:  # one callback per wait set
-        for entity in range(m[thread + at.T_FIRST], m[thread + at.T_END], at.ENTITY_COLUMNS):
-            m[entity + at.E_READY] = 0
-    m[chosen + at.E_READY] = 0
-    log(m, at.L_EXECUTE, thread, (m[chosen + at.E_ROW],))
-    m[thread + at.T_ENTITY] = chosen
-    m[thread + at.T_STEP] = at.TAKE
-    if m[chosen + at.E_KIND] != at.TIMER:
-        m[thread + at.T_LEFT] = draw(m, m[thread + at.T_TAKE])
-    elif m[thread + at.T_KIND] != at.EVENTS:  # there, it was called when it expired
+    callbacks.log(m, at.L_EXECUTE, m[X.NOW], thread, (m[chosen + E.ROW],))
+    m[thread + T.ENTITY] = chosen
+    m[thread + T.STEP] = at.TAKE
+    if m[chosen + E.KIND] != at.TIMER:
+        m[thread + T.LEFT] = callbacks.draw(m, m[thread + T.TAKE])
+    elif kind != at.EVENTS:  # there, it was called when it expired
         _call_timer(m, chosen)
 
 
 @compiled()
 def _refill(m, thread):
-    m[thread + at.T_STEP] = at.COLLECT
-    due = m[at.X_STOP]
-    for entity in range(m[thread + at.T_FIRST], m[thread + at.T_END], at.ENTITY_COLUMNS):
-        if m[entity + at.E_KIND] == at.TIMER and m[entity + at.E_DUE] <= m[at.X_LAST_TIMER]:
-            due = min(due, m[entity + at.E_DUE])
-    if m[thread + at.T_KIND] != at.EVENTS:
-        log(m, at.L_WAIT, thread, (max(0, due - m[at.X_NOW]),))
+    m[thread + T.STEP] = at.COLLECT
+    if m[thread + T.KIND] == at.EVENTS:
+        return
+    due = m[X.STOP]
+    for entity in range(m[thread + T.FIRST], m[thread + T.END], E.COLUMNS):
+        if m[entity + E.KIND] == at.TIMER and m[entity + E.DUE] <= m[X.LAST_TIMER]:
+            due = min(due, m[entity + E.DUE])
+    callbacks.log(m, at.L_WAIT, m[X.NOW], thread, (max(0, due - m[X.NOW]),))
 
 
 @compiled()
 def _take(m, thread):
     """Take the message of the chosen entity and start its callback; false if it is over."""
-    entity, now = m[thread + at.T_ENTITY], m[at.X_NOW]
-    m[thread + at.T_START] = at.NONE
-    if m[entity + at.E_KIND] == at.TIMER:
-        m[thread + at.T_ORIGIN], m[thread + at.T_NUMBER] = now, m[entity + at.E_INSTANCES]
-        if m[entity + at.E_STARTS_CHAIN] == 1:
-            m[thread + at.T_START] = now
+    entity, now = m[thread + T.ENTITY], m[X.NOW]
+    m[thread + T.START] = NONE
+    if m[entity + E.KIND] == at.TIMER:
+        m[thread + T.ORIGIN], m[thread + T.NUMBER] = now, m[entity + E.INSTANCES]
+        if m[entity + E.STARTS_CHAIN] == 1:
+            m[thread + T.START] = now
     else:
-        drop_expired(m, entity)
-        if m[entity + at.E_WAITING] == 0:
-            log(m, at.L_TAKE, thread, (m[entity + at.E_ROW], 0, 0, 0))
+        callbacks.drop_expired(m, entity)
+        if m[entity + E.WAITING] == 0:
+            callbacks.log(m, at.L_TAKE, now, thread, (m[entity + E.ROW], 0, 0, 0))
             return False
-        message = take_oldest(m, entity + at.E_HISTORY)
-        m[thread + at.T_SOURCE] = m[message + at.M_SOURCE]
-        m[thread + at.T_ORIGIN] = m[message + at.M_ORIGIN]
-        m[thread + at.T_MODE] = m[message + at.M_MODE]
-        m[thread + at.T_NUMBER] = m[message + at.M_NUMBER]
-        m[thread + at.T_CAME] = m[message + at.M_ARRIVAL]
-        if m[entity + at.E_ON_CHAIN] == 1:
-            m[thread + at.T_START] = m[message + at.M_START]
-        entry = (m[entity + at.E_ROW], m[message + at.M_ADDRESS], m[message + at.M_SOURCE], 1)
-        free_message(m, message)
-        log(m, at.L_TAKE, thread, entry)
-    m[entity + at.E_INSTANCES] += 1
-    log(m, at.L_START, thread, (m[entity + at.E_ROW], m[thread + at.T_USED]))
-    return begin_body(m, thread)
+        message = callbacks.take_oldest(m, entity + E.HISTORY)
+        for field in range(M.COLUMNS - M.SOURCE):
+            m[thread + T.SOURCE + field] = m[message + M.SOURCE + field]
+        if m[entity + E.ON_CHAIN] == 0:
+            m[thread + T.START] = NONE
+        entry = (m[entity + E.ROW], m[message + M.ADDRESS], m[message + M.SOURCE], 1)
+        callbacks.log(m, at.L_TAKE, now, thread, entry)
+        callbacks.free_message(m, message)
+    m[entity + E.INSTANCES] += 1
+    callbacks.log(m, at.L_START, now, thread, (m[entity + E.ROW], m[thread + T.USED]))
+    return callbacks.begin_body(m, thread)
 
 
 @compiled()
 def _work_for_executor(m, thread):
     """The next step of a publisher thread or a DDS thread."""
-    step = m[thread + at.T_STEP]
+    step, now = m[thread + T.STEP], m[X.NOW]
     if step == at.SENT:
-        duration = m[at.X_NOW] - m[thread + at.T_BEGAN]
-        publisher = m[thread + at.T_PUBLICATION]
-        entry = (m[publisher + at.P_ROW], m[thread + at.T_SOURCE], at.SENT_OUTCOME, duration)
-        log(m, at.L_SEND, thread, entry)
-        m[thread + at.T_STEP] = at.SEND
+        row, source = m[m[thread + T.PUBLICATION] + P.ROW], m[thread + T.SOURCE]
+        entry = (row, source, at.SENT_OUTCOME, now - m[thread + T.BEGAN])
+        callbacks.log(m, at.L_SEND, now, thread, entry)
+        m[thread + T.STEP] = at.SEND
     elif step == at.RECEIVED:
-        arrive(m, pop_head(m, thread))
-        m[thread + at.T_STEP] = at.RECEIVE
-    elif m[thread + at.T_HEAD] == at.NONE:
+        callbacks.arrive(m, callbacks.pop_head(m, thread))
+        m[thread + T.STEP] = at.RECEIVE
+    elif m[thread + T.HEAD] == NONE:
         _wait(m, thread)
     elif step == at.RECEIVE:
-        m[thread + at.T_LEFT] = draw(m, m[thread + at.T_RECEIVE])
-        m[thread + at.T_STEP] = at.RECEIVED
+        m[thread + T.LEFT] = callbacks.draw(m, m[thread + T.RECEIVE])
+        m[thread + T.STEP] = at.RECEIVED
     else:
-        _send_next(m, thread)
-
-
-@compiled()
-def _send_next(m, thread):
-    message, now = pop_head(m, thread), m[at.X_NOW]
-    publisher, source = m[message + at.M_PUBLISHER], m[message + at.M_SOURCE]
-    m[publisher + at.P_HELD] -= 1
-    if m[publisher + at.P_LIFESPAN] != at.NONE and now - source > m[publisher + at.P_LIFESPAN]:
-        log(m, at.L_SEND, thread, (m[publisher + at.P_ROW], source, at.EXPIRED, 0))
-        free_message(m, message)
-        return
-    m[thread + at.T_BEGAN] = now
-    m[thread + at.T_SOURCE] = source
-    m[thread + at.T_PUBLICATION] = publisher
-    send(m, thread, message)
-    m[thread + at.T_LEFT] = draw(m, m[thread + at.T_PUBLISH])
-    m[thread + at.T_STEP] = at.SENT
+        message = callbacks.pop_head(m, thread)
+        publisher, source = m[message + M.PUBLISHER], m[message + M.SOURCE]
+        lifespan = m[publisher + P.LIFESPAN]
+        m[publisher + P.UNSENT] -= 1
+        if lifespan != NONE and now - source > lifespan:
+            expired = (m[publisher + P.ROW], source, at.EXPIRED, 0)
+            callbacks.log(m, at.L_SEND, now, thread, expired)
+            callbacks.free_message(m, message)
+            return
+        m[thread + T.BEGAN], m[thread + T.SOURCE] = now, source
+        m[thread + T.PUBLICATION] = publisher
+        callbacks.send(m, thread, message)
+        m[thread + T.LEFT] = callbacks.draw(m, m[thread + T.PUBLISH])
+        m[thread + T.STEP] = at.SENT
 
 
 @compiled()
 def run(address):
     """Go on until the end, or until the caller has to look after the array; why (`X_PAUSED`)."""
     m = table_at(address)
-    m[at.X_PAUSED] = at.RUNNING
-    while m[at.X_PAUSED] == at.RUNNING:
+    m[X.PAUSED] = at.RUNNING
+    while m[X.PAUSED] == at.RUNNING:
         now = _next_instant(m)
-        if now > m[at.X_STOP]:
+        if now > m[X.STOP]:
             return at.OVER
-        m[at.X_NOW] = now
-        while m[at.X_HEAP_END] > m[at.X_HEAP] and m[m[at.X_HEAP] + at.H_TIME] <= now:
-            _happen(m)
+        m[X.NOW] = now
+        while m[X.HEAP_END] > m[X.HEAP] and m[m[X.HEAP] + H.TIME] <= now:
+            kind, row = callbacks.pop_event(m)
+            if kind == at.DELIVERY:
+                callbacks.deliver(m, row)
+            elif kind == at.EXPIRY:
+                expire(m, row)
+            else:
+                callbacks.wake(m, row)
         # A thread that goes on may cause something that happens now: one goes on at a time.
         if not _one_goes_on(m):
-            for core in range(m[at.X_CORES], m[at.X_CORES_END], at.CORE_COLUMNS):
-                if m[core + at.C_BOUNDARY] <= now:
+            for core in range(m[X.CORES], m[X.CORES_END], C.COLUMNS):
+                if m[core + C.BOUNDARY] <= now:
                     _cross_boundary(m, core)
-                if m[core + at.C_DIRTY] == 1:
+                if m[core + C.DIRTY] == 1:
                     _reschedule(m, core)
-    return m[at.X_PAUSED]
+    return m[X.PAUSED]
 
 
 @compiled()
 def _next_instant(m):
     now = at.FOREVER
-    if m[at.X_HEAP_END] > m[at.X_HEAP]:
-        now = m[m[at.X_HEAP] + at.H_TIME]
-    for core in range(m[at.X_CORES], m[at.X_CORES_END], at.CORE_COLUMNS):
-        if m[core + at.C_DIRTY] == 1:
-            return m[at.X_NOW]
-        now = min(now, m[core + at.C_UNTIL], m[core + at.C_BOUNDARY])
+    if m[X.HEAP_END] > m[X.HEAP]:
+        now = m[m[X.HEAP] + H.TIME]
+    for core in range(m[X.CORES], m[X.CORES_END], C.COLUMNS):
+        if m[core + C.DIRTY] == 1:
+            return m[X.NOW]
+        now = min(now, m[core + C.UNTIL], m[core + C.BOUNDARY])
     return now
-
-
-@compiled()
-def _happen(m):
-    kind, row = pop_event(m)
-    if kind == at.DELIVERY:
-        deliver(m, row)
-    elif kind == at.EXPIRY:
-        expire(m, row)
-    else:
-        wake(m, row)
 
 
 @compiled()
 def _one_goes_on(m):
     """Let one running thread go on that has used what it needed for a step, or its quantum."""
-    for core in range(m[at.X_CORES], m[at.X_CORES_END], at.CORE_COLUMNS):
-        if m[core + at.C_UNTIL] > m[at.X_NOW]:
+    for core in range(m[X.CORES], m[X.CORES_END], C.COLUMNS):
+        if m[core + C.UNTIL] > m[X.NOW]:
             continue
-        thread = m[core + at.C_RUNNING]
+        thread = m[core + C.RUNNING]
         _charge(m, core)
-        if m[thread + at.T_LEFT] == 0:
+        if m[thread + T.LEFT] == 0:
             advance(m, thread)
-        elif m[core + at.C_QUANTUM] <= 0:
-            m[thread + at.T_SEQUENCE] = m[at.X_COUNTER]
-            m[at.X_COUNTER] += 1
-            m[core + at.C_QUANTUM] = m[at.X_QUANTUM]
-            m[core + at.C_DIRTY] = 1
+        elif m[core + C.QUANTUM] <= 0:
+            m[thread + T.SEQUENCE] = m[X.COUNTER]
+            m[X.COUNTER] += 1
+            m[core + C.QUANTUM] = m[X.QUANTUM]
+            m[core + C.DIRTY] = 1
         _run_until(m, core)
         return True
     return False
@@ -301,91 +269,86 @@ def _one_goes_on(m):
 @compiled()
 def _run_until(m, core):
     """Note when the running thread needs to be looked at again."""
-    thread = m[core + at.C_RUNNING]
-    m[core + at.C_UNTIL] = at.FOREVER
-    if thread != at.NONE and m[thread + at.T_RUNNABLE] == 1:
-        left = m[thread + at.T_LEFT]
-        if m[thread + at.T_SERVER] != at.NONE:
-            left = min(left, m[core + at.C_QUANTUM])
-        m[core + at.C_UNTIL] = m[at.X_NOW] + left
+    thread = m[core + C.RUNNING]
+    m[core + C.UNTIL] = at.FOREVER
+    if thread != NONE and m[thread + T.RUNNABLE] == 1:
+        left = m[thread + T.LEFT]
+        if m[thread + T.SERVER] != NONE:
+            left = min(left, m[core + C.QUANTUM])
+        m[core + C.UNTIL] = m[X.NOW] + left
 
 
 @compiled()
 def _charge(m, core):
     """Account for what the running thread has used since it was looked at last."""
-    thread = m[core + at.C_RUNNING]
-    if thread == at.NONE:
+    thread = m[core + C.RUNNING]
+    if thread == NONE:
         return
-    used = m[at.X_NOW] - m[core + at.C_SINCE]
-    m[thread + at.T_LEFT] -= used
-    m[thread + at.T_USED] += used
-    m[core + at.C_QUANTUM] -= used
-    m[core + at.C_SINCE] = m[at.X_NOW]
+    used = m[X.NOW] - m[core + C.SINCE]
+    m[thread + T.LEFT] -= used
+    m[thread + T.USED] += used
+    m[core + C.QUANTUM] -= used
+    m[core + C.SINCE] = m[X.NOW]
 
 
 @compiled()
 def _cross_boundary(m, core):
     """Servers open and close; the next boundary may be in the next cycle."""
-    pair = m[core + at.C_NEXT]
-    m[core + at.C_MASK] = m[pair + 1]
+    pair = m[core + C.NEXT]
+    m[core + C.MASK] = m[pair + 1]
     following = pair + 2
-    if following == m[core + at.C_TABLE_END]:
-        following = m[core + at.C_TABLE]
-        m[core + at.C_BOUNDARY] += m[at.X_CYCLE]
-    m[core + at.C_BOUNDARY] += m[following] - m[pair]
-    m[core + at.C_NEXT] = following
-    m[core + at.C_DIRTY] = 1
+    if following == m[core + C.TABLE_END]:
+        following = m[core + C.TABLE]
+        m[core + C.BOUNDARY] += m[X.CYCLE]
+    m[core + C.BOUNDARY] += m[following] - m[pair]
+    m[core + C.NEXT] = following
+    m[core + C.DIRTY] = 1
 
 
 @compiled()
 def _reschedule(m, core):
     """Let the best eligible thread run."""
-    m[core + at.C_DIRTY] = 0
+    m[core + C.DIRTY] = 0
     _charge(m, core)
-    best = at.NONE
-    for place in range(m[core + at.C_FIRST], m[core + at.C_END]):
+    best = NONE
+    for place in range(m[core + C.FIRST], m[core + C.END]):
         thread = m[place]
-        if m[thread + at.T_RUNNABLE] == 0 or not _eligible(m, core, thread):
+        server = m[thread + T.SERVER]
+        eligible = server == NONE or (m[core + C.MASK] >> server) & 1 == 1
+        if m[thread + T.RUNNABLE] == 0 or not eligible:
             continue
-        if best == at.NONE or _goes_before(m, thread, best):
+        if best == NONE or _goes_before(m, thread, best):
             best = thread
-    if best != m[core + at.C_RUNNING]:
+    if best != m[core + C.RUNNING]:
         _switch(m, core, best)
     _run_until(m, core)
 
 
 @compiled()
-def _eligible(m, core, thread):
-    server = m[thread + at.T_SERVER]
-    return server == at.NONE or (m[core + at.C_MASK] >> server) & 1 == 1
-
-
-@compiled()
 def _goes_before(m, thread, other):
-    if m[thread + at.T_RANK] != m[other + at.T_RANK]:
-        return m[thread + at.T_RANK] < m[other + at.T_RANK]
-    return m[thread + at.T_SEQUENCE] < m[other + at.T_SEQUENCE]
+    if m[thread + T.RANK] != m[other + T.RANK]:
+        return m[thread + T.RANK] < m[other + T.RANK]
+    return m[thread + T.SEQUENCE] < m[other + T.SEQUENCE]
 
 
 @compiled()
 def _switch(m, core, thread):
-    before = m[core + at.C_RUNNING]
-    runnable, row = 0, at.NONE
-    if before != at.NONE:
-        row = m[before + at.T_ROW]
-        if m[before + at.T_RUNNABLE] == 1:
-            m[before + at.T_PREEMPTED] = 1
-            runnable = 1
-    if m[at.X_SWITCHES] == 1:
-        log(m, at.L_SWITCH, thread, ((core - m[at.X_CORES]) // at.CORE_COLUMNS, row, runnable))
-    m[core + at.C_RUNNING] = thread
-    if thread == at.NONE:
+    before, now = m[core + C.RUNNING], m[X.NOW]
+    runnable, row = 0, NONE
+    if before != NONE:
+        runnable, row = m[before + T.RUNNABLE], m[before + T.ROW]
+        m[before + T.PREEMPTED] |= runnable
+    if m[X.SWITCHES] == 1:
+        switched = ((core - m[X.CORES]) // C.COLUMNS, row, runnable)
+        callbacks.log(m, at.L_SWITCH, now, thread, switched)
+    m[core + C.RUNNING] = thread
+    if thread == NONE:
         return
-    if m[thread + at.T_PREEMPTED] == 1:
-        m[thread + at.T_LEFT] += m[at.X_PREEMPTION_COST]
-        m[thread + at.T_PREEMPTED] = 0
-    if thread != m[core + at.C_LAST]:
-        m[thread + at.T_LEFT] += m[at.X_SWITCH_COST]
-    m[core + at.C_LAST] = thread
-    m[core + at.C_SINCE] = m[at.X_NOW]
-    m[core + at.C_QUANTUM] = m[at.X_QUANTUM]
+    if m[thread + T.PREEMPTED] == 1:
+        m[thread + T.LEFT] += m[X.PREEMPTION_COST]
+        m[thread + T.PREEMPTED] = 0
+    if thread != m[core + C.LAST]:
+        m[thread + T.LEFT] += m[X.SWITCH_COST]
+    m[core + C.LAST] = thread
+    m[core + C.SINCE] = now
+    m[core + C.QUANTUM] = m[X.QUANTUM]

@@ -9,8 +9,6 @@ callback computes before it publishes.
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
 import polars as pl
 
 from chainshaper.analysis import data_flow
@@ -22,12 +20,10 @@ from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import (
     Application,
-    CallbackDescription,
     ExecutionTime,
     SimulationDescription,
 )
-
-__all__ = ["measured_costs", "with_recorded_times"]
+from chainshaper.workload.live import node_name
 
 DELIVERY_NS = 30_000
 """A message is taken to be under way for so long where no message shows it."""
@@ -52,38 +48,43 @@ def with_recorded_times(
     Raises:
         InputError: a callback of the application is not in the recording, or its CPU time is not.
     """
-    if not isinstance(recording, Recording):
-        recording = open_source(recording)
-    flow = data_flow(recording.events, recording.info.clock_offset_ns)
-    times = _computing_times(flow)
+    recording = recording if isinstance(recording, Recording) else open_source(recording)
+    times = _computing_times(data_flow(recording.events, recording.info.clock_offset_ns))
     nodes = {}
     for name, node in application.nodes.items():
-        callbacks = tuple(
-            callback
-            if callback.gate is not None
-            else _sampled(recording, times, "/" + name.strip("/"), callback, block)
-            for callback in node.callbacks
-        )
-        nodes[name] = node.model_copy(update={"callbacks": callbacks})
+        callbacks = []
+        for callback in node.callbacks:
+            if callback.gate is not None:
+                callbacks.append(callback)
+                continue
+            trigger = callback.timer_ns or callback.subscription or callback.synchronises[-1]
+            if (node_name(name), trigger) not in times:
+                raise InputError(
+                    f"{recording.path} has no CPU times of {node_name(name)}'s callback"
+                    f" {callback.subscription or callback.synchronises or 'of its timer'}: record"
+                    " the application that is described, with its threads' CPU times or"
+                    " sched_switch"
+                )
+            samples = _samples(times[node_name(name), trigger])
+            drawn = samples.model_copy(update={"block": block})
+            callbacks.append(callback.model_copy(update={"execution": drawn, "computes": None}))
+        nodes[name] = node.model_copy(update={"callbacks": tuple(callbacks)})
     return application.model_copy(update={"nodes": nodes})
 
 
 def measured_costs(recording: Recording | str | Path) -> SimulationDescription:
     """What a machine takes besides computing, from a recording of a live run on it.
 
-    Only executors that nothing of the application out-ranks on their core tell: others wait for
+    Only executors that nothing of the application out-ranks on their core count: others wait for
     more, such as the DDS threads that receive a large message there. Publishing lasts from a
     callback's last publication to its end; taking from the executor's choice to the callback's
     start. A message that came while the core was busy was there by the time that it was free, and
     from then to the choice the executor woke up; one that found it idle was on its way before that.
-    Messages that waited for a busy executor say nothing about either. What executors were kept from
-    while they computed, interrupts took.
+    What executors were kept from while they computed, interrupts took.
 
-    Raises:
-        InputError: no message of the recording was taken by such an executor that waited for it.
+    Raises InputError: no message of the recording was taken by such an executor that waited for it.
     """
-    if not isinstance(recording, Recording):
-        recording = open_source(recording)
+    recording = recording if isinstance(recording, Recording) else open_source(recording)
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
     core = pl.col("tid").replace_strict(_first_executors(recording), default=None)
     instances = flow.instances.with_columns(core=core).drop_nulls(["core", "end"])
@@ -101,8 +102,7 @@ def measured_costs(recording: Recording | str | Path) -> SimulationDescription:
         woken, came = _ordinary(came - DELIVERY_NS), came.clear()
     delivery = _ordinary(came) - round(float(woken.median()))  # type: ignore[arg-type]
     last = flow.publications.group_by("instance").agg(pl.col("sent").max(), pl.len())
-    published = instances.join(last.drop_nulls(), on="instance")
-    published = published.filter(~pl.Series(_stalled(flow, published["sent"], published["end"])))
+    published = _calm(flow, instances.join(last.drop_nulls(), on="instance"), "sent", "end")
     return SimulationDescription(
         wake_up=_samples(woken),
         take=_samples(_ordinary(read["start"] - read["chosen"])),
@@ -150,19 +150,19 @@ def _read(recording: Recording, flow: DataFlow, instances: pl.DataFrame) -> pl.D
             by=by,
             check_sortedness=False,
         )
-    return read.filter(~pl.Series(_stalled(flow, read["sent"], read["start"])))
+    return _calm(flow, read, "sent", "start")
 
 
-def _stalled(flow: DataFlow, start: pl.Series, end: pl.Series) -> npt.NDArray[np.bool_]:
-    """Which of some windows a stall of the machine hit: they say nothing about its costs."""
-    return stalled_after(flow, start.to_numpy(), end.to_numpy())
+def _calm(flow: DataFlow, frame: pl.DataFrame, start: str, end: str) -> pl.DataFrame:
+    """The rows in whose window no stall of the machine was: the others do not show its costs."""
+    hit = stalled_after(flow, frame[start].to_numpy(), frame[end].to_numpy())
+    return frame.filter(~pl.Series(hit))
 
 
 def _share_taken(instances: pl.DataFrame) -> float:
     """For which share of their response times instances did not run: median, or the default."""
     computed = instances.filter(pl.col("execution_ns") > COMPUTES_NS)
-    lasted = computed["end"] - computed["start"]
-    median = (1 - computed["execution_ns"] / lasted).median()
+    median = (1 - computed["execution_ns"] / (computed["end"] - computed["start"])).median()
     if not isinstance(median, float):
         return SimulationDescription().interrupts
     return min(0.5, max(0.0, median))
@@ -198,24 +198,6 @@ def _computing_times(flow: DataFlow) -> Mapping[tuple[str, str | int], pl.Series
     for (node, topic, period), group in frame.group_by("node", "topic", "period_ns"):
         found[str(node), int(period) if period is not None else str(topic)] = group["used"]
     return found
-
-
-def _sampled(
-    recording: Recording,
-    times: Mapping[tuple[str, str | int], pl.Series],
-    node: str,
-    callback: CallbackDescription,
-    block: int,
-) -> CallbackDescription:
-    trigger = callback.timer_ns or callback.subscription or callback.synchronises[-1]
-    if (node, trigger) not in times:
-        raise InputError(
-            f"{recording.path} has no CPU times of {node}'s callback"
-            f" {callback.subscription or callback.synchronises or 'of its timer'}: record the"
-            " application that is described, with its threads' CPU times or sched_switch"
-        )
-    samples = _samples(times[node, trigger]).model_copy(update={"block": block})
-    return callback.model_copy(update={"execution": samples, "computes": None})
 
 
 def _samples(values: pl.Series) -> ExecutionTime:

@@ -1,17 +1,22 @@
-"""Simulate an application, with or without a plan in force."""
+"""Simulate an application, with or without a plan in force, and write what the engine logs.
+
+One entry of the log often stands for several events of the same instant: what an executor chose
+is got ready and executed, a publication passes rclcpp, rcl and rmw, and so does a message that is
+taken.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
 import polars as pl
 
 from chainshaper.planning.overruns import open_until_done
 from chainshaper.planning.plan import Plan, publisher_servers
 from chainshaper.simulation import layout as at
-from chainshaper.simulation.arrays import Streams, System, build_machine, build_system
-from chainshaper.simulation.layout import Int64s, Memory
-from chainshaper.simulation.tables import Names, created_objects, event_frames, name_objects
+from chainshaper.simulation.arrays import Machine, System, build_machine, build_system
+from chainshaper.simulation.layout import Int64s, X
 from chainshaper.splicing.application import splice_application
 from chainshaper.values.compiled import kernel
 from chainshaper.values.durations import format_duration
@@ -20,12 +25,12 @@ from chainshaper.values.recording import (
     InForceInfo,
     Recording,
     RecordingInfo,
-    ThreadInfo,
     refuse_existing,
     write_recording,
 )
+from chainshaper.workload import live
 from chainshaper.workload.description import Application, application_as_written
-from chainshaper.workload.live import WARM_UP_CYCLES, origin_timer, timing_of
+from chainshaper.workload.event_log import LAYOUT, EventLog
 
 __all__ = ["simulate", "simulate_latencies"]
 
@@ -51,7 +56,7 @@ def simulate(
     """Simulate ``cycles`` periods of an application's chain and record its events.
 
     ``plan`` is in force as `chainshaper apply` has it: its servers run their threads in their
-    slots, its shaping node is spliced in and holds the output. ``seed`` replaces the
+    slots, its shaping node is spliced in and delays the output. ``seed`` replaces the
     description's. With ``switches`` the recording has `sched_switch` as well. Memory does not
     grow with ``cycles``. As in a live run, a few cycles before the recorded ones are left out.
 
@@ -61,23 +66,24 @@ def simulate(
         OperationError: messages pile up without end, or the recording cannot be written.
     """
     output = refuse_existing(output)
-    simulation = _prepare(application, plan, cycles, seed, events=True, switches=switches)
+    application, timing = _checked(application, plan, cycles, seed)
+    system, machine = _built(application, plan, timing, events=True, switches=switches)
     info = RecordingInfo(
         source="simulated",
         host="simulation",  # thread ids say nothing about any real machine
         kernel="none",
         clock_offset_ns=0,
         command=tuple(command),
-        processes={p.pid: p.node for p in simulation.system.processes},
-        threads=_thread_infos(simulation.system, simulation.names),
+        processes={process.pid: process.node for process in system.processes},
+        threads=system.threads,
         realtime=True,
-        notes=(f"simulated; the first {WARM_UP_CYCLES} cycles were not recorded",),
-        chain=simulation.system.application.chain,
-        application=application_as_written(simulation.system.application),
+        notes=(f"simulated; the first {live.WARM_UP_CYCLES} cycles were not recorded",),
+        chain=application.chain,
+        application=application_as_written(application),
         plan=None if plan is None else plan.model_dump(mode="json"),
-        in_force=None if plan is None else InForceInfo(since_ns=simulation.record_from_ns),
+        in_force=None if plan is None else InForceInfo(since_ns=timing.record_from_ns),
     )
-    return write_recording(output, _run(simulation, progress), info)
+    return write_recording(output, _event_tables(system, machine, progress), info)
 
 
 def simulate_latencies(
@@ -96,14 +102,19 @@ def simulate_latencies(
 
     Raises: as :func:`simulate`.
     """
-    simulation = _prepare(application, plan, cycles, seed, events=False, switches=False)
-    for _ in _run(simulation, progress):
+    application, timing = _checked(application, plan, cycles, seed)
+    _, machine = _built(application, plan, timing, latencies=cycles)
+    for _ in _runs(machine, progress):
         pass
-    latencies: Int64s = simulation.machine["latencies"][0]
-    return latencies
+    return machine.latencies
 
 
-def _refuse_functions(application: Application) -> None:
+def _checked(
+    application: Application, plan: Plan | None, cycles: int, seed: int | None
+) -> tuple[Application, live.Timing]:
+    """The application with the seed and the plan's shaping nodes, and the run's instants."""
+    if cycles < 1:
+        raise InputError(f"{cycles} cycles cannot be simulated: ask for at least 1")
     for name, callback in application.callbacks():
         if callback.computes is not None:
             raise InputError(
@@ -111,65 +122,10 @@ def _refuse_functions(application: Application) -> None:
                 "before it has run: measure it (`chainshaper run APP.yaml -o REC`), and simulate "
                 "with the times that were recorded (--execution-times REC)"
             )
-
-
-@dataclass(frozen=True)
-class _Simulation:
-    """A system with its machine, ready to run."""
-
-    system: System
-    machine: Memory
-    streams: Streams
-    names: Names
-    record_from_ns: int
-
-
-def _run(
-    simulation: _Simulation, progress: Progress | None = None
-) -> Iterator[dict[str, pl.DataFrame]]:
-    """Run to the end; the event tables part by part as they fill up, objects first."""
-    machine, control = simulation.machine, simulation.machine.array
-    yield created_objects(simulation.names)
-    while (reason := _run_engine(control.ctypes.data)) != at.OVER:
-        if reason == at.MESSAGES_FULL:
-            raise OperationError(
-                "messages pile up without end: an executor or a publisher thread that never gets"
-                " to run, or a delivery that takes far longer than a period; correct the"
-                " description, or the plan's slots"
-            )
-        simulation.streams.fill(machine)
-        if reason == at.LOG_FULL:
-            yield _flush(simulation)
-        if progress is not None:
-            done = (control[at.X_NOW] - START_NS) / (control[at.X_STOP] - START_NS)
-            progress(float(done), "simulating")
-    if control[at.X_LOGGING]:
-        yield _flush(simulation)
-
-
-def _flush(simulation: _Simulation) -> dict[str, pl.DataFrame]:
-    frames = event_frames(simulation.system, simulation.names, simulation.machine)
-    simulation.machine["counts"][:, at.A_COUNT] = 0
-    return frames
-
-
-def _prepare(
-    application: Application,
-    plan: Plan | None,
-    cycles: int,
-    seed: int | None,
-    *,
-    events: bool,
-    switches: bool,
-) -> _Simulation:
-    if cycles < 1:
-        raise InputError(f"{cycles} cycles cannot be simulated: ask for at least 1")
-    _refuse_functions(application)
     if seed is not None:
         application = application.model_copy(update={"seed": seed})
-    timer = origin_timer(application)
-    period = timer.timer_ns or 0
     if plan is not None:
+        period = live.origin_timer(application).timer_ns or 0
         if plan.chain.period_ns != period:
             raise InputError(
                 f"the plan is for a chain with the period {format_duration(plan.chain.period_ns)},"
@@ -178,8 +134,7 @@ def _prepare(
             )
         if plan.shaping_node is not None or any(publisher_servers(plan)):  # not in a baseline
             application = splice_application(application, plan)
-    system = build_system(application, follow_chain=not events)
-    timing = timing_of(application, cycles, START_NS)
+    timing = live.timing_of(application, cycles, START_NS)
     slowest = max((cb.timer_ns or 0) + cb.phase_ns for _, cb in application.callbacks())
     if timing.stop_ns + slowest > LONGEST_NS:
         raise InputError(
@@ -187,33 +142,172 @@ def _prepare(
             f" {format_duration(timing.stop_ns + slowest)}: simulate {format_duration(LONGEST_NS)}"
             " at the most"
         )
-    streams = Streams(application.seed)
-    machine, cores = build_machine(
-        system,
-        None if plan is None else open_until_done(plan),
-        timing,
-        streams,
-        events=events,
-        switches=switches,
-        latencies=0 if events else cycles,
-        warm_up=WARM_UP_CYCLES,
-    )
-    return _Simulation(
-        system, machine, streams, name_objects(system, machine, cores), timing.record_from_ns
-    )
+    return application, timing
 
 
-def _thread_infos(system: System, names: Names) -> tuple[ThreadInfo, ...]:
-    return tuple(
-        ThreadInfo(
-            tid=thread.tid,
-            pid=system.processes[thread.process].pid,
-            comm=comm,
-            node=system.processes[thread.process].node,
-            role=thread.role,
-            policy="SCHED_FIFO",
-            priority=thread.priority,
-            cores=(int(core),),
-        )
-        for thread, comm, core in zip(system.threads, names.comms, names.cpus, strict=True)
+def _built(
+    application: Application,
+    plan: Plan | None,
+    timing: live.Timing,
+    *,
+    events: bool = False,
+    switches: bool = False,
+    latencies: int = 0,
+) -> tuple[System, Machine]:
+    in_force = None if plan is None else open_until_done(plan)
+    system = build_system(application, in_force, follow_chain=not events)
+    machine = build_machine(
+        system, in_force, timing, events=events, switches=switches, latencies=latencies
     )
+    return system, machine
+
+
+def _runs(machine: Machine, progress: Progress | None = None) -> Iterator[int]:
+    """Run to the end; why the engine stopped, each time that it did."""
+    m = machine.array
+    while (reason := _run_engine(m.ctypes.data)) != at.OVER:
+        if reason == at.MESSAGES_FULL:
+            raise OperationError(
+                "messages pile up without end: an executor or a publisher thread that never gets"
+                " to run, or a delivery that takes far longer than a period; correct the"
+                " description, or the plan's slots"
+            )
+        machine.streams.fill(m)
+        yield reason
+        if progress is not None:
+            progress(float((m[X.NOW] - START_NS) / (m[X.STOP] - START_NS)), "simulating")
+    yield at.LOG_FULL
+
+
+def _event_tables(
+    system: System, machine: Machine, progress: Progress | None
+) -> Iterator[dict[str, pl.DataFrame]]:
+    """The event tables part by part as the log fills up, the objects' first."""
+    objects, handles = _create_objects(system)
+    yield live.event_tables(objects, from_ns=0)
+    for reason in _runs(machine, progress):
+        if reason == at.LOG_FULL:
+            yield _logged(system, machine, handles)
+            machine.forget_entries()
+
+
+Handles = dict[str, npt.NDArray[np.uint64]]
+"""By number: ``callback``, ``handle`` and ``rmw_subscription_handle`` of entities,
+``publisher_handle`` and ``rmw_publisher_handle`` of publishers."""
+
+
+def _create_objects(system: System) -> tuple[list[live.ProcessLog], Handles]:
+    """Give every object a handle, unique in its process, and note its creation."""
+    logs = [EventLog(clock=lambda: 0) for _ in system.processes]
+    for process, log in zip(system.processes, logs, strict=True):
+        log.node(process.node, "simulation")
+    publishers, entities = [], []
+    for publisher in system.publishers:
+        depth = system.depth(publisher.topic)
+        log = logs[publisher.process]
+        publishers.append(log.publisher(publisher.topic, depth, publisher.asynchronous))
+    for entity in system.entities:
+        log = logs[entity.process]
+        filtered = "message_filters::" if entity.described.synchronises else ""
+        node = system.processes[entity.process].node
+        callback = log.callback(f"{filtered}{node}::callback{entity.index}")
+        if entity.topic is None:
+            own = (log.timer(callback, entity.described.timer_ns or 0), 0)
+        else:
+            own = log.subscription(callback, entity.topic, system.depth(entity.topic))
+        entities.append((callback, *own))
+    core_of = {info.pid: info.cores[0] for info in system.threads if info.role == "executor"}
+    created = [
+        live.ProcessLog(process.pid, core_of[process.pid], b"", tuple(log.objects))
+        for process, log in zip(system.processes, logs, strict=True)
+    ]
+    names = ("callback", "handle", "rmw_subscription_handle")
+    names_of_publishers = ("publisher_handle", "rmw_publisher_handle")
+    by_entity = np.array(entities, dtype=np.uint64).reshape(-1, 3).T.copy()
+    by_publisher = np.array(publishers, dtype=np.uint64).reshape(-1, 2).T.copy()
+    handles = dict(zip(names, by_entity, strict=True))
+    return created, handles | dict(zip(names_of_publishers, by_publisher, strict=True))
+
+
+_LOGGED: dict[str, tuple[int, tuple[str, ...]]] = {
+    "callback_start": (at.L_START, ("callback", "thread_time")),
+    "callback_end": (at.L_END, ("callback", "thread_time")),
+    "rclcpp_publish": (at.L_PUBLISH, ("", "message")),
+    "rcl_publish": (at.L_PUBLISH, ("publisher_handle", "message")),
+    "rmw_publish": (at.L_PUBLISH, ("rmw_publisher_handle", "message")),
+    "rmw_take": (at.L_TAKE, LAYOUT["rmw_take"]),
+    "rcl_take": (at.L_TAKE, ("", "message", "", "taken")),
+    "rclcpp_executor_get_next_ready": (at.L_EXECUTE, ("",)),
+    "rclcpp_executor_execute": (at.L_EXECUTE, ("handle",)),
+    "rclcpp_executor_wait_for_work": (at.L_WAIT, ("timeout",)),
+    "asynchronous_send": (at.L_SEND, LAYOUT["asynchronous_send"][1:]),
+    "gate_release": (at.L_RELEASE, LAYOUT["gate_release"]),
+}
+"""Each event's kind of entry, and the event's columns for that entry's fields."""
+
+
+def _logged(system: System, machine: Machine, handles: Handles) -> dict[str, pl.DataFrame]:
+    """What is in the log, as event tables; only those in which there is something."""
+    of_threads = {
+        "pid": np.array([info.pid for info in system.threads], dtype=np.int32),
+        "tid": np.array([info.tid for info in system.threads], dtype=np.int32),
+        "cpu": np.array([info.cores[0] for info in system.threads], dtype=np.int32),
+    }
+    common: dict[int, list[pl.Series]] = {}
+    tables = {"sched_switch": _switches(system, machine)}
+    for name, (kind, fields) in _LOGGED.items():
+        time, thread, *entries = machine.entries(kind)
+        if not time.size:
+            continue
+        if kind not in common:
+            common[kind] = [pl.Series("time", time)]
+            common[kind] += [pl.Series(key, each[thread]) for key, each in of_threads.items()]
+        columns = {column.name: column for column in common[kind]}
+        for field, numbers in zip(fields, entries, strict=True):
+            if field in handles:
+                columns[field] = pl.Series(field, handles[field][numbers])
+            elif field:
+                is_address = field == "message"
+                columns[field] = pl.Series(
+                    field, numbers.view(np.uint64) if is_address else numbers
+                )
+        if name == "callback_start":
+            columns["is_intra_process"] = pl.zeros(time.size, dtype=pl.Int32(), eager=True)
+        elif name == "rmw_publish":
+            columns["timestamp"] = columns["time"]
+        elif name == "asynchronous_send":  # logged when it is over, an event when it began
+            columns["time"] -= columns["duration"]
+        frame = pl.DataFrame(columns)
+        if name == "rcl_take":
+            frame = frame.filter(pl.col("taken") == 1)
+        table = live.typed_table(name, frame, system.modes)
+        if kind in {at.L_SEND, at.L_RELEASE}:  # which others were logged before
+            table = table.sort("time", maintain_order=True)
+        tables[name] = table
+    if "rcl_take" in tables:
+        tables["rclcpp_take"] = tables["rcl_take"]
+    return {name: table for name, table in tables.items() if table.height}
+
+
+def _switches(system: System, machine: Machine) -> pl.DataFrame:
+    """What ran where: `sched_switch`, the idle thread being number 0."""
+    times, following, core, before, runnable = machine.entries(at.L_SWITCH)
+    # One place more than threads are: NONE, the last one, is the idle thread.
+    tids = np.array([*(info.tid for info in system.threads), 0])
+    pids = np.array([*(info.pid for info in system.threads), 0])
+    comms = np.array([*(info.comm for info in system.threads), "swapper"])
+    priorities = np.array([*(99 - info.priority for info in system.threads), 120])
+    columns = {
+        "time": times,
+        "pid": pids[before],
+        "tid": tids[before],
+        "cpu": np.array(system.cores)[core],
+        "prev_comm": comms[before],
+        "prev_tid": tids[before],
+        "prev_prio": priorities[before],
+        "prev_state": 1 - runnable,
+        "next_comm": comms[following],
+        "next_tid": tids[following],
+        "next_prio": priorities[following],
+    }
+    return live.typed_table("sched_switch", pl.DataFrame(columns))

@@ -1,13 +1,10 @@
 """Measuring a chain in a recording, and comparing the same chain in several recordings.
 
-A measurement joins the latency analysis with what the recording says of the machine, of the gates,
-and of the plan in force, whose prediction stands beside it.
-
 :func:`hop_breakdown` says where the latency goes. A hop is a callback of the chain. Its
 *communication* is the time from the publication before it to its own start: transport, and waiting
 for its executor. Its *computation* is the time from its start to its publication: execution,
-pre-emption, and, where another callback of the node publishes for it (a synchroniser), waiting for
-that one. Over a complete traversal the two add up to the latency, so mean shares add up to one.
+pre-emption, and waiting for another callback of the node that publishes for it (a synchroniser).
+Over a complete traversal the two add up to the latency, so mean shares add up to one.
 """
 
 from collections.abc import Sequence
@@ -17,6 +14,7 @@ from pathlib import Path
 import polars as pl
 
 from chainshaper.analysis import LatencyAnalysis, analyse_latency
+from chainshaper.analysis.latency import summary
 from chainshaper.planning import Plan
 from chainshaper.sources import open_source
 from chainshaper.values import events
@@ -25,19 +23,6 @@ from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
 from chainshaper.verify.overruns import dropped_in, into_open_slots, overruns_in
 from chainshaper.verify.predictions import PredictionHeld, due_of, hold_prediction
-
-__all__ = [
-    "PARTS",
-    "Comparison",
-    "LeftOut",
-    "Measurement",
-    "chain_of",
-    "compare_recordings",
-    "hop_breakdown",
-    "longest_stall",
-    "measure_latency",
-    "part_shares",
-]
 
 
 @dataclass(frozen=True)
@@ -65,14 +50,12 @@ class LeftOut:
 class Measurement:
     """A recording with its chain's latency analysis.
 
-    ``longest_stall_ns`` is the machine's own during the recording (None: it was not watched),
-    ``overruns`` counts outputs that came too late for their publish slot, per policy that was
-    applied to them: ``wait``, ``discard``, ``publish`` (None: nothing was gated);
-    ``into_open_slots`` those that came in time, but too late to wait until their slot's start
-    (None: no gate decided), and ``dropped`` messages that were lost at a gate, per reason. ``plan``
-    is the plan in force, and ``held`` its prediction beside this measurement. All of it is about
-    the time in which the plan was in force, where the recording says when that was: ``left_out``
-    names the rest.
+    ``longest_stall_ns`` is the machine's own (None: it was not watched), ``overruns`` counts
+    outputs that came too late for their publish slot, per policy (None: nothing was gated),
+    ``into_open_slots`` those that came in time, but too late to wait until their slot's start,
+    ``dropped`` messages that were lost at a gate, per reason (None: no gate decided). ``plan`` is
+    the plan in force, ``held`` its prediction beside this measurement. All of it is about the time
+    in which the plan was in force; ``left_out`` names the rest.
     """
 
     recording: Recording
@@ -195,36 +178,34 @@ def hop_breakdown(analysis: LatencyAnalysis) -> pl.DataFrame:
     without traversals, and for the first hop's communication), and ``…_share`` of the mean latency.
     """
     callbacks = {callback.id: callback for callback in analysis.graph.callbacks}
+    path = [callbacks[number] for number in analysis.chain.callbacks]
     complete = analysis.traversals.filter("complete")
-    hops = analysis.hops.join(complete.select("traversal"), on="traversal", how="semi")
-    latency = complete["latency_ns"].mean()
+    latency = pl.lit(complete["latency_ns"].mean(), dtype=pl.Float64)
+    hops = analysis.hops.join(complete, on="traversal", how="semi")
     found = hops.group_by("hop").agg(
-        pl.len().alias("count"),
-        (pl.col("via") == "sibling").sum().alias("by_sibling"),
-        *(_summary(part) for part in PARTS),
+        *(summary(f"{part}_ns", pl.col(f"{part}_ns")) for part in PARTS),
+        count=pl.len(),
+        by_sibling=(pl.col("via") == "sibling").sum(),
     )
     rows = pl.DataFrame(
         {
-            "hop": range(len(analysis.chain.callbacks)),
+            "hop": range(len(path)),
             "callback_id": analysis.chain.callbacks,
-            "node": [callbacks[number].node for number in analysis.chain.callbacks],
-            "callback": [callbacks[number].label for number in analysis.chain.callbacks],
+            "node": [callback.node for callback in path],
+            "callback": [callback.label for callback in path],
             "topic": analysis.chain.topics,
         },
         schema_overrides={"hop": pl.UInt8, "callback_id": pl.UInt32},
     )
-    joined = rows.join(found, on="hop", how="left", maintain_order="left")
-    means = [pl.col(f"{part}_ns").struct.field("mean").alias(f"{part}_share") for part in PARTS]
-    return joined.with_columns(
+    return rows.join(found, on="hop", how="left", maintain_order="left").select(
+        *rows.columns,
         pl.col("count", "by_sibling").fill_null(0),
-        *(mean / pl.lit(latency, dtype=pl.Float64) for mean in means),
+        *(f"{part}_ns" for part in PARTS),
+        *(
+            (pl.col(f"{part}_ns").struct.field("mean") / latency).alias(f"{part}_share")
+            for part in PARTS
+        ),
     )
-
-
-def _summary(part: str) -> pl.Expr:
-    values = pl.col(f"{part}_ns")
-    summary = pl.struct(min=values.min(), mean=values.mean(), max=values.max())
-    return pl.when(values.count() > 0).then(summary).alias(f"{part}_ns")
 
 
 def part_shares(frame: pl.DataFrame) -> dict[str, float | None]:

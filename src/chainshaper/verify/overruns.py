@@ -11,22 +11,13 @@ later cycle than due as having waited.
 import polars as pl
 
 from chainshaper.analysis import LatencyAnalysis
-from chainshaper.analysis.departures import with_overrun
+from chainshaper.analysis.messages import with_overrun
 from chainshaper.gate.decision import DROPPED
 from chainshaper.planning import Plan
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.plan import publisher_servers
 from chainshaper.values import events
 from chainshaper.values.recording import Recording
-
-__all__ = [
-    "dropped_in",
-    "dropped_text",
-    "gate_releases",
-    "into_open_slots",
-    "overruns_in",
-    "overruns_text",
-]
 
 _DONE = {
     "wait": "waited for the next slot",
@@ -91,12 +82,11 @@ def dropped_in(recording: Recording) -> dict[str, int] | None:
         return None
     table = events.table(recording.events, "gate_release", ["dropped", "lost", "overrun"])
     discarded = pl.col("release").is_null() & (pl.col("overrun") == "discard")
-    reasons = table.select(
-        pl.coalesce("dropped", pl.when(discarded).then(pl.lit("discarded")))
-    ).to_series()
-    counts = {reason: int((reasons == reason).sum()) for reason in DROPPED}
+    reason = pl.coalesce("dropped", pl.when(discarded).then(pl.lit("discarded")))
+    reasons = table.select(reason).to_series()
+    counts = {name: int((reasons == name).sum()) for name in DROPPED}
     counts["lost by DDS"] = int(table["lost"].sum())
-    return {reason: count for reason, count in counts.items() if count}
+    return {name: count for name, count in counts.items() if count}
 
 
 def dropped_text(dropped: dict[str, int]) -> str:
@@ -108,13 +98,11 @@ def dropped_text(dropped: dict[str, int]) -> str:
 
 def overruns_text(overruns: dict[str, int]) -> str:
     """``3 outputs were too late for their slot (2 discarded, 1 published at once)``."""
-    without = [
-        f"{n} {_WITHOUT_NODE[what]}" for what, n in overruns.items() if what in _WITHOUT_NODE
-    ]
+    parts = [f"{n} {_WITHOUT_NODE[what]}" for what, n in overruns.items() if what in _WITHOUT_NODE]
     treated = {policy: count for policy, count in overruns.items() if policy in _DONE}
-    if without and not treated:
-        return "; ".join(without)
-    total = sum(treated.values())
-    done = ", ".join(f"{count} {_DONE[policy]}" for policy, count in treated.items())
-    late = "output was too late for its" if total == 1 else "outputs were too late for their"
-    return "; ".join([f"{total} {late} slot ({done})", *without])
+    if treated or not parts:
+        total = sum(treated.values())
+        done = ", ".join(f"{count} {_DONE[policy]}" for policy, count in treated.items())
+        late = "output was too late for its" if total == 1 else "outputs were too late for their"
+        parts.insert(0, f"{total} {late} slot ({done})")
+    return "; ".join(parts)

@@ -9,29 +9,26 @@ With **modes** an output leaves in the slot of its cycle's mode, and what comes 
 late for it although there are others. Each mode is then held by itself against the share of
 latencies that fit; the whole depends on how long each was in force, which no plan knows.
 
-**What is promised.** With the anchor `stamp` a gate counts its slots from the message's own origin,
-and promises the latency. With the anchor `cycle`, and where a back end holds back a publisher's
-thread, slots count from the start of the cycle: the place in the cycle is promised then, and it is
-what is judged, whenever in the cycle the chain began.
+**What is promised.** With the anchor `stamp` a gate promises the latency. With the anchor `cycle`,
+and where a back end holds back a publisher's thread, slots count from the start of the cycle: the
+place in the cycle is promised and judged, whenever in the cycle the chain began.
 
-A verdict is found from the range and the figure that are printed, as they are printed. A range
-has room for what two finite samples may differ by, and no band is expected that so few outputs may
-well not have come in.
+A verdict is found from the range and the figure as they are printed. A range has room for what two
+finite samples may differ by, and no band is expected that so few outputs may well not have come in.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import polars as pl
 
 from chainshaper.analysis import LatencyAnalysis, LatencyStatistics, latency_statistics
-from chainshaper.analysis.punctuality import Due
+from chainshaper.analysis.disturbance import Due
 from chainshaper.planning import Plan, publish_slots
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.plan import publisher_servers, server_of
 from chainshaper.values.durations import milliseconds
-
-__all__ = ["BandHeld", "FigureHeld", "PredictionHeld", "due_of", "hold_prediction"]
 
 STANDARD_ERRORS = 3  # beyond so many, an average is not what was predicted
 MISSING = 0.003  # a band that is empty with no more than this probability is expected
@@ -57,9 +54,8 @@ class FigureHeld:
 class BandHeld:
     """One latency band, over undisturbed cycles whose output came in the cycle it was due.
 
-    ``inside`` counts outputs that left while the slot was open. Of a plan with modes it is the band
-    of ``mode``: ``late`` counts the mode's outputs that came behind its slot, and the shares are
-    those of its outputs that did not.
+    ``inside`` counts outputs that left while the slot was open. With modes it is that of ``mode``:
+    ``late`` counts the mode's outputs behind its slot, the shares are those of its others.
     """
 
     slot_start_ns: int
@@ -82,8 +78,7 @@ class PredictionHeld:
 
     The figures are latencies, or with ``counted_from`` the cycle places in it. ``late`` counts
     outputs that missed their last slot; they are in the figures, not in the bands. ``late_of_all``
-    counts those of ``cycles``, in which no cycle is left out (None: not known). ``bands`` is empty
-    for policies without publish slots.
+    counts those of all ``cycles`` (None: not known). Policies without slots have no ``bands``.
     """
 
     mean: FigureHeld
@@ -109,25 +104,19 @@ def due_of(plan: Plan) -> tuple[Due, ...]:
         margin_ns=plan.margin.epsilon_ns,
         output=plan.chain.output,
     )
-    sinks = (
-        replace(
-            own,
-            cycles=cycles_until_output(plan, node),
-            slots=server.slots,
-            last_slot={},
-            output=node.output,
-        )
-        for node in plan.further_shaping_nodes
-        if (server := server_of(plan, node.thread)) is not None
-    )
+    sinks = []
+    for node in plan.further_shaping_nodes:
+        server, cycles = server_of(plan, node.thread), cycles_until_output(plan, node)
+        if server is not None:
+            sink = replace(own, cycles=cycles, slots=server.slots, last_slot={}, output=node.output)
+            sinks.append(sink)
     return own, *sinks
 
 
 def _from_cycle(plan: Plan) -> bool:
     """Whether slots count from the start of the cycle, whenever in it the chain began."""
-    return any(publisher_servers(plan)) or (
-        plan.shaping_node is not None and plan.anchor == "cycle"
-    )
+    by_cycle = plan.shaping_node is not None and plan.anchor == "cycle"
+    return by_cycle or any(publisher_servers(plan))
 
 
 def hold_prediction(plan: Plan, analysis: LatencyAnalysis) -> PredictionHeld:
@@ -139,25 +128,28 @@ def hold_prediction(plan: Plan, analysis: LatencyAnalysis) -> PredictionHeld:
     slots = [(start + delay, end + delay) for start, end in publish_slots(plan)]
     from_cycle = _from_cycle(plan)
     outputs = _outputs(slots, analysis, "place_ns" if from_cycle else "latency_ns")
-    in_time = outputs.filter(~pl.col("late"))
-    shares = plan.predicted.shares if _represented(plan) else [None] * len(slots)
+    late = int(outputs["late"].sum())
+    shares = plan.predicted.shares
     if plan.modes is None:
-        bands = tuple(
-            _band(slot, share, in_time.filter(pl.col("slot") == number), in_time.height)
-            for number, (slot, share) in enumerate(zip(slots, shares, strict=True))
-        )
+        known = shares if _represented(plan) else [None] * len(slots)
+        bands = [
+            _band(slot, share, outputs, pl.col("slot") == number)
+            for number, (slot, share) in enumerate(zip(slots, known, strict=True))
+        ]
     else:
-        bands = tuple(
-            _band_of_mode(mode, slots[band - 1], sum(plan.predicted.shares[:band]), outputs)
-            for mode, band in plan.modes.bands.items()
-        )
+        bands = []
+        for mode, band in plan.modes.bands.items():
+            own = outputs.filter(pl.col("mode") == mode)
+            share, behind = sum(shares[:band]) or None, int(own["late"].sum())
+            found = _band(slots[band - 1], share, own, pl.lit(True), own.height)
+            bands.append(replace(found, mode=mode, late=behind))
     mean, longest, jitter = _figures(plan, slots, latency_statistics(outputs["judged_ns"]))
     return PredictionHeld(
         mean=mean,
         max=longest,
         jitter=jitter,
-        bands=bands,
-        late=outputs.height - in_time.height,
+        bands=tuple(bands),
+        late=late,
         late_of_all=analysis.statistics.late,
         cycles=analysis.statistics.count,
         counted_from="cycle" if from_cycle else "chain",
@@ -171,9 +163,14 @@ def _figures(
     predicted = plan.predicted
     mean, longest, jitter = predicted.mean_ns, predicted.max_ns, predicted.jitter_ns
     lowest_max, lowest_jitter = mean, 0  # of outputs that leave when they are ready
+    # Where outputs do not come in bands, their variance is not in the plan; between two limits it
+    # is at most (max − mean)·(mean − min).
+    variance = float(max(0, longest - mean) * max(0, mean - (longest - jitter)))
     if _represented(plan):
-        starts = [start for start, _ in slots]
-        mean = round(sum(s * at for s, at in zip(predicted.shares, starts, strict=True)))
+        starts, ends = zip(*slots, strict=True)
+        mean = round(_weighted(predicted.shares, starts))
+        average = _weighted(predicted.shares, ends)
+        variance = _weighted(predicted.shares, [(end - average) ** 2 for end in ends])
         longest, jitter = starts[-1], starts[-1] - starts[0]
         sure = [
             start
@@ -184,50 +181,29 @@ def _figures(
     elif slots:
         longest, jitter = min(longest, slots[-1][0]), 0
         lowest_max = longest
-    room = round(STANDARD_ERRORS * _standard_error(plan, slots, measured.count))
-    judged = plan.modes is None  # with modes it depends on how long each was in force
+    samples = 1 / plan.evidence.samples + 1 / measured.count if measured.count else 0.0
+    room = round(STANDARD_ERRORS * (variance * samples) ** 0.5)
+
+    def figure(at_start: int, name: str, lowest: int, above: int = 0) -> FigureHeld:
+        at_end, found = getattr(predicted, name), getattr(measured, name)
+        low, high, holds = min(lowest, at_start), at_end + above, None
+        if plan.modes is None and found is not None:  # as they are printed
+            holds = _printed(low) <= _printed(found) <= _printed(high)
+        return FigureHeld(at_start, at_end, low, high, found, holds)
+
     return (
-        _figure(mean, predicted.mean_ns, measured.mean_ns, mean - room, room, judged),
-        _figure(longest, predicted.max_ns, measured.max_ns, lowest_max, 0, judged),
-        _figure(jitter, predicted.jitter_ns, measured.jitter_ns, lowest_jitter, 0, judged),
+        figure(mean, "mean_ns", mean - room, room),
+        figure(longest, "max_ns", lowest_max),
+        figure(jitter, "jitter_ns", lowest_jitter),
     )
 
 
-def _figure(  # noqa: PLR0917 - the parts of a figure, each used once
-    at_start: int, at_end: int, measured: int | None, lowest: int, above: int, judged: bool
-) -> FigureHeld:
-    low, high = min(lowest, at_start), at_end + above
-    holds = None
-    if judged and measured is not None:
-        holds = _printed(low) <= _printed(measured) <= _printed(high)
-    return FigureHeld(at_start, at_end, low, high, measured, holds)
+def _weighted(shares: Sequence[float], values: Sequence[float]) -> float:
+    return sum(share * value for share, value in zip(shares, values, strict=True))
 
 
 def _printed(nanoseconds: int) -> float:
     return float(milliseconds(nanoseconds))
-
-
-def _standard_error(plan: Plan, slots: list[tuple[int, int]], count: int) -> float:
-    """How far the average may be off because both samples, before and after, are finite.
-
-    Where outputs do not come in bands, their variance is not in the plan; between two limits it
-    is at most (max − mean)·(mean − min).
-    """
-    if not count:
-        return 0.0
-    predicted = plan.predicted
-    if _represented(plan):
-        ends = [end for _, end in slots]
-        mean = sum(share * end for share, end in zip(predicted.shares, ends, strict=True))
-        variance = sum(
-            share * (end - mean) ** 2 for share, end in zip(predicted.shares, ends, strict=True)
-        )
-    else:
-        shortest = predicted.max_ns - predicted.jitter_ns
-        above, below = predicted.max_ns - predicted.mean_ns, predicted.mean_ns - shortest
-        variance = float(max(0, above) * max(0, below))
-    samples = 1 / plan.evidence.samples + 1 / count
-    return float((variance * samples) ** 0.5)
 
 
 def _represented(plan: Plan) -> bool:
@@ -244,12 +220,10 @@ def _outputs(slots: list[tuple[int, int]], analysis: LatencyAnalysis, judged: st
     """
     chosen = analysis.traversals.filter(pl.col("complete") & ~pl.col("disturbed"))
     decided = analysis.releases.filter(pl.col("hop") == len(analysis.chain.callbacks) - 1)
+    decided = decided.select("traversal", "slot", "mode", gated=True)
     started = [(pl.col("place_ns") >= start).cast(pl.Int32) for start, _ in slots]
-    return chosen.join(
-        decided.select("traversal", "slot", "mode", gated=True), on="traversal", how="left"
-    ).select(
-        "place_ns",
-        "mode",
+    return chosen.join(decided, on="traversal", how="left").select(
+        *("place_ns", "mode"),
         pl.col("late").fill_null(False),
         judged_ns=judged,
         slot=pl.when(pl.col("gated")).then("slot").otherwise(pl.sum_horizontal(-1, *started)),
@@ -257,28 +231,29 @@ def _outputs(slots: list[tuple[int, int]], analysis: LatencyAnalysis, judged: st
 
 
 def _band(
-    slot: tuple[int, int], predicted: float | None, own: pl.DataFrame, total: int
+    slot: tuple[int, int],
+    predicted: float | None,
+    outputs: pl.DataFrame,
+    mine: pl.Expr,
+    total: int | None = None,
 ) -> BandHeld:
-    found, place = latency_statistics(own["judged_ns"]), pl.col("place_ns")
-    inside = own.filter((place >= slot[0]) & (place < slot[1])).height
+    """The band of a slot: those of ``outputs`` in time that are ``mine``, of ``total``.
+
+    Without ``total`` the share is that of all outputs in time.
+    """
+    in_time = outputs.filter(~pl.col("late"))
+    total = in_time.height if total is None else total
+    own, place = in_time.filter(mine), pl.col("place_ns")
+    found = latency_statistics(own["judged_ns"])
     return BandHeld(
         slot_start_ns=slot[0],
         slot_end_ns=slot[1],
         predicted_share=predicted,
         count=found.count,
         share=found.count / total if total else None,
-        inside=inside,
+        inside=own.filter((place >= slot[0]) & (place < slot[1])).height,
         min_ns=found.min_ns,
         mean_ns=found.mean_ns,
         max_ns=found.max_ns,
         jitter_ns=found.jitter_ns,
     )
-
-
-def _band_of_mode(
-    mode: str, slot: tuple[int, int], predicted: float, outputs: pl.DataFrame
-) -> BandHeld:
-    own = outputs.filter(pl.col("mode") == mode)
-    in_time = own.filter(~pl.col("late"))
-    band = _band(slot, predicted or None, in_time, own.height)
-    return replace(band, mode=mode, late=own.height - in_time.height)

@@ -16,15 +16,9 @@ from typing import Any
 from chainshaper.values.errors import OperationError, PlatformError
 
 try:
+    from cyclonedds import core
     from cyclonedds._clayer import ddspy_take, ddspy_write_ts
-    from cyclonedds.core import (
-        GuardCondition,
-        InstanceState,
-        ReadCondition,
-        SampleState,
-        ViewState,
-        WaitSet,
-    )
+    from cyclonedds.core import InstanceState, ReadCondition, SampleState, ViewState
     from cyclonedds.domain import DomainParticipant
     from cyclonedds.idl import IdlStruct
     from cyclonedds.idl.types import int32, sequence, uint8, uint32, uint64
@@ -38,22 +32,7 @@ except ImportError as error:  # no wheel for this Python or processor
         "it exists for Python 3.10 to 3.13 on x86-64: use one of these"
     ) from error
 
-__all__ = [
-    "GuardCondition",
-    "Message",
-    "Publisher",
-    "Subscription",
-    "WaitSet",
-    "closed_domain_configuration",
-    "data_message",
-    "data_of",
-    "free_domain",
-    "join_domain",
-    "message_template",
-    "number_in",
-    "stamp_message",
-    "text_message",
-]
+GuardCondition, WaitSet = core.GuardCondition, core.WaitSet
 
 _DATA_HEAD = struct.Struct("<4siII4xQI")  # encapsulation, stamp, an empty frame id, number, length
 _LITTLE_ENDIAN = b"\0\1\0\0"
@@ -113,8 +92,7 @@ def closed_domain_configuration() -> str:
 def free_domain() -> int:
     """A DDS domain id in which no process of this machine takes part.
 
-    Raises:
-        OperationError: all of them are in use.
+    Raises OperationError: all of them are in use.
     """
     candidates = list(range(20, 101))  # 0 to 19 are what people choose by hand
     random.shuffle(candidates)
@@ -136,26 +114,10 @@ def join_domain(domain: int) -> Any:
     return DomainParticipant(domain)
 
 
-def message_template(payload_bytes: int) -> bytearray:
-    """A serialized message with a zero stamp and number, to be filled by :func:`stamp_message`."""
-    message = Stamped(Header(Time(0, 0), ""), 0, [0] * payload_bytes)  # type: ignore[arg-type]
-    serialized = bytes(message.serialize())
-    return bytearray(serialized + b"\0" * (-len(serialized) % 4))
-
-
-def stamp_message(template: bytearray, stamp_ns: int) -> bytes:
-    """A message with the given header stamp (ns of CLOCK_REALTIME); see ``gate.origin_of``."""
-    order = "little" if template[1] & 1 else "big"
-    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-    template[4:8] = seconds.to_bytes(4, order, signed=True)  # type: ignore[arg-type]
-    template[8:12] = nanoseconds.to_bytes(4, order)  # type: ignore[arg-type]
-    return bytes(template)
-
-
 def data_message(data: bytes | memoryview, stamp_ns: int, number: int = 0) -> bytes:
-    """A message that carries a number and ``data`` behind a header.
+    """A message that carries a number and ``data`` behind a header with that stamp.
 
-    ``stamp_ns`` is the header's stamp (ns of CLOCK_REALTIME).
+    ``stamp_ns`` is of CLOCK_REALTIME; see ``gate.origin_of``.
     """
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
     size = memoryview(data).nbytes
@@ -209,11 +171,8 @@ class Publisher:
         *,
         carries_text: bool = False,
     ) -> None:
-        self._writer = DataWriter(
-            participant,
-            _topic(participant, topic, carries_text),
-            qos=_qos(reliability, depth, lifespan_ns),
-        )
+        own = _topic(participant, topic, carries_text)
+        self._writer = DataWriter(participant, own, qos=_qos(reliability, depth, lifespan_ns))
         self._handle = self._writer._ref
 
     def write(self, payload: bytes, source_timestamp: int) -> None:
@@ -238,11 +197,8 @@ class Subscription:
         *,
         carries_text: bool = False,
     ) -> None:
-        self._reader = DataReader(
-            participant,
-            _topic(participant, topic, carries_text),
-            qos=_qos(reliability, depth),
-        )
+        own = _topic(participant, topic, carries_text)
+        self._reader = DataReader(participant, own, qos=_qos(reliability, depth))
         self.condition = ReadCondition(self._reader, _ANY)
         self._handle = self._reader._ref
 

@@ -1,7 +1,7 @@
 """The description of an application in one YAML file: what runs, how long, where.
 
-The live workload executes it with real processes over DDS; anything that can be said about a
-run before it happens is said here, and nothing about a particular application is said in code.
+The live workload executes it with real processes over DDS, the simulator as discrete events;
+nothing about a particular application is said in code.
 
     name: synthetic chain
     chain: /t1../t5
@@ -18,7 +18,7 @@ run before it happens is said here, and nothing about a particular application i
 """
 
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -36,20 +36,6 @@ from chainshaper.values.yaml_file import (
     read_model,
     wrong_value,
 )
-
-__all__ = [
-    "Application",
-    "CallbackDescription",
-    "ExecutionTime",
-    "GateDescription",
-    "ModesDescription",
-    "NodeDescription",
-    "Scheduling",
-    "SimulationDescription",
-    "TopicDescription",
-    "application_as_written",
-    "load_application",
-]
 
 LONGEST_BLOCK = 1024
 
@@ -74,7 +60,7 @@ class ExecutionTime(Part):
     @model_validator(mode="after")
     def _one_distribution(self) -> "ExecutionTime":
         given = [self.constant_ns, self.uniform_ns, self.normal_ns, self.samples_ns]
-        if sum(value is not None for value in given) != 1:
+        if given.count(None) != 3:
             raise wrong_value("give exactly one of constant, uniform, normal, samples")
         if self.block > 1 and self.samples_ns is None:
             raise wrong_value("a block is a stretch of `samples`: remove it", "block")
@@ -97,31 +83,25 @@ class ExecutionTime(Part):
         return self
 
 
-def _constant(nanoseconds: int) -> ExecutionTime:
-    return ExecutionTime(constant_ns=nanoseconds)
-
-
 class SimulationDescription(Part):
     """What a machine has by itself and a simulation needs as a value.
 
     CPU time: ``wake_up`` of a thread until it is at work, ``take`` of a message until its callback
     begins, ``publish`` of a message, by its executor or its publisher thread, ``receive`` of a
-    message by a DDS thread (None: these do not compete with anybody). ``delivery`` is how long a
-    message is under way, ``context_switch`` what switching to another thread costs the one
-    switched to, ``preemption`` what being resumed costs besides, ``quantum`` how long threads of
-    one server take turns for, ``interrupts`` the share of a core's time that interrupts and the
-    stall meter take away from callbacks (it counts as their CPU time), ``drift`` how much faster
-    the clocks of nodes are (ppm of a period).
+    message by a DDS thread (None: these compete with no thread), ``context_switch`` for the thread
+    switched to, ``preemption`` for one that is resumed. ``delivery`` is how long a message is under
+    way, ``quantum`` how long threads of one server take turns for, ``interrupts`` the share of a
+    core's time that interrupts and the stall meter take from callbacks (it counts as their CPU
+    time), ``drift`` how much faster the clocks of nodes are (ppm of a period).
 
-    The costs that stand here are medians of several runs of the live workload on a virtual machine
-    of two cores. Other machines, and other hours, have others.
+    The defaults are medians of several live runs on a virtual machine of two cores.
     """
 
     executor: Literal["single-threaded", "static", "events"] = "single-threaded"
-    wake_up: ExecutionTime = _constant(110_000)
-    take: ExecutionTime = _constant(42_000)
-    publish: ExecutionTime = _constant(95_000)
-    delivery: ExecutionTime = _constant(30_000)
+    wake_up: ExecutionTime = ExecutionTime(constant_ns=110_000)
+    take: ExecutionTime = ExecutionTime(constant_ns=42_000)
+    publish: ExecutionTime = ExecutionTime(constant_ns=95_000)
+    delivery: ExecutionTime = ExecutionTime(constant_ns=30_000)
     receive: ExecutionTime | None = None
     context_switch_ns: Duration = 0
     preemption_ns: Duration = 0
@@ -136,10 +116,8 @@ _NODE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 
 
 class ModesDescription(Part):
-    """The modes of a gate, as :class:`~chainshaper.gate.decision.Modes` has them.
-
-    The active one's name is read from ``topic``, which a callback ``announces`` it on.
-    """
+    """A gate's :class:`~chainshaper.gate.decision.Modes`, read from the ``topic`` that announces
+    them."""
 
     topic: FullName
     bands: Annotated[dict[str, int], Field(min_length=1)]
@@ -148,10 +126,7 @@ class ModesDescription(Part):
 
 
 class GateDescription(Part):
-    """A gate in a callback: the received message is republished inside ``slots`` only.
-
-    The fields are those of :class:`~chainshaper.gate.decision.Gate`.
-    """
+    """A :class:`~chainshaper.gate.decision.Gate` in a callback: republishing in ``slots`` only."""
 
     slots: Annotated[tuple[tuple[Duration, Duration], ...], Field(min_length=1)]
     cycle_ns: PositiveDuration
@@ -181,16 +156,14 @@ class GateDescription(Part):
 class CallbackDescription(Part):
     """One callback: a timer or a subscription, its execution time and the topics it publishes.
 
-    ``timer_ns`` is a timer's period and ``phase_ns`` delays its first expiry after the common
-    start. ``gate`` makes the callback a latency-shaping one: it executes nothing and forwards
-    the message it received. A callback that ``announces`` modes publishes their names in turn,
-    one an instance, each as a ``std_msgs/String``.
+    ``timer_ns`` is a timer's period, ``phase_ns`` delays its first expiry after the common start.
+    With a ``gate`` it executes nothing and forwards what it received. One that ``announces`` modes
+    publishes their names in turn, one an instance, each as a ``std_msgs/String``.
 
     ``synchronises`` has the inputs of a synchronising callback, which executes and publishes when
-    a message of every input has come, with the stamp of the first input's. Executors look at
-    callbacks of the ``kind`` service and client, whose subscription carries requests or
-    responses, behind those of topics. One that ``computes`` calls a Python function instead of
-    spending time (:mod:`chainshaper.workload.executor`).
+    a message of every input has come, with the stamp of the first input's. Executors look at the
+    ``kind`` service and client behind subscriptions of topics. One that ``computes`` calls a Python
+    function instead of spending time (:mod:`chainshaper.workload.executor`).
     """
 
     timer_ns: PositiveDuration | None = None
@@ -208,14 +181,16 @@ class CallbackDescription(Part):
     def subscriptions(self) -> tuple[str, ...]:
         """All topics that are subscribed to for this callback: the gate's modes come first."""
         modes = None if self.gate is None else self.gate.modes
-        mode_topic = () if modes is None else (modes.topic,)
-        inputs = self.synchronises if self.subscription is None else (self.subscription,)
-        return (*mode_topic, *inputs)
+        return (*(() if modes is None else (modes.topic,)), *self.inputs)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """The topics whose messages start it."""
+        return self.synchronises if self.subscription is None else (self.subscription,)
 
     @model_validator(mode="after")
     def _one_trigger(self) -> "CallbackDescription":
-        triggers = (self.timer_ns, self.subscription, self.synchronises or None)
-        if sum(trigger is not None for trigger in triggers) != 1:
+        if (self.timer_ns, self.subscription, self.synchronises or None).count(None) != 2:
             raise wrong_value(
                 "give either `timer: PERIOD` or `subscription: TOPIC` or `synchronises: [TOPICS]`"
             )
@@ -292,62 +267,29 @@ class Application(Part):
     @model_validator(mode="after")
     def _consistent(self) -> "Application":
         published = {topic for _, callback in self.callbacks() for topic in callback.publishes}
+        order = TopologicalSorter[str]()
+        same: dict[str, str] = {}
         for name, described in self.nodes.items():
             if not _NODE.fullmatch(name):
                 raise wrong_value("a node's name has letters, digits, _ and / only", "nodes", name)
             for number, callback in enumerate(described.callbacks):
-                where = ("nodes", name, "callbacks", number)
-                for wanted in (callback.subscription, *callback.synchronises):
-                    if wanted is not None and wanted not in published:
-                        key = "synchronises" if callback.subscription is None else "subscription"
-                        raise wrong_value(
-                            f"no node publishes {wanted}; published are "
-                            f"{', '.join(sorted(published)) or 'no topics'}",
-                            *(*where, key),
-                        )
-                modes = None if callback.gate is None else callback.gate.modes
-                if modes is not None and modes.topic not in self.announced():
-                    raise wrong_value(
-                        f"no callback `announces` modes on {modes.topic}: describe one",
-                        *(*where, "gate", "modes", "topic"),
-                    )
+                self._refuse_unpublished(callback, published, ("nodes", name, "callbacks", number))
+                for topic in callback.publishes:
+                    order.add(topic, *callback.inputs)
+            if (other := same.setdefault(name.strip("/"), name)) != name:
+                raise wrong_value(f"is the same name as {other!r}: rename one", "nodes", name)
         for topic in self.topics:
             if topic not in published:
                 raise wrong_value("is published by no node: remove it", "topics", topic)
-        self._refuse_equal_names()
-        self._refuse_unknown_way_points(published)
-        self._refuse_endless_cycles()
-        for node in self.simulation.drift:
-            if node not in self.nodes:
-                raise wrong_value("no such node: remove it", "simulation", "drift", node)
-        return self
-
-    def _refuse_equal_names(self) -> None:
-        """A leading slash does not make another name."""
-        seen: dict[str, str] = {}
-        for name in self.nodes:
-            other = seen.setdefault(name.strip("/"), name)
-            if other != name:
-                raise wrong_value(f"is the same name as {other!r}: rename one", "nodes", name)
-
-    def _refuse_unknown_way_points(self, topics: Collection[str]) -> None:
-        """A run takes its time: a chain that cannot be found in it is refused before."""
-        known = {*topics, *("/" + name.strip("/") for name in self.nodes)}
-        for way_point in self.chain.split(".."):
-            if "/" + way_point.strip().removeprefix("/") not in known:
+        # A run takes its time: a chain that cannot be found in it is refused before.
+        known = {*published, *("/" + name.strip("/") for name in self.nodes)}
+        for way_point in map(str.strip, self.chain.split("..")):
+            if "/" + way_point.removeprefix("/") not in known:
                 raise wrong_value(
-                    f"no topic or node is called {way_point.strip()!r}: write way points of "
+                    f"no topic or node is called {way_point!r}: write way points of "
                     f"{', '.join(sorted(known))}, such as FIRST..LAST",
                     "chain",
                 )
-
-    def _refuse_endless_cycles(self) -> None:
-        """No message may circle for ever."""
-        order = TopologicalSorter[str]()
-        for _, callback in self.callbacks():
-            for topic in filter(None, (callback.subscription, *callback.synchronises)):
-                for published in callback.publishes:
-                    order.add(published, topic)
         try:
             order.prepare()
         except CycleError as error:
@@ -356,6 +298,28 @@ class Application(Part):
                 f"{' → '.join(error.args[1])}; break it at one of these topics",
                 "nodes",
             ) from error
+        for node in self.simulation.drift:
+            if node not in self.nodes:
+                raise wrong_value("no such node: remove it", "simulation", "drift", node)
+        return self
+
+    def _refuse_unpublished(
+        self, callback: CallbackDescription, published: set[str], where: tuple[str | int, ...]
+    ) -> None:
+        for wanted in callback.inputs:
+            if wanted not in published:
+                key = "synchronises" if callback.subscription is None else "subscription"
+                raise wrong_value(
+                    f"no node publishes {wanted}; published are "
+                    f"{', '.join(sorted(published)) or 'no topics'}",
+                    *(*where, key),
+                )
+        modes = None if callback.gate is None else callback.gate.modes
+        if modes is not None and modes.topic not in self.announced():
+            raise wrong_value(
+                f"no callback `announces` modes on {modes.topic}: describe one",
+                *(*where, "gate", "modes", "topic"),
+            )
 
     def callbacks(self) -> Iterator[tuple[str, CallbackDescription]]:
         """Every callback with the name of its node, in the order of the file."""
@@ -373,12 +337,9 @@ class Application(Part):
 
     def scheduling_of(self, node: str) -> Scheduling:
         """Core and priority of a node's executor."""
-        own = self.nodes[node]
-        executors = self.scheduling.executors
-        return Scheduling(
-            core=executors.core if own.core is None else own.core,
-            priority=executors.priority if own.priority is None else own.priority,
-        )
+        own, executors = self.nodes[node], self.scheduling.executors
+        core = executors.core if own.core is None else own.core
+        return Scheduling(core=core, priority=own.priority or executors.priority)
 
     def dds_scheduling_of(self, node: str) -> Scheduling:
         """Core and priority of a node's DDS threads."""
@@ -387,17 +348,14 @@ class Application(Part):
 
     def cores(self) -> dict[int, str]:
         """Every core the application uses, with who asks for it."""
-        used = {self.scheduling.dds.core: "scheduling.dds"}
-        for node in self.nodes:
-            used[self.scheduling_of(node).core] = f"node {node}"
-        return used
+        executors = {self.scheduling_of(node).core: f"node {node}" for node in self.nodes}
+        return {self.scheduling.dds.core: "scheduling.dds", **executors}
 
 
 def load_application(path: str | Path) -> Application:
     """Read an application's YAML file.
 
-    Raises:
-        InputError: with file, line, key, reason and remedy of each wrong value.
+    Raises InputError: with file, line, key, reason and remedy of each wrong value.
     """
     return read_model(path, Application, made_by="like examples/synthetic_chain.yaml")
 

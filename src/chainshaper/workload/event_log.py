@@ -2,74 +2,38 @@
 
 A trace point appends a few integers to an array in locked memory, in one step, so that threads
 may share the log; names are written once, at start-up. Nothing touches a file or a pipe before
-the run is over. The layout is read back by
-:mod:`chainshaper.workload.live`, which turns it into the tables of
-:mod:`chainshaper.values.events`. Nothing heavy is imported: the pages are locked into memory.
-
-A process and the launcher talk in lines of JSON on pipes, and bytes at the end:
-
-1. launcher → process: what it is;
-2. process → launcher: that it is ready;
-3. launcher → process: when to start and stop (ns of CLOCK_MONOTONIC);
-4. process → launcher: one line with the size of its events, then the events;
-5. launcher → process: an empty line: leave.
-
-Between 3 and 4 neither touches a pipe, so that talking never disturbs what is measured.
+the run is over. :func:`chainshaper.workload.live.event_tables` reads the layout back. Nothing heavy
+is imported: the pages are locked into memory. The simulator notes its objects here as well.
 """
 
-import json
-import sys
 from array import array
 from collections.abc import Callable
+from functools import partial
+from itertools import count
 from time import monotonic_ns
 from typing import Any
 
 from chainshaper.gate.decision import ANCHORS, DROPPED, LATE, MESSAGES
 
-__all__ = [
-    "ABSENT",
-    "LAYOUT",
-    "WIDTH",
-    "WORDS",
-    "EventLog",
-    "number_of",
-    "receive",
-    "send",
-    "send_events",
-    "wait_for_leave",
-]
+__all__ = ["ABSENT", "LAYOUT", "WIDTH", "WORDS", "EventLog", "number_of"]
 
-LAYOUT: tuple[tuple[str, tuple[str, ...]], ...] = (
-    ("callback_start", ("callback", "thread_time", "is_intra_process")),
-    ("callback_end", ("callback", "thread_time")),
-    ("rclcpp_publish", ("message",)),
-    ("rcl_publish", ("publisher_handle", "message")),
-    ("rmw_publish", ("rmw_publisher_handle", "message", "timestamp")),
-    ("rmw_take", ("rmw_subscription_handle", "message", "source_timestamp", "taken")),
-    ("rcl_take", ("message",)),
-    ("rclcpp_take", ("message",)),
-    ("rclcpp_executor_get_next_ready", ()),
-    ("rclcpp_executor_wait_for_work", ("timeout",)),
-    ("rclcpp_executor_execute", ("handle",)),
-    (
-        "gate_release",
-        (
-            "callback",
-            "source_timestamp",
-            "arrival",
-            "origin",
-            "release",
-            "slot",
-            "cycles_waited",
-            "anchor",
-            "overrun",
-            "mode",
-            "dropped",
-        ),
-    ),
-    ("asynchronous_send", ("tid", "rmw_publisher_handle", "timestamp", "outcome", "duration")),
-    ("machine_stall", ("duration",)),
-)
+_RELEASE = "callback source_timestamp arrival origin release slot cycles_waited anchor overrun mode"
+LAYOUT: dict[str, tuple[str, ...]] = {
+    "callback_start": ("callback", "thread_time", "is_intra_process"),
+    "callback_end": ("callback", "thread_time"),
+    "rclcpp_publish": ("message",),
+    "rcl_publish": ("publisher_handle", "message"),
+    "rmw_publish": ("rmw_publisher_handle", "message", "timestamp"),
+    "rmw_take": ("rmw_subscription_handle", "message", "source_timestamp", "taken"),
+    "rcl_take": ("message",),
+    "rclcpp_take": ("message",),
+    "rclcpp_executor_get_next_ready": (),
+    "rclcpp_executor_wait_for_work": ("timeout",),
+    "rclcpp_executor_execute": ("handle",),
+    "gate_release": (*_RELEASE.split(), "dropped"),
+    "asynchronous_send": ("tid", "rmw_publisher_handle", "timestamp", "outcome", "duration"),
+    "machine_stall": ("duration",),
+}
 """Event names and the order of their fields; an event's number is its place in this list."""
 
 WIDTH = 13  # event number, time, and up to eleven fields
@@ -89,6 +53,9 @@ WORDS: dict[str, tuple[str, ...]] = {
 So is ``mode``, in the list of the gate's own modes.
 """
 
+FIRST_HANDLE = 0x55D0_0000_0100
+"""Handles are like real addresses: unique in their process and reused by the others."""
+
 
 def number_of(field: str, word: str | None) -> int:
     """The number under which a word of :data:`WORDS` is recorded."""
@@ -96,54 +63,68 @@ def number_of(field: str, word: str | None) -> int:
 
 
 class EventLog:
-    """Events of one process. :meth:`point` makes a fast recording function for one event."""
+    """Events of one process, and the objects of its node with their handles.
 
-    def __init__(self) -> None:
+    :meth:`point` makes a fast recording function for one event.
+    """
+
+    def __init__(self, clock: Callable[[], int] = monotonic_ns) -> None:
         self.rows = array("q")
         self.objects: list[dict[str, Any]] = []  # the init events, which carry names
+        self.new_handle: Callable[[], int] = partial(next, count(FIRST_HANDLE, 0x100))
+        self._clock = clock
+        self._node = self.new_handle()
 
     def init(self, event: str, **fields: Any) -> None:
         """Record an object's creation (`rcl_node_init` and its kind)."""
-        self.objects.append({"event": event, "time": monotonic_ns(), **fields})
+        self.objects.append({"event": event, "time": self._clock(), **fields})
+
+    def node(self, node: str, version: str) -> None:
+        """The process's node is created; ``node`` is its full name."""
+        self.init("rcl_init", context_handle=self.new_handle(), version=version)
+        namespace, _, name = node.rpartition("/")
+        named = {"node_name": name, "namespace": namespace or "/"}
+        self.init("rcl_node_init", node_handle=self._node, rmw_handle=self.new_handle(), **named)
+
+    def publisher(self, topic: str, depth: int, asynchronous: bool) -> tuple[int, int]:
+        """A publisher is created: its handle, and that of rmw."""
+        handle, rmw_handle = self.new_handle(), self.new_handle()
+        own = {"publisher_handle": handle, "rmw_publisher_handle": rmw_handle}
+        about = {"topic_name": topic, "queue_depth": depth, "asynchronous": int(asynchronous)}
+        self.init("rcl_publisher_init", node_handle=self._node, **own, **about)
+        return handle, rmw_handle
+
+    def callback(self, symbol: str) -> int:
+        """A callback is registered: its handle."""
+        handle = self.new_handle()
+        self.init("rclcpp_callback_register", callback=handle, symbol=symbol)
+        return handle
+
+    def timer(self, callback: int, period_ns: int) -> int:
+        """A timer is created for a callback: its handle."""
+        handle = self.new_handle()
+        self.init("rcl_timer_init", timer_handle=handle, period=period_ns)
+        self.init("rclcpp_timer_callback_added", timer_handle=handle, callback=callback)
+        self.init("rclcpp_timer_link_node", timer_handle=handle, node_handle=self._node)
+        return handle
+
+    def subscription(self, callback: int, topic: str, depth: int) -> tuple[int, int]:
+        """A subscription is created for a callback: its handle, and that of rmw."""
+        handle, rmw_handle, above = self.new_handle(), self.new_handle(), self.new_handle()
+        own = {"subscription_handle": handle, "rmw_subscription_handle": rmw_handle}
+        about = {"topic_name": topic, "queue_depth": depth}
+        self.init("rcl_subscription_init", node_handle=self._node, **own, **about)
+        self.init("rclcpp_subscription_init", subscription_handle=handle, subscription=above)
+        self.init("rclcpp_subscription_callback_added", subscription=above, callback=callback)
+        return handle, rmw_handle
 
     def point(self, event: str) -> Callable[..., None]:
         """A function of (time, *fields) that records one event; fields as in :data:`LAYOUT`."""
-        number = next(i for i, (name, _) in enumerate(LAYOUT) if name == event)
+        number = list(LAYOUT).index(event)
         extend = self.rows.extend
-        padding = (0,) * (WIDTH - 2 - len(LAYOUT[number][1]))
+        padding = (0,) * (WIDTH - 2 - len(LAYOUT[event]))
 
         def record(time_ns: int, *fields: int) -> None:
             extend((number, time_ns, *fields, *padding))
 
         return record
-
-
-def receive() -> dict[str, Any]:
-    """The launcher's next line; ends this process when the launcher is gone."""
-    line = sys.stdin.readline()
-    if not line:
-        sys.exit(0)
-    received: dict[str, Any] = json.loads(line)
-    return received
-
-
-def send(**fields: Any) -> None:
-    """One line to the launcher."""
-    sys.stdout.write(json.dumps(fields) + "\n")
-    sys.stdout.flush()
-
-
-def send_events(events: bytes, **fields: Any) -> None:
-    """What was recorded, behind a line that says how much it is."""
-    send(bytes=len(events), **fields)
-    # A process that is frozen while it writes has written a part; without a buffer
-    # (PYTHONUNBUFFERED) no other layer writes the rest.
-    left = memoryview(events)
-    while left:
-        left = left[sys.stdout.buffer.write(left) :]
-    sys.stdout.buffer.flush()
-
-
-def wait_for_leave() -> None:
-    """Stay until everybody is done: a participant that leaves early disturbs the others."""
-    sys.stdin.readline()

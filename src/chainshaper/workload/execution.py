@@ -8,18 +8,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["BLOCK", "ExecutionTimes", "blocks", "draw", "spend"]
-
 BLOCK = 1024
 
 
 def draw(
     execution: dict[str, Any], count: int, random: np.random.Generator
 ) -> npt.NDArray[np.int64]:
-    """``count`` execution times in ns from a described distribution (durations in ns).
-
-    ``execution`` is :class:`~chainshaper.workload.description.ExecutionTime` as a dictionary.
-    """
+    """``count`` execution times (ns) from a described ``ExecutionTime``, as a dictionary."""
     if (constant := execution.get("constant_ns")) is not None:
         return np.full(count, constant, dtype=np.int64)
     if (uniform := execution.get("uniform_ns")) is not None:
@@ -28,8 +23,8 @@ def draw(
         block = execution.get("block", 1)
         starts = (random.random(-(-count // block)) * len(samples)).astype(np.int64)
         places = (starts[:, None] + np.arange(block)).ravel()[:count] % len(samples)
-        drawn_samples: npt.NDArray[np.int64] = np.asarray(samples, dtype=np.int64)[places]
-        return drawn_samples
+        measured: npt.NDArray[np.int64] = np.asarray(samples, dtype=np.int64)[places]
+        return measured
     mean, deviation = execution["normal_ns"]
     low, high = execution["within_ns"]
     drawn = random.normal(mean, deviation, count)
@@ -78,10 +73,7 @@ class ExecutionTimes:
 
 
 def spend(cpu_ns: int, since_ns: int) -> None:
-    """Compute until this thread has used ``cpu_ns`` since its CPU clock showed ``since_ns``.
-
-    Pre-emption does not count.
-    """
+    """Compute until this thread has used ``cpu_ns`` since its CPU clock showed ``since_ns``."""
     clock = time.thread_time_ns
     until = since_ns + cpu_ns
     while clock() < until:

@@ -1,10 +1,9 @@
 """What runs in a node: executor, synchroniser, publisher thread, and what callbacks do.
 
-**Executor.** The order in which a node's callbacks run is part of what is measured, so it follows
-rclcpp's `SingleThreadedExecutor` (Casini et al., ECRTS 2019): wait until something is ready, take a
-snapshot of all that is, then run it to the end: timers first, then subscriptions, each in the order
-of registration and each at most once. What becomes ready meanwhile waits for the next snapshot. A
-timer that missed whole periods fires once and keeps its phase.
+**Executor.** As rclcpp's `SingleThreadedExecutor` (Casini et al., ECRTS 2019): wait until something
+is ready, take a snapshot of all that is, then run it to the end: timers first, then subscriptions,
+each in the order of registration and each at most once. What becomes ready meanwhile waits for the
+next snapshot. A timer that missed whole periods fires once and keeps its phase.
 
 **Synchroniser** (message_filters). Each input has a subscription and a callback of its own. The
 callback that completes a set, of the oldest message of every input, computes and publishes; the
@@ -13,23 +12,21 @@ others only leave their message.
 **Asynchronous publication.** As Fast DDS has it (paper, section 2.2): publishing puts the message
 into its writer's history, with the source timestamp of that instant, and wakes the **publisher
 thread** (``dds.asyn.…``), which sends for all asynchronous writers of the process. The history
-keeps the last ``depth`` messages that are not sent yet; one that is older than the topic's lifespan
+has the last ``depth`` messages that are not sent yet; one that is older than the topic's lifespan
 is not sent any more.
 
-A reservation server may keep this thread from running while the executor goes on (section 3.2.1).
-So what it waits for, it waits for in the kernel: without the interpreter's lock, and without any
-lock of DDS. Woken while its server is closed, it stops before it returns to user space, and
-the executor, which only appends and wakes, never waits for it. Stopped in the midst of sending,
-however, it holds both, and the process stands still: a publish slot has to be far longer than a
-send (:mod:`chainshaper.planning.overruns`).
+A reservation server may stop this thread while the executor goes on (section 3.2.1). So it waits
+in the kernel, without the interpreter's lock or one of DDS: woken while its server is closed, it
+stops before it returns to user space, and the executor, which only appends and wakes, never waits
+for it. Stopped in the midst of sending, however, it has both locks, and the process stands still:
+a publish slot has to be far longer than a send (:mod:`chainshaper.planning.overruns`).
 
-**Work.** Most descriptions only say how long a callback computes. One that ``computes:
-MODULE:FUNCTION`` does real work instead: the function is called with the serialized messages that
-it is for (none for a timer, the whole set for a synchronising callback, in the order of
-``synchronises``) and returns the serialized message to publish on every topic of the callback, or
-None: nothing then. :func:`~chainshaper.workload.dds.data_of` and
-:func:`~chainshaper.workload.dds.data_message` open and make messages; the stamp of the header, from
-which gates count, is the function's to pass on.
+**Work.** A callback spends its described time, or calls the function that it ``computes:`` with
+the serialized messages that it is for (none for a timer, the whole set for a synchronising
+callback). The function returns the serialized message to publish on every topic of the callback,
+or None: nothing then (:func:`~chainshaper.workload.dds.data_of` and
+:func:`~chainshaper.workload.dds.data_message` open and make messages). The stamp of the header,
+from which gates count, is the function's to pass on.
 """
 
 import importlib
@@ -51,24 +48,9 @@ from chainshaper.linux.own_processes import named_folders
 from chainshaper.linux.scheduling import set_thread_name
 from chainshaper.values.files import why_distrusted
 from chainshaper.workload import dds
-from chainshaper.workload.dds import GuardCondition, Message, Subscription, WaitSet
+from chainshaper.workload.dds import Message, Subscription
 from chainshaper.workload.event_log import EventLog, number_of
 from chainshaper.workload.execution import ExecutionTimes, spend
-
-__all__ = [
-    "AsynchronousWriter",
-    "Executor",
-    "Note",
-    "PublisherThread",
-    "SubscriptionEntity",
-    "Synchroniser",
-    "Timer",
-    "Work",
-    "computing",
-    "load_function",
-    "noting_sends",
-    "spending",
-]
 
 
 @dataclass
@@ -104,16 +86,15 @@ class Executor:
         self.timers: list[Timer] = []
         self.subscriptions: list[SubscriptionEntity] = []
         self.backlogs: list[Callable[[], bool]] = []
-        self._wait_set = WaitSet(participant)
+        self._wait_set = dds.WaitSet(participant)
         # Never triggered: an empty wait set would return at once instead of waiting.
-        self._guard = GuardCondition(participant)
+        self._guard = dds.GuardCondition(participant)
         self._wait_set.attach(self._guard)
         self._wait_for_work = log.point("rclcpp_executor_wait_for_work")
         self._next_ready = log.point("rclcpp_executor_get_next_ready")
         self._execute = log.point("rclcpp_executor_execute")
-        self._rmw_take = log.point("rmw_take")
-        self._rcl_take = log.point("rcl_take")
-        self._rclcpp_take = log.point("rclcpp_take")
+        takes = map(log.point, ("rmw_take", "rcl_take", "rclcpp_take"))
+        self._rmw_take, self._rcl_take, self._rclcpp_take = takes
 
     def add_subscription(self, entity: SubscriptionEntity) -> None:
         self.subscriptions.append(entity)
@@ -135,27 +116,23 @@ class Executor:
             timers = [timer for timer in self.timers if timer.due_ns <= now]
             subscriptions = [entity for entity in self.subscriptions if entity.subscription.ready()]
             for timer in timers:
-                self._run_timer(timer)
+                timer.call(self._chosen(timer.handle))
+                timer.callback()
             for entity in subscriptions:
-                self._run_subscription(entity)
+                self._chosen(entity.handle)
+                message = entity.subscription.take()
+                if message is None:
+                    self._rmw_take(monotonic_ns(), entity.rmw_handle, id(message), 0, 0)
+                    continue
+                self.record_take(entity.rmw_handle, message)
+                entity.callback(message)
 
-    def _run_timer(self, timer: Timer) -> None:
+    def _chosen(self, handle: int) -> int:
+        """Record that a timer or subscription is executed next; when that is (ns)."""
         now = monotonic_ns()
         self._next_ready(now)
-        self._execute(now, timer.handle)
-        timer.call(now)
-        timer.callback()
-
-    def _run_subscription(self, entity: SubscriptionEntity) -> None:
-        now = monotonic_ns()
-        self._next_ready(now)
-        self._execute(now, entity.handle)
-        message = entity.subscription.take()
-        if message is None:
-            self._rmw_take(monotonic_ns(), entity.rmw_handle, id(message), 0, 0)
-            return
-        self.record_take(entity.rmw_handle, message)
-        entity.callback(message)
+        self._execute(now, handle)
+        return now
 
     def record_take(self, rmw_handle: int, message: Message) -> None:
         """Record that a message was taken for the callback that starts next."""
@@ -205,10 +182,8 @@ class AsynchronousWriter:
         lifespan_ns: int | None,
         note: Note,
     ) -> None:
-        self._write = write
-        self._depth = depth
-        self._lifespan_ns = lifespan_ns
-        self._note = note
+        self._write, self._note = write, note
+        self._depth, self._lifespan_ns = depth, lifespan_ns
         self._history: deque[tuple[bytes, int]] = deque()
 
     def keep(self, payload: bytes, source_timestamp: int) -> None:
@@ -260,10 +235,8 @@ def noting_sends(record: Callable[..., None], rmw_handle: int) -> Note:
     """What records the sends of one publisher, whichever thread they happen in."""
 
     def note(time_ns: int, source_timestamp: int, outcome: str, duration_ns: int) -> None:
-        tid = threading.get_native_id()
-        record(
-            time_ns, tid, rmw_handle, source_timestamp, number_of("outcome", outcome), duration_ns
-        )
+        tid, number = threading.get_native_id(), number_of("outcome", outcome)
+        record(time_ns, tid, rmw_handle, source_timestamp, number, duration_ns)
 
     return note
 
@@ -273,10 +246,10 @@ Work = Callable[[Sequence[dds.Message], int, int], Iterable[bytes]]
 start; gives what is published on each topic, in their order. Nothing: nothing is published."""
 
 
-def spending(times: ExecutionTimes, templates: Sequence[bytearray], announced: list[bytes]) -> Work:
+def spending(times: ExecutionTimes, templates: Sequence[bytes], announced: list[bytes]) -> Work:
     """Spend the next execution time; the first message's stamp is passed on to all topics.
 
-    ``templates`` has a message per topic. What is ``announced`` is published in turn instead.
+    ``templates`` has the data for each topic. What is ``announced`` is published in turn instead.
     All that a callback does before it publishes is part of its execution time, so messages are
     made first.
     """
@@ -284,10 +257,7 @@ def spending(times: ExecutionTimes, templates: Sequence[bytearray], announced: l
 
     def work(messages: Sequence[dds.Message], wall_ns: int, cpu_ns: int) -> Sequence[bytes]:
         stamp = (origin_of(messages[0].payload) or 0) if messages else wall_ns
-        made = [
-            next(announcements, None) or dds.stamp_message(template, stamp)
-            for template in templates
-        ]
+        made = [next(announcements, None) or dds.data_message(one, stamp) for one in templates]
         spend(times.next(), cpu_ns)
         return made
 
@@ -335,7 +305,8 @@ def load_function(name: str) -> Callable[..., object]:
             + "".join(f"; not {place}: {reason}" for place, reason in places.items() if reason)
         )
     if found is None:
-        sys.exit(f"{name} cannot be loaded: {_file(module)} has no {attribute}")
+        file = getattr(sys.modules[module], "__file__", None) or module
+        sys.exit(f"{name} cannot be loaded: {file} has no {attribute}")
     if not callable(found):
         sys.exit(f"{name} cannot be called: name a function")
     return found  # type: ignore[no-any-return]
@@ -343,7 +314,3 @@ def load_function(name: str) -> Callable[..., object]:
 
 def _in_words(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
-
-
-def _file(module: str) -> str:
-    return getattr(sys.modules[module], "__file__", None) or module

@@ -1,10 +1,22 @@
-"""Starting processes of the live workload, watching them, and leaving none behind."""
+"""Starting processes of the live workload, talking with them, and leaving none behind.
+
+A process and we talk in lines of JSON on pipes, and bytes at the end:
+
+1. we → process: what it is;
+2. process → us: that it is ready;
+3. we → process: when to start and stop (ns of CLOCK_MONOTONIC);
+4. process → us: one line with the size of its events, then the events;
+5. we → process: an empty line: leave.
+
+Between 3 and 4 neither touches a pipe, so that talking never disturbs what is measured.
+"""
 
 import contextlib
 import json
 import os
 import select
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -14,14 +26,11 @@ from typing import IO, Any
 from chainshaper.linux.own_processes import end_in_words, module_command
 from chainshaper.values.errors import OperationError
 
-__all__ = ["Child", "end_all", "first_casualty", "start_child"]
-
 
 @dataclass(frozen=True)
 class Child:
-    """A process of ours: what it is for people, its pipes and error output, and what of its
-    output was received and not taken yet.
-    """
+    """A process of ours: its name for people, its pipes and error output, and what of its output
+    was received and not taken yet."""
 
     name: str
     process: subprocess.Popen[bytes]
@@ -42,8 +51,7 @@ class Child:
     def hear(self, within_s: float | None = None) -> dict[str, Any]:
         """Its next line, waited for as long as it takes or, between its parts, ``within_s``.
 
-        Raises:
-            OperationError: it died instead, or was silent.
+        Raises OperationError: it died instead, or was silent.
         """
         line = self._take(lambda received: received.find(b"\n") + 1, within_s)
         try:
@@ -81,7 +89,7 @@ class Child:
         return taken
 
     def obituary(self) -> str:
-        """One sentence about how it died, with the last thing it said."""
+        """One sentence about how it died, with the last line of its error output."""
         try:
             code = self.process.wait(timeout=2)
         except subprocess.TimeoutExpired:
@@ -99,11 +107,10 @@ def start_child(
     arguments: Sequence[str] = (),
     libraries: Sequence[str] = (),
 ) -> Child:
-    """Start ``python -m module ARGUMENTS`` in a session of its own, with pipes to talk to it.
+    """Start ``python -m module ARGUMENTS`` with pipes to talk to it.
 
-    ``libraries`` are what it needs beyond Python's own.
-
-    A session of its own keeps Ctrl-C for us: we end children in order, they do not die at random.
+    ``libraries`` are what it needs beyond Python's own. A session of its own keeps Ctrl-C for us:
+    we end children in order, they do not die at random.
     """
     errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the child
     try:
@@ -142,3 +149,37 @@ def end_all(children: Iterable[Child], patience_s: float = 2.0) -> None:
             if stream is not None:
                 with contextlib.suppress(OSError):  # unsent bytes of a broken pipe
                     stream.close()
+
+
+# The other end ----------------------------------------------------------------------------
+
+
+def receive() -> dict[str, Any]:
+    """The launcher's next line; ends this process when the launcher is gone."""
+    line = sys.stdin.readline()
+    if not line:
+        sys.exit(0)
+    received: dict[str, Any] = json.loads(line)
+    return received
+
+
+def send(**fields: Any) -> None:
+    """One line to the launcher."""
+    sys.stdout.write(json.dumps(fields) + "\n")
+    sys.stdout.flush()
+
+
+def send_events(events: bytes, **fields: Any) -> None:
+    """What was recorded, behind a line that says how much it is."""
+    send(bytes=len(events), **fields)
+    # A process that is frozen while it writes has written a part; without a buffer
+    # (PYTHONUNBUFFERED) no other layer writes the rest.
+    left = memoryview(events)
+    while left:
+        left = left[sys.stdout.buffer.write(left) :]
+    sys.stdout.buffer.flush()
+
+
+def wait_for_leave() -> None:
+    """Stay until all are done: a participant that leaves early disturbs the others."""
+    sys.stdin.readline()

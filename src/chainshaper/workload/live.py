@@ -8,7 +8,7 @@ that end with the run, so nothing on the machine is different afterwards.
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -40,25 +40,13 @@ from chainshaper.workload.description import (
 )
 from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS
 from chainshaper.workload.launcher import Child, end_all, first_casualty, start_child
-from chainshaper.workload.stall_watch import (
+from chainshaper.workload.stall_meter import (
     far_from,
     meter_tables,
     promote_meters,
     read_meters,
     start_meters,
 )
-
-__all__ = [
-    "Enforcement",
-    "ProcessLog",
-    "Progress",
-    "StartedNodes",
-    "Timing",
-    "event_tables",
-    "origin_timer",
-    "run_application",
-    "timing_of",
-]
 
 Progress = Callable[[float, str], None]
 """Called with the share done (0 to 1) and what is being done."""
@@ -88,9 +76,10 @@ LOOK_NS = 1_000_000_000
 """How often is looked who governs the nodes: others write it down every second."""
 ANSWER_S = 60.0
 """A process that is silent for longer, discovery included, hangs."""
+SHOWN = ("tid", "pid", "comm", "policy", "priority", "cores")
+"""What the kernel shows of a thread, and a recording has."""
 SINGLE_THREADED = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 """What a callback computes, it computes on its executor's thread."""
-NODE_MODULE = "chainshaper.workload.node_process"
 
 
 def run_application(
@@ -122,22 +111,19 @@ def run_application(
     if cycles < 1:
         raise InputError(f"{cycles} cycles cannot be recorded: ask for at least 1")
     check_cores(application.cores())
-    timer = origin_timer(application)
     permitted = may_use_fifo()
     if realtime and not permitted:
         raise PlatformError(
             "real-time scheduling was asked for, but this process may not use SCHED_FIFO: run as "
             "root, give your user an rtprio limit of 98 in /etc/security/limits.conf, or do without"
         )
-    reason = "the process may not use SCHED_FIFO" if not permitted else "SCHED_FIFO was declined"
     realtime = permitted if realtime is None else realtime
     nodes: dict[str, Child] = {}
     meters: dict[int, Child] = {}
-    governed: tuple[Governed, ...] = ()
     finished = False
     try:
         progress(0.0, "starting nodes")
-        _start_nodes(application, timer, nodes, realtime)
+        _start_nodes(application, nodes, realtime)
         if realtime:  # what can be pre-empted itself cannot tell a stall from ordinary scheduling
             start_meters(application.cores(), meters)
         memory_locked = _await_ready([*nodes.values(), *meters.values()])
@@ -145,9 +131,9 @@ def run_application(
         promote_meters(meters, realtime)
         lead = LEAD_NS if enforcement is None else LEAD_NS + ENFORCING_NS
         timing = timing_of(application, cycles, time.monotonic_ns() + lead)
-        offset_before = clock_offset()
-        pids = {node_name(name): child.pid for name, child in nodes.items()}
-        started = StartedNodes(pids, timing.anchor_ns)
+        offset = clock_offset()
+        processes = {child.pid: node_name(name) for name, child in nodes.items()}
+        started = StartedNodes({node: pid for pid, node in processes.items()}, timing.anchor_ns)
         with nullcontext() if enforcement is None else enforcement(started):
             for child in [*nodes.values(), *meters.values()]:
                 child.tell(**asdict(timing))
@@ -164,16 +150,15 @@ def run_application(
     in_force = None if plan is None else InForceInfo(since_ns=timing.record_from_ns)
     if plan is None and together is not None:
         in_force = InForceInfo(since_ns=together.since_ns, until_ns=together.until_ns)
-    notes = _notes(None if realtime else reason, memory_locked, clock_offset() - offset_before)
     info = RecordingInfo(
         source="live",
         rmw="cyclonedds",
-        clock_offset_ns=offset_before,
+        clock_offset_ns=offset,
         command=tuple(command),
-        processes={child.pid: node_name(name) for name, child in nodes.items()},
+        processes=processes,
         threads=threads,
         realtime=realtime,
-        notes=notes,
+        notes=tuple(_notes(realtime, permitted, memory_locked, clock_offset() - offset)),
         stall_meter=meter_info,
         chain=application.chain,
         application=application_as_written(application),
@@ -227,59 +212,48 @@ def timing_of(application: Application, cycles: int, start: int) -> Timing:
     end, apart = first + cycles * period, min(1_000_000, period // 10)
     gates = [cb.gate for _, cb in application.callbacks() if cb.gate is not None]
     releases = [opens for gate in gates for opens, _ in gate.slots] or [0]
-    held = max((gate.due_cycles for gate in gates), default=0)
+    delayed = max((gate.due_cycles for gate in gates), default=0)
     return Timing(
         start_ns=start,
         anchor_ns=anchor,
         record_from_ns=first - apart,
         last_timer_ns=end - apart,
-        stop_ns=end + max(2 * period, 200_000_000) + held * period,
+        stop_ns=end + max(2 * period, 200_000_000) + delayed * period,
         meter_from_ns=anchor + far_from(releases),
     )
 
 
-def _start_nodes(
-    application: Application, timer: CallbackDescription, nodes: dict[str, Child], realtime: bool
-) -> None:
-    """Start a process per node, into ``nodes``: what fails later can end those started."""
+def _start_nodes(application: Application, nodes: dict[str, Child], realtime: bool) -> None:
+    """Start a process per node, into ``nodes``: what fails later can end those started.
+
+    Each gets its description, durations in ns, and its name in the arguments that ROS 2 has.
+    """
     from chainshaper.workload.dds import closed_domain_configuration, free_domain
 
     domain = free_domain()
     environment = {"CYCLONEDDS_URI": closed_domain_configuration(), **SINGLE_THREADED}
-    for name in application.nodes:
-        nodes[name] = start_child(
-            f"node {name}", NODE_MODULE, environment, _ros_arguments(name), LIBRARIES
+    described = [callback for _, callback in application.callbacks()]
+    writers = Counter(topic for callback in described for topic in callback.publishes)
+    readers = Counter(topic for callback in described for topic in callback.subscriptions)
+    for name, node in application.nodes.items():
+        namespace, _, base = node_name(name).rpartition("/")
+        arguments = ("--ros-args", "-r", f"__node:={base}", "-r", f"__ns:={namespace or '/'}")
+        module = "chainshaper.workload.node_process"
+        nodes[name] = start_child(f"node {name}", module, environment, arguments, LIBRARIES)
+        executor, dds = application.scheduling_of(name), application.dds_scheduling_of(name)
+        nodes[name].tell(
+            node=node_name(name),
+            domain=domain,
+            seed=application.seed,
+            parent=os.getpid(),
+            discovery_ns=DISCOVERY_NS,
+            origin_phase=origin_timer(application).phase_ns,
+            delivery_core=dds.core if realtime and dds.core != executor.core else None,
+            callbacks=[callback.model_dump() for callback in node.callbacks],
+            topics={topic: application.topic(topic).model_dump() for topic in writers},
+            announced=sorted(application.announced()),
+            expected={topic: (writers[topic], readers[topic]) for topic in writers},
         )
-        nodes[name].tell(**_spec(application, name, timer, domain, realtime))
-
-
-def _ros_arguments(name: str) -> tuple[str, ...]:
-    """A node's name as ROS 2 programs get it: its command line shows it."""
-    namespace, _, base = node_name(name).rpartition("/")
-    return ("--ros-args", "-r", f"__node:={base}", "-r", f"__ns:={namespace or '/'}")
-
-
-def _spec(
-    application: Application, name: str, timer: CallbackDescription, domain: int, realtime: bool
-) -> dict[str, Any]:
-    """A node's description as its process gets it: durations are ns here."""
-    callbacks = [callback for _, callback in application.callbacks()]
-    writers = Counter(topic for callback in callbacks for topic in callback.publishes)
-    readers = Counter(topic for callback in callbacks for topic in callback.subscriptions)
-    executor, dds = application.scheduling_of(name), application.dds_scheduling_of(name)
-    return {
-        "node": node_name(name),
-        "domain": domain,
-        "seed": application.seed,
-        "parent": os.getpid(),
-        "discovery_ns": DISCOVERY_NS,
-        "origin_phase": timer.phase_ns,
-        "delivery_core": dds.core if realtime and dds.core != executor.core else None,
-        "callbacks": [cb.model_dump() for cb in application.nodes[name].callbacks],
-        "topics": {topic: application.topic(topic).model_dump() for topic in writers},
-        "announced": sorted(application.announced()),
-        "expected": {topic: (writers[topic], readers[topic]) for topic in writers},
-    }
 
 
 def _await_ready(children: Sequence[Child]) -> bool:
@@ -299,13 +273,12 @@ def _allocate_threads(application: Application, nodes: dict[str, Child], realtim
     for name, child in nodes.items():
         executor, dds = application.scheduling_of(name), application.dds_scheduling_of(name)
         for thread in list_threads(child.pid):
+            core, priority = dds.core, dds.priority
             if thread.role == "executor":
                 core, priority = executor.core, executor.priority
             elif thread.role == "publisher":
                 # Below the executor: it shares the writer's lock with it, and may spin on it.
                 core, priority = executor.core, max(1, executor.priority - 1)
-            else:
-                core, priority = dds.core, dds.priority
             apply_scheduling(thread, Scheduling(priority if realtime else None, cores=(core,)))
 
 
@@ -319,8 +292,7 @@ def _watch(
 
     And the plans that others put in force meanwhile (`chainshaper apply`).
 
-    Raises:
-        OperationError: a process ended before its time.
+    Raises OperationError: a process ended before its time.
     """
     children = [*nodes.values(), *meters.values()]
     threads: tuple[ThreadInfo, ...] = ()
@@ -345,21 +317,13 @@ def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[Thread
     children += [(child, "") for child in meters.values()]
     return tuple(
         ThreadInfo(
-            tid=thread.tid,
-            pid=thread.pid,
-            comm=thread.comm,
             node=node,
             role=thread.role if node else "stall-meter",
-            policy=thread.policy,
-            priority=thread.priority,
-            cores=thread.cores,
+            **{name: getattr(thread, name) for name in SHOWN},
         )
         for child, node in children
         for thread in list_threads(child.pid)
     )
-
-
-_MAY_BE_ABSENT = {"gate_release": ("release", "slot")}
 
 
 @dataclass(frozen=True)
@@ -382,41 +346,43 @@ def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataF
     for log in logs:
         rows = np.frombuffer(log.rows, dtype=np.int64).reshape(-1, WIDTH)
         rows = rows[rows[:, 1] >= from_ns]
-        for number, (name, fields) in enumerate(LAYOUT):
+        common = {"pid": log.pid, "tid": log.pid, "cpu": log.core}  # executors: the main thread
+        found: list[tuple[str, pl.DataFrame]] = []
+        for number, (name, fields) in enumerate(LAYOUT.items()):
             mine = rows[rows[:, 0] == number]
             if len(mine):
-                columns = {"time": mine[:, 1]}
-                columns |= {field: mine[:, 2 + i] for i, field in enumerate(fields)}
-                parts.setdefault(name, []).append(_typed(name, pl.DataFrame(columns), log))
-        for created in log.objects:
-            name = created["event"]
-            fields_of = {key: [value] for key, value in created.items() if key != "event"}
-            parts.setdefault(name, []).append(_typed(name, pl.DataFrame(fields_of), log))
+                own = mine[:, 1 : 2 + len(fields)]
+                found.append((name, pl.DataFrame(own, schema=["time", *fields])))
+        for name in dict.fromkeys(created["event"] for created in log.objects):
+            own_objects = [created for created in log.objects if created["event"] == name]
+            found.append((name, pl.DataFrame(own_objects)))
+        for name, frame in found:
+            missing = {key: pl.lit(value) for key, value in common.items() if key not in frame}
+            table = typed_table(name, frame.with_columns(**missing), log.modes)
+            parts.setdefault(name, []).append(table)
     return {
         name: pl.concat(frames).sort("time", maintain_order=True)
         for name, frames in sorted(parts.items())
     }
 
 
-def _typed(name: str, frame: pl.DataFrame, log: ProcessLog) -> pl.DataFrame:
-    frame = frame.with_columns(
-        pl.when(pl.col(field) != ABSENT).then(pl.col(field)).alias(field)
-        for field in _MAY_BE_ABSENT.get(name, ())
-    )
-    frame = frame.with_columns(
-        pl.col(field).replace_strict(dict(enumerate(words)), default=None, return_dtype=pl.String())
-        for field, words in {**WORDS, "mode": log.modes}.items()
-        if field in frame.columns
-    )
-    tid = pl.col("tid") if "tid" in frame.columns else pl.lit(log.pid)  # executors: the main thread
-    types = {**events.FIELDS[name], **events.OPTIONAL_FIELDS.get(name, {})}
-    return frame.select(
-        pl.col("time").cast(pl.Int64),
-        pl.lit(log.pid, dtype=pl.Int32).alias("pid"),
-        tid.cast(pl.Int32).alias("tid"),
-        pl.lit(log.core, dtype=pl.Int32).alias("cpu"),
-        *(pl.col(field).cast(type_) for field, type_ in types.items() if field in frame.columns),
-    )
+def typed_table(name: str, frame: pl.DataFrame, modes: Sequence[str] = ()) -> pl.DataFrame:
+    """An event's table from columns of numbers, which stand for words and nulls as in the log.
+
+    Columns that the event does not have are left out.
+    """
+    types = {**events.COMMON_COLUMNS, **events.FIELDS[name], **events.OPTIONAL_FIELDS.get(name, {})}
+    words = {**WORDS, "mode": tuple(modes)}
+    columns = []
+    for field in filter(frame.columns.__contains__, types):
+        column = frame[field]
+        if field in words:
+            named = dict(enumerate(words[field]))
+            column = column.replace_strict(named, default=None, return_dtype=pl.String())
+        elif field in {"release", "slot"}:
+            column = column.replace({ABSENT: None})
+        columns.append(column.cast(types[field]))
+    return pl.DataFrame(columns)
 
 
 def _read_log(name: str, child: Child, application: Application) -> ProcessLog:
@@ -429,21 +395,18 @@ def _read_log(name: str, child: Child, application: Application) -> ProcessLog:
 
 
 def _notes(
-    no_realtime_because: str | None, memory_locked: bool, clock_moved_ns: int
-) -> tuple[str, ...]:
-    notes = [f"the first {WARM_UP_CYCLES} cycles warmed up and were not recorded"]
-    if no_realtime_because is not None:
-        notes.append(
-            f"taken without real-time scheduling ({no_realtime_because}), and without watching for "
+    realtime: bool, permitted: bool, memory_locked: bool, clock_moved_ns: int
+) -> Iterator[str]:
+    yield f"the first {WARM_UP_CYCLES} cycles warmed up and were not recorded"
+    if not realtime:
+        reason = "SCHED_FIFO was declined" if permitted else "the process may not use SCHED_FIFO"
+        yield (
+            f"taken without real-time scheduling ({reason}), and without watching for "
             "stalls of the machine"
         )
     if not memory_locked:
-        notes.append("memory was not locked: page faults may have cost time")
+        yield "memory was not locked: page faults may have cost time"
     if abs(clock_moved_ns) > 1_000_000:
-        notes.append(
-            f"the wall clock moved by {format_duration(clock_moved_ns)} against CLOCK_MONOTONIC"
-        )
-    others = foreign_realtime_processes()
-    if others:
-        notes.append(f"other real-time processes were running: {', '.join(others)}")
-    return tuple(notes)
+        yield f"the wall clock moved by {format_duration(clock_moved_ns)} against CLOCK_MONOTONIC"
+    if others := foreign_realtime_processes():
+        yield f"other real-time processes were running: {', '.join(others)}"

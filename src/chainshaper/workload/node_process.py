@@ -1,7 +1,7 @@
 """One node of the live workload, in a process of its own: ``python -m …node_process``.
 
 Started by :mod:`chainshaper.workload.live`, with which it talks as
-:mod:`chainshaper.workload.event_log` says. This module imports little on purpose: every page of
+:mod:`chainshaper.workload.launcher` says. This module imports little on purpose: every page of
 it is locked into memory.
 """
 
@@ -11,8 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import count
-from typing import Any
+from typing import Any, TypeAlias
 
 from chainshaper.gate.clear_core import ClearCore
 from chainshaper.gate.decision import READER_DEPTH, STALL_NS, Gate, Modes, Outcome, Shaper, text_of
@@ -22,37 +21,14 @@ from chainshaper.linux.scheduling import (
     signalled_with_parent,
     stop_garbage_collection,
 )
-from chainshaper.workload import dds
-from chainshaper.workload.event_log import (
-    ABSENT,
-    LAYOUT,
-    EventLog,
-    number_of,
-    receive,
-    send,
-    send_events,
-    wait_for_leave,
-)
+from chainshaper.workload import dds, executor
+from chainshaper.workload.event_log import ABSENT, LAYOUT, EventLog, number_of
 from chainshaper.workload.execution import ExecutionTimes
-from chainshaper.workload.executor import (
-    AsynchronousWriter,
-    Executor,
-    PublisherThread,
-    SubscriptionEntity,
-    Synchroniser,
-    Timer,
-    Work,
-    computing,
-    load_function,
-    noting_sends,
-    spending,
-)
-
-__all__ = ["NodeProcess", "main"]
+from chainshaper.workload.launcher import receive, send, send_events, wait_for_leave
 
 GATE_FIELDS = ("cycle_ns", "anchor", "overrun", "due_cycles", "messages", "depth")
-FIRST_HANDLE = 0x55D0_0000_0100
-"""Handles are like real addresses: unique in this process and reused by the others."""
+
+Body: TypeAlias = Callable[[dds.Message], None]
 
 
 @dataclass(frozen=True)
@@ -60,7 +36,7 @@ class TracedPublisher:
     """A publisher with its trace points, which are recorded apart from sending."""
 
     write: Callable[[bytes, int], None]
-    template: bytearray
+    template: bytes
     handle: int
     rmw_handle: int
     point: dict[str, Callable[..., None]]
@@ -89,26 +65,16 @@ class NodeProcess:
     def __init__(self, spec: dict[str, Any]) -> None:
         self.spec = spec
         self.log = EventLog()
-        self.new_handle = partial(next, count(FIRST_HANDLE, 0x100))
         self.participant = dds.join_domain(spec["domain"])
-        self.executor = Executor(self.participant, self.log)
+        self.executor = executor.Executor(self.participant, self.log)
         self.publishers: dict[str, dds.Publisher] = {}
         self.subscriptions: list[tuple[str, dds.Subscription]] = []
-        self.publisher_thread: PublisherThread | None = None
+        self.publisher_thread: executor.PublisherThread | None = None
         self.shapers: list[Shaper] = []
-        self.first_due: list[tuple[Timer, int]] = []
+        self.first_due: list[tuple[executor.Timer, int]] = []
         self.execution_times: list[ExecutionTimes] = []
-        self._point = {name: self.log.point(name) for name, _ in LAYOUT}
-        self.node_handle = self.new_handle()
-        self.log.init("rcl_init", context_handle=self.new_handle(), version="live workload")
-        namespace, _, name = spec["node"].rpartition("/")
-        self.log.init(
-            "rcl_node_init",
-            node_handle=self.node_handle,
-            rmw_handle=self.new_handle(),
-            node_name=name,
-            namespace="/" + namespace.strip("/"),
-        )
+        self._point = {name: self.log.point(name) for name in LAYOUT}
+        self.log.node(spec["node"], "live workload")
         kinds = ("subscription", "service", "client")  # as executors look at them
         numbered = list(enumerate(spec["callbacks"]))
         for index, callback in sorted(numbered, key=lambda each: kinds.index(each[1]["kind"])):
@@ -117,189 +83,85 @@ class NodeProcess:
     # Building -----------------------------------------------------------------------------
 
     def _add_callback(self, index: int, callback: dict[str, Any]) -> None:
-        handle = self.new_handle()
         publishers = [self._publisher(topic) for topic in callback["publishes"]]
-        subscription, rmw_handle = None, self.new_handle()
-        if callback["subscription"] is not None:
-            depth = 0 if callback["gate"] is None else READER_DEPTH
-            subscription = self._subscription(callback["subscription"], depth)
-        if callback["gate"] is not None and subscription is not None:
-            shaper = self._shaper(callback["gate"])
-            body = self._shaping_body(
-                (handle, rmw_handle), shaper, callback["gate"], publishers[0], subscription
-            )
-            if callback["gate"]["modes"] is not None:  # before the messages that it concerns
-                self._add_modes(callback["gate"]["modes"]["topic"], shaper)
-        else:
-            work = self._work(index, callback, publishers)
-            if callback["synchronises"]:
-                self._add_inputs(index, callback["synchronises"], work, publishers)
-                return
-            body = self._working_body(handle, work, publishers)
-        if subscription is None:
-            self._add_timer(handle, callback, body)
-        else:
-            topic = callback["subscription"]
-            self._add_subscription(handle, topic, subscription, body, rmw_handle)
-        symbol = f"{self.spec['node']}::callback{index}"
-        self.log.init("rclcpp_callback_register", callback=handle, symbol=symbol)
+        symbol, topic = f"{self.spec['node']}::callback{index}", callback["subscription"]
+        if callback["gate"] is not None:
+            self._add_gate(symbol, topic, callback["gate"], publishers[0])
+            return
+        work = self._work(index, callback, publishers)
+        if callback["synchronises"]:
+            topics = callback["synchronises"]
+            depths = [self.spec["topics"][topic]["depth"] for topic in topics]
+            synchroniser = executor.Synchroniser[dds.Message](depths)
+            for number, topic in enumerate(topics):
+                # As in ROS 2, by which the analysis knows the inputs of one synchroniser.
+                handle = self.log.callback(f"message_filters::{symbol}.{number}")
+                complete = partial(synchroniser.add, number)
+                body = self._working_body(handle, work, publishers, complete)
+                self._subscribe(handle, topic, body)
+            return
+        handle = self.log.callback(symbol)
+        body = self._working_body(handle, work, publishers)
+        if topic is not None:
+            self._subscribe(handle, topic, body)
+            return
+        period = callback["timer_ns"]
+        timer = executor.Timer(self.log.timer(handle, period), period, body)
+        self.executor.timers.append(timer)
+        self.first_due.append((timer, callback["phase_ns"]))
 
     def _work(
-        self, index: int, callback: dict[str, Any], publishers: list["TracedPublisher"]
-    ) -> Work:
+        self, index: int, callback: dict[str, Any], publishers: Sequence[TracedPublisher]
+    ) -> executor.Work:
         """What the callback does: call the function that it names, or spend drawn times."""
         if callback["computes"] is not None:
-            function = load_function(callback["computes"])
-            return computing(callback["computes"], function, len(publishers))
+            function = executor.load_function(callback["computes"])
+            return executor.computing(callback["computes"], function, len(publishers))
         times = ExecutionTimes(callback["execution"], self.spec["seed"], self.spec["node"], index)
         self.execution_times.append(times)
         announced = [dds.text_message(mode) for mode in callback["announces"]]
-        return spending(times, [publisher.template for publisher in publishers], announced)
+        return executor.spending(times, [publisher.template for publisher in publishers], announced)
 
-    def _add_inputs(
-        self,
-        index: int,
-        topics: Sequence[str],
-        work: Work,
-        publishers: list["TracedPublisher"],
-    ) -> None:
-        """The subscriptions of a synchronising callback, each with a callback of its own."""
-        depths = [self.spec["topics"][topic]["depth"] for topic in topics]
-        synchroniser = Synchroniser[dds.Message](depths)
-        for number, topic in enumerate(topics):
-            handle = self.new_handle()
-            complete = partial(synchroniser.add, number)
-            body = self._working_body(handle, work, publishers, complete)
-            self._add_subscription(handle, topic, self._subscription(topic), body)
-            # As in ROS 2, by which the analysis knows the inputs of one synchroniser.
-            symbol = f"message_filters::{self.spec['node']}::callback{index}.{number}"
-            self.log.init("rclcpp_callback_register", callback=handle, symbol=symbol)
-
-    def _add_timer(
-        self, handle: int, callback: dict[str, Any], body: Callable[[dds.Message | None], None]
-    ) -> None:
-        timer = Timer(self.new_handle(), callback["timer_ns"], lambda: body(None))
-        self.executor.timers.append(timer)
-        self.first_due.append((timer, callback["phase_ns"]))
-        self.log.init("rcl_timer_init", timer_handle=timer.handle, period=timer.period_ns)
-        self.log.init("rclcpp_timer_callback_added", timer_handle=timer.handle, callback=handle)
-        self.log.init(
-            "rclcpp_timer_link_node", timer_handle=timer.handle, node_handle=self.node_handle
-        )
-
-    def _add_subscription(
-        self,
-        handle: int,
-        topic: str,
-        subscription: dds.Subscription,
-        body: Callable[[dds.Message | None], None],
-        rmw_handle: int | None = None,
-    ) -> None:
-        entity = SubscriptionEntity(
-            handle=self.new_handle(),
-            rmw_handle=rmw_handle or self.new_handle(),
-            subscription=subscription,
-            callback=body,
-        )
-        rclcpp_handle = self.new_handle()
-        self.executor.add_subscription(entity)
-        self.log.init(
-            "rcl_subscription_init",
-            subscription_handle=entity.handle,
-            node_handle=self.node_handle,
-            rmw_subscription_handle=entity.rmw_handle,
-            topic_name=topic,
-            queue_depth=self.spec["topics"][topic]["depth"],
-        )
-        own = {"subscription_handle": entity.handle, "subscription": rclcpp_handle}
-        self.log.init("rclcpp_subscription_init", **own)
-        self.log.init(
-            "rclcpp_subscription_callback_added", subscription=rclcpp_handle, callback=handle
-        )
-
-    def _add_modes(self, topic: str, shaper: Shaper) -> None:
-        """Listen to the modes that are announced."""
-        handle = self.new_handle()
-        start, end = self._point["callback_start"], self._point["callback_end"]
-
-        def body(message: dds.Message | None) -> None:
-            assert message is not None  # noqa: S101 - it is a subscription's
-            now = time.monotonic_ns()
-            start(now, handle, time.thread_time_ns(), 0)
-            shaper.switch(text_of(message.payload), now)
-            end(time.monotonic_ns(), handle, time.thread_time_ns())
-
-        self._add_subscription(handle, topic, self._subscription(topic), body)
+    def _subscribe(self, handle: int, topic: str, body: Body) -> None:
+        subscription, depth = self._subscription(topic), self.spec["topics"][topic]["depth"]
+        own = self.log.subscription(handle, topic, depth)
+        self.executor.add_subscription(executor.SubscriptionEntity(*own, subscription, body))
 
     def _subscription(self, topic: str, depth: int = 0) -> dds.Subscription:
-        qos = self.spec["topics"][topic]
-        subscription = dds.Subscription(
-            self.participant,
-            topic,
-            qos["reliability"],
-            max(depth, qos["depth"]),
-            carries_text=topic in self.spec["announced"],
-        )
+        qos, text = self.spec["topics"][topic], topic in self.spec["announced"]
+        own = (topic, qos["reliability"], max(depth, qos["depth"]))
+        subscription = dds.Subscription(self.participant, *own, carries_text=text)
         self.subscriptions.append((topic, subscription))
         return subscription
 
-    def _publisher(self, topic: str) -> "TracedPublisher":
-        qos = self.spec["topics"][topic]
-        publisher = dds.Publisher(
-            self.participant,
-            topic,
-            qos["reliability"],
-            qos["depth"],
-            qos["lifespan_ns"],
-            carries_text=topic in self.spec["announced"],
-        )
+    def _publisher(self, topic: str) -> TracedPublisher:
+        qos, text = self.spec["topics"][topic], topic in self.spec["announced"]
+        own = (topic, qos["reliability"], qos["depth"], qos["lifespan_ns"])
+        publisher = dds.Publisher(self.participant, *own, carries_text=text)
         self.publishers[topic] = publisher
-        handle, rmw_handle = self.new_handle(), self.new_handle()
-        self.log.init(
-            "rcl_publisher_init",
-            publisher_handle=handle,
-            node_handle=self.node_handle,
-            rmw_publisher_handle=rmw_handle,
-            topic_name=topic,
-            queue_depth=qos["depth"],
-            asynchronous=int(qos["publication"] == "asynchronous"),
-        )
-        return TracedPublisher(
-            write=(
-                self._asynchronously(publisher.write, qos, rmw_handle)
-                if qos["publication"] == "asynchronous"
-                else publisher.write
-            ),
-            template=dds.message_template(qos["payload"]),
-            handle=handle,
-            rmw_handle=rmw_handle,
-            point=self._point,
-        )
-
-    def _asynchronously(
-        self, write: Callable[[bytes, int], None], qos: dict[str, Any], rmw_handle: int
-    ) -> Callable[[bytes, int], None]:
-        """Let the process's publisher thread do the writing."""
-        if self.publisher_thread is None:
-            self.publisher_thread = PublisherThread()
-        note = noting_sends(self._point["asynchronous_send"], rmw_handle)
-        writer = AsynchronousWriter(write, qos["depth"], qos["lifespan_ns"], note)
-        return partial(self.publisher_thread.publish, writer)
+        asynchronous, write = qos["publication"] == "asynchronous", publisher.write
+        handle, rmw_handle = self.log.publisher(topic, qos["depth"], asynchronous)
+        if asynchronous:  # the process's publisher thread does the writing
+            self.publisher_thread = self.publisher_thread or executor.PublisherThread()
+            note = executor.noting_sends(self._point["asynchronous_send"], rmw_handle)
+            writer = executor.AsynchronousWriter(write, qos["depth"], qos["lifespan_ns"], note)
+            write = partial(self.publisher_thread.publish, writer)
+        return TracedPublisher(write, bytes(qos["payload"]), handle, rmw_handle, self._point)
 
     def _working_body(
         self,
         handle: int,
-        work: Work,
-        publishers: list["TracedPublisher"],
+        work: executor.Work,
+        publishers: Sequence[TracedPublisher],
         complete: Callable[[dds.Message], tuple[dds.Message, ...]] | None = None,
-    ) -> Callable[[dds.Message | None], None]:
+    ) -> Callable[..., None]:
         """An ordinary callback: work, then publish.
 
         With ``complete`` nothing is done until a message completes a set, for which it is then.
         """
         start, end = self._point["callback_start"], self._point["callback_end"]
 
-        def body(message: dds.Message | None) -> None:
+        def body(message: dds.Message | None = None) -> None:
             now, wall, used = time.monotonic_ns(), time.time_ns(), time.thread_time_ns()
             start(now, handle, used, 0)
             messages: tuple[dds.Message, ...] = () if message is None else (message,)
@@ -312,35 +174,12 @@ class NodeProcess:
 
         return body
 
-    def _shaper(self, gate: dict[str, Any]) -> Shaper:
-        modes, core = gate["modes"], self.spec["delivery_core"]
-        delivery_core = None if core is None else ClearCore(core)
+    # Gates --------------------------------------------------------------------------------
 
-        def get_ready(release_ns: int) -> None:
-            if delivery_core is not None:
-                delivery_core.clear_until(release_ns + gate["pause_ns"])
-
-        shaper = Shaper(
-            Gate(
-                slots=tuple((begin, finish) for begin, finish in gate["slots"]),
-                modes=modes and Modes(modes["bands"], modes["default"], modes["late"]),
-                **{name: gate[name] for name in GATE_FIELDS},
-            ),
-            gate["spin_ns"],
-            get_ready,
-        )
-        self.shapers.append(shaper)
-        return shaper
-
-    def _shaping_body(
-        self,
-        handles: tuple[int, int],
-        shaper: Shaper,
-        gate: dict[str, Any],
-        publisher: "TracedPublisher",
-        subscription: dds.Subscription,
-    ) -> Callable[[dds.Message | None], None]:
-        """The latency-shaping callback (paper, section 3.2.2): hold, then republish unchanged.
+    def _add_gate(
+        self, symbol: str, topic: str, gate: dict[str, Any], publisher: TracedPublisher
+    ) -> None:
+        """The latency-shaping callback (paper, section 3.2.2): delay, then republish unchanged.
 
         Between waking and writing nothing is computed, and after writing the thread pauses, so
         that threads it outranks can deliver; only then are its events recorded. It does not
@@ -352,9 +191,14 @@ class NodeProcess:
         Delay that no other thread caused is recorded like the stall meter's own findings. A
         message that is dropped is recorded, and not published.
         """
+        shaper, subscription = self._shaper(gate), self._subscription(topic, READER_DEPTH)
+        if gate["modes"] is not None:  # before the messages that it concerns
+            self._listen(gate["modes"]["topic"], shaper)
+        handle = self.log.callback(symbol)
+        depth = self.spec["topics"][topic]["depth"]
+        own_handle, rmw_handle = self.log.subscription(handle, topic, depth)
         start, end = self._point["callback_start"], self._point["callback_end"]
-        stalled, (handle, rmw_handle) = self._point["machine_stall"], handles
-        pause_ns = gate["pause_ns"]
+        stalled, pause_ns = self._point["machine_stall"], gate["pause_ns"]
         note = partial(self._note_release, handle, gate)
         waiting, overflowed = shaper.queue.waiting, shaper.overflowed
 
@@ -366,16 +210,16 @@ class NodeProcess:
 
         def let_one_pass() -> None:
             start(time.monotonic_ns(), handle, time.thread_time_ns(), 0)
-            if (held := shaper.hold()) is not None:
-                if held.release.at_ns is not None:
-                    payload = held.message.payload
+            if (outcome := shaper.hold()) is not None:
+                if outcome.release.at_ns is not None:
+                    payload = outcome.message.payload
                     published, source_timestamp = publisher.send(payload)
-                    lost = shaper.time_lost(held.release, published)
+                    lost = shaper.time_lost(outcome.release, published)
                     shaper.rest(published, pause_ns)
                     publisher.record(payload, published, source_timestamp)
                     if lost >= STALL_NS:
-                        stalled(held.release.at_ns, lost)
-                note(held)
+                        stalled(outcome.release.at_ns, lost)
+                note(outcome)
             end(time.monotonic_ns(), handle, time.thread_time_ns())
             for gone in overflowed:
                 self.executor.record_take(rmw_handle, gone.message.about)
@@ -384,8 +228,7 @@ class NodeProcess:
                 end(time.monotonic_ns(), handle, time.thread_time_ns())
             overflowed.clear()
 
-        def body(message: dds.Message | None) -> None:
-            assert message is not None  # noqa: S101 - a gate has a subscription, by validation
+        def body(message: dds.Message) -> None:
             alone = not waiting
             shaper.arrive(message.payload, time.monotonic_ns(), about=message)
             if alone:
@@ -401,17 +244,47 @@ class NodeProcess:
 
         shaper.look = look
         self.executor.backlogs.append(work_off)
-        return body
+        entity = executor.SubscriptionEntity(own_handle, rmw_handle, subscription, body)
+        self.executor.add_subscription(entity)
 
-    def _note_release(self, handle: int, gate: dict[str, Any], held: Outcome) -> None:
+    def _shaper(self, gate: dict[str, Any]) -> Shaper:
+        modes, core = gate["modes"], self.spec["delivery_core"]
+        delivery_core = None if core is None else ClearCore(core)
+
+        def get_ready(release_ns: int) -> None:
+            if delivery_core is not None:
+                delivery_core.clear_until(release_ns + gate["pause_ns"])
+
+        decided = Gate(
+            slots=tuple((begin, finish) for begin, finish in gate["slots"]),
+            modes=modes and Modes(modes["bands"], modes["default"], modes["late"]),
+            **{name: gate[name] for name in GATE_FIELDS},
+        )
+        self.shapers.append(Shaper(decided, gate["spin_ns"], get_ready))
+        return self.shapers[-1]
+
+    def _listen(self, topic: str, shaper: Shaper) -> None:
+        """Listen to the modes that are announced."""
+        handle = self.log.new_handle()
+        start, end = self._point["callback_start"], self._point["callback_end"]
+
+        def body(message: dds.Message) -> None:
+            now = time.monotonic_ns()
+            start(now, handle, time.thread_time_ns(), 0)
+            shaper.switch(text_of(message.payload), now)
+            end(time.monotonic_ns(), handle, time.thread_time_ns())
+
+        self._subscribe(handle, topic, body)
+
+    def _note_release(self, handle: int, gate: dict[str, Any], outcome: Outcome) -> None:
         """Record what became of a message at a gate."""
         modes = [] if gate["modes"] is None else list(gate["modes"]["bands"])
-        release = held.release
+        message, release = outcome.message, outcome.release
         self._point["gate_release"](
-            held.awake_ns,
+            outcome.awake_ns,
             handle,
-            held.message.about.source_timestamp,
-            held.message.arrival_ns,
+            message.about.source_timestamp,
+            message.arrival_ns,
             release.origin_ns,
             ABSENT if release.at_ns is None else release.at_ns,
             ABSENT if release.slot is None else release.slot,
@@ -419,25 +292,21 @@ class NodeProcess:
             number_of("anchor", release.anchor),
             number_of("overrun", release.overrun),
             ABSENT if release.mode is None else modes.index(release.mode),
-            number_of("dropped", held.dropped),
+            number_of("dropped", outcome.dropped),
         )
 
     # Running ------------------------------------------------------------------------------
 
     def wait_for_counterparts(self, deadline_ns: int) -> list[str]:
         """Wait until DDS discovery is complete; what is still missing at the deadline."""
-        expected = self.spec["expected"]
+        ends: list[tuple[str, dds.Publisher | dds.Subscription, str, int, str]] = []
+        ends += [(f"publisher of {t}", one, t, 1, "readers") for t, one in self.publishers.items()]
+        ends += [(f"subscription to {t}", one, t, 0, "writers") for t, one in self.subscriptions]
         while True:
             missing = [
-                f"publisher of {topic} found {publisher.matched()} of {expected[topic][1]} readers"
-                for topic, publisher in self.publishers.items()
-                if publisher.matched() < expected[topic][1]
-            ]
-            missing += [
-                f"subscription to {topic} found {subscription.matched()} of "
-                f"{expected[topic][0]} writers"
-                for topic, subscription in self.subscriptions
-                if subscription.matched() < expected[topic][0]
+                f"{name} found {end.matched()} of {self.spec['expected'][topic][place]} {others}"
+                for name, end, topic, place, others in ends
+                if end.matched() < self.spec["expected"][topic][place]
             ]
             if not missing or time.monotonic_ns() > deadline_ns:
                 return missing

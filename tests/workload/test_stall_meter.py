@@ -7,8 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.workload.stall_meter import NO_PACE, PERIOD_NS, WAKEUPS_PER_PACE, watch
-from chainshaper.workload.stall_watch import far_from, stalls_watched
+from chainshaper.workload.stall_meter import (
+    NO_PACE,
+    PERIOD_NS,
+    WAKEUPS_PER_PACE,
+    far_from,
+    stalls_watched,
+    watch,
+)
 
 
 def test_the_pace_of_all_wake_ups_is_noted_stretch_by_stretch() -> None:

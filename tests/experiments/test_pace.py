@@ -2,8 +2,7 @@
 
 import numpy as np
 import polars as pl
-
-from chainshaper.analysis.disturbance import ordinary_pace, relative_pace
+from validate_simulator import ordinary_pace, relative_pace
 
 
 def _tables() -> dict[str, pl.DataFrame]:
