@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper.splicing.generated_package import generic_package
+from chainshaper.splicing.shaping_process import generic_package
 
 __all__ = ["compiled"]
 

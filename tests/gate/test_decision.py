@@ -35,6 +35,11 @@ DISCARD, PUBLISH = replace(TWO, overrun="discard"), replace(TWO, overrun="publis
 # The last slot is the city's.
 MODES = Modes(bands={"city": 2, "village": 1, "highway": 0}, default="city")
 MODAL = Gate(slots=((20, 21), (40, 42), (60, 61)), cycle_ns=100, modes=MODES)
+MODAL_MS = Gate(
+    slots=tuple((start * MS, end * MS) for start, end in MODAL.slots),
+    cycle_ns=100 * MS,
+    modes=MODES,
+)
 
 
 def with_late(late: str, overrun: str = "wait") -> Gate:
@@ -51,7 +56,6 @@ def gates(draw: st.DrawFn) -> Gate:
         cycle_ns=cycle,
         anchor=draw(st.sampled_from(["stamp", "cycle"])),
         phase_ns=draw(st.integers(-100, 100)),
-        max_future_ns=draw(st.integers(0, 50)),
         due_cycles=draw(st.integers(0, 2)),
     )
 
@@ -66,15 +70,12 @@ ARRIVALS, STAMPS = st.integers(0, 1000), st.none() | st.integers(0, 1000)
     ("arrival", "leaves_at", "slot", "cycles_waited"),
     [
         (1000, 1020, 0, 0),  # as early as can be
-        (1019, 1020, 0, 0),  # just before the slot
         (1020, 1020, 0, 0),  # at its start: inside
         (1024, 1024, 0, 0),  # inside: at once
         (1025, 1025, 1, 0),  # at its end: outside, but the next slot begins here
-        (1029, 1029, 1, 0),
         (1030, 1080, 2, 0),  # between two slots
         (1099, 1099, 2, 0),  # the last instant of a slot that ends with the cycle
         (1100, 1120, 0, 1),  # after the last slot: the next cycle, and counted
-        (1130, 1180, 2, 1),
         (1740, 1780, 2, 7),  # seven cycles late
     ],
 )
@@ -91,7 +92,6 @@ def test_stamped_messages_leave_in_the_first_slot_they_can_reach(
     [
         (7, 67, 7, 0),  # cycles start at 7, 107, 207, …, whatever the stamp says
         (66, 67, 7, 0),
-        (67, 67, 7, 0),
         (68, 167, 7, 1),  # missed
         (106, 167, 7, 1),
         (107, 167, 107, 0),  # a new cycle begins
@@ -110,35 +110,26 @@ def test_the_cycle_anchor_counts_from_its_phase(
 
 
 @pytest.mark.parametrize(
-    ("changes", "arrival", "stamp", "anchor"),
+    ("due_cycles", "arrival", "stamp", "anchor"),
     [
-        ({}, 1000, None, "cycle"),
-        ({}, 2000, 1000, "stamp"),  # ten cycles is the oldest, unless said otherwise
-        ({}, 2001, 1000, "cycle"),
-        ({"max_age_ns": 2000}, 2001, 1000, "stamp"),
-        ({"max_future_ns": 150}, 1000, 1150, "stamp"),
-        ({"max_future_ns": 150}, 1000, 1151, "cycle"),
+        (0, 1000, None, "cycle"),
+        (0, 2000, 1000, "stamp"),  # ten cycles is the oldest, and those it is due after
+        (0, 2001, 1000, "cycle"),
+        (2, 2200, 1000, "stamp"),
+        (2, 2201, 1000, "cycle"),
+        (0, 1000, 1000 + MS, "stamp"),
+        (0, 1000, 1001 + MS, "cycle"),
     ],
 )
 def test_a_stamp_is_of_use_that_is_neither_old_nor_far_from_the_future(
-    changes: dict[str, int], arrival: int, stamp: int | None, anchor: str
+    due_cycles: int, arrival: int, stamp: int | None, anchor: str
 ) -> None:
-    assert release_of(replace(ONE, **changes), arrival, stamp).anchor == anchor  # type: ignore[arg-type]
-
-
-def test_without_a_stamp_of_use_a_message_is_anchored_to_the_cycle() -> None:
-    release = release_of(replace(ONE, phase_ns=30), 1000, stamp_ns=None)
-    assert release == Release(1090, 930, 0, 1, "cycle", "wait")
-    real = Gate(((60 * MS, 61 * MS),), 100 * MS, phase_ns=3 * MS)
-    hours_old = release_of(real, 7200 * SECOND, stamp_ns=50 * MS)
-    assert hours_old.at_ns == 7200 * SECOND + 63 * MS
-    assert release_of(real, 0, stamp_ns=7200 * SECOND).at_ns == 63 * MS, "and not in two hours"
+    assert release_of(replace(ONE, due_cycles=due_cycles), arrival, stamp).anchor == anchor
 
 
 def test_a_stamp_slightly_from_the_future_still_starts_cycle_0() -> None:
-    gate = replace(ONE, max_future_ns=150)
     # The other host's clock is 150 ns ahead: more than a whole cycle, and no slot is skipped.
-    assert release_of(gate, 1000, stamp_ns=1150) == Release(1210, 1150, 0, 0, "stamp")
+    assert release_of(ONE, 1000, stamp_ns=1150) == Release(1210, 1150, 0, 0, "stamp")
     assert release_of(DISCARD, 990, stamp_ns=1000).at_ns == 1020, "no overrun"
 
 
@@ -148,29 +139,14 @@ def test_a_message_leaves_at_the_first_instant_inside_a_slot(
 ) -> None:
     gate = replace(gate, due_cycles=0)
     release = release_of(gate, arrival, stamp)
-
     assert release.at_ns is not None
     assert release.slot is not None
     instant = max(arrival, release.origin_ns)  # no cycle exists before the first one
     while not _inside_a_slot(gate, instant - release.origin_ns):
         instant += 1
     assert release.at_ns == instant
-
-    after_start = release.at_ns - release.origin_ns - release.cycles_waited * gate.cycle_ns
     start, end = gate.slots[release.slot]
-    assert start <= after_start < end
-    assert release_of(gate, arrival, stamp) == release, "the same question, another answer"
-
-
-def _inside_a_slot(gate: Gate, since_origin: int) -> bool:
-    return any(start <= since_origin % gate.cycle_ns < end for start, end in gate.slots)
-
-
-@given(gates(), ARRIVALS, st.integers(0, 1000))
-def test_the_origin_is_the_stamp_or_a_start_of_the_cycle(
-    gate: Gate, arrival: int, stamp: int
-) -> None:
-    release = release_of(gate, arrival, stamp)
+    assert start <= release.at_ns - release.start_ns(gate.cycle_ns) < end
     if release.anchor == "stamp":
         assert (gate.anchor, release.origin_ns) == ("stamp", stamp)
     else:
@@ -178,21 +154,24 @@ def test_the_origin_is_the_stamp_or_a_start_of_the_cycle(
         assert 0 <= arrival - release.origin_ns < gate.cycle_ns
 
 
+def _inside_a_slot(gate: Gate, since_origin: int) -> bool:
+    return any(start <= since_origin % gate.cycle_ns < end for start, end in gate.slots)
+
+
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
         ({"slots": ()}, "without slots"),
         ({"cycle_ns": 0}, "longer than nothing"),
-        ({"cycle_ns": -100}, "longer than nothing"),
         ({"cycle_ns": 60}, "within the cycle"),  # the slot ends after it
         ({"slots": ((60, 60),)}, "must ascend"),  # empty
-        ({"slots": ((61, 60),)}, "must ascend"),
         ({"slots": ((-1, 60),)}, "within the cycle"),
         ({"slots": ((30, 40), (10, 20))}, "must ascend"),
         ({"slots": ((10, 20), (19, 30))}, "not overlap"),
         ({"anchor": "clock"}, "choose one of stamp, cycle"),
         ({"overrun": "drop"}, "choose one of wait, discard, publish"),
         ({"due_cycles": -1}, "due beforehand"),
+        ({"depth": 0}, "for one at least"),
         ({"modes": Modes({"city": 3}, "city")}, "numbered 0 to 0"),
         ({"modes": Modes({"city": -1}, "city")}, "numbered 0 to 0"),
     ],
@@ -221,11 +200,9 @@ def test_modes_that_make_no_sense_are_refused(default: str, late: str, reason: s
     ("arrival", "waits", "discards", "publishes"),
     [
         (1000, 1020, 1020, 1020),  # in time, all policies agree
-        (1025, 1025, 1025, 1025),
         (1030, 1060, 1060, 1060),  # it missed a slot, but not the last
         (1060, 1060, 1060, 1060),  # the last instant
         (1061, 1120, None, 1061),  # the first one that is too late
-        (1099, 1120, None, 1099),
         (1130, 1160, None, 1130),  # in the next cycle: still an overrun of its own
     ],
 )
@@ -315,28 +292,11 @@ def test_who_wakes_behind_the_slot_discards_what_came_in_time(
 
 
 @pytest.mark.parametrize(
-    ("mode", "arrival", "leaves_at", "slot"),
-    [
-        ("city", 1000, 1060, 2),  # early: past both slots before its own
-        ("city", 1020, 1060, 2),  # inside another mode's slot: that one is not open to it
-        ("city", 1060, 1060, 2),  # inside its own
-        ("village", 1000, 1040, 1),
-        ("village", 1041, 1041, 1),  # the last instant
-        ("highway", 1000, 1020, 0),
-    ],
-)
-def test_an_early_message_waits_for_the_slot_of_its_mode(
-    mode: str, arrival: int, leaves_at: int, slot: int
-) -> None:
-    release = release_of(MODAL, arrival, 1000, changes=[(500, mode)])
-    assert release == Release(leaves_at, 1000, slot, 0, "stamp", None, mode)
-    without = release_of(replace(MODAL, modes=None), 1000, 1000, [(0, mode)])
-    assert (without.at_ns, without.mode) == (1020, None), "nothing is asked of them"
-
-
-@pytest.mark.parametrize(
     ("late", "overrun", "arrival", "leaves_at", "slot", "treated"),
     [
+        ("wait", "wait", 1000, 1040, 1, None),  # early: past the slot of another mode
+        ("wait", "wait", 1020, 1040, 1, None),  # inside that: it is not open to it
+        ("wait", "wait", 1041, 1041, 1, None),  # the last instant of its own
         # Behind the village's slot, before the city's.
         ("wait", "discard", 1042, 1140, 1, "wait"),
         ("discard", "wait", 1042, None, None, "discard"),
@@ -344,7 +304,6 @@ def test_an_early_message_waits_for_the_slot_of_its_mode(
         ("next-slot", "discard", 1042, 1060, 2, "next-slot"),
         ("next-slot", "discard", 1060, 1060, 2, "next-slot"),
         # Behind the last slot of all: an overrun like any other where the next slot is taken.
-        ("wait", "discard", 1070, 1140, 1, "wait"),
         ("next-slot", "wait", 1070, 1140, 1, "wait"),
         ("next-slot", "discard", 1061, None, None, "discard"),
         ("next-slot", "publish", 1061, 1061, None, "publish"),
@@ -353,11 +312,12 @@ def test_an_early_message_waits_for_the_slot_of_its_mode(
         ("next-slot", "wait", 1142, 1160, 2, "wait"),
     ],
 )
-def test_a_late_message_is_treated_as_said(  # noqa: PLR0917 - a row of the table
+def test_a_message_leaves_in_the_slot_of_its_mode_or_as_said(  # noqa: PLR0917 - a row of the table
     late: str, overrun: str, arrival: int, leaves_at: int | None, slot: int | None, treated: str
 ) -> None:
     release = release_of(with_late(late, overrun), arrival, 1000, changes=[(0, "village")])
     assert (release.at_ns, release.slot, release.overrun) == (leaves_at, slot, treated)
+    assert release.mode == "village"
 
 
 @pytest.mark.parametrize(
@@ -366,7 +326,6 @@ def test_a_late_message_is_treated_as_said(  # noqa: PLR0917 - a row of the tabl
         (1000, 1000, "highway"),  # at the very start: in force
         (1001, 1000, "city"),  # within the cycle: not in this one
         (1001, 1100, "highway"),  # but in the next
-        (1099, 1000, "city"),
     ],
 )
 def test_a_change_is_in_force_from_the_next_cycle_on(
@@ -381,7 +340,6 @@ def test_a_late_message_has_the_mode_of_the_cycle_that_it_belongs_to() -> None:
     changes = [(1050, "highway"), (1150, "village")]
     release = release_of(with_late("publish"), 1175, 1000, changes)
     assert (release.mode, release.at_ns) == ("city", 1175)
-    assert release_of(MODAL, 1175, 1100, changes).mode == "highway"
     assert release_of(MODAL, 1275, 1200, changes).mode == "village"
 
 
@@ -389,9 +347,9 @@ LATER = st.integers(0, 400)
 CHANGES = st.lists(st.tuples(LATER, st.sampled_from(sorted(MODES.bands)))).map(sorted)
 
 
-@given(st.sampled_from(LATE), st.sampled_from(OVERRUNS), LATER, CHANGES)
-def test_a_message_leaves_in_its_modes_slot_unless_it_is_late_and_takes_the_next(
-    late: str, overrun: str, arrival: int, changes: list[tuple[int, str]]
+@given(st.sampled_from(LATE), st.sampled_from(OVERRUNS), LATER, LATER, CHANGES)
+def test_a_cycle_has_one_mode_and_messages_leave_in_its_slot_unless_late(
+    late: str, overrun: str, arrival: int, other: int, changes: list[tuple[int, str]]
 ) -> None:
     release = release_of(with_late(late, overrun), arrival, 0, changes)
     assert release.mode is not None
@@ -402,16 +360,9 @@ def test_a_message_leaves_in_its_modes_slot_unless_it_is_late_and_takes_the_next
         assert (release.slot, release.at_ns) == (band, max(arrival, start))
     elif release.slot is not None and late != "next-slot":
         assert release.slot == band
-
-
-@given(st.sampled_from(LATE), LATER, LATER, CHANGES)
-def test_one_cycle_has_one_mode(
-    late: str, first: int, second: int, changes: list[tuple[int, str]]
-) -> None:
     gate = replace(with_late(late), anchor="cycle")
-    one, two = (release_of(gate, arrival, None, changes) for arrival in (first, second))
-    if one.origin_ns == two.origin_ns:
-        assert one.mode == two.mode
+    one, two = (release_of(gate, time, None, changes) for time in (arrival, other))
+    assert one.origin_ns != two.origin_ns or one.mode == two.mode
 
 
 # Messages, and a gate at work -------------------------------------------------------------------
@@ -423,12 +374,10 @@ def test_the_stamp_is_read_in_either_byte_order(stamp: int, big_endian: bool) ->
 
 
 def test_payloads_without_a_stamp_have_no_origin() -> None:
-    assert origin_of(serialized(0)) is None
-    assert origin_of(b"") is None
-    assert origin_of(serialized(5)[:11]) is None
-    assert origin_of(serialized(5)[:12]) == 5
     not_a_header = bytes([0, 1, 0, 0]) + b"\xff" * 8  # 4.3 billion ns in a second
-    assert origin_of(not_a_header) is None
+    for payload in (serialized(0), b"", serialized(5)[:11], not_a_header):
+        assert origin_of(payload) is None
+    assert origin_of(serialized(5)[:12]) == 5
 
 
 @pytest.mark.parametrize(
@@ -439,7 +388,6 @@ def test_payloads_without_a_stamp_have_no_origin() -> None:
         (b"\0\1\0\0\1\0\0\0\0", ""),
         (b"\0\1\0\0\6\0\0\0city\0", None),  # longer than the message
         (b"\0\1\0\0\0\0\0\0", None),
-        (b"\0\1\0\0", None),
         (b"", None),
     ],
 )
@@ -460,8 +408,8 @@ def test_a_new_phase_is_in_force_from_the_next_cycle_that_begins_there(
     shaper.set_phase(phase * MS, 100 * MS if phase == 13 else 100 * MS + 1)
     before = decided(shaper, b"", first_ms * MS - 1)
     assert before.origin_ns == 100 * MS, "what comes until then belongs to a cycle as it was"
-    assert decided(shaper, b"", first_ms * MS).origin_ns == first_ms * MS
-    assert decided(shaper, b"", (first_ms + 100) * MS).origin_ns == (first_ms + 100) * MS
+    for later in (first_ms, first_ms + 100):
+        assert decided(shaper, b"", later * MS).origin_ns == later * MS
 
 
 def test_a_step_of_the_wall_clock_disturbs_no_message(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -472,38 +420,31 @@ def test_a_step_of_the_wall_clock_disturbs_no_message(monkeypatch: pytest.Monkey
     offset = 1_700_000_000 * SECOND
     monkeypatch.setattr(decision, "clock_offset", lambda: offset)
     shaper = Shaper(Gate(((60 * MS, 61 * MS),), 100 * MS))
-
     started = 5 * SECOND + 42 * MS
-    before = decided(shaper, serialized(started + offset), started + 30 * MS)
-    assert (before.anchor, before.at_ns) == ("stamp", started + 60 * MS)
-
     under_way = serialized(started + 100 * MS + offset)
-    offset += 3600 * SECOND
-    during = decided(shaper, under_way, started + 130 * MS)
-    assert (during.anchor, during.at_ns) == ("cycle", started + 160 * MS)
 
-    after = decided(shaper, serialized(started + 200 * MS + offset), started + 230 * MS)
-    assert (after.anchor, after.at_ns) == ("stamp", started + 260 * MS)
-    stampless = decided(shaper, serialized(0), started + 330 * MS)
-    assert (stampless.anchor, stampless.at_ns) == ("cycle", started + 360 * MS)
+    def passing(payload: bytes, after_ms: int) -> tuple[str, int | None]:
+        release = decided(shaper, payload, started + after_ms * MS)
+        return release.anchor, release.at_ns
+
+    assert passing(serialized(started + offset), 30) == ("stamp", started + 60 * MS)
+    offset += 3600 * SECOND
+    assert passing(under_way, 130) == ("cycle", started + 160 * MS)
+    later = serialized(started + 200 * MS + offset)
+    assert passing(later, 230) == ("stamp", started + 260 * MS)
+    assert passing(serialized(0), 330) == ("cycle", started + 360 * MS)
 
 
 def test_a_shaper_follows_the_modes_that_are_announced(monkeypatch: pytest.MonkeyPatch) -> None:
     """The offset between the two clocks, zero here, cannot be set for a test."""
     monkeypatch.setattr(decision, "clock_offset", lambda: 0)
-    slots = tuple((start * MS, end * MS) for start, end in MODAL.slots)
-    shaper = Shaper(Gate(slots=slots, cycle_ns=100 * MS, modes=MODES))
-    assert shaper.mode == "city"
+    shaper = Shaper(MODAL_MS)
     assert decided(shaper, serialized(1000 * MS), 1010 * MS).at_ns == 1060 * MS
-
     assert shaper.switch("highway", 1050 * MS)
-    assert shaper.mode == "highway"
     assert decided(shaper, serialized(1000 * MS), 1055 * MS).at_ns == 1060 * MS, "it was begun"
     assert decided(shaper, serialized(1100 * MS), 1110 * MS).at_ns == 1120 * MS
-
     assert shaper.switch("highway", 1150 * MS), "no change, but a mode that exists"
     assert not shaper.switch("sea", 1150 * MS)
     assert not shaper.switch(None, 1150 * MS)
     assert decided(shaper, serialized(1200 * MS), 1210 * MS).mode == "highway"
-    without = Shaper(ONE)
-    assert (without.mode, without.switch("city", 5)) == (None, False)
+    assert not Shaper(ONE).switch("city", 5)

@@ -47,7 +47,6 @@ def gates(draw: st.DrawFn) -> Gate:
         cycle_ns=cycle,
         anchor=draw(st.sampled_from(("stamp", "cycle"))),
         phase_ns=draw(st.integers(0, 300)),
-        max_future_ns=1_000_000,
         overrun=draw(st.sampled_from(("wait", "discard", "publish"))),
         due_cycles=draw(st.integers(0, 2)),
         modes=modes,

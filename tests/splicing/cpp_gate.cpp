@@ -6,7 +6,6 @@
 
 #include "chainshaper_shaping/gate.hpp"
 #include "chainshaper_shaping/gate_log.hpp"
-#include "chainshaper_shaping/shaper.hpp"
 
 using namespace chainshaper;  // NOLINT
 
@@ -38,8 +37,6 @@ Gate read_gate() {
   Gate gate;
   gate.anchor = static_cast<Anchor>(number());
   gate.phase_ns = number();
-  gate.max_age_ns = maybe();
-  gate.max_future_ns = number();
   gate.overrun = static_cast<Policy>(number());
   gate.due_cycles = number();
   gate.messages = static_cast<Messages>(number());
@@ -105,7 +102,7 @@ void walk() {
       now += slept ? late_ns : 0;
       if (queue.replaced(release, now)) {
         dropped = Dropped::replaced;
-      } else if (policy_of(queue.gate) == Policy::discard && missed(queue.gate, release, now)) {
+      } else if (queue.gate.policy() == Policy::discard && missed(queue.gate, release, now)) {
         release.overrun = Policy::discard;
         dropped = Dropped::discarded;
       }

@@ -16,10 +16,14 @@ from typing import Any
 
 from passing import serialized
 
+from chainshaper.planning import Modes, Plan
+from chainshaper.planning.plan import revised
+from chainshaper.splicing.shaped_outputs import ShapedOutput, find_outputs
 from chainshaper.splicing.shaping_process import ShapingProcess
 
-__all__ = ["PUBLISHERS", "RELIABLE", "NodeRun", "running_node", "stamped"]
-
+MS = 1_000_000
+# Wide enough that a busy machine wakes the node within them.
+SLOTS = ((15 * MS, 25 * MS), (30 * MS, 45 * MS))
 STAND_IN = Path(__file__).parent / "rclpy_stand_in.py"
 
 # As rmw_cyclonedds tells it of a publisher: neither its history nor its depth is known.
@@ -33,9 +37,22 @@ RELIABLE = {
     "liveliness": 1,
     "liveliness_lease_duration": "infinite",
 }
-
-
 PUBLISHERS = {"/t3_tmp": [{"type": "sensor_msgs/msg/Image", "qos": RELIABLE}]}
+
+
+def with_slots(plan: Plan, *slots: tuple[int, int]) -> Plan:
+    """The plan with these publish slots."""
+    servers = tuple(
+        server.model_copy(update={"slots": slots}) if server.name == "output" else server
+        for server in plan.servers
+    )
+    return revised(plan, servers=servers)
+
+
+def banded(plan: Plan) -> Plan:
+    """Two slots, one for each mode."""
+    modes = Modes(topic="/mode", default="city", bands={"city": 2, "highway": 1}, late="next-slot")
+    return revised(with_slots(plan, *SLOTS), modes=modes)
 
 
 class NodeRun:
@@ -86,9 +103,7 @@ class NodeRun:
     def hear(self, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
         """The next thing it says that is wanted."""
         while (line := self._lines.get(timeout=30)) is not None:
-            words = json.loads(line) if line.startswith("{") else {"text": line.strip()}
-            self.said.append(words)
-            if wanted(words):
+            if wanted(words := self._heard(line)):
                 return words
         raise AssertionError(f"it ended without saying so: {self.said}")
 
@@ -97,11 +112,14 @@ class NodeRun:
         until = time.monotonic() + within_s
         while (left := until - time.monotonic()) > 0:
             with suppress(Empty):
-                words = json.loads(self._lines.get(timeout=left) or "{}")
-                self.said.append(words)
-                if wanted(words):
+                if wanted(self._heard(self._lines.get(timeout=left) or "{}")):
                     return True
         return False
+
+    def _heard(self, line: str) -> dict[str, Any]:
+        words: dict[str, Any] = {"text": line.strip()}
+        self.said.append(json.loads(line) if line.startswith("{") else words)
+        return self.said[-1]
 
     def end(self, how: signal.Signals | None = None) -> int:
         """End it, by the end of its input or by a signal; its exit code, all said being read."""
@@ -111,7 +129,7 @@ class NodeRun:
         else:
             self.process.send_signal(how)
         while (line := self._lines.get(timeout=30)) is not None:
-            self.said.append(json.loads(line) if line.startswith("{") else {"text": line.strip()})
+            self._heard(line)
         return self.process.wait(30)
 
 
@@ -164,6 +182,11 @@ def running_node(
     finally:
         child.kill()
         child.wait()
+
+
+def outputs(folder: Path) -> tuple[ShapedOutput, ...]:
+    """The outputs of the nodes that run in a folder."""
+    return find_outputs([str(folder / "outputs"), str(folder / "chainshaper" / "outputs")])
 
 
 def stamped(rest: bytes = b"rest", age_ns: int = 0) -> bytes:

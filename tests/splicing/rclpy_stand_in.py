@@ -23,7 +23,7 @@ import yaml
 # Addresses of rcl's objects: the last one fits into no 32 bits.
 NODE, SUBSCRIPTION, PUBLISHER, TIMER = 0x1000, 0x2000, 0x4000, 0x7F0000003000
 
-_state = {"ok": False, "stopped": False}
+_running = [False]
 
 
 class ExternalShutdownException(Exception):  # noqa: N818 - upstream's name
@@ -54,10 +54,8 @@ class _Record(SimpleNamespace):
     """Fields as they are given. Upstream checks those of a QoSProfile; the test does here."""
 
 
-class QoSProfile(_Record): ...
-
-
-class Clock(_Record): ...
+# Messages, of their packages, and what has fields only.
+QoSProfile = Clock = SetParametersResult = DiagnosticStatus = KeyValue = String = _Record
 
 
 class Parameter(SimpleNamespace):
@@ -65,9 +63,6 @@ class Parameter(SimpleNamespace):
 
     def __init__(self, name: str, *, value: Any) -> None:
         super().__init__(name=name, value=value)
-
-
-SetParametersResult = DiagnosticStatus = KeyValue = String = _Record  # messages, of their packages
 
 
 class Subscription:
@@ -99,21 +94,20 @@ def _say(**what: Any) -> None:
 
 
 def init() -> None:
-    _state["ok"] = True
-    signal.signal(signal.SIGTERM, _stop)
+    def stop(*_: object) -> None:
+        _running[0] = False
+        raise ExternalShutdownException
 
-
-def _stop(*_: object) -> None:
-    _state["ok"] = False
-    raise ExternalShutdownException
+    _running[0] = True
+    signal.signal(signal.SIGTERM, stop)
 
 
 def ok() -> bool:
-    return _state["ok"]
+    return _running[0]
 
 
 def try_shutdown() -> None:
-    _state["ok"] = False
+    _running[0] = False
     _say(event="shutdown")
 
 
@@ -144,16 +138,17 @@ class _Executor:
             raise ExternalShutdownException
         node, message = self._node, json.loads(line)
         if "set" in message:
-            node.on_set([Parameter(*message["set"][:1], value=message["set"][1])])
+            name, value = message["set"]
+            node.on_set([Parameter(name, value=value)])
         elif "tick" in message:
             for timer in node.timers:
                 timer()
         else:
             subscription = node.subscriptions[message["topic"]]
-            if subscription.raw:
-                _call(subscription, *_taken(message))
-            else:
-                subscription.callback(String(data=message["data"]))
+            callback = subscription.callback
+            taken = _taken(message) if subscription.raw else (String(data=message["data"]), {})
+            informed = len(inspect.signature(callback).parameters) == 2
+            callback(*taken[: 2 if informed and hasattr(Subscription, "CallbackType") else 1])
 
 
 def get_global_executor() -> _Executor:
@@ -165,14 +160,6 @@ def _taken(message: dict[str, Any]) -> tuple[bytes, dict[str, Any]]:
     if "number" in message:
         info["publication_sequence_number"] = message["number"]
     return bytes.fromhex(message["payload"]), info
-
-
-def _call(subscription: SimpleNamespace, payload: bytes, info: dict[str, Any]) -> None:
-    callback = subscription.callback
-    if len(inspect.signature(callback).parameters) == 2 and hasattr(Subscription, "CallbackType"):
-        callback(payload, info)
-    else:
-        callback(payload)
 
 
 class _Handle(SimpleNamespace):
@@ -202,8 +189,9 @@ class Logger:
 
 
 class Publisher:
-    def __init__(self, topic: str, word: str = "published") -> None:
-        self._topic, self._word = topic, word
+    def __init__(self, topic: str) -> None:
+        self._topic = topic
+        self._word = "rehearsed" if topic.startswith("/_") else "published"
         self.handle = SimpleNamespace(pointer=PUBLISHER)
 
     def get_subscription_count(self) -> int:
@@ -221,8 +209,7 @@ class Node:
     def __init__(self, _: str, *, automatically_declare_parameters_from_overrides: bool) -> None:
         assert automatically_declare_parameters_from_overrides
         words = sys.argv[1:]
-        rules = [word.split(":=") for word in words if ":=" in word]
-        self._names = dict(rules)
+        self._names = dict(word.split(":=") for word in words if ":=" in word)
         file = words[words.index("--params-file") + 1]
         with open(file, encoding="utf-8") as stream:  # noqa: PTH123
             self._parameters = yaml.safe_load(stream)["/**"]["ros__parameters"]
@@ -244,8 +231,7 @@ class Node:
 
     def get_publishers_info_by_topic(self, topic: str) -> list[SimpleNamespace]:
         self._looks += 1
-        if self._looks == 1:
-            return []
+        found = self._publishers.get(self.resolve_topic_name(topic), [])
         return [
             SimpleNamespace(
                 node_name="node5",
@@ -253,7 +239,7 @@ class Node:
                 topic_type=info["type"],
                 qos_profile=SimpleNamespace(**info["qos"]),
             )
-            for info in self._publishers.get(self.resolve_topic_name(topic), [])
+            for info in (found if self._looks > 1 else [])
         ]
 
     def count_subscribers(self, _: str) -> int:
@@ -262,12 +248,11 @@ class Node:
     def get_clock(self) -> SimpleNamespace:
         return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=lambda: "now"))
 
-    def create_publisher(self, message_type: type, topic: str, qos: QoSProfile | int) -> Publisher:
+    def create_publisher(self, message_type: type, topic: str, qos: Any) -> Publisher:
         topic = self.resolve_topic_name(topic)
-        if topic.startswith("/_"):
-            return Publisher(topic, "rehearsed")
-        said = {"depth": qos} if isinstance(qos, int) else vars(qos)
-        _say(publisher=topic, type=message_type.__name__, qos=said)
+        if not topic.startswith("/_"):
+            said = {"depth": qos} if isinstance(qos, int) else vars(qos)
+            _say(publisher=topic, type=message_type.__name__, qos=said)
         return Publisher(topic)
 
     def create_subscription(
@@ -275,7 +260,7 @@ class Node:
         message_type: type,
         topic: str,
         callback: Callable[..., None],
-        qos: QoSProfile,
+        qos: Any,
         *,
         raw: bool = False,
     ) -> SimpleNamespace:
@@ -287,7 +272,7 @@ class Node:
         return subscription
 
     def create_timer(
-        self, seconds: float, callback: Callable[[], None], clock: Clock | None = None
+        self, seconds: float, callback: Callable[[], None], clock: Any = None
     ) -> SimpleNamespace:
         kind = None if clock is None else clock.clock_type
         _say(timer=seconds, clock=kind, time=time.monotonic_ns())
@@ -297,8 +282,7 @@ class Node:
     def add_on_set_parameters_callback(self, callback: Callable[..., object]) -> None:
         self.on_set = callback
 
-    def destroy_node(self) -> None:
-        pass
+    def destroy_node(self) -> None: ...
 
 
 for _name in (

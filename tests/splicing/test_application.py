@@ -24,8 +24,9 @@ def application(tmp_path: Path) -> Application:
 def test_the_publisher_is_remapped_and_the_shaping_node_takes_its_place(
     application: Application, plan: Plan
 ) -> None:
+    before = application.model_dump_json()
     spliced = splice_application(application, plan)
-
+    assert application.model_dump_json() == before, "the given one is left as it is"
     assert spliced.nodes["third"].callbacks[0].publishes == ("/t3_tmp",)
     shaping = spliced.nodes["chainshaper_t3"]
     (callback,) = shaping.callbacks
@@ -35,27 +36,11 @@ def test_the_publisher_is_remapped_and_the_shaping_node_takes_its_place(
     assert callback.gate.slots == publish_slots(plan)
     assert (callback.gate.cycle_ns, callback.gate.anchor) == (50_000_000, "stamp")
     assert (callback.gate.spin_ns, callback.gate.pause_ns) == (1_000_000, 2_000_000)
-
-
-def test_nothing_else_changes(application: Application, plan: Plan) -> None:
-    before = application.model_dump_json()
-    spliced = splice_application(application, plan)
-    assert application.model_dump_json() == before, "the given one is left as it is"
+    asynchronous = TopicDescription(publication="asynchronous")
+    assert spliced.topic("/t3_tmp") == spliced.topic("/t3") == asynchronous
     for name in ("first", "second", "actuator"):
         assert spliced.nodes[name] == application.nodes[name]
     assert (spliced.chain, spliced.seed) == (application.chain, application.seed)
-
-
-def test_the_new_topic_has_the_outputs_quality_of_service(
-    application: Application, plan: Plan
-) -> None:
-    spliced = splice_application(application, plan)
-    asynchronous = TopicDescription(publication="asynchronous")
-    assert spliced.topic("/t3_tmp") == spliced.topic("/t3") == asynchronous
-
-
-def test_the_spliced_application_is_a_right_one(application: Application, plan: Plan) -> None:
-    spliced = splice_application(application, plan)
     assert Application.model_validate(spliced.model_dump()) == spliced
 
 
@@ -116,11 +101,10 @@ def test_how_overruns_are_treated_goes_with_the_gate(application: Application, p
     assert gate.due_cycles == 1
 
 
-def test_a_gated_publisher_needs_no_node(application: Application) -> None:
+def test_a_gated_publisher_needs_no_node_and_discards_by_a_lifespan(
+    application: Application,
+) -> None:
     assert splice_application(application, _asynchronous()) == application
-
-
-def test_a_gated_publisher_discards_by_a_lifespan(application: Application) -> None:
     discarding = _asynchronous(overrun="discard")
     spliced = splice_application(application, discarding)
     assert spliced.topic("/t3").lifespan_ns == 31_000_000
@@ -163,13 +147,6 @@ def test_every_topic_of_let_per_callback_gets_a_gate_of_its_own(
     }
     published = [topic for _, callback in spliced.callbacks() for topic in callback.publishes]
     assert sorted(published) == ["/t1", "/t1_tmp", "/t2", "/t2_tmp", "/t3", "/t3_tmp"]
-
-
-def test_a_shaping_node_is_spliced_once(application: Application, plan: Plan) -> None:
-    assert plan.shaping_node is not None
-    more = plan.model_copy(update={"further_shaping_nodes": (plan.shaping_node,)})
-    with pytest.raises(InputError, match=r"has a node .* already"):
-        splice_application(application, more)
 
 
 def test_an_output_that_two_nodes_publish_is_refused(application: Application, plan: Plan) -> None:

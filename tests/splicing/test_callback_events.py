@@ -16,7 +16,8 @@ IMAGES = [{"type": "sensor_msgs/msg/Image", "qos": RELIABLE}]
 # As the stand-in for rclpy has them.
 NODE, SUBSCRIPTION, PUBLISHER, TIMER = 0x1000, 0x2000, 0x4000, 0x7F0000003000
 
-LIBRARY = r"""
+LIBRARIES = {
+    "tracetools": r"""
 #include <stdbool.h>
 #include <stdint.h>
 #include <stdio.h>
@@ -37,23 +38,21 @@ TRACE_POINT(rclcpp_subscription_init)
 TRACE_POINT(rclcpp_subscription_callback_added)
 TRACE_POINT(rclcpp_timer_callback_added)
 TRACE_POINT(rclcpp_timer_link_node)
+TRACE_POINT(rcl_publish)
 void ros_trace_rclcpp_callback_register(const void * callback, const char * symbol)
 {tell("rclcpp_callback_register", callback, 0, symbol);}
 void ros_trace_callback_start(const void * callback, bool intra)
 {tell("callback_start", callback, intra, "-");}
-TRACE_POINT(rcl_publish)
 void ros_trace_rmw_publish(const void * message) {tell("rmw_publish", message, 0, "-");}
 void ros_trace_rmw_take(const void * handle, const void * message, int64_t stamp, bool taken)
 {tell("rmw_take", handle, (intptr_t)message, stamp > 0 && taken ? "taken" : "-");}
 #ifndef INCOMPLETE
 void ros_trace_callback_end(const void * callback) {tell("callback_end", callback, 0, "-");}
 #endif
-"""
-
-
-RCL = """
-const void * rcl_subscription_get_rmw_handle(const char * subscription) {return subscription + 8;}
-"""
+""",
+    "rcl": "const void * rcl_subscription_get_rmw_handle(const char * subscription)"
+    " {return subscription + 8;}\n",
+}
 
 
 def preloaded(folder: Path, *flags: str) -> dict[str, str]:
@@ -61,7 +60,7 @@ def preloaded(folder: Path, *flags: str) -> dict[str, str]:
     if shutil.which("gcc") is None:
         pytest.skip("no gcc to build the tracing library with")
     libraries = []
-    for name, text in (("tracetools", LIBRARY), ("rcl", RCL)):
+    for name, text in LIBRARIES.items():
         source, library = folder / f"{name}.c", folder / f"lib{name}.so"
         source.write_text(text)
         gcc = ["gcc", "-shared", "-fPIC", f"-Wl,-soname,lib{name}.so", *flags]
@@ -75,13 +74,29 @@ def heard(folder: Path) -> list[tuple[str, int, int, str]]:
     return [(event, int(first), int(second), text) for event, first, second, text in lines]
 
 
-def test_the_throttlers_callbacks_are_seen_like_those_of_rclcpp(tmp_path: Path) -> None:
-    process = write_throttler({"/raw": "/scan"}, 100_000_000, "python", tmp_path)
-    with running_node(process, tmp_path, {"/raw": IMAGES}, environment=preloaded(tmp_path)) as run:
+def throttled_once(folder: Path, environment: dict[str, str]) -> None:
+    process = write_throttler({"/raw": "/scan"}, 100_000_000, "python", folder)
+    with running_node(process, folder, {"/raw": IMAGES}, environment=environment) as run:
         run.tell(topic="/raw", payload="aa", source=1)
         run.tell(tick=1)
         run.hear(lambda words: "published" in words)
         assert run.end() == 0
+
+
+def shaped_once(folder: Path, plan: Plan, environment: dict[str, str]) -> str:
+    """The source timestamp in its log, of a message that has 77."""
+    assert plan.shaping_node is not None
+    log = folder / "gate.csv"
+    process = write_shaping_process(plan, plan.shaping_node, "python", folder, log=log)
+    with running_node(process, folder, environment=environment) as run:
+        run.send(stamped(), 77)
+        run.hear_published()
+        assert run.end() == 0
+    return log.read_text().splitlines()[1].split(",")[4]
+
+
+def test_the_throttlers_callbacks_are_seen_like_those_of_rclcpp(tmp_path: Path) -> None:
+    throttled_once(tmp_path, preloaded(tmp_path))
     subscribed, added, named, timed, linked, named_too, *ran = heard(tmp_path)
     reader, timer = added[2], timed[2]
     assert subscribed[:2] == ("rclcpp_subscription_init", SUBSCRIPTION)
@@ -96,49 +111,27 @@ def test_the_throttlers_callbacks_are_seen_like_those_of_rclcpp(tmp_path: Path) 
     ]
 
 
+def test_a_library_without_all_trace_points_is_left_alone(tmp_path: Path) -> None:
+    throttled_once(tmp_path, preloaded(tmp_path, "-DINCOMPLETE"))
+    assert not (tmp_path / "heard").exists()
+
+
 def test_the_shaping_node_still_gets_message_and_source_timestamp(
     tmp_path: Path, plan: Plan
 ) -> None:
     """rclpy looks at how many arguments a callback takes."""
-    assert plan.shaping_node is not None
-    log = tmp_path / "gate.csv"
-    process = write_shaping_process(plan, plan.shaping_node, "python", tmp_path, log=log)
-    with running_node(process, tmp_path, environment=preloaded(tmp_path)) as run:
-        run.send(stamped(), 77)
-        run.hear_published()
-        assert run.end() == 0
-    assert log.read_text().splitlines()[1].split(",")[4] == "77"
+    assert shaped_once(tmp_path, plan, preloaded(tmp_path)) == "77"
     assert [event for event, *_ in heard(tmp_path)][-2:] == ["callback_start", "callback_end"]
-
-
-def test_a_library_without_all_trace_points_is_left_alone(tmp_path: Path) -> None:
-    process = write_throttler({"/raw": "/scan"}, 100_000_000, "python", tmp_path)
-    library = preloaded(tmp_path, "-DINCOMPLETE")
-    with running_node(process, tmp_path, {"/raw": IMAGES}, environment=library) as run:
-        run.tell(topic="/raw", payload="aa", source=1)
-        run.tell(tick=1)
-        run.hear(lambda words: "published" in words)
-        assert run.end() == 0
-    assert not (tmp_path / "heard").exists()
 
 
 def test_on_humble_serialized_messages_are_seen_as_on_later_distributions(
     tmp_path: Path, plan: Plan
 ) -> None:
-    """There neither rcl nor rmw tells of them."""
-    assert plan.shaping_node is not None
-    process = write_shaping_process(plan, plan.shaping_node, "python", tmp_path)
-    humble = {**preloaded(tmp_path), "STAND_IN_HUMBLE": "1"}
-    with running_node(process, tmp_path, environment=humble) as run:
-        run.send(stamped(), 77)
-        run.hear_published()
-        assert run.end() == 0
-    taken, _, published, written, _ = heard(tmp_path)[-5:]
+    """There neither rcl nor rmw has events of them, and a callback gets no source timestamp."""
+    assert not shaped_once(tmp_path, plan, {**preloaded(tmp_path), "STAND_IN_HUMBLE": "1"})
+    taken, started, published, written, ended = heard(tmp_path)[-5:]
     message = taken[2]
     assert taken == ("rmw_take", SUBSCRIPTION + 8, message, "taken")
     assert published == ("rcl_publish", PUBLISHER, message, "-")
     assert written == ("rmw_publish", message, 0, "-")
-    events = [event for event, *_ in heard(tmp_path)]
-    assert events[-5:][::3] == ["rmw_take", "rmw_publish"]
-    assert events[-4] == "callback_start", "as where the executor takes the message"
-    assert events[-1] == "callback_end"
+    assert (started[0], ended[0]) == ("callback_start", "callback_end"), "where it is executed"

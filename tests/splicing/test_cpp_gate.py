@@ -33,8 +33,8 @@ def as_text(case: Case) -> str:
     """A case as the driver reads it; modes are named by their numbers."""
     gate, modes = case.gate, case.gate.modes
     names = [] if modes is None else list(modes.bands)
-    words = [ANCHORS.index(gate.anchor), gate.phase_ns, _or_dash(gate.max_age_ns)]
-    words += [gate.max_future_ns, LATE.index(gate.overrun), gate.due_cycles]
+    words: list[int | str] = [ANCHORS.index(gate.anchor), gate.phase_ns]
+    words += [LATE.index(gate.overrun), gate.due_cycles]
     words += [MESSAGES.index(gate.messages), gate.depth, gate.cycle_ns]
     words += [len(gate.slots), *(bound for slot in gate.slots for bound in slot)]
     words += [len(names)]
@@ -86,8 +86,6 @@ def _any_case(draw: random.Random) -> Case:
         cycle_ns=cycle * scale,
         anchor=draw.choice(ANCHORS),
         phase_ns=draw.randint(-100, 100) * scale,
-        max_age_ns=draw.choice([None, draw.randint(0, 300) * scale]),
-        max_future_ns=draw.randint(0, 50) * scale,
         overrun=draw.choice(OVERRUNS),
         due_cycles=draw.randint(0, 2),
         modes=modes,

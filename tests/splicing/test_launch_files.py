@@ -1,4 +1,7 @@
-"""What splicing writes for launch files: the nodes that it adds, and whose topics it redirects."""
+"""What splicing writes for launch files: the nodes that it adds, and whose topics it redirects.
+
+And which launch file a `ros2 launch …` means, and the same command for another one.
+"""
 
 import ast
 import json
@@ -11,6 +14,7 @@ from launch_cases import NDT, ROBOTS, plan_for
 
 from chainshaper import Plan, Splicing, ThrottledInput, splice_launch_files, splice_throttlers
 from chainshaper.planning.plan import revised
+from chainshaper.splicing.spliced_launch import parse_launch_command
 from chainshaper.values.errors import InputError, PlatformError
 from chainshaper.values.recording import Recording, open_recording
 
@@ -85,7 +89,7 @@ def test_the_user_s_file_is_included_as_it_is(name: str, tmp_path: Path) -> None
     assert "+++ " + str(tmp_path / "out/robot.launch.py") in spliced.diff
 
 
-@pytest.mark.parametrize("folder", ["out", "two words", "a'b", "a$b", 'a"b', "a\\b", "a#b", "a\nb"])
+@pytest.mark.parametrize("folder", ["out", "two 'words'", 'a$"\\b#\nc'])
 def test_both_nodes_are_started_with_their_files_and_again_when_they_end(
     robot: Path, folder: str
 ) -> None:
@@ -105,6 +109,8 @@ def test_a_package_s_node_is_started_with_its_parameters_and_remaps(robot: Path)
     node, standby = launched(spliced)["PROCESSES"]
     nodes = robot.parent / "out/shaping_nodes"
     assert (nodes / node["package"] / "package.xml").is_file()
+    same = {"output": "screen", "respawn": True, "respawn_delay": 0.1}
+    assert standby.items() >= same.items()
     assert node == {
         "package": "chainshaper_shaping",
         "executable": "shaping_node",
@@ -112,11 +118,8 @@ def test_a_package_s_node_is_started_with_its_parameters_and_remaps(robot: Path)
         "parameters": [str(nodes / "chainshaper_pose.yaml")],
         "remappings": [("input", "/pose_tmp"), ("output", "/pose")],
         "name": "chainshaper_pose",
-        "output": "screen",
-        "respawn": True,
-        "respawn_delay": 0.1,
+        **same,
     }
-    assert standby["respawn"]
 
 
 def test_several_launch_files_are_launched_together(robot: Path) -> None:
@@ -173,17 +176,13 @@ def test_all_shaping_nodes_of_a_plan_are_spliced(robot: Path, known: str) -> Non
     assert redirects(spliced) == wanted
 
 
-def test_a_typed_node_takes_its_type_from_the_recording(robot: Path) -> None:
-    seen = recorded(robot.parent, ("/ndt", "/pose", "publisher"), type_="std_msgs/msg/Header")
+def test_a_recording_knows_the_type_and_a_standby_is_no_second_publisher(robot: Path) -> None:
+    names = ("/ndt", "/chainshaper_pose_standby")
+    endpoints = [(name, "/pose", "publisher") for name in names]
+    seen = recorded(robot.parent, *endpoints, type_="std_msgs/msg/Header")
     out = robot.parent / "out"
     spliced = splice_launch_files(PLAN, [robot], out, node="typed", recording=seen)
     assert spliced.processes[0].package == "shaping_std_msgs_header"
-
-
-def test_a_standby_is_no_second_publisher(robot: Path) -> None:
-    names = ("/chainshaper_pose", "/chainshaper_pose_standby")
-    seen = recorded(robot.parent, *[(name, "/pose", "publisher") for name in names])
-    spliced = splice_launch_files(PLAN, [robot], robot.parent / "out", recording=seen)
     assert redirects(spliced) == {"/pose": ("/pose_tmp", ("/ndt",))}
 
 
@@ -204,21 +203,14 @@ def test_an_input_reaches_its_subscribers_by_way_of_one_throttler(
     assert (parameters["period_ns"], parameters["fifo_priority"]) == (100 * MS, 85)
 
 
-def test_inputs_of_other_periods_have_a_throttler_of_their_own(
-    robot: Path, recording: Recording
-) -> None:
-    inputs = [REAR, ThrottledInput(topic="/front", period_ns=50 * MS)]
-    spliced = splice_throttlers(inputs, [robot], robot.parent / "out", recording=recording)
+def test_inputs_of_other_periods_have_a_throttler_of_their_own(robot: Path) -> None:
+    both = [REAR.model_copy(update={"subscriber": node}) for node in ("/fusion", "/icp")]
+    inputs = [*both, ThrottledInput(topic="/front", period_ns=50 * MS, subscriber="/fusion")]
+    spliced = splice_throttlers(inputs, [robot], robot.parent / "out", node="cpp")
     names = ["chainshaper_throttler", "chainshaper_throttler_2"]
     assert [process.name for process in spliced.processes] == names
-    added = [one["added"] for one in launched(spliced)["REDIRECTS"]]
-    assert added == [(f"/{name}",) for name in names]
-
-
-def test_named_subscribers_need_no_recording(robot: Path) -> None:
-    inputs = [REAR.model_copy(update={"subscriber": node}) for node in ("/fusion", "/icp")]
-    spliced = splice_throttlers(inputs, [robot], robot.parent / "out", node="cpp")
-    assert redirects(spliced) == {"/rear": ("/rear_throttled", ("/fusion", "/icp"))}
+    assert [one["added"] for one in launched(spliced)["REDIRECTS"]] == [(f"/{n}",) for n in names]
+    assert redirects(spliced)["/rear"] == ("/rear_throttled", ("/fusion", "/icp"))
     assert launched(spliced)["PROCESSES"][0]["executable"] == "throttler"
 
 
@@ -241,30 +233,23 @@ def test_a_plan_is_spliced_into_the_throttled_launch_file(
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("a.launch.xml", "<robot/>", "a.launch.xml: no launch file"),
-        ("a.launch.yaml", "robot: 1\n", "a.launch.yaml: no launch file"),
-        ("a.launch.yaml", "", "a.launch.yaml: no launch file"),
-        ("a.launch.py", "print('hello')\n", "a.launch.py: no launch file"),
-        ("a.launch", "nothing", "a.launch: no launch file"),
-        ("a.txt", NDT, "a.txt: a launch file's name ends in .py, .xml, .yaml, .yml or .launch"),
+        ("a.launch.xml", b"<robot/>", "a.launch.xml: no launch file"),
+        ("a.launch.yaml", b"robot: 1\n", "a.launch.yaml: no launch file"),
+        ("a.launch.py", b"print('hello')\n", "a.launch.py: no launch file"),
+        ("a.launch", b"nothing", "a.launch: no launch file"),
+        ("a.txt", NDT.encode(), "a launch file's name ends in .py, .xml, .yaml, .yml or .launch"),
+        ("a.launch.xml", b"<launch>\xff</launch>", "1: not a text in UTF-8"),
+        ("a.launch.xml", None, "a.launch.xml: cannot be read .No such file"),
     ],
 )
 def test_what_is_no_launch_file_is_refused(
-    tmp_path: Path, name: str, text: str, message: str
+    tmp_path: Path, name: str, text: bytes | None, message: str
 ) -> None:
-    (tmp_path / name).write_text(text)
-    with pytest.raises(InputError) as caught:
+    if text is not None:
+        (tmp_path / name).write_bytes(text)
+    with pytest.raises(InputError, match=message):
         splice_launch_files(PLAN, [tmp_path / name], tmp_path / "spliced")
-    assert message in str(caught.value)
-    assert [path.name for path in tmp_path.iterdir()] == [name]
-
-
-def test_a_file_that_is_not_there_or_not_text_is_named(tmp_path: Path) -> None:
-    file = tmp_path / "no.launch.xml"
-    for message in (r"no\.launch\.xml: cannot be read \(No such file", "1: not a text in UTF-8"):
-        with pytest.raises(InputError, match=message):
-            splice_launch_files(PLAN, [file], tmp_path / "spliced")
-        file.write_bytes(b"<launch>\xff</launch>")
+    assert not (tmp_path / "spliced").exists()
 
 
 def test_a_plan_that_shapes_nothing_or_does_not_know_the_publisher_is_refused(robot: Path) -> None:
@@ -277,13 +262,10 @@ def test_a_plan_that_shapes_nothing_or_does_not_know_the_publisher_is_refused(ro
     ):
         with pytest.raises(InputError, match=message):
             splice_launch_files(plan, [robot], robot.parent / "out")
-    assert not (robot.parent / "out").exists()
-
-
-def test_two_publishers_of_the_output_are_refused(robot: Path) -> None:
     seen = recorded(robot.parent, *[(node, "/pose", "publisher") for node in ("/ndt", "/other")])
     with pytest.raises(InputError, match="/pose has 2 publishers, /ndt, /other"):
         splice_launch_files(PLAN, [robot], robot.parent / "out", recording=seen)
+    assert not (robot.parent / "out").exists()
 
 
 @pytest.mark.parametrize(
@@ -312,3 +294,66 @@ def test_a_dry_run_without_ros_2_says_what_it_needs(
     with pytest.raises(PlatformError, match="a dry run needs ROS 2: source its setup"):
         splice_launch_files(PLAN, [robot], robot.parent / "out", dry_run=True)
     assert not (robot.parent / "out").exists()
+
+
+# The command ------------------------------------------------------------------------------------
+
+ROS2 = "/opt/ros/jazzy/bin/ros2"
+
+
+@pytest.fixture
+def share(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The share folder of a package `robot` in the environment, with one launch file."""
+    index = tmp_path / "install/share/ament_index/resource_index/packages"
+    index.mkdir(parents=True)
+    (index / "robot").touch()
+    share = tmp_path / "install/share/robot"
+    (share / "launch").mkdir(parents=True)
+    (share / "launch/all.launch.py").touch()
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"/nowhere:{tmp_path / 'install'}")
+    return share
+
+
+def test_a_package_and_the_name_of_a_file_anywhere_in_it(share: Path) -> None:
+    words = [ROS2, "launch", "-n", "--launch-prefix", "nice", "robot", "all.launch.py"]
+    command = parse_launch_command([*words, "speed:=3", "map:=a:=b", "--debug"])
+    assert command.file == share / "launch/all.launch.py"
+    assert command.arguments == {"speed": "3", "map": "a:=b"}
+    assert command.with_file(Path("/copy.py")) == [
+        *words[:5],
+        "/copy.py",
+        "speed:=3",
+        "map:=a:=b",
+        "--debug",
+    ]
+
+
+def test_a_path_needs_no_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("robot.launch.xml").touch()
+    command = parse_launch_command(["ros2", "launch", "robot.launch.xml", "speed:=3"])
+    assert command.file == tmp_path / "robot.launch.xml"
+    assert command.with_file(Path("/c.xml")) == ["ros2", "launch", "/c.xml", "speed:=3"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["ros2", "run", "robot", "node"], "`ros2 run robot node` is not `ros2 launch"),
+        (["ros2", "launch"], "is not `ros2 launch"),
+        (["ros2", "launch", "-d"], "no launch file given"),
+        (["ros2", "launch", "other", "all.launch.py"], "other: neither a launch file nor a pack"),
+        (["ros2", "launch", "robot"], "no launch file given: `ros2 launch robot FILE`"),
+        (["ros2", "launch", "robot", "a.launch.py"], "robot has no launch file a.launch.py in /"),
+    ],
+)
+def test_what_cannot_be_launched_is_said(share: Path, words: list[str], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        parse_launch_command(words)
+
+
+def test_two_files_of_one_name_are_told_apart_by_their_path(share: Path) -> None:
+    (share / "old").mkdir()
+    (share / "old/all.launch.py").touch()
+    with pytest.raises(InputError, match=r"has 2 files .*launch/all.launch.py or .*old/all"):
+        parse_launch_command(["ros2", "launch", "robot", "all.launch.py"])

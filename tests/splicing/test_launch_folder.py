@@ -55,21 +55,19 @@ def test_in_it_are_a_launch_file_the_shaping_nodes_and_a_manifest(spliced: Splic
     assert str(spliced.logs[0]) in spliced.processes[0].parameters_file.read_text()
 
 
-def test_undo_removes_all_of_it(spliced: Splicing, robot: Path) -> None:
-    undo_splice(spliced.folder)
-    assert [path.name for path in robot.parent.iterdir()] == [robot.name]
-    assert robot.read_text() == NDT
-
-
-def test_what_running_and_building_leave_does_not_keep_it_from_being_removed(
-    spliced: Splicing,
+def test_undo_removes_all_of_it_with_what_running_and_building_left(
+    spliced: Splicing, robot: Path
 ) -> None:
     for name in ("__pycache__/a.pyc", "logs/chainshaper_pose.csv", "shaping_nodes/build/a/b"):
         path = spliced.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("left")
+    (spliced.folder / "robot.launch.py").unlink()  # what the user removed is not missed
     undo_splice(spliced.folder)
-    assert not spliced.folder.exists()
+    assert [path.name for path in robot.parent.iterdir()] == [robot.name]
+    assert robot.read_text() == NDT
+    with pytest.raises(InputError, match="no such folder, so there is nothing to undo"):
+        undo_splice(spliced.folder)
 
 
 @pytest.mark.parametrize(
@@ -98,14 +96,6 @@ def test_what_the_user_changed_or_added_is_neither_removed_nor_replaced(
     assert _tree(spliced.folder) == before
 
 
-def test_what_the_user_removed_does_not_keep_the_rest_from_being_removed(
-    spliced: Splicing,
-) -> None:
-    (spliced.folder / "robot.launch.py").unlink()
-    undo_splice(spliced.folder)
-    assert not spliced.folder.exists()
-
-
 @pytest.mark.parametrize("manifest", [None, "", "[]", '{"format": 2}', '{"format": 1}'])
 def test_a_folder_that_is_not_ours_is_left_alone(
     tmp_path: Path, robot: Path, plan: Plan, manifest: str | None
@@ -124,20 +114,7 @@ def test_a_folder_that_is_not_ours_is_left_alone(
     assert (folder / "a").exists()
 
 
-def test_nothing_to_undo_is_said(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such folder, so there is nothing to undo"):
-        undo_splice(tmp_path / "nothing")
-
-
-def test_another_plan_replaces_what_was_spliced(spliced: Splicing, robot: Path, plan: Plan) -> None:
-    other = revised(plan, overrun="discard")
-    splice_launch_files(other, [robot], spliced.folder)
-    parameters = spliced.processes[0].parameters_file.read_text()
-    assert "overrun: discard" in parameters
-    assert [path.name for path in robot.parent.iterdir() if path.name.startswith(".")] == []
-
-
-def test_the_same_again_leaves_the_folder_with_its_logs_as_it_is(
+def test_the_same_again_leaves_the_folder_and_another_plan_replaces_it(
     spliced: Splicing, robot: Path, plan: Plan
 ) -> None:
     spliced.logs[0].write_text("measured")
@@ -145,15 +122,18 @@ def test_the_same_again_leaves_the_folder_with_its_logs_as_it_is(
     splice_launch_files(plan, [robot], spliced.folder)
     assert spliced.folder.stat().st_ino == inode
     assert spliced.logs[0].read_text() == "measured"
+    splice_launch_files(revised(plan, overrun="discard"), [robot], spliced.folder)
+    parameters = spliced.processes[0].parameters_file.read_text()
+    assert "overrun: discard" in parameters
+    assert [path.name for path in robot.parent.iterdir() if path.name.startswith(".")] == []
 
 
-def test_an_empty_folder_may_be_filled(tmp_path: Path, robot: Path, plan: Plan) -> None:
+def test_an_empty_folder_may_be_filled_but_it_needs_a_parent(
+    tmp_path: Path, robot: Path, plan: Plan
+) -> None:
     (tmp_path / "empty").mkdir()
     assert splice_launch_files(plan, [robot], tmp_path / "empty").folder == tmp_path / "empty"
     assert (tmp_path / "empty/robot.launch.py").is_file()
-
-
-def test_a_folder_without_a_parent_is_refused(tmp_path: Path, robot: Path, plan: Plan) -> None:
     with pytest.raises(InputError, match="no such folder to write spliced into"):
         splice_launch_files(plan, [robot], tmp_path / "no" / "spliced")
 
@@ -187,16 +167,12 @@ def test_a_copy_whose_original_is_gone_names_the_original(
         splice_launch_files(plan, [spliced.folder / "robot.launch.py"], tmp_path / "again")
 
 
-def test_the_manifest_names_the_originals(spliced: Splicing, robot: Path) -> None:
-    manifest = json.loads((spliced.folder / "splice.json").read_text())
-    assert manifest["copies"] == {"robot.launch.py": [str(robot)]}
-
-
 def test_a_folder_of_copies_from_an_earlier_version_is_known(
     spliced: Splicing, robot: Path, plan: Plan, tmp_path: Path
 ) -> None:
     path = spliced.folder / "splice.json"
     manifest = json.loads(path.read_text())
+    assert manifest["copies"] == {"robot.launch.py": [str(robot)]}
     path.write_text(json.dumps({**manifest, "copies": {"robot.launch.py": str(robot)}}))
     (again,) = splice_launch_files(plan, [*spliced.launch.values()], tmp_path / "again").originals
     assert f"LAUNCH_FILES = [{str(robot)!r}]" in again.read_text()

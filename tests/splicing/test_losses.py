@@ -5,56 +5,56 @@ import os
 import signal
 import time
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import polars as pl
 import pytest
-from node_run import NodeRun, running_node, stamped
+from node_run import NodeRun, outputs, running_node, stamped, with_slots
 from processes import wait_for
 
 from chainshaper.planning import Plan
 from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log, rows_missing
-from chainshaper.splicing.shaped_outputs import ShapedOutput, find_outputs, output_text
-from chainshaper.splicing.shaping_process import ShapingProcess, write_shaping_process
+from chainshaper.splicing.shaped_outputs import output_text
+from chainshaper.splicing.shaping_process import write_shaping_process
 
 MS = 1_000_000
+OPEN = (0, 50 * MS)  # a slot that is always open
 
 
-def process_of(
+@contextmanager
+def at_work(
     plan: Plan, folder: Path, log: Path, slot: tuple[int, int] = (20 * MS, 45 * MS), **changes: Any
-) -> ShapingProcess:
+) -> Iterator[NodeRun]:
     """The node of a plan with one slot; ``log_bytes`` is no part of a plan."""
-    servers = tuple(
-        server.model_copy(update={"slots": (slot,)}) if server.name == "output" else server
-        for server in plan.servers
-    )
-    log_bytes = changes.pop("log_bytes", None)
-    plan = revised(plan, servers=servers, anchor="cycle", **changes)
+    log_bytes = changes.pop("log_bytes", 100_000_000)
+    plan = revised(with_slots(plan, slot), anchor="cycle", **changes)
     assert plan.shaping_node is not None
     process = write_shaping_process(plan, plan.shaping_node, "python", folder, log=log)
-    if log_bytes is not None:
-        with process.parameters_file.open("a") as file:
-            file.write(f"    log_bytes: {log_bytes}\n")
-    return process
+    with process.parameters_file.open("a") as file:
+        file.write(f"    log_bytes: {log_bytes}\n")
+    with running_node(process, folder) as run:
+        yield run
 
 
 def send(run: NodeRun, count: int, first: int = 0, pause_s: float = 0.0) -> list[bytes]:
-    payloads = [stamped(first.to_bytes(4, "big")) for first in range(first, first + count)]
+    payloads = [stamped(number.to_bytes(4, "big")) for number in range(first, first + count)]
     for number, payload in enumerate(payloads, start=first):
         run.send(payload, time.time_ns(), number=number)
         time.sleep(pause_s)
     return payloads
 
 
-def outputs(folder: Path) -> tuple[ShapedOutput, ...]:
-    return find_outputs(iter([str(folder / "outputs"), str(folder / "chainshaper" / "outputs")]))
+def wait_until_counted(folder: Path, count: int) -> None:
+    """Until `status` knows of so many messages of the one output, those that DDS lost included."""
 
+    def counted() -> int:
+        return sum(output.published + sum(output.lost.values()) for output in outputs(folder))
 
-def counted(folder: Path) -> int:
-    """How many messages of the one output `status` knows of, those that DDS lost included."""
-    return sum(output.published + sum(output.lost.values()) for output in outputs(folder))
+    wait_for(lambda: counted() == count, "all to be counted")
 
 
 def wait_for_rows(log: Path, count: int) -> pl.DataFrame:
@@ -70,16 +70,15 @@ def wait_for_rows(log: Path, count: int) -> pl.DataFrame:
 def test_bursts_leave_as_planned_and_the_rest_is_counted(
     tmp_path: Path, plan: Plan, messages: str, lost: str
 ) -> None:
-    log, bursts, size = tmp_path / "gate.csv", 3, 20
-    process = process_of(plan, tmp_path, log, messages=messages)
+    log, bursts, size = tmp_path / "gate.csv", 2, 20
     sent: list[bytes] = []
-    with running_node(process, tmp_path) as run:
+    with at_work(plan, tmp_path, log, messages=messages) as run:
         for burst in range(bursts):
             # When the slot has just closed: what comes while it is open leaves at once.
             time.sleep((plan.cycle_ns - time.monotonic_ns() % plan.cycle_ns) / 1e9)
             sent += send(run, size, burst * size)
             wait_for_rows(log, len(sent))
-        wait_for(lambda: counted(tmp_path) == len(sent), "all to be counted")
+        wait_until_counted(tmp_path, len(sent))
         (output,) = outputs(tmp_path)
         assert run.end() == 0
     out, rows = run.published, read_gate_log(log)
@@ -87,12 +86,12 @@ def test_bursts_leave_as_planned_and_the_rest_is_counted(
     assert len(sent) == len(out) + dropped.total()
     assert rows["release"].count() == len(out)
     assert out == [payload for payload in sent if payload in out], "in the order they came"
-    assert dropped[lost] > 0
     assert (output.published, output.lost) == (len(out), dropped)
     assert output.late == rows["overrun"].count()
-    said_of_it = f"so far {len(out)} messages published, {output.late} late, "
-    assert said_of_it in output_text(output)
-    assert f", {dropped[lost]} {lost}" in output_text(output)
+    text = output_text(output)
+    assert f"so far {len(out)} messages published, {output.late} late, " in text
+    assert dropped[lost] > 0
+    assert f", {dropped[lost]} {lost}" in text
     assert set(dropped) <= {lost, "overflowed"}
     if messages == "all-in-order":
         assert len(out) >= bursts * 10, "the history has room for ten"
@@ -102,24 +101,22 @@ def test_bursts_leave_as_planned_and_the_rest_is_counted(
 
 def test_what_the_history_can_hold_leaves_and_nothing_is_lost(tmp_path: Path, plan: Plan) -> None:
     """Ten times the cycle's rate, beside which the slot is open half of the time."""
-    log, count = tmp_path / "gate.csv", 100
-    process = process_of(plan, tmp_path, log)
-    with running_node(process, tmp_path) as run:
+    log, count = tmp_path / "gate.csv", 60
+    with at_work(plan, tmp_path, log) as run:
         sent = send(run, count, pause_s=0.005)
         rows = wait_for_rows(log, count)
         run.end()
-    dropped = rows["dropped"].drop_nulls()
-    assert len(sent) == len(run.published) + len(dropped)
+    assert len(sent) == len(run.published) + rows["dropped"].count()
     assert rows["lost"].sum() == 0
 
 
 def test_what_dds_lost_before_the_gate_is_counted(tmp_path: Path, plan: Plan) -> None:
     log = tmp_path / "gate.csv"
-    with running_node(process_of(plan, tmp_path, log), tmp_path) as run:
+    with at_work(plan, tmp_path, log) as run:
         for number in (5, 6, 9, 10, 2):  # the last is from a publisher that was started again
             send(run, 1, number)
         rows = wait_for_rows(log, 5)
-        wait_for(lambda: counted(tmp_path) == 5 + 2, "all to be counted")
+        wait_until_counted(tmp_path, 5 + 2)
         (output,) = outputs(tmp_path)
         assert run.end() == 0
     assert output.lost["lost by DDS"] == 2
@@ -129,8 +126,7 @@ def test_what_dds_lost_before_the_gate_is_counted(tmp_path: Path, plan: Plan) ->
 
 def test_the_log_is_bounded_and_says_which_rows_are_gone(tmp_path: Path, plan: Plan) -> None:
     log = tmp_path / "gate.csv"
-    process = process_of(plan, tmp_path, log, (0, 50 * MS), log_bytes=4_000)
-    with running_node(process, tmp_path) as run:
+    with at_work(plan, tmp_path, log, OPEN, log_bytes=4_000) as run:
         for number in range(60):
             send(run, 1, number)
             run.hear_published()
@@ -144,8 +140,7 @@ def test_the_log_is_bounded_and_says_which_rows_are_gone(tmp_path: Path, plan: P
 
 def test_a_full_disk_does_not_stop_the_output(full_disk: Path, tmp_path: Path, plan: Plan) -> None:
     log = full_disk / "gate.csv"
-    process = process_of(plan, tmp_path, log, (0, 50 * MS))
-    with running_node(process, tmp_path) as run:
+    with at_work(plan, tmp_path, log, OPEN) as run:
         sent = send(run, 5, pause_s=0.02)
         run.hear_published(sent[-1])
         (full_disk / "filling").unlink()
@@ -159,15 +154,14 @@ def test_a_log_that_is_removed_is_made_anew(tmp_path: Path, plan: Plan) -> None:
     folder = tmp_path / "logs"
     folder.mkdir()
     log = folder / "gate.csv"
-    process = process_of(plan, tmp_path, log, (0, 50 * MS))
-    with running_node(process, tmp_path) as run:
+    with at_work(plan, tmp_path, log, OPEN) as run:
         send(run, 1, 1)
         wait_for_rows(log, 1)
         log.unlink()
         folder.rmdir()
         (last,) = send(run, 1, 2)
         run.hear_published(last)
-        time.sleep(0.5)  # until its row has found no file
+        time.sleep(0.3)  # until its row has found no file
         folder.mkdir()
         wait_for(lambda: bool(send(run, 1, 3, 0.1)) and log.exists(), "a new log")
         run.end()
@@ -179,17 +173,15 @@ def test_a_log_that_is_removed_is_made_anew(tmp_path: Path, plan: Plan) -> None:
 def test_a_disk_that_hangs_does_not_stop_the_output(tmp_path: Path, plan: Plan) -> None:
     """The process that writes the log stands still."""
     log = tmp_path / "gate.csv"
-    process = process_of(plan, tmp_path, log, (0, 50 * MS))
-    with running_node(process, tmp_path) as run:
+    with at_work(plan, tmp_path, log, OPEN) as run:
         send(run, 1)
         wait_for_rows(log, 1)
         children = Path(f"/proc/{run.process.pid}/task/{run.process.pid}/children")
-        writers = [
+        (writer,) = (
             int(pid)
             for pid in children.read_text().split()
             if b"_write_rows" in Path(f"/proc/{pid}/cmdline").read_bytes()
-        ]
-        (writer,) = writers
+        )
         os.kill(writer, signal.SIGSTOP)
         try:
             sent = send(run, 30, 1, 0.005)

@@ -13,17 +13,18 @@ from typing import Any
 
 import polars as pl
 import pytest
+from node_run import SLOTS, banded
 from ros2 import ros2_environment
 
-from chainshaper.planning import Modes, Plan
+from chainshaper.planning import Plan
 from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log
 from chainshaper.sources.ros import own_environment, run_with_rclpy
 from chainshaper.sources.ros import script as ros_script
-from chainshaper.splicing.generated_package import build_package
 from chainshaper.splicing.shaping_process import (
     NodeKind,
     ShapingProcess,
+    build_package,
     write_shaping_process,
     write_throttler,
 )
@@ -31,7 +32,6 @@ from chainshaper.splicing.shaping_process import (
 pytestmark = [pytest.mark.ros2, pytest.mark.timeout(600)]
 
 MS = 1_000_000
-SLOTS = ((15 * MS, 25 * MS), (30 * MS, 45 * MS))
 TYPE = "geometry_msgs/msg/PointStamped"
 COUNTERPART = Path(__file__).parent / "ros_counterpart.py"
 COUNT = 30
@@ -47,26 +47,27 @@ def in_ros_environment() -> Iterator[None]:
         yield
 
 
-def banded(plan: Plan) -> Plan:
-    servers = tuple(
-        server.model_copy(update={"slots": SLOTS}) if server.name == "output" else server
-        for server in plan.servers
-    )
-    modes = Modes(topic="/mode", default="city", bands={"city": 2, "highway": 1}, late="next-slot")
-    return revised(plan, servers=servers, modes=modes)
-
-
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> Path:
     """A folder with both packages, built once."""
     if shutil.which("colcon") is None:
         pytest.skip("colcon is not on the PATH, so no package can be built")
     folder = tmp_path_factory.mktemp("workspace")
-    assert plan.shaping_node is not None
     for kind in ("cpp", "typed"):
-        write_shaping_process(plan, plan.shaping_node, kind, folder, message_type=TYPE)
+        written(plan, kind, folder)
     build_package(folder)
     return folder
+
+
+@pytest.fixture
+def place(kind: NodeKind, request: pytest.FixtureRequest) -> Path | None:
+    """Where the package of a kind is built."""
+    return None if kind == "python" else request.getfixturevalue("workspace")
+
+
+def written(plan: Plan, kind: NodeKind, folder: Path, log: Path | None = None) -> ShapingProcess:
+    assert plan.shaping_node is not None
+    return write_shaping_process(plan, plan.shaping_node, kind, folder, message_type=TYPE, log=log)
 
 
 @contextmanager
@@ -74,15 +75,12 @@ def started(
     process: ShapingProcess, workspace: Path | None, exit_code: int = 0
 ) -> Iterator["subprocess.Popen[str]"]:
     """The process as a launch file would start it; ended by SIGINT, which it must obey."""
-    command = list(process.command or ())
+    command = process.command_line
     if process.package is not None and workspace is not None and process.executable is not None:
         folder = workspace / "install" / "lib" / process.package
-        command = [str(folder / process.executable)]
-    rules = [("__node", process.name), ("__ns", process.namespace), *process.remappings]
-    remaps = [word for match, target in rules for word in ("-r", f"{match}:={target}")]
-    parameters = ["--params-file", str(process.parameters_file)]
+        command = [str(folder / process.executable), *command]
     child = subprocess.Popen(
-        [*command, "--ros-args", *remaps, *parameters],
+        command,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -122,15 +120,11 @@ def rclpy_has_source_timestamps() -> bool:
 @pytest.mark.parametrize("quality", ["latched", "best_effort"])
 @pytest.mark.parametrize("kind", ["python", "cpp", "typed"])
 def test_messages_come_back_in_the_slot_of_their_mode(
-    tmp_path: Path, plan: Plan, kind: NodeKind, quality: str, request: pytest.FixtureRequest
+    tmp_path: Path, plan: Plan, kind: NodeKind, quality: str, place: Path | None
 ) -> None:
-    workspace = None if kind == "python" else request.getfixturevalue("workspace")
     plan, log = banded(plan), tmp_path / "gate.csv"
-    assert plan.shaping_node is not None
-    process = write_shaping_process(
-        plan, plan.shaping_node, kind, tmp_path, message_type=TYPE, log=log
-    )
-    with started(process, workspace):
+    process = written(plan, kind, tmp_path, log)
+    with started(process, place):
         offered, *messages = exchanged(quality)
     assert offered["type"] == TYPE
     assert (offered["reliability"], offered["durability"]) == (
@@ -163,17 +157,13 @@ def test_messages_come_back_in_the_slot_of_their_mode(
 @pytest.mark.parametrize("messages", ["all-in-order", "newest"])
 @pytest.mark.parametrize("kind", ["python", "cpp", "typed"])
 def test_of_more_than_one_a_cycle_none_is_lost_that_is_not_counted(
-    tmp_path: Path, plan: Plan, kind: NodeKind, messages: str, request: pytest.FixtureRequest
+    tmp_path: Path, plan: Plan, kind: NodeKind, messages: str, place: Path | None
 ) -> None:
-    workspace = None if kind == "python" else request.getfixturevalue("workspace")
     plan = revised(plan, anchor="cycle", messages=messages, overrun="wait")
     log = tmp_path / "gate.csv"
-    assert plan.shaping_node is not None
-    process = write_shaping_process(
-        plan, plan.shaping_node, kind, tmp_path, message_type=TYPE, log=log
-    )
+    process = written(plan, kind, tmp_path, log)
     count = 200
-    with started(process, workspace):
+    with started(process, place):
         exchanged("latched", count, plan.cycle_ns / 1e9 / 8)
     rows = read_gate_log(log)
     assert rows.height == count, "in = out + lost"
@@ -186,15 +176,13 @@ def test_of_more_than_one_a_cycle_none_is_lost_that_is_not_counted(
 
 @pytest.mark.parametrize("kind", ["python", "cpp"])
 def test_a_running_node_is_told_where_cycles_begin(
-    tmp_path: Path, plan: Plan, kind: NodeKind, request: pytest.FixtureRequest
+    tmp_path: Path, plan: Plan, kind: NodeKind, place: Path | None
 ) -> None:
-    workspace = None if kind == "python" else request.getfixturevalue("workspace")
     plan, log = revised(plan, anchor="cycle"), tmp_path / "gate.csv"
-    assert plan.shaping_node is not None
-    process = write_shaping_process(plan, plan.shaping_node, kind, tmp_path, log=log)
+    process = written(plan, kind, tmp_path, log)
     node = f"/{process.name}"
     phase = 12_345_678
-    with started(process, workspace), ThreadPoolExecutor() as beside:
+    with started(process, place), ThreadPoolExecutor() as beside:
         coming = beside.submit(exchanged, "best_effort", 200)
         arguments = (ros_script.__file__, "parameter", "phase_ns", str(phase), "/nobody", node)
         said = run_with_rclpy(own_environment(), *arguments, within_s=30)
@@ -207,25 +195,25 @@ def test_a_running_node_is_told_where_cycles_begin(
 
 @pytest.mark.parametrize("kind", ["python", "cpp"])
 def test_it_stops_while_it_waits_for_its_input(
-    tmp_path: Path, plan: Plan, kind: NodeKind, request: pytest.FixtureRequest
+    tmp_path: Path, plan: Plan, kind: NodeKind, place: Path | None
 ) -> None:
-    workspace = None if kind == "python" else request.getfixturevalue("workspace")
-    assert plan.shaping_node is not None
-    process = write_shaping_process(plan, plan.shaping_node, kind, tmp_path)
-    with started(process, workspace) as child:
+    process = written(plan, kind, tmp_path)
+    with started(process, place) as child:
         assert child.stdout is not None
         for line in child.stdout:
             if "waiting for a publisher of /t3_tmp" in line:
                 break
 
 
-def test_a_typed_node_refuses_another_type(tmp_path: Path, plan: Plan, workspace: Path) -> None:
-    assert plan.shaping_node is not None
-    process = write_shaping_process(plan, plan.shaping_node, "typed", tmp_path, message_type=TYPE)
+@pytest.mark.parametrize("kind", ["typed"])
+def test_a_typed_node_refuses_another_type(
+    tmp_path: Path, plan: Plan, kind: NodeKind, place: Path | None
+) -> None:
+    process = written(plan, kind, tmp_path)
     say = [*("ros2", "topic", "pub", "/t3_tmp", "std_msgs/msg/Header"), "{}"]
     other = subprocess.Popen(say, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
-        with started(process, workspace, exit_code=1) as child:
+        with started(process, place, exit_code=1) as child:
             output, _ = child.communicate(timeout=60)
         assert f"made for {TYPE}, but its input is std_msgs/msg/Header" in output
     finally:
@@ -235,12 +223,11 @@ def test_a_typed_node_refuses_another_type(tmp_path: Path, plan: Plan, workspace
 
 @pytest.mark.parametrize("kind", ["python", "cpp"])
 def test_the_throttler_publishes_once_a_period(
-    tmp_path: Path, kind: Any, request: pytest.FixtureRequest
+    tmp_path: Path, kind: Any, place: Path | None
 ) -> None:
-    workspace = None if kind == "python" else request.getfixturevalue("workspace")
     # Messages come every 50 ms, so that two are there each time.
     process = write_throttler({"/t3_tmp": "/t3"}, 100 * MS, kind, tmp_path)
-    with started(process, workspace) as child:
+    with started(process, place) as child:
         _, *messages = exchanged("latched")
         time.sleep(0.3)
         child.send_signal(signal.SIGINT)

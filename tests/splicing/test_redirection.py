@@ -57,11 +57,8 @@ def test_every_name_that_has_the_topic_gets_the_target(
     assert found == [(place, f"ndt:{match}:=/pose_tmp") for match, place in added.items()]
 
 
-def test_a_node_that_has_another_topic_is_not_redirected() -> None:
+def test_a_node_that_has_another_topic_or_the_target_already_gets_no_rule() -> None:
     assert redirecting(["/pose:=/other"], "/ndt", "/pose", "/pose_tmp") is None
-
-
-def test_what_a_person_has_remapped_to_the_target_counts() -> None:
     assert redirecting(["/pose:=/pose_tmp"], "/ndt", "/pose", "/pose_tmp") == []
 
 
@@ -123,15 +120,6 @@ def test_what_only_a_shell_understands_is_left_alone(command: str) -> None:
     assert words == [command]
 
 
-def test_all_topics_of_a_node_are_redirected() -> None:
-    words = ["n", "--ros-args", "-r", "__node:=ndt", "-r", "o:=/pose", "-r", "i:=/rear"]
-    rear = Redirect("subscription", "/rear", "/rear_throttled", ["/ndt"], ["/throttler"])
-    redirect_command(words, [pose(), rear])
-    rules = [word for word in words if ":=" in word]
-    assert topic_of("o", "/ndt", rules) == "/pose_tmp"
-    assert topic_of("i", "/ndt", rules) == "/rear_throttled"
-
-
 @pytest.mark.parametrize(
     ("name", "namespace", "redirected"),
     [
@@ -177,35 +165,27 @@ UNNAMED = "n --ros-args"
         ([f"{NAMED} -r /pose:=/x"], [], [], "nothing was redirected: /ndt has another topic"),
         ([NAMED], ["/icp"], ["/ndt"], "/icp publishes it past /shaping, /standby"),
         ([NAMED], [], ["/ndt", "/icp"], "more was redirected than meant: /icp publishes /pose_tmp"),
+        ([NAMED, NAMED], [], [], "more was redirected than meant: /ndt was started more than once"),
     ],
 )
-def test_what_was_started_is_held_against_the_graph(
+def test_what_was_started_is_compared_with_the_graph(
     commands: list[str], on_topic: list[str], on_target: list[str], mistake: str | None
 ) -> None:
-    found = started(pose(), *commands).mistake(on_topic, on_target)
+    redirect = started(pose(), *commands)
+    found = redirect.mistake(on_topic, on_target)
     assert (found is None) if mistake is None else (found or "").startswith(mistake), found
+    said = redirect.message(found or "", ["/icp"], [])
+    assert said.startswith(f"/pose: {found or ''}. Publishers found: of /pose /icp; of /pose_tmp n")
 
 
-def test_anybody_may_subscribe_to_a_throttled_topic() -> None:
+def test_any_node_may_subscribe_to_a_throttled_topic() -> None:
     redirect = started(pose("/ndt", "/icp", kind="subscription"), NAMED)
     assert redirect.mistake(["/other"], ["/ndt", "/icp", "/rviz"]) is None
-    assert redirect.mistake(["/icp"], ["/ndt", "/icp"]) == "/icp subscribes to it past " + (
-        "/shaping, /standby"
-    )
+    past = redirect.mistake(["/icp"], ["/ndt", "/icp"])
+    assert past == "/icp subscribes to it past /shaping, /standby"
 
 
-def test_a_node_that_has_ended_is_redirected_no_more() -> None:
-    redirect = started(pose(), NAMED, ended=True)
-    assert (redirect.mistake([], []) or "").startswith("nothing was redirected: no node /ndt runs")
-
-
-def test_a_node_is_redirected_once_unless_it_has_ended() -> None:
-    assert started(pose(), NAMED).twice() is None
-    assert started(pose(), NAMED, NAMED, ended=True).twice() is None
-    twice = "more was redirected than meant: /ndt was started more than once"
-    assert started(pose(), NAMED, NAMED).twice() == twice
-
-
-def test_a_message_names_the_topic_and_who_was_found() -> None:
-    said = pose().message("it failed", ["/icp"], [])
-    assert said.startswith("/pose: it failed. Publishers found: of /pose /icp; of /pose_tmp none.")
+def test_a_node_that_has_ended_is_redirected_no_more_and_may_start_again() -> None:
+    ended = started(pose(), NAMED, ended=True).mistake([], [])
+    assert (ended or "").startswith("nothing was redirected: no node /ndt runs")
+    assert started(pose(), NAMED, NAMED, ended=True).mistake([], []) is None

@@ -5,16 +5,18 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from node_run import NodeRun, running_node, stamped
+from node_run import NodeRun, banded, outputs, running_node, stamped
 from processes import wait_for
 
 from chainshaper.gate.handover import Page, open_page
-from chainshaper.planning import Modes, Plan
+from chainshaper.planning import Plan
 from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log, releases_so_far
 from chainshaper.splicing.shaped_outputs import find_outputs, output_text
@@ -32,12 +34,27 @@ def written(
         plan, plan.shaping_node, "python", folder, log=folder / "gate.csv"
     )
     assert process.standby is not None
-    parameters = process.standby.parameters_file
-    own = f"patience_ns: {max(plan.cycle_ns // 2, 10 * MS)}\n"
-    text = parameters.read_text()
-    assert own in text
-    parameters.write_text(text.replace(own, f"patience_ns: {patience_ns}\n"))
+    before = change(process.standby, patience_ns=patience_ns)
+    assert before["patience_ns"] == max(plan.cycle_ns // 2, 10 * MS)
     return process, process.standby
+
+
+def change(process: ShapingProcess, **parameters: object) -> dict[str, Any]:
+    """Give a process other parameters than the plan's; what it had."""
+    values = yaml.safe_load(process.parameters_file.read_text())["/**"]["ros__parameters"]
+    text = yaml.safe_dump({"/**": {"ros__parameters": values | parameters}})
+    process.parameters_file.write_text(text)
+    return values  # type: ignore[no-any-return]
+
+
+@contextmanager
+def both(
+    process: ShapingProcess, beside: ShapingProcess, folder: Path
+) -> Iterator[tuple[NodeRun, NodeRun]]:
+    """Shaping node and standby at work; the node is in force with a first message, 1."""
+    with running_node(beside, folder) as standby, running_node(process, folder) as shaping:
+        take_over(1, folder, shaping)
+        yield shaping, standby
 
 
 def came(run: NodeRun) -> list[int]:
@@ -51,14 +68,26 @@ def say(number: int, *runs: NodeRun) -> None:
         run.send(payload, 1000 + number)
 
 
+def say_until_shaped(number: int, shaping: NodeRun, standby: NodeRun) -> int:
+    """Messages until the shaping node publishes again; the last one's number."""
+    while not shaping.heard(lambda words: words.get("published") == "/t3", within_s=0.7):
+        number += 1  # a busy machine is late again
+        say(number, shaping, standby)
+    return number
+
+
 def take_over(number: int, folder: Path, shaping: NodeRun) -> None:
     """Give a message to a shaping node, which comes into force with it."""
     say(number, shaping)
     wait_for(lambda: outputs(folder)[0].shaping_node == shaping.process.pid, "it to be in force")
 
 
-def outputs(folder: Path) -> Any:
-    return find_outputs(iter([str(folder / "outputs"), str(folder / "chainshaper" / "outputs")]))
+def diagnosed(standby: NodeRun) -> tuple[int, str]:
+    """The state of the output, as the standby publishes it."""
+    standby.tell(tick=1)
+    report = standby.hear(lambda words: "diagnostics" in words)
+    assert report["diagnostics"] == "chainshaper: /t3"
+    return report["level"], report["message"]
 
 
 def test_what_a_killed_node_had_in_hand_goes_around_it_until_it_is_back(
@@ -72,10 +101,8 @@ def test_what_a_killed_node_had_in_hand_goes_around_it_until_it_is_back(
             shaping.hear_published()
             (output,) = outputs(tmp_path)
             assert (output.topic, output.state) == ("/t3", "shaped")
-            assert (output.shaping_node, output.standby) == (
-                shaping.process.pid,
-                standby.process.pid,
-            )
+            pids = (shaping.process.pid, standby.process.pid)
+            assert (output.shaping_node, output.standby) == pids
             say(2, shaping, standby)
             time.sleep(0.005)  # the node holds it for 21 ms
             shaping.process.kill()
@@ -86,45 +113,26 @@ def test_what_a_killed_node_had_in_hand_goes_around_it_until_it_is_back(
         (output,) = outputs(tmp_path)
         assert (output.state, output.shaping_node) == ("bypassed", None)
         assert "/t3 is bypassed for " in output_text(output)
-        standby.tell(tick=1)
-        report = standby.hear(lambda words: "diagnostics" in words)
-        assert (report["diagnostics"], report["level"]) == ("chainshaper: /t3", 1)
-        assert report["message"].endswith("2 messages")
+        level, text = diagnosed(standby)
+        assert (level, text.endswith("2 messages")) == (1, True)
         with running_node(process, tmp_path) as again:
             take_over(3, tmp_path, again)
-            say(4, again, standby)
-            again.hear_published()
-            say(5, again, standby)
-            again.hear_published()
-            standby.tell(tick=2)
-            report = standby.hear(lambda words: "diagnostics" in words)
-            assert (report["level"], report["message"]) == (0, "shaped")
+            for number in (4, 5):
+                say(number, again, standby)
+                again.hear_published()
+            assert diagnosed(standby) == (0, "shaped")
             again.end()
         standby.end()
     assert (came(shaping), came(standby), came(again)) == ([1], [2, 3], [4, 5])
     assert "chainshaper_t3 is not there: /t3: messages go around it" in standby.logged
     assert any("is back after " in text and "2 messages came" in text for text in standby.logged)
-    gate = read_gate_log(tmp_path / "gate.csv")
+    logs = [tmp_path / "gate.csv", tmp_path / "chainshaper_t3_standby.csv"]
+    gate, bypass = map(read_gate_log, logs)
     assert gate["source_timestamp"].to_list() == [1001, 1004, 1005]
-    bypass = read_gate_log(tmp_path / "chainshaper_t3_standby.csv")
     assert bypass["source_timestamp"].to_list() == [1002, 1003]
     assert bypass["overrun"].to_list() == ["bypass"] * 2
-    logs = [tmp_path / "gate.csv", tmp_path / "chainshaper_t3_standby.csv"]
-    assert releases_so_far(logs).size == gate.height, "the others left in no slot"
     assert (bypass["published"] >= bypass["release"]).all()
-
-
-def change(process: ShapingProcess, **parameters: object) -> None:
-    """Other parameters than the plan's."""
-    values = yaml.safe_load(process.parameters_file.read_text())
-    values["/**"]["ros__parameters"] |= parameters
-    process.parameters_file.write_text(yaml.safe_dump(values))
-
-
-def dealt_with(folder: Path) -> int:
-    """How many messages the shaping node has published or dropped."""
-    (output,) = outputs(folder)
-    return Page(*output.page.rsplit("/", 1))["released"]
+    assert releases_so_far(logs).size == gate.height, "the others left in no slot"
 
 
 @pytest.mark.parametrize(
@@ -140,13 +148,18 @@ def test_what_waits_in_a_killed_node_goes_around_it_but_not_what_it_has_dropped(
     timing = {"cycle_ns": 60_000 * MS, "slots_ns": slot, "anchor": "cycle"}
     phase = (time.monotonic_ns() - 1000 * MS) % (60_000 * MS)
     change(process, **{**timing, "phase_ns": phase, "overrun": "wait", **changes})
-    with running_node(beside, tmp_path) as standby, running_node(process, tmp_path) as shaping:
-        take_over(1, tmp_path, shaping)
+
+    def dealt_with() -> int:
+        (output,) = outputs(tmp_path)
+        place, name = output.page.rsplit("/", 1)
+        return Page(place, name)["released"]
+
+    with both(process, beside, tmp_path) as (shaping, standby):
         say(1, standby)
         for number in range(2, 9):
             say(number, shaping, standby)
-        wait_for(lambda: dealt_with(tmp_path) == dropped, f"{dropped} to be dropped")
-        time.sleep(0.2)  # the node takes what has come, every 50 ms
+        wait_for(lambda: dealt_with() == dropped, f"{dropped} to be dropped")
+        time.sleep(0.1)  # the node takes what has come, every 50 ms
         shaping.process.kill()
         say(9, standby)
         for _ in range(dropped + 1, 10):
@@ -159,9 +172,8 @@ def test_what_a_stopped_node_finds_when_it_goes_on_is_neither_doubled_nor_counte
     tmp_path: Path, plan: Plan
 ) -> None:
     process, beside = written(plan, tmp_path, patience_ns=300 * MS)
-    change(process, depth=3, cycle_ns=1000 * MS, slots_ns=[500 * MS, 700 * MS])
-    with running_node(beside, tmp_path) as standby, running_node(process, tmp_path) as shaping:
-        take_over(1, tmp_path, shaping)
+    change(process, depth=3, cycle_ns=600 * MS, slots_ns=[300 * MS, 450 * MS])
+    with both(process, beside, tmp_path) as (shaping, standby):
         shaping.process.send_signal(signal.SIGSTOP)  # while it waits for the slot
         say(1, standby)
         for number in range(2, 9):
@@ -169,15 +181,13 @@ def test_what_a_stopped_node_finds_when_it_goes_on_is_neither_doubled_nor_counte
         for _ in range(1, 9):
             standby.hear_published()
         shaping.process.send_signal(signal.SIGCONT)
-        number = 8
-        while not shaping.heard(lambda words: words.get("published") == "/t3", within_s=0.9):
-            number += 1
-            say(number, shaping, standby)
+        number = say_until_shaped(8, shaping, standby)
         shaping.end()
         standby.end()
     assert came(standby)[:8] == list(range(1, 9))
     assert sorted(came(shaping) + came(standby)) == list(range(1, number + 1))
     assert read_gate_log(tmp_path / "gate.csv")["dropped"].to_list() == [None] * len(came(shaping))
+    assert any("it hangs, or was stopped" in text for text in standby.logged)
 
 
 def test_with_the_fallback_silence_nothing_is_published_and_all_is_counted(
@@ -191,9 +201,8 @@ def test_with_the_fallback_silence_nothing_is_published_and_all_is_counted(
         (output,) = outputs(tmp_path)
         assert output.state == "silent"
         assert "3 messages were not published" in output_text(output)
-        standby.tell(tick=1)
-        report = standby.hear(lambda words: "diagnostics" in words)
-        assert (report["level"], report["message"].partition(" ")[0]) == (2, "silent")
+        level, text = diagnosed(standby)
+        assert (level, text.partition(" ")[0]) == (2, "silent")
         standby.end()
     assert not [words for words in standby.said if "publisher" in words and "t3" in str(words)]
     assert came(standby) == []
@@ -202,47 +211,18 @@ def test_with_the_fallback_silence_nothing_is_published_and_all_is_counted(
     assert log["release"].null_count() == 3
 
 
-def test_a_node_that_is_stopped_is_gone_around(tmp_path: Path, plan: Plan) -> None:
-    process, beside = written(plan, tmp_path, patience_ns=500 * MS)
-    with running_node(beside, tmp_path) as standby, running_node(process, tmp_path) as shaping:
-        take_over(1, tmp_path, shaping)
-        say(1, standby)
-        shaping.hear_published()
-        shaping.process.send_signal(signal.SIGSTOP)
-        for number in (2, 3):
-            say(number, shaping, standby)
-            standby.hear_published()
-        shaping.process.send_signal(signal.SIGCONT)
-        number = 3
-        while not shaping.heard(lambda words: words.get("published") == "/t3", within_s=0.6):
-            number += 1  # a busy machine is late again
-            say(number, shaping, standby)
-        shaping.end()
-        standby.end()
-    assert came(standby)[:2] == [2, 3]
-    assert sorted(came(shaping) + came(standby)) == list(range(1, number + 1))
-    assert any("it hangs, or was stopped" in text for text in standby.logged)
-
-
 def test_a_node_that_starts_again_goes_on_in_its_cycle_and_mode(tmp_path: Path, plan: Plan) -> None:
-    slots = ((15 * MS, 25 * MS), (30 * MS, 45 * MS))
-    servers = tuple(
-        server.model_copy(update={"slots": slots}) if server.name == "output" else server
-        for server in plan.servers
-    )
-    modes = Modes(topic="/mode", default="city", bands={"city": 2, "highway": 1}, late="next-slot")
-    plan = revised(plan, servers=servers, modes=modes, anchor="cycle")
-    process, _ = written(plan, tmp_path)
-    for announced in (True, False):
+    process, _ = written(banded(revised(plan, anchor="cycle")), tmp_path)
+    for run_number in (1, 2):
         with running_node(process, tmp_path) as run:
-            if announced:
+            if run_number == 1:
                 run.tell(set=["phase_ns", 13 * MS])
                 run.tell(topic="/mode", data="highway")
-                time.sleep(0.15)  # it is in force from the next cycle on
-            say(int(announced), run)
+                time.sleep(0.1)  # it is in force from the next cycle on
+            say(run_number, run)
             run.hear_published()
-            seen = 2 - int(announced)
-            wait_for(lambda: read_gate_log(tmp_path / "gate.csv").height == seen, "its log")  # noqa: B023
+            rows = tmp_path / "gate.csv"
+            wait_for(lambda: read_gate_log(rows).height == run_number, "its log")  # noqa: B023
             run.process.kill()
     log = read_gate_log(tmp_path / "gate.csv")
     assert [origin % (50 * MS) for origin in log["origin"]] == [13 * MS] * log.height
@@ -253,10 +233,9 @@ def test_a_node_that_fails_at_once_waits_longer_each_time_and_says_so(
     tmp_path: Path, plan: Plan
 ) -> None:
     process, _ = written(plan, tmp_path)
-    text = process.parameters_file.read_text()
     for failed in range(4):
         if failed == 2:  # for another reason
-            process.parameters_file.write_text(text.replace("cycle_ns: 50000000", "cycle_ns: 5"))
+            change(process, cycle_ns=5)
         unknown = {"/t3_tmp": [{"type": "no/msg/T", "qos": {}}]}
         with running_node(process, tmp_path, unknown, spinning=False) as run:
             assert run.end() == 1
@@ -273,24 +252,20 @@ def test_without_a_folder_the_node_works_alone_and_the_standby_says_that_it_cann
         script = Path(one.command[1])
         text = script.read_text().replace("/dev/shm/chainshaper-", f"{tmp_path}/no/such/folder-")
         script.write_text(text)
-    (tmp_path / "outputs").touch()
-    (tmp_path / "chainshaper").touch()
-    (tmp_path / "no").touch()
+    for name in ("outputs", "chainshaper", "no"):
+        (tmp_path / name).touch()
     with running_node(beside, tmp_path, spinning=False) as standby:
         standby.hear(lambda words: "/t3 falls silent when" in words.get("log", ""))
         with running_node(process, tmp_path) as shaping:
             say(1, shaping)
             shaping.hear_published()
             assert any("nothing can be agreed" in text for text in shaping.logged)
-        wait_for(lambda: standby.process.poll() is None, "the standby to be there")
-        standby.process.kill()
+        assert standby.process.poll() is None, "it is there"
 
 
 def test_the_standby_leaves_the_cores_of_servers_alone(tmp_path: Path, plan: Plan) -> None:
     _, beside = written(plan, tmp_path)
     servers = {server.core for server in plan.servers}
-    parameters = yaml.safe_load(beside.parameters_file.read_text())["/**"]["ros__parameters"]
-    assert set(parameters["server_cores"]) == servers
     with running_node(beside, tmp_path) as standby:
         say(1, standby)
         standby.hear_published()
@@ -305,14 +280,14 @@ def test_pages_of_others_are_looked_at_without_trust(
     folder = tmp_path / "outputs"
     monkeypatch.setattr("chainshaper.gate.handover.page_folders", lambda: iter([str(folder)]))
     good, bad = open_page("good", "/t5"), open_page("bad", "/t5\x1b[31m")
-    assert find_outputs(iter([str(folder)])) == (), "none of their processes lives"
+    assert find_outputs([str(folder)]) == (), "none of their processes lives"
     for page in (good, bad):
         assert page.lock()
         page["holder"] = os.getpid()
     (folder / "short").write_bytes(b"x")
     (folder / "link").symlink_to(good.path)
     os.mkfifo(folder / "fifo")
-    (output,) = find_outputs(iter([str(folder), str(tmp_path / "missing")]))
+    (output,) = find_outputs([str(folder), str(tmp_path / "missing")])
     assert (output.topic, output.state) == ("/t5", "no standby")
     assert "it falls silent when that ends" in output_text(output)
 
@@ -325,17 +300,12 @@ def test_a_program_is_started_again_until_it_is_to_end(tmp_path: Path, plan: Pla
     command = [sys.executable, str(tmp_path / "respawning.py"), "child.py", "--ros-args"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as run:
         assert run.stdout is not None
-        first = _started(run.stdout.readline())
-        os.kill(first, signal.SIGKILL)
-        second = _started(run.stdout.readline())
+        first, argument = run.stdout.readline().split()
+        assert argument == "--ros-args"
+        os.kill(int(first), signal.SIGKILL)
+        second = run.stdout.readline().split()[0]
         assert second != first
         run.send_signal(signal.SIGINT)
         assert run.wait(20) != 0
     with pytest.raises(ProcessLookupError):
-        os.kill(second, 0)
-
-
-def _started(line: str) -> int:
-    pid, argument = line.split()
-    assert argument == "--ros-args"
-    return int(pid)
+        os.kill(int(second), 0)

@@ -259,7 +259,7 @@ def splice(
     first, then record and plan, and splice the plan into its launch file. Launch the file that it
     names, with your launch arguments; your launch files stay as they are.
     """
-    from chainshaper.splicing.generated_package import build_package, check_build_tools
+    from chainshaper.splicing.shaping_process import build_package, check_build_tools
     from chainshaper.splicing.spliced_launch import NODES
 
     if undo:

@@ -4,15 +4,15 @@
     record                   profile    plan         splice     apply,
                                                                 recorded
 
-Each step is what the verb of its name does, and leaves its result in the folder: any of them can
-be looked at, and repeated by hand. The first, short recording tells which chains there are and
-which nodes a chain has; the second measures it under the paper's profiling condition (section 2.4),
-as far as that is permitted.
+Each step is what the verb of its name does, and leaves its result in the folder. The first, short
+recording tells which chains there are and which nodes a chain has; the second measures it under the
+paper's profiling condition (section 2.4), as far as that is permitted.
 """
 
 import sys
 import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,23 +25,19 @@ from chainshaper.flow.exploration import list_chains
 from chainshaper.flow.launch_splicing import Splicing, splice_launch_files
 from chainshaper.flow.plan import plan_recording
 from chainshaper.flow.profiling import chain_nodes, profiling_condition
-from chainshaper.flow.record import Scheduling, record_command
+from chainshaper.flow.record import record_command
 from chainshaper.linux.processes import Process, run_users
 from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.planning import Plan, PlanRequest, save_plan
 from chainshaper.reporting.figures import write_comparison
-from chainshaper.splicing.generated_package import build_package, check_build_tools
-from chainshaper.splicing.shaping_process import NodeKind
+from chainshaper.splicing.shaping_process import NodeKind, build_package, check_build_tools
 from chainshaper.splicing.spliced_launch import NODES, LaunchCommand, parse_launch_command
 from chainshaper.values.application import ApplicationGraph
-from chainshaper.values.errors import ChainshaperError, InputError, OperationError
+from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording, refuse_existing
 from chainshaper.verify.measure import Comparison, compare_recordings
 
-__all__ = ["ShapedLaunch", "shape_launch"]
-
-FIRST_LOOK_NS = 10_000_000_000
-"""How long the first recording takes: long enough for everything to have started and run."""
+FIRST_LOOK_NS = 10_000_000_000  # long enough for everything to have started and run
 
 Choose: TypeAlias = Callable[[ApplicationGraph, ChainEnumeration], str]
 """Asked which of the chains that were found is meant."""
@@ -115,45 +111,36 @@ def shape_launch(
 
     first = record("first", command, FIRST_LOOK_NS)
     chain = _chain(first, chain, choose)
-    before = record(
-        "before",
-        command,
-        duration_ns,
-        chain=chain,
-        watch_stalls=True,
-        scheduling=_profiled(first, chain),
-    )
+    permitted = may_use_fifo()  # else it is measured under ordinary scheduling
+    profiled = profiling_condition(chain_nodes(first, chain), like=first) if permitted else None
+    measured: dict[str, Any] = {"chain": chain, "watch_stalls": True}
+    before = record("before", command, duration_ns, scheduling=profiled, **measured)
     progress(0.0, "planning")
     plan = plan_recording(before, chain, request or PlanRequest())
     save_plan(plan, folder / "plan.yaml")
     planned(plan)
-    splicing = _spliced(plan, launch, folder / "launch", node, first)
+    splicing = splice_launch_files(
+        *(plan, [launch.file], folder / "launch"),
+        node=node,
+        arguments=launch.arguments,
+        recording=first,
+    )
     after = record(
         "after",
         _with_shaping_node(launch, splicing),
         duration_ns,
-        chain=chain,
-        watch_stalls=True,
         scheduling=_in_force(plan, back_end, first, taken),
         plan=plan,
         gate_logs=splicing.logs,
+        **measured,
     )
     progress(0.0, "comparing")
     comparison = compare_recordings([before, after], chain)
     write_comparison(comparison, folder)
-    found = [
-        *before.info.notes,
-        *splicing.notes,
-        *after.info.notes,
-    ]
-    if not may_use_fifo():
+    found = [*before.info.notes, *splicing.notes, *after.info.notes]
+    if not permitted:
         found.insert(0, "measured under ordinary scheduling: SCHED_FIFO is not permitted.")
     return ShapedLaunch(folder, chain, plan, splicing, comparison, tuple(dict.fromkeys(found)))
-
-
-def _profiled(first: Recording, chain: str) -> Scheduling | None:
-    """The paper's profiling condition, if we may."""
-    return profiling_condition(chain_nodes(first, chain), like=first) if may_use_fifo() else None
 
 
 def _chain(first: Recording, chain: str | None, choose: Choose | None) -> str:
@@ -174,19 +161,6 @@ def _chain(first: Recording, chain: str | None, choose: Choose | None) -> str:
     return choose(graph_of(flow), found)
 
 
-def _spliced(
-    plan: Plan, launch: LaunchCommand, folder: Path, node: NodeKind, recording: Recording
-) -> Splicing:
-    return splice_launch_files(
-        plan,
-        [launch.file],
-        folder,
-        node=node,
-        arguments=launch.arguments,
-        recording=recording,
-    )
-
-
 def _with_shaping_node(launch: LaunchCommand, splicing: Splicing) -> list[str]:
     """The command that launches both, in the environment that the shaping node needs."""
     words = launch.with_file(next(iter(splicing.launch.values())))
@@ -204,40 +178,30 @@ def _in_force(
 
     A thread of its own does what `chainshaper apply` does, until the context ends.
     """
-    stop, ended = threading.Event(), threading.Event()
-    states: list[RunState] = []
-    failures: list[ChainshaperError] = []
+    stop, states = threading.Event(), list[RunState]()
+    with ThreadPoolExecutor(1, "apply") as beside:
+        applied = beside.submit(
+            apply_plan,
+            plan,
+            back_end=back_end,
+            recording=recording,
+            wait_ns=START_NS,
+            users=users,
+            stop=stop,
+            watch=states.append,
+        )
 
-    def apply() -> None:
+        def opened(_: Sequence[Process]) -> bool:
+            if applied.done():
+                applied.result()  # raises what it failed with
+                raise OperationError("the plan was released meanwhile")
+            if not states:
+                return False
+            ours = [one for one in states[-1].servers if one.kept_by == states[-1].back_end]
+            return all(server.counters.slots for server in ours)
+
         try:
-            apply_plan(
-                plan,
-                back_end=back_end,
-                recording=recording,
-                wait_ns=START_NS,
-                users=users,
-                stop=stop,
-                watch=states.append,
-            )
-        except ChainshaperError as error:
-            failures.append(error)
+            yield opened
         finally:
-            ended.set()
-
-    def opened(_: Sequence[Process]) -> bool:
-        if ended.is_set():
-            raise failures[0] if failures else OperationError("the plan was released meanwhile")
-        if not states:
-            return False
-        kept = [one for one in states[-1].servers if one.kept_by == states[-1].back_end]
-        return all(server.counters.slots for server in kept)
-
-    thread = threading.Thread(target=apply, name="apply")
-    thread.start()
-    try:
-        yield opened
-    finally:
-        stop.set()
-        thread.join()
-    if failures:
-        raise failures[0]
+            stop.set()
+    applied.result()

@@ -1,8 +1,8 @@
 """Splicing nodes into launch files: the paper's Republisher Editor and Throttler (4.2, 5.1).
 
-The functions behind `chainshaper splice`. Nothing of the user's is edited, copied or parsed: a
-launch file is written that includes the user's, starts our nodes, and redirects a topic where
-`ros2 launch` starts the node that has it (:mod:`chainshaper.splicing.redirection`).
+Nothing of the user's is edited, copied or parsed: a launch file is written that includes the
+user's, starts our nodes, and redirects a topic where `ros2 launch` starts the node that has it
+(:mod:`chainshaper.splicing.redirection`).
 
 A shaping node stands behind an output: its publisher is redirected, and subscribers notice nothing.
 A throttler stands before an input: its subscribers are redirected, because what publishes it, a
@@ -44,47 +44,29 @@ from chainshaper.values.plan_choices import Fallback
 from chainshaper.values.yaml_file import FullName, Part, PositiveDuration
 
 if TYPE_CHECKING:
-    from chainshaper.values.application import ApplicationGraph
     from chainshaper.values.recording import Recording
 
-__all__ = [
-    "Splicing",
-    "ThrottledInput",
-    "splice_launch_files",
-    "splice_throttlers",
-    "undo_splice",
-]
-
 THROTTLER = "chainshaper_throttler"
-THROTTLER_PRIORITY = 85
-"""Of SCHED_FIFO, until `apply` puts it into its server: it is to wake in time from the start."""
+THROTTLER_PRIORITY = 85  # of SCHED_FIFO, until `apply` puts it into its server
+DRY_RUN_S = 120.0  # how long a dry run may take
 
-DRY_RUN_S = 120.0
-"""How long a dry run may take."""
-
+_Names: TypeAlias = Mapping[str, Sequence[str]]
 _Written: TypeAlias = tuple[list[ShapingProcess], list[Redirect]]
 
 
 @dataclass(frozen=True)
 class Splicing:
-    """What was spliced.
-
-    ``launch`` maps each launch file (or the executable of `ros2 run`) to the one to launch instead,
-    ``originals`` that one to the first that it includes. ``processes`` are the nodes that were
-    added, ``logs`` where shaping nodes and their standbys note what they did. ``redirects`` are the
-    nodes that get another topic, ``redirected`` what a dry run found of each. ``diff`` is the new
-    launch file as a unified diff, ``notes`` what to know before relying on it.
-    """
+    """What was spliced."""
 
     folder: Path
-    launch: Mapping[Path, Path]
-    originals: Mapping[Path, Path]
-    processes: tuple[ShapingProcess, ...]
-    logs: tuple[Path, ...]
-    diff: str
-    notes: tuple[str, ...]
-    redirects: tuple[Redirect, ...]
-    redirected: tuple[Mapping[str, Any], ...] = ()
+    launch: Mapping[Path, Path]  # each launch file, or executable: the one to launch instead
+    originals: Mapping[Path, Path]  # that one: the first that it includes
+    processes: tuple[ShapingProcess, ...]  # that were added
+    logs: tuple[Path, ...]  # of shaping nodes and their standbys
+    diff: str  # the new launch file as a unified diff
+    notes: tuple[str, ...]  # what to know before relying on it
+    redirects: tuple[Redirect, ...]  # nodes that get another topic
+    redirected: tuple[Mapping[str, Any], ...] = ()  # what a dry run found of each
 
 
 class ThrottledInput(Part):
@@ -131,28 +113,31 @@ def splice_launch_files(
             " `chainshaper plan REC --chain FIRST..LAST -o plan.yaml`"
         )
     folder = usable(Path(output))
-    graph = None if recording is None else _graph(recording)
+    publishers = _endpoints(recording, "publisher")
     nodes = (plan.shaping_node, *plan.further_shaping_nodes)
-    publishers = {one.name: _publisher(plan, one, graph) for one in nodes}
+    redirects = [
+        Redirect(
+            *("publisher", one.output, one.input, (_publisher(plan, one, publishers),)),
+            added=(f"/{one.name}", f"/{one.name}{STANDBY}"),
+        )
+        for one in nodes
+    ]
     plan = plan if fallback is None else revised(plan, fallback=fallback)
+    seen = () if recording is None else recording.info.endpoints
+    types = {one.topic: one.type for one in reversed(seen) if one.type}
     logs = {one.name: folder / LOGS / f"{one.name}.csv" for one in nodes}
 
-    def written(place: Path) -> _Written:
+    def written(into: Path) -> _Written:
         made = [
             write_shaping_process(
-                *(plan, one, node, place),
-                message_type=message_type or _type_of(one.output, recording),
+                *(plan, one, node, folder / NODES),
+                message_type=message_type or types.get(one.output),
                 log=logs[one.name],
+                into=into,
             )
             for one in nodes
         ]
-        return made, [
-            Redirect(
-                *("publisher", one.output, one.input, (publishers[one.name],)),
-                added=(f"/{one.name}", f"/{one.name}{STANDBY}"),
-            )
-            for one in nodes
-        ]
+        return made, redirects
 
     dry = dict(arguments or {}) if dry_run else None
     spliced = _spliced(launch_files, folder, written, throttled=False, dry=dry)
@@ -185,20 +170,26 @@ def splice_throttlers(
     if not inputs:
         raise InputError("no input to throttle: name one, such as /points_raw=100ms")
     folder = usable(Path(output))
-    graph = None if recording is None else _graph(recording)
+    subscribers = _endpoints(recording, "subscription")
     by_period: dict[int, dict[str, tuple[str, ...]]] = {}
     for one in inputs:
         topics = by_period.setdefault(one.period_ns, {})
-        nodes = (*topics.get(one.topic, ()), *_subscribers(one, graph))
+        nodes = (*topics.get(one.topic, ()), *_subscribers(one, subscribers))
         topics[one.topic] = tuple(dict.fromkeys(nodes))
 
-    def written(place: Path) -> _Written:
+    def written(into: Path) -> _Written:
         made, redirects = [], []
         for number, (period_ns, topics) in enumerate(by_period.items(), start=1):
             name = THROTTLER if number == 1 else f"{THROTTLER}_{number}"
             targets = {topic: f"{topic}_throttled" for topic in topics}
-            how: dict[str, Any] = {"name": name, "fifo_priority": THROTTLER_PRIORITY}
-            made.append(write_throttler(targets, period_ns, node, place, **how))
+            made.append(
+                write_throttler(
+                    *(targets, period_ns, node, folder / NODES),
+                    name=name,
+                    fifo_priority=THROTTLER_PRIORITY,
+                    into=into,
+                )
+            )
             redirects += [
                 Redirect("subscription", topic, targets[topic], nodes, (f"/{name}",))
                 for topic, nodes in topics.items()
@@ -229,7 +220,7 @@ def _spliced(
 ) -> Splicing:
     """The folder, or with launch arguments for a ``dry`` run none.
 
-    ``written`` writes our nodes into one, and says what is redirected to them.
+    ``written`` writes our nodes, and says what is redirected to them.
     """
     given = [str(word) for word in launch_files]
     words = original_words(given, throttled=not throttled)
@@ -239,12 +230,11 @@ def _spliced(
     if dry is not None:
         with tempfile.TemporaryDirectory() as nowhere:
             made, redirects = written(Path(nowhere))
-            text = launch_text(words, made, redirects)
+        text = launch_text(words, made, redirects)
         found = _tried(words, redirects, dry)
     else:
         with new_folder(folder, {name: words}, throttled=throttled) as partial:
             made, redirects = written(partial / NODES)
-            made = [_moved(one, partial, folder) for one in made]
             text = launch_text(words, made, redirects)
             (partial / name).write_text(text, encoding="utf-8")
     diff = difflib.unified_diff([], text.splitlines(keepends=True), "/dev/null", str(copy))
@@ -290,67 +280,49 @@ def _tried(
     return found
 
 
-def _subscribers(one: ThrottledInput, graph: "ApplicationGraph | None") -> list[str]:
-    nodes = [one.subscriber] if one.subscriber else []
-    if not nodes and graph is not None:
-        nodes = sorted(graph.subscribers.get(one.topic, ()))
-        if not nodes:
-            raise InputError(
-                f"no node subscribes to {one.topic} in the recording; to these topics nodes do:"
-                f" {', '.join(sorted(graph.subscribers)) or 'nothing'}"
-            )
-    if not nodes:
+def _endpoints(recording: "Recording | None", kind: str) -> _Names | None:
+    """Who publishes or subscribes what: events tell, and discovery about those not in use."""
+    if recording is None:
+        return None
+    from chainshaper.analysis.graph import application_graph
+
+    graph = application_graph(recording.events)
+    found = graph.publishers if kind == "publisher" else graph.subscribers
+    nodes = {topic: list(names) for topic, names in found.items()}
+    for one in recording.info.endpoints:
+        if one.kind == kind and one.node not in nodes.setdefault(one.topic, []):
+            nodes[one.topic].append(one.node)
+    return nodes
+
+
+def _subscribers(one: ThrottledInput, known: _Names | None) -> Sequence[str]:
+    if one.subscriber:
+        return [one.subscriber]
+    if known is None:
         raise InputError(
             f"who subscribes to {one.topic} is not known: name a recording of the application with"
             f" --recording REC, or the node with --throttle NODE:{one.topic}=PERIOD"
         )
-    return nodes
+    if not known.get(one.topic):
+        raise InputError(
+            f"no node subscribes to {one.topic} in the recording; to these topics nodes do:"
+            f" {', '.join(sorted(known)) or 'nothing'}"
+        )
+    return sorted(known[one.topic])
 
 
-def _graph(recording: "Recording") -> "ApplicationGraph":
-    """Who publishes and subscribes what: events tell, and discovery about those not in use."""
-    from chainshaper.analysis.graph import application_graph
-
-    graph = application_graph(recording.events)
-    named: dict[str, dict[str, tuple[str, ...]]] = {
-        "publisher": dict(graph.publishers),
-        "subscription": dict(graph.subscribers),
-    }
-    for one in recording.info.endpoints:
-        known = named[one.kind].get(one.topic, ())
-        named[one.kind][one.topic] = tuple(dict.fromkeys((*known, one.node)))
-    return replace(graph, publishers=named["publisher"], subscribers=named["subscription"])
-
-
-def _publisher(plan: Plan, node: ShapingNode, graph: "ApplicationGraph | None") -> str:
-    names = () if graph is None else graph.publishers.get(node.output, ())
-    names = tuple(name for name in names if name != f"/{node.name}{STANDBY}")
+def _publisher(plan: Plan, node: ShapingNode, known: _Names | None) -> str:
+    standby = f"/{node.name}{STANDBY}"
+    names = [name for name in (known or {}).get(node.output, ()) if name != standby]
     if len(names) > 1:
         raise InputError(
             f"{node.output} has {len(names)} publishers, {', '.join(sorted(names))}: a shaping node"
             " stands behind one, so plan for a topic that has one"
         )
-    known = plan.chain.publisher if node is plan.shaping_node else node.publisher
-    if known is not None:
-        return known
-    if not names:
+    planned = plan.chain.publisher if node is plan.shaping_node else node.publisher
+    if planned is None and not names:
         raise InputError(
             f"the plan does not say who publishes {node.output}: name a recording of the"
             " application with --recording REC"
         )
-    return names[0]
-
-
-def _type_of(topic: str, recording: "Recording | None") -> str | None:
-    endpoints = () if recording is None else recording.info.endpoints
-    return next((one.type for one in endpoints if one.topic == topic and one.type), None)
-
-
-def _moved(process: ShapingProcess, here: Path, there: Path) -> ShapingProcess:
-    """The same process once its folder stands where it belongs."""
-    command = process.command and tuple(
-        word.replace(str(here), str(there), 1) for word in process.command
-    )
-    parameters = there / process.parameters_file.relative_to(here)
-    standby = process.standby and _moved(process.standby, here, there)
-    return replace(process, command=command, parameters_file=parameters, standby=standby)
+    return planned or names[0]

@@ -1,24 +1,44 @@
 """A core that is clear of other work while an output is delivered there.
 
-DDS threads that receive outrank everything else on their core, but that does not help them at once:
-unless the kernel is fully preemptible, an ordinary thread that is inside a system call goes on
-until it is through with it, and a core that idles has to wake up first. So a thread of the lowest
-real-time priority watches the clock there, from somewhat before a release until the output is
-delivered. Ordinary threads do not run meanwhile, and receiving ones preempt it within microseconds.
-
-That thread is a process of its own: within one of Python it would hold up the gate.
+DDS threads that receive outrank everything else on their core, but unless the kernel is fully
+preemptible, an ordinary thread that is inside a system call goes on until it is through with it,
+and a core that idles has to wake up first. So a thread of the lowest real-time priority watches the
+clock there, from somewhat before a release until the output is delivered: ordinary threads do not
+run meanwhile, and receiving ones preempt it within microseconds. It is a process of its own, since
+within one of Python it would hold up the gate.
 """
 
 import inspect
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import suppress
+from typing import Any
+
+
+def started_beside(
+    function: Callable[..., None], *arguments: Any
+) -> tuple["subprocess.Popen[bytes]", int]:
+    """A process that has this function only, and a pipe to its standard input.
+
+    It imports what it needs itself. It hears no Ctrl-C, and ends with who has the pipe.
+    """
+    program = f"{inspect.getsource(function)}\n{function.__name__}{arguments!r}"
+    reading, writing = os.pipe()
+    process = subprocess.Popen(
+        [sys.executable, "-I", "-S", "-c", program],
+        stdin=reading,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    os.close(reading)
+    return process, writing
 
 
 def _clear(core: int) -> None:
     """Clear a core until the times (ns of CLOCK_MONOTONIC) that come on standard input."""
-    import os  # this function is all that its process has
+    import os
     import time
 
     os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
@@ -30,26 +50,11 @@ def _clear(core: int) -> None:
 
 
 class ClearCore:
-    """A process that clears a core. It ends with the one that made it, and hears no Ctrl-C.
-
-    Where SCHED_FIFO or the core is refused, it clears none.
-    """
+    """A process that clears a core; none where SCHED_FIFO or the core is refused."""
 
     def __init__(self, core: int) -> None:
-        program = f"{inspect.getsource(_clear)}\n_clear({core})"
-        times, self._times = os.pipe()
-        self._process = subprocess.Popen(
-            [sys.executable, "-I", "-S", "-c", program],
-            stdin=times,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
-        os.close(times)
-
-    @property
-    def pid(self) -> int:
-        """The id of its process."""
-        return self._process.pid
+        self._process, self._times = started_beside(_clear, core)
+        self.pid = self._process.pid
 
     def clear_until(self, time_ns: int) -> None:
         """Clear the core from now until then."""

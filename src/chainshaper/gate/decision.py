@@ -1,47 +1,23 @@
 """The gate: when may a message of the chain's output leave?
 
-A latency-shaping node receives the chain's output early, late or somewhere between, and lets it
-go only inside the publish slots of its server R_m° (paper, sections 3.2.2 and 3.3). The gate
-*is* that server: holding back one's own publication takes no kernel support.
+A latency-shaping node lets its messages go only inside the publish slots of its server R_m° (paper,
+sections 3.2.2 and 3.3): the gate *is* that server. Slots repeat every cycle, counted from an
+**anchor**: the ``stamp`` of the message (its first field is a ``std_msgs/Header``), or ``phase_ns``
+of CLOCK_MONOTONIC and every ``cycle`` thereafter.
 
-Slots repeat every cycle and are counted from an **anchor**, the instant at which a cycle starts:
+An early message waits for its slot; one inside a slot leaves at once. One behind the last slot it
+was due in is an **overrun** (section 6): ``wait`` for a slot of a later cycle, ``discard`` it, or
+``publish`` it at once. Under logical execution time a message is due in a later cycle than its own,
+and leaves in none before.
 
-* ``stamp``: the cycle starts when the chain started, which the message itself says (its first
-  field is a ``std_msgs/Header``). Latency is constant even when the first callback's timer
-  drifts or starts late.
-* ``cycle``: cycles start at ``phase_ns`` of CLOCK_MONOTONIC and every cycle thereafter. The output
-  is strictly periodic, and messages need no stamp.
+Of several **messages** in a cycle leave ``all-in-order`` (the oldest is dropped where more than
+``depth`` wait), the ``newest`` of those that wait, or the ``first`` that came. With **modes**
+(section 3.3) each mode has a slot of its own; a change is in force from the first cycle that begins
+after it, and ``late`` messages may also take the ``next-slot`` of their cycle.
 
-A message that arrives before a slot waits for its start; one that arrives inside a slot leaves
-at once. One that comes behind the last slot it was due in is an **overrun** (section 6):
-
-* ``wait``: it takes the first slot of a later cycle, so that outputs come in slots only;
-* ``discard``: it is never published, so that no receiver acts on old data;
-* ``publish``: it leaves at once, so that it does not become older still.
-
-No message leaves before the cycle that it is due in. Under logical execution time that is a later
-one than its own, however early it came.
-
-Of several **messages** in a cycle, a policy says which leave:
-
-* ``all-in-order``: all that are due in one slot leave in it, one behind the other. What does not
-  fit into the slot has overrun. A gate has room for ``depth`` messages; the oldest one of a full
-  gate is dropped, as in a DDS history;
-* ``newest``: of those that wait when it is time, only the last one that came. One that comes
-  when another of its cycle has left already has overrun;
-* ``first``: only the one that came first.
-
-With **modes** (section 3.3) each mode of the system has its own slot: the latency is constant
-within a mode, and the servers stay as they are when it changes. An early message waits for the
-slot of its mode, past the slots before it; one that comes behind it is treated like an overrun,
-by a policy of its own, which may also be ``next-slot``: it takes the next slot of the cycle.
-A message has the mode of the cycle it belongs to: a change is in force from the first cycle that
-begins after it was announced, and no cycle has two modes.
-
-This module states all that the gates of the node in C++ and of the simulator share with it: words,
-limits and the log's columns. `schema.hpp` is generated from it
-(:mod:`chainshaper.splicing.generated_package`), and every gate runs `tests/gate_conformance.yaml`.
-It imports the standard library only: it is a part of the Python nodes' own files.
+Words, limits, the log's columns and the nodes' ROS parameters are stated here for the node in C++,
+too: `schema.hpp` is generated from them. Every gate runs `tests/gate_conformance.yaml`. Only the
+standard library is imported, since this is a part of the Python nodes' own files.
 """
 
 import ctypes
@@ -50,7 +26,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias, get_args
 
 Anchor: TypeAlias = Literal["stamp", "cycle"]
@@ -68,39 +45,23 @@ LOG_COLUMNS = (
 )
 """Of a shaping node's log, comma-separated, a row per message: the event ``gate_release``."""
 
-DEPTH = 10
-"""So many messages may wait at a gate unless it is said otherwise."""
-
-READER_DEPTH = 1000
-"""History of the reader of a gate: what it has no room for, it drops itself, and so counts it."""
-
+DEPTH = 10  # so many messages may wait at a gate unless it is said otherwise
+READER_DEPTH = 1000  # of the history before a gate: the gate itself drops, and counts, the rest
 MAX_FUTURE_NS = 1_000_000
-MAX_AGE_CYCLES = 10
-"""A stamp is of use that is no more cycles old than these and those the message is due after."""
-
-STALL_NS = 100_000
-"""A thread may wake up so late on a machine that does not stall."""
-
-STEP_NS = 500_000
-"""Slewing moves the wall clock by at most 50 us in a cycle of 100 ms: this is a step."""
-
-LOOK_NS = 50_000_000
-"""Between two looks for messages: often enough for the reader's history, and for the core."""
-
-OTHERS_NS = 2_000_000
-"""An executor's other callbacks take less."""
-
-CHANGES = 64
-"""So many changes of the mode reach back further than the oldest stamp that is of use."""
+MAX_AGE_CYCLES = 10  # the oldest stamp of use, beside the cycles after which the message is due
+STALL_NS = 100_000  # a thread may wake up so late on a machine that does not stall
+STEP_NS = 500_000  # of the wall clock; slewing moves it by at most 50 us in a cycle of 100 ms
+LOOK_NS = 50_000_000  # between two looks for messages: often enough for the reader's history
+OTHERS_NS = 2_000_000  # an executor's other callbacks take less
+CHANGES = 64  # so many changes of the mode reach back further than the oldest stamp of use
 
 
 @dataclass(frozen=True)
 class Modes:
-    """Which slot the messages of each mode leave in.
+    """Which of the gate's ``slots`` (by its place, from 0) the messages of each mode leave in.
 
-    ``bands`` has the place of every mode's slot in the gate's ``slots``, from 0. ``default`` is in
-    force until a mode is announced. ``late`` says what becomes of a message that comes behind its
-    mode's slot; with ``next-slot`` one behind the last slot, too, is an overrun like any other.
+    ``default`` is in force until a mode is announced. ``late`` says what becomes of a message that
+    comes behind its mode's slot; with ``next-slot`` one behind the last slot is still an overrun.
     """
 
     bands: Mapping[str, int]
@@ -122,16 +83,13 @@ class Gate:
     """The publish slots of one output. All times are nanoseconds.
 
     ``slots`` are half-open ``(start, end)`` intervals counted from the anchor, ascending, apart
-    from each other and inside ``[0, cycle_ns)``. ``phase_ns`` anchors cycles to CLOCK_MONOTONIC;
-    with the ``stamp`` anchor it is used for messages whose stamp is of no use. A stamp is of use
-    when its message is at most ``max_age_ns`` old and comes at most ``max_future_ns`` from the
-    future (clocks of different hosts disagree a little).
+    from each other and inside ``[0, cycle_ns)``. With the ``stamp`` anchor, ``phase_ns`` serves
+    messages whose stamp is of no use: it is older than :data:`MAX_AGE_CYCLES`, or from the future
+    (clocks of different hosts disagree a little).
 
-    A message is due in the cycle that it belongs to, or ``due_cycles`` later (under logical
-    execution time), and leaves no earlier. With the ``cycle`` anchor a message belongs to the cycle
-    that it arrives in, since nothing says in which one its chain began. Under logical execution
-    time it is due in the next one then: the data of each callback came a cycle before its output
-    is due.
+    A message is due in the cycle that it belongs to, or ``due_cycles`` later. With the ``cycle``
+    anchor it belongs to the cycle it arrives in, and is due in the next one at the latest: the data
+    of each callback came a cycle before its output is due.
 
     Raises:
         ValueError: such a gate makes no sense.
@@ -141,8 +99,6 @@ class Gate:
     cycle_ns: int
     anchor: str = "stamp"
     phase_ns: int = 0
-    max_age_ns: int | None = None  # None: MAX_AGE_CYCLES and those it is due after
-    max_future_ns: int = MAX_FUTURE_NS
     overrun: str = "wait"
     due_cycles: int = 0
     modes: Modes | None = None
@@ -183,27 +139,29 @@ class Gate:
             return self.overrun
         return self.modes.late
 
+    def counts_from(self, stamp_ns: int | None, arrival_ns: int) -> bool:
+        """Whether a message's slots count from its stamp."""
+        if stamp_ns is None or self.anchor != "stamp":
+            return False
+        max_age = (MAX_AGE_CYCLES + self.due_cycles) * self.cycle_ns
+        return -MAX_FUTURE_NS <= arrival_ns - stamp_ns <= max_age
 
-@dataclass(slots=True)
+
+@dataclass(slots=True)  # making a frozen one takes a microsecond more, on the way of every message
 class Release:
-    """The gate's decision for one message; times are ns of CLOCK_MONOTONIC.
+    """The gate's decision for one message; times are ns of CLOCK_MONOTONIC."""
 
-    ``at_ns`` is when the message may leave (not after the arrival: at once; None: never),
-    ``slot`` which of the slots that is (None: it is in none), ``cycles_waited`` how many cycles
-    after its own, ``anchor`` what the slots were counted from. ``overrun`` is None for a message
-    that came in time, and otherwise the policy that was applied to it. ``mode`` is the mode of
-    its cycle; None: there are no modes.
-
-    (Making one that is frozen takes a microsecond more, on the way of every message.)
-    """
-
-    at_ns: int | None
+    at_ns: int | None  # when it may leave (not after the arrival: at once; None: never)
     origin_ns: int
-    slot: int | None
-    cycles_waited: int
-    anchor: str
-    overrun: str | None = None
-    mode: str | None = None
+    slot: int | None  # in which one that is, if in any
+    cycles_waited: int  # after its own
+    anchor: str  # what the slots were counted from
+    overrun: str | None = None  # the policy that was applied to it; None: it came in time
+    mode: str | None = None  # of its cycle; None: there are no modes
+
+    def start_ns(self, cycle_ns: int) -> int:
+        """When the cycle starts in which the message leaves."""
+        return self.origin_ns + self.cycles_waited * cycle_ns
 
 
 def release_of(
@@ -215,12 +173,11 @@ def release_of(
     ready_ns: int | None = None,
     phase_ns: int | None = None,
 ) -> Release:
-    """Decide when a message that arrived at ``arrival_ns`` may leave.
+    """Decide when a message that arrived at ``arrival_ns`` may leave (ns of CLOCK_MONOTONIC).
 
-    ``stamp_ns`` is its origin on CLOCK_MONOTONIC (see :func:`origin_of`), None if it has none.
-    ``changes`` are the modes that were announced, each with the time (ns), ascending. It leaves at
-    ``ready_ns`` at the earliest, where others are before it. ``phase_ns`` is in force instead of
-    the gate's own.
+    ``stamp_ns`` is its origin, None if it has none; ``changes`` are the modes that were announced,
+    each with the time, ascending. It leaves at ``ready_ns`` at the earliest, where others are
+    before it. ``phase_ns`` is in force instead of the gate's own.
 
         >>> gate = Gate(slots=((60, 61),), cycle_ns=100)
         >>> release_of(gate, arrival_ns=1040, stamp_ns=1000).at_ns      # early: it waits
@@ -233,7 +190,7 @@ def release_of(
         1120
     """
     cycle_ns, modes = gate.cycle_ns, gate.modes
-    if stamp_ns is not None and _counts_from(gate, stamp_ns, arrival_ns):
+    if stamp_ns is not None and gate.counts_from(stamp_ns, arrival_ns):
         origin, anchor, due = stamp_ns, "stamp", gate.due_cycles
     else:
         elapsed = (arrival_ns - (gate.phase_ns if phase_ns is None else phase_ns)) % cycle_ns
@@ -269,24 +226,88 @@ def missed(gate: Gate, release: Release, now_ns: int) -> bool:
     """Whether the slot that a message was to leave in is over (ns of CLOCK_MONOTONIC)."""
     if release.slot is None:
         return False
-    _, end = gate.slots[release.slot]
-    return now_ns >= release.origin_ns + release.cycles_waited * gate.cycle_ns + end
+    return now_ns >= release.start_ns(gate.cycle_ns) + gate.slots[release.slot][1]
 
 
-def _counts_from(gate: Gate, stamp_ns: int, arrival_ns: int) -> bool:
-    """Whether a message's slots count from its stamp."""
-    max_age = gate.max_age_ns
-    if max_age is None:
-        max_age = (MAX_AGE_CYCLES + gate.due_cycles) * gate.cycle_ns
-    return gate.anchor == "stamp" and -gate.max_future_ns <= arrival_ns - stamp_ns <= max_age
+@dataclass
+class NodeParameters:
+    """The ROS parameters of shaping node, standby and throttler; times are ns, 0-based places.
+
+    Python nodes read them as they are here, those in C++ from the struct that `schema.hpp` has.
+    """
+
+    slots_ns: list[int] = field(default_factory=list)  # start and end of each, one after the other
+    cycle_ns: int = 0
+    anchor: str = "stamp"
+    phase_ns: int = 0
+    overrun: str = "wait"
+    due_cycles: int = 0
+    messages: str = "all-in-order"
+    depth: int = 0  # 0: the publisher's history, DEPTH at least
+    mode_topic: str = ""  # no modes
+    mode_names: list[str] = field(default_factory=list)
+    mode_slots: list[int] = field(default_factory=list)
+    mode_default: str = ""
+    mode_late: str = "wait"
+    spin_ns: int = 0
+    pause_ns: int = 0
+    core: int = -1
+    fifo_priority: int = 0
+    output_depth: int = DEPTH  # where the history of the original publisher is not known
+    server_cores: list[int] = field(default_factory=list)
+    log: str = ""
+    log_bytes: int = 100_000_000  # the log and the one before it have no more
+    handover: str = ""  # the node is alone
+    # Of the standby,
+    shaping_node: str = "the shaping node"
+    fallback: str = "bypass"
+    patience_ns: int = 0
+    # and of the throttler.
+    inputs: list[str] = field(default_factory=list)
+    outputs: list[str] = field(default_factory=list)
+    period_ns: int = 0
+
+    def gate(self, depth: int = DEPTH) -> Gate:
+        """The gate that they describe, with room for so many messages.
+
+        Raises:
+            ValueError: they describe none.
+        """
+        bands = dict(zip(self.mode_names, self.mode_slots, strict=True))
+        return Gate(
+            slots=tuple(zip(self.slots_ns[::2], self.slots_ns[1::2], strict=False)),
+            modes=Modes(bands, self.mode_default, self.mode_late) if self.mode_topic else None,
+            depth=depth,
+            **{name: getattr(self, name) for name in _SAME},
+        )
+
+
+_SAME = ("cycle_ns", "anchor", "phase_ns", "overrun", "due_cycles", "messages")
+
+
+def gate_parameters(gate: Gate, mode_topic: str = "") -> dict[str, Any]:
+    """The parameters that describe a gate, whose modes are announced on that topic."""
+    known: dict[str, Any] = {"slots_ns": [bound for slot in gate.slots for bound in slot]}
+    known |= {name: getattr(gate, name) for name in _SAME}
+    if gate.modes is not None:
+        known |= {
+            "mode_topic": mode_topic,
+            "mode_names": list(gate.modes.bands),
+            "mode_slots": list(gate.modes.bands.values()),
+            "mode_default": gate.modes.default,
+            "mode_late": gate.modes.late,
+        }
+    return known
+
+
+# Serialized messages ----------------------------------------------------------------------------
 
 
 def origin_of(payload: bytes) -> int | None:
     """The header stamp of a serialized message in ns of its clock, None if it is zero or short.
 
-    A message whose first field is a ``std_msgs/Header`` has its stamp (int32 seconds, uint32
-    nanoseconds) right behind the 4-byte CDR encapsulation header, whose second byte gives the
-    byte order. Nothing else of the message needs to be known.
+    It stands (int32 seconds, uint32 nanoseconds) right behind the encapsulation header of a message
+    whose first field is a ``std_msgs/Header``.
     """
     if len(payload) < 12:
         return None
@@ -301,7 +322,7 @@ def origin_of(payload: bytes) -> int | None:
 def text_of(payload: bytes) -> str | None:
     """The text of a serialized ``std_msgs/String``, None where the bytes are none.
 
-    Behind the encapsulation header stand the length, with the final NUL, and the characters.
+    Its length, with the final NUL, and the characters stand behind the encapsulation header.
     """
     if len(payload) < 8:
         return None
@@ -311,38 +332,34 @@ def text_of(payload: bytes) -> str | None:
     return payload[8 : 7 + length].decode(errors="replace")
 
 
+# Clocks ------------------------------------------------------------------------------------------
+
+
 class _Timespec(ctypes.Structure):
     _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
 
 
 _libc = ctypes.CDLL(None, use_errno=True)
-_TIMER_ABSTIME = 1
+_TIMER_ABSTIME, _EINTR = 1, 4
 
 
 def sleep_until(deadline_ns: int) -> None:
     """Sleep until an instant of CLOCK_MONOTONIC; returns at once when it has passed.
 
-    ``time.sleep`` takes a relative time, so a pre-emption between computing and sleeping would
-    be added to it. An absolute sleep cannot be late for that reason.
+    The relative time of ``time.sleep`` would be added to a pre-emption before it.
     """
     request = _Timespec(*divmod(max(0, deadline_ns), 1_000_000_000))
-    while True:
-        # A signal ends the sleep early (EINTR, 4); the deadline stays the same.
+    error = _EINTR  # a signal ends the sleep early; the deadline stays the same
+    while error == _EINTR:
         error = _libc.clock_nanosleep(
             time.CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(request), None
         )
-        if error != 4:
-            break
     if error:
         raise OSError(error, f"clock_nanosleep: {os.strerror(error)}")
 
 
 def watch_until(deadline_ns: int) -> int:
-    """Watch the clock until an instant of CLOCK_MONOTONIC has come; returns the time then.
-
-    Waking from a sleep costs the kernel some tens of microseconds, and not always the same.
-    Watching the clock over the last stretch trades a little CPU time for that variation.
-    """
+    """Watch the clock, to microseconds, until an instant of CLOCK_MONOTONIC; the time then."""
     clock = time.monotonic_ns
     now = clock()
     while now < deadline_ns:
@@ -363,32 +380,28 @@ def clock_offset() -> int:
     return best
 
 
+# Messages that wait -------------------------------------------------------------------------------
+
+
 @dataclass(eq=False)
 class Waiting:
-    """A message that has come and not left; times are ns of CLOCK_MONOTONIC.
-
-    ``about`` is what its owner knows of it besides. ``lost`` counts those that were lost on the
-    way between the one before it and this one (None: not known).
-    """
+    """A message that has come and not left; times are ns of CLOCK_MONOTONIC."""
 
     payload: bytes
     arrival_ns: int
     stamp_ns: int | None
     phase_ns: int
-    about: Any = None
-    lost: int | None = None
+    about: Any = None  # what its owner knows of it besides
+    lost: int | None = None  # how many, between the one before it and this one; None: not known
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a message: it may leave now, or was ``dropped``, for that reason.
-
-    ``awake_ns`` is when that was clear (CLOCK_MONOTONIC).
-    """
+    """What became of a message: it may leave now, or was ``dropped``, for that reason."""
 
     message: Waiting
     release: Release
-    awake_ns: int
+    awake_ns: int  # when that was clear (CLOCK_MONOTONIC)
     dropped: str | None = None
 
 
@@ -400,25 +413,30 @@ class Queue:
         self.phase_ns = gate.phase_ns
         self.waiting: deque[Waiting] = deque()
         self.changes: deque[tuple[int, str]] = deque(maxlen=CHANGES)
+        self.free_ns = 0  # when it is the turn of the oldest message, if it is there then
         # The starts of the cycle that the oldest message, or another for it, leaves in, and of
         # that in which one has left.
         self._leaving: int | None = None
         self._left: int | None = None
-        self.free_ns = 0  # when it is the turn of the oldest message, if it is there then
 
     def arrive(
-        self, payload: bytes, arrival_ns: int, stamp_ns: int | None, about: Any = None
+        self,
+        payload: bytes,
+        arrival_ns: int,
+        stamp_ns: int | None,
+        about: Any = None,
+        lost: int | None = None,
     ) -> Outcome | None:
         """A message came; the one for which there is no room any more."""
-        self.waiting.append(Waiting(payload, arrival_ns, stamp_ns, self.phase_ns, about))
-        if stamp_ns is not None and _counts_from(self.gate, stamp_ns, arrival_ns):
+        message = Waiting(payload, arrival_ns, stamp_ns, self.phase_ns, about, lost)
+        self.waiting.append(message)
+        if stamp_ns is not None and self.gate.counts_from(stamp_ns, arrival_ns):
             self.phase_ns = stamp_ns % self.gate.cycle_ns
         if len(self.waiting) <= self.gate.depth:
             return None
         oldest = self.waiting.popleft()
-        return Outcome(
-            oldest, _withheld(self._release(oldest, arrival_ns)), arrival_ns, "overflowed"
-        )
+        release = _withheld(self._release(oldest, arrival_ns))
+        return Outcome(oldest, release, arrival_ns, "overflowed")
 
     def decide(self) -> tuple[Release, str | None]:
         """When the oldest message may leave, or why it never does."""
@@ -429,7 +447,7 @@ class Queue:
             return release, "discarded"
         if release.slot is None or self.gate.messages == "all-in-order":
             return release, None
-        if self._left is not None and self._same_cycle(self._start(release), self._left):
+        if self._left is not None and self._same_cycle(release, self._left):
             if self.gate.messages == "first":
                 return _withheld(release), "surplus"
             release = self._release(oldest, max(ready, self._left + self.gate.slots[-1][1]))
@@ -437,20 +455,16 @@ class Queue:
                 return release, "discarded"
             if release.slot is None:
                 return replace(release, at_ns=ready), None
-        start = self._start(release)
-        if self._leaving is None or not self._same_cycle(start, self._leaving):
-            self._leaving = start
+        if self._leaving is None or not self._same_cycle(release, self._leaving):
+            self._leaving = release.start_ns(self.gate.cycle_ns)
         return release, None
 
     def replaced(self, release: Release, now_ns: int) -> bool:
         """Whether a newer message leaves for the oldest one, which was to leave like this."""
         if self.gate.messages != "newest" or release.slot is None or self._leaving is None:
             return False
-        for newer in list(self.waiting)[1:]:
-            other = self._release(newer, now_ns)
-            if other.slot is not None and self._same_cycle(self._start(other), self._leaving):
-                return True
-        return False
+        others = [self._release(newer, now_ns) for newer in list(self.waiting)[1:]]
+        return any(one.slot is not None and self._same_cycle(one, self._leaving) for one in others)
 
     def leave(self, release: Release | None, now_ns: int) -> None:
         """The oldest message leaves, or is dropped; None: it is not this gate's to decide."""
@@ -460,21 +474,14 @@ class Queue:
             self._left = self._leaving
 
     def _release(self, message: Waiting, ready_ns: int) -> Release:
+        arrival, stamp, phase = message.arrival_ns, message.stamp_ns, message.phase_ns
         return release_of(
-            self.gate,
-            message.arrival_ns,
-            message.stamp_ns,
-            self.changes,
-            ready_ns=ready_ns,
-            phase_ns=message.phase_ns,
+            self.gate, arrival, stamp, self.changes, ready_ns=ready_ns, phase_ns=phase
         )
 
-    def _start(self, release: Release) -> int:
-        return release.origin_ns + release.cycles_waited * self.gate.cycle_ns
-
-    def _same_cycle(self, start_ns: int, other_ns: int) -> bool:
+    def _same_cycle(self, release: Release, start_ns: int) -> bool:
         """Stamps are not quite periodic: cycles are the same less than half a cycle apart."""
-        return 2 * abs(start_ns - other_ns) < self.gate.cycle_ns
+        return 2 * abs(release.start_ns(self.gate.cycle_ns) - start_ns) < self.gate.cycle_ns
 
 
 def _withheld(release: Release) -> Release:
@@ -489,13 +496,11 @@ class Shaper:
     under way during a step may be of either side: it is anchored to the cycle instead, at the phase
     that the last good stamp had.
 
-    One shaper belongs to one thread, which does nothing else at the time of a release. That makes
-    it a witness of the machine's own stalls (:meth:`time_lost`). ``look`` has new messages
-    :meth:`arrive`: it is called while others wait, before each release and behind it.
-
-    ``on_waking`` is called with the time of a release when it wakes ``spin_ns`` before that, to
-    watch the clock from there; what it does there should be over in time. ``on_decision`` is
-    called with each decision, before it is waited for, and where cycles begin.
+    One shaper belongs to one thread, which does nothing else at the time of a release: so it is a
+    witness of the machine's own stalls (:meth:`time_lost`). ``look`` has new messages
+    :meth:`arrive`, while others wait, before each release and behind it. ``on_waking`` gets the
+    time of a release ``spin_ns`` before it, when the clock is watched from; ``on_decision`` each
+    decision, before it is waited for, and where cycles begin.
     """
 
     def __init__(
@@ -506,41 +511,27 @@ class Shaper:
         look: Callable[[], None] = lambda: None,
         on_decision: Callable[[Release, int], None] = lambda *_: None,
     ) -> None:
-        self.queue = Queue(gate)
+        self.gate, self.queue = gate, Queue(gate)
         self.spin_ns = spin_ns
         self.overflowed: list[Outcome] = []  # since the owner has emptied it
-        self._on_waking = on_waking
         self.look = look
-        self._on_decision = on_decision
-        self._looked = 0
+        self._on_waking, self._on_decision = on_waking, on_decision
+        self._looked_ns = self._waited_ns = 0
         self._offset = clock_offset()
-        self._waiting = _WaitingTime()
-        self._waited = 0
         self._next_phase: tuple[int, int] | None = None  # from when on, and which
-
-    @property
-    def gate(self) -> Gate:
-        """The gate that is at work."""
-        return self.queue.gate
+        self._thread, self._schedstat = 0, -1
 
     def set_phase(self, phase_ns: int, now_ns: int) -> None:
         """Cycles begin elsewhere, from the first such beginning after ``now_ns`` on."""
         self._next_phase = (now_ns + (phase_ns - now_ns) % self.gate.cycle_ns, phase_ns)
 
-    @property
-    def mode(self) -> str | None:
-        """The mode that was announced last; None without modes."""
-        if self.gate.modes is None:
-            return None
-        changes = self.queue.changes
-        return changes[-1][1] if changes else self.gate.modes.default
-
     def switch(self, mode: str | None, now_ns: int) -> bool:
         """A mode is announced, in force from the next cycle on; False: there is none like it."""
-        if self.gate.modes is None or mode is None or mode not in self.gate.modes.bands:
+        modes, changes = self.gate.modes, self.queue.changes
+        if modes is None or mode is None or mode not in modes.bands:
             return False
-        if mode != self.mode:
-            self.queue.changes.append((now_ns, mode))
+        if mode != (changes[-1][1] if changes else modes.default):
+            changes.append((now_ns, mode))
         return True
 
     def arrive(
@@ -559,16 +550,14 @@ class Shaper:
         offset = clock_offset()
         stepped = abs(offset - self._offset) > STEP_NS
         self._offset = offset
-        stamp = None if stepped else origin_of(payload)
-        arrival = now_ns
+        stamp, arrival = (None if stepped else origin_of(payload)), now_ns
         if source_ns is not None and not stepped:
-            arrival = min(now_ns, max(self._looked, source_ns - offset))
+            arrival = min(now_ns, max(self._looked_ns, source_ns - offset))
         if self._next_phase is not None and arrival >= self._next_phase[0]:
             self.queue.phase_ns = self._next_phase[1]
             self._next_phase = None
-        full = self.queue.arrive(payload, arrival, None if stamp is None else stamp - offset, about)
-        self.queue.waiting[-1].lost = lost
-        if full is not None:
+        stamp = None if stamp is None else stamp - offset
+        if (full := self.queue.arrive(payload, arrival, stamp, about, lost)) is not None:
             self.overflowed.append(full)
 
     def hold(self) -> Outcome | None:
@@ -582,7 +571,7 @@ class Shaper:
         release, dropped = queue.decide()
         self._on_decision(release, queue.phase_ns)
         if release.at_ns is not None:
-            self._waited = self._waiting.so_far()
+            self._waited_ns = self._others_ran_ns()
             slept = release.at_ns > now
             while (awake := release.at_ns - self.spin_ns) > now:
                 sleep_until(min(awake, now + LOOK_NS))
@@ -601,7 +590,7 @@ class Shaper:
             self._on_waking(release.at_ns)
             if time.monotonic_ns() < release.at_ns:
                 # Awake in time: what other threads took before is of no consequence.
-                self._waited = self._waiting.so_far()
+                self._waited_ns = self._others_ran_ns()
         awake = watch_until(release.at_ns)
         if self.gate.policy == "discard" and missed(self.gate, release, awake):
             release, dropped = replace(_withheld(release), overrun="discard"), "discarded"
@@ -611,15 +600,14 @@ class Shaper:
     def _look(self) -> None:
         now = time.monotonic_ns()
         self.look()
-        self._looked = now
+        self._looked_ns = now
 
     def nothing_due(self) -> bool:
         """Whether there is time for something else before the next release."""
         if not self.queue.waiting:
             return True
-        release, _ = self.queue.decide()
-        latest = time.monotonic_ns() + self.spin_ns + OTHERS_NS
-        return release.at_ns is not None and release.at_ns > latest
+        at_ns = self.queue.decide()[0].at_ns
+        return at_ns is not None and at_ns > time.monotonic_ns() + self.spin_ns + OTHERS_NS
 
     def rest(self, published_ns: int, pause_ns: int) -> None:
         """Pause behind a publication, unless another message has to leave meanwhile."""
@@ -627,8 +615,8 @@ class Shaper:
         self._look()
         until = published_ns + pause_ns
         if self.queue.waiting:
-            release, _ = self.queue.decide()
-            if release.at_ns is None or release.at_ns - self.spin_ns <= until:
+            at_ns = self.queue.decide()[0].at_ns
+            if at_ns is None or at_ns - self.spin_ns <= until:
                 return
         sleep_until(until)
         self.queue.free_ns = time.monotonic_ns()
@@ -636,33 +624,23 @@ class Shaper:
     def time_lost(self, release: Release, until_ns: int) -> int:
         """How much of the delay from a release until then the machine itself took (ns).
 
-        The kernel counts for how long a thread was ready but others ran. What is left of the delay
-        no thread used: interrupts, or a core that was taken away from the whole system. (Until it
-        had published, that takes microseconds besides.) To be called right after publishing.
+        What other threads did not run either, no thread used: interrupts, or a core that was taken
+        away from the whole system. To be called right after publishing.
         """
         if release.at_ns is None:
             return 0
-        return max(0, until_ns - release.at_ns - (self._waiting.so_far() - self._waited))
+        return max(0, until_ns - release.at_ns - (self._others_ran_ns() - self._waited_ns))
 
+    def _others_ran_ns(self) -> int:
+        """For how long this thread has been ready while others ran, by the kernel's account.
 
-class _WaitingTime:
-    """For how long the calling thread has been ready while others ran, by the kernel's account.
-
-    The second number of `/proc/thread-self/schedstat` (Documentation/scheduler/sched-stats.rst).
-    Where the kernel has none, all delay is taken to be other threads', and none the machine's.
-    """
-
-    def __init__(self) -> None:
-        self._file: int | None = None
-        self._thread: int | None = None
-
-    def so_far(self) -> int:
+        The second number of `/proc/thread-self/schedstat` (kernel: scheduler/sched-stats.rst);
+        without one, all delay is taken to be other threads', and none the machine's.
+        """
         if self._thread != threading.get_ident():  # the file is bound to who opened it
-            self._thread = threading.get_ident()
-            try:
-                self._file = os.open("/proc/thread-self/schedstat", os.O_RDONLY)
-            except OSError:
-                self._file = None
-        if self._file is None:
+            self._thread, self._schedstat = threading.get_ident(), -1
+            with suppress(OSError):
+                self._schedstat = os.open("/proc/thread-self/schedstat", os.O_RDONLY)
+        if self._schedstat < 0:
             return time.monotonic_ns()
-        return int(os.pread(self._file, 128, 0).split()[1])
+        return int(os.pread(self._schedstat, 128, 0).split()[1])

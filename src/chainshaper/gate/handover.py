@@ -1,21 +1,18 @@
 """Which process publishes a shaped output: the shaping node, or the standby beside it.
 
-A shaping node is a single point in front of the actuator. So a second process, the **standby**,
-receives the same messages and passes them on while no shaping node is in force. For each message
-one of the two is responsible, whenever either is killed, stopped or started:
+The standby receives the same messages as the shaping node, and passes them on while that is not
+in force. For each one of the two is responsible, whenever either is killed, stopped or started:
 
-* The **lock** of a file says whether a shaping node is in force. The kernel frees it at the node's
+* The **lock** of a file says whether a shaping node is in force; the kernel frees it at the node's
   death. The node takes it with the first message that it receives, when its output is ready; the
   standby takes it for as long as it publishes, and not at all while the node has it.
 * The file itself is a **page** in memory that both map: which messages each of them has dealt with
   (by their source timestamps), and until when the node may take for the one that it holds.
 
-A message that the node has received and not released when it dies is published by the standby. One
-that the standby has published is left out by the node. A node that is late for its own release by
-more than a given patience hangs, or is stopped: the standby publishes what is due, and the node,
-when it goes on, leaves it out. What is left is the time from a publication until it is noted in
-the page, some microseconds: a process that is killed just there has published a message that the
-other publishes again.
+What the node has received and not released when it dies, the standby publishes; what the standby
+has published, the node leaves out. A node that is late for its own release by more than a given
+patience hangs, or is stopped: the standby publishes what is due. What is left are the microseconds
+from a publication until it is noted: who is killed just there leaves it to be published again.
 
 Standard library only, as the gate; `handover.hpp` is the node's side in C++, with the same page,
 whose layout is filled in from here.
@@ -71,23 +68,14 @@ _AT = {name: place for place, name in enumerate(FIELDS)}
 _SIZE = 8 * TOPIC + TOPIC_BYTES
 _FLOCK = "hhqqi4x"  # struct flock: type, whence, start, length, process
 
-GIVE_UP_NS = 50_000_000
-"""A node waits so long for a standby, which needs the lock for a fraction of a millisecond."""
-
-AT_ONCE_NS = 30_000_000_000
-"""A node that deals with no message for so long has not failed at once."""
-
-BACK_OFF_AFTER = 3
-"""So many starts may fail at once; then each waits twice as long as the one before."""
+GIVE_UP_NS = 50_000_000  # a node waits so long for a standby, which needs the lock a moment only
+AT_ONCE_NS = 30_000_000_000  # a node that deals with no message for so long has not failed at once
+BACK_OFF_AFTER = 3  # so many starts may fail at once; each further one waits twice as long
 
 
 def page_folders() -> Iterator[str]:
-    """Where pages are, the best place first: of root, of a login session, of any user.
-
-    `/dev/shm` is in memory and empty after booting, like the others.
-    """
-    user = os.geteuid()
-    session = os.environ.get("XDG_RUNTIME_DIR")
+    """Where pages are, in memory, the best first: of root, of a login session, of any user."""
+    user, session = os.geteuid(), os.environ.get("XDG_RUNTIME_DIR")
     if user == 0:
         yield "/run/chainshaper/outputs"
     elif session:
@@ -99,9 +87,7 @@ def open_page(name: str, topic: str) -> "Page":
     """The page of an output: the one that is there, or else a new one.
 
     ``name`` tells it from others in this domain; whoever publishes the ``topic`` gives the same.
-
-    Raises:
-        OSError: no folder is ours alone, or the file is not.
+    OSError: no folder is ours alone, or the file is not.
     """
     domain = os.environ.get("ROS_DOMAIN_ID") or "0"
     problem = OSError("no folder")
@@ -182,24 +168,23 @@ class Page:
         """Take a right, if no process has it: to publish, to be the standby, or to publish as the
         standby although the shaping node has the first. It ends with the process.
         """
-        return self._lock(byte, fcntl.F_WRLCK)
-
-    def unlock(self, byte: int = PUBLISHING) -> None:
-        """Give the right back."""
-        self._lock(byte, fcntl.F_UNLCK)
-
-    def is_locked(self, byte: int = PUBLISHING) -> bool:
-        """Whether another process has the right."""
-        asked = struct.pack(_FLOCK, fcntl.F_WRLCK, 0, byte, 1, 0)
-        answer = fcntl.fcntl(self._file, fcntl.F_OFD_GETLK, asked)
-        return bool(struct.unpack(_FLOCK, answer)[0] != fcntl.F_UNLCK)
-
-    def _lock(self, byte: int, kind: int) -> bool:
         try:
-            fcntl.fcntl(self._file, fcntl.F_OFD_SETLK, struct.pack(_FLOCK, kind, 0, byte, 1, 0))
+            self._ask(fcntl.F_OFD_SETLK, fcntl.F_WRLCK, byte)
         except BlockingIOError:
             return False
         return True
+
+    def unlock(self, byte: int = PUBLISHING) -> None:
+        """Give the right back."""
+        self._ask(fcntl.F_OFD_SETLK, fcntl.F_UNLCK, byte)
+
+    def is_locked(self, byte: int = PUBLISHING) -> bool:
+        """Whether another process has the right."""
+        return self._ask(fcntl.F_OFD_GETLK, fcntl.F_WRLCK, byte) != fcntl.F_UNLCK
+
+    def _ask(self, command: int, kind: int, byte: int) -> int:
+        answer = fcntl.fcntl(self._file, command, struct.pack(_FLOCK, kind, 0, byte, 1, 0))
+        return int(struct.unpack(_FLOCK, answer)[0])
 
     def note(self, key: int | None, *, bypassed: bool) -> None:
         """A message has been dealt with, by the standby or by the shaping node."""
@@ -298,11 +283,9 @@ class Turn:
             with suppress(OSError):  # without a folder this page has to do
                 left = self.page
                 self._open()
+                for one in left.noted(bypassed=False):  # a standby that lags has to know them
+                    self.page.note(one, bypassed=False)
                 left.close()
-
-    def drop(self, key: int | None) -> None:
-        """A message that was received has no room any more, and is never published."""
-        self.page.note(key, bypassed=False)
 
     def count(self, dropped: str | None, lost: int | None, *, late: bool) -> None:
         """A message has been published, or was ``dropped`` for that reason of the gate.
@@ -314,9 +297,9 @@ class Turn:
         self.page["late"] += late
 
     def _come_into_force(self, key: int | None) -> bool:
-        give_up = time.monotonic_ns() + GIVE_UP_NS
-        while not self.page.lock():
-            if _is_alive(self.page["holder"]):  # another shaping node
+        page, give_up = self.page, time.monotonic_ns() + GIVE_UP_NS
+        while not page.lock():
+            if _is_alive(page["holder"]):  # another shaping node
                 return False
             if self._gave_up or time.monotonic_ns() > give_up:
                 self._gave_up = True  # the standby was stopped while it published
@@ -324,17 +307,15 @@ class Turn:
             time.sleep(0.001)
         else:
             self._in_force, self._gave_up = True, False
-        self.page["until_ns"] = time.monotonic_ns()
-        self.page["first"], self.page["holder"] = key or 0, os.getpid()
-        while self._to_be_acknowledged(key) and time.monotonic_ns() < give_up:
-            time.sleep(0.0002)
+        page["until_ns"] = time.monotonic_ns()
+        page["first"], page["holder"] = key or 0, os.getpid()
+        # A standby still deals with what came before this node's first message.
+        if page["listening"] and key is not None:
+            while page.is_locked(STANDING_BY) and time.monotonic_ns() < give_up:
+                if key == page["acknowledged"] or key in page.noted(bypassed=True):
+                    break
+                time.sleep(0.0002)
         return True
-
-    def _to_be_acknowledged(self, key: int | None) -> bool:
-        """Whether a standby still deals with what came before this node's first message."""
-        if not self.page["listening"] or not self.page.is_locked(STANDING_BY):
-            return False
-        return key not in (None, self.page["acknowledged"], *self.page.noted(bypassed=True))
 
 
 class _Waiting(NamedTuple):
@@ -387,12 +368,14 @@ class Standby:
         with self._mutex:
             self._follow()
             self.page["listening"] = 1
+            self._pending.append(_Waiting(key or 0, payload, now))
             if key is not None:
-                self._pending.append(_Waiting(key, payload, now))
                 self._look(now)
             elif self._none_in_force():
-                self._pass_on([_Waiting(0, payload, now)])
+                self._pass_on(len(self._pending))
                 self.page.unlock()
+            else:
+                self._pending.clear()  # what the shaping node holds is lost with it
         with suppress(BlockingIOError):
             os.write(self._wake, b".")
 
@@ -413,60 +396,55 @@ class Standby:
 
     def watch(self) -> None:
         """Look when the shaping node dies, and when it should have released a message; for ever."""
-        watched, died = 0, -1
-        poll = select.poll()
-        poll.register(self._woken, select.POLLIN)
         while True:
             with self._mutex:  # the page may be left meanwhile
-                holder = self.page["holder"]
-            if holder != watched:
-                if died >= 0:
-                    poll.unregister(died)
-                    os.close(died)
-                watched, died = holder, _end_of(holder)
-                if died >= 0:
-                    poll.register(died, select.POLLIN)
-            ready = poll.poll(self._patience_left_ms())
-            if (self._woken, select.POLLIN) in ready:
+                holder, left_ms = self.page["holder"], self._patience_left_ms()
+            poll, died = select.poll(), _end_of(holder)
+            poll.register(self._woken, select.POLLIN)
+            if died >= 0:
+                poll.register(died, select.POLLIN)
+            ended = (died, select.POLLIN) in poll.poll(left_ms)
+            with suppress(BlockingIOError):
                 os.read(self._woken, 4096)
-            self.look()
-            if died >= 0 and (died, select.POLLIN) in ready:
-                poll.unregister(died)
+            if died >= 0:
                 os.close(died)
-                died = -1
+            self.look()
+            if ended:
+                time.sleep(0.001)  # another node with its lock is about to say so
 
     def _patience_left_ms(self) -> int:
-        with self._mutex:
-            self._forget()
-            if not self._pending:
-                return -1 if self.page["holder"] else 1000
-            return max(1, (self._due_ns() - time.monotonic_ns()) // 1_000_000 + 1)
+        self._forget()
+        if not self._pending:
+            return -1 if self.page["holder"] else 1000
+        return max(1, (self._due_ns() - time.monotonic_ns()) // 1_000_000 + 1)
 
     def _due_ns(self) -> int:
         """When the shaping node is too late with what it has to do."""
-        oldest = self._pending[0].arrival_ns
-        return max(self.page["until_ns"], oldest) + self._patience_ns
+        return max(self.page["until_ns"], self._pending[0].arrival_ns) + self._patience_ns
 
     def _look(self, now: int) -> None:
-        if self._none_in_force():
-            self._forget()
-            self._gone("is not there")
-            self._pass_on(list(self._pending))
-            self.page.unlock()
-            return
+        alone = self._none_in_force()
         self._forget()
         taken = self.page["taken"]
-        if self._pending and (now > self._due_ns() or taken == self._stuck_at):
+        if alone:
+            self._gone("is not there")
+            self._pass_on(len(self._pending))
+            self.page.unlock()
+        elif self._pending and (now > self._due_ns() or taken == self._stuck_at):
             self._stuck_at = taken
             self._gone("is late for its own release: it hangs, or was stopped")
             self.page.lock(PASSING)
             for waiting in self._pending:  # the node is there, and could go on at any time
                 self.page.note(waiting.key, bypassed=True)
-            self._pass_on(list(self._pending), noted=True)
+            self._pass_on(len(self._pending), noted=True)
             self.page.unlock(PASSING)
         elif taken != self._stuck_at:
             self._back()
-            self._pass_on_before_its_first()
+            # What came before the first message of the node in force came to this process alone.
+            first, keys = self.page["first"], [waiting.key for waiting in self._pending]
+            if first != self.page["acknowledged"] and first in keys:
+                self._pass_on(keys.index(first))
+                self.page["acknowledged"] = first
 
     def _none_in_force(self) -> bool:
         """Take the lock, if no shaping node has it."""
@@ -478,27 +456,16 @@ class Standby:
     def _forget(self) -> None:
         """Leave out what was dealt with, and what came before: order is not to be broken."""
         known = {*self.page.noted(bypassed=False), *self.page.noted(bypassed=True)}
-        for place in range(len(self._pending) - 1, -1, -1):
-            if self._pending[place].key in known:
-                for _ in range(place + 1):
-                    self._pending.popleft()
-                return
+        dealt_with = [place for place, one in enumerate(self._pending, 1) if one.key in known]
+        for _ in range(max(dealt_with, default=0)):
+            self._pending.popleft()
 
-    def _pass_on_before_its_first(self) -> None:
-        """Publish what came before the first message of the node in force, and so not to it."""
-        first = self.page["first"]
-        keys = [waiting.key for waiting in self._pending]
-        if first != self.page["acknowledged"] and first in keys:
-            self._pass_on(list(self._pending)[: keys.index(first)])
-            self.page["acknowledged"] = first
-
-    def _pass_on(self, messages: list[_Waiting], *, noted: bool = False) -> None:
-        for waiting in messages:
+    def _pass_on(self, count: int, *, noted: bool = False) -> None:
+        for _ in range(count):
+            waiting = self._pending.popleft()
             self._publish(waiting.payload, waiting.key or None, waiting.arrival_ns)
             if not noted:
                 self.page.note(waiting.key, bypassed=True)
-        for _ in range(min(len(messages), len(self._pending))):
-            self._pending.popleft()
 
     def _gone(self, why: str) -> None:
         if not self.page["bypassing_since_ns"]:
@@ -510,8 +477,7 @@ class Standby:
             self._why = why
 
     def _back(self) -> None:
-        since = self.page["bypassing_since_ns"]
-        if since:
+        if since := self.page["bypassing_since_ns"]:
             self.page["bypassing_since_ns"] = 0
             passed = self.page["bypassed"] - self.page["bypassed_before"]
             after_s = (time.monotonic_ns() - since) / 1e9

@@ -11,11 +11,7 @@ lifespan by which DDS discards what overran.
 
 from typing import Any
 
-from chainshaper.planning.overruns import (
-    Writer,
-    check_publication,
-    output_lifespan,
-)
+from chainshaper.planning.overruns import Writer, check_publication, output_lifespan
 from chainshaper.planning.plan import Plan, ShapingNode, publisher_servers
 from chainshaper.splicing.shaping_process import gate_of
 from chainshaper.values.errors import InputError
@@ -40,7 +36,13 @@ def splice_application(application: Application, plan: Plan) -> Application:
     shaping = plan.shaping_node
     if shaping is None and any(publisher_servers(plan)):
         check_publication(plan, writers_of(application))
-        return _with_lifespan(application, plan.chain.output, output_lifespan(plan))
+        topic, lifespan_ns = plan.chain.output, output_lifespan(plan)
+        if topic is None or lifespan_ns is None:
+            return application
+        described = application.topic(topic)
+        shortest = min(lifespan_ns, described.lifespan_ns or lifespan_ns)
+        changed = described.model_copy(update={"lifespan_ns": shortest})
+        return application.model_copy(update={"topics": {**application.topics, topic: changed}})
     if shaping is None:
         raise InputError(
             "the plan has no `shaping_node`, so there is nothing to splice: plan again with "
@@ -75,25 +77,22 @@ def _spliced(application: Application, plan: Plan, shaping: ShapingNode) -> Appl
             f"the application publishes {shaping.input} already, the name that the plan gives to "
             "the unshaped output: change `shaping_node.input` in the plan"
         )
-    nodes = {
-        name: _remapped(node, shaping.output, shaping.input) if name == publishers[0] else node
-        for name, node in application.nodes.items()
-    }
+    nodes, topics = dict(application.nodes), dict(application.topics)
+    publisher = nodes[publishers[0]]
+    callbacks = []
+    for callback in publisher.callbacks:
+        published = [shaping.input if t == shaping.output else t for t in callback.publishes]
+        callbacks.append(callback.model_copy(update={"publishes": tuple(published)}))
+    nodes[publishers[0]] = publisher.model_copy(update={"callbacks": tuple(callbacks)})
     depth = shaping.depth or max(10, application.topic(shaping.output).depth)
     nodes[shaping.name] = _described(plan, shaping, depth)
-    topics = dict(application.topics)
     if shaping.output in topics:
         topics[shaping.input] = topics[shaping.output]  # the same quality of service
-    chain = _from_its_publisher(application.chain, shaping)
+    first, *others = application.chain.split("..")
+    chain = application.chain
+    if others and first.strip() == shaping.output:  # it starts where it did
+        chain = "..".join([shaping.input, *others])
     return application.model_copy(update={"nodes": nodes, "topics": topics, "chain": chain})
-
-
-def _from_its_publisher(chain: str, shaping: ShapingNode) -> str:
-    """A chain whose first topic is shaped starts where it did, not at the shaping node."""
-    first, *others = chain.split("..")
-    if not others or first.strip() != shaping.output:
-        return chain
-    return "..".join([shaping.input, *others])
 
 
 def writers_of(application: Application) -> list[Writer]:
@@ -110,17 +109,6 @@ def writers_of(application: Application) -> list[Writer]:
     ]
 
 
-def _with_lifespan(
-    application: Application, topic: str | None, lifespan_ns: int | None
-) -> Application:
-    if topic is None or lifespan_ns is None:
-        return application
-    described = application.topic(topic)
-    shortest = min(lifespan_ns, described.lifespan_ns or lifespan_ns)
-    changed = described.model_copy(update={"lifespan_ns": shortest})
-    return application.model_copy(update={"topics": {**application.topics, topic: changed}})
-
-
 def _described(plan: Plan, shaping: ShapingNode, depth: int) -> NodeDescription:
     gate = gate_of(plan, shaping, depth)
     same = ("slots", "cycle_ns", "anchor", "overrun", "due_cycles", "messages", "depth")
@@ -129,22 +117,10 @@ def _described(plan: Plan, shaping: ShapingNode, depth: int) -> NodeDescription:
     if gate.modes is not None and plan.modes is not None:
         described["modes"] = {"topic": plan.modes.topic, **vars(gate.modes)}
     with wrong_values_refused(NodeDescription, "the plan's shaping node cannot be run: "):
-        return NodeDescription(
-            core=shaping.core,
-            priority=shaping.fifo_priority,
-            callbacks=(
-                CallbackDescription(
-                    subscription=shaping.input,
-                    publishes=(shaping.output,),
-                    gate=GateDescription.model_validate(described),
-                ),
-            ),
+        callback = CallbackDescription(
+            subscription=shaping.input,
+            publishes=(shaping.output,),
+            gate=GateDescription.model_validate(described),
         )
-
-
-def _remapped(node: NodeDescription, old: str, new: str) -> NodeDescription:
-    callbacks = []
-    for callback in node.callbacks:
-        publishes = tuple(new if topic == old else topic for topic in callback.publishes)
-        callbacks.append(callback.model_copy(update={"publishes": publishes}))
-    return node.model_copy(update={"callbacks": tuple(callbacks)})
+        core, priority = shaping.core, shaping.fifo_priority
+        return NodeDescription(core=core, priority=priority, callbacks=(callback,))

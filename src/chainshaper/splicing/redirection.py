@@ -21,12 +21,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-WITHIN = "chainshaper_within"
+WITHIN = "chainshaper_within"  # a launch argument: how long (s) after its start all has to run
 WITHIN_S = 30.0
-"""A launch argument and its default (s): how long after its start the application has to run."""
-
-DISCOVERY_S = 5.0
-"""How long before that it begins to listen for the publishers and subscriptions that there are."""
+DISCOVERY_S = 5.0  # how long before that it begins to listen for who publishes and subscribes
 
 _DRY_RUN = "chainshaper_dry_run"
 _RULE = re.compile(r"(?:(\w+):(?!//|=))?(?:rostopic://)?([^:]+):=(.+)", re.DOTALL)
@@ -35,17 +32,13 @@ _FOR_A_SHELL = re.compile(r"[;&|<>()$`*?~#\n]")
 
 @dataclass
 class Started:
-    """A process or component that is, or may be, ``node``; ``rules`` are those that were added.
-
-    ``named`` is whether the launch says its name. Otherwise the executable may be of that name,
-    and ROS 2 follows the rules if it is. ``action`` is a process's.
-    """
+    """A process or component that is, or may be, ``node``."""
 
     node: str
     label: str
-    named: bool
-    rules: Sequence[str]
-    action: Any = None
+    named: bool  # by the launch; else ROS 2 follows the rules if the executable is of that name
+    rules: Sequence[str]  # that were added
+    action: Any = None  # a process's
 
     @property
     def runs(self) -> bool:
@@ -55,21 +48,16 @@ class Started:
 
 @dataclass
 class Redirect:
-    """``nodes`` (full names) have ``target`` in place of ``topic``, as a ``kind`` of endpoint.
+    """``nodes`` (full names) have ``target`` in place of ``topic``, as a ``kind`` of endpoint."""
 
-    ``kind`` is ``publisher`` or ``subscription``; ``added`` are our own nodes, which have the topic
-    instead. ``others`` and ``elsewhere`` are for messages: what else was started, and who is of a
-    meant name and has another topic by a rule of its own.
-    """
-
-    kind: str
+    kind: str  # publisher or subscription
     topic: str
     target: str
     nodes: Sequence[str]
-    added: Sequence[str]
+    added: Sequence[str]  # our own nodes, which have the topic instead
     started: list[Started] = field(default_factory=list)
-    others: list[str] = field(default_factory=list)
-    elsewhere: list[str] = field(default_factory=list)
+    others: list[str] = field(default_factory=list)  # what else was started
+    elsewhere: list[str] = field(default_factory=list)  # who has another topic by its own rule
 
     def values(self) -> dict[str, Any]:
         """What a launch file says of it, and a dry run is asked."""
@@ -107,21 +95,15 @@ class Redirect:
             added += own
         return sorted(added, key=lambda one: one[0])
 
-    def twice(self) -> str | None:
-        """Which node was started again while it runs, in words, if one was."""
-        running = [one.node for one in self.started if one.named and one.runs]
-        twice = [node for node in self.nodes if running.count(node) > 1]
-        if not twice:
-            return None
-        return f"more was redirected than meant: {_names(twice)} was started more than once"
-
     def mistake(self, on_topic: Sequence[str], on_target: Sequence[str]) -> str | None:
         """What is wrong with who has the topic and who the target, in words, if anything is.
 
-        A node that launch runs under its name need not have the target yet.
+        A node that launch runs under its name need not have the target yet, but runs once only.
         """
-        known = {*on_target, *(one.node for one in self.started if one.named and one.runs)}
-        lacking = [node for node in self.nodes if node not in known]
+        running = [one.node for one in self.started if one.named and one.runs]
+        if twice := [node for node in self.nodes if running.count(node) > 1]:
+            return f"more was redirected than meant: {_names(twice)} was started more than once"
+        lacking = [node for node in self.nodes if node not in {*on_target, *running}]
         elsewhere = [node for node in lacking if node in self.elsewhere]
         if elsewhere:
             return f"nothing was redirected: {_names(elsewhere)} has another topic in place of it"
@@ -129,13 +111,13 @@ class Redirect:
             others = _names(self.others)
             return f"nothing was redirected: no node {_names(lacking)} runs; started were {others}"
         if self.kind == "subscription":
-            past = [one for one in on_topic if one in self.nodes]
-            return f"{_names(past)} subscribes to it past {_names(self.added)}" if past else None
-        surplus = [one for one in on_target if one not in self.nodes]
-        if surplus:
-            return f"more was redirected than meant: {_names(surplus)} publishes {self.target} too"
-        past = [one for one in on_topic if one not in self.added]
-        return f"{_names(past)} publishes it past {_names(self.added)}" if past else None
+            past, does = [one for one in on_topic if one in self.nodes], "subscribes to"
+        else:
+            past, does = [one for one in on_topic if one not in self.added], "publishes"
+            if surplus := [one for one in on_target if one not in self.nodes]:
+                too = f"{_names(surplus)} publishes {self.target} too"
+                return f"more was redirected than meant: {too}"
+        return f"{_names(past)} {does} it past {_names(self.added)}" if past else None
 
     def message(self, problem: str, on_topic: Sequence[str], on_target: Sequence[str]) -> str:
         """A problem with all that a person needs to see what it comes from."""
@@ -264,7 +246,12 @@ def launch_description(
     from launch_ros.actions import Node
 
     parts = [Redirect(**one) for one in redirects]
-    actions: list[Any] = [OpaqueFunction(function=_begin, args=[parts])]
+    within = DeclareLaunchArgument(
+        WITHIN,
+        default_value=str(WITHIN_S),
+        description="after how many seconds a topic that was not redirected ends the launch",
+    )
+    actions: list[Any] = [within, OpaqueFunction(function=_begin, args=[parts])]
     actions += [(Node if "package" in one else ExecuteProcess)(**one) for one in processes]
     for file in files:
         description = AnyLaunchDescriptionSource(file).get_launch_description(LaunchContext())
@@ -276,21 +263,12 @@ def launch_description(
             if includes is None and argument.default_value is None
             if not argument._conditionally_included
         ]
-        actions += [
-            DeclareLaunchArgument(one.name, description=one.description) for one in required
-        ]
-        actions.append(
-            IncludeLaunchDescription(
-                LaunchDescriptionSource(description, file, "spliced launch file"),
-                launch_arguments=[(one.name, LaunchConfiguration(one.name)) for one in required],
-            )
-        )
-    within = DeclareLaunchArgument(
-        WITHIN,
-        default_value=str(WITHIN_S),
-        description="after how many seconds a topic that was not redirected ends the launch",
-    )
-    return LaunchDescription([within, *actions])
+        for one in required:
+            actions.append(DeclareLaunchArgument(one.name, description=one.description))
+        source = LaunchDescriptionSource(description, file, "spliced launch file")
+        handed_on = [(one.name, LaunchConfiguration(one.name)) for one in required]
+        actions.append(IncludeLaunchDescription(source, launch_arguments=handed_on))
+    return LaunchDescription(actions)
 
 
 def _begin(context: Any, redirects: Sequence[Redirect]) -> list[Any] | None:
@@ -317,11 +295,7 @@ def _listen(context: Any) -> None:
 
 
 def redirect_from_now_on(redirects: Sequence[Redirect]) -> None:
-    """Let whatever this process launches be redirected.
-
-    Raises:
-        AttributeError: this `launch_ros` makes its requests in another way.
-    """
+    """Let whatever this process launches be redirected."""
     from launch.descriptions import Executable
     from launch_ros.actions import load_composable_nodes as loading
 
@@ -343,11 +317,7 @@ def redirect_from_now_on(redirects: Sequence[Redirect]) -> None:
 
 
 def _check(context: Any, redirects: Sequence[Redirect]) -> None:
-    """Hold what was redirected against the graph of ROS 2.
-
-    Raises:
-        RuntimeError: nothing was redirected, or more than is meant. It ends the launch.
-    """
+    """Compare what was redirected with the graph of ROS 2; a RuntimeError ends the launch."""
     import launch.logging
     from launch_ros.ros_adapters import get_ros_node
 
@@ -355,17 +325,16 @@ def _check(context: Any, redirects: Sequence[Redirect]) -> None:
     messages = []
     for one in redirects:
         ask = getattr(asked, f"get_{one.kind}s_info_by_topic")
-        found = [[_full_name(info) for info in ask(topic)] for topic in (one.topic, one.target)]
-        mistake = one.twice() or one.mistake(*found)
-        messages += [one.message(mistake, *found)] if mistake else []
-        there = "is redirected" if {*one.nodes} <= {*found[1]} else "is redirected when it comes"
+        on_topic, on_target = (
+            [f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in ask(topic)]
+            for topic in (one.topic, one.target)
+        )
+        if mistake := one.mistake(on_topic, on_target):
+            messages.append(one.message(mistake, on_topic, on_target))
+        there = "is redirected" if {*one.nodes} <= {*on_target} else "is redirected when it comes"
         logger.info(f"{one.topic} of {_names(one.nodes)} {there}: {one.target}")
     if messages:
         raise RuntimeError("; ".join(messages))
-
-
-def _full_name(info: Any) -> str:
-    return f"{info.node_namespace.rstrip('/')}/{info.node_name}"
 
 
 def dry_run(
@@ -375,9 +344,10 @@ def dry_run(
     arguments: dict[str, str],
     folder: str,
 ) -> list[dict[str, Any]]:
-    """Carry out launch files in a folder without starting a process; what would be redirected.
+    """Carry out launch files in a folder without starting a process.
 
-    Timers fire at once, and what event handlers would start is started.
+    For each redirect: who would be redirected, and what is wrong with that. Timers fire at once,
+    and what event handlers would start is started.
     """
     import asyncio
 
@@ -422,20 +392,17 @@ def dry_run(
     for file in files:
         source = AnyLaunchDescriptionSource(file)
         carry_out(IncludeLaunchDescription(source, launch_arguments=arguments.items()), context)
-    return [_found(one) for one in parts]
-
-
-def _found(redirect: Redirect) -> dict[str, Any]:
-    """What a dry run found: who would be redirected, or what is wrong with that."""
-    maybe = [one.node for one in redirect.started if not one.named]
-    return {
-        "topic": redirect.topic,
-        "target": redirect.target,
-        "problem": redirect.twice() or redirect.mistake([], maybe),
-        "redirected": [
-            {"node": one.node, "as": one.label, "rules": one.rules} for one in redirect.started
-        ],
-    }
+    return [
+        {
+            "topic": part.topic,
+            "target": part.target,
+            "problem": part.mistake([], [one.node for one in part.started if not one.named]),
+            "redirected": [
+                {"node": one.node, "as": one.label, "rules": one.rules} for one in part.started
+            ],
+        }
+        for part in parts
+    ]
 
 
 if __name__ == "__main__":

@@ -1,12 +1,16 @@
 """The shaping node of a plan as a ROS 2 process: its files, and what a launch file has to start.
 
 Three kinds do the same: ``python`` needs no building, ``cpp`` is one package for all types,
-``typed`` is the paper's package, generated for one type. All read the same parameters, which say
-what the plan says, and write the same log (:mod:`chainshaper.sources.gate_log`).
+``typed`` is the paper's package (section 4.2), generated for one type. All read the same
+parameters, which say what the plan says, and write the same log.
 """
 
 import ast
 import hashlib
+import os
+import re
+import shutil
+import subprocess
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,22 +18,17 @@ from typing import Any, Literal, TypeAlias
 
 import yaml
 
-from chainshaper.gate.decision import DEPTH, Gate, Modes
-from chainshaper.gate.parameters import gate_parameters
+from chainshaper.analysis.chains import close_names
+from chainshaper.gate import decision, handover
+from chainshaper.gate.decision import DEPTH, Gate, Modes, NodeParameters, gate_parameters
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.plan import Plan, ShapingNode, server_of
-from chainshaper.splicing.generated_package import (
-    GENERIC_PACKAGE,
-    generic_package,
-    message_type_named,
-    typed_package,
-)
-from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.files import write_whole
 
 NodeKind: TypeAlias = Literal["python", "cpp", "typed"]
-_PACKAGE = Path(__file__).parents[1]
-_PYTHON_NODES = _PACKAGE / "splicing" / "nodes" / "python"
+_SOURCES = Path(__file__).parents[2]
+_NODES = Path(__file__).parent / "nodes"
 
 RESPAWN = {"respawn": True, "respawn_delay": 0.1}
 """What a launch file says of every process that is added, in the words of all its languages.
@@ -43,13 +42,9 @@ SHORTEST_PATIENCE_NS = 10_000_000  # a node later than that hangs, or than half 
 
 @dataclass(frozen=True)
 class ShapingProcess:
-    """A process that a launch file starts: a shaping node, or a throttler.
+    """A process that a launch file starts, again when it ends: a shaping node, or a throttler.
 
-    It is either a ``command`` (without ``--ros-args``; name, namespace, parameters and remappings
-    are for the launch file to add) or an ``executable`` of a ``package``. ``parameters_file`` is
-    a ROS 2 parameters file; ``remappings`` are pairs such as ``("input", "/t5_tmp")``. The
-    launch starts it again when it ends, and its ``standby`` as well, which passes its output on
-    meanwhile.
+    It is either a ``command`` (without ``--ros-args``) or an ``executable`` of a ``package``.
     """
 
     name: str
@@ -57,9 +52,9 @@ class ShapingProcess:
     command: tuple[str, ...] | None
     package: str | None
     executable: str | None
-    parameters_file: Path
-    remappings: tuple[tuple[str, str], ...]
-    standby: "ShapingProcess | None" = None
+    parameters_file: Path  # of ROS 2
+    remappings: tuple[tuple[str, str], ...]  # such as ("input", "/t5_tmp")
+    standby: "ShapingProcess | None" = None  # passes its output on meanwhile
 
     @property
     def command_line(self) -> list[str]:
@@ -78,12 +73,14 @@ def write_shaping_process(
     *,
     message_type: str | None = None,
     log: Path | None = None,
+    into: Path | None = None,
 ) -> ShapingProcess:
     """Write a shaping node of a plan into ``folder``; what a launch file has to start.
 
     ``message_type`` is the type of the chain's output, such as ``sensor_msgs/msg/Image``: the
     ``typed`` kind is generated for it, the others find it out when they run. ``log`` is where the
-    node notes what it did with each message. Files that are there and equal are left alone.
+    node notes what it did with each message. Files that are there and equal are left alone. Those
+    that are to be moved to ``folder`` later are written ``into`` another one.
 
     Raises:
         InputError: a file is there with another content; no type for the typed kind, or none that
@@ -95,31 +92,27 @@ def write_shaping_process(
             f"the typed shaping node is generated for one type, and that of {node.output} is not "
             "known: name it, as `ros2 topic type` prints it, or choose the kind cpp"
         )
-    package, files = _program(kind, "shaping_node", node.name, message_type)
     remappings = (("input", node.input), ("output", node.output))
-    parameters = shaping_parameters(plan, node, log)
+    standby = f"{node.name}{STANDBY}"
+    process, files = _process(
+        *(kind, "shaping_node", node.name, folder),
+        remappings=remappings,
+        message_type=message_type,
+    )
+    beside, files_beside = _process("python", "standby", standby, folder, remappings=remappings)
     # The files may be moved before they are used; the log stays where it is.
     place = hashlib.sha256(str((log or folder).absolute()).encode()).hexdigest()
-    parameters["handover"] = page = f"{node.name}.{place[:8]}"
-    standby = f"{node.name}{STANDBY}"
-    of_standby = {
-        "handover": page,
+    parameters = shaping_parameters(plan, node, log)
+    parameters["handover"] = f"{node.name}.{place[:8]}"
+    of_standby = {name: parameters[name] for name in ("handover", "output_depth", "depth")} | {
         "shaping_node": node.name,
         "fallback": plan.fallback,
         "patience_ns": max(plan.cycle_ns // 2, SHORTEST_PATIENCE_NS),
-        "output_depth": parameters["output_depth"],
-        "depth": parameters["depth"],
         "server_cores": _server_cores(plan),
         "log": "" if log is None else str(log.with_stem(standby).absolute()),
     }
-    files |= {
-        f"{node.name}.yaml": _yaml(parameters),
-        f"{standby}.py": python_node("standby"),
-        f"{standby}.yaml": _yaml(of_standby),
-    }
-    _write(folder, files)
-    beside = _process(folder, standby, None, "standby", remappings)
-    process = _process(folder, node.name, package, "shaping_node", remappings)
+    files |= {f"{node.name}.yaml": _yaml(parameters), f"{standby}.yaml": _yaml(of_standby)}
+    _write(into or folder, {**files, **files_beside})
     return replace(process, standby=beside)
 
 
@@ -134,12 +127,13 @@ def write_throttler(
     core: int | None = None,
     fifo_priority: int | None = None,
     depth: int = DEPTH,
+    into: Path | None = None,
 ) -> ShapingProcess:
     """Write a throttler into ``folder`` (paper, section 5.1); what a launch file has to start.
 
     Each of the ``topics`` is republished on the one it maps to, once every ``period_ns``, at
     ``phase_ns`` after multiples of it on CLOCK_MONOTONIC. ``depth`` is the history of the
-    publishers where that of the originals is not known.
+    publishers where that of the originals is not known; ``into`` as for a shaping process.
 
     Raises:
         InputError: no topics, no period, or a file is there with another content.
@@ -156,9 +150,9 @@ def write_throttler(
         "fifo_priority": fifo_priority or 0,
         "output_depth": depth,
     }
-    package, files = _program(kind, "throttler", name, None)
-    _write(folder, {**files, f"{name}.yaml": _yaml(parameters)})
-    return _process(folder, name, package, "throttler", ())
+    process, files = _process(kind, "throttler", name, folder)
+    _write(into or folder, {**files, f"{name}.yaml": _yaml(parameters)})
+    return process
 
 
 def gate_of(plan: Plan, node: ShapingNode, depth: int = DEPTH) -> Gate:
@@ -203,63 +197,34 @@ def _server_cores(plan: Plan) -> list[int]:
     return sorted({server.core for server in plan.servers})
 
 
-def python_node(executable: str) -> str:
-    """The one file of a Python node: the gate as it is, what it needs of ROS 2, and the node.
-
-    What one of these parts imports from another is there already, so such imports are left out.
-    """
-    parts: dict[Path, str] = {}
-    _add_part(_PYTHON_NODES / f"{executable}.py", parts)
-    return "#!/usr/bin/env python3\n" + "\n\n".join(parts.values())
-
-
-def _add_part(path: Path, parts: dict[Path, str]) -> None:
-    """Add the text of a file without its imports of ours, behind the files that these name."""
-    text = path.read_text(encoding="utf-8")
-    lines = text.splitlines(keepends=True)
-    for statement in reversed(ast.parse(text).body):
-        module = getattr(statement, "module", None) or ""
-        if isinstance(statement, ast.ImportFrom) and module.startswith("chainshaper."):
-            del lines[statement.lineno - 1 : statement.end_lineno]
-            imported = _PACKAGE.parent / f"{module.replace('.', '/')}.py"
-            if imported not in parts:
-                _add_part(imported, parts)
-    parts[path] = "".join(lines)
-
-
-def _program(
-    kind: NodeKind, executable: str, name: str, message_type: str | None
-) -> tuple[str | None, dict[str, str]]:
-    """The package that has an executable, if it has one, and the files by their paths."""
-    if kind == "python":
-        return None, {
-            f"{name}.py": python_node(executable),
-            "respawning.py": (_PYTHON_NODES / "respawning.py").read_text(encoding="utf-8"),
-        }
-    package, files = GENERIC_PACKAGE, generic_package()
-    if kind == "typed" and message_type is not None:
-        known = message_type_named(message_type)
-        package, files = known.node_package, typed_package(known)
-    return package, {f"{package}/{path}": text for path, text in files.items()}
-
-
 def _process(
-    folder: Path,
-    name: str,
-    package: str | None,
+    kind: NodeKind,
     executable: str,
-    remappings: tuple[tuple[str, str], ...],
-) -> ShapingProcess:
-    folder = folder.absolute()
-    return ShapingProcess(
-        name=name,
-        namespace="/",
-        command=("python3", str(folder / f"{name}.py")) if package is None else None,
-        package=package,
-        executable=None if package is None else executable,
-        parameters_file=folder / f"{name}.yaml",
-        remappings=remappings,
-    )
+    name: str,
+    folder: Path,
+    *,
+    remappings: tuple[tuple[str, str], ...] = (),
+    message_type: str | None = None,
+) -> tuple[ShapingProcess, dict[str, str]]:
+    """A process with its program's files, by their paths below the folder."""
+    folder, command, package = folder.absolute(), None, None
+    if kind == "python":
+        command = ("python3", str(folder / f"{name}.py"))
+        files = {f"{name}.py": python_node(executable)}
+        if executable != "standby":  # that stands beside one that has it
+            files["respawning.py"] = _respawning()
+    else:
+        known = message_type_named(message_type) if kind == "typed" and message_type else None
+        package = GENERIC_PACKAGE if known is None else known.node_package
+        filled = generic_package() if known is None else typed_package(known)
+        files = {f"{package}/{path}": text for path, text in filled.items()}
+    runs = None if package is None else executable
+    parameters = folder / f"{name}.yaml"
+    return ShapingProcess(name, "/", command, package, runs, parameters, remappings), files
+
+
+def _respawning() -> str:
+    return (_NODES / "python/respawning.py").read_text(encoding="utf-8")
 
 
 def _yaml(parameters: dict[str, Any]) -> str:
@@ -283,3 +248,217 @@ def _write(folder: Path, files: dict[str, str]) -> None:
             write_whole(path, [text.encode()])
     except OSError as error:
         raise OperationError(f"{error.filename}: cannot be written: {error.strerror}") from error
+
+
+def python_node(executable: str) -> str:
+    """The one file of a Python node: the gate as it is, what it needs of ROS 2, and the node.
+
+    What one of these parts imports from another is there already, so such imports are left out.
+    """
+    parts: dict[Path, str] = {}
+    _add_part(_NODES / "python" / f"{executable}.py", parts)
+    return "#!/usr/bin/env python3\n" + "\n\n".join(parts.values())
+
+
+def _add_part(path: Path, parts: dict[Path, str]) -> None:
+    """Add the text of a file without its imports of ours, behind the files that these name."""
+    text = path.read_text(encoding="utf-8")
+    lines = text.splitlines(keepends=True)
+    for statement in reversed(ast.parse(text).body):
+        module = getattr(statement, "module", None) or ""
+        if isinstance(statement, ast.ImportFrom) and module.startswith("chainshaper."):
+            del lines[statement.lineno - 1 : statement.end_lineno]
+            imported = _SOURCES / f"{module.replace('.', '/')}.py"
+            if imported not in parts:
+                _add_part(imported, parts)
+    parts[path] = "".join(lines)
+
+
+# Packages in C++ ----------------------------------------------------------------------------------
+
+GENERIC_PACKAGE = "chainshaper_shaping"
+_TYPE = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
+_CPP_TYPES = {
+    int: "std::int64_t",
+    str: "std::string",
+    list[int]: "std::vector<std::int64_t>",
+    list[str]: "std::vector<std::string>",
+}
+
+
+@dataclass(frozen=True)
+class MessageType:
+    """A message type, such as ``sensor_msgs/msg/PointCloud2``."""
+
+    package: str
+    name: str
+
+    @property
+    def full_name(self) -> str:
+        """As `ros2 topic type` prints it."""
+        return f"{self.package}/msg/{self.name}"
+
+    @property
+    def snake_name(self) -> str:
+        """As rosidl names the header: ``point_cloud2``.
+
+        Upstream: `convert_camel_case_to_lower_case_underscore` of rosidl_pycommon.
+        """
+        words = re.sub(r"(.)([A-Z][a-z]+)", r"\1_\2", self.name)
+        return re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", words).lower()
+
+    @property
+    def node_package(self) -> str:
+        """The name of the package that is generated for this type."""
+        return f"shaping_{self.package}_{self.snake_name}"
+
+
+def message_type_named(text: str) -> MessageType:
+    """The message type of this name.
+
+    Raises:
+        InputError: it is no type's name, or not installed where there is a ROS 2 environment.
+    """
+    match = _TYPE.fullmatch(text)
+    if match is None:
+        raise InputError(
+            f"{text!r} is not a message type: write PACKAGE/msg/TYPE, such as "
+            "sensor_msgs/msg/PointCloud2, as `ros2 topic type TOPIC` prints it"
+        )
+    package, name = match.groups()
+    prefixes = [one for one in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if one]
+    folders = [Path(prefix) / "share" / package / "msg" for prefix in prefixes]
+    installed = sorted({path.stem for folder in folders for path in folder.glob("*.msg")})
+    if prefixes and not installed:
+        raise InputError(
+            f"{text}: no package {package} with messages in this ROS 2 environment: source the "
+            "workspace that has it, or correct the name"
+        )
+    if prefixes and name not in installed:
+        near = ", ".join(close_names(name, installed)) or ", ".join(installed[:5])
+        raise InputError(
+            f"{text}: the package {package} has no message {name}: did you mean {near}?"
+        )
+    return MessageType(package, name)
+
+
+def generic_package() -> dict[str, str]:
+    """The files of the package for all types: paths inside it, and their text."""
+    files = _filled(GENERIC_PACKAGE, "topics of any type", ["std_msgs"], "shaping_node throttler")
+    del files["include/message.hpp"]
+    return files
+
+
+def typed_package(message_type: MessageType) -> dict[str, str]:
+    """The files of the package generated for one type: paths inside it, and their text."""
+    package, name = message_type.package, message_type.full_name
+    messages = sorted({"std_msgs", package})  # the modes of the system are a std_msgs/String
+    files = _filled(
+        *(message_type.node_package, name, messages, "shaping_node"),
+        TYPE=name,
+        HEADER=f"{package}/msg/{message_type.snake_name}.hpp",
+        CLASS=f"{package}::msg::{message_type.name}",
+    )
+    del files["src/throttler.cpp"]
+    return files
+
+
+def _filled(
+    project: str, shaped: str, messages: list[str], nodes: str, **values: str
+) -> dict[str, str]:
+    """The files of a package, with the templates among them, ``….in``, filled in."""
+    values |= _schema() | {
+        "PROJECT": project,
+        "FOR": shaped,
+        "NODES": nodes,
+        "FIND_MESSAGES": "\n".join(f"find_package({name} REQUIRED)" for name in messages),
+        "MESSAGE_TARGETS": " ".join(f"${{{name}_TARGETS}}" for name in messages),
+        "DEPENDS": "\n".join(f"  <depend>{name}</depend>" for name in messages),
+    }
+    files = {"scripts/respawning": _respawning()}
+    for path in sorted((_NODES / "cpp").rglob("*.*")):
+        text = path.read_text(encoding="utf-8")
+        if path.suffix == ".in":
+            text = re.sub("@([A-Z_]+)@", lambda found: values.get(found[1], found[0]), text)
+        files[str(path.relative_to(_NODES / "cpp")).removesuffix(".in")] = text
+    return files
+
+
+def _schema() -> dict[str, str]:
+    """What the gate in C++ shares with the one in Python, as `schema.hpp.in` has it."""
+    words = {
+        "Anchor": decision.ANCHORS,
+        "Policy": decision.LATE,
+        "Messages": decision.MESSAGES,
+        "Dropped": decision.DROPPED,
+    }
+    numbers = {
+        name.lower(): value
+        for room in (decision, handover)
+        for name, value in vars(room).items()
+        if name.isupper() and isinstance(value, int) and not name.startswith("_")
+    }
+    numbers["log_columns"] = len(decision.LOG_COLUMNS)
+    usual = vars(NodeParameters())
+    types = {name: _CPP_TYPES[kind] for name, kind in NodeParameters.__annotations__.items()}
+    return {
+        "WORDS": "\n".join(
+            f"enum class {kind} {{ {', '.join(name.replace('-', '_') for name in names)} }};\n"
+            f"inline constexpr std::array<const char *, {len(names)}> {kind.lower()}_names{{\n"
+            f"    {', '.join(map(_in_cpp, names))}}};"
+            for kind, names in words.items()
+        ),
+        "CONSTANTS": "\n".join(
+            f"inline constexpr std::int64_t {name} = {value};" for name, value in numbers.items()
+        ),
+        "LOG_HEADER": '"\n    "'.join(f"{n}," for n in decision.LOG_COLUMNS).removesuffix(","),
+        "FIELDS": ", ".join(handover.FIELDS),
+        "PARAMETERS": "\n  ".join(f"{types[n]} {n}{{{_in_cpp(usual[n])}}};" for n in types),
+        "READS": "\n    ".join(f'read("{name}", {name});' for name in types),
+    }
+
+
+def _in_cpp(value: str | int | list[Any]) -> str:
+    return f'"{value}"' if isinstance(value, str) else str(value).strip("[]")
+
+
+def check_build_tools() -> None:
+    """PlatformError: colcon, CMake, a compiler or the ROS 2 environment is missing."""
+    compiler = os.environ.get("CXX", "c++").split()[0]
+    packages = {"colcon": "python3-colcon-common-extensions", "cmake": "cmake", compiler: "g++"}
+    for program, package in packages.items():
+        if shutil.which(program) is None:
+            raise PlatformError(
+                f"{program}, which building the shaping node needs, is not on the PATH: install it "
+                f"(`apt install {package}`), or choose `--node python`, which needs no building"
+            )
+    if not os.environ.get("AMENT_PREFIX_PATH"):
+        raise PlatformError(
+            "building the shaping node needs a ROS 2 environment, and none is sourced: "
+            "`source /opt/ros/DISTRIBUTION/setup.bash` first, or choose `--node python`"
+        )
+
+
+def build_package(folder: Path) -> Path:
+    """Build the packages in a folder with colcon; the file to source, ``install/setup.bash``.
+
+    Raises:
+        PlatformError: see :func:`check_build_tools`.
+        OperationError: the build failed; the end of what it said is in the message.
+    """
+    check_build_tools()
+    build = subprocess.run(
+        ["colcon", "--log-base", "log", "build", "--base-paths", ".", "--merge-install"],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+    )
+    if build.returncode:
+        end = "\n".join(build.stdout.splitlines()[-20:])
+        raise OperationError(
+            f"{folder}: `colcon build` failed with exit code {build.returncode}; all it said is in "
+            f"{folder / 'log' / 'latest_build'}. It ended with:\n{end}"
+        )
+    return folder / "install" / "setup.bash"

@@ -27,35 +27,19 @@ from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.files import open_to_all
 from chainshaper.values.yaml_file import read_text
 
-__all__ = [
-    "LOGS",
-    "NODES",
-    "LaunchCommand",
-    "is_run",
-    "launch_file_name",
-    "launch_text",
-    "new_folder",
-    "original_words",
-    "parse_launch_command",
-    "remove_folder",
-    "usable",
-]
-
 MANIFEST = "splice.json"
 NODES = "shaping_nodes"
 LOGS = "logs"
 _FORMAT = 1
 _DERIVED = {LOGS, *(f"{NODES}/{name}" for name in ("build", "install", "log"))}
 _WITH_VALUE = ("--launch-prefix", "--launch-prefix-filter")
-_SIGNS = {
+_SIGNS = {  # what the text of a launch file has in it, by the end of its name
     ".py": "generate_launch_description",
     ".xml": "<launch",
     ".yaml": r"(?m)^[\s'\"{]*launch\b",
     ".yml": r"(?m)^[\s'\"{]*launch\b",
     ".launch": "launch",
 }
-"""What the text of a launch file has in it, by the end of its name."""
-
 _TEXT = '''"""Starts {what} with nodes added; written by `chainshaper splice`."""
 
 import importlib.util
@@ -79,16 +63,12 @@ def generate_launch_description():
 
 @dataclass(frozen=True)
 class LaunchCommand:
-    """`ros2 launch …` as it was typed.
+    """`ros2 launch …` as it was typed."""
 
-    ``before`` and ``after`` are the words around those that name the launch ``file``;
-    ``arguments`` are launch arguments by name.
-    """
-
-    before: tuple[str, ...]
+    before: tuple[str, ...]  # the words before those that name the launch file
     file: Path
     after: tuple[str, ...]
-    arguments: dict[str, str]
+    arguments: dict[str, str]  # of the launch, by name
 
     def with_file(self, file: Path) -> list[str]:
         """The command that launches another file in the same way."""
@@ -112,37 +92,30 @@ def parse_launch_command(command: Sequence[str]) -> LaunchCommand:
     at = 2
     while at < len(words) and words[at].startswith("-"):
         at += 2 if words[at] in _WITH_VALUE else 1
-    if at >= len(words):
+    first, second = [*words[at : at + 2], "", ""][:2]
+    if not first:
         raise InputError("no launch file given: `ros2 launch PACKAGE FILE`, or `ros2 launch FILE`")
-    first = words[at]
-    if Path(first).is_file():
-        return _command(words, at, at + 1, Path(first))
-    share = _package_share(first)
-    if share is None:
-        raise InputError(
-            f"{first}: neither a launch file nor a package of this environment; is it sourced "
-            "(`source install/setup.bash`)?"
-        )
-    if at + 1 >= len(words):
-        raise InputError(f"no launch file given: `ros2 launch {first} FILE`")
-    return _command(words, at, at + 2, _file_of_package(share, first, words[at + 1]))
-
-
-def _package_share(package: str) -> Path | None:
-    """The share folder of a package in the environment, found as `ament_index` finds it."""
-    for prefix in filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)):
-        if (Path(prefix) / "share/ament_index/resource_index/packages" / package).is_file():
-            return Path(prefix) / "share" / package
-    return None
-
-
-def _command(words: list[str], start: int, end: int, file: Path) -> LaunchCommand:
+    file, end = Path(first), at + 1
+    if not file.is_file():
+        file, end = _file_of_package(first, second), at + 2
     after = words[end:]
     arguments = dict(word.split(":=", 1) for word in after if ":=" in word)
-    return LaunchCommand(tuple(words[:start]), file.absolute(), tuple(after), arguments)
+    return LaunchCommand(tuple(words[:at]), file.absolute(), tuple(after), arguments)
 
 
-def _file_of_package(share: Path, package: str, name: str) -> Path:
+def _file_of_package(package: str, name: str) -> Path:
+    """A launch file anywhere in a package's share folder, which is found as `ament_index` does."""
+    prefixes = filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep))
+    shares = [Path(prefix) / "share" for prefix in prefixes]
+    index = Path("ament_index/resource_index/packages", package)
+    share = next((one / package for one in shares if (one / index).is_file()), None)
+    if share is None:
+        raise InputError(
+            f"{package}: neither a launch file nor a package of this environment; is it sourced "
+            "(`source install/setup.bash`)?"
+        )
+    if not name:
+        raise InputError(f"no launch file given: `ros2 launch {package} FILE`")
     found = [Path(folder) / name for folder, _, files in os.walk(share) if name in files]
     if not found:
         raise InputError(f"package {package} has no launch file {name} in {share}")
@@ -152,22 +125,6 @@ def _file_of_package(share: Path, package: str, name: str) -> Path:
             f"meant, {' or '.join(map(str, sorted(found)))}"
         )
     return found[0]
-
-
-def _check_launch_file(path: Path) -> None:
-    """Look at a launch file as far as a mistaken one would be noticed; launch alone reads it.
-
-    Raises:
-        InputError: there is no such file, or it is no launch file.
-    """
-    if path.suffix not in _SIGNS:
-        raise InputError(
-            f"{path}: a launch file's name ends in .py, .xml, .yaml, .yml or .launch: give one"
-        )
-    if not re.search(_SIGNS[path.suffix], read_text(path, "what `ros2 launch` starts")):
-        raise InputError(
-            f"{path}: no launch file: it has no `launch`, or no `generate_launch_description`"
-        )
 
 
 def launch_file_name(words: Sequence[str]) -> str:
@@ -216,6 +173,41 @@ def _keywords(process: ShapingProcess) -> dict[str, Any]:
     }
 
 
+def original_words(words: Sequence[str], *, throttled: bool = False) -> list[str]:
+    """Launch files as they were before splicing, each once, or `ros2 run …` as it is.
+
+    With ``throttled`` a launch file that has a throttler is an original too.
+
+    Raises:
+        InputError: one of them is not there, or is no launch file.
+    """
+    if is_run(words):
+        return list(words)
+    found: list[str] = []
+    for word in words:
+        file = Path(word).absolute()
+        manifest = _manifest(file.parent)
+        ours = manifest is not None and file.name in manifest["copies"]
+        if manifest is None or not ours or (throttled and manifest["throttled"]):
+            _check_launch_file(file)
+            found.append(str(file))
+        else:
+            found += original_words(manifest["copies"][file.name], throttled=throttled)
+    return list(dict.fromkeys(found)) if not is_run(found) else found
+
+
+def _check_launch_file(path: Path) -> None:
+    """Look at a launch file as far as a mistaken one would be noticed; launch alone reads it."""
+    if path.suffix not in _SIGNS:
+        raise InputError(
+            f"{path}: a launch file's name ends in .py, .xml, .yaml, .yml or .launch: give one"
+        )
+    if not re.search(_SIGNS[path.suffix], read_text(path, "what `ros2 launch` starts")):
+        raise InputError(
+            f"{path}: no launch file: it has no `launch`, or no `generate_launch_description`"
+        )
+
+
 def usable(folder: Path) -> Path:
     """The absolute path of the folder to write, once it is sure that nothing would be lost.
 
@@ -236,10 +228,8 @@ def _refuse_changed(folder: Path, consequence: str) -> None:
         raise InputError(
             f"{folder} was not written by `chainshaper splice`, so it is {consequence}"
         )
-    found = _hashes(folder)
-    changed = sorted(
-        name for name, digest in found.items() if manifest["files"].get(name, "") != digest
-    )
+    known = manifest["files"]
+    changed = sorted(name for name, digest in _hashes(folder).items() if known.get(name) != digest)
     if changed:
         raise InputError(
             f"{folder}: {', '.join(changed)} was changed or added since it was written, so it is"
@@ -253,16 +243,16 @@ def _manifest(folder: Path) -> dict[str, Any] | None:
     """
     try:
         values = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-        if values["format"] == _FORMAT:
-            copies = {  # earlier versions copied each launch file
-                name: [words] if isinstance(words, str) else list(words)
-                for name, words in values["copies"].items()
-            }
-            throttled = bool(values.get("throttled"))
-            return {"copies": copies, "files": dict(values["files"]), "throttled": throttled}
+        if values["format"] != _FORMAT:
+            return None
+        copies = {  # earlier versions copied each launch file
+            name: [words] if isinstance(words, str) else list(words)
+            for name, words in values["copies"].items()
+        }
+        throttled = bool(values.get("throttled"))
+        return {"copies": copies, "files": dict(values["files"]), "throttled": throttled}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        pass
-    return None
+        return None
 
 
 def _hashes(folder: Path) -> dict[str, str]:
@@ -274,26 +264,6 @@ def _hashes(folder: Path) -> dict[str, str]:
         if path.is_file() and not derived and str(name) != MANIFEST:
             found[str(name)] = hashlib.sha256(path.read_bytes()).hexdigest()
     return found
-
-
-def original_words(words: Sequence[str], *, throttled: bool = False) -> list[str]:
-    """Launch files as they were before splicing, each once, or `ros2 run …` as it is.
-
-    With ``throttled`` a launch file that has a throttler is an original too.
-    """
-    if is_run(words):
-        return list(words)
-    found: list[str] = []
-    for word in words:
-        file = Path(word).absolute()
-        manifest = _manifest(file.parent)
-        ours = manifest is not None and file.name in manifest["copies"]
-        if manifest is None or not ours or (throttled and manifest["throttled"]):
-            _check_launch_file(file)
-            found.append(str(file))
-        else:
-            found += original_words(manifest["copies"][file.name], throttled=throttled)
-    return list(dict.fromkeys(found)) if not is_run(found) else found
 
 
 @contextmanager
@@ -328,17 +298,20 @@ def new_folder(
 
 def _replace(folder: Path, new: Path) -> None:
     """Put a new folder in the place of an older one of ours, which comes back if that fails."""
-    if not folder.exists():
-        new.rename(folder)
-        return
-    aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.older-", dir=folder.parent))
-    folder.rename(aside)
+    aside = _moved_aside(folder) if folder.exists() else None
     try:
         new.rename(folder)
     except OSError:
-        aside.rename(folder)
+        if aside is not None:
+            aside.rename(folder)
         raise
-    shutil.rmtree(aside, ignore_errors=True)
+    if aside is not None:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def _moved_aside(folder: Path) -> Path:
+    aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.older-", dir=folder.parent))
+    return folder.rename(aside)
 
 
 def remove_folder(folder: Path) -> None:
@@ -353,8 +326,6 @@ def remove_folder(folder: Path) -> None:
         raise InputError(f"{folder}: no such folder, so there is nothing to undo")
     _refuse_changed(folder, "not removed: move away what you need, and remove the rest")
     try:
-        aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.older-", dir=folder.parent))
-        folder.rename(aside)
-        shutil.rmtree(aside)
+        shutil.rmtree(_moved_aside(folder))
     except OSError as error:
         raise OperationError(f"{folder}: cannot be removed: {error}") from error

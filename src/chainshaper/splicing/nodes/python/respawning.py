@@ -11,8 +11,8 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 DELAY_S = 0.1
 
@@ -26,25 +26,17 @@ def main() -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: asked.append(number))
     while True:
-        child = subprocess.Popen(command)
-        code = _ended(child, asked)
+        child, handed_on = subprocess.Popen(command), 0
+        while child.poll() is None:
+            for one in asked[handed_on:]:
+                child.send_signal(one)
+                handed_on += 1
+            with suppress(subprocess.TimeoutExpired):
+                child.wait(0.05)
         if asked:
-            return code
-        sys.stderr.write(f"{sys.argv[1]} ended with code {code}: it is started again\n")
+            return child.returncode
+        sys.stderr.write(f"{sys.argv[1]} ended with code {child.returncode}: it is started again\n")
         time.sleep(DELAY_S)
-
-
-def _ended(child: "subprocess.Popen[Any]", asked: list[int]) -> int:
-    """Wait for a program's end, and hand on what this process is asked."""
-    handed_on = 0
-    while True:
-        for number in asked[handed_on:]:
-            child.send_signal(number)
-        handed_on = len(asked)
-        try:
-            return child.wait(0.05)
-        except subprocess.TimeoutExpired:
-            continue
 
 
 if __name__ == "__main__":

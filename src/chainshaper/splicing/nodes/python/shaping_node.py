@@ -23,49 +23,38 @@ from std_msgs.msg import Empty, String
 from chainshaper.gate.clear_core import ClearCore
 from chainshaper.gate.decision import Outcome, Release, Shaper
 from chainshaper.gate.handover import STANDING_BY, Turn
-from chainshaper.splicing.nodes.python.endpoints import (
+from chainshaper.splicing.nodes.python.node import (
+    HUMBLE,
+    GateLog,
+    create_subscription,
     message_class,
     parameters_of,
+    publish_function,
     room_of,
     run,
+    take_event,
     wait,
     wait_for_publisher,
 )
-from chainshaper.splicing.nodes.python.gate_log import log_of
-from chainshaper.splicing.nodes.python.tracing import (
-    HUMBLE,
-    create_subscription,
-    publish_function,
-    take_event,
-)
 
 DISCOVERY_S, SETTLING_S = 2.0, 0.1
-
-
-REHEARSAL_TOPIC = "/_chainshaper_rehearsal"
-"""Of all shaping nodes, and hidden, since its name begins with an underscore."""
-
-EMPTY = bytes((0, 1, 0, 0, 0))
-"""A serialized ``std_msgs/Empty``."""
-
-REHEARSAL_NS = 400_000
-"""A rehearsal is not begun later before a release than this: the first may take most of it."""
+REHEARSAL_TOPIC = "/_chainshaper_rehearsal"  # of all shaping nodes; the underscore hides it
+EMPTY = bytes((0, 1, 0, 0, 0))  # a serialized std_msgs/Empty
+REHEARSAL_NS = 400_000  # none begins later before a release: the first may take most of it
 
 
 class Readiness:
     """What follows a release takes the same time in every cycle: rehearsed, and on awake cores.
 
-    Publishing is fast when its code and data are in the processor's caches, and slow, never equally
-    slow, when the chain has run there since the last time. So it is rehearsed shortly before each
-    release: a message without receivers goes the way of the real one, through the same layers of
-    ROS 2 and DDS, and a datagram to ourselves the way through the network stack. Measured on a
-    chain of five nodes, from the release to `rmw_publish` and from there until the message is sent,
+    Publishing is fast while its code and data are in the processor's caches, where the chain has
+    run since. So shortly before each release a message without receivers goes the way of the real
+    one through ROS 2 and DDS, and a datagram to ourselves that through the network stack. Measured
+    on a chain of five nodes, from the release to `rmw_publish` and from there until it is sent,
     p50 / p99.5 in µs: 66 / 163 and 99 / 171 without, 15 / 55 and 45 / 107 with it.
 
-    A core that sleeps takes tens of microseconds to wake up, on virtual machines more, and never
-    the same: most of what a subscriber sees of an output's jitter. While `/dev/cpu_dma_latency` is
-    open, cores wake up within the microseconds written there, 0 at best
-    (Documentation/power/pm_qos_interface.rst). What is written ends with the process.
+    A core that sleeps takes tens of microseconds to wake up, and never the same. While
+    `/dev/cpu_dma_latency` is open, cores wake up within the microseconds written there
+    (Documentation/power/pm_qos_interface.rst).
     """
 
     AWAKE, AS_USUAL = (value.to_bytes(4, sys.byteorder, signed=True) for value in (0, -1))
@@ -111,30 +100,11 @@ class Readiness:
             os.write(self._latency, latency)
 
 
-class Gaps:
-    """How many messages are missing before each, by the publisher's numbers (None: not known)."""
+def listen_to_modes(node: Node, shaper: Shaper, topic: str) -> None:
+    """Subscribe to the topic of the modes, once discovery has had its time.
 
-    def __init__(self) -> None:
-        self._last: int | None = None
-
-    def before(self, info: dict[str, int]) -> int | None:
-        """What is missing between a message and the one before it."""
-        number = info.get("publication_sequence_number")
-        last, self._last = self._last, number
-        if number is None or last is None:
-            return None if number is None else 0
-        return max(0, number - last - 1)  # a publisher that is started again counts anew
-
-
-def listen_to_modes(node: Node, shaper: Shaper) -> None:
-    """Subscribe to the topic of the modes, if there is one.
-
-    A mode that was announced before is only delivered when it is asked for, and only if its
-    publisher keeps it; so discovery should have had its time.
+    A mode that was announced before is delivered where it is asked for, if its publisher stores it.
     """
-    topic = parameters_of(node).mode_topic
-    if not topic:
-        return
     qos, logger = QoSProfile(depth=10), node.get_logger()
     for info in node.get_publishers_info_by_topic(topic):
         if info.qos_profile.durability == QoSDurabilityPolicy.TRANSIENT_LOCAL:
@@ -149,37 +119,13 @@ def listen_to_modes(node: Node, shaper: Shaper) -> None:
     create_subscription(node, String, topic, announced, qos)
 
 
-def change_phase_with(node: Node, shaper: Shaper) -> None:
-    """Let the parameter ``phase_ns`` be set while the node runs.
-
-    It is in force from the next cycle on; the log shows it as the origin of what comes then.
-    """
-
-    def changed(parameters: Any) -> Any:
-        for changed_one in parameters:
-            if changed_one.name == "phase_ns":
-                shaper.set_phase(changed_one.value, time.monotonic_ns())
-        return SetParametersResult(successful=True)
-
-    node.add_on_set_parameters_callback(changed)
-
-
-def delivery_core(node: Node) -> int | None:
-    """Where DDS threads deliver the output: the first core that is ours to use and has no server.
-
-    None where the plan does not name its servers' cores, because it leaves receivers alone.
-    """
-    taken = set(parameters_of(node).server_cores)
-    return min(os.sched_getaffinity(0) - taken, default=None) if taken else None
-
-
-def turn_of(node: Node) -> Turn | None:
-    """What is agreed with the standby; None: the node is alone, since nothing names a page.
+def turn_of(node: Node, name: str) -> Turn | None:
+    """What is agreed with the standby on the page of this name; None: the node is alone.
 
     After several nodes that failed at once this one waits, so that starting over and over does not
     take a core. To be called before anything that may fail.
     """
-    name, logger = parameters_of(node).handover, node.get_logger()
+    logger = node.get_logger()
     if not name:
         return None
     try:
@@ -194,63 +140,75 @@ def turn_of(node: Node) -> Turn | None:
     return turn
 
 
-def go_on(shaper: Shaper, turn: Turn) -> None:
-    """Have cycles begin where they did for the node before this one, in its mode."""
-    gate, mode = shaper.gate, turn.page["mode"]
-    if turn.phase_ns is not None:  # from now on, not the next cycle
-        shaper.set_phase(turn.phase_ns, time.monotonic_ns() - gate.cycle_ns)
-    if gate.modes is not None and 0 < mode <= len(gate.modes.bands):
-        shaper.switch(list(gate.modes.bands)[mode - 1], 0)
-
-
-def await_receivers(node: Node, turn: Turn, publisher: Any) -> None:
-    """Leave the output to the standby, if there is one, until its receivers know this node too.
-
-    What is published before is lost to them. How far discovery has come at the other side cannot
-    be seen: it is given a little longer.
-    """
-    topic, give_up = node.resolve_topic_name("output"), time.monotonic() + DISCOVERY_S
-    while turn.page.is_locked(STANDING_BY) and time.monotonic() < give_up:
-        if publisher.get_subscription_count() >= node.count_subscribers(topic):
-            wait(SETTLING_S)
-            return
-        wait(0.01)
-
-
 class Shaping:
     """The gate of a node, with its endpoints and its log."""
 
     def __init__(self, node: Node) -> None:
-        self._turn = turn_of(node)
-        self._log = log_of(node)
         parameters = parameters_of(node)
+        self._turn = turn_of(node, parameters.handover)
+        self._log = GateLog(node)
         self._pause_ns = parameters.pause_ns
-        self._readiness = Readiness(node, delivery_core(node), self._pause_ns)
+        # DDS threads deliver the output on the first core that is ours to use and has no server;
+        # where the plan leaves receivers alone it does not name its servers' cores.
+        taken = set(parameters.server_cores)
+        core = min(os.sched_getaffinity(0) - taken, default=None) if taken else None
+        self._readiness = Readiness(node, core, self._pause_ns)
         parameters.gate()  # one that makes no sense is refused before its input is there
         info = wait_for_publisher(node, "input")
         depth, offered, asked = room_of(node, info)
+        gate = parameters.gate(depth)
+        self._modes = [] if gate.modes is None else list(gate.modes.bands)
         self._shaper = Shaper(
-            parameters.gate(depth),
-            parameters.spin_ns,
-            self._readiness.get_ready,
-            self._look,
-            self._decided,
+            *(gate, parameters.spin_ns, self._readiness.get_ready, self._look, self._decided)
         )
-        if self._turn is not None:
-            go_on(self._shaper, self._turn)
-        self._gaps = Gaps()
+        self._go_on()
+        self._number: int | None = None  # the publisher's, of the last message
         self._its_turn = False  # of the oldest message
-        change_phase_with(node, self._shaper)
+        node.add_on_set_parameters_callback(self._parameters_set)
         self._type = message_class(info.topic_type)
         publisher = node.create_publisher(self._type, "output", offered)
         self._publish = publish_function(publisher)
-        listen_to_modes(node, self._shaper)
+        if parameters.mode_topic:
+            listen_to_modes(node, self._shaper, parameters.mode_topic)
         # On Humble the log lacks the source timestamp.
         shape = self._shape_uninformed if HUMBLE else self._shape
         self._input = create_subscription(node, self._type, "input", shape, asked, raw=True)
         self._taken_again = take_event(self._input)
-        if self._turn is not None:
-            await_receivers(node, self._turn, publisher)
+        self._await_receivers(node, publisher)
+
+    def _go_on(self) -> None:
+        """Have cycles begin where they did for the node before this one, in its mode."""
+        if self._turn is None:
+            return
+        if self._turn.phase_ns is not None:  # from now on, not the next cycle
+            now = time.monotonic_ns() - self._shaper.gate.cycle_ns
+            self._shaper.set_phase(self._turn.phase_ns, now)
+        if 0 < (mode := self._turn.page["mode"]) <= len(self._modes):
+            self._shaper.switch(self._modes[mode - 1], 0)
+
+    def _parameters_set(self, parameters: Any) -> Any:
+        """``phase_ns`` may be set while the node runs, in force from the next cycle on.
+
+        The log shows it as the origin of what comes then.
+        """
+        for one in parameters:
+            if one.name == "phase_ns":
+                self._shaper.set_phase(one.value, time.monotonic_ns())
+        return SetParametersResult(successful=True)
+
+    def _await_receivers(self, node: Node, publisher: Any) -> None:
+        """Leave the output to the standby, if there is one, until its receivers know this node too.
+
+        What is published before is lost to them. How far discovery has come at the other side
+        cannot be seen: it is given a little longer.
+        """
+        topic, give_up = node.resolve_topic_name("output"), time.monotonic() + DISCOVERY_S
+        page = None if self._turn is None else self._turn.page
+        while page is not None and page.is_locked(STANDING_BY) and time.monotonic() < give_up:
+            if publisher.get_subscription_count() >= node.count_subscribers(topic):
+                wait(SETTLING_S)
+                return
+            wait(0.01)
 
     def work_off(self) -> bool:
         """Deal with what waits at the gate, until there is time for the node's other callbacks.
@@ -296,16 +254,18 @@ class Shaping:
                     raise
                 return  # it was interrupted meanwhile; to ask before publishing would cost time
             published = time.monotonic_ns()
-            if turn is not None:
-                turn.done(key)
+        if turn is not None:
+            turn.done(key)
+        if published is not None:
             stalled = self._shaper.time_lost(outcome.release, outcome.awake_ns)
             self._shaper.rest(published, self._pause_ns)
-        elif turn is not None:
-            turn.done(key)
         self._readiness.relax()
         self._note(outcome, published, stalled)
         if not self._shaper.queue.waiting:
             gc.collect()  # here is time for it; all that is older is frozen
+
+    def _shape_uninformed(self, payload: bytes) -> None:
+        self._shape(payload, {})
 
     def _note(
         self, outcome: Outcome, published: int | None = None, stalled: int | None = None
@@ -316,11 +276,12 @@ class Shaping:
             late = outcome.release.overrun is not None
             self._turn.count(outcome.dropped, outcome.message.lost, late=late)
 
-    def _shape_uninformed(self, payload: bytes) -> None:
-        self._shape(payload, {})
-
     def _arrive(self, payload: bytes, info: dict[str, int], *, waited: bool) -> None:
-        source, lost = info.get("source_timestamp"), self._gaps.before(info)
+        source, number = info.get("source_timestamp"), info.get("publication_sequence_number")
+        last, self._number = self._number, number
+        lost = None if number is None else 0
+        if number is not None and last is not None:
+            lost = max(0, number - last - 1)  # a publisher that is started again counts anew
         now = time.monotonic_ns()
         overflowed, before = self._shaper.overflowed, len(self._shaper.overflowed)
         self._shaper.arrive(payload, now, source if waited else None, source, lost)
@@ -330,13 +291,12 @@ class Shaping:
         if self._turn.was_bypassed(gone):
             overflowed.pop()
         else:
-            self._turn.drop(gone)
+            self._turn.page.note(gone, bypassed=False)
 
     def _decided(self, release: Release, phase_ns: int) -> None:
         """The standby sees it."""
         if self._turn is not None:
-            names = [] if self._shaper.gate.modes is None else list(self._shaper.gate.modes.bands)
-            mode = 0 if release.mode is None else names.index(release.mode) + 1
+            mode = 0 if release.mode is None else self._modes.index(release.mode) + 1
             self._turn.hold(release.at_ns, phase_ns, mode)
 
     def _look(self) -> None:

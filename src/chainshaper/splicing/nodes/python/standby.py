@@ -24,7 +24,9 @@ from rclpy.node import Node
 
 from chainshaper.gate.decision import Outcome, Release, Waiting
 from chainshaper.gate.handover import Standby
-from chainshaper.splicing.nodes.python.endpoints import (
+from chainshaper.splicing.nodes.python.node import (
+    HUMBLE,
+    GateLog,
     message_class,
     parameters_of,
     room_of,
@@ -32,8 +34,6 @@ from chainshaper.splicing.nodes.python.endpoints import (
     wait,
     wait_for_publisher,
 )
-from chainshaper.splicing.nodes.python.gate_log import log_of
-from chainshaper.splicing.nodes.python.tracing import HUMBLE
 
 
 def leave_cores(taken: set[int]) -> None:
@@ -65,7 +65,12 @@ def diagnostics_of(node: Node, standby: Standby, shaping_node: str) -> None:
 
     def report() -> None:
         page = standby.page
-        level, text = state_of(page)
+        level, text = 0, "shaped"
+        if since := page["bypassing_since_ns"]:
+            level, word = 1 + page["silent"], ("bypassed", "silent")[page["silent"]]
+            seconds = (time.monotonic_ns() - since) / 1e9
+            count = page["bypassed"] - page["bypassed_before"]
+            text = f"{word} for {seconds:.1f} s, {count} messages"
         values = {
             "output": page.topic,
             "shaping node": shaping_node,
@@ -87,23 +92,12 @@ def diagnostics_of(node: Node, standby: Standby, shaping_node: str) -> None:
     node.create_timer(1.0, report)
 
 
-def state_of(page: Any) -> tuple[int, str]:
-    """The state of an output: the level of a `DiagnosticStatus`, and a text."""
-    since = page["bypassing_since_ns"]
-    if not since:
-        return 0, "shaped"
-    word = ("bypassed", "silent")[page["silent"]]
-    messages = page["bypassed"] - page["bypassed_before"]
-    seconds = (time.monotonic_ns() - since) / 1e9
-    return 1 + page["silent"], f"{word} for {seconds:.1f} s, {messages} messages"
-
-
 def set_up(node: Node) -> Callable[[], bool]:
     """Make the node's endpoints, and begin to watch."""
     parameters = parameters_of(node)
     leave_cores(set(parameters.server_cores))
     silent, shaping_node = parameters.fallback == "silence", parameters.shaping_node
-    log, logger = log_of(node), node.get_logger()
+    log, logger = GateLog(node), node.get_logger()
     info = wait_for_publisher(node, "input")
     _, offered, asked = room_of(node, info)
     message_type, topic = message_class(info.topic_type), node.resolve_topic_name("output")

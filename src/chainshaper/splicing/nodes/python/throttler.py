@@ -6,11 +6,9 @@ Each topic of ``inputs`` is republished on the topic of ``outputs`` in the same 
 came since the last time. Where none came nothing is published, and where several came the older
 ones are dropped; both are counted, and said at the end.
 
-The paper's is triggered by its input: it republishes what comes, and blocks what comes too soon
-after that. It is its server, a slot of 2 ms in every cycle, that makes the output periodic; where
-nothing holds the thread back, the output is as irregular as the input. Here a timer does what the
-slot does there, on every kernel. As the first message of a period would have become old by then,
-the newest is published.
+The paper's is triggered by its input, and its server, a slot of 2 ms in every cycle, makes the
+output periodic. Here a timer does that, on every kernel; the first message of a period would have
+become old by then.
 """
 
 import atexit
@@ -23,18 +21,16 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from chainshaper.gate.decision import sleep_until
-from chainshaper.splicing.nodes.python.endpoints import (
+from chainshaper.splicing.nodes.python.node import (
     asked_of,
+    create_subscription,
+    create_timer,
     message_class,
     offered_by,
     parameters_of,
+    publish_function,
     run,
     wait_for_publisher,
-)
-from chainshaper.splicing.nodes.python.tracing import (
-    create_subscription,
-    create_timer,
-    publish_function,
 )
 
 

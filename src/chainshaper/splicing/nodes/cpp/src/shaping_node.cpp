@@ -9,7 +9,6 @@
 
 #include "chainshaper_shaping/gate_log.hpp"
 #include "chainshaper_shaping/handover.hpp"
-#include "chainshaper_shaping/node.hpp"
 #include "chainshaper_shaping/readiness.hpp"
 #include "rcl/subscription.h"
 #include "std_msgs/msg/string.hpp"
@@ -69,8 +68,6 @@ void publish(Publisher & output, const Message & message) { output.publish(messa
 }  // namespace
 
 #else
-#include "chainshaper_shaping/serialized.hpp"
-
 namespace {
 
 using Message = rclcpp::SerializedMessage;
@@ -124,9 +121,8 @@ std::optional<std::size_t> delivery_core(const std::vector<std::int64_t> & taken
   return std::nullopt;
 }
 
-// What is agreed with the standby; none: the node is alone, since nothing names a page. After
-// several nodes that failed at once this one waits, so that starting over and over does not take a
-// core; so this comes before anything that may fail.
+// What is agreed with the standby; none: the node is alone, since nothing names a page. It waits
+// where nodes before it failed at once, so this comes before anything that may fail.
 std::optional<Turn> turn_of(rclcpp::Node & node) {
   const auto page = parameters_of(node).handover;
   if (page.empty()) return std::nullopt;
@@ -146,22 +142,6 @@ std::optional<Turn> turn_of(rclcpp::Node & node) {
   return turn;
 }
 
-// How many messages are missing before each, by its publisher's numbers; none: not known.
-class Gaps {
-public:
-  Maybe before(const rmw_message_info_t & info) {
-    if (info.publication_sequence_number == RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED)
-      return std::nullopt;
-    const auto last = last_;
-    last_ = static_cast<std::int64_t>(info.publication_sequence_number);
-    // A publisher that is started again counts anew.
-    return last ? std::max<std::int64_t>(0, last_.value() - *last - 1) : 0;
-  }
-
-private:
-  Maybe last_;
-};
-
 // Emits the event of a take once more, when a callback is executed for its message: others were
 // taken meanwhile, and a callback is for the message that was taken last.
 void take_again(const rclcpp::SubscriptionBase & subscription, const void * message,
@@ -175,6 +155,17 @@ void take_again(const rclcpp::SubscriptionBase & subscription, const void * mess
   }
 }
 
+// How many messages may wait, by default as many as in the publisher's history.
+std::size_t depth_of(const Parameters & parameters, const Offer & offer) {
+  if (parameters.depth > 0) return static_cast<std::size_t>(parameters.depth);
+  return std::max<std::size_t>(schema::depth, offer.publisher.depth());
+}
+
+rclcpp::QoS deeper(rclcpp::QoS qos, std::size_t depth) {
+  if (qos.history() == rclcpp::HistoryPolicy::KeepLast) qos.keep_last(std::max(depth, qos.depth()));
+  return qos;
+}
+
 // The gate of a node, with its endpoints and its log.
 class Shaping {
 public:
@@ -186,7 +177,7 @@ public:
         turn_(std::move(turn)),
         readiness_(node, delivery_core(parameters_.server_cores), parameters_.pause_ns),
         shaper_(
-            gate_of(parameters_, depth_for(parameters_, offer.publisher)), parameters_.spin_ns,
+            gate_of(parameters_, depth_of(parameters_, offer)), parameters_.spin_ns,
             [this](std::int64_t release_ns) { readiness_.get_ready(release_ns); },
             [this] { look(); },
             [this](const Release & release, std::int64_t phase_ns) {
@@ -207,9 +198,17 @@ public:
           result.successful = true;
           return result;
         });
-    output_ = make_publisher(node, offer.type, offered(offer.publisher));
+    // What leaves in one slot must find room in the writer, too. What the gate has no room for it
+    // drops, and so counts it: its reader has more room.
+    const auto depth = depth_of(parameters_, offer);
+    const bool latched =
+        offer.publisher.durability() == rclcpp::DurabilityPolicy::TransientLocal;
+    output_ = make_publisher(node, offer.type,
+                             latched ? offer.publisher : deeper(offer.publisher, depth));
     listen_to_modes();
-    input_ = subscribe(node, offer.type, asked(offer.subscription),
+    const auto asked =
+        deeper(offer.subscription, std::max<std::size_t>(schema::reader_depth, depth));
+    input_ = subscribe(node, offer.type, asked,
                        [this](Pointer message, const rclcpp::MessageInfo & info) {
                          shape(std::move(message), info);
                        });
@@ -245,14 +244,6 @@ public:
   }
 
 private:
-  // The gate drops what it has no room for, and so counts it: its reader has more of it. What
-  // leaves in one slot must find room in the writer, too.
-  rclcpp::QoS asked(rclcpp::QoS qos) const { return deeper(qos, std::max(reader_depth, depth())); }
-  rclcpp::QoS offered(rclcpp::QoS qos) const {
-    const bool latched = qos.durability() == rclcpp::DurabilityPolicy::TransientLocal;
-    return latched ? qos : deeper(qos, depth());
-  }
-
   // To be called when discovery has had its time. A mode that was announced before is only
   // delivered when it is asked for, and only if its publisher keeps it.
   void listen_to_modes() {
@@ -300,11 +291,11 @@ private:
         return;  // it was interrupted meanwhile; to ask before publishing would cost time
       }
       published_ns = monotonic_ns();
-      if (turn_) turn_->done(key);
+    }
+    if (turn_) turn_->done(key);
+    if (published_ns) {
       stalled_ns = shaper_.time_lost(*outcome);
       shaper_.rest(*published_ns, parameters_.pause_ns);
-    } else if (turn_) {
-      turn_->done(key);
     }
     readiness_.relax();
     note(*outcome, published_ns, stalled_ns);
@@ -318,30 +309,26 @@ private:
       arrive(message, info.get_rmw_message_info(), true);
   }
 
-  std::size_t depth() const { return shaper_.queue.gate.depth; }
-
-  // How many messages may wait: what the publisher's history has, where it is not said.
-  static std::size_t depth_for(const Parameters & parameters, const rclcpp::QoS & offered) {
-    return parameters.depth > 0 ? static_cast<std::size_t>(parameters.depth)
-                                : std::max(default_depth, offered.depth());
-  }
-
-  static rclcpp::QoS deeper(rclcpp::QoS qos, std::size_t depth) {
-    if (qos.history() == rclcpp::HistoryPolicy::KeepLast)
-      qos.keep_last(std::max(depth, qos.depth()));
-    return qos;
-  }
-
   void arrive(Pointer message, const rmw_message_info_t & info, bool waited) {
     const auto stamp = stamp_of(*message);
     const auto before = shaper_.overflowed.size();
-    shaper_.arrive(std::move(message), stamp, info.source_timestamp, waited, gaps_.before(info));
+    shaper_.arrive(std::move(message), stamp, info.source_timestamp, waited, missing_before(info));
     if (!turn_ || shaper_.overflowed.size() == before) return;
     const auto gone = shaper_.overflowed.back().waiting.source_timestamp.value_or(0);
     if (turn_->was_bypassed(gone))
       shaper_.overflowed.pop_back();
     else
       turn_->drop(gone);
+  }
+
+  // How many messages are missing before this one, by its publisher's numbers; none: not known.
+  Maybe missing_before(const rmw_message_info_t & info) {
+    if (info.publication_sequence_number == RMW_MESSAGE_INFO_SEQUENCE_NUMBER_UNSUPPORTED)
+      return std::nullopt;
+    const auto last = number_;
+    number_ = static_cast<std::int64_t>(info.publication_sequence_number);
+    // A publisher that is started again counts anew.
+    return last ? std::max<std::int64_t>(0, *number_ - *last - 1) : 0;
   }
 
   // Losses are said when they happen, at most every ten seconds.
@@ -376,10 +363,10 @@ private:
   Readiness readiness_;
   Shaper<Pointer> shaper_;
   GateLog log_;
-  Gaps gaps_;
   std::shared_ptr<Publisher> output_;
   std::shared_ptr<Input> input_;
   bool its_turn_{false};  // of the oldest message
+  Maybe number_;          // its publisher's, of the last message
   std::string said_;
   std::int64_t said_ns_{0};
   rclcpp::node_interfaces::OnSetParametersCallbackHandle::SharedPtr phase_;

@@ -10,7 +10,6 @@
 #include <vector>
 
 #include "chainshaper_shaping/node.hpp"
-#include "chainshaper_shaping/serialized.hpp"
 
 namespace {
 

@@ -1,15 +1,19 @@
-// The gate: when may a message of the chain's output leave, and which of those that wait?
-//
-// The same decisions as chainshaper/gate/decision.py, which explains them: slots repeat every
-// cycle from an anchor, an early message waits for its slot, one that comes behind the last slot
-// it was due in is an overrun, and with modes each mode has its own slot. No ROS 2 here, no
-// clocks. All times are nanoseconds.
+// The gate: when may a message of the chain's output leave, and which of those that wait? The same
+// as chainshaper/gate/decision.py, which explains it. No ROS 2 here. All times are nanoseconds.
 
 #pragma once
+
+#include <errno.h>
+#include <fcntl.h>
+#include <sys/syscall.h>
+#include <time.h>
+#include <unistd.h>
 
 #include <algorithm>
 #include <cstdlib>
 #include <deque>
+#include <functional>
+#include <limits>
 #include <optional>
 #include <stdexcept>
 #include <utility>
@@ -27,13 +31,11 @@ struct Slot {
   std::int64_t end;
 };
 
-// The place of a word among those that there are; none: it is none of them.
 template <typename Words>
 std::optional<std::size_t> place_of(const Words & words, const std::string & word) {
   const auto found = std::find(words.begin(), words.end(), word);
-  return found == words.end()
-             ? std::nullopt
-             : std::optional<std::size_t>(static_cast<std::size_t>(found - words.begin()));
+  if (found == words.end()) return std::nullopt;
+  return static_cast<std::size_t>(found - words.begin());
 }
 
 // Modes are numbered in the order of `names`; `bands` has the place of each one's slot.
@@ -49,13 +51,22 @@ struct Gate {
   std::int64_t cycle_ns{0};
   Anchor anchor{Anchor::stamp};
   std::int64_t phase_ns{0};
-  Maybe max_age_ns{};  // none: max_age_cycles and those it is due after
-  std::int64_t max_future_ns{default_max_future_ns};
   Policy overrun{Policy::wait};
   std::int64_t due_cycles{0};
   std::optional<Modes> modes{};
   Messages messages{Messages::all_in_order};
-  std::size_t depth{default_depth};
+  std::size_t depth{schema::depth};
+
+  Policy policy() const {
+    return modes && modes->late != Policy::next_slot ? modes->late : overrun;
+  }
+
+  bool counts_from(Maybe stamp_ns, std::int64_t arrival_ns) const {
+    if (!stamp_ns || anchor != Anchor::stamp) return false;
+    const auto age_ns = arrival_ns - *stamp_ns;
+    const auto oldest_ns = (schema::max_age_cycles + due_cycles) * cycle_ns;
+    return -schema::max_future_ns <= age_ns && age_ns <= oldest_ns;
+  }
 };
 
 // A mode that was announced, and when.
@@ -70,6 +81,10 @@ struct Release {
   Anchor anchor;
   std::optional<Policy> overrun;
   std::optional<std::size_t> mode;
+
+  std::int64_t start_ns(std::int64_t cycle_ns) const {
+    return origin_ns + cycles_waited * cycle_ns;
+  }
 };
 
 // Throws std::invalid_argument for a gate that makes no sense.
@@ -122,70 +137,42 @@ inline Gate gate_of(const Parameters & parameters, std::size_t depth) {
   return gate;
 }
 
-// The mode of the cycle that began at `origin_ns`; none without modes.
-inline std::optional<std::size_t> mode_at(const Gate & gate, std::int64_t origin_ns,
-                                          const std::deque<Change> & changes) {
-  if (!gate.modes) return std::nullopt;
-  for (auto change = changes.rbegin(); change != changes.rend(); ++change)
-    if (change->first <= origin_ns) return change->second;
-  return gate.modes->initial;
-}
-
-// What becomes of a message that comes behind the last slot that is open to it.
-inline Policy policy_of(const Gate & gate) {
-  const bool own = gate.modes && gate.modes->late != Policy::next_slot;
-  return own ? gate.modes->late : gate.overrun;
-}
-
-// The places [first, last) of the slots that are open to messages of a mode.
-inline std::pair<std::size_t, std::size_t> open_to(const Gate & gate,
-                                                   std::optional<std::size_t> mode) {
-  if (!mode) return {0, gate.slots.size()};
-  const std::size_t band = gate.modes->bands[*mode];
-  return {band, gate.modes->late == Policy::next_slot ? gate.slots.size() : band + 1};
-}
-
 // As Python's: never negative.
 inline std::int64_t modulo(std::int64_t value, std::int64_t cycle_ns) {
   const std::int64_t rest = value % cycle_ns;
   return rest < 0 ? rest + cycle_ns : rest;
 }
 
-inline bool usable(const Gate & gate, std::int64_t age_ns) {
-  const std::int64_t max_age =
-      gate.max_age_ns.value_or((max_age_cycles + gate.due_cycles) * gate.cycle_ns);
-  return -gate.max_future_ns <= age_ns && age_ns <= max_age;
-}
-
-// Decide when a message that arrived at `arrival_ns`, with this stamp (both CLOCK_MONOTONIC), may
-// leave. `changes` are the modes that were announced, ascending in time. It leaves at `ready_ns` at
-// the earliest, where others are before it.
 inline Release release_of(const Gate & gate, std::int64_t arrival_ns, Maybe stamp_ns,
                           const std::deque<Change> & changes, std::int64_t ready_ns,
                           std::int64_t phase_ns) {
   const std::int64_t cycle_ns = gate.cycle_ns;
-  std::int64_t origin{};
-  Anchor anchor{};
-  std::int64_t due = gate.due_cycles;
-  if (gate.anchor == Anchor::stamp && stamp_ns && usable(gate, arrival_ns - *stamp_ns)) {
+  std::int64_t origin = arrival_ns - modulo(arrival_ns - phase_ns, cycle_ns);
+  std::int64_t due = std::min<std::int64_t>(gate.due_cycles, 1);
+  Anchor anchor = Anchor::cycle;
+  if (gate.counts_from(stamp_ns, arrival_ns)) {
     origin = *stamp_ns;
+    due = gate.due_cycles;
     anchor = Anchor::stamp;
-  } else {
-    origin = arrival_ns - modulo(arrival_ns - phase_ns, cycle_ns);
-    anchor = Anchor::cycle;
-    due = std::min<std::int64_t>(due, 1);
   }
-  const auto mode = mode_at(gate, origin, changes);
-  const auto [first, last] = open_to(gate, mode);
+  std::optional<std::size_t> mode;
+  std::size_t first = 0;
+  std::size_t last = gate.slots.size();
+  if (gate.modes) {
+    const auto before = [origin](const Change & change) { return change.first <= origin; };
+    const auto announced = std::find_if(changes.rbegin(), changes.rend(), before);
+    mode = announced == changes.rend() ? gate.modes->initial : announced->second;
+    first = gate.modes->bands[*mode];
+    if (gate.modes->late != Policy::next_slot) last = first + 1;
+  }
   const std::int64_t ready = std::max(arrival_ns, ready_ns);
   // A stamp slightly from the future puts the arrival before its own cycle: cycle 0 still.
   std::int64_t cycle = std::max<std::int64_t>(0, (ready - origin) / cycle_ns);
   const std::int64_t due_from = origin + due * cycle_ns;
   const bool overran = ready >= due_from + gate.slots[last - 1].end;
-  const Policy policy = policy_of(gate);
+  const Policy policy = gate.policy();
   if (overran && policy != Policy::wait) {
-    Maybe at_once;
-    if (policy == Policy::publish) at_once = ready;
+    const Maybe at_once = policy == Policy::publish ? Maybe(ready) : std::nullopt;
     return {at_once, origin, std::nullopt, cycle, anchor, policy, mode};
   }
   std::optional<Policy> treated;
@@ -210,11 +197,9 @@ inline Release withheld(Release release) {
   return release;
 }
 
-// Whether the slot that a message was to leave in is over.
 inline bool missed(const Gate & gate, const Release & release, std::int64_t now_ns) {
-  if (!release.slot) return false;
-  return now_ns >=
-         release.origin_ns + release.cycles_waited * gate.cycle_ns + gate.slots[*release.slot].end;
+  return release.slot &&
+         now_ns >= release.start_ns(gate.cycle_ns) + gate.slots[*release.slot].end;
 }
 
 // The header stamp of a serialized message in ns of its clock; none if it is zero or short. It
@@ -247,7 +232,6 @@ struct Waiting {
   std::uint64_t number;
 };
 
-// What became of a message: it may leave now, or was dropped, for that reason.
 template <typename Message>
 struct Outcome {
   Waiting<Message> waiting;
@@ -263,28 +247,23 @@ public:
     check(this->gate);
   }
 
-  // A message came; the one for which there is no room any more.
   std::optional<Outcome<Message>> arrive(Message message, std::int64_t arrival_ns, Maybe stamp_ns,
                                          Maybe source_timestamp = {}, Maybe lost = {}) {
     waiting.push_back(
         {std::move(message), arrival_ns, stamp_ns, phase_ns, source_timestamp, lost, number_++});
-    if (gate.anchor == Anchor::stamp && stamp_ns && usable(gate, arrival_ns - *stamp_ns))
-      phase_ns = *stamp_ns % gate.cycle_ns;
+    if (gate.counts_from(stamp_ns, arrival_ns)) phase_ns = *stamp_ns % gate.cycle_ns;
     if (waiting.size() <= gate.depth) return std::nullopt;
-    Waiting<Message> oldest = std::move(waiting.front());
-    waiting.pop_front();
-    const Release release = withheld(release_at(oldest, arrival_ns));
-    return Outcome<Message>{std::move(oldest), release, arrival_ns, Dropped::overflowed};
+    const Release release = withheld(release_at(waiting.front(), arrival_ns));
+    return Outcome<Message>{take_oldest(), release, arrival_ns, Dropped::overflowed};
   }
 
-  // When the oldest message may leave, or why it never does.
   std::pair<Release, std::optional<Dropped>> decide() {
     const auto & oldest = waiting.front();
     const std::int64_t ready_ns = std::max(oldest.arrival_ns, free_ns);
     Release release = release_at(oldest, ready_ns);
     if (!release.at_ns) return {release, Dropped::discarded};
     if (!release.slot || gate.messages == Messages::all_in_order) return {release, std::nullopt};
-    if (left_ && same_cycle(start_of(release), *left_)) {
+    if (same_cycle(release, left_)) {
       if (gate.messages == Messages::first) return {withheld(release), Dropped::surplus};
       release = release_at(oldest, std::max(ready_ns, *left_ + gate.slots.back().end));
       if (!release.at_ns) return {release, Dropped::discarded};
@@ -293,17 +272,15 @@ public:
         return {release, std::nullopt};
       }
     }
-    const std::int64_t start = start_of(release);
-    if (!leaving_ || !same_cycle(start, *leaving_)) leaving_ = start;
+    if (!same_cycle(release, leaving_)) leaving_ = release.start_ns(gate.cycle_ns);
     return {release, std::nullopt};
   }
 
-  // Whether a newer message leaves for the oldest one, which was to leave like this.
   bool replaced(const Release & release, std::int64_t now_ns) const {
-    if (gate.messages != Messages::newest || !release.slot || !leaving_) return false;
+    if (gate.messages != Messages::newest || !release.slot) return false;
     return std::any_of(waiting.begin() + 1, waiting.end(), [&](const Waiting<Message> & newer) {
       const Release other = release_at(newer, now_ns);
-      return other.slot && same_cycle(start_of(other), *leaving_);
+      return other.slot && same_cycle(other, leaving_);
     });
   }
 
@@ -311,9 +288,7 @@ public:
   Waiting<Message> leave(const std::optional<Release> & release, std::int64_t now_ns) {
     free_ns = now_ns;
     if (release && release->slot) left_ = leaving_;
-    Waiting<Message> oldest = std::move(waiting.front());
-    waiting.pop_front();
-    return oldest;
+    return take_oldest();
   }
 
   const Gate gate;
@@ -323,17 +298,18 @@ public:
   std::int64_t free_ns{0};  // when it is the turn of the oldest message, if it is there then
 
 private:
+  Waiting<Message> take_oldest() {
+    Waiting<Message> oldest = std::move(waiting.front());
+    waiting.pop_front();
+    return oldest;
+  }
+
   Release release_at(const Waiting<Message> & one, std::int64_t ready_ns) const {
     return release_of(gate, one.arrival_ns, one.stamp_ns, changes, ready_ns, one.phase_ns);
   }
 
-  std::int64_t start_of(const Release & release) const {
-    return release.origin_ns + release.cycles_waited * gate.cycle_ns;
-  }
-
-  // Stamps are not quite periodic: cycles are the same less than half a cycle apart.
-  bool same_cycle(std::int64_t start_ns, std::int64_t other_ns) const {
-    return 2 * std::abs(start_ns - other_ns) < gate.cycle_ns;
+  bool same_cycle(const Release & release, Maybe start_ns) const {
+    return start_ns && 2 * std::abs(release.start_ns(gate.cycle_ns) - *start_ns) < gate.cycle_ns;
   }
 
   // The starts of the cycle that the oldest message, or another for it, leaves in, and of that in
@@ -341,6 +317,211 @@ private:
   Maybe leaving_;
   Maybe left_;
   std::uint64_t number_{0};
+};
+
+inline std::int64_t clock_ns(clockid_t clock) {
+  timespec now{};
+  clock_gettime(clock, &now);
+  return now.tv_sec * std::int64_t{1'000'000'000} + now.tv_nsec;
+}
+
+inline std::int64_t monotonic_ns() { return clock_ns(CLOCK_MONOTONIC); }
+
+inline void sleep_until(std::int64_t deadline_ns) {
+  deadline_ns = std::max<std::int64_t>(0, deadline_ns);
+  timespec request{};
+  request.tv_sec = static_cast<time_t>(deadline_ns / 1'000'000'000);
+  request.tv_nsec = static_cast<long>(deadline_ns % 1'000'000'000);  // NOLINT(runtime/int)
+  while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &request, nullptr) == EINTR) continue;
+}
+
+inline std::int64_t watch_until(std::int64_t deadline_ns) {
+  std::int64_t now = monotonic_ns();
+  while (now < deadline_ns) now = monotonic_ns();
+  return now;
+}
+
+inline std::int64_t clock_offset() {
+  std::int64_t best_width = std::numeric_limits<std::int64_t>::max();
+  std::int64_t best = 0;
+  for (int attempt = 0; attempt < 5 && best_width >= 2'000; ++attempt) {
+    const std::int64_t before = monotonic_ns();
+    const std::int64_t realtime = clock_ns(CLOCK_REALTIME);
+    const std::int64_t after = monotonic_ns();
+    if (after - before < best_width) {  // a longer bracket means that something came between
+      best_width = after - before;
+      best = realtime - (before + after) / 2;
+    }
+  }
+  return best;
+}
+
+// A gate at work: holds each message until its release, and minds the clocks. `Message` is what
+// the queue holds. `look` takes what has come and has it arrive: it is called while others wait,
+// before each release and behind it. `on_waking` is called with the time of a release when it wakes
+// `spin_ns` before that, to watch the clock from there; `on_decision` with each decision, before it
+// is waited for, and where cycles begin.
+template <typename Message>
+class Shaper {
+public:
+  Shaper(
+      Gate gate, std::int64_t spin_ns,
+      std::function<void(std::int64_t)> on_waking = [](std::int64_t) {},
+      std::function<void()> look = [] {},
+      std::function<void(const Release &, std::int64_t)> on_decision = [](const Release &,
+                                                                          std::int64_t) {})
+      : queue(std::move(gate)),
+        look(std::move(look)),
+        spin_ns_(spin_ns),
+        on_waking_(std::move(on_waking)),
+        on_decision_(std::move(on_decision)),
+        offset_(clock_offset()) {}
+
+  Shaper(const Shaper &) = delete;
+  Shaper & operator=(const Shaper &) = delete;
+
+  ~Shaper() {
+    if (schedstat_ >= 0) close(schedstat_);
+  }
+
+  void set_phase(std::int64_t phase_ns, std::int64_t now_ns) {
+    next_phase_ = {now_ns + modulo(phase_ns - now_ns, queue.gate.cycle_ns), phase_ns};
+  }
+
+  // A mode is announced, in force from the next cycle on; false: there is none like it.
+  bool announce(const std::string & name, std::int64_t now_ns) {
+    const auto & modes = queue.gate.modes;
+    const auto mode = modes ? place_of(modes->names, name) : std::nullopt;
+    if (!mode) return false;
+    auto & changes = queue.changes;
+    if (*mode != (changes.empty() ? modes->initial : changes.back().second)) {
+      changes.emplace_back(now_ns, *mode);
+      if (changes.size() > schema::changes) changes.pop_front();
+    }
+    return true;
+  }
+
+  // A message with this stamp (CLOCK_REALTIME) was taken now. One that `waited` in the reader
+  // counts as having come at its source timestamp, if that is after the last look.
+  void arrive(Message message, Maybe stamp_ns, Maybe source_timestamp = {}, bool waited = false,
+              Maybe lost = {}) {
+    const std::int64_t offset = clock_offset();
+    const bool stepped = std::abs(offset - offset_) > schema::step_ns;
+    offset_ = offset;
+    Maybe origin;
+    if (stamp_ns && !stepped) origin = *stamp_ns - offset;
+    std::int64_t arrival_ns = monotonic_ns();
+    if (waited && source_timestamp && !stepped)
+      arrival_ns = std::min(arrival_ns, std::max(looked_ns_, *source_timestamp - offset));
+    if (next_phase_ && arrival_ns >= next_phase_->first) {
+      queue.phase_ns = next_phase_->second;
+      next_phase_.reset();
+    }
+    auto full = queue.arrive(std::move(message), arrival_ns, origin, source_timestamp, lost);
+    if (full) overflowed.push_back(std::move(*full));
+  }
+
+  // Wait until the oldest message leaves, or is dropped; none: it was overflowed meanwhile. One
+  // that is to be discarded is not waited for; where overruns are discarded, so is a message whose
+  // slot is over when this thread wakes.
+  std::optional<Outcome<Message>> hold() {
+    const std::uint64_t number = queue.waiting.front().number;
+    std::int64_t now = monotonic_ns();
+    auto [release, dropped] = queue.decide();
+    on_decision_(release, queue.phase_ns);
+    bool slept = false;
+    if (release.at_ns) {
+      waited_ns_ = others_ran_ns();
+      slept = *release.at_ns > now;
+      while (*release.at_ns - spin_ns_ > now) {
+        sleep_until(std::min(*release.at_ns - spin_ns_, now + schema::look_ns));
+        look_again();
+        now = monotonic_ns();
+      }
+      if (!slept && queue.gate.messages == Messages::newest) look_again();
+      if (queue.waiting.front().number != number) return std::nullopt;
+      if (queue.replaced(release, now)) {
+        release = withheld(release);
+        dropped = Dropped::replaced;
+      }
+    }
+    if (!release.at_ns) return Outcome<Message>{queue.leave(release, now), release, now, dropped};
+    if (slept) {
+      on_waking_(*release.at_ns);
+      // Awake in time: what other threads took before is of no consequence.
+      if (monotonic_ns() < *release.at_ns) waited_ns_ = others_ran_ns();
+    }
+    const std::int64_t awake = watch_until(*release.at_ns);
+    if (queue.gate.policy() == Policy::discard && missed(queue.gate, release, awake)) {
+      release = withheld(release);
+      release.overrun = Policy::discard;
+      dropped = Dropped::discarded;
+    }
+    return Outcome<Message>{queue.leave(release, awake), release, awake, dropped};
+  }
+
+  bool nothing_due() {
+    if (queue.waiting.empty()) return true;
+    const auto at_ns = queue.decide().first.at_ns;
+    return at_ns && *at_ns > monotonic_ns() + spin_ns_ + schema::others_ns;
+  }
+
+  void rest(std::int64_t published_ns, std::int64_t pause_ns) {
+    queue.free_ns = published_ns;
+    look_again();
+    const std::int64_t until = published_ns + pause_ns;
+    if (!queue.waiting.empty()) {
+      const auto at_ns = queue.decide().first.at_ns;
+      if (!at_ns || *at_ns - spin_ns_ <= until) return;
+    }
+    sleep_until(until);
+    queue.free_ns = monotonic_ns();
+  }
+
+  std::int64_t time_lost(const Outcome<Message> & outcome) {
+    if (!outcome.release.at_ns) return 0;
+    const std::int64_t others = others_ran_ns() - waited_ns_;
+    return std::max<std::int64_t>(0, outcome.awake_ns - *outcome.release.at_ns - others);
+  }
+
+  Queue<Message> queue;
+  std::vector<Outcome<Message>> overflowed;  // since the owner has emptied it
+  std::function<void()> look;
+
+private:
+  void look_again() {
+    const std::int64_t now = monotonic_ns();
+    look();
+    looked_ns_ = now;
+  }
+
+  // For how long this thread has been ready while others ran: the second number of
+  // /proc/thread-self/schedstat. Without one, all delay is taken to be other threads'.
+  std::int64_t others_ran_ns() {
+    const auto thread = static_cast<pid_t>(syscall(SYS_gettid));
+    if (thread != thread_) {  // the file is bound to who opened it
+      if (schedstat_ >= 0) close(schedstat_);
+      schedstat_ = open("/proc/thread-self/schedstat", O_RDONLY | O_CLOEXEC);
+      thread_ = thread;
+    }
+    char text[128];
+    const auto size = schedstat_ < 0 ? -1 : pread(schedstat_, text, sizeof(text) - 1, 0);
+    if (size <= 0) return monotonic_ns();
+    text[size] = '\0';
+    char * second = nullptr;
+    std::strtoll(text, &second, 10);
+    return std::strtoll(second, nullptr, 10);
+  }
+
+  std::int64_t spin_ns_;
+  std::function<void(std::int64_t)> on_waking_;
+  std::function<void(const Release &, std::int64_t)> on_decision_;
+  std::int64_t offset_;
+  std::int64_t looked_ns_{0};
+  std::int64_t waited_ns_{0};
+  int schedstat_{-1};
+  pid_t thread_{-1};
+  std::optional<std::pair<std::int64_t, std::int64_t>> next_phase_;  // from when on, and which
 };
 
 }  // namespace chainshaper

@@ -1,18 +1,14 @@
-// What a gate did, one line per message: comma-separated values that chainshaper reads.
+// What a gate did, one line of comma-separated values per message. No ROS 2 here.
 //
 // A thread of its own writes them to the file, so that neither a slow disk nor a full one can delay
 // the gate: that puts a line into a pipe, and goes on without it where the pipe is full. Lines are
-// numbered, so that those that are missing can be counted. No ROS 2 here.
+// numbered, so that those that are missing can be counted.
 
 #pragma once
 
-#include <fcntl.h>
 #include <pthread.h>
 #include <sched.h>
-#include <sys/syscall.h>
-#include <unistd.h>
 
-#include <cerrno>
 #include <cstdio>
 #include <cstring>
 #include <thread>
@@ -21,91 +17,29 @@
 
 namespace chainshaper {
 
-// Adds lines to a file, whole ones only. A file that would have more than half of `most_bytes`
-// becomes `….1`, in place of the one before it; one that has been removed is made anew. What cannot
-// be written is missing.
-class RowWriter {
+class GateLog {
 public:
-  RowWriter(std::string path, std::int64_t most_bytes)
-      : path_(std::move(path)), most_bytes_(most_bytes) {
-    if (pipe2(ends_, O_CLOEXEC) == 0) {
-      fcntl(ends_[1], F_SETFL, O_NONBLOCK);
-      fcntl(ends_[1], F_SETPIPE_SZ, 1 << 20);  // more than a user may have is refused
-      writer_ = std::thread([this] { write(); });
-    }
-  }
-
-  ~RowWriter() {
+  ~GateLog() {
+    if (!writer_.joinable()) return;
     close(ends_[1]);
-    if (writer_.joinable()) writer_.join();
+    writer_.join();
     close(ends_[0]);
   }
 
-  // False: there is no room. Never waits.
-  bool put(const char * line, std::size_t size) {
-    return ::write(ends_[1], line, size) == static_cast<ssize_t>(size);
-  }
-
-private:
-  void write() {
-    pthread_setname_np(pthread_self(), "gate_log");
-    std::string lines;
-    std::array<char, 4096> received;
-    for (;;) {
-      const auto size = read(ends_[0], received.data(), received.size());
-      if (size > 0) {
-        lines.append(received.data(), static_cast<std::size_t>(size));
-        const auto whole = lines.rfind('\n') + 1;
-        append(lines.substr(0, whole));
-        lines.erase(0, whole);
-      } else if (size == 0 || errno != EINTR) {
-        return;
-      }
-    }
-  }
-
-  void append(const std::string & lines) {
-    const auto opened = [this] {
-      return open(path_.c_str(), O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC, 0644);
-    };
-    int file = opened();
-    std::int64_t before = file < 0 ? 0 : lseek(file, 0, SEEK_END);
-    const auto header = static_cast<std::int64_t>(std::strlen(log_header));
-    if (before > header && before + static_cast<std::int64_t>(lines.size()) > most_bytes_ / 2 &&
-        std::rename(path_.c_str(), (path_ + ".1").c_str()) == 0) {
-      close(file);
-      file = opened();
-      before = 0;
-    }
-    if (file < 0) return;
-    const std::string whole = (before == 0 ? log_header : "") + lines;
-    if (::write(file, whole.data(), whole.size()) != static_cast<ssize_t>(whole.size()))
-        [[maybe_unused]]
-      const int cut = ftruncate(file, before);
-    close(file);
-  }
-
-  std::string path_;
-  std::int64_t most_bytes_;
-  int ends_[2]{-1, -1};
-  std::thread writer_;
-};
-
-class GateLog {
-public:
-  // Lines are added to a file that is there; false (and errno): it cannot be written now.
+  // Lines are added to a file that is there; false (and errno): it cannot be written now. The file
+  // and the one before it, `….1`, have no more than `most_bytes`.
   bool open_file(const std::string & path, std::int64_t most_bytes) {
-    const int flags = O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC | O_NONBLOCK;
-    const int file = open(path.c_str(), flags, 0644);
+    path_ = path;
+    most_bytes_ = most_bytes;
+    const bool opened = append("");
     const int because = errno;
-    if (file >= 0) {
-      if (lseek(file, 0, SEEK_END) == 0) [[maybe_unused]]
-        const auto size = ::write(file, log_header, std::strlen(log_header));
-      close(file);
+    if (pipe2(ends_, O_CLOEXEC) == 0) {
+      fcntl(ends_[1], F_SETFL, O_NONBLOCK);
+      fcntl(ends_[1], F_SETPIPE_SZ, 1 << 20);  // more than a user may have is refused
+      writer_ = std::thread([this] { write_lines(); });
     }
-    writer_.emplace(path, most_bytes);
     errno = because;
-    return file >= 0;
+    return opened;
   }
 
   // `published_ns` is when publishing returned, `stalled_ns` for how long the machine stood still
@@ -117,17 +51,16 @@ public:
     ++rows;
     if (why) ++dropped[static_cast<std::size_t>(*why)];
     lost_by_dds += static_cast<std::uint64_t>(waiting.lost.value_or(0));
-    if (!writer_) return;
+    if (!writer_.joinable()) return;
     size_ = 0;
-    const auto mode = release.mode ? gate.modes->names[*release.mode].c_str() : "";
     row(awake_ns, getpid(), syscall(SYS_gettid), sched_getcpu(), waiting.source_timestamp,
         waiting.arrival_ns, release.origin_ns, release.at_ns, release.slot, release.cycles_waited,
         anchor_names[static_cast<std::size_t>(release.anchor)],
-        release.overrun ? policy_names[static_cast<std::size_t>(*release.overrun)] : "", mode,
-        published_ns, stalled_ns, why ? dropped_names[static_cast<std::size_t>(*why)] : "",
-        waiting.lost, rows);
+        release.overrun ? policy_names[static_cast<std::size_t>(*release.overrun)] : "",
+        release.mode ? gate.modes->names[*release.mode].c_str() : "", published_ns, stalled_ns,
+        why ? dropped_names[static_cast<std::size_t>(*why)] : "", waiting.lost, rows);
     line_[size_ - 1] = '\n';  // in place of the last comma
-    if (!writer_->put(line_.data(), size_)) ++unlogged;
+    if (::write(ends_[1], line_.data(), size_) != static_cast<ssize_t>(size_)) ++unlogged;
   }
 
   // What is lost so far, in words; empty: nothing.
@@ -148,10 +81,49 @@ public:
   std::uint64_t unlogged{0};
 
 private:
+  void write_lines() {
+    pthread_setname_np(pthread_self(), "gate_log");
+    std::string lines;
+    std::array<char, 4096> received;
+    for (;;) {
+      const auto size = read(ends_[0], received.data(), received.size());
+      if (size == 0 || (size < 0 && errno != EINTR)) return;
+      if (size < 0) continue;
+      lines.append(received.data(), static_cast<std::size_t>(size));
+      const auto whole = lines.rfind('\n') + 1;
+      append(lines.substr(0, whole));
+      lines.erase(0, whole);
+    }
+  }
+
+  // Adds whole lines only; what cannot be written is missing. A file that would have more than half
+  // of `most_bytes_` becomes `….1`; one that has been removed is made anew. Whether it is there.
+  bool append(const std::string & lines) {
+    const auto opened = [this] {
+      return open(path_.c_str(), O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC | O_NONBLOCK, 0644);
+    };
+    int file = opened();
+    if (file < 0) return false;
+    std::int64_t before = lseek(file, 0, SEEK_END);
+    const auto header = static_cast<std::int64_t>(std::strlen(schema::log_header));
+    if (before > header && before + static_cast<std::int64_t>(lines.size()) > most_bytes_ / 2 &&
+        std::rename(path_.c_str(), (path_ + ".1").c_str()) == 0) {
+      close(file);
+      if ((file = opened()) < 0) return false;
+      before = 0;
+    }
+    const std::string whole = (before == 0 ? schema::log_header : "") + lines;
+    if (::write(file, whole.data(), whole.size()) != static_cast<ssize_t>(whole.size()))
+        [[maybe_unused]]
+      const int cut = ftruncate(file, before);
+    close(file);
+    return true;
+  }
+
   // The values of the columns, in the order of `log_header`.
   template <typename... Values>
   void row(const Values &... values) {
-    static_assert(sizeof...(values) == log_columns);
+    static_assert(sizeof...(values) == schema::log_columns);
     (add(values), ...);
   }
 
@@ -173,7 +145,10 @@ private:
     size_ = std::min(line_.size() - 1, size_ + static_cast<std::size_t>(written));
   }
 
-  std::optional<RowWriter> writer_;
+  std::string path_;
+  std::int64_t most_bytes_{0};
+  int ends_[2]{-1, -1};
+  std::thread writer_;
   std::array<char, 512> line_{};
   std::size_t size_{0};
 };

@@ -4,17 +4,14 @@
 
 #pragma once
 
-#include <fcntl.h>
 #include <signal.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
-#include <unistd.h>
 
-#include <cerrno>
 #include <cstring>
 #include <memory>
 
-#include "shaper.hpp"
+#include "gate.hpp"
 
 namespace chainshaper {
 
@@ -40,9 +37,9 @@ public:
       throw std::runtime_error(path_ + ": " + reason);
     }
     inode_ = found.st_ino;
-    auto * const text = static_cast<char *>(memory_) + 8 * topic_at;
-    std::memset(text, 0, topic_bytes);
-    std::memcpy(text, topic.data(), std::min(topic.size(), topic_bytes));
+    auto * const text = static_cast<char *>(memory_) + 8 * schema::topic;
+    std::memset(text, 0, schema::topic_bytes);
+    std::memcpy(text, topic.data(), std::min<std::size_t>(topic.size(), schema::topic_bytes));
   }
 
   Page(const Page &) = delete;
@@ -58,37 +55,40 @@ public:
   void set(Field field, std::int64_t value) { write(static_cast<std::size_t>(field), value); }
   void add(Field field, std::int64_t more = 1) { set(field, get(field) + more); }
 
-  bool lock() { return locks(publishing); }
+  // Take a byte of the file, if no process has it; see whether another one has it.
+  bool lock(off_t byte) {
+    struct flock wanted = region(byte);
+    return fcntl(file_, F_OFD_SETLK, &wanted) == 0;
+  }
 
-  bool has_standby() const { return is_locked(standing_by); }
-
-  // Whether the standby publishes although this node has the lock.
-  bool is_passing() const { return is_locked(passing); }
+  bool is_locked(off_t byte) const {
+    struct flock asked = region(byte);
+    return fcntl(file_, F_OFD_GETLK, &asked) == 0 && asked.l_type != F_UNLCK;
+  }
 
   bool is_current() const {
     struct stat found{};
     return stat(path_.c_str(), &found) == 0 && found.st_ino == inode_;
   }
 
-  // This node has dealt with a message.
   void note_released(std::int64_t key) {
     const auto number = get(Field::released);
-    write(released_at + static_cast<std::size_t>(number) % page_ring, key);
+    write(static_cast<std::size_t>(schema::released + number % schema::ring), key);
     set(Field::released, number + 1);
   }
 
-  // The latest messages that the standby has dealt with, ascending.
-  std::vector<std::int64_t> bypassed() const {
+  // The latest messages of the ring at this place, ascending.
+  std::vector<std::int64_t> noted(std::size_t ring) const {
     std::vector<std::int64_t> found;
-    found.reserve(page_ring);
-    for (std::size_t place = bypassed_at; place < bypassed_at + page_ring; ++place)
-      found.push_back(read(place));
+    found.reserve(schema::ring);
+    for (std::size_t place = 0; place < schema::ring; ++place)
+      found.push_back(read(ring + place));
     std::sort(found.begin(), found.end());
     return found;
   }
 
 private:
-  static constexpr off_t size = 8 * topic_at + topic_bytes;
+  static constexpr off_t size = 8 * schema::topic + schema::topic_bytes;
 
   static struct flock region(off_t byte) {
     struct flock wanted{};
@@ -97,16 +97,6 @@ private:
     wanted.l_start = byte;
     wanted.l_len = 1;
     return wanted;
-  }
-
-  bool locks(off_t byte) {
-    struct flock wanted = region(byte);
-    return fcntl(file_, F_OFD_SETLK, &wanted) == 0;
-  }
-
-  bool is_locked(off_t byte) const {
-    struct flock asked = region(byte);
-    return fcntl(file_, F_OFD_GETLK, &asked) == 0 && asked.l_type != F_UNLCK;
   }
 
   // Another process writes there as well.
@@ -155,9 +145,9 @@ inline void check_private(const std::string & folder) {
 // The page of an output: the one that is there, or else a new one. Throws where no folder is ours
 // alone.
 inline std::unique_ptr<Page> open_page(const std::string & name, const std::string & topic,
-                                       const std::vector<std::string> & folders = page_folders()) {
+                                       const std::vector<std::string> & folders) {
   const auto domain = std::to_string(std::atoi(text_in_environment("ROS_DOMAIN_ID").c_str()));
-  const auto file = name + "." + domain + ".v" + std::to_string(page_version);
+  const auto file = name + "." + domain + ".v" + std::to_string(schema::version);
   std::string problem = "no folder";
   for (const bool make : {false, true}) {
     for (const auto & folder : folders) {
@@ -179,38 +169,34 @@ public:
       : name_(std::move(name)), topic_(std::move(topic)), folders_(std::move(folders)) {
     page_ = open_page(name_, topic_, folders_);
     const auto now = monotonic_ns();
-    if (now - page_->get(Field::started_ns) > at_once_ns) page_->set(Field::failed_starts, 0);
+    if (now - page_->get(Field::started_ns) > schema::at_once_ns)
+      page_->set(Field::failed_starts, 0);
     page_->set(Field::started_ns, now);
     page_->add(Field::starts);
     page_->add(Field::failed_starts);
   }
 
-  bool has_standby() const { return page_->has_standby(); }
+  bool has_standby() const { return page_->is_locked(schema::standing_by); }
 
   // How many nodes before this one have failed, shortly one after the other.
   std::int64_t failed_before() const { return page_->get(Field::failed_starts) - 1; }
 
-  // For how long to wait before starting, because of that.
   double wait_s() const {
-    const auto failed = failed_before() - back_off_after;
-    return failed < 0
-               ? 0.0
-               : std::min(10.0, 0.5 * static_cast<double>(1 << std::min<std::int64_t>(failed, 5)));
+    const auto failed = failed_before() - schema::back_off_after;
+    if (failed < 0) return 0.0;
+    return std::min(10.0, 0.5 * static_cast<double>(1 << std::min<std::int64_t>(failed, 5)));
   }
 
-  // Where cycles began for the shaping node before this one.
   Maybe phase_ns() const {
     if (page_->get(Field::phase_known) == 0) return std::nullopt;
     return page_->get(Field::phase_ns);
   }
 
-  // The mode in force for that node, by its number.
   std::optional<std::size_t> mode() const {
     const auto number = page_->get(Field::mode);
     return number > 0 ? std::optional<std::size_t>(number - 1) : std::nullopt;
   }
 
-  // Whether a message that was received is this node's to deal with.
   bool take(std::int64_t key) {
     if (!in_force_ && !come_into_force(key)) return false;
     page_->set(Field::until_ns, monotonic_ns());
@@ -226,16 +212,15 @@ public:
     page_->set(Field::phase_known, 1);
   }
 
-  // Whether the standby has dealt with a message.
   bool was_bypassed(std::int64_t key) {
     const auto count = page_->get(Field::bypassed);
     if (count != seen_) {
       // What the standby is about to publish comes first.
-      const auto give_up = monotonic_ns() + give_up_ns;
-      while (page_->is_passing() && monotonic_ns() < give_up) sleep_until(monotonic_ns() + 100'000);
-      bypassed_ = page_->bypassed();
-      if (seen_ >= 0 && count - seen_ > static_cast<std::int64_t>(page_ring))
-        oldest_ = bypassed_.front();  // older ones were, too
+      const auto give_up = monotonic_ns() + schema::give_up_ns;
+      while (page_->is_locked(schema::passing) && monotonic_ns() < give_up)
+        sleep_until(monotonic_ns() + 100'000);
+      bypassed_ = page_->noted(schema::bypassed);
+      if (seen_ >= 0 && count - seen_ > schema::ring) oldest_ = bypassed_.front();  // so were older
       seen_ = count;
     }
     if (key >= oldest_ && !std::binary_search(bypassed_.begin(), bypassed_.end(), key)) {
@@ -246,27 +231,27 @@ public:
     return true;
   }
 
-  // A message has been published or discarded.
   void done(std::int64_t key) {
     page_->note_released(key);
     page_->set(Field::until_ns, monotonic_ns());
     page_->set(Field::failed_starts, 0);
-    if (!page_->is_current()) {
-      try {
-        page_ = open_page(name_, topic_, folders_);
-        in_force_ = false;
-        seen_ = -1;
-        oldest_ = 0;
-      } catch (const std::runtime_error &) {
-        // Without a folder this page has to do, which no other process finds.
-      }
+    if (page_->is_current()) return;
+    try {
+      auto next = open_page(name_, topic_, folders_);
+      for (const auto one : page_->noted(schema::released))
+        next->note_released(one);  // a standby that lags has to know them
+      page_ = std::move(next);
+      in_force_ = false;
+      seen_ = -1;
+      oldest_ = 0;
+    } catch (const std::runtime_error &) {
+      // Without a folder this page has to do, which no other process finds.
     }
   }
 
   // A message that was received has no room any more, and is never published.
   void drop(std::int64_t key) { page_->note_released(key); }
 
-  // A message has been published, or was dropped; so many were missing before it.
   void count(std::optional<Dropped> dropped, Maybe lost, bool late) {
     const auto reason = [](Dropped why) {  // they stand in the page in their order
       return static_cast<Field>(static_cast<int>(Field::replaced) + static_cast<int>(why));
@@ -277,41 +262,31 @@ public:
   }
 
 private:
-  static bool is_alive(std::int64_t pid) {
-    return pid > 0 && kill(static_cast<pid_t>(pid), 0) == 0;
-  }
-
   bool come_into_force(std::int64_t key) {
-    const auto give_up = monotonic_ns() + give_up_ns;
-    in_force_ = page_->lock();
-    while (!in_force_) {
-      if (is_alive(page_->get(Field::holder)))  // another shaping node
+    const auto give_up = monotonic_ns() + schema::give_up_ns;
+    while (!(in_force_ = page_->lock(schema::publishing))) {
+      const auto holder = page_->get(Field::holder);
+      if (holder > 0 && kill(static_cast<pid_t>(holder), 0) == 0)  // another shaping node
         return false;
-      if (gave_up_ || monotonic_ns() > give_up) {  // the standby was stopped while it published
-        gave_up_ = true;
-        break;
-      }
+      gave_up_ = gave_up_ || monotonic_ns() > give_up;  // the standby was stopped while it published
+      if (gave_up_) break;
       sleep_until(monotonic_ns() + 1'000'000);
-      in_force_ = page_->lock();
     }
     gave_up_ = gave_up_ && !in_force_;
     page_->set(Field::until_ns, monotonic_ns());
     page_->set(Field::first, key);
     page_->set(Field::holder, getpid());
-    while (may_be_acknowledged() && !is_acknowledged(key) && monotonic_ns() < give_up)
+    // A standby still deals with what came before this node's first message.
+    const bool listening = page_->get(Field::listening) > 0;
+    while (listening && has_standby() && !is_acknowledged(key) && monotonic_ns() < give_up)
       sleep_until(monotonic_ns() + 200'000);
     return true;
   }
 
-  // Whether the standby has dealt with all that came before this node's first message.
   bool is_acknowledged(std::int64_t key) const {
-    const auto bypassed = page_->bypassed();
+    const auto bypassed = page_->noted(schema::bypassed);
     return page_->get(Field::acknowledged) == key ||
            std::binary_search(bypassed.begin(), bypassed.end(), key);
-  }
-
-  bool may_be_acknowledged() const {
-    return page_->has_standby() && page_->get(Field::listening) > 0;
   }
 
   std::string name_;

@@ -1,6 +1,6 @@
 // What the shaping nodes and the throttler have in common on the side of ROS 2: parameters, the
-// quality of service of a topic's publisher, and real-time scheduling of the calling thread.
-// Written for Humble to Rolling; where they differ, it is said.
+// quality of service of a topic's publisher, serialized messages, and real-time scheduling of the
+// calling thread. Written for Humble to Rolling; where they differ, it is said.
 
 #pragma once
 
@@ -12,16 +12,16 @@
 #include <cstring>
 #include <memory>
 
+#include "gate.hpp"
 #include "rclcpp/rclcpp.hpp"
-#include "shaper.hpp"
+#include "rclcpp/version.h"
+
+#if !RCLCPP_VERSION_GTE(25, 0, 0)
+#include "rcl/subscription.h"
+#include "tracetools/tracetools.h"
+#endif
 
 namespace chainshaper {
-
-// Parameters come from the file only: what is in it, is declared.
-inline std::shared_ptr<rclcpp::Node> make_node(const std::string & name) {
-  return std::make_shared<rclcpp::Node>(
-      name, rclcpp::NodeOptions().automatically_declare_parameters_from_overrides(true));
-}
 
 inline Parameters parameters_of(rclcpp::Node & node) {
   Parameters found;
@@ -73,8 +73,7 @@ inline bool wait(double seconds) {
 inline std::optional<Offer> wait_for_publisher(rclcpp::Node & node, const std::string & topic) {
   const auto depth = static_cast<std::size_t>(parameters_of(node).output_depth);
   const std::string name = node.get_node_topics_interface()->resolve_topic_name(topic);
-  bool said = false;
-  while (rclcpp::ok()) {
+  for (bool said = false; rclcpp::ok(); said = true) {
     const auto found = node.get_publishers_info_by_topic(topic);
     if (!found.empty() && !found[0].topic_type().empty()) {
       if (found.size() > 1) {
@@ -87,10 +86,7 @@ inline std::optional<Offer> wait_for_publisher(rclcpp::Node & node, const std::s
                   found[0].node_name().c_str(), offer.type.c_str());
       return offer;
     }
-    if (!said) {
-      RCLCPP_INFO(node.get_logger(), "waiting for a publisher of %s", name.c_str());
-      said = true;
-    }
+    if (!said) RCLCPP_INFO(node.get_logger(), "waiting for a publisher of %s", name.c_str());
     wait(0.01);
   }
   return std::nullopt;
@@ -101,7 +97,6 @@ inline std::optional<Offer> wait_for_publisher(rclcpp::Node & node, const std::s
 // of DDS must not; later ones do not get the class. What is not permitted is warned of.
 inline void become_realtime(rclcpp::Node & node) {
   const auto parameters = parameters_of(node);
-  const auto core = parameters.core;
   const auto warn = [&](const char * what, const char * remedy) {
     RCLCPP_WARN(node.get_logger(), "%s: %s; it works on without: %s", what, std::strerror(errno),
                 remedy);
@@ -114,10 +109,10 @@ inline void become_realtime(rclcpp::Node & node) {
     if (sched_setscheduler(0, SCHED_FIFO | SCHED_RESET_ON_FORK, &wanted) != 0)
       warn("SCHED_FIFO is refused", "give the user an rtprio limit of 98");
   }
-  if (core >= 0) {
+  if (parameters.core >= 0) {
     cpu_set_t cores;
     CPU_ZERO(&cores);
-    CPU_SET(static_cast<std::size_t>(core), &cores);
+    CPU_SET(static_cast<std::size_t>(parameters.core), &cores);
     if (sched_setaffinity(0, sizeof(cores), &cores) != 0)
       warn("the core is refused", "name another in the plan");
   }
@@ -132,7 +127,9 @@ int run(int argc, char ** argv, const std::string & name, SetUp && set_up) {
   // seen the first it gives the signal back, as it was before: ignored.
   std::signal(SIGINT, SIG_IGN);
   rclcpp::init(argc, argv);
-  auto node = make_node(name);
+  // Parameters come from the file only: what is in it, is declared.
+  const auto node = std::make_shared<rclcpp::Node>(
+      name, rclcpp::NodeOptions().automatically_declare_parameters_from_overrides(true));
   int code = 0;
   try {
     const std::function<bool()> work_off = set_up(*node);
@@ -148,6 +145,76 @@ int run(int argc, char ** argv, const std::string & name, SetUp && set_up) {
   }
   rclcpp::shutdown();
   return code;
+}
+
+// Messages of any type, as they came from the wire: receiving them with their source timestamps,
+// and publishing them, so that a tracer sees both.
+//
+// From Jazzy on rclcpp's generic subscriptions and publishers do all that. Before, their callbacks
+// are given the message only (rclcpp issue 1604), and none of rclcpp, rcl and rmw has trace points
+// on the way of serialized messages: here they are passed what rclcpp knows, and emit the events
+// that Jazzy has. Upstream: ros2_tracing, `tracetools/include/tracetools/tracetools.h`, 4.1.1.
+
+using Taken =
+    std::function<void(std::shared_ptr<rclcpp::SerializedMessage>, const rclcpp::MessageInfo &)>;
+
+#if !RCLCPP_VERSION_GTE(25, 0, 0)
+
+class SerializedSubscription : public rclcpp::GenericSubscription {
+public:
+  SerializedSubscription(rclcpp::Node & node, const std::string & topic, const std::string & type,
+                         const rclcpp::QoS & qos, Taken taken)
+      : GenericSubscription(
+            node.get_node_base_interface().get(),
+            rclcpp::get_typesupport_library(type, "rosidl_typesupport_cpp"), topic, type, qos,
+            [](std::shared_ptr<rclcpp::SerializedMessage>) {}, rclcpp::SubscriptionOptions()),
+        taken_(taken) {
+    const void * handle = get_subscription_handle().get();
+    TRACEPOINT(rclcpp_subscription_init, handle, static_cast<const void *>(this));
+    TRACEPOINT(rclcpp_subscription_callback_added, static_cast<const void *>(this),
+               static_cast<const void *>(&taken_));
+  }
+
+  void handle_serialized_message(const std::shared_ptr<rclcpp::SerializedMessage> & message,
+                                 const rclcpp::MessageInfo & info) override {
+    const auto source_timestamp = info.get_rmw_message_info().source_timestamp;
+    const void * handle = rcl_subscription_get_rmw_handle(get_subscription_handle().get());
+    const void * callback = &taken_;
+    TRACEPOINT(rmw_take, handle, static_cast<const void *>(message.get()), source_timestamp, true);
+    TRACEPOINT(callback_start, callback, false);
+    taken_(message, info);
+    TRACEPOINT(callback_end, callback);
+  }
+
+private:
+  Taken taken_;
+};
+
+#endif
+
+inline rclcpp::GenericSubscription::SharedPtr subscribe_serialized(rclcpp::Node & node,
+                                                                   const std::string & topic,
+                                                                   const std::string & type,
+                                                                   const rclcpp::QoS & qos,
+                                                                   Taken taken) {
+#if RCLCPP_VERSION_GTE(25, 0, 0)
+  return node.create_generic_subscription(topic, type, qos, taken);
+#else
+  auto subscription = std::make_shared<SerializedSubscription>(node, topic, type, qos, taken);
+  node.get_node_topics_interface()->add_subscription(subscription, nullptr);
+  return subscription;
+#endif
+}
+
+inline void publish_serialized(rclcpp::GenericPublisher & publisher,
+                               const rclcpp::SerializedMessage & message) {
+#if !RCLCPP_VERSION_GTE(25, 0, 0)
+  const void * content = &message;
+  const void * handle = publisher.get_publisher_handle().get();
+  TRACEPOINT(rcl_publish, handle, content);
+  TRACEPOINT(rmw_publish, content);
+#endif
+  publisher.publish(message);
 }
 
 }  // namespace chainshaper

@@ -1,30 +1,23 @@
 // Making what follows a release take the same time in every cycle, as Readiness of chainshaper's
-// Python node, which says why: the publication is rehearsed, and idle cores do not sleep.
+// Python node, which says why: the publication is rehearsed, idle cores do not sleep, and the core
+// where the output is delivered is clear of other work (chainshaper/gate/clear_core.py).
 
 #pragma once
 
 #include <arpa/inet.h>
-#include <errno.h>
-#include <fcntl.h>
 #include <netinet/in.h>
 #include <pthread.h>
-#include <sched.h>
 #include <semaphore.h>
 #include <sys/socket.h>
-#include <unistd.h>
 
 #include <atomic>
-#include <cstring>
 #include <thread>
 
-#include "rclcpp/rclcpp.hpp"
-#include "shaper.hpp"
+#include "node.hpp"
 
 namespace chainshaper {
 
-// A core that is clear of other work while an output is delivered there: as
-// chainshaper/gate/clear_core.py, which says why. Where SCHED_FIFO or the core is refused, it is
-// not.
+// Where SCHED_FIFO or the core is refused, it is not clear.
 class ClearCore {
 public:
   explicit ClearCore(std::size_t core) {
@@ -55,13 +48,10 @@ private:
     CPU_ZERO(&cores);
     CPU_SET(core, &cores);
     if (sched_setscheduler(0, SCHED_FIFO | SCHED_RESET_ON_FORK, &lowest) != 0 ||
-        sched_setaffinity(0, sizeof(cores), &cores) != 0) {
+        sched_setaffinity(0, sizeof(cores), &cores) != 0)
       return;
-    }
     for (;;) {
-      while (sem_wait(&more_) != 0) {
-        // A signal ended the wait early.
-      }
+      while (sem_wait(&more_) != 0) continue;  // a signal ended the wait early
       if (until_ns_ == over) return;
       watch_until(until_ns_);
     }
