@@ -1,25 +1,25 @@
 # `make demo` and `make test` need nothing but Python 3.10 or newer; see scripts/setup.
 
-.PHONY: demo test test-computing test-machine test-kernel lint benchmark experiments docs clean
+.PHONY: demo test test-untimed test-timed test-kernel lint benchmark experiments docs clean
 
 demo: .venv/.ready
 	.venv/bin/chainshaper demo
 
-# What only computes runs beside what needs the machine (tests/conftest.py).
-test: lint
+# Tests that need the machine's cores for themselves, and all others beside them (tests/conftest.py).
+test: .venv/.ready-dev
 	scripts/test-tools
-	$(MAKE) --jobs=2 --output-sync=line test-computing test-machine
+	$(MAKE) --jobs=2 --output-sync=line test-untimed test-timed
 
-test-computing:
-	.venv/bin/python -m pytest -m computing
+test-untimed: lint
+	.venv/bin/python -m pytest -m "not timed"
 
-# Live tests need cores that nothing else takes. What fails beside the computing half is named, and
-# tried once more when that is through; what fails again has failed.
-machine = .venv/bin/python -m pytest -m "not computing" -o cache_dir=.pytest_cache/machine
-test-machine:
-	$(machine); code=$$?; [ $$code = 1 ] || exit $$code; \
-		while pgrep -f "pytest -m computin[g]" >/dev/null; do sleep 1; done; \
-		echo "tried once more, alone:"; $(machine) --last-failed --last-failed-no-failures none
+# What fails beside the others is named, and tried once more when those are through; what fails again
+# has failed.
+timed = .venv/bin/python -m pytest -m timed -o cache_dir=.pytest_cache/timed
+test-timed: .venv/.ready-dev
+	$(timed); code=$$?; [ $$code = 1 ] || exit $$code; \
+		while pgrep -f "pytest -m not time[d]" >/dev/null; do sleep 1; done; \
+		echo "tried once more, alone:"; $(timed) --last-failed --last-failed-no-failures none
 
 # In QEMU, what needs another kernel than this machine's: the sched_ext back end, LTTng's kernel
 # tracer. Fetches about 130 MB once; a quarter of an hour or so.

@@ -23,10 +23,9 @@ settings.register_profile("chainshaper", deadline=None)
 settings.load_profile("chainshaper")
 
 
-# Folders whose tests only compute: `make test` runs them beside all others, which follow each other
-# in one process, because they need the machine's cores or tracers for themselves.
-COMPUTING = {"analysis", "experiments", "planning", "reporting", "simulation"}
-COMPUTING |= {"sources/ctf", "splicing", "values"}
+# Folders whose tests run live threads against the clock: they need the machine's cores for
+# themselves and follow each other in one process, while `make test` runs all others beside them.
+TIMED = {".", "enforcement", "flow", "gate", "linux", "verify", "workload"}
 LIVE_RUNS = {"unshaped", "shaped"}
 
 Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
@@ -34,12 +33,12 @@ Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
 
 @pytest.hookimpl(tryfirst=True)  # before the command line's choice of marks is looked at
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that may run beside others."""
+    """Mark the tests that need the machine's cores for themselves."""
     for item in items:
         folder = item.path.parent.relative_to(Path(__file__).parent).as_posix()
         live = LIVE_RUNS & set(getattr(item, "fixturenames", ()))
-        if folder in COMPUTING and not live and not item.get_closest_marker("ros2"):
-            item.add_marker("computing")
+        if folder in TIMED or live or item.get_closest_marker("ros2"):
+            item.add_marker("timed")
 
 
 ALLOWED_SKIPS = [

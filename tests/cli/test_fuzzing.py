@@ -27,8 +27,6 @@ from chainshaper.planning import Plan, dump_plan
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import load_application
 
-pytestmark = pytest.mark.computing
-
 CASES = int(os.environ.get("CHAINSHAPER_FUZZ_CASES", "25"))
 FIRST = int(os.environ.get("CHAINSHAPER_FUZZ_FIRST", "0"))
 SECONDS = 60  # of one case, on a machine that does other things

@@ -27,8 +27,6 @@ from chainshaper.planning.plan import revised
 from chainshaper.values.recording import Recording, write_recording
 from chainshaper.values.safe_text import shown
 
-pytestmark = pytest.mark.computing
-
 HOSTILE = (
     "\x1b]0;owned\x07\x1b[31m\x1b[2J\x9b5n\r\b\x7f\t\x00\u202e\u2067\u200b\u2028\ufffe"
     "[bold][/bold][/][link=x]:smile:$x^{<b>&\"'\\"

@@ -13,8 +13,6 @@ from command_line import called
 
 from chainshaper.cli.ros2_chain import ChainCommand
 
-pytestmark = pytest.mark.computing
-
 ROOT = Path(__file__).parents[2]
 
 

@@ -9,8 +9,6 @@ from command_line import called, json_of, refused
 
 from chainshaper.planning import Plan, save_plan
 
-pytestmark = pytest.mark.computing
-
 ROBOT = '<launch>\n  <node pkg="robot" exec="third" name="third"/>\n</launch>\n'
 
 

@@ -8,8 +8,6 @@ import pytest
 from command_line import called, json_of, refused
 from reference_traces import CHAINS, TRACES, reference_folder, reference_trace
 
-pytestmark = pytest.mark.computing
-
 SYSTEMS = {
     "jazzy_chain_cyclonedds": ("jazzy", "rmw_cyclonedds_cpp"),
     "jazzy_chain_fastrtps_async": ("jazzy", "rmw_fastrtps_cpp"),

@@ -120,6 +120,7 @@ def test_a_thread_that_got_the_id_of_one_that_ended_is_not_touched(
     tmp_path: Path, journal: Journal
 ) -> None:
     with acting(tmp_path, "a") as actor:
+        time.sleep(0.05)  # in ticks of 10 ms: it has not begun after the change, as heirs have
         change_all(journal, [(actor.thread("a"), WANTED)])
         text = journal.path.read_text()
         started = actor.thread("a").started
@@ -136,7 +137,7 @@ def test_what_threads_inherited_goes_back_to_what_their_parents_had(
     with acting(tmp_path, "early") as actor:
         before = state_of(actor.pid)
         early = state_of(actor.tids["early"])
-        time.sleep(0.05)  # starts are told in ticks of 10 ms
+        time.sleep(0.05)  # starts are counted in ticks of 10 ms
         change_all(journal, [(actor.thread("main"), WANTED)])
         time.sleep(0.05)
         actor.begin("late")  # by the main thread
