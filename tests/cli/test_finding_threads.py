@@ -18,6 +18,8 @@ from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.planning import Plan, save_plan
 from chainshaper.values.recording import RecordingInfo, write_recording
 
+pytestmark = pytest.mark.timed
+
 CYCLONE = ("gc", "dq.builtins", "dq.user", "tev", "recv")
 
 

@@ -13,6 +13,8 @@ from small_chain import NODES
 from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.values.recording import Recording
 
+pytestmark = pytest.mark.timed
+
 
 @pytest.fixture
 def run(application_file: Path) -> Iterator[Running]:

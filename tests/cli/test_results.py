@@ -122,6 +122,7 @@ def test_doctor_as_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert checks["bpftrace"]["found"] == (as_root if os.geteuid() == 0 else "needs root")
 
 
+@pytest.mark.timed
 def test_demo_puts_everything_into_one_folder(application_file: Path) -> None:
     """With the small chain and few cycles: the flow is the same."""
     for cycles in ("8", "40", "120"):  # a busy machine may disturb eight of eight
