@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.computing
-
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 

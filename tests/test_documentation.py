@@ -22,6 +22,8 @@ from pathlib import Path
 import pytest
 from command_line import Finished, called
 
+pytestmark = pytest.mark.timed
+
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 CONSOLE = re.compile(r"```console\n(.*?)```", re.DOTALL)
