@@ -24,8 +24,11 @@ settings.load_profile("chainshaper")
 
 
 # Folders whose tests run live threads against the clock: they need the machine's cores for
-# themselves and follow each other in one process, while `make test` runs all others beside them.
+# themselves and follow each other in one process, while `make test` runs all others beside them;
+# and what stands in these folders but looks at no clock.
 TIMED = {"enforcement", "flow", "gate", "linux", "verify", "workload"}
+TIMELESS = {"linux/test_own_processes", "workload/test_computing", "workload/test_launcher"}
+TIMELESS |= {"enforcement/test_litmus", "enforcement/test_node_threads", "gate/test_decision"}
 LIVE_RUNS = {"unshaped", "shaped"}
 
 Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
@@ -35,9 +38,10 @@ Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests that need the machine's cores for themselves."""
     for item in items:
-        folder = item.path.parent.relative_to(Path(__file__).parent).as_posix()
+        file = item.path.relative_to(Path(__file__).parent).with_suffix("")
+        timed = file.parent.as_posix() in TIMED and file.as_posix() not in TIMELESS
         live = LIVE_RUNS & set(getattr(item, "fixturenames", ()))
-        if folder in TIMED or live or item.get_closest_marker("ros2"):
+        if timed or live or item.get_closest_marker("ros2"):
             item.add_marker("timed")
 
 

@@ -22,8 +22,6 @@ from pathlib import Path
 import pytest
 from command_line import Finished, called
 
-pytestmark = pytest.mark.timed
-
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 CONSOLE = re.compile(r"```console\n(.*?)```", re.DOTALL)
@@ -38,7 +36,15 @@ def commands(page: Path) -> list[str]:
     return [line[2:] for block in blocks for line in block.splitlines() if line.startswith("$ ")]
 
 
-PAGES_WITH_COMMANDS = [page for page in PAGES if commands(page)]
+def with_live_runs(page: Path) -> bool:
+    return any(re.match(r"chainshaper (apply|demo|run|shape)", line) for line in commands(page))
+
+
+PAGES_WITH_COMMANDS = [
+    pytest.param(page, id=page.name, marks=[pytest.mark.timed] if with_live_runs(page) else [])
+    for page in PAGES
+    if commands(page)
+]
 
 
 def shortened(command: str, cycles: int) -> str:
@@ -113,7 +119,7 @@ def tried(steps: Callable[[Path, int], Iterable[str]], folder: Path, recorded: P
     pytest.fail(f"{command}\n{finished.out}\n{finished.err}")
 
 
-@pytest.mark.parametrize("page", PAGES_WITH_COMMANDS, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES_WITH_COMMANDS)
 def test_every_command_runs(page: Path, tmp_path: Path, recorded: Path) -> None:
     def read(folder: Path, cycles: int) -> Iterable[str]:
         text = page.read_text()
@@ -125,6 +131,7 @@ def test_every_command_runs(page: Path, tmp_path: Path, recorded: Path) -> None:
     tried(read, tmp_path, recorded)
 
 
+@pytest.mark.timed
 def test_the_python_example_of_the_readme_runs(tmp_path: Path, recorded: Path) -> None:
     (example,) = PYTHON.findall((ROOT / "README.md").read_text())
 
