@@ -1,9 +1,9 @@
-"""Run by an interpreter that has bt2: pickle a trace's first events to standard output.
+"""Run by an interpreter that has bt2: pickle every event of a trace to standard output.
 
-    python babeltrace_dump.py MOST FOLDER…
+    python babeltrace_dump.py FOLDER…
 
-Writes a dict: ``events`` (name, clock cycles or None, packet context, contexts, payload), at most
-MOST of them, ``discarded`` and ``lost``.
+Writes a dict: ``events`` (name, clock cycles or None, packet context, contexts, payload),
+``discarded`` and ``lost``.
 """
 
 import pickle
@@ -33,7 +33,7 @@ def fields(of: Any) -> Any:
 
 
 events, discarded, lost = [], 0, 0
-for message in bt2.TraceCollectionMessageIterator(sys.argv[2:]):
+for message in bt2.TraceCollectionMessageIterator(sys.argv[1:]):
     if type(message) is bt2._DiscardedEventsMessageConst:
         discarded += message.count or 0
     elif type(message) is bt2._DiscardedPacketsMessageConst:
@@ -44,6 +44,4 @@ for message in bt2.TraceCollectionMessageIterator(sys.argv[2:]):
         packet, payload = fields(event.packet.context_field), fields(event.payload_field)
         clock = message.default_clock_snapshot.value
         events.append((event.name, clock, packet, context, payload))
-        if len(events) == int(sys.argv[1]):
-            break
 pickle.dump({"events": events, "discarded": discarded, "lost": lost}, sys.stdout.buffer)

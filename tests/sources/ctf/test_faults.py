@@ -223,8 +223,8 @@ def test_numba_is_imported_only_to_decode() -> None:
 
 
 # As for the campaigns of tests/cli/test_fuzzing.py.
-CASES = int(os.environ.get("CHAINSHAPER_FUZZ_CASES", "100"))
-SECONDS = 3 if CASES == 100 else 1e9
+CASES = int(os.environ.get("CHAINSHAPER_FUZZ_CASES", "300"))
+SECONDS = 7 if CASES == 300 else 1e9
 
 
 def test_random_damage_to_streams(tmp_path: Path) -> None:
