@@ -28,7 +28,7 @@ settings.load_profile("chainshaper")
 # and what stands in these folders but looks at no clock.
 TIMED = {"enforcement", "flow", "gate", "linux", "verify", "workload"}
 TIMELESS = {"linux/test_own_processes", "workload/test_computing", "workload/test_launcher"}
-TIMELESS |= {"enforcement/test_litmus", "enforcement/test_node_threads", "gate/test_decision"}
+TIMELESS |= {"gate/test_decision", "workload/test_description", "workload/test_execution_times"}
 LIVE_RUNS = {"unshaped", "shaped"}
 
 Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
