@@ -233,13 +233,14 @@ def simple_paths(graph_: ApplicationGraph, start: str, end: str) -> Iterator[tup
             yield from onward((one.id, start), (start,))
 
 
+def of_edges(edges: list[tuple[int, int]]) -> ApplicationGraph:
+    """A timer that publishes /t0, and for each edge a callback from one topic to another."""
+    onward = [callback(i, f"/n{i}", 2, f"/t{a}", f"/t{b}") for i, (a, b) in enumerate(edges, 1)]
+    return of_callbacks([callback(0, "/s", 1, None, "/t0"), *onward])
+
+
 SMALL = st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5)), min_size=1, max_size=14).map(
-    lambda edges: of_callbacks(
-        [
-            callback(0, "/s", 1, None, "/t0"),
-            *(callback(i, f"/n{i}", 2, f"/t{a}", f"/t{b}") for i, (a, b) in enumerate(edges, 1)),
-        ]
-    )
+    of_edges
 )
 
 
@@ -259,6 +260,15 @@ def test_listing_agrees_with_trying_everything(graph_: ApplicationGraph) -> None
             assert found.count == len(expected)
         assert found.count <= len(expected)
         assert set(itertools.chain(*(chain.topics for chain in found.chains))) <= topics
+
+
+def test_with_cycles_the_better_of_two_orders_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A depth-first search meets the way back from /t1 first: 3 paths agree with its order."""
+    back = of_edges([(1, 2), (0, 2), (0, 1), (0, 1), (1, 0)])
+    monkeypatch.setattr("chainshaper.analysis.chains.STEPS", 3)  # as if it were large
+    found = enumerate_chains(back, "/t0", "/t2", limit=1)
+    assert (found.complete, found.exact) == (False, False)
+    assert found.count == len(list(simple_paths(back, "/t0", "/t2"))) == 6
 
 
 def test_the_only_path_through_a_large_cycle_is_found() -> None:
