@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -15,6 +16,7 @@ from pathlib import Path
 
 import pytest
 from cpp_program import compiled
+from processes import wait_for
 
 from chainshaper.gate.decision import DROPPED
 from chainshaper.gate.handover import RING, Page, Standby, Turn, open_page
@@ -309,3 +311,17 @@ def test_a_message_that_is_too_old_for_the_ring_is_left_out_too() -> None:
     assert passed == list(numbers)
     assert not any(turn.take(number) for number in numbers)
     assert turn.take(RING + 10)
+
+
+def test_a_node_whose_end_its_parent_has_not_seen_keeps_the_standby_no_busier() -> None:
+    page = open_page("t5", "/t5")
+    ended = subprocess.Popen(["true"])
+    os.waitid(os.P_PID, ended.pid, os.WEXITED | os.WNOWAIT)  # a zombie from here on
+    page["holder"] = ended.pid
+    standby, looks = Standby("t5", "/t5", lambda *_: None, lambda _: None, 0), list[int]()
+    standby.look = lambda: looks.append(1)  # type: ignore[method-assign]
+    threading.Thread(target=standby.watch, daemon=True).start()
+    wait_for(lambda: bool(looks), "the standby to see that the node has ended")
+    time.sleep(0.2)  # several hundred looks, one for each millisecond, unless it waits
+    ended.wait()
+    assert len(looks) < 5

@@ -396,10 +396,11 @@ class Standby:
 
     def watch(self) -> None:
         """Look when the shaping node dies, and when it should have released a message; for ever."""
+        gone = 0  # a process stays readable as one that has ended until its parent takes note
         while True:
             with self._mutex:  # the page may be left meanwhile
                 holder, left_ms = self.page["holder"], self._patience_left_ms()
-            poll, died = select.poll(), _end_of(holder)
+            poll, died = select.poll(), -1 if holder == gone else _end_of(holder)
             poll.register(self._woken, select.POLLIN)
             if died >= 0:
                 poll.register(died, select.POLLIN)
@@ -410,6 +411,7 @@ class Standby:
                 os.close(died)
             self.look()
             if ended:
+                gone = holder
                 time.sleep(0.001)  # another node with its lock is about to say so
 
     def _patience_left_ms(self) -> int:
