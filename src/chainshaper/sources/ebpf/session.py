@@ -203,7 +203,7 @@ class EbpfTracer:
         emitting = (table["pid"] for name, table in tables.items() if name != "sched_switch")
         commands = {pid: names.get(pid) or "" for pids in emitting for pid in pids.unique()}
         # What `rcl_init` would say of the library's version, whether or not it was traced.
-        versions = [point.library.version for point in self._points[:1]]
+        versions = [point.tracing_library.version for point in self._points[:1]]
         info = RecordingInfo(
             source="ebpf",
             distribution=distribution_of({"rcl_init": pl.DataFrame({"version": versions})}, {}),

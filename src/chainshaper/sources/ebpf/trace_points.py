@@ -120,7 +120,7 @@ class TracePoint:
 
     event: str
     file: Path
-    library: TracingLibrary
+    tracing_library: TracingLibrary
 
     @property
     def arguments(self) -> tuple[Argument, ...]:
@@ -129,7 +129,7 @@ class TracePoint:
             columns = ("context_handle",)
         elif self.event == "rclcpp_publish":  # the publisher's address, mostly null, comes first
             columns = (None, "message")
-        elif self.event == "rmw_publish" and not self.library.handles_at_rmw:
+        elif self.event == "rmw_publish" and not self.tracing_library.handles_at_rmw:
             columns = ("message",)
         types = events.FIELDS[self.event]
         return tuple(
@@ -141,11 +141,11 @@ class TracePoint:
     @property
     def handle(self) -> str | None:
         """The address of the `rmw_publisher_t` or `rmw_subscription_t` that the event is about."""
-        at_rmw = self.library.handles_at_rmw
+        at_rmw = self.tracing_library.handles_at_rmw
         if self.event == "rmw_take" or (self.event == "rmw_publish" and at_rmw):
             return "arg0"
         if self.event == "rcl_publish" and not at_rmw:
-            at = _RMW_HANDLE_AT_HUMBLE if self.library.major == 4 else _RMW_HANDLE_AT_IRON
+            at = _RMW_HANDLE_AT_HUMBLE if self.tracing_library.major == 4 else _RMW_HANDLE_AT_IRON
             return f"*(uint64 *)(*(uint64 *)arg0 + {at})"
         return None
 
@@ -395,7 +395,7 @@ def _table(rows: pl.DataFrame, point: TracePoint, texts: pl.DataFrame) -> pl.Dat
         else:
             rows = rows.with_columns(pl.col(next(values)).alias(column))
     if point.event == "rcl_init":
-        rows = rows.with_columns(version=pl.lit(point.library.version, dtype=pl.String))
+        rows = rows.with_columns(version=pl.lit(point.tracing_library.version, dtype=pl.String))
     return _typed(rows, point.event)
 
 
