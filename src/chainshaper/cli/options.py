@@ -137,9 +137,9 @@ def wish(name: str, **more: Any) -> Any:
 
 
 _MODES = option(
-    "--modes TOPIC:MODE=BAND,…",
-    "Each mode's band, 1 is the first; the first mode named is in force until the topic"
-    " (std_msgs/String) names another. Such as /driving_mode:city=2,highway=1.",
+    "--modes TOPIC:MODE[=BAND],…",
+    "Each mode's band, 1 is the first, found where none has a number; the first mode named is in"
+    " force until the topic (std_msgs/String) names another. Such as /driving_mode:city,highway.",
     rich_help_panel=BANDS,
 )
 _LATE = option(
@@ -166,7 +166,10 @@ def takes_wishes(*names: str) -> Callable[[Callable[..., None]], Any]:
         @wraps(verb)
         def called(**values: Any) -> None:
             wished = {name: values.pop(name) for name in names}
-            modes = modes_of(wished.pop("modes", None), wished.pop("late", None))
+            text = wished.pop("modes", None)
+            modes = modes_of(text, wished.pop("late", None))
+            if modes is not None and "=" not in text:
+                wished["bands_of_modes"] = "found"
             verb(**values, request=cs.PlanRequest(**wished, modes=modes))
 
         options = []
@@ -188,7 +191,8 @@ def takes_wishes(*names: str) -> Callable[[Callable[..., None]], Any]:
 def modes_of(text: str | None, late: Late | None) -> "Modes | None":
     """The modes that `--modes` names, such as ``/mode:city=2,highway=1``; the first is the default.
 
-    An output behind its mode's slot leaves at once unless ``late`` says otherwise.
+    Without numbers bands have those of the modes' order. An output behind its mode's slot leaves at
+    once unless ``late`` says otherwise.
 
     Raises:
         InputError: it is not of this form, or names what no mode or topic may be called.
@@ -203,9 +207,11 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
     topic, _, listed = text.partition(":")
     pairs = [pair.partition("=") for pair in listed.split(",")]
     bands = {mode: int(band) for mode, _, band in pairs if band.isdecimal()}
+    if listed and "=" not in listed:
+        bands = {mode: number for number, (mode, _, _) in enumerate(pairs, start=1)}
     if len(bands) != len(pairs):
         raise InputError(
-            f"--modes {text}: write the topic, and a band for each mode once, such as"
+            f"--modes {text}: write the topic, and each mode once, all with a band or none, such as"
             " /driving_mode:city=2,highway=1"
         )
     with wrong_values_refused(Modes):

@@ -2,8 +2,9 @@
 
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import chainshaper as cs
 from chainshaper.cli.applying import recording_of
@@ -23,6 +24,9 @@ from chainshaper.cli.options import (
 from chainshaper.cli.output import notes, present, print_json, progress, show_line, warn
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Fallback
+
+if TYPE_CHECKING:
+    from chainshaper.planning import Modes
 
 
 @takes_wishes(*PLAN_WISHES)
@@ -47,6 +51,12 @@ def plan(
     curve: Path | None = option(
         "--curve FILE.png",
         "With --bands auto: draw the average over the number of bands.",
+        rich_help_panel="Latency bands",
+    ),
+    mode_profile: list[str] | None = option(
+        "--mode-profile MODE=REC",
+        "With --modes: what was measured in one mode alone, a recording or a file of latencies"
+        " (may be repeated). Default: the cycles of the recording that began in it.",
         rich_help_panel="Latency bands",
     ),
     sink: list[str] | None = option(
@@ -76,7 +86,10 @@ def plan(
     if curve is not None and request.bands != "auto":
         raise InputError("--curve draws what --bands auto looked at: add --bands auto")
     wanted: list[str | None] = [*chain] if chain else [None]
-    profiles = _profiles(recording, latencies, period, [*wanted, *(sink or [])])
+    chains = [*wanted, *(sink or [])]
+    profiles = _profiles(recording, latencies, period, chains)
+    if mode_profile:
+        profiles = _with_modes(profiles, mode_profile, request.modes, chains)
     planned, sinks = profiles[: len(wanted)], profiles[len(wanted) :]
     if len(planned) > 1:
         if sinks or curve is not None:
@@ -89,7 +102,7 @@ def plan(
         cs.save_plan(made, output)
     values: dict[str, Any] = {**plan_json(made), "warnings": plan_warnings(made)}
     tables = [plan_table(made)]
-    if len(publish_slots(made)) > 1:
+    if len(publish_slots(made)) > 1 or made.modes is not None:
         tables.append(bands_table(made))
     if choice is not None:
         values["choice"] = choice_json(choice)
@@ -114,6 +127,28 @@ def _profiles(
     if len(chains) > 1:
         raise InputError("--latencies are those of one chain: give a recording for several")
     return (cs.Profile(read_latencies(latencies), period, spec=chains[0]),)
+
+
+def _with_modes(
+    profiles: "Sequence[cs.Profile]",
+    given: Sequence[str],
+    modes: "Modes | None",
+    chains: Sequence[str | None],
+) -> "tuple[cs.Profile, ...]":
+    """The profiles with those of single modes, which are given as MODE=REC or MODE=FILE."""
+    apart: dict[str, Sequence[cs.Profile]] = {}
+    for text in given:
+        mode, _, name = text.partition("=")
+        if modes is None or mode not in modes.bands or not name or mode in apart:
+            known = "with --modes" if modes is None else f"for {', '.join(modes.bands)}, each once"
+            raise InputError(f"--mode-profile {text}: write MODE=REC, {known}")
+        where = (None, Path(name)) if Path(name).is_file() else (Path(name), None)
+        own = _profiles(*where, profiles[0].period_ns, chains)
+        apart[mode] = [replace(one, recording=name) for one in own]
+    return tuple(
+        replace(profile, of_modes={mode: own[number] for mode, own in apart.items()})
+        for number, profile in enumerate(profiles)
+    )
 
 
 def offsets(

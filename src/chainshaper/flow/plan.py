@@ -9,6 +9,7 @@ node with which the chain begins: what feeds a subscription there is not planned
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import cycle, islice
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +29,17 @@ from chainshaper.values.application import ApplicationGraph, Callback, Chain
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
+from chainshaper.values.yaml_file import wrong_values_refused
 from chainshaper.verify.measure import chain_of, longest_stall
 from chainshaper.workload.description import Application
-from chainshaper.workload.live import Enforcement, Progress, origin_timer, run_application
+from chainshaper.workload.live import (
+    Enforcement,
+    Progress,
+    instances_before_recording,
+    node_name,
+    origin_timer,
+    run_application,
+)
 
 __all__ = ["plan_recording", "profile_chains", "shape_application"]
 
@@ -102,10 +111,35 @@ def _profile_of(
         longest_stall_ns=longest_stall(recording),
         utilisation=_utilisation(flow, graph, core_of),
         longest_send_ns=_longest_send(flow),
+        longest_publication_ns=_longest_publication(flow, stages[-1].node, chain.topics[-1]),
         lost_events=sum(recording.info.lost.values()) or None,
         output_depth=_output_depth(flow, stages[-1].node, chain.topics[-1]),
         all_disturbed=all_disturbed or None,
+        announced=_announced(recording, flow),
+        began_ns=every["start"].to_numpy(),
+        hit=every["disturbed"].to_numpy(),
     )
+
+
+def _announced(recording: Recording, flow: DataFlow) -> dict[str, list[tuple[int, str]]]:
+    """When which mode was announced, by topic: no event has it, but the description of what ran has
+    what its timers announce in turn. Of a recording that lacks events nothing is sure.
+    """
+    found: dict[str, list[tuple[int, str]]] = {}
+    if recording.info.application is None or any(recording.info.lost.values()):
+        return found
+    with wrong_values_refused(Application, f"{recording.path}: the description that ran: "):
+        application = Application.model_validate(recording.info.application)
+    for name, callback in application.callbacks():
+        if not callback.announces or callback.timer_ns is None:
+            continue
+        (topic,), before = callback.publishes, instances_before_recording(application, callback)
+        sent = flow.publications.filter(topic=topic, node=node_name(name))["time"].to_list()
+        # The last one before the recording is in force when it begins.
+        times, names = ([0] if before else []) + sent, cycle(callback.announces)
+        named = zip(times, islice(names, max(0, before - 1), None), strict=False)
+        found[topic] = sorted([*found.get(topic, []), *named])
+    return found
 
 
 def _period(analysis: LatencyAnalysis, given: int | None) -> int:
@@ -307,13 +341,39 @@ def _longest_send(flow: DataFlow) -> int | None:
     sends = events.table(flow.events, "asynchronous_send").filter(pl.col("outcome") == "sent")
     if not sends.height:
         return None
+    return _longest_calm(flow, sends)
+
+
+def _longest_publication(flow: DataFlow, node: str, topic: str) -> int | None:
+    """How long a synchronous publisher's thread took to publish one output, at most (ns).
+
+    No event says when a publication was over: not after the end of its callback, the next that the
+    callback made, and when all subscribers had the message. A shaping node's will take as long.
+    """
+    following, taken = pl.col("time").shift(-1).over("instance"), pl.col("time").max()
+    ended = flow.instances.select("instance", "end")
+    readers = flow.takes.drop_nulls("publication").group_by("publication").agg(taken=taken)
+    sent = (
+        flow.publications.drop_nulls("instance")
+        .with_columns(following=following)
+        .filter((pl.col("topic") == topic) & (pl.col("node") == node))
+        .join(ended, on="instance", how="left")
+        .join(readers, on="publication", how="left")
+        .filter(pl.col("end").is_not_null())
+        .select("time", duration=pl.min_horizontal("end", "following", "taken") - pl.col("time"))
+    )
+    return _longest_calm(flow, sent) if sent.height else None
+
+
+def _longest_calm(flow: DataFlow, lasted: pl.DataFrame) -> int:
+    """The longest ``duration`` from a ``time`` on; of those that no stall fell into, if any."""
     stalls = events.table(flow.events, "machine_stall")
     (began, ended), (stalled, over) = (
         (one["time"].to_numpy(), (one["time"] + one["duration"]).to_numpy())
-        for one in (sends, stalls)
+        for one in (lasted, stalls)
     )
-    calm = sends.filter(~pl.Series(overlapping(began, ended, stalled, over)))
-    return int((calm if calm.height else sends)["duration"].max())  # type: ignore[arg-type]
+    calm = lasted.filter(~pl.Series(overlapping(began, ended, stalled, over)))
+    return int((calm if calm.height else lasted)["duration"].max())  # type: ignore[arg-type]
 
 
 def _output_depth(flow: DataFlow, node: str, topic: str) -> int | None:

@@ -200,7 +200,7 @@ def with_bands(
     length = problem.publish_slot_ns
     slots = tuple((end - length, end) for end in placement.slot_ends_ns)
     predicted = predict_bands(problem.latencies_ns, placement.slot_ends_ns, length)
-    return _with_publish_slots(plan, slots, predicted=predicted)
+    return with_publish_slots(plan, slots, predicted=predicted)
 
 
 @dataclass(frozen=True)
@@ -261,7 +261,7 @@ def with_long_slot(plan: Plan, latencies_ns: NDArray[np.int64], slot_start_ns: i
         shares=(1.0,),
     )
     slots = ((slot_start_ns, end),)
-    return _with_publish_slots(plan, slots, predicted=predicted, policy="one-long-slot")
+    return with_publish_slots(plan, slots, predicted=predicted, policy="one-long-slot")
 
 
 def _problem(plan: Plan, latencies_ns: NDArray[np.int64], limits: dict[str, Any]) -> BandProblem:
@@ -276,7 +276,8 @@ def _last_publish_slot(plan: Plan) -> Slot:
     return slots[-1]
 
 
-def _with_publish_slots(plan: Plan, slots: tuple[Slot, ...], **changes: object) -> Plan:
+def with_publish_slots(plan: Plan, slots: tuple[Slot, ...], **changes: object) -> Plan:
+    """The plan with other slots for its output, and other fields."""
     publishing = output_server(plan)
     servers = with_slots(plan.servers, {} if publishing is None else {publishing.name: slots})
     return revised(plan, servers=below_executors(servers), **changes)

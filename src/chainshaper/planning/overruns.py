@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from chainshaper.planning.margins import OVERRUN_PROBABILITY, cycles_needed
+from chainshaper.planning.modes import mode_warnings
 from chainshaper.planning.plan import (
     PER_CALLBACK,
     Plan,
@@ -197,7 +198,8 @@ def publication_warnings(plan: Plan) -> list[str]:
 
 def plan_warnings(plan: Plan) -> list[str]:
     """What a person must know before relying on a plan; one sentence each, none if all is well."""
-    return [*_about_late_outputs(plan), *_about_evidence(plan), *publication_warnings(plan)]
+    about = (_about_late_outputs(plan), mode_warnings(plan), _about_evidence(plan))
+    return [*(one for found in about for one in found), *publication_warnings(plan)]
 
 
 def _about_late_outputs(plan: Plan) -> Iterator[str]:

@@ -37,7 +37,7 @@ from chainshaper.values.yaml_file import (
     wrong_values_refused,
 )
 
-SHORTEST_SLOT_NS = 1_000_000  # of an asynchronous publisher
+SHORTEST_SLOT_NS = 1_000_000  # of an asynchronous publisher; of any, unless one is given
 SENDS_PER_SLOT = 4
 PER_CALLBACK = ("server-per-callback", "let-per-callback")
 """Policies whose slots follow from the callbacks, so that an execution may span cycles."""
@@ -83,7 +83,8 @@ class Evidence(Part):
     (``all_disturbed``), of all. ``max_of_all_ns`` is the longest of all, ``incomplete`` counts
     traversals without an end, ``disturbed`` those hit by a stall of the machine; ``utilisation`` is
     the share of its core that the chain takes, ``longest_send_ns`` is of the output's asynchronous
-    publisher. ``None`` is: not known.
+    publisher, ``longest_publication_ns`` of its synchronous one, for which Δ was ``given``, is as
+    long as ``measured``, or the ``least``. ``modes`` has each mode's own. ``None`` is: not known.
     """
 
     recording: str | None = None
@@ -98,8 +99,11 @@ class Evidence(Part):
     longest_stall_ns: Duration | None = None
     utilisation: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
     longest_send_ns: Duration | None = None
+    longest_publication_ns: Duration | None = None
+    publish_slot: Literal["given", "measured", "least"] | None = None
     lost_events: FromOne | None = None
     all_disturbed: Literal[True] | None = None
+    modes: "dict[ModeName, Evidence] | None" = None
 
     @model_validator(mode="after")
     def _ordered(self) -> "Evidence":
@@ -223,13 +227,15 @@ class Prediction(Part):
     """What the plan promises: end-to-end latency, and the share of cycles per latency band.
 
     A band is represented by the end of its slot (section 4.1). The jitter is the widest distance of
-    two outputs, from the start of the first slot to the end of the last.
+    two outputs, from the start of the first slot to the end of the last. ``modes`` has the same for
+    each mode in its slot, with the share of its cycles that are in time for it.
     """
 
     mean_ns: Duration
     max_ns: Duration
     jitter_ns: Duration
     shares: tuple[Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)], ...] = ()
+    modes: "dict[ModeName, Prediction] | None" = None
 
 
 class BandPrediction(NamedTuple):

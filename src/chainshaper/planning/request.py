@@ -10,10 +10,11 @@ plans have one thread. Chains that share no more than cores, and sinks that fork
 first callback, are planned right; the others are refused with what they have in common.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import combinations, permutations
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +30,19 @@ from chainshaper.planning.margins import (
     derive_margin,
     late_share,
 )
+from chainshaper.planning.modes import bands_of_modes, slots_of_modes, with_modes
 from chainshaper.planning.offsets import refuse_common
-from chainshaper.planning.plan import PER_CALLBACK, Evidence, Margin, Modes, Plan, revised
+from chainshaper.planning.plan import (
+    PER_CALLBACK,
+    SENDS_PER_SLOT,
+    SHORTEST_SLOT_NS,
+    Evidence,
+    Margin,
+    Modes,
+    Plan,
+    publish_slots,
+    revised,
+)
 from chainshaper.planning.shaping import (
     CallbackTimes,
     evidence_of,
@@ -67,7 +79,10 @@ class Profile:
     branches, and before the chain begins. ``receivers`` are the nodes that subscribe to the chain's
     output and are none of these. ``callbacks`` are those of the chain and its branches, see
     :func:`~chainshaper.planning.shaping.server_per_callback`. ``output_depth`` is the history of
-    the output's writer. The rest is :class:`~chainshaper.planning.plan.Evidence`.
+    the output's writer. Modes: ``announced`` has, by topic, when which one was named; ``began_ns``
+    and ``hit`` are when each cycle of ``every_latency_ns`` began, and whether the machine disturbed
+    it; ``of_modes`` are profiles of modes that were measured apart. The rest is
+    :class:`~chainshaper.planning.plan.Evidence`.
     """
 
     latencies_ns: NDArray[np.int64]
@@ -90,8 +105,13 @@ class Profile:
     longest_stall_ns: int | None = None
     utilisation: float | None = None
     longest_send_ns: int | None = None
+    longest_publication_ns: int | None = None
     lost_events: int | None = None
     all_disturbed: bool | None = None
+    announced: Mapping[str, Sequence[tuple[int, str]]] = field(default_factory=dict)
+    began_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    hit: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
+    of_modes: Mapping[str, "Profile"] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -109,15 +129,48 @@ class Profile:
         """The longest of the latencies that are planned from."""
         return int(check_latencies(self.latencies_ns).max())
 
+    def in_modes(self, modes: Modes) -> dict[str, "Profile"]:
+        """Each mode's own profile: the one given, or of the cycles that began in it, as gates count
+        them. None where nothing says which mode was in force.
+
+        Raises OperationError: fewer than two cycles of a mode were measured.
+        """
+        known = modes.topic in self.announced
+        named = [one for one in self.announced.get(modes.topic, ()) if one[1] in modes.bands]
+        place = np.searchsorted([at for at, _ in named], self.began_ns, side="right")
+        in_force = np.array([modes.default, *(mode for _, mode in named)])[place]
+        return {
+            mode: self.of_modes.get(mode) or self._in_mode(mode, (in_force == mode) & known)
+            for mode in (modes.bands if known or self.of_modes else ())
+        }
+
+    def _in_mode(self, mode: str, mine: NDArray[np.bool_]) -> "Profile":
+        if (count := int(mine.sum())) < 2:
+            raise OperationError(
+                f"{self.recording or self.name}: {count or 'no'} cycle of {self.name} began in mode"
+                f" {mode!r}, too few to place its slot: record a run in which it is in force for"
+                f" longer, or give its own profile (--mode-profile {mode}=REC)"
+            )
+        every, hit = self.every[mine], self.hit[mine]
+        stalled = int((~hit).sum()) < 2
+        return replace(
+            self,
+            latencies_ns=every if stalled else every[~hit],
+            every_latency_ns=every,
+            disturbed=int(hit.sum()),
+            all_disturbed=stalled or None,
+        )
+
 
 @dataclass(frozen=True)
 class PlanRequest(Wishes):
     """The wishes for a plan; every field has the default that the command line has.
 
-    ``modes`` give each mode of the system one of the bands.
+    ``modes`` give each mode of the system one of the bands, which may have to be ``found``.
     """
 
     modes: Modes | None = None
+    bands_of_modes: Literal["given", "found"] = "given"
 
 
 _STANDARD = PlanRequest()
@@ -138,7 +191,13 @@ def plan_chain(
     _refuse_entangled((profile, *sinks), request.policy, sinks=True)
     if any(sink.all_disturbed for sink in sinks) or profile.all_disturbed:
         profile, sinks = _covered(profile, request), [_covered(sink, request) for sink in sinks]
-    margin = _margin(profile, request)
+    modes = request.modes if request.policy == "shaped" else None
+    apart = {} if modes is None else profile.in_modes(modes)
+    finish: Callable[[Plan], Plan] = partial(_with_policy, profile=profile, request=request)
+    if modes is not None and apart:
+        profile, margin, finish = _together(profile, request, modes, apart)
+    else:
+        margin = _margin(profile, request)
     longest, period = profile.longest_ns, profile.period_ns
     if request.policy == "let-per-chain" and longest >= period:
         raise OperationError(
@@ -148,10 +207,10 @@ def plan_chain(
         )
     measured = profile
     if request.policy in OWN_SLOTS:  # shaping, only the start of the plan, must fit into a cycle
-        most = max(1, period - margin.epsilon_ns - request.publish_slot_ns)
+        most = max(1, period - margin.epsilon_ns - _slot_ns(profile, request))
         latencies = np.minimum(check_latencies(profile.latencies_ns), most)
         measured = replace(profile, latencies_ns=latencies)
-    plan = _with_policy(_shaped(measured, request, margin, sinks), profile, request)
+    plan = finish(_shaped(measured, request, margin, sinks))
     if request.policy in OWN_SLOTS:
         figures = evidence_of(profile.latencies_ns).model_dump(exclude_unset=True)
         plan = revised(plan, evidence=plan.evidence.model_copy(update=figures))
@@ -170,7 +229,7 @@ def plan_chain(
             f"--fallback {request.fallback} is for an output with a shaping node, and the plan has"
             " none: leave it out, or plan with synchronous publication"
         )
-    return revised(plan, modes=request.modes)
+    return plan if apart else _with_unmeasured(plan, request)
 
 
 def plan_chains(profiles: Sequence[Profile], request: PlanRequest = _STANDARD) -> tuple[Plan, ...]:
@@ -213,7 +272,69 @@ def _covered(profile: Profile, request: PlanRequest) -> Profile:
 
 def _latest(profile: Profile, request: PlanRequest) -> int:
     """The longest latency behind which a publish slot fits into the cycle."""
-    return profile.period_ns - request.publish_slot_ns - EPSILON_NS
+    return profile.period_ns - _slot_ns(profile, request) - EPSILON_NS
+
+
+def _slot_ns(profile: Profile, request: PlanRequest) -> int:
+    """Δ, long enough for a publication (eq. 2 and 4): given, or as long as the longest measured.
+
+    It is 1 ms at least, which moves no output, and which a machine that stalls needs; several times
+    as long as a send of an asynchronous publisher, whose thread must not be stopped in one.
+    """
+    if request.publish_slot_ns is not None:
+        return request.publish_slot_ns
+    every = (profile, *profile.of_modes.values())
+    longest = max(one.longest_publication_ns or 0 for one in every)
+    if request.publication == "asynchronous":
+        longest = SENDS_PER_SLOT * max(one.longest_send_ns or 0 for one in every)
+    grid = max(1, request.grid_ns)
+    return max(SHORTEST_SLOT_NS, -(-longest // grid) * grid)
+
+
+def _together(
+    profile: Profile, request: PlanRequest, modes: Modes, apart: Mapping[str, Profile]
+) -> tuple[Profile, Margin, Callable[[Plan], Plan]]:
+    """The profile of all modes, the margin up to their last slot, what gives a plan their slots."""
+    apart = {mode: _covered(one, request) for mode, one in apart.items()}
+    margins = {mode: _margin(one, request) for mode, one in apart.items()}
+    starts = {mode: one.longest_ns + margins[mode].epsilon_ns for mode, one in apart.items()}
+    length = _slot_ns(profile, request)
+    if request.bands_of_modes == "found":
+        modes = modes.model_copy(update={"bands": bands_of_modes(starts, length)})
+    slots = slots_of_modes(starts, modes.bands, length)
+    why = f"but each mode's slot is placed from its own latencies, here {len(slots)}: leave it out"
+    _refuse_placement(replace(request, bands=1) if request.bands == len(slots) else request, why)
+    measured = {}
+    for mode, one in apart.items():
+        names = ("recording", "disturbed", "all_disturbed", "realtime")
+        known = {name: getattr(one, name) for name in names}
+        own = evidence_of(one.latencies_ns, max_of_all_ns=int(one.every.max()), **known)
+        measured[mode] = own, float((one.every < slots[modes.bands[mode] - 1][1]).mean())
+    both = replace(
+        profile,
+        latencies_ns=np.concatenate([one.latencies_ns for one in apart.values()]),
+        every_latency_ns=np.concatenate([one.every for one in apart.values()]),
+        disturbed=sum(one.disturbed for one in apart.values()),
+        all_disturbed=any(one.all_disturbed for one in apart.values()) or None,
+    )
+    late = [margin.overrun_probability or 0.0 for margin in margins.values()]
+    last = {"epsilon_ns": slots[-1][0] - both.longest_ns, "overrun_probability": max(late) or None}
+    margin = margins[max(starts, key=starts.__getitem__)].model_copy(update=last)
+    return both, margin, partial(with_modes, modes=modes, slots=slots, measured=measured)
+
+
+def _with_unmeasured(plan: Plan, request: PlanRequest) -> Plan:
+    """With modes about which no latencies are known: they share the slots there are."""
+    modes, slots = request.modes, len(publish_slots(plan))
+    wanted = 0 if modes is None or plan.shaping_node is None else max(modes.bands.values())
+    if modes is not None and wanted > (0 if request.bands_of_modes == "found" else slots):
+        raise InputError(
+            f"nothing says when the modes {', '.join(modes.bands)} of {modes.topic} were in force"
+            " while the chain was measured, so no slot can be placed for each: record an"
+            " application whose description `announces` them, or give each mode's own profile"
+            " (--mode-profile MODE=REC)"
+        )
+    return revised(plan, modes=modes)
 
 
 def _shaped(
@@ -225,12 +346,16 @@ def _shaped(
         values["output_depth"] = profile.output_depth
     else:  # how long sends take is no evidence for it
         del values["longest_send_ns"]
+    length = _slot_ns(profile, request)
+    found = "measured" if length > SHORTEST_SLOT_NS else "least"
+    values["publish_slot"] = found if request.publish_slot_ns is None else "given"
     # At once by default, unless the thread of an asynchronous publisher has outputs due later.
     bound = request.publication == "asynchronous" and request.policy in OWN_SLOTS
     plan = plan_shaping(
         profile.latencies_ns,
         profile.period_ns,
         wishes=request,
+        publish_slot_ns=length,
         margin=margin,
         spec=profile.spec,
         output=profile.topics[-1] if profile.topics else None,
@@ -313,15 +438,17 @@ def _refuse_contradictions(request: PlanRequest, sinks: bool) -> None:
         raise InputError("a slot's start goes with the policy one-long-slot: add it")
     if request.policy == "shaped":
         return
+    why = f"which the policy {request.policy} has not: leave it out, or plan with the policy shaped"
+    _refuse_placement(request, why)
+    if sinks:
+        raise InputError(f"further sinks are shaped, not planned as {request.policy}")
+
+
+def _refuse_placement(request: PlanRequest, why: str) -> None:
     for name in ("bands", "solver", "max_gap_ns", "max_share", "minimise", "mean_at_most_ns"):
         if getattr(request, name) != getattr(_STANDARD, name):
             option = name.removesuffix("_ns").replace("_", "-")
-            raise InputError(
-                f"--{option} places latency bands, which the policy {request.policy} has not:"
-                " leave it out, or plan with the policy shaped"
-            )
-    if sinks:
-        raise InputError(f"further sinks are shaped, not planned as {request.policy}")
+            raise InputError(f"--{option} places latency bands, {why}")
 
 
 def _refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: bool = False) -> None:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from chainshaper.planning.bands import predict_bands
 from chainshaper.planning.margins import EPSILON_NS, check_latencies
 from chainshaper.planning.plan import (
+    SHORTEST_SLOT_NS,
     ChainOfPlan,
     Evidence,
     Margin,
@@ -69,8 +70,8 @@ def plan_shaping(
     ε, L̄ + ε + Δ) (eq. 4 with a shaping node, eq. 2 with an asynchronous publisher thread), in the
     same cycle (eq. 3), at the better priority, on ``output_core`` (default: the same core).
 
-    ε is the margin's or, without one, 1 ms unless the wishes say otherwise. ``nodes`` are those
-    whose executors run the chain. ``fifo_priority`` and ``receivers`` are for the shaping node.
+    ε is the margin's or, without one, 1 ms unless the wishes say otherwise; so is Δ. ``nodes`` are
+    those whose executors run the chain, ``fifo_priority`` and ``receivers`` for the shaping node.
     ``values`` are fields of :class:`~chainshaper.planning.plan.ChainOfPlan` (without ``output`` the
     plan can be studied, not carried out) and of :class:`~chainshaper.planning.plan.Evidence`, and
     single :class:`~chainshaper.values.plan_choices.Wishes`.
@@ -81,7 +82,8 @@ def plan_shaping(
     latencies = check_latencies(latencies_ns)
     of_chain = {n: values.pop(n) for n in ChainOfPlan.model_fields.keys() & values.keys()}
     wishes = replace(wishes or Wishes(), **{n: values.pop(n) for n in _WISHES & values.keys()})
-    length, longest = wishes.publish_slot_ns, int(latencies.max())
+    length = SHORTEST_SLOT_NS if wishes.publish_slot_ns is None else wishes.publish_slot_ns
+    longest = int(latencies.max())
     given = EPSILON_NS if wishes.epsilon_ns is None else wishes.epsilon_ns
     epsilon = given if margin is None else margin.epsilon_ns
     if epsilon < 0 or length <= 0 or period_ns <= 0:

@@ -13,7 +13,7 @@ from chainshaper.enforcement.threads import Allocation, NodeThread, WantedSchedu
 from chainshaper.enforcement.undoing import RunState, ServerState
 from chainshaper.linux.runs import Journal
 from chainshaper.linux.threads import POLICIES
-from chainshaper.planning import BandChoice, Plan, band_predictions
+from chainshaper.planning import BandChoice, Plan, band_predictions, publish_slots
 from chainshaper.planning.plan import slot_text
 from chainshaper.reporting.graph_drawing import short_symbol
 from chainshaper.reporting.tables import (
@@ -377,7 +377,16 @@ def plan_table(plan: Plan) -> ResultTable:
 
 
 def bands_table(plan: Plan) -> ResultTable:
-    """What a plan predicts of each latency band."""
+    """What a plan predicts of each latency band, or of each mode by what was measured in it."""
+    if plan.modes is not None and plan.evidence.modes and plan.predicted.modes:
+        columns = [*words("mode"), *figures("cycles", "min", "mean", "max", "slot", "in time")]
+        table = ResultTable("Modes, as measured, and their slots [ms]", columns)
+        for mode, own in plan.evidence.modes.items():
+            times = map(ms, (own.min_latency_ns, own.mean_latency_ns, own.max_latency_ns))
+            slot = slots_ms(publish_slots(plan)[plan.modes.bands[mode] - 1])
+            in_time = percent(plan.predicted.modes[mode].shares[0])
+            table.add(mode, f"{own.samples:,}", *times, slot, in_time)
+        return table
     columns = figures("slot", "share of cycles", "jitter at most")
     table = ResultTable("Predicted latency bands [ms]", columns)
     for start, end, share, jitter in band_predictions(plan):

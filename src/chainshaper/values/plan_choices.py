@@ -52,7 +52,8 @@ class Wishes:
 
     The margin is ``epsilon_ns`` behind the longest undisturbed latency where that is given.
     Otherwise it covers all cycles, also disturbed ones, but a share of ``overrun_probability``
-    (None: 1 %, or as few as the sample shows). ``overrun`` None: an output that missed its slot
+    (None: 1 %, or as few as the sample shows). ``publish_slot_ns`` is Δ of eq. 2 and 4, None: the
+    longest publication measured, 1 ms at least. ``overrun`` None: an output that missed its slot
     leaves at once, where the policy and the publisher allow it. ``bands`` to ``seed`` go with the
     policy ``shaped``, see :func:`~chainshaper.planning.bands.with_bands`; ``slot_start_ns`` goes
     with ``one-long-slot``.
@@ -61,7 +62,9 @@ class Wishes:
     policy: Annotated[Policy, Option("How it is scheduled.")] = "shaped"
     publication: Annotated[Publication, Option(
         "By a shaping node, or the publisher's own thread.")] = "synchronous"
-    publish_slot_ns: Annotated[int, Option("Length of the publish slot.")] = 1_000_000
+    publish_slot_ns: Annotated[int | None, Option(
+        "Length of the publish slot. Default: the longest publication measured, at least 1ms.")
+    ] = None
     slot_start_ns: Annotated[int | None, Option("Where the slot of one-long-slot starts.")] = None
     epsilon_ns: Annotated[int | None, Option(
         "A given margin behind the longest undisturbed latency. Default: 1ms behind the latency"

@@ -140,7 +140,8 @@ def hold_prediction(plan: Plan, analysis: LatencyAnalysis) -> PredictionHeld:
         bands = []
         for mode, band in plan.modes.bands.items():
             own = outputs.filter(pl.col("mode") == mode)
-            share, behind = sum(shares[:band]) or None, int(own["late"].sum())
+            promised, behind = (plan.predicted.modes or {}).get(mode), int(own["late"].sum())
+            share = (sum(shares[:band]) or None) if promised is None else promised.shares[0]
             found = _band(slots[band - 1], share, own, pl.lit(True), own.height)
             bands.append(replace(found, mode=mode, late=behind))
     mean, longest, jitter = _figures(plan, slots, latency_statistics(outputs["judged_ns"]))

@@ -223,6 +223,12 @@ def timing_of(application: Application, cycles: int, start: int) -> Timing:
     )
 
 
+def instances_before_recording(application: Application, timer: CallbackDescription) -> int:
+    """How often a timer expires before a run, live or simulated, is recorded."""
+    warm_up_ns = timing_of(application, 0, 0).record_from_ns - timer.phase_ns
+    return max(0, -(-warm_up_ns // (timer.timer_ns or 1)))
+
+
 def _start_nodes(application: Application, nodes: dict[str, Child], realtime: bool) -> None:
     """Start a process per node, into ``nodes``: what fails later can end those started.
 
