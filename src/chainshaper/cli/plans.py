@@ -2,9 +2,8 @@
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import chainshaper as cs
 from chainshaper.cli.applying import recording_of
@@ -24,9 +23,6 @@ from chainshaper.cli.options import (
 from chainshaper.cli.output import notes, present, print_json, progress, show_line, warn
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Fallback
-
-if TYPE_CHECKING:
-    from chainshaper.planning import Modes
 
 
 @takes_wishes(*PLAN_WISHES)
@@ -86,10 +82,12 @@ def plan(
     if curve is not None and request.bands != "auto":
         raise InputError("--curve draws what --bands auto looked at: add --bands auto")
     wanted: list[str | None] = [*chain] if chain else [None]
-    chains = [*wanted, *(sink or [])]
-    profiles = _profiles(recording, latencies, period, chains)
-    if mode_profile:
-        profiles = _with_modes(profiles, mode_profile, request.modes, chains)
+    pairs = [one.partition("=") for one in mode_profile or ()]
+    if not all(request.modes is not None and place for _, _, place in pairs):
+        raise InputError("--mode-profile goes with --modes, as MODE=REC: correct one of the two")
+    known: dict[str, Any] = {"modes": request.modes}
+    known["mode_recordings"] = {mode: place for mode, _, place in pairs}
+    profiles = _profiles(recording, latencies, period, [*wanted, *(sink or [])], **known)
     planned, sinks = profiles[: len(wanted)], profiles[len(wanted) :]
     if len(planned) > 1:
         if sinks or curve is not None:
@@ -116,39 +114,21 @@ def plan(
 
 
 def _profiles(
-    recording: Path | None, latencies: Path | None, period: int | None, chains: Sequence[str | None]
+    recording: Path | None,
+    latencies: Path | None,
+    period: int | None,
+    chains: Sequence[str | None],
+    **modes: Any,
 ) -> "tuple[cs.Profile, ...]":
     from chainshaper.planning import read_latencies
 
     if recording is not None:
-        return cs.profile_chains(recording, chains, period_ns=period)
+        return cs.profile_chains(recording, chains, period_ns=period, **modes)
     if latencies is None or period is None:
         raise InputError("--latencies needs the chain's period: add --period, such as 100ms")
     if len(chains) > 1:
         raise InputError("--latencies are those of one chain: give a recording for several")
     return (cs.Profile(read_latencies(latencies), period, spec=chains[0]),)
-
-
-def _with_modes(
-    profiles: "Sequence[cs.Profile]",
-    given: Sequence[str],
-    modes: "Modes | None",
-    chains: Sequence[str | None],
-) -> "tuple[cs.Profile, ...]":
-    """The profiles with those of single modes, which are given as MODE=REC or MODE=FILE."""
-    apart: dict[str, Sequence[cs.Profile]] = {}
-    for text in given:
-        mode, _, name = text.partition("=")
-        if modes is None or mode not in modes.bands or not name or mode in apart:
-            known = "with --modes" if modes is None else f"for {', '.join(modes.bands)}, each once"
-            raise InputError(f"--mode-profile {text}: write MODE=REC, {known}")
-        where = (None, Path(name)) if Path(name).is_file() else (Path(name), None)
-        own = _profiles(*where, profiles[0].period_ns, chains)
-        apart[mode] = [replace(one, recording=name) for one in own]
-    return tuple(
-        replace(profile, of_modes={mode: own[number] for mode, own in apart.items()})
-        for number, profile in enumerate(profiles)
-    )
 
 
 def offsets(

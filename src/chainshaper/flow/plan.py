@@ -6,11 +6,12 @@ followed backwards here, from every input of a synchronising callback to what st
 node with which the chain begins: what feeds a subscription there is not planned for.
 """
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import polars as pl
@@ -18,7 +19,8 @@ import polars as pl
 from chainshaper.analysis import DataFlow, LatencyAnalysis, analyse_latency, data_flow
 from chainshaper.analysis.disturbance import overlapping
 from chainshaper.analysis.graph import goes_on_elsewhere
-from chainshaper.planning import CallbackTimes, Plan, PlanRequest, Profile, plan_chain
+from chainshaper.planning import CallbackTimes, Modes, Plan, PlanRequest, Profile, plan_chain
+from chainshaper.planning.margins import read_latencies
 from chainshaper.planning.overruns import refuse_offset
 from chainshaper.planning.plan import publisher_servers
 from chainshaper.planning.request import DEFAULT_CORE
@@ -35,8 +37,7 @@ from chainshaper.workload.description import Application
 from chainshaper.workload.live import (
     Enforcement,
     Progress,
-    instances_before_recording,
-    node_name,
+    announcers,
     origin_timer,
     run_application,
 )
@@ -52,34 +53,64 @@ def profile_chains(
     chains: Sequence[str | None] = (None,),
     *,
     period_ns: int | None = None,
+    modes: Modes | None = None,
+    mode_recordings: Mapping[str, str | Path] = MappingProxyType({}),
 ) -> tuple[Profile, ...]:
     """What the planner needs of recorded chains: see :func:`chainshaper.planning.plan_chain`.
 
     ``period_ns`` is for chains that no timer starts; None stands for the chain that the recording
     names. Latencies and all other times but ``every_latency_ns`` are over cycles that the machine
     did not disturb: a stall is not part of the chain's latency, but its output is late
-    nevertheless. Only where fewer than two were undisturbed, they are over all.
+    nevertheless. Only where fewer than two were undisturbed, they are over all. Of ``modes``, each
+    has a profile of its own: of its recording or file of latencies in ``mode_recordings``, or of
+    the cycles that began in it, where the description of what ran says when that was.
 
-    Raises InputError: no such chain, or a chain's period is not known, or known and given as well.
-    OperationError: a chain with fewer than two complete traversals.
+    Raises InputError: no such chain or mode, or a chain's period is not known, or known and given
+    as well. OperationError: fewer than two complete traversals of a chain, or in a mode.
     """
     if not isinstance(recording, Recording):
         recording = open_source(recording)
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
     analyses = [analyse_latency(flow, chain_of(recording, chain)) for chain in chains]
-    return tuple(_profile_of(recording, flow, analysis, period_ns) for analysis in analyses)
+    profiles = [_profile_of(recording, flow, analysis, period_ns) for analysis in analyses]
+    if modes is None:
+        return tuple(profiles)
+    for number, analysis in enumerate(analyses):
+        apart: dict[str, Profile] = {}
+        for mode, place in mode_recordings.items():
+            if mode not in modes.bands:
+                raise InputError(
+                    f"{mode!r} is none of the modes {', '.join(modes.bands)}: correct it"
+                )
+            if Path(place).is_file():
+                apart[mode] = Profile(read_latencies(Path(place)), profiles[number].period_ns)
+            else:
+                (apart[mode],) = profile_chains(place, chains[number:][:1], period_ns=period_ns)
+        in_force = _modes_in_force(recording, flow, analysis.traversals["start"], modes)
+        for mode in modes.bands if apart or in_force.count() else ():
+            if mode not in apart:
+                own = replace(analysis, traversals=analysis.traversals.filter(in_force == mode))
+                apart[mode] = _profile_of(recording, flow, own, period_ns, mode)
+        profiles[number] = replace(profiles[number], of_modes=apart)
+    return tuple(profiles)
 
 
 def _profile_of(
-    recording: Recording, flow: DataFlow, analysis: LatencyAnalysis, period_ns: int | None
+    recording: Recording,
+    flow: DataFlow,
+    analysis: LatencyAnalysis,
+    period_ns: int | None,
+    mode: str | None = None,
 ) -> Profile:
-    graph, chain, statistics = analysis.graph, analysis.chain, analysis.statistics
+    graph, chain = analysis.graph, analysis.chain
     every = analysis.traversals.filter("complete")
     if every.height < 2:
+        began = "" if mode is None else f" that began in mode {mode!r}"
+        given = "" if mode is None else f"; or give the mode's own (--mode-profile {mode}=REC)"
         raise OperationError(
-            f"{recording.path}: of {analysis.traversals.height} traversals of {chain.spec}"
+            f"{recording.path}: of {analysis.traversals.height} traversals of {chain.spec}{began}"
             f" {every.height or 'none'} is complete, too few to plan from: see `chainshaper"
-            " latency`, and record again, longer"
+            f" latency`, and record again, longer{given}"
         )
     calm = every.filter(~pl.col("disturbed"))
     all_disturbed = calm.height < 2
@@ -105,8 +136,8 @@ def _profile_of(
         callbacks=tuple(_times(flow, instances, stage, core_of[stage.node]) for stage in stages),
         fifo_priority=min(97, priority.get(stages[-1].node, DEFAULT_PRIORITY) + 5),
         recording=str(recording.path),
-        incomplete=statistics.incomplete,
-        disturbed=statistics.disturbed,
+        incomplete=analysis.traversals.height - every.height,
+        disturbed=int(every["disturbed"].sum()),
         realtime=recording.info.realtime,
         longest_stall_ns=longest_stall(recording),
         utilisation=_utilisation(flow, graph, core_of),
@@ -115,31 +146,31 @@ def _profile_of(
         lost_events=sum(recording.info.lost.values()) or None,
         output_depth=_output_depth(flow, stages[-1].node, chain.topics[-1]),
         all_disturbed=all_disturbed or None,
-        announced=_announced(recording, flow),
-        began_ns=every["start"].to_numpy(),
-        hit=every["disturbed"].to_numpy(),
     )
 
 
-def _announced(recording: Recording, flow: DataFlow) -> dict[str, list[tuple[int, str]]]:
-    """When which mode was announced, by topic: no event has it, but the description of what ran has
-    what its timers announce in turn. Of a recording that lacks events nothing is sure.
+def _modes_in_force(
+    recording: Recording, flow: DataFlow, starts: pl.Series, modes: Modes
+) -> pl.Series:
+    """The mode in which each cycle began, as gates count them; null where that is not known.
+
+    No event has it, but the description of what ran has what its timers announce in turn. Of a
+    recording that lacks events nothing is sure.
     """
-    found: dict[str, list[tuple[int, str]]] = {}
-    if recording.info.application is None or any(recording.info.lost.values()):
-        return found
-    with wrong_values_refused(Application, f"{recording.path}: the description that ran: "):
-        application = Application.model_validate(recording.info.application)
-    for name, callback in application.callbacks():
-        if not callback.announces or callback.timer_ns is None:
-            continue
-        (topic,), before = callback.publishes, instances_before_recording(application, callback)
-        sent = flow.publications.filter(topic=topic, node=node_name(name))["time"].to_list()
-        # The last one before the recording is in force when it begins.
-        times, names = ([0] if before else []) + sent, cycle(callback.announces)
-        named = zip(times, islice(names, max(0, before - 1), None), strict=False)
-        found[topic] = sorted([*found.get(topic, []), *named])
-    return found
+    named: list[tuple[int, str]] = []
+    if recording.info.application is not None and not any(recording.info.lost.values()):
+        with wrong_values_refused(Application, f"{recording.path}: the description that ran: "):
+            application = Application.model_validate(recording.info.application, strict=False)
+        for node, in_turn, before in announcers(application, modes.topic):
+            sent = flow.publications.filter(topic=modes.topic, node=node)["time"].to_list()
+            # The last one before the recording is in force when it begins.
+            times = [0, *sent] if before else sent
+            named += zip(times, islice(cycle(in_turn), max(0, before - 1), None), strict=False)
+    if not named:
+        return pl.Series([None] * len(starts), dtype=pl.String)
+    known = sorted(one for one in named if one[1] in modes.bands)
+    place = np.searchsorted([time for time, _ in known], starts.to_numpy(), side="right")
+    return pl.Series([modes.default, *(mode for _, mode in known)]).gather(place)
 
 
 def _period(analysis: LatencyAnalysis, given: int | None) -> int:
@@ -415,7 +446,8 @@ def plan_recording(
 
     Raises: as :func:`profile_chains` and :func:`chainshaper.planning.plan_chain`.
     """
-    profile, *further = profile_chains(recording, (chain, *sinks), period_ns=period_ns)
+    wanted = (chain, *sinks)
+    profile, *further = profile_chains(recording, wanted, period_ns=period_ns, modes=request.modes)
     return plan_chain(profile, request, further)
 
 

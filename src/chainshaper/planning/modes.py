@@ -4,10 +4,9 @@ With L̄ and ε of the cycles that began in a mode, its outputs may leave from L
 mode by itself. R_m, the chain's server, is open until the slot of the slowest.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 from chainshaper.planning.bands import with_publish_slots
-from chainshaper.planning.margins import OVERRUN_PROBABILITY, cycles_needed
 from chainshaper.planning.plan import Evidence, Modes, Plan, Prediction, Slot
 from chainshaper.values.errors import InputError
 
@@ -25,67 +24,44 @@ def bands_of_modes(starts_ns: Mapping[str, int], length_ns: int) -> dict[str, in
 def slots_of_modes(
     starts_ns: Mapping[str, int], bands: Mapping[str, int], length_ns: int
 ) -> tuple[Slot, ...]:
-    """A slot for each band, behind the one before: it begins when all of its modes' outputs may
-    leave.
+    """A slot for each band, behind the one before, when all outputs of its modes may leave.
 
     Raises InputError: no mode has one of the bands.
     """
     slots: list[Slot] = []
     for band in range(1, max(bands.values()) + 1):
-        own = [starts_ns[mode] for mode in bands if bands[mode] == band]
-        if not own:
+        if band not in bands.values():
             raise InputError(
                 f"no mode has the band {band}, so no latencies say where its slot is: number the"
                 " modes' bands from 1 on, or leave out the numbers"
             )
+        own = (starts_ns[mode] for mode in bands if bands[mode] == band)
         start = max(*own, slots[-1][1] if slots else 0)
         slots.append((start, start + length_ns))
     return tuple(slots)
 
 
 def with_modes(
-    plan: Plan,
-    modes: Modes,
-    slots: tuple[Slot, ...],
-    measured: Mapping[str, tuple[Evidence, float]],
+    plan: Plan, modes: Modes, slots: tuple[Slot, ...], measured: Mapping[str, Evidence]
 ) -> Plan:
-    """A shaped plan with the modes' slots. ``measured`` has what each mode's was placed from, and
-    the share of its cycles that are in time for it.
+    """A shaped plan with slots for modes of which each was measured.
 
     The prediction of the whole is for modes in force as often as they were measured.
     """
-    promised, shares = {}, [0.0] * len(slots)
-    every = sum(own.samples for own, _ in measured.values())
-    for mode, (own, in_time) in measured.items():
-        start, end = slots[modes.bands[mode] - 1]
-        shares[modes.bands[mode] - 1] += own.samples / every
-        promised[mode] = Prediction(
-            mean_ns=end, max_ns=end, jitter_ns=end - start, shares=(in_time,)
-        )
+    own = {mode: slots[band - 1] for mode, band in modes.bands.items()}
+    weights = [
+        sum(one.samples for mode, one in measured.items() if own[mode] == slot) for slot in slots
+    ]
+    ends = [end for _, end in slots]
     predicted = Prediction(
-        mean_ns=round(sum(share * end for share, (_, end) in zip(shares, slots, strict=True))),
-        max_ns=slots[-1][1],
-        jitter_ns=slots[-1][1] - slots[0][0],
-        shares=tuple(min(1.0, share) for share in shares),
-        modes=promised,
+        mean_ns=round(sum(w * end for w, end in zip(weights, ends, strict=True)) / sum(weights)),
+        max_ns=ends[-1],
+        jitter_ns=ends[-1] - slots[0][0],
+        shares=tuple(weight / sum(weights) for weight in weights),
+        modes={
+            mode: Prediction(mean_ns=end, max_ns=end, jitter_ns=end - start, shares=(1.0,))
+            for mode, (start, end) in own.items()
+        },
     )
-    of_modes = {mode: own for mode, (own, _) in measured.items()}
-    evidence = plan.evidence.model_copy(update={"modes": of_modes})
+    evidence = plan.evidence.model_copy(update={"modes": dict(measured)})
     return with_publish_slots(plan, slots, evidence=evidence, predicted=predicted, modes=modes)
-
-
-def mode_warnings(plan: Plan) -> Iterator[str]:
-    """What is doubtful about the modes' slots, one sentence each."""
-    needed = cycles_needed(OVERRUN_PROBABILITY)
-    if plan.modes is not None and plan.evidence.modes is None:
-        yield (
-            "nothing says which mode was in force in which cycle: the slots of the modes are placed"
-            " from all latencies together, and a mode that takes longer than its slot will be late."
-            " Give each mode's own profile (--mode-profile MODE=REC)."
-        )
-    for mode, own in (plan.evidence.modes or {}).items():
-        if (cycles := max(own.samples, own.disturbed)) < needed:
-            yield (
-                f"the sample of mode {mode} is small: {cycles} cycles are too few to say how late"
-                f" one of its outputs in a hundred will be. Record {needed} of its cycles or more."
-            )

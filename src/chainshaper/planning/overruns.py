@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from chainshaper.planning.margins import OVERRUN_PROBABILITY, cycles_needed
-from chainshaper.planning.modes import mode_warnings
 from chainshaper.planning.plan import (
     PER_CALLBACK,
     Plan,
@@ -198,8 +197,7 @@ def publication_warnings(plan: Plan) -> list[str]:
 
 def plan_warnings(plan: Plan) -> list[str]:
     """What a person must know before relying on a plan; one sentence each, none if all is well."""
-    about = (_about_late_outputs(plan), mode_warnings(plan), _about_evidence(plan))
-    return [*(one for found in about for one in found), *publication_warnings(plan)]
+    return [*_about_late_outputs(plan), *_about_evidence(plan), *publication_warnings(plan)]
 
 
 def _about_late_outputs(plan: Plan) -> Iterator[str]:
@@ -208,10 +206,14 @@ def _about_late_outputs(plan: Plan) -> Iterator[str]:
     cycles, needed = evidence.samples + evidence.disturbed, cycles_needed(OVERRUN_PROBABILITY)
     if evidence.all_disturbed:
         cycles = max(evidence.samples, evidence.disturbed)
-    if cycles < needed:
+    fewest = min(
+        [cycles, *(one.samples + one.disturbed for one in (evidence.modes or {}).values())]
+    )
+    if fewest < needed:
+        of = " of a mode" if fewest < cycles else ""
         yield (
-            f"the sample is small: {cycles} cycles are too few to say how late one output in a"
-            f" hundred will be. Record {needed} cycles or more."
+            f"the sample is small: {fewest} cycles{of} are too few to say how late one output in a"
+            f" hundred will be. Record {needed} cycles{of} or more."
         )
     stall = evidence.longest_stall_ns
     what = "" if stall is None else f", longest stall {milliseconds(stall)} ms"
@@ -239,6 +241,12 @@ def _about_late_outputs(plan: Plan) -> Iterator[str]:
 
 def _about_evidence(plan: Plan) -> Iterator[str]:
     """What is doubtful about the measurements, or about how much of the cycle is used."""
+    if plan.modes is not None and plan.evidence.modes is None:
+        yield (
+            "nothing says which mode was in force while latencies were measured, so the modes share"
+            " bands of them all: a mode that takes longer than its slot will be late. Give each"
+            " mode's own profile (--mode-profile MODE=REC)."
+        )
     evidence, cycle, margin = plan.evidence, plan.cycle_ns, plan.margin
     longest, used = evidence.max_latency_ns, evidence.utilisation or 0.0
     last = max((end for _, end in publish_slots(plan)), default=longest)

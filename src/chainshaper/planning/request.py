@@ -40,7 +40,6 @@ from chainshaper.planning.plan import (
     Margin,
     Modes,
     Plan,
-    publish_slots,
     revised,
 )
 from chainshaper.planning.shaping import (
@@ -79,9 +78,7 @@ class Profile:
     branches, and before the chain begins. ``receivers`` are the nodes that subscribe to the chain's
     output and are none of these. ``callbacks`` are those of the chain and its branches, see
     :func:`~chainshaper.planning.shaping.server_per_callback`. ``output_depth`` is the history of
-    the output's writer. Modes: ``announced`` has, by topic, when which one was named; ``began_ns``
-    and ``hit`` are when each cycle of ``every_latency_ns`` began, and whether the machine disturbed
-    it; ``of_modes`` are profiles of modes that were measured apart. The rest is
+    the output's writer, ``of_modes`` has what was measured in each mode of the system. The rest is
     :class:`~chainshaper.planning.plan.Evidence`.
     """
 
@@ -108,9 +105,6 @@ class Profile:
     longest_publication_ns: int | None = None
     lost_events: int | None = None
     all_disturbed: bool | None = None
-    announced: Mapping[str, Sequence[tuple[int, str]]] = field(default_factory=dict)
-    began_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    hit: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
     of_modes: Mapping[str, "Profile"] = field(default_factory=dict)
 
     @property
@@ -128,38 +122,6 @@ class Profile:
     def longest_ns(self) -> int:
         """The longest of the latencies that are planned from."""
         return int(check_latencies(self.latencies_ns).max())
-
-    def in_modes(self, modes: Modes) -> dict[str, "Profile"]:
-        """Each mode's own profile: the one given, or of the cycles that began in it, as gates count
-        them. None where nothing says which mode was in force.
-
-        Raises OperationError: fewer than two cycles of a mode were measured.
-        """
-        known = modes.topic in self.announced
-        named = [one for one in self.announced.get(modes.topic, ()) if one[1] in modes.bands]
-        place = np.searchsorted([at for at, _ in named], self.began_ns, side="right")
-        in_force = np.array([modes.default, *(mode for _, mode in named)])[place]
-        return {
-            mode: self.of_modes.get(mode) or self._in_mode(mode, (in_force == mode) & known)
-            for mode in (modes.bands if known or self.of_modes else ())
-        }
-
-    def _in_mode(self, mode: str, mine: NDArray[np.bool_]) -> "Profile":
-        if (count := int(mine.sum())) < 2:
-            raise OperationError(
-                f"{self.recording or self.name}: {count or 'no'} cycle of {self.name} began in mode"
-                f" {mode!r}, too few to place its slot: record a run in which it is in force for"
-                f" longer, or give its own profile (--mode-profile {mode}=REC)"
-            )
-        every, hit = self.every[mine], self.hit[mine]
-        stalled = int((~hit).sum()) < 2
-        return replace(
-            self,
-            latencies_ns=every if stalled else every[~hit],
-            every_latency_ns=every,
-            disturbed=int(hit.sum()),
-            all_disturbed=stalled or None,
-        )
 
 
 @dataclass(frozen=True)
@@ -191,13 +153,17 @@ def plan_chain(
     _refuse_entangled((profile, *sinks), request.policy, sinks=True)
     if any(sink.all_disturbed for sink in sinks) or profile.all_disturbed:
         profile, sinks = _covered(profile, request), [_covered(sink, request) for sink in sinks]
-    modes = request.modes if request.policy == "shaped" else None
-    apart = {} if modes is None else profile.in_modes(modes)
-    finish: Callable[[Plan], Plan] = partial(_with_policy, profile=profile, request=request)
-    if modes is not None and apart:
-        profile, margin, finish = _together(profile, request, modes, apart)
+    if (modes := request.modes) is not None and profile.of_modes and request.policy == "shaped":
+        profile, margin, modes, finish = _together(profile, request, modes)
     else:
+        finish = partial(_with_policy, profile=profile, request=request)
         margin = _margin(profile, request)
+        if request.bands_of_modes == "found":
+            raise InputError(
+                "nothing says which mode was in force while latencies were measured, so none has a"
+                " slot that can be found: give the modes' own profiles (--mode-profile MODE=REC),"
+                " or record an application whose description `announces` them"
+            )
     longest, period = profile.longest_ns, profile.period_ns
     if request.policy == "let-per-chain" and longest >= period:
         raise OperationError(
@@ -229,7 +195,7 @@ def plan_chain(
             f"--fallback {request.fallback} is for an output with a shaping node, and the plan has"
             " none: leave it out, or plan with synchronous publication"
         )
-    return plan if apart else _with_unmeasured(plan, request)
+    return revised(plan, modes=modes)
 
 
 def plan_chains(profiles: Sequence[Profile], request: PlanRequest = _STANDARD) -> tuple[Plan, ...]:
@@ -248,8 +214,8 @@ def band_choice(plan: Plan, profile: Profile, request: PlanRequest) -> BandChoic
     return choose_bands(plan, latencies, **_of(request, *_LIMITS, "least_gain"))
 
 
-def _of(request: PlanRequest, *names: str) -> dict[str, Any]:
-    return {name: getattr(request, name) for name in names}
+def _of(one: PlanRequest | Profile, *names: str) -> dict[str, Any]:
+    return {name: getattr(one, name) for name in names}
 
 
 def _covered(profile: Profile, request: PlanRequest) -> Profile:
@@ -292,10 +258,12 @@ def _slot_ns(profile: Profile, request: PlanRequest) -> int:
 
 
 def _together(
-    profile: Profile, request: PlanRequest, modes: Modes, apart: Mapping[str, Profile]
-) -> tuple[Profile, Margin, Callable[[Plan], Plan]]:
-    """The profile of all modes, the margin up to their last slot, what gives a plan their slots."""
-    apart = {mode: _covered(one, request) for mode, one in apart.items()}
+    profile: Profile, request: PlanRequest, modes: Modes
+) -> tuple[Profile, Margin, Modes, Callable[[Plan], Plan]]:
+    """The profile of all modes, the margin up to their last slot, the modes with bands, and what
+    gives a plan the slots.
+    """
+    apart = {mode: _covered(profile.of_modes[mode], request) for mode in modes.bands}
     margins = {mode: _margin(one, request) for mode, one in apart.items()}
     starts = {mode: one.longest_ns + margins[mode].epsilon_ns for mode, one in apart.items()}
     length = _slot_ns(profile, request)
@@ -304,12 +272,10 @@ def _together(
     slots = slots_of_modes(starts, modes.bands, length)
     why = f"but each mode's slot is placed from its own latencies, here {len(slots)}: leave it out"
     _refuse_placement(replace(request, bands=1) if request.bands == len(slots) else request, why)
-    measured = {}
-    for mode, one in apart.items():
-        names = ("recording", "disturbed", "all_disturbed", "realtime")
-        known = {name: getattr(one, name) for name in names}
-        own = evidence_of(one.latencies_ns, max_of_all_ns=int(one.every.max()), **known)
-        measured[mode] = own, float((one.every < slots[modes.bands[mode] - 1][1]).mean())
+    measured = {
+        mode: evidence_of(one.latencies_ns, **_of(one, "recording", "disturbed", "all_disturbed"))
+        for mode, one in apart.items()
+    }
     both = replace(
         profile,
         latencies_ns=np.concatenate([one.latencies_ns for one in apart.values()]),
@@ -320,21 +286,7 @@ def _together(
     late = [margin.overrun_probability or 0.0 for margin in margins.values()]
     last = {"epsilon_ns": slots[-1][0] - both.longest_ns, "overrun_probability": max(late) or None}
     margin = margins[max(starts, key=starts.__getitem__)].model_copy(update=last)
-    return both, margin, partial(with_modes, modes=modes, slots=slots, measured=measured)
-
-
-def _with_unmeasured(plan: Plan, request: PlanRequest) -> Plan:
-    """With modes about which no latencies are known: they share the slots there are."""
-    modes, slots = request.modes, len(publish_slots(plan))
-    wanted = 0 if modes is None or plan.shaping_node is None else max(modes.bands.values())
-    if modes is not None and wanted > (0 if request.bands_of_modes == "found" else slots):
-        raise InputError(
-            f"nothing says when the modes {', '.join(modes.bands)} of {modes.topic} were in force"
-            " while the chain was measured, so no slot can be placed for each: record an"
-            " application whose description `announces` them, or give each mode's own profile"
-            " (--mode-profile MODE=REC)"
-        )
-    return revised(plan, modes=modes)
+    return both, margin, modes, partial(with_modes, modes=modes, slots=slots, measured=measured)
 
 
 def _shaped(

@@ -378,14 +378,13 @@ def plan_table(plan: Plan) -> ResultTable:
 
 def bands_table(plan: Plan) -> ResultTable:
     """What a plan predicts of each latency band, or of each mode by what was measured in it."""
-    if plan.modes is not None and plan.evidence.modes and plan.predicted.modes:
-        columns = [*words("mode"), *figures("cycles", "min", "mean", "max", "slot", "in time")]
+    if plan.modes is not None and plan.evidence.modes is not None:
+        columns = [*words("mode"), *figures("cycles", "min", "mean", "max", "slot")]
         table = ResultTable("Modes, as measured, and their slots [ms]", columns)
         for mode, own in plan.evidence.modes.items():
             times = map(ms, (own.min_latency_ns, own.mean_latency_ns, own.max_latency_ns))
-            slot = slots_ms(publish_slots(plan)[plan.modes.bands[mode] - 1])
-            in_time = percent(plan.predicted.modes[mode].shares[0])
-            table.add(mode, f"{own.samples:,}", *times, slot, in_time)
+            slot = publish_slots(plan)[plan.modes.bands[mode] - 1]
+            table.add(mode, f"{own.samples:,}", *times, slots_ms(slot))
         return table
     columns = figures("slot", "share of cycles", "jitter at most")
     table = ResultTable("Predicted latency bands [ms]", columns)

@@ -223,10 +223,14 @@ def timing_of(application: Application, cycles: int, start: int) -> Timing:
     )
 
 
-def instances_before_recording(application: Application, timer: CallbackDescription) -> int:
-    """How often a timer expires before a run, live or simulated, is recorded."""
-    warm_up_ns = timing_of(application, 0, 0).record_from_ns - timer.phase_ns
-    return max(0, -(-warm_up_ns // (timer.timer_ns or 1)))
+def announcers(application: Application, topic: str) -> Iterator[tuple[str, tuple[str, ...], int]]:
+    """The nodes whose timers announce modes on a topic, what in turn, and how often before a run,
+    live or simulated, is recorded.
+    """
+    for name, timer in application.callbacks():
+        if timer.announces and timer.timer_ns is not None and topic in timer.publishes:
+            warm_up_ns = timing_of(application, 0, 0).record_from_ns - timer.phase_ns
+            yield node_name(name), timer.announces, max(0, -(-warm_up_ns // timer.timer_ns))
 
 
 def _start_nodes(application: Application, nodes: dict[str, Child], realtime: bool) -> None:
