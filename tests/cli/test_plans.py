@@ -267,14 +267,24 @@ def test_modes_get_their_bands(unshaped: Recording, tmp_path: Path) -> None:
     assert "no `shaping_node`" in refused(2, *two, *asynchronous, "--bands", "1")
     assert "--late publish goes with modes" in refused(2, *plan, "--late", "publish")
     for wrong, reason in {
-        "/mode:city": "a band for each mode once",
-        "/mode:city=1,city=2": "a band for each mode once",
-        "/mode": "a band for each mode once",
+        "/mode:city,highway=1": "all with a band or none",
+        "/mode:city=1,city=2": "each mode once",
+        "/mode:city,city": "each mode once",
+        "/mode": "each mode once",
+        "/mode:city": "nothing says which mode was in force",
         "mode:city=1": "topic: 'mode' is not a full ROS 2 name",
         "/mode:1st=1": "'1st' is not a mode's name",
         "/t3:city=1": "/t3 carries the chain's output",
     }.items():
         assert reason in refused(2, *plan, "--modes", wrong)
+    assert any("share bands of them all" in warning for warning in values["warnings"])
+    apart = [f"--mode-profile={mode}={unshaped.path}" for mode in ("city", "highway")]
+    found = json_of(*plan, *apart, "--modes", "/mode:city,highway")
+    assert found["modes"]["bands"] == {"city": 1, "highway": 1}, "as long as each other"
+    assert found["evidence"]["modes"]["city"]["recording"] == str(unshaped.path)
+    assert "Modes, as measured" in called(*plan, *apart, *modes).out
+    assert "goes with --modes, as MODE=REC" in refused(2, *plan, *apart)
+    assert "goes with --modes, as MODE=REC" in refused(2, *two, "--mode-profile", "city")
 
 
 @pytest.fixture

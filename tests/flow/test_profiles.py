@@ -109,6 +109,26 @@ def test_branches_that_the_chain_waits_for_are_found() -> None:
     assert profile.latencies_ns.tolist() == [(96 - cycle) * MS - 1 for cycle in range(3)]
 
 
+def test_a_publication_takes_until_its_callback_ends_or_publishes_again_or_all_have_it() -> None:
+    story = Story()
+    node, reader = story.node("/writer", 1), story.node("/reader", 2)
+    timer, reads = story.timer(node, period=1000), story.subscription(reader, "/out")
+    out, other = story.publisher(node, "/out"), story.publisher(node, "/other")
+    story.runs(timer, 1000, 1140, writes=((out, 1100),))
+    story.runs(timer, 2000, 2900, writes=((out, 2100), (other, 2150)))
+    story.runs(timer, 3000, 3900, writes=((out, 3100),))
+    story.runs(reads, 3161, 3200, reads=3100)
+    info = RecordingInfo(source="simulated", clock_offset_ns=OFFSET)
+    recording = Recording(Path("story"), info, story.tables())
+    (profile,) = profile_chains(recording, ["/out"])
+    assert profile.longest_publication_ns == 60, "of 40, 50 and 60 ns"
+    stall = {"time": 3110, "cpu": 1, "duration": 20}
+    types = {**events.COMMON_COLUMNS, **events.FIELDS["machine_stall"]}
+    stalled = {**story.tables(), "machine_stall": pl.DataFrame([stall], schema_overrides=types)}
+    (profile,) = profile_chains(replace(recording, events=stalled), ["/out"])
+    assert profile.longest_publication_ns == 50, "a stall is no part of it"
+
+
 def test_a_chain_that_no_timer_starts_needs_its_period_and_leaves_out_what_feeds_it() -> None:
     """The throttler feeds the rear filter, and the front filter's branch is followed so far."""
     chain = "/rear_filtered../fused../pose"

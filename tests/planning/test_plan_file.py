@@ -69,7 +69,8 @@ def test_a_hand_edited_plan_is_read(tmp_path: Path) -> None:
     values = plan_json(plan)
     assert values["bands_ns"] == [65_000_000]
     assert values["predicted"] == {
-        **{"mean_ns": 65_000_000, "max_ns": 65_000_000, "jitter_ns": 1_000_000, "shares": [1.0]}
+        **{"mean_ns": 65_000_000, "max_ns": 65_000_000, "jitter_ns": 1_000_000, "shares": [1.0]},
+        "modes": None,
     }
     assert values["servers"][0]["slots"] == [[0, 64_000_000]]
     assert values["chain"]["period_ns"] == 100_000_000
@@ -326,6 +327,7 @@ def plans(draw: st.DrawFn) -> Plan:
             longest_stall_ns=draw(optional(times)),
             utilisation=draw(optional(st.floats(0, 2))),
             longest_send_ns=draw(optional(times)),
+            longest_publication_ns=draw(optional(times)),
             all_disturbed=draw(st.sampled_from([None, True])),
         ),
         margin=draw(st.sampled_from([derived, Margin(epsilon_ns=draw(times))])),

@@ -8,7 +8,7 @@ import pytest
 from calm_runs import calm_run
 from small_chain import EXECUTOR_CORE, small_chain_text
 
-from chainshaper import measure_latency, shape_application
+from chainshaper import measure_latency, profile_chains, shape_application
 from chainshaper.planning import Modes, Plan
 from chainshaper.planning.plan import revised
 from chainshaper.splicing.application import splice_application
@@ -79,6 +79,18 @@ def test_a_change_is_in_force_from_the_next_cycle_on(recording: Recording) -> No
     for before, after in changes:
         # It was heard after the last cycle of the old mode began, and before the new one's did.
         assert any(before - MS <= time <= after + MS for time in heard)
+
+
+def test_the_gate_and_the_profile_take_each_cycle_for_one_of_the_same_mode(
+    recording: Recording,
+) -> None:
+    """The gate read the announcements, the profile counts them, from before the recording on."""
+    modes = Modes(topic="/mode", default="city", bands=BANDS)
+    (profile,) = profile_chains(recording, modes=modes)
+    decided = recording.events["gate_release"]
+    assert decided.height == profile.every.size
+    for mode, own in profile.of_modes.items():
+        assert own.every.size == decided.filter(mode=mode).height
 
 
 def test_modes_that_nobody_announces_are_refused(tmp_path: Path, plan: Plan) -> None:

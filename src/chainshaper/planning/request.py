@@ -296,8 +296,8 @@ def _shaped(
     values = {n: getattr(profile, n) for n in Evidence.model_fields if hasattr(profile, n)}
     if request.publication == "asynchronous":
         values["output_depth"] = profile.output_depth
-    else:  # how long sends take is no evidence for it
-        del values["longest_send_ns"]
+    unused = "publication" if request.publication == "asynchronous" else "send"
+    del values[f"longest_{unused}_ns"]  # no evidence for it
     length = _slot_ns(profile, request)
     found = "measured" if length > SHORTEST_SLOT_NS else "least"
     values["publish_slot"] = found if request.publish_slot_ns is None else "given"
