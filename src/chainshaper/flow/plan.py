@@ -37,9 +37,10 @@ from chainshaper.workload.description import Application
 from chainshaper.workload.live import (
     Enforcement,
     Progress,
-    announcers,
+    node_name,
     origin_timer,
     run_application,
+    timing_of,
 )
 
 __all__ = ["plan_recording", "profile_chains", "shape_application"]
@@ -75,42 +76,38 @@ def profile_chains(
     profiles = [_profile_of(recording, flow, analysis, period_ns) for analysis in analyses]
     if modes is None:
         return tuple(profiles)
+    if others := ", ".join(mode_recordings.keys() - modes.bands.keys()):
+        raise InputError(f"{others}: none of the modes {', '.join(modes.bands)}: correct it")
     for number, analysis in enumerate(analyses):
         apart: dict[str, Profile] = {}
         for mode, place in mode_recordings.items():
-            if mode not in modes.bands:
-                raise InputError(
-                    f"{mode!r} is none of the modes {', '.join(modes.bands)}: correct it"
-                )
             if Path(place).is_file():
-                apart[mode] = Profile(read_latencies(Path(place)), profiles[number].period_ns)
+                bare, period = read_latencies(Path(place)), profiles[number].period_ns
+                apart[mode] = Profile(bare, period, recording=str(place))
             else:
                 (apart[mode],) = profile_chains(place, chains[number:][:1], period_ns=period_ns)
         in_force = _modes_in_force(recording, flow, analysis.traversals["start"], modes)
-        for mode in modes.bands if apart or in_force.count() else ():
-            if mode not in apart:
-                own = replace(analysis, traversals=analysis.traversals.filter(in_force == mode))
-                apart[mode] = _profile_of(recording, flow, own, period_ns, mode)
+        for mode in modes.bands.keys() - apart if apart or in_force.count() else ():
+            own = replace(analysis, traversals=analysis.traversals.filter(in_force == mode))
+            try:
+                apart[mode] = _profile_of(recording, flow, own, period_ns)
+            except OperationError as error:
+                remedy = f"or give the mode's own profile (--mode-profile {mode}=REC)"
+                raise OperationError(f"mode {mode}: {error}; {remedy}") from error
         profiles[number] = replace(profiles[number], of_modes=apart)
     return tuple(profiles)
 
 
 def _profile_of(
-    recording: Recording,
-    flow: DataFlow,
-    analysis: LatencyAnalysis,
-    period_ns: int | None,
-    mode: str | None = None,
+    recording: Recording, flow: DataFlow, analysis: LatencyAnalysis, period_ns: int | None
 ) -> Profile:
     graph, chain = analysis.graph, analysis.chain
     every = analysis.traversals.filter("complete")
     if every.height < 2:
-        began = "" if mode is None else f" that began in mode {mode!r}"
-        given = "" if mode is None else f"; or give the mode's own (--mode-profile {mode}=REC)"
         raise OperationError(
-            f"{recording.path}: of {analysis.traversals.height} traversals of {chain.spec}{began}"
+            f"{recording.path}: of {analysis.traversals.height} traversals of {chain.spec}"
             f" {every.height or 'none'} is complete, too few to plan from: see `chainshaper"
-            f" latency`, and record again, longer{given}"
+            " latency`, and record again, longer"
         )
     calm = every.filter(~pl.col("disturbed"))
     all_disturbed = calm.height < 2
@@ -158,14 +155,21 @@ def _modes_in_force(
     recording that lacks events nothing is sure.
     """
     named: list[tuple[int, str]] = []
-    if recording.info.application is not None and not any(recording.info.lost.values()):
+    described = recording.info.application
+    if described is not None and not any(recording.info.lost.values()):
         with wrong_values_refused(Application, f"{recording.path}: the description that ran: "):
-            application = Application.model_validate(recording.info.application, strict=False)
-        for node, in_turn, before in announcers(application, modes.topic):
-            sent = flow.publications.filter(topic=modes.topic, node=node)["time"].to_list()
+            application = Application.model_validate(described, strict=False)
+        warm_up_ns = timing_of(application, 0, 0).record_from_ns
+        for name, timer in application.callbacks():
+            if timer.timer_ns is None or not timer.announces or modes.topic not in timer.publishes:
+                continue
+            node, before = node_name(name), -((timer.phase_ns - warm_up_ns) // timer.timer_ns)
+            times = flow.publications.filter(topic=modes.topic, node=node)["time"].to_list()
             # The last one before the recording is in force when it begins.
-            times = [0, *sent] if before else sent
-            named += zip(times, islice(cycle(in_turn), max(0, before - 1), None), strict=False)
+            times = [0, *times] if before > 0 else times
+            named += zip(
+                times, islice(cycle(timer.announces), max(0, before - 1), None), strict=False
+            )
     if not named:
         return pl.Series([None] * len(starts), dtype=pl.String)
     known = sorted(one for one in named if one[1] in modes.bands)

@@ -11,23 +11,19 @@ from chainshaper.planning.plan import Evidence, Modes, Plan, Prediction, Slot
 from chainshaper.values.errors import InputError
 
 
-def bands_of_modes(starts_ns: Mapping[str, int], length_ns: int) -> dict[str, int]:
-    """A band for each mode, by when its outputs may leave; slots that would overlap are one."""
-    first, band, bands = 0, 0, dict.fromkeys(starts_ns, 0)
-    for mode in sorted(starts_ns, key=starts_ns.__getitem__):
+def place_modes(
+    starts_ns: Mapping[str, int], length_ns: int, given: Mapping[str, int] | None = None
+) -> tuple[dict[str, int], tuple[Slot, ...]]:
+    """The band of each mode, and the slots: each behind the one before, when all outputs of its
+    modes may leave. Unless bands are ``given``, slots that would overlap are one.
+
+    Raises InputError: of the bands given, one is no mode's.
+    """
+    first, band, bands = 0, 0, dict(given or {})
+    for mode in () if given else sorted(starts_ns, key=starts_ns.__getitem__):
         if not band or starts_ns[mode] >= first + length_ns:
             first, band = starts_ns[mode], band + 1
         bands[mode] = band
-    return bands
-
-
-def slots_of_modes(
-    starts_ns: Mapping[str, int], bands: Mapping[str, int], length_ns: int
-) -> tuple[Slot, ...]:
-    """A slot for each band, behind the one before, when all outputs of its modes may leave.
-
-    Raises InputError: no mode has one of the bands.
-    """
     slots: list[Slot] = []
     for band in range(1, max(bands.values()) + 1):
         if band not in bands.values():
@@ -35,10 +31,10 @@ def slots_of_modes(
                 f"no mode has the band {band}, so no latencies say where its slot is: number the"
                 " modes' bands from 1 on, or leave out the numbers"
             )
-        own = (starts_ns[mode] for mode in bands if bands[mode] == band)
+        own = (start for mode, start in starts_ns.items() if bands[mode] == band)
         start = max(*own, slots[-1][1] if slots else 0)
         slots.append((start, start + length_ns))
-    return tuple(slots)
+    return bands, tuple(slots)
 
 
 def with_modes(
@@ -48,20 +44,19 @@ def with_modes(
 
     The prediction of the whole is for modes in force as often as they were measured.
     """
-    own = {mode: slots[band - 1] for mode, band in modes.bands.items()}
-    weights = [
-        sum(one.samples for mode, one in measured.items() if own[mode] == slot) for slot in slots
-    ]
-    ends = [end for _, end in slots]
+    ends, cycles = [end for _, end in slots], [0] * len(slots)
+    alone = {}
+    for mode, own in measured.items():
+        start, end = slots[(place := modes.bands[mode] - 1)]
+        cycles[place] += own.samples
+        alone[mode] = Prediction(mean_ns=end, max_ns=end, jitter_ns=end - start, shares=(1.0,))
+    shares = tuple(own / sum(cycles) for own in cycles)
     predicted = Prediction(
-        mean_ns=round(sum(w * end for w, end in zip(weights, ends, strict=True)) / sum(weights)),
+        mean_ns=round(sum(share * end for share, end in zip(shares, ends, strict=True))),
         max_ns=ends[-1],
         jitter_ns=ends[-1] - slots[0][0],
-        shares=tuple(weight / sum(weights) for weight in weights),
-        modes={
-            mode: Prediction(mean_ns=end, max_ns=end, jitter_ns=end - start, shares=(1.0,))
-            for mode, (start, end) in own.items()
-        },
+        shares=shares,
+        modes=alone,
     )
     evidence = plan.evidence.model_copy(update={"modes": dict(measured)})
     return with_publish_slots(plan, slots, evidence=evidence, predicted=predicted, modes=modes)

@@ -30,7 +30,7 @@ from chainshaper.planning.margins import (
     derive_margin,
     late_share,
 )
-from chainshaper.planning.modes import bands_of_modes, slots_of_modes, with_modes
+from chainshaper.planning.modes import place_modes, with_modes
 from chainshaper.planning.offsets import refuse_common
 from chainshaper.planning.plan import (
     PER_CALLBACK,
@@ -266,10 +266,9 @@ def _together(
     apart = {mode: _covered(profile.of_modes[mode], request) for mode in modes.bands}
     margins = {mode: _margin(one, request) for mode, one in apart.items()}
     starts = {mode: one.longest_ns + margins[mode].epsilon_ns for mode, one in apart.items()}
-    length = _slot_ns(profile, request)
-    if request.bands_of_modes == "found":
-        modes = modes.model_copy(update={"bands": bands_of_modes(starts, length)})
-    slots = slots_of_modes(starts, modes.bands, length)
+    given = None if request.bands_of_modes == "found" else modes.bands
+    bands, slots = place_modes(starts, _slot_ns(profile, request), given)
+    modes = modes.model_copy(update={"bands": bands})
     why = f"but each mode's slot is placed from its own latencies, here {len(slots)}: leave it out"
     _refuse_placement(replace(request, bands=1) if request.bands == len(slots) else request, why)
     measured = {

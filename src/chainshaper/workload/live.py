@@ -223,16 +223,6 @@ def timing_of(application: Application, cycles: int, start: int) -> Timing:
     )
 
 
-def announcers(application: Application, topic: str) -> Iterator[tuple[str, tuple[str, ...], int]]:
-    """The nodes whose timers announce modes on a topic, what in turn, and how often before a run,
-    live or simulated, is recorded.
-    """
-    for name, timer in application.callbacks():
-        if timer.announces and timer.timer_ns is not None and topic in timer.publishes:
-            warm_up_ns = timing_of(application, 0, 0).record_from_ns - timer.phase_ns
-            yield node_name(name), timer.announces, max(0, -(-warm_up_ns // timer.timer_ns))
-
-
 def _start_nodes(application: Application, nodes: dict[str, Child], realtime: bool) -> None:
     """Start a process per node, into ``nodes``: what fails later can end those started.
 
