@@ -9,7 +9,6 @@ node with which the chain begins: what feeds a subscription there is not planned
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import cycle, islice
 from pathlib import Path
 from types import MappingProxyType
 
@@ -164,12 +163,11 @@ def _modes_in_force(
             if timer.timer_ns is None or not timer.announces or modes.topic not in timer.publishes:
                 continue
             node, before = node_name(name), -((timer.phase_ns - warm_up_ns) // timer.timer_ns)
-            times = flow.publications.filter(topic=modes.topic, node=node)["time"].to_list()
+            sent = flow.publications.filter(topic=modes.topic, node=node)["time"].to_list()
             # The last one before the recording is in force when it begins.
-            times = [0, *times] if before > 0 else times
-            named += zip(
-                times, islice(cycle(timer.announces), max(0, before - 1), None), strict=False
-            )
+            times = [0, *sent] if before > 0 else sent
+            turns, which = len(timer.announces), enumerate(times, start=max(0, before - 1))
+            named += [(time, timer.announces[turn % turns]) for turn, time in which]
     if not named:
         return pl.Series([None] * len(starts), dtype=pl.String)
     known = sorted(one for one in named if one[1] in modes.bands)

@@ -206,9 +206,8 @@ def _about_late_outputs(plan: Plan) -> Iterator[str]:
     cycles, needed = evidence.samples + evidence.disturbed, cycles_needed(OVERRUN_PROBABILITY)
     if evidence.all_disturbed:
         cycles = max(evidence.samples, evidence.disturbed)
-    fewest = min(
-        [cycles, *(one.samples + one.disturbed for one in (evidence.modes or {}).values())]
-    )
+    apart = [one.samples + one.disturbed for one in (evidence.modes or {}).values()]
+    fewest = min([cycles, *apart])
     if fewest < needed:
         of = " of a mode" if fewest < cycles else ""
         yield (

@@ -249,10 +249,9 @@ def _slot_ns(profile: Profile, request: PlanRequest) -> int:
     """
     if request.publish_slot_ns is not None:
         return request.publish_slot_ns
-    every = (profile, *profile.of_modes.values())
-    longest = max(one.longest_publication_ns or 0 for one in every)
+    longest = profile.longest_publication_ns or 0
     if request.publication == "asynchronous":
-        longest = SENDS_PER_SLOT * max(one.longest_send_ns or 0 for one in every)
+        longest = SENDS_PER_SLOT * (profile.longest_send_ns or 0)
     grid = max(1, request.grid_ns)
     return max(SHORTEST_SLOT_NS, -(-longest // grid) * grid)
 
