@@ -9,6 +9,7 @@ import chainshaper as cs
 from chainshaper.cli.applying import recording_of
 from chainshaper.cli.options import (
     APPLICATION,
+    DESCRIPTIONS,
     JSON,
     NODE,
     PLAN_WISHES,
@@ -16,7 +17,6 @@ from chainshaper.cli.options import (
     NodeKind,
     argument,
     option,
-    plan_in_force,
     takes_wishes,
     wish,
 )
@@ -31,11 +31,9 @@ def plan(
     chain: list[str] | None = option(
         "--chain FIRST..LAST",
         "The chain, by topics or nodes: /t1../t5. Default: the one the recording names."
-        " Give several to plan chains that share cores: their offsets are found.",
+        " Give several to plan them together: what they share, and when each one's cycles start.",
     ),
-    output: Path | None = option(
-        "--output -o plan.yaml", "File to write; for several chains a folder, which must not exist."
-    ),
+    output: Path | None = option("--output -o plan.yaml", "File to write; must not exist."),
     latencies: Path | None = option(
         "--latencies FILE", "Instead of a recording: a duration a line, or .npy in ns."
     ),
@@ -63,7 +61,7 @@ def plan(
     """
     from chainshaper.planning import (
         band_choice,
-        plan_chains,
+        plan_application,
         plan_json,
         plan_warnings,
         publish_slots,
@@ -81,7 +79,7 @@ def plan(
     if len(planned) > 1:
         if sinks or curve is not None:
             raise InputError("--sink and --curve go with one chain: plan chains one by one")
-        _place_and_print(plan_chains(planned, request), output, json)
+        _print_application(*plan_application(planned, request), output, json)
         return
     made = cs.plan_chain(planned[0], request, sinks)
     choice = band_choice(made, planned[0], request) if request.bands == "auto" else None
@@ -119,7 +117,8 @@ def _profiles(
 def offsets(
     plans: list[Path] = argument("PLAN PLAN...", "Plans, one a chain.", ...),
     output: Path | None = option(
-        "--output -o DIR", "Folder to write the plans into; must not exist."
+        "--output -o plan.yaml",
+        "One plan of all chains; or a folder, for a plan each. Must not exist.",
     ),
     time_limit: float = option(
         "--time-limit SECONDS", "How long to search, per group.", 60.0, min=0.1
@@ -131,17 +130,34 @@ def offsets(
     Where chains cannot take turns on a core, they run at the same time at different priorities, and
     only their publish slots are kept apart.
     """
-    _place_and_print([cs.load_plan(path) for path in plans], output, json, time_limit)
+    from chainshaper.planning import save_plans
+    from chainshaper.planning.application_plan import combined
+
+    placed, remarks = cs.place_chains(
+        [chain for path in plans for chain in cs.load_application_plan(path).chains],
+        time_limit_s=time_limit,
+    )
+    if output is not None and output.suffix not in DESCRIPTIONS:
+        written = save_plans(placed, output)
+        _print_placed(placed, remarks, written, json)
+        return
+    _print_application(combined(placed), remarks, output, json)
 
 
-def _place_and_print(
-    plans: "Sequence[cs.Plan]", output: Path | None, json: bool, time_limit: float = 60.0
+def _print_application(
+    plan: "cs.ApplicationPlan", remarks: Sequence[str], output: Path | None, json: bool
 ) -> None:
-    from chainshaper.planning import plan_json, plan_warnings, save_plans
+    if output is not None:
+        cs.save_application_plan(plan, output)
+    _print_placed(plan.chains, remarks, [] if output is None else [output], json)
+
+
+def _print_placed(
+    placed: "Sequence[cs.Plan]", remarks: Sequence[str], written: Sequence[Path], json: bool
+) -> None:
+    from chainshaper.planning import plan_json, plan_warnings
     from chainshaper.reporting.overviews import plan_table
 
-    placed, remarks = cs.place_chains(plans, time_limit_s=time_limit)
-    written = [] if output is None else save_plans(placed, output)
     warnings = [*remarks, *(warning for one in placed for warning in plan_warnings(one))]
     files = [str(path) for path in written]
     values = {"plans": [plan_json(one) for one in placed], "files": files, "warnings": warnings}
@@ -190,7 +206,8 @@ def sweep(
         raise InputError("a cluster has workers of its own: leave out --workers, or --scheduler")
     if draw is not None:
         draw = new_file(draw, (".png", ".pdf", ".svg"))
-    described, in_force = cs.load_application(application), plan_in_force(plan)
+    described = cs.load_application(application)
+    in_force = None if plan is None else cs.load_plan(plan)
     axes = [parse_axis(text) for text in vary]
     if len(dict(axes)) < len(axes):
         raise InputError("an axis is given twice: give all of its values in one --vary")
@@ -290,7 +307,7 @@ def splice(
     elif plan is None or not files:
         raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
     else:
-        planned = cs.load_plan(plan)
+        planned = cs.load_application_plan(plan)
         warn(planned)
         common |= {"message_type": message_type, "fallback": fallback}
         known = _opened(recording or recording_of(planned))

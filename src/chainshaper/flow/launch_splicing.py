@@ -17,7 +17,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from chainshaper.planning.plan import Plan, ShapingNode, revised
+from chainshaper.planning.application_plan import ApplicationPlan, combined, whole
+from chainshaper.planning.plan import Plan, ShapingNode, revised, shaping_nodes
 from chainshaper.sources.ros import own_environment, run_with_rclpy
 from chainshaper.splicing import redirection
 from chainshaper.splicing.redirection import Redirect
@@ -81,7 +82,7 @@ class ThrottledInput(Part):
 
 
 def splice_launch_files(
-    plan: Plan,
+    plan: Plan | ApplicationPlan,
     launch_files: Sequence[str | Path],
     output: str | Path,
     *,
@@ -107,35 +108,37 @@ def splice_launch_files(
             redirected, or more than is meant.
         PlatformError: there is no ROS 2 environment for a dry run.
     """
-    if plan.shaping_node is None:
+    joint = whole(plan)
+    if fallback is not None:
+        joint = combined([revised(chain, fallback=fallback) for chain in joint.chains])
+    if any(chain.shaping_node is None for chain in joint.chains):
         raise InputError(
             "the plan has no `shaping_node`, so there is nothing to splice: plan again with"
             " `chainshaper plan REC --chain FIRST..LAST -o plan.yaml`"
         )
     folder = usable(Path(output))
     publishers = _endpoints(recording, "publisher")
-    nodes = (plan.shaping_node, *plan.further_shaping_nodes)
+    nodes = [(chain, node) for chain in joint.chains for node in shaping_nodes(chain)]
     redirects = [
         Redirect(
-            *("publisher", one.output, one.input, (_publisher(plan, one, publishers),)),
+            *("publisher", one.output, one.input, (_publisher(chain, one, publishers),)),
             added=(f"/{one.name}", f"/{one.name}{STANDBY}"),
         )
-        for one in nodes
+        for chain, one in nodes
     ]
-    plan = plan if fallback is None else revised(plan, fallback=fallback)
     seen = () if recording is None else recording.info.endpoints
     types = {one.topic: one.type for one in reversed(seen) if one.type}
-    logs = {one.name: folder / LOGS / f"{one.name}.csv" for one in nodes}
+    logs = {one.name: folder / LOGS / f"{one.name}.csv" for one in joint.shaping_nodes}
 
     def written(into: Path) -> _Written:
         made = [
             write_shaping_process(
-                *(plan, one, node, folder / NODES),
+                *(chain, one, node, folder / NODES),
                 message_type=message_type or types.get(one.output),
                 log=logs[one.name],
                 into=into,
             )
-            for one in nodes
+            for chain, one in nodes
         ]
         return made, redirects
 

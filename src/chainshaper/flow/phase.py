@@ -26,7 +26,7 @@ import numpy.typing as npt
 from chainshaper.enforcement.threads import Allocation
 from chainshaper.linux.scheduling import become_fifo, set_state, state_of
 from chainshaper.linux.threads import has_ended, start_of
-from chainshaper.planning.plan import Plan, shaping_nodes
+from chainshaper.planning.plan import ShapingNode
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 
@@ -276,12 +276,12 @@ NO_NODE = Telling((), None, 0.0)
 """No node is to get a phase."""
 
 
-def tell_phase(plan: Plan, found: Allocation, phase_ns: int) -> Telling:
-    """Begin to give a plan's shaping nodes in ROS 2 where the chain begins in every cycle.
+def tell_phase(nodes: Collection[ShapingNode], found: Allocation, phase_ns: int) -> Telling:
+    """Begin to give shaping nodes in ROS 2 where their chain begins in every cycle.
 
     The nodes of a chain are in one domain: any of them has the environment in which all are found.
     """
-    names = [node.thread.node for node in shaping_nodes(plan)]
+    names = [node.thread.node for node in nodes]
     pids = {node: one.thread.pid for node in names for one in found.threads if node in one.nodes}
     if not pids:
         return NO_NODE
@@ -291,14 +291,14 @@ def tell_phase(plan: Plan, found: Allocation, phase_ns: int) -> Telling:
 
     try:
         environments = {node: _environment_for(pid) for node, pid in pids.items()}
-        nodes = tuple(node for node, one in environments.items() if _is_ros(one))
-        if not nodes:  # they are the live workload's
+        ours = tuple(node for node, one in environments.items() if _is_ros(one))
+        if not ours:  # they are the live workload's
             return NO_NODE
-        arguments = ("parameter", "phase_ns", str(phase_ns % plan.cycle_ns), *nodes)
-        script = start_with_rclpy(environments[nodes[0]], ros_script.__file__, *arguments)
+        arguments = ("parameter", "phase_ns", str(phase_ns), *ours)
+        script = start_with_rclpy(environments[ours[0]], ros_script.__file__, *arguments)
     except OperationError as error:
         return Telling(tuple(pids), None, 0.0, str(error))
-    return Telling(nodes, script, time.monotonic())
+    return Telling(ours, script, time.monotonic())
 
 
 def _environment_for(pid: int) -> "Environment":
