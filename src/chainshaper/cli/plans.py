@@ -132,16 +132,18 @@ def offsets(
     """
     from chainshaper.planning import save_plans
     from chainshaper.planning.application_plan import combined
+    from chainshaper.planning.several_chains import numbered
 
     placed, remarks = cs.place_chains(
         [chain for path in plans for chain in cs.load_application_plan(path).chains],
         time_limit_s=time_limit,
     )
-    if output is not None and output.suffix not in DESCRIPTIONS:
-        written = save_plans(placed, output)
-        _print_placed(placed, remarks, written, json)
+    if output is not None and output.suffix in DESCRIPTIONS:
+        alone = [[place] for place in range(len(placed))]
+        _print_application(combined(numbered(placed, alone)), remarks, output, json)
         return
-    _print_application(combined(placed), remarks, output, json)
+    written = [] if output is None else save_plans(placed, output)
+    _print_placed(placed, remarks, written, json)
 
 
 def _print_application(

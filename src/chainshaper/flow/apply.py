@@ -18,6 +18,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,6 +32,7 @@ from chainshaper.enforcement.servers import BackEnd, ServerCounters, ServerTable
 from chainshaper.enforcement.threads import Allocation, NodeThread, RecordedProcess
 from chainshaper.enforcement.undoing import RunState, ServerState
 from chainshaper.flow import threads
+from chainshaper.flow.drift import TimerTrack
 from chainshaper.flow.phase import DriftWatch, Phase, Telling, tell_phase
 from chainshaper.flow.threads import LEAD_NS
 from chainshaper.linux.own_processes import end_command, start_command
@@ -48,7 +50,7 @@ from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.overruns import publication_warnings
 from chainshaper.planning.plan import Plan, shaping_nodes
 from chainshaper.values.durations import format_duration
-from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.errors import OperationError
 
 if TYPE_CHECKING:
     from chainshaper.values.recording import Recording  # slow to import
@@ -110,11 +112,7 @@ def apply_plan(
     table, taken = threads.server_table(opened), run_users(users)
     check_cores({server.core: f"server {server.name}" for server in opened.servers})
     choice = choose_back_end(back_end)
-    if not gates(choice.name) and any(chain.offset_ns for chain in given.chains):
-        raise InputError(
-            f"the back end {choice.name} sets priorities only, and chains whose cycles start at"
-            " offsets have to be stopped until then: choose freezer or scx"
-        )
+    threads.refuse_offsets(given, choice.name)
     nodes = {thread.node for server in opened.servers for thread in server.threads}
     nodes.update(receiver for node in opened.shaping_nodes for receiver in node.receivers)
     recorded: tuple[RecordedProcess, ...] = ()
@@ -165,6 +163,7 @@ class _Run:
     command: subprocess.Popen[bytes] | None = None
     servers: BackEnd | None = None
     telling: list[Telling] = field(default_factory=list)
+    waits_ns: list[int] = field(default_factory=list)  # from each timer to its slot, if measured
     found: Allocation = field(init=False)
     state: RunState = field(init=False)
 
@@ -254,6 +253,10 @@ class _Run:
         if phase_ns is None:
             phases = self.measure_phases(progress)
             anchor = threads.common_anchor(self.plan, phases)
+            self.waits_ns = [
+                (anchor + chain.offset_ns - phase.at_ns) % chain.cycle_ns
+                for chain, phase in zip(self.plan.chains, phases, strict=True)
+            ]
             spread = max(phase.spread_ns for phase in phases)
         else:
             anchor = (phase_ns + LEAD_NS - self.plan.chains[0].offset_ns) % cycle_ns
@@ -328,18 +331,16 @@ class _Run:
     def watch_over(self, servers: BackEnd, watch: Callable[[RunState], None]) -> None:
         """Watch over the run until it is to end; the state is then as it was last."""
         drifts, sent, notes = self.drift_watches(), dict[int, int](), self.state.notes
+        following = self.follow(servers, drifts)
         latest: tuple[NodeThread, ...] = ()
         unsaved = untaken = ""
         while True:
             is_over = self.command_ended or self.stop.is_set()
-            moved = {place: one.latest_ns or 0 for place, one in enumerate(drifts)}
+            followed_ns = next(following)
+            seen = {k: one.latest_ns for k, one in enumerate(drifts)}
+            moved = {k: ns + followed_ns for k, ns in seen.items() if ns is not None}
             self.end_telling()
-            self.look_at(
-                servers,
-                max(moved.values(), key=abs)
-                if any(one.latest_ns is not None for one in drifts)
-                else None,
-            )
+            self.look_at(servers, max(moved.values(), key=abs, default=None))
             if is_over := is_over or self.state.failure is not None:
                 self.state = replace(self.state, ended_ns=time.monotonic_ns())
             trouble = filter(None, (unsaved, untaken))
@@ -358,7 +359,7 @@ class _Run:
             new = {k: ns for k, ns in moved.items() if abs(ns - sent.get(k, 0)) > PHASE_BOUND_NS}
             if new and not self.telling:
                 sent.update(new)
-                self.tell(self.state.anchor_ns or 0, new)
+                self.tell(self.state.anchor_ns or 0, {k: ns - followed_ns for k, ns in new.items()})
                 said = (
                     f"the beginning of {chain_name(self.plan.chains[place])} has moved by"
                     f" {format_duration(ns)} since the plan was put in force; shaping nodes get it,"
@@ -371,6 +372,33 @@ class _Run:
             if self.guardians is not None:
                 self.guardians.renew()
             latest, untaken = self.look_again(servers, latest)
+
+    def follow(self, servers: BackEnd, drifts: Sequence[DriftWatch]) -> Iterator[int]:
+        """Move the slots with the chain's timer; yields how far they have moved (ns).
+
+        Of several chains the one with the shortest wait for its slot is followed: the timers of one
+        machine have one clock. Where outputs count from the cycle and not from their stamp, slots
+        stay where they are until the timer is seen behind their opening.
+        """
+        anchor_ns, waits = self.state.anchor_ns or 0, self.waits_ns
+        if not gates(self.choice.name) or not waits:
+            yield from repeat(0)
+        first = min(range(len(drifts)), key=lambda place: waits[place])
+        stamped = all(chain.anchor == "stamp" for chain in self.plan.chains)
+        track = TimerTrack(waits[first], time.monotonic_ns(), looks=stamped)
+        seen = 0
+        while True:
+            before_ns = track.opens_ns
+            if drifts[first].looks > seen:
+                seen = drifts[first].looks
+                track.saw(drifts[first].latest_ns or 0, time.monotonic_ns())
+            if track.opens_ns != before_ns:
+                moved_ns = (anchor_ns + track.opens_ns) % self.plan.cycle_ns
+                servers.arm(moved_ns)
+                self.state = replace(self.state, anchor_ns=moved_ns)
+                for chain, drift in zip(self.plan.chains, drifts, strict=True):
+                    drift.expect(self.begins(chain, moved_ns))
+            yield track.opens_ns
 
     def drift_watches(self) -> list[DriftWatch]:
         """Watches over where chains begin, one for each first thread."""

@@ -178,9 +178,10 @@ def find_drift(
 class DriftWatch:
     """Looks every ten seconds, in a thread of its own, where a thread begins its cycles now.
 
-    ``latest_ns`` is how far that is from ``expected_ns`` (None: not seen yet). Looking takes a
-    tenth of a core: it is done on ``cores``, if there are any, and only ``NEAR`` where the thread
-    began last. A thread that is not seen there any more is looked for in the whole cycle.
+    ``latest_ns`` is how far that is from where it is expected (None: not seen yet), by look number
+    ``looks``. Looking takes a tenth of a core: it is done on ``cores``, if there are any, and only
+    ``NEAR`` where the thread began last. A thread that is not seen there any more is looked for in
+    the whole cycle.
     """
 
     EVERY_S = 10.0
@@ -199,9 +200,14 @@ class DriftWatch:
         cores: Collection[int] = (),
     ) -> None:
         self.latest_ns: int | None = None
+        self.looks = 0
         self._thread, self._cycle_ns, self._expected_ns = (pid, tid), cycle_ns, expected_ns
         self._slots, self._cores = slots, cores
         threading.Thread(target=self._look_again, name="drift-watch", daemon=True).start()
+
+    def expect(self, expected_ns: int) -> None:
+        """The thread is to begin elsewhere from now on; what is seen of it till then is void."""
+        self._expected_ns = expected_ns
 
     def _look_again(self) -> None:
         if self._cores:
@@ -210,11 +216,16 @@ class DriftWatch:
         with contextlib.suppress(OperationError):  # the thread has ended
             while True:
                 time.sleep(self.EVERY_S)
-                drift = self._look(near_ns)
-                near_ns = None if drift is None else self._expected_ns + drift
-                self.latest_ns = self.latest_ns if drift is None else drift
+                expected_ns = self._expected_ns
+                drift = self._look(near_ns, expected_ns)
+                near_ns = None if drift is None else expected_ns + drift
+                if expected_ns != self._expected_ns:
+                    near_ns = self._expected_ns
+                elif drift is not None:
+                    self.latest_ns = drift
+                    self.looks += 1
 
-    def _look(self, near_ns: int | None) -> int | None:
+    def _look(self, near_ns: int | None, expected_ns: int) -> int | None:
         """The drift, if the thread was seen; near where it was expected, None: anywhere."""
         cycle_ns, near = self._cycle_ns, round(self.NEAR * self._cycle_ns)
 
@@ -226,7 +237,7 @@ class DriftWatch:
         seen = watch_wake_ups(
             *self._thread, cycles * cycle_ns, least_ns=least_ns, rest_ns=until_near
         )
-        return find_drift(seen, cycle_ns, cycles, self._expected_ns, self._slots)
+        return find_drift(seen, cycle_ns, cycles, expected_ns, self._slots)
 
 
 @contextlib.contextmanager

@@ -15,7 +15,7 @@ from functools import partial
 from typing import TYPE_CHECKING, cast
 
 from chainshaper.enforcement import threads as allocation
-from chainshaper.enforcement.back_ends import choose_back_end
+from chainshaper.enforcement.back_ends import choose_back_end, gates
 from chainshaper.enforcement.litmus import litmus_commands
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.enforcement.threads import (
@@ -194,6 +194,7 @@ def planned_changes(
     found = find_threads(plan, recording, users=users)
     if back_end != "litmus":
         choice = choose_back_end(back_end)
+        refuse_offsets(plan, choice.name)
         wanted = allocation.plan_scheduling(plan, found, available_cores())
         threads = allocation.left_by_back_end(choice.name, wanted)
         return Changes(choice.name, choice.reason, threads, (), found.notes)
@@ -211,6 +212,15 @@ def planned_changes(
         notes += ("slots are counted from a beginning that is measured when the chain runs",)
     anchor = 0 if phase_ns is None else phase_ns + LEAD_NS
     return Changes("litmus", "asked for", (), litmus_commands(table, members, anchor), notes)
+
+
+def refuse_offsets(plan: ApplicationPlan, back_end: str) -> None:
+    """Refuse offsets where nothing stops a chain until its cycle starts. Raises InputError."""
+    if not gates(back_end) and any(chain.offset_ns for chain in plan.chains):
+        raise InputError(
+            f"the back end {back_end} sets priorities only, and chains whose cycles start at"
+            " offsets have to be stopped until then: choose freezer or scx"
+        )
 
 
 def server_table(plan: ApplicationPlan) -> ServerTable:

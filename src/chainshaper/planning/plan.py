@@ -276,13 +276,6 @@ class Plan(Part):
     modes: Modes | None = None
     predicted: Prediction
 
-    @model_validator(mode="before")
-    @classmethod
-    def _of_one_chain(cls, values: Any) -> Any:
-        if isinstance(values, dict) and "chains" in values:
-            raise wrong_value("is of several chains, and only one is wanted here", "chains")
-        return values
-
     @model_validator(mode="after")
     def _consistent(self) -> "Plan":
         rules = (_cycle, _servers, _overlaps, _shaping_nodes, _modes, _publisher_threads)
@@ -608,7 +601,17 @@ def load_plan(path: str | Path) -> Plan:
     Raises InputError: no such file, not YAML, or wrong values; each is named with its line, key,
     reason and remedy.
     """
-    return read_model(path, Plan, made_by="written by `chainshaper plan`")
+    several = ("chains", _OfSeveralChains)
+    return read_model(path, Plan, made_by="written by `chainshaper plan`", otherwise=several)
+
+
+class _OfSeveralChains(Plan):
+    """What a file is that has a plan where one chain's is wanted: refused."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refused(cls, _: object) -> object:
+        raise wrong_value("the plan is of several chains, and that of one is wanted here", "chains")
 
 
 def dump_plan(plan: Plan) -> str:

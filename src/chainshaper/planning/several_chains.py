@@ -65,9 +65,10 @@ def _planned(
 ) -> tuple[ApplicationPlan, list[str]]:
     plans = [plan_chain(profile, request) for profile in profiles]
     groups = _beginning_together(profiles)
-    for number, group in enumerate(groups):
+    for group in groups:
         for k, plan in zip(group, _sharing_servers([plans[k] for k in group]), strict=True):
-            plans[k] = _with_names(plan, number, k)
+            plans[k] = plan
+    plans = numbered(plans, groups)
     placed, remarks = place_chains(plans, together=groups, time_limit_s=time_limit_s)
     return combined(placed), remarks
 
@@ -151,19 +152,24 @@ def _behind(plan: Plan, taken: Sequence[tuple[int, Slot]]) -> Plan:
     return revised(plan, servers=with_slots(plan.servers, slots), predicted=predicted)
 
 
-def _with_names(plan: Plan, group: int, place: int) -> Plan:
-    """The plan with the names of its servers numbered by its group, or by its place among chains:
-    those of the first chain stay.
+def numbered(plans: Sequence[Plan], groups: Sequence[Sequence[int]]) -> list[Plan]:
+    """The plans with the names of their servers numbered, by the first chain of the group that
+    shares them, or by their own: those of the first chain stay.
     """
-    gates = publishing_servers(plan)
-
-    def named(server: Server) -> Server:
-        number = place if server in gates else group
-        return (
-            server.model_copy(update={"name": f"{server.name}_{number + 1}"}) if number else server
-        )
-
-    return revised(plan, servers=tuple(map(named, plan.servers)))
+    renamed = list(plans)
+    for group in groups:
+        for place in group:
+            gates = publishing_servers(plans[place])
+            names = {
+                one.name: f"{one.name}_{number}" if number > 1 else one.name
+                for one in plans[place].servers
+                for number in [1 + (place if one in gates else group[0])]
+            }
+            servers = tuple(
+                one.model_copy(update={"name": names[one.name]}) for one in plans[place].servers
+            )
+            renamed[place] = revised(plans[place], servers=servers)
+    return renamed
 
 
 def _fitting(

@@ -22,7 +22,7 @@ from chainshaper.planning.plan import Plan, publisher_servers
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.arrays import Machine, System, build_machine, build_system
 from chainshaper.simulation.layout import Int64s, X
-from chainshaper.splicing.application import check_period, splice_application
+from chainshaper.splicing.application import check_periods, splice_application
 from chainshaper.values.compiled import kernel
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError
@@ -136,8 +136,7 @@ def _checked(
         if all(shaping):
             application = splice_application(application, plan)
         else:  # a baseline
-            for chain in plan.chains:
-                check_period(application, chain)
+            check_periods(application, plan)
     timing = live.timing_of(application, cycles, START_NS)
     slowest = max((cb.timer_ns or 0) + cb.phase_ns for _, cb in application.callbacks())
     if timing.stop_ns + slowest > LONGEST_NS:

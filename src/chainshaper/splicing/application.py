@@ -38,33 +38,41 @@ def splice_application(application: Application, plan: Plan | ApplicationPlan) -
         InputError: the plan shapes nothing, or does not fit the application.
     """
     joint = whole(plan)
+    check_periods(application, joint)
     for chain in joint.chains:
-        check_period(application, chain)
-    for chain in joint.chains:
-        application = _with_chain(_at_offset(application, joint, chain), chain)
+        application = _with_chain(_at_offset(application, joint, chain), joint, chain)
     return application
 
 
-def check_period(application: Application, plan: Plan) -> None:
+def check_periods(application: Application, joint: ApplicationPlan) -> None:
     """Refuse a chain that does not have its plan's period in the application.
 
     Raises InputError: so it is, or the application has no such chain.
     """
-    _, timer = origin_timer(application, plan.chain.spec)
-    if timer.timer_ns != plan.chain.period_ns:
-        raise InputError(
-            f"the plan is for a chain with the period {format_duration(plan.chain.period_ns)}, but"
-            f" {plan.chain.spec or application.chain} of {application.name!r} has"
-            f" {format_duration(timer.timer_ns or 0)}: plan again from a recording of this"
-            " application"
-        )
+    for chain in joint.chains:
+        _, timer = _origin(application, joint, chain)
+        if timer.timer_ns != chain.chain.period_ns:
+            raise InputError(
+                "the plan is for a chain with the period"
+                f" {format_duration(chain.chain.period_ns)}, but"
+                f" {chain.chain.spec or application.chain} of {application.name!r} has"
+                f" {format_duration(timer.timer_ns or 0)}: plan again from a recording of this"
+                " application"
+            )
+
+
+def _origin(
+    application: Application, joint: ApplicationPlan, chain: Plan
+) -> tuple[str, CallbackDescription]:
+    """The timer that starts a chain: a plan of one chain is for the application's own."""
+    return origin_timer(application, chain.chain.spec if len(joint.chains) > 1 else None)
 
 
 def _at_offset(application: Application, joint: ApplicationPlan, chain: Plan) -> Application:
     """The application with the timer that starts a chain expiring at the chain's offset."""
     if not joint.moves_timers:
         return application
-    name, timer = origin_timer(application, chain.chain.spec)
+    name, timer = _origin(application, joint, chain)
     node = application.nodes[name]
     moved = timer.model_copy(update={"phase_ns": chain.offset_ns})
     callbacks = tuple(moved if one is timer else one for one in node.callbacks)
@@ -72,7 +80,7 @@ def _at_offset(application: Application, joint: ApplicationPlan, chain: Plan) ->
     return application.model_copy(update={"nodes": nodes})
 
 
-def _with_chain(application: Application, plan: Plan) -> Application:
+def _with_chain(application: Application, joint: ApplicationPlan, plan: Plan) -> Application:
     shaping = plan.shaping_node
     if shaping is None and any(publisher_servers(plan)):
         check_publication(plan, writers_of(application))
@@ -94,11 +102,13 @@ def _with_chain(application: Application, plan: Plan) -> Application:
             "`announces` modes there: describe one, or remove `modes` from the plan"
         )
     for node in (shaping, *plan.further_shaping_nodes):
-        application = _spliced(application, plan, node)
+        application = _spliced(application, joint, plan, node)
     return application
 
 
-def _spliced(application: Application, plan: Plan, shaping: ShapingNode) -> Application:
+def _spliced(
+    application: Application, joint: ApplicationPlan, plan: Plan, shaping: ShapingNode
+) -> Application:
     """The application with one shaping node behind the publisher of its output."""
     if shaping.name in {name.strip("/") for name in application.nodes}:
         raise InputError(
@@ -125,7 +135,7 @@ def _spliced(application: Application, plan: Plan, shaping: ShapingNode) -> Appl
         callbacks.append(callback.model_copy(update={"publishes": tuple(published)}))
     nodes[publishers[0]] = publisher.model_copy(update={"callbacks": tuple(callbacks)})
     depth = shaping.depth or max(10, application.topic(shaping.output).depth)
-    _, timer = origin_timer(application, plan.chain.spec)
+    _, timer = _origin(application, joint, plan)
     nodes[shaping.name] = _described(plan, shaping, depth, timer.phase_ns)
     if shaping.output in topics:
         topics[shaping.input] = topics[shaping.output]  # the same quality of service
