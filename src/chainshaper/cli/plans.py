@@ -248,9 +248,10 @@ def splice(
     *,
     output: Path = option("--output -o DIR", "Folder for the launch file.", ...),
     throttle: list[str] | None = option(
-        "--throttle [NODE:]TOPIC=PERIOD",
+        "--throttle [NODE:]TOPIC=PERIOD[,RULE]",
         "Instead of a plan: a throttler before an input that is not quite periodic, for "
-        "NODE or whoever subscribes in the recording (may be repeated).",
+        "NODE or whoever subscribes in the recording (may be repeated). RULE: newest, at fixed "
+        "instants (default), or first, as it comes.",
     ),
     node: NodeKind = NODE,
     message_type: str | None = option(
@@ -322,7 +323,7 @@ def splice(
 
 
 def _throttled(inputs: list[str], recording: Path | None, common: dict[str, Any]) -> "cs.Splicing":
-    """Inputs as they are written: ``/fusion:/points_raw=100ms``."""
+    """Inputs as they are written: ``/fusion:/points_raw=100ms``, ``/points_raw=100ms,first``."""
     from chainshaper.values.durations import parse_duration
     from chainshaper.values.yaml_file import wrong_values_refused
 
@@ -330,11 +331,13 @@ def _throttled(inputs: list[str], recording: Path | None, common: dict[str, Any]
         raise InputError("give the launch files: `splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`")
     parsed = []
     for text in inputs:
-        where, equals, period = text.rpartition("=")
+        where, equals, how = text.rpartition("=")
+        period, comma, rule = how.partition(",")
         if not equals:
             raise InputError(f"--throttle {text}: write a topic and a period: /points_raw=100ms")
         node, _, topic = where.rpartition(":")
         values = {"topic": topic, "period_ns": parse_duration(period), "subscriber": node or None}
+        values |= {"rule": rule} if comma else {}
         with wrong_values_refused(cs.ThrottledInput):
             parsed.append(cs.ThrottledInput.model_validate(values))
     return cs.splice_throttlers(parsed, recording=_opened(recording), **common)
