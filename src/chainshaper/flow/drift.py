@@ -44,7 +44,7 @@ class TimerTrack:
         """
         elapsed = now_ns - self.at_ns
         expected = self.expires_ns + round(self.rate * elapsed)
-        if begins_ns > SEEN_NS:
+        if abs(begins_ns) > SEEN_NS:  # before the opening: nothing stopped it
             self._learn(self.opens_ns + begins_ns, expected, now_ns)
             self.opens_ns = self.expires_ns + self.lead_ns
         elif self._step_ns:  # the timer is earlier still

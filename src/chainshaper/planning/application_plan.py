@@ -111,7 +111,7 @@ class ApplicationPlan(Part):
                     name="+".join(together),
                     core=own[0][0].core,
                     priority=min(server.priority for server, _ in own),
-                    slots=tuple(_united(slots)) if len(own) > 1 else tuple(sorted(slots)),
+                    slots=tuple(_united(slots) if len(self.chains) > 1 else sorted(slots)),
                     threads=tuple(threads),
                 )
             )
