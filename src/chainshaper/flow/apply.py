@@ -28,7 +28,7 @@ from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, ma
 from chainshaper.enforcement.freezer import groups_of, run_of
 from chainshaper.enforcement.guardian import Guardians, run_claimed
 from chainshaper.enforcement.scheduling_memory import change_all, look_alikes, note_descendants
-from chainshaper.enforcement.servers import BackEnd, ServerCounters, ServerTable
+from chainshaper.enforcement.servers import BackEnd, ServerCounters
 from chainshaper.enforcement.threads import Allocation, NodeThread, RecordedProcess
 from chainshaper.enforcement.undoing import RunState, ServerState
 from chainshaper.flow import threads
@@ -107,21 +107,20 @@ def apply_plan(
             the chain has no regular beginning, the kernel refuses something, the servers failed,
             the application ended by itself, or ``stop`` was set before the plan was in force.
     """
-    given = whole(plan)
-    opened = open_until_done(given)
-    table, taken = threads.server_table(opened), run_users(users)
-    check_cores({server.core: f"server {server.name}" for server in opened.servers})
+    given, taken = whole(plan), run_users(users)
+    threads.server_table(given)
+    check_cores({server.core: f"server {server.name}" for server in given.servers})
     choice = choose_back_end(back_end)
     threads.refuse_offsets(given, choice.name)
-    nodes = {thread.node for server in opened.servers for thread in server.threads}
-    nodes.update(receiver for node in opened.shaping_nodes for receiver in node.receivers)
+    nodes = {thread.node for server in given.servers for thread in server.threads}
+    nodes.update(receiver for node in given.shaping_nodes for receiver in node.receivers)
     recorded: tuple[RecordedProcess, ...] = ()
     if recording is not None:  # looked up once: that takes longer than looking at processes
         recorded, _ = threads.recorded_processes(recording)
     stop = stop or threading.Event()
-    cores = {server.core for server in plan.servers}
+    cores = {server.core for server in given.servers}
     journal = undoing.claim_run(cores, nodes, folder, lambda: _go_on(stop))
-    run = _Run(given, opened, choice, journal, recorded, taken, stop)
+    run = _Run(given, given, choice, journal, recorded, taken, stop)
     try:
         run.guardians = Guardians(journal)
         if command:
@@ -129,9 +128,11 @@ def apply_plan(
         run.await_nodes((START_NS if command else 0) if wait_ns is None else wait_ns, progress)
         run.guardians.await_ready(run.go_on)
         run.schedule()
+        run.begin_state(command, plan_path)
+        run.find_anchor(phase_ns, progress)
+        table = threads.server_table(run.plan)
         run.servers = make_back_end(choice.name, table, journal, run.go_on)
-        run.begin_state(table, command, plan_path)
-        run.arm(run.servers, phase_ns, progress)
+        run.arm(run.servers, progress)
         run.watch_over(run.servers, watch)
         strangers = look_alikes(journal, groups_of(run_of(journal)))
     finally:
@@ -153,7 +154,7 @@ class _Run:
     """What belongs together, and is to be put back, while a plan is in force."""
 
     given: ApplicationPlan
-    plan: ApplicationPlan  # as it is carried out: with room for overruns
+    plan: ApplicationPlan  # as it is carried out: with room for overruns, once timers are known
     choice: Choice
     journal: Journal
     recorded: tuple[RecordedProcess, ...]
@@ -163,6 +164,7 @@ class _Run:
     command: subprocess.Popen[bytes] | None = None
     servers: BackEnd | None = None
     telling: list[Telling] = field(default_factory=list)
+    anchor_ns: int = 0
     waits_ns: list[int] = field(default_factory=list)  # from each timer to its slot, if measured
     found: Allocation = field(init=False)
     state: RunState = field(init=False)
@@ -217,9 +219,7 @@ class _Run:
         left = allocation.left_by_back_end(self.choice.name, wanted)
         change_all(self.journal, ((one.thread.thread, one.wanted) for one in left))
 
-    def begin_state(self, table: ServerTable, command: Sequence[str], plan_path: str) -> None:
-        keeper = self.choice.name if gates(self.choice.name) else "none: priority only"
-        kept_by = {server.name: keeper for server in table.servers}
+    def begin_state(self, command: Sequence[str], plan_path: str) -> None:
         self.state = RunState(
             run=self.folder.name,
             owner=os.getpid(),
@@ -232,34 +232,44 @@ class _Run:
             anchor_ns=None,
             phase_spread_ns=None,
             drift_ns=None,
-            servers=tuple(
-                ServerState(
-                    *(one.name, one.core, one.priority, one.slots, ()),
-                    kept_by=kept_by.get(one.name, "gate"),
-                    counters=_NOTHING,
-                )
-                for one in self.plan.servers
-            ),
+            servers=(),
             notes=tuple(note for one in self.plan.chains for note in publication_warnings(one)),
             failure=None,
         )
         self.name_strangers(self.found)
 
-    def arm(
-        self, servers: BackEnd, phase_ns: int | None, progress: Callable[[float, str], None]
-    ) -> None:
-        """Measure where chains begin, put their threads into the servers, and close these."""
-        spread, cycle_ns = None, self.plan.cycle_ns
+    def find_anchor(self, phase_ns: int | None, progress: Callable[[float, str], None]) -> None:
+        """Measure where chains begin, and see from when on their slots count."""
         if phase_ns is None:
             phases = self.measure_phases(progress)
-            anchor = threads.common_anchor(self.plan, phases)
+            self.anchor_ns = threads.common_anchor(self.given, phases)
             self.waits_ns = [
-                (anchor + chain.offset_ns - phase.at_ns) % chain.cycle_ns
-                for chain, phase in zip(self.plan.chains, phases, strict=True)
+                (self.anchor_ns + chain.offset_ns - phase.at_ns) % chain.cycle_ns
+                for chain, phase in zip(self.given.chains, phases, strict=True)
             ]
             spread = max(phase.spread_ns for phase in phases)
+            self.state = replace(self.state, phase_spread_ns=spread)
         else:
-            anchor = (phase_ns + LEAD_NS - self.plan.chains[0].offset_ns) % cycle_ns
+            anchor_ns = phase_ns + LEAD_NS - self.given.chains[0].offset_ns
+            self.anchor_ns = anchor_ns % self.given.cycle_ns
+        self.plan = open_until_done(self.given)
+        table, keeper = threads.server_table(self.plan), self.choice.name
+        if not gates(keeper):
+            keeper = "none: priority only"
+        kept_by = {server.name: keeper for server in table.servers}
+        servers = tuple(
+            ServerState(
+                *(one.name, one.core, one.priority, one.slots, ()),
+                kept_by=kept_by.get(one.name, "gate"),
+                counters=_NOTHING,
+            )
+            for one in self.plan.servers
+        )
+        self.state = replace(self.state, servers=servers)
+
+    def arm(self, servers: BackEnd, progress: Callable[[float, str], None]) -> None:
+        """Put the threads into the servers, and close these."""
+        anchor, cycle_ns = self.anchor_ns, self.plan.cycle_ns
         self.tell(anchor)
         while self.still_telling() and not (self.stop.wait(0.05) or self.command_ended):
             progress(1.0, "telling shaping nodes where cycles begin")
@@ -272,7 +282,6 @@ class _Run:
         self.state = replace(
             self.state,
             anchor_ns=anchor,
-            phase_spread_ns=spread,
             in_force_ns=since + (anchor - since) % cycle_ns,
         )
 
