@@ -1,4 +1,4 @@
-"""Node Throttler: scans that come too early after the last one are held back, per lidar.
+"""Node Throttler: of each lidar's scans the first of a period passes as it comes, the paper's rule.
 
 It makes of a lidar that is played back at almost 10 Hz a source of at most one scan a period, so
 its callbacks can be seen as the timers that begin chains. What passes gets a stamp there.
@@ -6,13 +6,14 @@ its callbacks can be seen as the timers that begin chains. What passes gets a st
 
 import time
 
+from chainshaper.gate.throttling import FirstOfPeriod
 from chainshaper.workload.dds import data_message, data_of, number_in
 
 __all__ = ["throttle_front", "throttle_rear"]
 
-SHORTEST_NS = 80_000_000
+PERIOD_NS = 100_000_000
 
-_passed_ns = {"rear": 0, "front": 0}
+_rules = {lidar: FirstOfPeriod(PERIOD_NS) for lidar in ("rear", "front")}
 
 
 def throttle_rear(scan: bytes) -> bytes | None:
@@ -26,8 +27,6 @@ def throttle_front(scan: bytes) -> bytes | None:
 
 
 def _throttled(scan: bytes, lidar: str) -> bytes | None:
-    now = time.monotonic_ns()
-    if now - _passed_ns[lidar] < SHORTEST_NS:
+    if not _rules[lidar].passes(time.monotonic_ns()):
         return None
-    _passed_ns[lidar] = now
     return data_message(data_of(scan), time.time_ns(), number_in(scan))

@@ -158,7 +158,7 @@ def test_without_the_privilege_it_runs_with_what_it_may(
         ("plan REC --latencies LATENCIES", "give either a recording or --latencies"),
         ("plan --latencies LATENCIES", "add --period"),
         ("plan REC --period 1s", "--period goes with --latencies"),
-        ("plan REC --sink /t1../t3", "both publish /t3"),
+        ("plan REC --sink /t1../t3", "is given twice"),
         ("latency REC --instances", "--instances goes with --json"),
         ("compare REC", "a comparison needs two recordings"),
         ("record -o OUT", "no command given"),

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from command_line import called, json_of, refused
 
-from chainshaper import load_plan, plan_shaping, save_plan
+from chainshaper import load_application_plan, load_plan, plan_shaping, save_plan
 from chainshaper.planning import (
     Modes,
     Plan,
@@ -216,33 +216,33 @@ def test_chains_take_turns_where_they_can(saved: Callable[..., Path], tmp_path: 
     assert "exists already and is not overwritten" in again
 
 
-def test_an_offset_is_refused_where_the_chains_timer_starts_its_cycles(
+def test_an_offset_is_refused_where_nothing_stops_the_chain(
     application_file: Path, plan: Plan
 ) -> None:
     file, output = application_file.with_name("plan.yaml"), application_file.with_name("rec")
     save_plan(revised(plan, offset_ns=7 * MS), file)
-    for words in (
-        ("apply", file, "--dry-run"),
-        ("apply", file),
-        ("shape", application_file, file, "-o", output),
-    ):
-        assert "offset: 7ms cannot be carried out here" in refused(2, *words)
-    assert not output.exists()
+    for words in (("apply", file, "--dry-run"), ("apply", file)):
+        said = refused(2, *words, "--backend", "fifo")
+        assert "fifo sets priorities only, and chains whose cycles start at offsets" in said
     assert called("simulate", application_file, file, "-o", output, "--cycles", "3").code == 0
 
 
 def test_several_chains_of_a_recording_and_a_further_sink(tmp_path: Path) -> None:
-    recording, folder = tmp_path / "rec", tmp_path / "plans"
+    recording, file = tmp_path / "rec", tmp_path / "both.yaml"
     assert called("simulate", TWO_CHAINS, "-o", recording, "--cycles", "100").code == 0
     chains = ("--chain", "/scan../command", "--chain", "/image../label")
-    values = json_of("plan", recording, *chains, "-o", folder)
+    values = json_of("plan", recording, *chains, "-o", file)
     assert [plan["chain"]["spec"] for plan in values["plans"]] == list(chains[1::2])
-    assert sorted(path.name for path in folder.iterdir()) == ["1_command.yaml", "2_label.yaml"]
+    written = load_application_plan(file)
+    assert [plan.chain.spec for plan in written.chains] == list(chains[1::2])
+    assert "the plan is of several chains" in refused(
+        *(2, "sweep", TWO_CHAINS, file, "--vary", "plan.margin.epsilon=1ms", "-o", "x.parquet")
+    )
     assert "one by one" in refused(2, "plan", recording, *chains, "--sink", "/scan../map")
     values = json_of("plan", recording, *chains[:2], "--sink", "/scan../map")
     assert [node["output"] for node in values["further_shaping_nodes"]] == ["/map"]
     twice = refused(2, "plan", recording, "--sink", "/scan../command")
-    assert "both publish /command" in twice
+    assert "the chain /scan../command is given twice" in twice
 
 
 def test_a_plan_says_that_events_were_lost(unshaped: Recording, tmp_path: Path) -> None:

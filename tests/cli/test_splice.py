@@ -83,7 +83,9 @@ def test_the_fallback_is_the_plan_s_or_the_option_s(files: Files) -> None:
 
 def test_a_throttler_needs_no_plan(files: Files) -> None:
     _, robot, folder = files
-    said = json_of("splice", "--throttle", "/third:/t1=100ms", robot, "n:=1", "-o", folder)
+    said = json_of("splice", "--throttle", "/third:/t1=100ms,first", robot, "n:=1", "-o", folder)
+    parameters = folder / "shaping_nodes" / "chainshaper_throttler.yaml"
+    assert "rule: first" in parameters.read_text()
     assert said["nodes"] == ["chainshaper_throttler"]
     assert "'target': '/t1_throttled'" in said["diff"]
     assert called("splice", "--undo", "-o", folder).out == f"{folder} is removed\n"
@@ -138,6 +140,7 @@ def test_a_plan_s_own_recording_tells_publishers_where_it_exists(files: Files, p
         ("PLAN ROBOT -o DIR --node typed --type Header", "'Header' is not a message type"),
         ("ROBOT -o DIR --throttle /t1=100ms", "--recording REC, or the node"),
         ("ROBOT -o DIR --throttle /third:/t1", "write a topic and a period"),
+        ("ROBOT -o DIR --throttle /third:/t1=1s,last", "'last' should be 'newest' or 'first'"),
         ("ROBOT -o DIR --throttle third:/t1=1s", "'third' is not a full ROS"),
         ("ROBOT -o DIR --throttle /third:/t1=0ms", "is zero"),
         ("-o DIR --throttle /third:/t1=1s", "give the launch files"),

@@ -28,7 +28,8 @@ from chainshaper.enforcement.threads import (
 from chainshaper.linux.processes import Process, read_process
 from chainshaper.linux.scheduling import Scheduling
 from chainshaper.linux.threads import Thread, ThreadRole, dds_kind, role_of
-from chainshaper.planning import Plan, plan_shaping
+from chainshaper.planning import plan_shaping
+from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.plan import Server, ShapingNode, revised
 from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.values.errors import InputError, OperationError
@@ -196,10 +197,10 @@ def test_a_process_started_after_the_recording_is_not_in_it(
 MS = 1_000_000
 
 
-def _plan(*servers: Server) -> Plan:
+def _plan(*servers: Server) -> ApplicationPlan:
     """A plan with these servers and nothing to publish."""
     plan = plan_shaping(np.array([5 * MS, 20 * MS]), 100 * MS)
-    return revised(plan, servers=servers)
+    return whole(revised(plan, servers=servers))
 
 
 def _server(
@@ -284,9 +285,8 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
         receivers=("/sink", "/a", "/absent"),
     )
     chain = _server("chain", EXECUTOR_A, priority=2)
-    plan = revised(
-        _plan(chain, _server("output", node.thread, priority=1, start=1)), shaping_node=node
-    )
+    bare = _plan(chain, _server("output", node.thread, priority=1, start=1)).chains[0]
+    plan = whole(revised(bare, shaping_node=node))
     gate, sink = _node("/gate", 100, "executor"), _node("/sink", 300, "executor", "dds", "unknown")
     receiving = replace(sink[1], thread=replace(sink[1].thread, kind="receive"))
     allocation = _allocation(gate, _node("/a", 200, "executor"), [sink[0], receiving, sink[2]])
@@ -300,7 +300,7 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
     more_cores = _by_tid(plan_scheduling(plan, allocation, (0, 1, 2, 3)))
     assert more_cores[301] == Scheduling(91, (0,)), "the core that is kept clear for them"
     assert 300 not in _by_tid(left_by_back_end("scx", wanted)), "it would outrank the servers"
-    alone = revised(plan, shaping_node=node.model_copy(update={"receivers": ()}))
+    alone = whole(revised(bare, shaping_node=node.model_copy(update={"receivers": ()})))
     assert set(_by_tid(plan_scheduling(alone, allocation, (0, 1)))) == {100, 200}
 
 
@@ -385,7 +385,7 @@ def test_more_priorities_than_there_are_are_refused() -> None:
 
 
 @st.composite
-def applications(draw: st.DrawFn) -> tuple[Plan, Allocation]:
+def applications(draw: st.DrawFn) -> tuple[ApplicationPlan, Allocation]:
     """Nodes with executors, publishers and DDS threads, spread over servers on two cores."""
     count = draw(st.integers(1, 5))
     nodes: list[list[NodeThread]] = []
@@ -410,7 +410,7 @@ def applications(draw: st.DrawFn) -> tuple[Plan, Allocation]:
 
 @given(applications())
 def test_whatever_the_plan_the_order_of_priorities_holds(
-    application: tuple[Plan, Allocation],
+    application: tuple[ApplicationPlan, Allocation],
 ) -> None:
     plan, allocation = application
     wanted = plan_scheduling(plan, allocation, (0, 1, 2))

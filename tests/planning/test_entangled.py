@@ -6,7 +6,7 @@ import pytest
 
 from chainshaper import measure_latency, simulate
 from chainshaper.flow.plan import plan_recording, profile_chains
-from chainshaper.planning import Plan, PlanRequest, place_chains, plan_chains, publish_slots
+from chainshaper.planning import Plan, PlanRequest, place_chains, plan_application, publish_slots
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application, load_application
@@ -109,19 +109,32 @@ def test_a_sink_that_forks_off_is_planned_right(
     assert (node.output, node.receivers) == (sink.rpartition("..")[2], receivers)
 
 
-@pytest.mark.parametrize("second", ["/o1../o2", "/b1../b2"])
-def test_chains_that_share_no_more_than_a_core_are_planned_right(
-    second: str, application: Application, recording: Recording, tmp_path: Path
+@pytest.mark.parametrize(
+    ("others", "apart"),
+    [
+        (["/o1../o2"], False),  # on a core of its own
+        (["/b1../b2"], True),  # takes turns with the first
+        (["/t1../forked", "/t1../twin"], False),  # sinks of one graph, in slots apart
+        (["/b1../b2", "/t1../forked", "/o1../o2"], True),
+    ],
+)
+def test_chains_are_planned_together(
+    others: list[str], apart: bool, application: Application, recording: Recording, tmp_path: Path
 ) -> None:
-    """The second chain has a core of its own, or takes turns with the first."""
-    chains = ("/t1../t3", second)
-    plans, remarks = place_chains(plan_chains(profile_chains(recording, chains), REQUEST))
+    """All at once in force, every output comes in its slot, the first chain's where it was."""
+    chains = ["/t1../t3", *others]
+    plan, remarks = plan_application(profile_chains(recording, chains), REQUEST)
     assert not remarks
-    assert (plans[1].offset_ns > 0) == (second == "/b1../b2")
-    for plan, chain in zip(plans, chains, strict=True):
-        ((opens, closes),) = publish_slots(plan)
-        first, last = _outputs(application, plan, chain, tmp_path / chain.replace("/", "_"))
-        assert opens <= first <= last < closes
+    assert any(one.offset_ns for one in plan.chains) == apart
+    assert publish_slots(plan.chains[0]) == publish_slots(
+        plan_recording(recording, "/t1../t3", REQUEST)
+    )
+    together = simulate(application, tmp_path / "together", plan, cycles=200)
+    for one, chain in zip(plan.chains, chains, strict=True):
+        ((opens, closes),) = publish_slots(one)
+        found = measure_latency(together, chain).analysis.statistics
+        assert (found.count, found.late, found.jitter_ns) == (200, 0, 0)
+        assert opens <= (found.min_ns or 0) < closes
 
 
 @pytest.mark.parametrize(
@@ -130,7 +143,7 @@ def test_chains_that_share_no_more_than_a_core_are_planned_right(
         (("/t1../t3", "/t1../t2"), "/t1../t3 waits for /t2, which the plan for /t1../t2"),
         (("/t1../t2", "/t1../t3"), "/t1../t3 waits for /t2, which the plan for /t1../t2"),
         (("/t1../t2../t3../end", "/t1../t3"), "waits for /t3, which"),
-        (("/t1../t3", "/t1../t3"), "both publish /t3"),
+        (("/t1../t3", "/t1../t3"), "the chain /t1../t3 is given twice"),
         (("/t1../t3", "second../t3"), "both publish /t3"),
         # What a synchronising callback waits for is on a branch of the chain to it.
         (("/t1../t2../t3../met", "/t1../forked"), "waits for /forked, which"),
@@ -144,27 +157,14 @@ def test_a_chain_that_waits_for_what_another_has_shaped_is_refused(
         if as_sink:
             plan_recording(recording, chains[0], period_ns=100 * MS, sinks=chains[1:])
         else:
-            plan_chains(profile_chains(recording, chains, period_ns=100 * MS))
+            plan_application(profile_chains(recording, chains, period_ns=100 * MS))
     assert words in str(refused.value)
     assert all(chain in str(refused.value) for chain in chains)
 
 
-@pytest.mark.parametrize(
-    ("second", "words"),
-    [
-        ("/t1../forked", "share /first: a thread runs in the servers of one plan"),
-        ("/t1../twin", "share /first, /second"),
-    ],
-)
-def test_chains_that_share_nodes_are_sinks_of_one_or_refused(
-    second: str, words: str, recording: Recording
-) -> None:
-    profiles = profile_chains(recording, ("/t1../t3", second))
-    with pytest.raises(InputError, match="as its --sink") as refused:
-        plan_chains(profiles)
-    assert words in str(refused.value)
-    one_by_one = [plan_recording(recording, chain) for chain in ("/t1../t3", second)]
-    with pytest.raises(InputError, match="a thread runs in the servers of one plan"):
+def test_plans_made_one_by_one_are_not_those_of_one_graph(recording: Recording) -> None:
+    one_by_one = [plan_recording(recording, chain) for chain in ("/t1../t3", "/t1../forked")]
+    with pytest.raises(InputError, match="begin at the same callback: plan them together"):
         place_chains(one_by_one)
     with pytest.raises(InputError, match="both publish /t3"):
         place_chains(one_by_one[:1] * 2)
@@ -175,8 +175,8 @@ def test_what_else_has_no_plan_together_is_refused(recording: Recording) -> None
         plan_recording(recording, "/t1../t3", sinks=["/o1../o2"])
     profiles = profile_chains(recording, ("/t1../t3", "behind../end"), period_ns=100 * MS)
     with pytest.raises(InputError, match=r"behind\.\./end waits for /t3, which"):
-        plan_chains(profiles)
+        plan_application(profiles)
     # LET of every callback shapes what lies on the way, too.
     forked = profile_chains(recording, ("/t1../t3", "/t1../forked"))
     with pytest.raises(InputError, match=r"/t1\.\./forked waits for /t1, which the plan for"):
-        plan_chains(forked, PlanRequest(policy="let-per-callback"))
+        plan_application(forked, PlanRequest(policy="let-per-callback"))

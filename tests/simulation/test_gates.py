@@ -58,7 +58,7 @@ def as_array(gate: Gate) -> tuple[at.Int64s, int]:
     some: Any = SimpleNamespace
     described = some(gate=some(**vars(gate), spin_ns=0, pause_ns=0))
     rows = Rows([0] * X.COLUMNS)
-    place = _add_gate(rows, some(modes=NAMES), described, some(anchor_ns=gate.phase_ns))
+    place = _add_gate(rows, some(modes=NAMES), described, some(start_ns=0))
     return np.array(rows, dtype=np.int64), place
 
 

@@ -52,7 +52,7 @@ def _changed(plan: Plan, **changes: object) -> Plan:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"output": "/t9"}, "/t9, which no node of the application publishes; exactly one"),
+        ({"output": "/t9"}, "publishes /t9, but the chain's output is /t3"),
         ({"name": "second"}, "has a node 'second' already.*change it in the plan"),
         ({"input": "/t1"}, "publishes /t1 already.*change `shaping_node.input` in the plan"),
         ({"fifo_priority": 98}, "cannot be run: priority: 98 should be less than or equal to 97"),

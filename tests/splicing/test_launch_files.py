@@ -203,11 +203,14 @@ def test_an_input_reaches_its_subscribers_by_way_of_one_throttler(
     assert (parameters["period_ns"], parameters["fifo_priority"]) == (100 * MS, 85)
 
 
-def test_inputs_of_other_periods_have_a_throttler_of_their_own(robot: Path) -> None:
+def test_inputs_of_other_periods_or_rules_have_a_throttler_of_their_own(robot: Path) -> None:
     both = [REAR.model_copy(update={"subscriber": node}) for node in ("/fusion", "/icp")]
     inputs = [*both, ThrottledInput(topic="/front", period_ns=50 * MS, subscriber="/fusion")]
+    inputs += [inputs[-1].model_copy(update={"topic": "/side", "rule": "first"})]
     spliced = splice_throttlers(inputs, [robot], robot.parent / "out", node="cpp")
-    names = ["chainshaper_throttler", "chainshaper_throttler_2"]
+    names = ["chainshaper_throttler", "chainshaper_throttler_2", "chainshaper_throttler_3"]
+    read = [one.parameters_file.read_text() for one in spliced.processes]
+    assert ["rule: first" in text for text in read] == [False, False, True]
     assert [process.name for process in spliced.processes] == names
     assert [one["added"] for one in launched(spliced)["REDIRECTS"]] == [(f"/{n}",) for n in names]
     assert redirects(spliced)["/rear"] == ("/rear_throttled", ("/fusion", "/icp"))

@@ -16,6 +16,7 @@ import pytest
 from node_run import SLOTS, banded
 from ros2 import ros2_environment
 
+from chainshaper.gate.throttling import RULES, Rule
 from chainshaper.planning import Plan
 from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log
@@ -221,12 +222,13 @@ def test_a_typed_node_refuses_another_type(
         other.wait()
 
 
+@pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("kind", ["python", "cpp"])
 def test_the_throttler_publishes_once_a_period(
-    tmp_path: Path, kind: Any, place: Path | None
+    tmp_path: Path, kind: Any, place: Path | None, rule: Rule
 ) -> None:
     # Messages come every 50 ms, so that two are there each time.
-    process = write_throttler({"/t3_tmp": "/t3"}, 100 * MS, kind, tmp_path)
+    process = write_throttler({"/t3_tmp": "/t3"}, 100 * MS, kind, tmp_path, rule=rule)
     with started(process, place) as child:
         _, *messages = exchanged("latched")
         time.sleep(0.3)
@@ -239,4 +241,9 @@ def test_the_throttler_publishes_once_a_period(
     published, missing, dropped = [int(word) for word in summary.split() if word.isdigit()]
     assert published == len(numbers)
     assert published + dropped in (COUNT - 1, COUNT)  # one may have been taken and not published
-    assert missing > 0, "none came before and after"
+    if rule == "newest":
+        assert missing > 0, "none came before and after"
+    else:
+        assert (numbers[0], missing) == (0, 0)
+        delays = sorted(message["since_start"] for message in messages)
+        assert delays[len(delays) // 2] < 20 * MS, "they leave as they come"

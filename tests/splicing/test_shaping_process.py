@@ -401,8 +401,8 @@ def test_the_throttler_publishes_what_is_newest_and_counts_the_rest(tmp_path: Pa
     assert published == [("/rear", "bb"), ("/front", "cc"), ("/front", "dd")]
     texts = [words["text"] for words in run.said if "text" in words]
     assert texts == [
-        "/rear: 1 published, 1 times nothing new, 1 dropped for newer ones",
-        "/front: 2 published, 0 times nothing new, 0 dropped for newer ones",
+        "/rear: 1 published, 1 times nothing new, 1 dropped",
+        "/front: 2 published, 0 times nothing new, 0 dropped",
     ]
     assert any("nothing new for /rear" in text for text in run.logged)
     timers = [words for words in run.said if "timer" in words]
@@ -412,6 +412,26 @@ def test_the_throttler_publishes_what_is_newest_and_counts_the_rest(tmp_path: Pa
     for words in timers:
         assert (words["time"] - phase) % period < period // 4
     assert {words["clock"] for words in timers} == {3}, "CLOCK_MONOTONIC"
+
+
+def test_by_the_papers_rule_the_first_message_of_a_period_is_published_as_it_comes(
+    tmp_path: Path,
+) -> None:
+    topics = {"/rear/raw": "/rear", "/front/raw": "/front"}
+    process = write_throttler(topics, 2_000 * MS, "python", tmp_path, rule="first")
+    with running_node(process, tmp_path, RAW) as run:
+        for payload in ("aa", "bb"):
+            run.tell(topic="/rear/raw", payload=payload, source=1)
+        run.tell(topic="/front/raw", payload="cc", source=1)
+        run.hear(lambda words: words.get("payload") == "cc")
+        time.sleep(1.7)  # four fifths of a period
+        run.tell(topic="/rear/raw", payload="dd", source=1)
+        assert run.end() == 0
+    published = [words["payload"] for words in run.said if "published" in words]
+    assert published == ["aa", "cc", "dd"]
+    texts = [words["text"] for words in run.said if "text" in words]
+    assert texts[0] == "/rear: 2 published, 0 times nothing new, 1 dropped"
+    assert not any("timer" in words for words in run.said)
 
 
 def test_the_throttler_is_in_the_cpp_package_too(tmp_path: Path) -> None:
@@ -427,3 +447,5 @@ def test_a_throttler_needs_topics_and_a_period(
 ) -> None:
     with pytest.raises(InputError, match="needs topics and a period"):
         write_throttler(topics, period, "python", tmp_path)
+    with pytest.raises(InputError, match="`first` has no phase"):
+        write_throttler({"/raw": "/scan"}, 1, "python", tmp_path, rule="first", phase_ns=1)

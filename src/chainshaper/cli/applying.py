@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 LINE_EVERY = 10
 
 
-def recording_of(plan: "cs.Plan") -> Path | None:
+def recording_of(plan: "cs.ApplicationPlan") -> Path | None:
     """The recording that a plan was made from, where it is still there."""
-    own = Path(plan.evidence.recording or "")
-    return own if plan.evidence.recording and own.is_dir() else None
+    named = plan.chains[0].evidence.recording
+    return Path(named) if named and Path(named).is_dir() else None
 
 
 def threads(
@@ -52,11 +52,11 @@ def threads(
     """Show the threads of running nodes: executors, DDS threads, publishers; class and cores."""
     from chainshaper.reporting.overviews import threads_json, threads_table
 
-    place: int | cs.Plan | None = None
+    place: int | cs.ApplicationPlan | None = None
     if where is not None and where.isdecimal():
         place = int(where)
     elif where is not None:
-        place = cs.load_plan(where)
+        place = cs.load_application_plan(where)
         recording = recording or recording_of(place)
     recorded = None if recording is None else cs.open_source(recording)
     found = cs.find_threads(place, recorded, users=user or ())
@@ -98,7 +98,7 @@ def apply(
     """
     from chainshaper.reporting.overviews import servers_table
 
-    planned = cs.load_plan(plan)
+    planned = cs.load_application_plan(plan)
     how: dict[str, Any] = {
         "recording": None if recording is None else cs.open_source(recording),
         "phase_ns": phase,
@@ -127,7 +127,9 @@ def apply(
         raise OperationError(f"the command ended with code {done.exit_code}")
 
 
-def _show_changes(plan: "cs.Plan", backend: str, json: bool, how: dict[str, Any]) -> None:
+def _show_changes(
+    plan: "cs.ApplicationPlan", backend: str, json: bool, how: dict[str, Any]
+) -> None:
     import shlex
 
     from chainshaper.reporting.overviews import changes_table

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 Source: TypeAlias = Literal["lttng", "ebpf"]
 
+DESCRIPTIONS = (".yaml", ".yml")
+"""What files that people write end with: applications and plans."""
+
 NodeKind: TypeAlias = Literal["python", "cpp", "typed"]
 """How a shaping node is made."""
 
@@ -114,9 +117,9 @@ NODE: NodeKind = option(
 )
 
 
-def plan_in_force(path: Path | None) -> "cs.Plan | None":
+def plan_in_force(path: Path | None) -> "cs.ApplicationPlan | None":
     """The plan of a file, if one is named."""
-    return None if path is None else cs.load_plan(path)
+    return None if path is None else cs.load_application_plan(path)
 
 
 _WISHES = {field.name: field for field in fields(Wishes)}

@@ -84,11 +84,12 @@ def notes(lines: Iterable[str]) -> None:
         say(f"note: {line}")
 
 
-def warn(plan: "cs.Plan") -> None:
+def warn(plan: "cs.Plan | cs.ApplicationPlan") -> None:
     """What is doubtful about a plan, before it is used."""
     from chainshaper.planning import plan_warnings
+    from chainshaper.planning.application_plan import whole
 
-    notes(plan_warnings(plan))
+    notes(dict.fromkeys(said for one in whole(plan).chains for said in plan_warnings(one)))
 
 
 @contextmanager

@@ -9,6 +9,7 @@ import chainshaper as cs
 from chainshaper.cli.applying import recording_of
 from chainshaper.cli.options import (
     APPLICATION,
+    DESCRIPTIONS,
     JSON,
     NODE,
     PLAN_WISHES,
@@ -16,7 +17,6 @@ from chainshaper.cli.options import (
     NodeKind,
     argument,
     option,
-    plan_in_force,
     takes_wishes,
     wish,
 )
@@ -31,11 +31,9 @@ def plan(
     chain: list[str] | None = option(
         "--chain FIRST..LAST",
         "The chain, by topics or nodes: /t1../t5. Default: the one the recording names."
-        " Give several to plan chains that share cores: their offsets are found.",
+        " Give several to plan them together: what they share, and when each one's cycles start.",
     ),
-    output: Path | None = option(
-        "--output -o plan.yaml", "File to write; for several chains a folder, which must not exist."
-    ),
+    output: Path | None = option("--output -o plan.yaml", "File to write; must not exist."),
     latencies: Path | None = option(
         "--latencies FILE", "Instead of a recording: a duration a line, or .npy in ns."
     ),
@@ -69,7 +67,7 @@ def plan(
     """
     from chainshaper.planning import (
         band_choice,
-        plan_chains,
+        plan_application,
         plan_json,
         plan_warnings,
         publish_slots,
@@ -92,7 +90,7 @@ def plan(
     if len(planned) > 1:
         if sinks or curve is not None:
             raise InputError("--sink and --curve go with one chain: plan chains one by one")
-        _place_and_print(plan_chains(planned, request), output, json)
+        _print_application(*plan_application(planned, request), output, json)
         return
     made = cs.plan_chain(planned[0], request, sinks)
     choice = band_choice(made, planned[0], request) if request.bands == "auto" else None
@@ -134,7 +132,8 @@ def _profiles(
 def offsets(
     plans: list[Path] = argument("PLAN PLAN...", "Plans, one a chain.", ...),
     output: Path | None = option(
-        "--output -o DIR", "Folder to write the plans into; must not exist."
+        "--output -o plan.yaml",
+        "One plan of all chains; or a folder, for a plan each. Must not exist.",
     ),
     time_limit: float = option(
         "--time-limit SECONDS", "How long to search, per group.", 60.0, min=0.1
@@ -146,17 +145,36 @@ def offsets(
     Where chains cannot take turns on a core, they run at the same time at different priorities, and
     only their publish slots are kept apart.
     """
-    _place_and_print([cs.load_plan(path) for path in plans], output, json, time_limit)
+    from chainshaper.planning import save_plans
+    from chainshaper.planning.application_plan import combined
+    from chainshaper.planning.several_chains import numbered
+
+    placed, remarks = cs.place_chains(
+        [chain for path in plans for chain in cs.load_application_plan(path).chains],
+        time_limit_s=time_limit,
+    )
+    if output is not None and output.suffix in DESCRIPTIONS:
+        alone = [[place] for place in range(len(placed))]
+        _print_application(combined(numbered(placed, alone)), remarks, output, json)
+        return
+    written = [] if output is None else save_plans(placed, output)
+    _print_placed(placed, remarks, written, json)
 
 
-def _place_and_print(
-    plans: "Sequence[cs.Plan]", output: Path | None, json: bool, time_limit: float = 60.0
+def _print_application(
+    plan: "cs.ApplicationPlan", remarks: Sequence[str], output: Path | None, json: bool
 ) -> None:
-    from chainshaper.planning import plan_json, plan_warnings, save_plans
+    if output is not None:
+        cs.save_application_plan(plan, output)
+    _print_placed(plan.chains, remarks, [] if output is None else [output], json)
+
+
+def _print_placed(
+    placed: "Sequence[cs.Plan]", remarks: Sequence[str], written: Sequence[Path], json: bool
+) -> None:
+    from chainshaper.planning import plan_json, plan_warnings
     from chainshaper.reporting.overviews import plan_table
 
-    placed, remarks = cs.place_chains(plans, time_limit_s=time_limit)
-    written = [] if output is None else save_plans(placed, output)
     warnings = [*remarks, *(warning for one in placed for warning in plan_warnings(one))]
     files = [str(path) for path in written]
     values = {"plans": [plan_json(one) for one in placed], "files": files, "warnings": warnings}
@@ -205,7 +223,8 @@ def sweep(
         raise InputError("a cluster has workers of its own: leave out --workers, or --scheduler")
     if draw is not None:
         draw = new_file(draw, (".png", ".pdf", ".svg"))
-    described, in_force = cs.load_application(application), plan_in_force(plan)
+    described = cs.load_application(application)
+    in_force = None if plan is None else cs.load_plan(plan)
     axes = [parse_axis(text) for text in vary]
     if len(dict(axes)) < len(axes):
         raise InputError("an axis is given twice: give all of its values in one --vary")
@@ -244,9 +263,10 @@ def splice(
     *,
     output: Path = option("--output -o DIR", "Folder for the launch file.", ...),
     throttle: list[str] | None = option(
-        "--throttle [NODE:]TOPIC=PERIOD",
+        "--throttle [NODE:]TOPIC=PERIOD[,RULE]",
         "Instead of a plan: a throttler before an input that is not quite periodic, for "
-        "NODE or whoever subscribes in the recording (may be repeated).",
+        "NODE or whoever subscribes in the recording (may be repeated). RULE: newest, at fixed "
+        "instants (default), or first, as it comes.",
     ),
     node: NodeKind = NODE,
     message_type: str | None = option(
@@ -305,7 +325,7 @@ def splice(
     elif plan is None or not files:
         raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
     else:
-        planned = cs.load_plan(plan)
+        planned = cs.load_application_plan(plan)
         warn(planned)
         common |= {"message_type": message_type, "fallback": fallback}
         known = _opened(recording or recording_of(planned))
@@ -318,7 +338,7 @@ def splice(
 
 
 def _throttled(inputs: list[str], recording: Path | None, common: dict[str, Any]) -> "cs.Splicing":
-    """Inputs as they are written: ``/fusion:/points_raw=100ms``."""
+    """Inputs as they are written: ``/fusion:/points_raw=100ms``, ``/points_raw=100ms,first``."""
     from chainshaper.values.durations import parse_duration
     from chainshaper.values.yaml_file import wrong_values_refused
 
@@ -326,11 +346,13 @@ def _throttled(inputs: list[str], recording: Path | None, common: dict[str, Any]
         raise InputError("give the launch files: `splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`")
     parsed = []
     for text in inputs:
-        where, equals, period = text.rpartition("=")
+        where, equals, how = text.rpartition("=")
+        period, comma, rule = how.partition(",")
         if not equals:
             raise InputError(f"--throttle {text}: write a topic and a period: /points_raw=100ms")
         node, _, topic = where.rpartition(":")
         values = {"topic": topic, "period_ns": parse_duration(period), "subscriber": node or None}
+        values |= {"rule": rule} if comma else {}
         with wrong_values_refused(cs.ThrottledInput):
             parsed.append(cs.ThrottledInput.model_validate(values))
     return cs.splice_throttlers(parsed, recording=_opened(recording), **common)

@@ -12,6 +12,7 @@ from chainshaper.cli.options import (
     APPLICATION,
     CHAIN,
     CYCLES,
+    DESCRIPTIONS,
     JSON,
     NODE,
     REALTIME,
@@ -48,7 +49,7 @@ if TYPE_CHECKING:
 
 MIB = 1 << 20
 STDERR = 2
-DESCRIPTIONS = (".yaml", ".yml")
+
 SHAPING_DURATION_NS = 60_000_000_000
 
 COMMAND: list[str] | None = argument(
@@ -363,7 +364,7 @@ def _shape_described(
 ) -> None:
     from chainshaper.verify.overruns import dropped_in, dropped_text, overruns_in, overruns_text
 
-    described, planned = cs.load_application(application), cs.load_plan(plan)
+    described, planned = cs.load_application(application), cs.load_application_plan(plan)
     warn(planned)
     with progress(f"shaping {described.name}") as report:
         recording = cs.shape_application(
@@ -375,8 +376,9 @@ def _shape_described(
             command=sys.argv,
             progress=report,
         )
-    if overruns := overruns_in(recording, planned):
-        notes([overruns_text(overruns)])
+    for chain in planned.chains:
+        if overruns := overruns_in(recording, chain):
+            notes([overruns_text(overruns)])
     if dropped := dropped_in(recording):
         notes([dropped_text(dropped)])
     notes(recording.info.notes)

@@ -34,7 +34,8 @@ from chainshaper.linux.processes import (
 )
 from chainshaper.linux.scheduling import Scheduling
 from chainshaper.linux.threads import TICK_NS, Thread, ThreadRole
-from chainshaper.planning.plan import Plan, Server, shaping_nodes
+from chainshaper.planning.application_plan import ApplicationPlan
+from chainshaper.planning.plan import Server
 from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.values.errors import InputError, OperationError
 
@@ -258,7 +259,9 @@ class WantedScheduling:
     reason: str
 
 
-def server_members(plan: Plan, allocation: Allocation) -> dict[str, tuple[NodeThread, ...]]:
+def server_members(
+    plan: ApplicationPlan, allocation: Allocation
+) -> dict[str, tuple[NodeThread, ...]]:
     """The threads of each server of a plan, by the server's name.
 
     Nodes of one process may share an executor: then it is one thread of their server. Raises
@@ -326,7 +329,7 @@ def server_priorities(priorities: Iterable[int]) -> dict[int, int]:
 
 
 def plan_scheduling(
-    plan: Plan, allocation: Allocation, available_cores: Sequence[int]
+    plan: ApplicationPlan, allocation: Allocation, available_cores: Sequence[int]
 ) -> tuple[WantedScheduling, ...]:
     """What every thread concerned by a plan shall get: servers' threads first, then the others.
 
@@ -337,7 +340,7 @@ def plan_scheduling(
     members = server_members(plan, allocation)
     planned = {one.thread.identity for group in members.values() for one in group}
     below = min(server_priorities(server.priority for server in plan.servers).values()) - _STEP
-    cores = {receiver: node.core for node in shaping_nodes(plan) for receiver in node.receivers}
+    cores = {receiver: node.core for node in plan.shaping_nodes for receiver in node.receivers}
     receiving = [
         WantedScheduling(one, Scheduling(max(1, below), (core,)), None, _RECEIVES)
         for one in allocation.threads

@@ -10,13 +10,15 @@ The shaping node is its own server: its thread gets a priority and a core, and n
 """
 
 import contextlib
+import json
 import os
 import subprocess
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,19 +28,27 @@ from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, ma
 from chainshaper.enforcement.freezer import groups_of, run_of
 from chainshaper.enforcement.guardian import Guardians, run_claimed
 from chainshaper.enforcement.scheduling_memory import change_all, look_alikes, note_descendants
-from chainshaper.enforcement.servers import BackEnd, ServerCounters, ServerTable
+from chainshaper.enforcement.servers import BackEnd, ServerCounters
 from chainshaper.enforcement.threads import Allocation, NodeThread, RecordedProcess
 from chainshaper.enforcement.undoing import RunState, ServerState
 from chainshaper.flow import threads
-from chainshaper.flow.phase import NO_NODE, DriftWatch, Telling, measure_phase, tell_phase
+from chainshaper.flow.drift import TimerTrack
+from chainshaper.flow.phase import DriftWatch, Phase, Telling, tell_phase
 from chainshaper.flow.threads import LEAD_NS
 from chainshaper.linux.own_processes import end_command, start_command
 from chainshaper.linux.processes import run_users
 from chainshaper.linux.runs import PLAN_FILE, Journal
 from chainshaper.linux.scheduling import available_cores, check_cores
 from chainshaper.linux.threads import list_threads
-from chainshaper.planning.overruns import open_until_done, publication_warnings, refuse_offset
-from chainshaper.planning.plan import Plan, publisher_servers, shaping_nodes
+from chainshaper.planning.application_plan import (
+    ApplicationPlan,
+    open_until_done,
+    plan_values,
+    whole,
+)
+from chainshaper.planning.offsets import chain_name
+from chainshaper.planning.overruns import publication_warnings
+from chainshaper.planning.plan import Plan, shaping_nodes
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 
@@ -64,7 +74,7 @@ class Applied:
 
 
 def apply_plan(
-    plan: Plan,
+    plan: Plan | ApplicationPlan,
     command: Sequence[str] = (),
     *,
     command_stdout: int | None = None,
@@ -83,32 +93,34 @@ def apply_plan(
 
     ``command`` is started first (its output goes to ``command_stdout``); without one, the
     application runs already. Its nodes have ``wait_ns`` to appear (default: 30 s with a command,
-    else none). ``phase_ns`` is where in a cycle the chain's first timer expires, on CLOCK_MONOTONIC
-    (None: it is measured). ``recording`` is one of the very processes. Only processes of ``users``
-    (names or numbers; default: who launched us, and root) are nodes of the plan. ``watch`` gets the
-    state every second; ``folder`` is where runs stand (default: `/run/chainshaper`).
+    else none). ``phase_ns`` is where in a cycle the first chain's timer expires, on CLOCK_MONOTONIC
+    (None: those of all chains are measured). ``recording`` is one of the very processes. Only
+    processes of ``users`` (names or numbers; default: who launched us, and root) are nodes of the
+    plan. ``watch`` gets the state every second; ``folder`` is where runs stand (default:
+    `/run/chainshaper`).
 
     Raises:
-        InputError: the plan names no threads, or has an offset; or there is no such user.
+        InputError: the plan names no threads, or has offsets, which priorities alone cannot carry
+            out; or there is no such user.
         PlatformError: the machine lacks a core or the back end, or we a privilege.
         OperationError: another run governs a core or node, a node does not appear or is ambiguous,
             the chain has no regular beginning, the kernel refuses something, the servers failed,
             the application ended by itself, or ``stop`` was set before the plan was in force.
     """
-    refuse_offset(plan)
-    given, plan = plan, open_until_done(plan)
-    table, taken = threads.server_table(plan), run_users(users)
-    check_cores({server.core: f"server {server.name}" for server in plan.servers})
+    given, taken = whole(plan), run_users(users)
+    threads.server_table(given)
+    check_cores({server.core: f"server {server.name}" for server in given.servers})
     choice = choose_back_end(back_end)
-    nodes = {thread.node for server in plan.servers for thread in server.threads}
-    nodes.update(receiver for node in shaping_nodes(plan) for receiver in node.receivers)
+    threads.refuse_offsets(given, choice.name)
+    nodes = {thread.node for server in given.servers for thread in server.threads}
+    nodes.update(receiver for node in given.shaping_nodes for receiver in node.receivers)
     recorded: tuple[RecordedProcess, ...] = ()
     if recording is not None:  # looked up once: that takes longer than looking at processes
         recorded, _ = threads.recorded_processes(recording)
     stop = stop or threading.Event()
-    cores = {server.core for server in plan.servers}
+    cores = {server.core for server in given.servers}
     journal = undoing.claim_run(cores, nodes, folder, lambda: _go_on(stop))
-    run = _Run(given, plan, choice, journal, recorded, taken, stop)
+    run = _Run(given, given, choice, journal, recorded, taken, stop)
     try:
         run.guardians = Guardians(journal)
         if command:
@@ -116,9 +128,11 @@ def apply_plan(
         run.await_nodes((START_NS if command else 0) if wait_ns is None else wait_ns, progress)
         run.guardians.await_ready(run.go_on)
         run.schedule()
+        run.begin_state(command, plan_path)
+        run.find_anchor(phase_ns, progress)
+        table = threads.server_table(run.plan)
         run.servers = make_back_end(choice.name, table, journal, run.go_on)
-        run.begin_state(table, command, plan_path)
-        run.arm(run.servers, phase_ns, progress)
+        run.arm(run.servers, progress)
         run.watch_over(run.servers, watch)
         strangers = look_alikes(journal, groups_of(run_of(journal)))
     finally:
@@ -139,8 +153,8 @@ def _go_on(stop: threading.Event) -> None:
 class _Run:
     """What belongs together, and is to be put back, while a plan is in force."""
 
-    given: Plan
-    plan: Plan  # as it is carried out: with room for overruns
+    given: ApplicationPlan
+    plan: ApplicationPlan  # as it is carried out: with room for overruns, once timers are known
     choice: Choice
     journal: Journal
     recorded: tuple[RecordedProcess, ...]
@@ -149,7 +163,9 @@ class _Run:
     guardians: Guardians | None = None
     command: subprocess.Popen[bytes] | None = None
     servers: BackEnd | None = None
-    telling: Telling = NO_NODE
+    telling: list[Telling] = field(default_factory=list)
+    anchor_ns: int = 0
+    waits_ns: list[int] = field(default_factory=list)  # from each timer to its slot, if measured
     found: Allocation = field(init=False)
     state: RunState = field(init=False)
 
@@ -203,9 +219,7 @@ class _Run:
         left = allocation.left_by_back_end(self.choice.name, wanted)
         change_all(self.journal, ((one.thread.thread, one.wanted) for one in left))
 
-    def begin_state(self, table: ServerTable, command: Sequence[str], plan_path: str) -> None:
-        keeper = self.choice.name if gates(self.choice.name) else "none: priority only"
-        kept_by = {server.name: keeper for server in table.servers}
+    def begin_state(self, command: Sequence[str], plan_path: str) -> None:
         self.state = RunState(
             run=self.folder.name,
             owner=os.getpid(),
@@ -218,60 +232,97 @@ class _Run:
             anchor_ns=None,
             phase_spread_ns=None,
             drift_ns=None,
-            servers=tuple(
-                ServerState(
-                    *(one.name, one.core, one.priority, one.slots, ()),
-                    kept_by=kept_by.get(one.name, "gate"),
-                    counters=_NOTHING,
-                )
-                for one in self.plan.servers
-            ),
-            notes=tuple(publication_warnings(self.plan)),
+            servers=(),
+            notes=tuple(note for one in self.plan.chains for note in publication_warnings(one)),
             failure=None,
         )
         self.name_strangers(self.found)
 
-    def arm(
-        self, servers: BackEnd, phase_ns: int | None, progress: Callable[[float, str], None]
-    ) -> None:
-        """Measure where the chain begins, put its threads into the servers, and close these."""
-        spread, cycle_ns = None, self.plan.cycle_ns
+    def find_anchor(self, phase_ns: int | None, progress: Callable[[float, str], None]) -> None:
+        """Measure where chains begin, and see from when on their slots count."""
         if phase_ns is None:
-            origin = threads.first_thread(self.plan, self.found)
+            phases = self.measure_phases(progress)
+            self.anchor_ns = threads.common_anchor(self.given, phases)
+            self.waits_ns = [
+                (self.anchor_ns + chain.offset_ns - phase.at_ns) % chain.cycle_ns
+                for chain, phase in zip(self.given.chains, phases, strict=True)
+            ]
+            spread = max(phase.spread_ns for phase in phases)
+            self.state = replace(self.state, phase_spread_ns=spread)
+        else:
+            anchor_ns = phase_ns + LEAD_NS - self.given.chains[0].offset_ns
+            self.anchor_ns = anchor_ns % self.given.cycle_ns
+        self.plan = open_until_done(self.given)
+        table, keeper = threads.server_table(self.plan), self.choice.name
+        if not gates(keeper):
+            keeper = "none: priority only"
+        kept_by = {server.name: keeper for server in table.servers}
+        servers = tuple(
+            ServerState(
+                *(one.name, one.core, one.priority, one.slots, ()),
+                kept_by=kept_by.get(one.name, "gate"),
+                counters=_NOTHING,
+            )
+            for one in self.plan.servers
+        )
+        self.state = replace(self.state, servers=servers)
 
-            def measured(share: float) -> None:
-                self.go_on()
-                progress(share, "measuring where in a cycle the chain begins")
-
-            phase = measure_phase(origin.pid, origin.tid, cycle_ns, progress=measured)
-            phase_ns, spread = phase.at_ns, phase.spread_ns
-            if spread > LEAD_NS:
-                self.note(
-                    f"the chain's beginning varies by {format_duration(spread)} from cycle to "
-                    "cycle: it is started by something less regular than a timer"
-                )
-        anchor = (phase_ns + LEAD_NS) % cycle_ns
-        # Held back by a server, the chain begins as its slot opens, otherwise with its timer.
-        begins = anchor if gates(self.choice.name) else phase_ns
-        self.telling = tell_phase(self.plan, self.found, begins)
-        while not (self.telling.is_over() or self.stop.wait(0.05) or self.command_ended):
+    def arm(self, servers: BackEnd, progress: Callable[[float, str], None]) -> None:
+        """Put the threads into the servers, and close these."""
+        anchor, cycle_ns = self.anchor_ns, self.plan.cycle_ns
+        self.tell(anchor)
+        while self.still_telling() and not (self.stop.wait(0.05) or self.command_ended):
             progress(1.0, "telling shaping nodes where cycles begin")
         self.end_telling()
         self.assign(servers)
         servers.arm(anchor)
         since = servers.in_force_from() or time.monotonic_ns()
         with contextlib.suppress(OSError):  # a full /run ends no plan; recordings lack it then
-            (self.folder / PLAN_FILE).write_text(self.given.model_dump_json())
+            (self.folder / PLAN_FILE).write_text(json.dumps(plan_values(self.given)))
         self.state = replace(
             self.state,
             anchor_ns=anchor,
-            phase_spread_ns=spread,
             in_force_ns=since + (anchor - since) % cycle_ns,
         )
 
+    def measure_phases(self, progress: Callable[[float, str], None]) -> list[Phase]:
+        """Where in its cycle each chain begins."""
+
+        def measured(share: float) -> None:
+            self.go_on()
+            progress(share, "measuring where in a cycle the chain begins")
+
+        phases = threads.chain_phases(self.plan, self.found, measured)
+        for chain, phase in zip(self.plan.chains, phases, strict=True):
+            if phase.spread_ns > LEAD_NS:
+                self.note(
+                    f"the beginning of {chain_name(chain)} varies by"
+                    f" {format_duration(phase.spread_ns)} from cycle to cycle: it is started by"
+                    " something less regular than a timer"
+                )
+        return phases
+
+    def begins(self, chain: Plan, anchor_ns: int) -> int:
+        """Where a chain begins in its cycles: as its slot opens, where a server stops it until
+        then, otherwise with its timer.
+        """
+        early = 0 if gates(self.choice.name) else LEAD_NS
+        return (anchor_ns + chain.offset_ns - early) % chain.cycle_ns
+
+    def tell(self, anchor_ns: int, moved_ns: Mapping[int, int] | None = None) -> None:
+        """Begin to give shaping nodes where cycles begin: all, or of chains that have moved."""
+        for place, chain in enumerate(self.plan.chains):
+            if moved_ns is None or place in moved_ns:
+                begins = self.begins(chain, anchor_ns) + (moved_ns or {}).get(place, 0)
+                telling = tell_phase(shaping_nodes(chain), self.found, begins % chain.cycle_ns)
+                self.telling.append(telling)
+
+    def still_telling(self) -> bool:
+        return not all(telling.is_over() for telling in self.telling)
+
     def assign(self, servers: BackEnd) -> None:
         """Put the threads that are not in their servers yet there."""
-        themselves = {node.thread.node for node in shaping_nodes(self.plan)}
+        themselves = {node.thread.node for node in self.plan.shaping_nodes}
         already = {one.name: one.threads for one in self.state.servers}
         members = allocation.server_members(self.plan, self.found)
         for name, group in members.items():
@@ -288,21 +339,17 @@ class _Run:
 
     def watch_over(self, servers: BackEnd, watch: Callable[[RunState], None]) -> None:
         """Watch over the run until it is to end; the state is then as it was last."""
-        origin, gated = threads.first_thread(self.plan, self.found), gates(self.choice.name)
-        begins = (self.state.anchor_ns or 0) - (0 if gated else LEAD_NS)
-        own = (s.slots for s in self.state.servers if gated and origin.tid in s.threads)
-        drift = DriftWatch(
-            *(origin.pid, origin.tid, self.plan.cycle_ns, begins, next(own, ())),
-            cores=set(available_cores()) - {server.core for server in self.plan.servers},
-        )
-        sent_ns, notes = 0, self.state.notes
+        drifts, sent, notes = self.drift_watches(), dict[int, int](), self.state.notes
+        following = self.follow(servers, drifts)
         latest: tuple[NodeThread, ...] = ()
         unsaved = untaken = ""
         while True:
             is_over = self.command_ended or self.stop.is_set()
-            moved_ns = drift.latest_ns
+            followed_ns = next(following)
+            seen = {k: one.latest_ns for k, one in enumerate(drifts)}
+            moved = {k: ns + followed_ns for k, ns in seen.items() if ns is not None}
             self.end_telling()
-            self.look_at(servers, moved_ns)
+            self.look_at(servers, max(moved.values(), key=abs, default=None))
             if is_over := is_over or self.state.failure is not None:
                 self.state = replace(self.state, ended_ns=time.monotonic_ns())
             trouble = filter(None, (unsaved, untaken))
@@ -318,20 +365,73 @@ class _Run:
             if is_over:
                 self.state = shown
                 return
-            if abs((moved_ns or 0) - sent_ns) > PHASE_BOUND_NS and self.telling is NO_NODE:
-                sent_ns = moved_ns or 0
-                self.telling = tell_phase(self.plan, self.found, begins + sent_ns)
-                moved = (
-                    f"the chain's beginning has moved by {format_duration(sent_ns)} since the plan "
-                    "was put in force; shaping nodes get it, and outputs without a stamp follow "
-                    "from the next cycle"
+            new = {k: ns for k, ns in moved.items() if abs(ns - sent.get(k, 0)) > PHASE_BOUND_NS}
+            if new and not self.telling:
+                sent.update(new)
+                self.tell(self.state.anchor_ns or 0, {k: ns - followed_ns for k, ns in new.items()})
+                said = (
+                    f"the beginning of {chain_name(self.plan.chains[place])} has moved by"
+                    f" {format_duration(ns)} since the plan was put in force; shaping nodes get it,"
+                    " and outputs without a stamp follow from the next cycle"
+                    for place, ns in sent.items()
                 )
-                self.state = replace(self.state, notes=(*notes, moved))
+                self.state = replace(self.state, notes=(*notes, *said))
             if self.stop.wait(_LOOK_S):
                 continue
             if self.guardians is not None:
                 self.guardians.renew()
             latest, untaken = self.look_again(servers, latest)
+
+    def follow(self, servers: BackEnd, drifts: Sequence[DriftWatch]) -> Iterator[int]:
+        """Move the slots with the chain's timer; yields how far they have moved (ns).
+
+        Of several chains the one with the shortest wait for its slot is followed: the timers of one
+        machine have one clock. Where outputs count from the cycle and not from their stamp, slots
+        stay where they are until the timer is seen behind their opening.
+        """
+        anchor_ns, waits = self.state.anchor_ns or 0, self.waits_ns
+        if not gates(self.choice.name) or not waits:
+            yield from repeat(0)
+        first = min(range(len(drifts)), key=lambda place: waits[place])
+        stamped = all(chain.anchor == "stamp" for chain in self.plan.chains)
+        track = TimerTrack(waits[first], time.monotonic_ns(), looks=stamped)
+        seen = 0
+        while True:
+            before_ns = track.opens_ns
+            if drifts[first].looks > seen:
+                seen = drifts[first].looks
+                track.saw(drifts[first].latest_ns or 0, time.monotonic_ns())
+            if track.opens_ns != before_ns:
+                moved_ns = (anchor_ns + track.opens_ns) % self.plan.cycle_ns
+                servers.arm(moved_ns)
+                self.state = replace(self.state, anchor_ns=moved_ns)
+                for chain, drift in zip(self.plan.chains, drifts, strict=True):
+                    drift.expect(self.begins(chain, moved_ns))
+            yield track.opens_ns
+
+    def drift_watches(self) -> list[DriftWatch]:
+        """Watches over where chains begin, one for each first thread."""
+        gated, cores = gates(self.choice.name), {server.core for server in self.plan.servers}
+        watches: dict[int, DriftWatch] = {}
+        found = []
+        for chain, origin in zip(
+            self.plan.chains, threads.first_threads(self.plan, self.found), strict=True
+        ):
+            if origin.tid not in watches:
+                own = (
+                    one.slots
+                    for one in chain.servers
+                    for state in self.state.servers
+                    if gated and state.name == one.name and origin.tid in state.threads
+                )
+                watches[origin.tid] = DriftWatch(
+                    *(origin.pid, origin.tid, chain.cycle_ns),
+                    self.begins(chain, self.state.anchor_ns or 0),
+                    next(own, ()),
+                    cores=set(available_cores()) - cores,
+                )
+            found.append(watches[origin.tid])
+        return found
 
     def look_at(self, servers: BackEnd, drift_ns: int | None) -> None:
         """What the servers have done so far, and why the plan is no longer in force, if so."""
@@ -394,9 +494,9 @@ class _Run:
 
     def end_telling(self) -> None:
         """Note what went wrong with telling the shaping nodes, once that is over."""
-        if self.telling.is_over():
-            telling, self.telling = self.telling, NO_NODE
-            self.note(*telling.end())
+        if not self.still_telling():
+            telling, self.telling = self.telling, []
+            self.note(*(said for one in telling for said in one.end()))
 
     def put_back(self) -> None:
         """Everything as it was: first let all threads go, then end our command, then the rest."""
@@ -406,7 +506,8 @@ class _Run:
                 self.servers.release()
             except OperationError as error:
                 problems.append(str(error))
-        self.telling.end()
+        for telling in self.telling:
+            telling.end()
         if self.command is not None:
             end_command(self.command)
         problems += undoing.undo_run(self.journal, by_owner=True)
@@ -421,7 +522,7 @@ class _Run:
 
 
 @contextlib.contextmanager
-def publishers_gated(plan: Plan, nodes: "StartedNodes") -> Iterator[None]:
+def publishers_gated(plan: ApplicationPlan, nodes: "StartedNodes") -> Iterator[None]:
     """Inside, the publisher threads that a plan names run in the slots of their servers only.
 
     For the live workload (paper, section 3.2.1, design 1): which process each node is, and when
@@ -433,7 +534,11 @@ def publishers_gated(plan: Plan, nodes: "StartedNodes") -> Iterator[None]:
             or the servers failed meanwhile.
     """
     choice = choose_back_end("freezer")  # the others want threads of the fair class
-    planned = [(server, names) for _, server, names in publisher_servers(open_until_done(plan))]
+    planned = [
+        (server, [thread.node for thread in server.threads if thread.role == "publisher"])
+        for server in open_until_done(plan).servers
+    ]
+    planned = [(server, names) for server, names in planned if names]
     table = threads.table_of(plan.cycle_ns, (server for server, _ in planned))
     cores = {server.core for server, _ in planned}
     with run_claimed(cores, {name for _, names in planned for name in names}) as journal:
@@ -443,7 +548,7 @@ def publishers_gated(plan: Plan, nodes: "StartedNodes") -> Iterator[None]:
                 for name in names:
                     for tid in _publisher_threads(name, nodes):
                         servers.assign(tid, server.name)
-            servers.arm(nodes.anchor_ns)
+            servers.arm(nodes.start_ns if plan.moves_timers else nodes.anchor_ns)
             yield
             failure = servers.failure()
         finally:

@@ -17,7 +17,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from chainshaper.planning.plan import Plan, ShapingNode, revised
+from chainshaper.gate.throttling import Rule
+from chainshaper.planning.application_plan import ApplicationPlan, combined, whole
+from chainshaper.planning.plan import Plan, ShapingNode, revised, shaping_nodes
 from chainshaper.sources.ros import own_environment, run_with_rclpy
 from chainshaper.splicing import redirection
 from chainshaper.splicing.redirection import Redirect
@@ -72,16 +74,18 @@ class Splicing:
 class ThrottledInput(Part):
     """A topic that is to reach its ``subscriber`` once every ``period_ns``, at the most.
 
-    Without a ``subscriber`` all of them are meant, as a recording knows them.
+    Without a ``subscriber`` all of them are meant, as a recording knows them. The ``rule`` says
+    which messages reach it, and when (:mod:`chainshaper.gate.throttling`).
     """
 
     topic: FullName
     period_ns: PositiveDuration
     subscriber: FullName | None = None
+    rule: Rule = "newest"
 
 
 def splice_launch_files(
-    plan: Plan,
+    plan: Plan | ApplicationPlan,
     launch_files: Sequence[str | Path],
     output: str | Path,
     *,
@@ -107,35 +111,37 @@ def splice_launch_files(
             redirected, or more than is meant.
         PlatformError: there is no ROS 2 environment for a dry run.
     """
-    if plan.shaping_node is None:
+    joint = whole(plan)
+    if fallback is not None:
+        joint = combined([revised(chain, fallback=fallback) for chain in joint.chains])
+    if any(chain.shaping_node is None for chain in joint.chains):
         raise InputError(
             "the plan has no `shaping_node`, so there is nothing to splice: plan again with"
             " `chainshaper plan REC --chain FIRST..LAST -o plan.yaml`"
         )
     folder = usable(Path(output))
     publishers = _endpoints(recording, "publisher")
-    nodes = (plan.shaping_node, *plan.further_shaping_nodes)
+    nodes = [(chain, node) for chain in joint.chains for node in shaping_nodes(chain)]
     redirects = [
         Redirect(
-            *("publisher", one.output, one.input, (_publisher(plan, one, publishers),)),
+            *("publisher", one.output, one.input, (_publisher(chain, one, publishers),)),
             added=(f"/{one.name}", f"/{one.name}{STANDBY}"),
         )
-        for one in nodes
+        for chain, one in nodes
     ]
-    plan = plan if fallback is None else revised(plan, fallback=fallback)
     seen = () if recording is None else recording.info.endpoints
     types = {one.topic: one.type for one in reversed(seen) if one.type}
-    logs = {one.name: folder / LOGS / f"{one.name}.csv" for one in nodes}
+    logs = {one.name: folder / LOGS / f"{one.name}.csv" for one in joint.shaping_nodes}
 
     def written(into: Path) -> _Written:
         made = [
             write_shaping_process(
-                *(plan, one, node, folder / NODES),
+                *(chain, one, node, folder / NODES),
                 message_type=message_type or types.get(one.output),
                 log=logs[one.name],
                 into=into,
             )
-            for one in nodes
+            for chain, one in nodes
         ]
         return made, redirects
 
@@ -158,8 +164,8 @@ def splice_throttlers(
     """Write a launch file whose nodes get these inputs by way of a throttler.
 
     It takes ``/points`` and republishes it as ``/points_throttled``, where the subscribers listen
-    now. Inputs with the same period have one throttler, as in the paper. A plan is spliced into
-    such a launch file later, since it is made from a recording of it. The rest is as for
+    now. Inputs with the same period and rule have one throttler, as in the paper. A plan is spliced
+    into such a launch file later, since it is made from a recording of it. The rest is as for
     :func:`splice_launch_files`.
 
     Raises:
@@ -171,20 +177,21 @@ def splice_throttlers(
         raise InputError("no input to throttle: name one, such as /points_raw=100ms")
     folder = usable(Path(output))
     subscribers = _endpoints(recording, "subscription")
-    by_period: dict[int, dict[str, tuple[str, ...]]] = {}
+    alike: dict[tuple[int, Rule], dict[str, tuple[str, ...]]] = {}
     for one in inputs:
-        topics = by_period.setdefault(one.period_ns, {})
+        topics = alike.setdefault((one.period_ns, one.rule), {})
         nodes = (*topics.get(one.topic, ()), *_subscribers(one, subscribers))
         topics[one.topic] = tuple(dict.fromkeys(nodes))
 
     def written(into: Path) -> _Written:
         made, redirects = [], []
-        for number, (period_ns, topics) in enumerate(by_period.items(), start=1):
+        for number, ((period_ns, rule), topics) in enumerate(alike.items(), start=1):
             name = THROTTLER if number == 1 else f"{THROTTLER}_{number}"
             targets = {topic: f"{topic}_throttled" for topic in topics}
             made.append(
                 write_throttler(
                     *(targets, period_ns, node, folder / NODES),
+                    rule=rule,
                     name=name,
                     fifo_priority=THROTTLER_PRIORITY,
                     into=into,

@@ -26,7 +26,7 @@ import numpy.typing as npt
 from chainshaper.enforcement.threads import Allocation
 from chainshaper.linux.scheduling import become_fifo, set_state, state_of
 from chainshaper.linux.threads import has_ended, start_of
-from chainshaper.planning.plan import Plan, shaping_nodes
+from chainshaper.planning.plan import ShapingNode
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 
@@ -178,9 +178,10 @@ def find_drift(
 class DriftWatch:
     """Looks every ten seconds, in a thread of its own, where a thread begins its cycles now.
 
-    ``latest_ns`` is how far that is from ``expected_ns`` (None: not seen yet). Looking takes a
-    tenth of a core: it is done on ``cores``, if there are any, and only ``NEAR`` where the thread
-    began last. A thread that is not seen there any more is looked for in the whole cycle.
+    ``latest_ns`` is how far that is from where it is expected (None: not seen yet), by look number
+    ``looks``. Looking takes a tenth of a core: it is done on ``cores``, if there are any, and only
+    ``NEAR`` where the thread began last. A thread that is not seen there any more is looked for in
+    the whole cycle.
     """
 
     EVERY_S = 10.0
@@ -199,9 +200,14 @@ class DriftWatch:
         cores: Collection[int] = (),
     ) -> None:
         self.latest_ns: int | None = None
+        self.looks = 0
         self._thread, self._cycle_ns, self._expected_ns = (pid, tid), cycle_ns, expected_ns
         self._slots, self._cores = slots, cores
         threading.Thread(target=self._look_again, name="drift-watch", daemon=True).start()
+
+    def expect(self, expected_ns: int) -> None:
+        """The thread is to begin elsewhere from now on; what is seen of it till then is void."""
+        self._expected_ns = expected_ns
 
     def _look_again(self) -> None:
         if self._cores:
@@ -210,11 +216,16 @@ class DriftWatch:
         with contextlib.suppress(OperationError):  # the thread has ended
             while True:
                 time.sleep(self.EVERY_S)
-                drift = self._look(near_ns)
-                near_ns = None if drift is None else self._expected_ns + drift
-                self.latest_ns = self.latest_ns if drift is None else drift
+                expected_ns = self._expected_ns
+                drift = self._look(near_ns, expected_ns)
+                near_ns = None if drift is None else expected_ns + drift
+                if expected_ns != self._expected_ns:
+                    near_ns = self._expected_ns
+                elif drift is not None:
+                    self.latest_ns = drift
+                    self.looks += 1
 
-    def _look(self, near_ns: int | None) -> int | None:
+    def _look(self, near_ns: int | None, expected_ns: int) -> int | None:
         """The drift, if the thread was seen; near where it was expected, None: anywhere."""
         cycle_ns, near = self._cycle_ns, round(self.NEAR * self._cycle_ns)
 
@@ -226,7 +237,7 @@ class DriftWatch:
         seen = watch_wake_ups(
             *self._thread, cycles * cycle_ns, least_ns=least_ns, rest_ns=until_near
         )
-        return find_drift(seen, cycle_ns, cycles, self._expected_ns, self._slots)
+        return find_drift(seen, cycle_ns, cycles, expected_ns, self._slots)
 
 
 @contextlib.contextmanager
@@ -276,12 +287,12 @@ NO_NODE = Telling((), None, 0.0)
 """No node is to get a phase."""
 
 
-def tell_phase(plan: Plan, found: Allocation, phase_ns: int) -> Telling:
-    """Begin to give a plan's shaping nodes in ROS 2 where the chain begins in every cycle.
+def tell_phase(nodes: Collection[ShapingNode], found: Allocation, phase_ns: int) -> Telling:
+    """Begin to give shaping nodes in ROS 2 where their chain begins in every cycle.
 
     The nodes of a chain are in one domain: any of them has the environment in which all are found.
     """
-    names = [node.thread.node for node in shaping_nodes(plan)]
+    names = [node.thread.node for node in nodes]
     pids = {node: one.thread.pid for node in names for one in found.threads if node in one.nodes}
     if not pids:
         return NO_NODE
@@ -291,14 +302,14 @@ def tell_phase(plan: Plan, found: Allocation, phase_ns: int) -> Telling:
 
     try:
         environments = {node: _environment_for(pid) for node, pid in pids.items()}
-        nodes = tuple(node for node, one in environments.items() if _is_ros(one))
-        if not nodes:  # they are the live workload's
+        ours = tuple(node for node, one in environments.items() if _is_ros(one))
+        if not ours:  # they are the live workload's
             return NO_NODE
-        arguments = ("parameter", "phase_ns", str(phase_ns % plan.cycle_ns), *nodes)
-        script = start_with_rclpy(environments[nodes[0]], ros_script.__file__, *arguments)
+        arguments = ("parameter", "phase_ns", str(phase_ns), *ours)
+        script = start_with_rclpy(environments[ours[0]], ros_script.__file__, *arguments)
     except OperationError as error:
         return Telling(tuple(pids), None, 0.0, str(error))
-    return Telling(nodes, script, time.monotonic())
+    return Telling(ours, script, time.monotonic())
 
 
 def _environment_for(pid: int) -> "Environment":

@@ -19,8 +19,8 @@ from chainshaper.analysis import DataFlow, LatencyAnalysis, analyse_latency, dat
 from chainshaper.analysis.disturbance import overlapping
 from chainshaper.analysis.graph import goes_on_elsewhere
 from chainshaper.planning import CallbackTimes, Modes, Plan, PlanRequest, Profile, plan_chain
+from chainshaper.planning.application_plan import ApplicationPlan, plan_values, whole
 from chainshaper.planning.margins import read_latencies
-from chainshaper.planning.overruns import refuse_offset
 from chainshaper.planning.plan import publisher_servers
 from chainshaper.planning.request import DEFAULT_CORE
 from chainshaper.sources import open_source
@@ -33,14 +33,7 @@ from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import wrong_values_refused
 from chainshaper.verify.measure import chain_of, longest_stall
 from chainshaper.workload.description import Application
-from chainshaper.workload.live import (
-    Enforcement,
-    Progress,
-    node_name,
-    origin_timer,
-    run_application,
-    timing_of,
-)
+from chainshaper.workload.live import Enforcement, Progress, node_name, run_application, timing_of
 
 __all__ = ["plan_recording", "profile_chains", "shape_application"]
 
@@ -455,7 +448,7 @@ def plan_recording(
 
 def shape_application(
     application: Application,
-    plan: Plan,
+    plan: Plan | ApplicationPlan,
     output: str | Path,
     *,
     cycles: int = 320,
@@ -464,34 +457,27 @@ def shape_application(
     command: Sequence[str] = (),
     progress: Progress = lambda *_: None,
 ) -> Recording:
-    """Splice the plan's shaping node into an application, run it and record it.
+    """Splice the plan's shaping nodes into an application, run it and record it.
 
     ``enforcement`` puts the plan's servers in force while it runs. A shaping node does without; the
     thread of an asynchronous publisher is gated unless ``enforcement`` does so
     (:func:`chainshaper.flow.apply.publishers_gated`).
 
-    Raises InputError: the plan does not fit the application, or has an offset; and what
+    Raises InputError: the plan does not fit the application; and what
     :func:`~chainshaper.workload.live.run_application` raises. PlatformError: the plan gates a
     publisher's thread, and threads cannot be frozen here.
     """
-    refuse_offset(plan)
-    if any(publisher_servers(plan)) and enforcement is None:
+    joint = whole(plan)
+    if any(next(publisher_servers(one), None) for one in joint.chains) and enforcement is None:
         from chainshaper.flow.apply import publishers_gated
 
-        enforcement = partial(publishers_gated, plan)
-    period = origin_timer(application).timer_ns
-    if period != plan.chain.period_ns:
-        raise InputError(
-            f"the plan is for a chain with the period {format_duration(plan.chain.period_ns)}, but "
-            f"{application.chain} of {application.name!r} has {format_duration(period or 0)}: plan "
-            "again from a recording of this application"
-        )
+        enforcement = partial(publishers_gated, joint)
     return run_application(
-        splice_application(application, plan),
+        splice_application(application, joint),
         output,
         cycles=cycles,
         realtime=realtime,
-        plan=plan.model_dump(mode="json"),
+        plan=plan_values(joint),
         enforcement=enforcement,
         command=command,
         progress=progress,

@@ -59,8 +59,11 @@ from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError, extra_library
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.yaml_file import AS_YAML, PlainData, compose, wrong_values_refused
-from chainshaper.workload.description import Application, application_as_written
-from chainshaper.workload.live import origin_timer
+from chainshaper.workload.description import (
+    Application,
+    application_as_written,
+    origin_timer,
+)
 
 __all__ = ["parse_axis", "rows_beside", "sweep"]
 
@@ -347,7 +350,7 @@ def application_at(grid: Grid, values: Values) -> Application:
         return grid.application
     described: Any = application_as_written(grid.application)
     if (load := changes.get(INTERFERENCE)) is not None:
-        timer = origin_timer(grid.application)
+        _, timer = origin_timer(grid.application)
         described = _interfered(described, timer.timer_ns or 0, _nanoseconds(INTERFERENCE, load))
     for name, value in changes.items():
         if name != INTERFERENCE:

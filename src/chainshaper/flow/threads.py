@@ -9,12 +9,13 @@ Which nodes a process has, its creation events say; which threads execute, the c
 import platform
 import time
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, cast
 
 from chainshaper.enforcement import threads as allocation
-from chainshaper.enforcement.back_ends import choose_back_end
+from chainshaper.enforcement.back_ends import choose_back_end, gates
 from chainshaper.enforcement.litmus import litmus_commands
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.enforcement.threads import (
@@ -24,12 +25,14 @@ from chainshaper.enforcement.threads import (
     WantedScheduling,
     allocate,
 )
-from chainshaper.flow.phase import measure_phase
+from chainshaper.flow.phase import Phase, measure_phase
 from chainshaper.linux.processes import descendants, find_applications, list_processes, run_users
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.linux.threads import Thread, ThreadRole
-from chainshaper.planning.overruns import open_until_done, refuse_offset
-from chainshaper.planning.plan import Plan, Server, shaping_nodes
+from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
+from chainshaper.planning.offsets import chain_name
+from chainshaper.planning.plan import Plan, Server
+from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.values.errors import InputError, OperationError
 
 if TYPE_CHECKING:
@@ -43,7 +46,7 @@ _KNOWN_ROLES = ("executor", "publisher", "dds")
 
 
 def find_threads(
-    where: int | Plan | None = None,
+    where: int | Plan | ApplicationPlan | None = None,
     recording: "Recording | None" = None,
     *,
     recorded: Sequence[RecordedProcess] = (),
@@ -79,7 +82,8 @@ def find_threads(
         servers: tuple[Server, ...] = ()
         hosted = None
         if where is not None:  # receivers need not run
-            gates, servers = shaping_nodes(where), where.servers
+            joint = whole(where)
+            gates, servers = joint.shaping_nodes, joint.servers
             hosted = {receiver for gate in gates for receiver in gate.receivers}
             hosted |= {thread.node for server in servers for thread in server.threads}
         chosen = tuple(
@@ -172,7 +176,7 @@ class Changes:
 
 
 def planned_changes(
-    plan: Plan,
+    plan: Plan | ApplicationPlan,
     back_end: str = "auto",
     *,
     recording: "Recording | None" = None,
@@ -185,12 +189,12 @@ def planned_changes(
 
     Raises: as :func:`.apply_plan`.
     """
-    refuse_offset(plan)
-    plan = open_until_done(plan)
+    plan = open_until_done(whole(plan))
     table = server_table(plan)
     found = find_threads(plan, recording, users=users)
     if back_end != "litmus":
         choice = choose_back_end(back_end)
+        refuse_offsets(plan, choice.name)
         wanted = allocation.plan_scheduling(plan, found, available_cores())
         threads = allocation.left_by_back_end(choice.name, wanted)
         return Changes(choice.name, choice.reason, threads, (), found.notes)
@@ -201,8 +205,8 @@ def planned_changes(
             for name, group in allocation.server_members(plan, found).items()
         }
         if phase_ns is None:
-            origin = first_thread(plan, found)
-            phase_ns = measure_phase(origin.pid, origin.tid, plan.cycle_ns).at_ns
+            phases = chain_phases(plan, found)
+            phase_ns = common_anchor(plan, phases) - LEAD_NS
     except OperationError:
         members = {s.name: [f"TID:{t.node}" for t in s.threads] for s in plan.servers}
         notes += ("slots are counted from a beginning that is measured when the chain runs",)
@@ -210,12 +214,21 @@ def planned_changes(
     return Changes("litmus", "asked for", (), litmus_commands(table, members, anchor), notes)
 
 
-def server_table(plan: Plan) -> ServerTable:
+def refuse_offsets(plan: ApplicationPlan, back_end: str) -> None:
+    """Refuse offsets where nothing stops a chain until its cycle starts. Raises InputError."""
+    if not gates(back_end) and any(chain.offset_ns for chain in plan.chains):
+        raise InputError(
+            f"the back end {back_end} sets priorities only, and chains whose cycles start at"
+            " offsets have to be stopped until then: choose freezer or scx"
+        )
+
+
+def server_table(plan: ApplicationPlan) -> ServerTable:
     """The servers of a plan whose threads a back end has to keep inside their slots.
 
     Raises OperationError: there are none.
     """
-    gated_by_themselves = {node.thread for node in shaping_nodes(plan)}
+    gated_by_themselves = {node.thread for node in plan.shaping_nodes}
     servers = [s for s in plan.servers if set(s.threads) - gated_by_themselves]
     if not servers:
         raise OperationError(
@@ -231,17 +244,73 @@ def table_of(cycle_ns: int, servers: Iterable[Server]) -> ServerTable:
     return ServerTable(cycle_ns, tuple(bare))
 
 
-def first_thread(plan: Plan, found: Allocation) -> Thread:
-    """The thread that begins the chain: the first executor of the server whose slot comes first.
+def first_threads(plan: ApplicationPlan, found: Allocation) -> list[Thread]:
+    """The thread that begins each chain: the first executor of its server whose slot comes first.
 
-    Raises OperationError: no server holds an executor, or see :func:`.server_members`.
+    Raises OperationError: no server of a chain holds an executor, or see :func:`.server_members`.
     """
     members = allocation.server_members(plan, found)
-    for server in sorted(plan.servers, key=lambda one: (one.slots[0][0], one.priority)):
-        for member in members[server.name]:
-            if member.thread.role == "executor":
-                return member.thread
+    of_thread = {
+        planned: [one.thread for one in members[server.name] if planned.node in one.nodes]
+        for server in plan.servers
+        for planned in server.threads
+    }
+    return [_first_thread(chain, of_thread) for chain in plan.chains]
+
+
+def _first_thread(chain: Plan, of_thread: Mapping[PlannedThread, Sequence[Thread]]) -> Thread:
+    for server in sorted(chain.servers, key=lambda one: (one.slots[0][0], one.priority)):
+        for planned in server.threads:
+            for thread in of_thread.get(planned, ()):
+                if thread.role == "executor":
+                    return thread
     raise OperationError(
-        "no server of the plan holds an executor, so nothing says where in a cycle the chain "
-        "begins: give its phase (--phase)"
+        f"no server of {chain_name(chain)} holds an executor, so nothing says where in a cycle the"
+        " chain begins: give its phase (--phase)"
     )
+
+
+def chain_phases(
+    plan: ApplicationPlan, found: Allocation, progress: Callable[[float], None] = lambda _: None
+) -> list[Phase]:
+    """Where in its cycle each chain begins, watched one after the other.
+
+    Raises OperationError: as :func:`first_threads` and :func:`.measure_phase`.
+    """
+    phases: dict[tuple[int, int], Phase] = {}
+    origins = first_threads(plan, found)
+    for number, (chain, origin) in enumerate(zip(plan.chains, origins, strict=True)):
+        place = (origin.tid, chain.cycle_ns)  # chains of one graph begin alike
+        if place not in phases:
+            phases[place] = measure_phase(
+                *(origin.pid, origin.tid, chain.cycle_ns),
+                progress=partial(_share_of, progress, number, len(plan.chains)),
+            )
+    return [phases[o.tid, c.cycle_ns] for c, o in zip(plan.chains, origins, strict=True)]
+
+
+def _share_of(progress: Callable[[float], None], done: int, parts: int, share: float) -> None:
+    progress((done + share) / parts)
+
+
+def common_anchor(plan: ApplicationPlan, phases: Sequence[Phase]) -> int:
+    """The instant of CLOCK_MONOTONIC, modulo the hyper-period, from which all cycles count.
+
+    A chain whose first thread waits in a server begins when its slot opens. Timers expire when
+    they do: the instant is chosen such that every slot opens :data:`LEAD_NS` after its chain's
+    timer at least, and that the longest of these waits is as short as can be.
+    """
+    hyper = plan.cycle_ns
+    wanted = [
+        (phase.at_ns + LEAD_NS - chain.offset_ns, chain.cycle_ns)
+        for chain, phase in zip(plan.chains, phases, strict=True)
+    ]
+
+    def longest_wait(anchor_ns: int) -> int:
+        return max((anchor_ns - first) % cycle for first, cycle in wanted)
+
+    # Waits only grow with the anchor, but where one starts again: the best is at such a place.
+    candidates = {
+        (first + n * cycle) % hyper for first, cycle in wanted for n in range(hyper // cycle)
+    }
+    return min(sorted(candidates), key=longest_wait)

@@ -266,6 +266,7 @@ class NodeParameters:
     inputs: list[str] = field(default_factory=list)
     outputs: list[str] = field(default_factory=list)
     period_ns: int = 0
+    rule: str = "newest"
 
     def gate(self, depth: int = DEPTH) -> Gate:
         """The gate that they describe, with room for so many messages.

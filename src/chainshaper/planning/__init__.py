@@ -4,6 +4,9 @@ Everything starts with :func:`plan_shaping`; each further step takes a plan and 
 :func:`plan_chain` takes all of them that a :class:`PlanRequest` asks for.
 """
 
+from chainshaper.planning.application_plan import ApplicationPlan as ApplicationPlan
+from chainshaper.planning.application_plan import load_application_plan as load_application_plan
+from chainshaper.planning.application_plan import save_application_plan as save_application_plan
 from chainshaper.planning.bands import BandChoice as BandChoice
 from chainshaper.planning.bands import choose_bands as choose_bands
 from chainshaper.planning.bands import with_bands as with_bands
@@ -31,7 +34,7 @@ from chainshaper.planning.request import PlanRequest as PlanRequest
 from chainshaper.planning.request import Profile as Profile
 from chainshaper.planning.request import band_choice as band_choice
 from chainshaper.planning.request import plan_chain as plan_chain
-from chainshaper.planning.request import plan_chains as plan_chains
+from chainshaper.planning.several_chains import plan_application as plan_application
 from chainshaper.planning.shaping import CallbackTimes as CallbackTimes
 from chainshaper.planning.shaping import let_per_callback as let_per_callback
 from chainshaper.planning.shaping import let_per_chain as let_per_chain

@@ -21,9 +21,9 @@ well but may run out of time.
 import math
 import random
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from itertools import combinations
-from typing import TypeAlias
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from itertools import chain, combinations
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +43,33 @@ _Allowed: TypeAlias = dict[tuple[int, int], tuple[int, _Intervals]]
 """For chains j, k whose slots can collide: g, and what (offset k − offset j) mod g may be."""
 
 
+class Timetable(NamedTuple):
+    """What moves as one against others: a cycle, and the slots in it by core and priority."""
+
+    name: str
+    cycle_ns: int
+    slots: dict[tuple[int, int], list[Slot]]
+
+
+def timetable(plans: Sequence[Plan], without: Collection[str] = ()) -> Timetable:
+    """The slots of a chain, or of several that share servers, of which each counts once.
+
+    Servers of the names ``without`` do not count.
+    """
+    servers = {server.name: server for plan in plans for server in plan.servers}
+    for name in without:
+        servers.pop(name, None)
+    slots: dict[tuple[int, int], list[Slot]] = {}
+    for server in servers.values():
+        slots.setdefault((server.core, server.priority), []).extend(server.slots)
+    return Timetable(" and ".join(map(chain_name, plans)), plans[0].cycle_ns, slots)
+
+
 def place_chains(
-    plans: Sequence[Plan], *, time_limit_s: float = TIME_LIMIT_SECONDS
+    plans: Sequence[Plan],
+    *,
+    together: Sequence[Sequence[int]] | None = None,
+    time_limit_s: float = TIME_LIMIT_SECONDS,
 ) -> tuple[tuple[Plan, ...], list[str]]:
     """Offsets for chains that share cores, and what is to be known about them.
 
@@ -52,93 +77,124 @@ def place_chains(
     same time, the chain with the shorter period at the better priority, and only their publish
     slots stay apart. Raises as :func:`with_offsets`.
     """
+    together = together or [[k] for k in range(len(plans))]
     try:
-        return with_offsets(plans, time_limit_s=time_limit_s), []
+        return with_offsets(plans, together=together, time_limit_s=time_limit_s), []
     except OperationError as error:
-        ranked = list(plans)
-        for rank, k in enumerate(sorted(range(len(plans)), key=lambda k: (plans[k].cycle_ns, k))):
-            own = {"priority": OUTPUT_PRIORITY + 1 + rank}
-            publishing = publishing_servers(plans[k])
-            servers = [s if s in publishing else s.model_copy(update=own) for s in plans[k].servers]
-            ranked[k] = revised(plans[k], servers=tuple(servers))
+        ranked = _ranked(plans, together)
         if ranked == list(plans):
             raise
         remark = (
-            f"{error} Instead, the chains run at the same time at priorities of their own, and"
+            f"{error}. Instead, the chains run at the same time at priorities of their own, and"
             " only their publish slots are kept apart: their latencies must have been measured"
             " while all of them ran like this."
         )
-        return with_offsets(ranked, time_limit_s=time_limit_s), [remark]
+        return with_offsets(ranked, together=together, time_limit_s=time_limit_s), [remark]
+
+
+def _ranked(plans: Sequence[Plan], together: Sequence[Sequence[int]]) -> list[Plan]:
+    """The plans with a priority for each group of chains; as they are where groups share threads,
+    which have one priority.
+    """
+    threads = [
+        {thread for k in group for server in plans[k].servers for thread in server.threads}
+        for group in together
+    ]
+    if any(one & two for one, two in combinations(threads, 2)):
+        return list(plans)
+    ranked = list(plans)
+    shortest_first = sorted(together, key=lambda group: (plans[group[0]].cycle_ns, group[0]))
+    for rank, group in enumerate(shortest_first):
+        own = {"priority": OUTPUT_PRIORITY + 1 + rank}
+        publishing = {server.name for k in group for server in publishing_servers(plans[k])}
+        for k in group:
+            servers = tuple(
+                one if one.name in publishing else one.model_copy(update=own)
+                for one in plans[k].servers
+            )
+            ranked[k] = revised(plans[k], servers=servers)
+    return ranked
 
 
 def with_offsets(
-    plans: Sequence[Plan], *, time_limit_s: float = TIME_LIMIT_SECONDS
+    plans: Sequence[Plan],
+    *,
+    together: Sequence[Sequence[int]] | None = None,
+    time_limit_s: float = TIME_LIMIT_SECONDS,
 ) -> tuple[Plan, ...]:
     """The plans of several chains with offsets that keep their slots apart.
 
-    The first chain, and any that shares no core with another, has the offset 0. ``time_limit_s``
-    bounds the search among chains that can collide with each other.
+    ``together`` are groups of chains (places in ``plans``) that begin at the same callback: they
+    share servers and have one offset (default: none do). The first group, and any that shares no
+    core with another, has the offset 0. ``time_limit_s`` bounds the search among groups that can
+    collide with each other.
 
-    Raises InputError: no plans, or plans that govern the same threads or the same output.
-    OperationError: there are no such offsets, with the reason where a single pair of chains or the
-    load of a core already excludes them; or the time was up before an answer. PlatformError: more
-    than a few chains collide and OR-tools is not installed.
+    Raises InputError: no plans, or plans that govern the same output. OperationError: there are no
+    such offsets, with the reason where a single pair of chains or the load of a core already
+    excludes them; or the time was up before an answer. PlatformError: more than a few chains
+    collide and OR-tools is not installed.
     """
     if not plans:
         raise InputError("no plans to find offsets for: give one per chain")
-    allowed: _Allowed = {}
     for one, two in combinations(plans, 2):
-        threads = [{t for server in plan.servers for t in server.threads} for plan in (one, two)]
-        shared = {thread.node for thread in threads[0]} & {thread.node for thread in threads[1]}
-        refuse_common((_name(one), _name(two)), (one.chain.output, two.chain.output), shared)
-    for j, k in combinations(range(len(plans)), 2):
-        common, forbidden = _collisions(plans[j], plans[k])
+        refuse_common((chain_name(one), chain_name(two)), (one.chain.output, two.chain.output))
+    together = together or [[k] for k in range(len(plans))]
+    for group, other in combinations(together, 2):
+        _refuse_same_beginning(plans[group[0]], plans[other[0]])
+    found = _find_offsets([timetable([plans[k] for k in one]) for one in together], time_limit_s)
+    offset_of = {k: found[number] for number, one in enumerate(together) for k in one}
+    return tuple(revised(plan, offset_ns=offset_of[k]) for k, plan in enumerate(plans))
+
+
+def _find_offsets(tables: Sequence[Timetable], time_limit_s: float) -> dict[int, int]:
+    allowed: _Allowed = {}
+    for j, k in combinations(range(len(tables)), 2):
+        common, forbidden = collisions(tables[j], tables[k])
         if forbidden:
             intervals = _between(forbidden, common)
             if not intervals:
-                raise OperationError(_pair_too_long(plans[j], plans[k], common))
+                raise OperationError(_pair_too_long(tables[j], tables[k], common))
             allowed[j, k] = common, intervals
             allowed[k, j] = common, [(-end % common, -start % common) for start, end in intervals]
-    for (core, priority), load in _loads(plans).items():
+    for (core, priority), load in _loads(tables).items():
         if load > 1 + 1e-9:
             raise OperationError(
-                f"the slots of all chains on core {core} at priority {priority} fill {load:.1%} of"
-                " its time: move a chain to another core, or give servers different priorities"
+                f"the slots of {_names_on(tables, core, priority)} on core {core} at priority"
+                f" {priority} fill {load:.1%} of its time, {load - 1:.1%} too much: move a chain to"
+                " another core, or give servers different priorities"
             )
-    offsets = dict.fromkeys(range(len(plans)), 0)
-    for group in _groups(len(plans), allowed):
+    offsets = dict.fromkeys(range(len(tables)), 0)
+    for group in _joined(len(tables), allowed):
+        if len(group) == 1:
+            continue
         if len(group) <= MOST_SEARCHED:
-            solution = _search(plans, allowed, group, {group[0]: 0})
+            solution = _search(tables, allowed, group, {group[0]: 0})
         else:
             deadline = time.monotonic() + time_limit_s
-            solution = _fitted(plans, allowed, group, deadline)
+            solution = _fitted(tables, allowed, group, deadline)
             if solution is None:
-                solution = _solve(plans, allowed, group, max(0.0, deadline - time.monotonic()))
+                solution = _solve(tables, allowed, group, max(0.0, deadline - time.monotonic()))
         if solution is None:
             raise OperationError(
-                f"there are no offsets at which {', '.join(_name(plans[k]) for k in group)} keep"
+                f"there are no offsets at which {', '.join(tables[k].name for k in group)} keep"
                 " their slots apart, although any two of them could: move one to another core,"
                 " give servers different priorities, or shorten slots"
             )
         offsets.update(solution)
-    return tuple(revised(plan, offset_ns=offsets[k]) for k, plan in enumerate(plans))
+    return offsets
 
 
-def _slots(plan: Plan) -> dict[tuple[int, int], list[Slot]]:
-    """All slots by core and priority."""
-    found: dict[tuple[int, int], list[Slot]] = {}
-    for server in plan.servers:
-        found.setdefault((server.core, server.priority), []).extend(server.slots)
-    return found
+def _slots_of(table: Timetable) -> Iterator[Slot]:
+    return chain.from_iterable(table.slots.values())
 
 
-def _collisions(one: Plan, two: Plan) -> tuple[int, _Intervals]:
+def collisions(one: Timetable, two: Timetable) -> tuple[int, _Intervals]:
     """g, and the differences of offsets modulo g at which slots collide."""
     common = math.gcd(one.cycle_ns, two.cycle_ns)
     forbidden: _Intervals = []
-    for place, slots in _slots(one).items():
+    for place, slots in one.slots.items():
         for start, end in slots:
-            for other_start, other_end in _slots(two).get(place, []):
+            for other_start, other_end in two.slots.get(place, []):
                 # They collide if `two` starts later by more than this and less than that.
                 first, last = start - other_end + 1, end - other_start - 1
                 if last - first + 1 >= common:
@@ -157,34 +213,34 @@ def _between(forbidden: _Intervals, common: int) -> _Intervals:
     return allowed
 
 
-def _groups(count: int, allowed: _Allowed) -> list[list[int]]:
-    """Chains that can collide with each other, directly or through others."""
+def _joined(count: int, pairs: Iterable[tuple[int, int]]) -> list[list[int]]:
+    """The numbers below ``count``, together where pairs link them, directly or through others."""
     groups = [{k} for k in range(count)]
-    for pair in allowed:
+    for pair in pairs:
         merged = set().union(*(group for group in groups if group.intersection(pair)))
         groups = [group for group in groups if not group & merged] + [merged]
-    return [sorted(group) for group in groups if len(group) > 1]
+    return sorted(sorted(group) for group in groups)
 
 
 def _search(
-    plans: Sequence[Plan], allowed: _Allowed, group: list[int], placed: dict[int, int]
+    tables: Sequence[Timetable], allowed: _Allowed, group: list[int], placed: dict[int, int]
 ) -> dict[int, int] | None:
     if len(placed) == len(group):
         return placed
     for k in (k for k in group if k not in placed):
-        candidates = _candidates(plans, allowed, k, placed)
+        candidates = _candidates(tables, allowed, k, placed)
         fitting = np.ones(candidates.size, dtype=bool)
         for j, base in placed.items():
             fitting &= _apart(allowed, j, k, candidates - base)
         for offset in candidates[fitting].tolist():
-            found = _search(plans, allowed, group, {**placed, k: offset})
+            found = _search(tables, allowed, group, {**placed, k: offset})
             if found is not None:
                 return found
     return None
 
 
 def _candidates(
-    plans: Sequence[Plan], allowed: _Allowed, k: int, placed: dict[int, int]
+    tables: Sequence[Timetable], allowed: _Allowed, k: int, placed: dict[int, int]
 ) -> NDArray[np.int64]:
     """Offsets of chain k, ascending, at which it is tight with one of the placed chains; or 0."""
     found = [np.zeros(1, dtype=np.int64)]
@@ -192,7 +248,7 @@ def _candidates(
         if (j, k) in allowed:
             common, intervals = allowed[j, k]
             ends = np.array(intervals, dtype=np.int64).ravel()
-            repeats = np.arange(0, plans[k].cycle_ns, common, dtype=np.int64)
+            repeats = np.arange(0, tables[k].cycle_ns, common, dtype=np.int64)
             found.append(np.add.outer((base + ends) % common, repeats).ravel())
     return np.unique(np.concatenate(found))
 
@@ -211,7 +267,7 @@ def _apart(allowed: _Allowed, j: int, k: int, distances: NDArray[np.int64]) -> N
 
 
 def _fitted(
-    plans: Sequence[Plan], allowed: _Allowed, group: list[int], deadline: float
+    tables: Sequence[Timetable], allowed: _Allowed, group: list[int], deadline: float
 ) -> dict[int, int] | None:
     """Chains fitted in one after the other; None says nothing.
 
@@ -220,19 +276,19 @@ def _fitted(
     hard ones come to stay and the others move around them (guided ejection: Nagata and Bräysy,
     Operations Research Letters 37, 2009).
     """
-    busy = [sum(end - start for s in plan.servers for start, end in s.slots) for plan in plans]
-    waiting = sorted(group, key=lambda k: (-plans[k].cycle_ns, busy[k]))
+    busy = [sum(end - start for start, end in _slots_of(table)) for table in tables]
+    waiting = sorted(group, key=lambda k: (-tables[k].cycle_ns, busy[k]))
     weight = dict.fromkeys(group, 1)
     placed: dict[int, int] = {}
     generator = random.Random(0)  # noqa: S311 - no secrets here; the same plans, the same offsets
     for _ in range(MOST_FITTINGS):
         if not waiting:
             first = placed[group[0]]
-            return {k: (offset - first) % plans[k].cycle_ns for k, offset in placed.items()}
+            return {k: (offset - first) % tables[k].cycle_ns for k, offset in placed.items()}
         if time.monotonic() > deadline:
             break
         k = waiting.pop()
-        candidates = _candidates(plans, allowed, k, placed)
+        candidates = _candidates(tables, allowed, k, placed)
         in_the_way = {j: ~_apart(allowed, j, k, candidates - placed[j]) for j in placed}
         cost = sum((weight[j] * hit for j, hit in in_the_way.items()), np.zeros(candidates.size))
         least = np.flatnonzero(cost == cost.min())
@@ -249,21 +305,21 @@ def _fitted(
 
 
 def _solve(
-    plans: Sequence[Plan], allowed: _Allowed, group: list[int], time_limit_s: float
+    tables: Sequence[Timetable], allowed: _Allowed, group: list[int], time_limit_s: float
 ) -> dict[int, int] | None:
     cp_model = extra_library("ortools.sat.python.cp_model", "offsets for this many chains")
     model = cp_model.CpModel()
-    offsets = {k: model.new_int_var(0, plans[k].cycle_ns - 1, f"offset{k}") for k in group}
+    offsets = {k: model.new_int_var(0, tables[k].cycle_ns - 1, f"offset{k}") for k in group}
     model.add(offsets[group[0]] == 0)
     for j, k in combinations(group, 2):
         if (j, k) in allowed:
             common, intervals = allowed[j, k]
-            least, most = -(plans[j].cycle_ns // common) - 1, plans[k].cycle_ns // common + 1
+            least, most = -(tables[j].cycle_ns // common) - 1, tables[k].cycle_ns // common + 1
             cycles = model.new_int_var(least, most, f"n{j}_{k}")
             domain = cp_model.Domain.from_intervals([list(interval) for interval in intervals])
             difference = offsets[k] - offsets[j] - common * cycles
             model.add_linear_expression_in_domain(difference, domain)
-    for slots in _played_out(plans, group):
+    for slots in _played_out(tables, group):
         model.add_no_overlap(
             [
                 model.new_fixed_size_interval_var(offsets[k] + start, end - start, "")
@@ -278,7 +334,7 @@ def _solve(
         return None
     if status in (cp_model.OPTIMAL, cp_model.FEASIBLE):
         return {k: int(solver.value(offset)) for k, offset in offsets.items()}
-    loads = _loads([plans[k] for k in group])
+    loads = _loads([tables[k] for k in group])
     core, priority = max(loads, key=lambda place: (loads[place], place))
     raise OperationError(
         f"undecided: in the time allowed neither offsets for {len(group)} chains that share cores"
@@ -288,62 +344,78 @@ def _solve(
     )
 
 
-def _played_out(plans: Sequence[Plan], group: list[int]) -> Iterator[list[tuple[int, int, int]]]:
+def _played_out(
+    tables: Sequence[Timetable], group: list[int]
+) -> Iterator[list[tuple[int, int, int]]]:
     """Per core and priority, every slot (chain, start, end) of a hyper-period and the cycle before.
 
     Pairs of chains say all that there is to say, but only from slots side by side does a solver see
     that a core is too full for all of them. Nothing, where a hyper-period is too long to be of use.
     """
-    hyper_period = math.lcm(*(plans[k].cycle_ns for k in group))
-    if sum(hyper_period // plans[k].cycle_ns for k in group) > MOST_CYCLES:
+    hyper_period = math.lcm(*(tables[k].cycle_ns for k in group))
+    if sum(hyper_period // tables[k].cycle_ns for k in group) > MOST_CYCLES:
         return
-    slots = {k: _slots(plans[k]) for k in group}
+    slots = {k: tables[k].slots for k in group}
     for place in sorted(set().union(*slots.values())):
         yield [
             (k, start + cycle, end + cycle)
             for k in group
             for start, end in slots[k].get(place, [])
-            for cycle in range(-plans[k].cycle_ns, hyper_period, plans[k].cycle_ns)
+            for cycle in range(-tables[k].cycle_ns, hyper_period, tables[k].cycle_ns)
         ]
 
 
-def _loads(plans: Sequence[Plan]) -> dict[tuple[int, int], float]:
+def _loads(tables: Sequence[Timetable]) -> dict[tuple[int, int], float]:
     """The share of time that slots take, per core and priority."""
     loads: dict[tuple[int, int], float] = {}
-    for plan in plans:
-        for place, slots in _slots(plan).items():
-            busy = sum((end - start) / plan.cycle_ns for start, end in slots)
+    for table in tables:
+        for place, slots in table.slots.items():
+            busy = sum((end - start) / table.cycle_ns for start, end in slots)
             loads[place] = loads.get(place, 0.0) + busy
     return dict(sorted(loads.items()))
 
 
-def _pair_too_long(one: Plan, two: Plan, common: int) -> str:
+def _pair_too_long(one: Timetable, two: Timetable, common: int) -> str:
+    longest = {
+        place: max(end - start for start, end in slots)
+        + max((end - start for start, end in two.slots.get(place, [])), default=0)
+        for place, slots in one.slots.items()
+    }
+    (core, priority), needed = max(longest.items(), key=lambda item: (item[1], item[0]))
+    excess = f", {format_duration(needed - common)} too long" if needed > common else ""
     return (
-        f"the slots of {_name(one)} and {_name(two)} collide at every offset: with cycles of"
-        f" {format_duration(one.cycle_ns)} and {format_duration(two.cycle_ns)} they meet in every"
-        f" distance modulo {format_duration(common)}, which leaves no room for both. Move one to"
-        " another core, give their servers different priorities, or use periods with a larger"
-        " common divisor"
+        f"the slots of {one.name} and {two.name} on core {core} at priority {priority} collide at"
+        f" every offset: with cycles of {format_duration(one.cycle_ns)} and"
+        f" {format_duration(two.cycle_ns)} they meet in every distance modulo"
+        f" {format_duration(common)}, which leaves no room for both (their longest take"
+        f" {format_duration(needed)}{excess}). Move one to another core, give their servers"
+        " different priorities, or use periods with a larger common divisor"
     )
 
 
-def _name(plan: Plan) -> str:
+def _names_on(tables: Sequence[Timetable], core: int, priority: int) -> str:
+    return ", ".join(table.name for table in tables if (core, priority) in table.slots)
+
+
+def chain_name(plan: Plan) -> str:
+    """What a plan's chain is called in messages."""
     return plan.chain.spec or plan.chain.output or "a chain without a name"
 
 
-def refuse_common(
-    names: tuple[str, str], outputs: tuple[str | None, str | None], nodes: Iterable[str] = ()
-) -> None:
-    """Refuse to plan two chains one by one whose plans would have one output, or these nodes."""
+def _refuse_same_beginning(one: Plan, two: Plan) -> None:
+    begins = [(plan.chain.spec or "").split("..")[0].strip() for plan in (one, two)]
+    if begins[0] and begins[0] == begins[1]:
+        raise InputError(
+            f"{chain_name(one)} and {chain_name(two)} begin at the same callback: plan them"
+            " together (`chainshaper plan REC --chain A --chain B`)"
+        )
+
+
+def refuse_common(names: tuple[str, str], outputs: tuple[str | None, str | None]) -> None:
+    """Refuse to plan two chains whose plans would have one output."""
     one, two = names
     if outputs[0] is not None and outputs[0] == outputs[1]:
         raise InputError(
             f"{one} and {two} both publish {outputs[0]}, and one shaping node can hold it at one"
             " place only: name each output once, with the chain that takes longest"
-        )
-    if shared := sorted(nodes):
-        raise InputError(
-            f"{one} and {two} share {', '.join(shared)}: a thread runs in the servers of one plan."
-            " Plan one of the two alone or, where both begin at the same callback, the other as"
-            " its --sink"
         )

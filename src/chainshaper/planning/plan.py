@@ -16,6 +16,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import combinations, pairwise, product
 from pathlib import Path
+from textwrap import indent
 from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 
 import yaml
@@ -606,11 +607,43 @@ def load_plan(path: str | Path) -> Plan:
     Raises InputError: no such file, not YAML, or wrong values; each is named with its line, key,
     reason and remedy.
     """
-    return read_model(path, Plan, made_by="written by `chainshaper plan`")
+    several = ("chains", _OfSeveralChains)
+    return read_model(path, Plan, made_by="written by `chainshaper plan`", otherwise=several)
+
+
+class _OfSeveralChains(Plan):
+    """What a file is that has a plan where one chain's is wanted: refused."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refused(cls, _: object) -> object:
+        raise wrong_value("the plan is of several chains, and that of one is wanted here", "chains")
 
 
 def dump_plan(plan: Plan) -> str:
     """The YAML text of a plan; reading it gives an equal plan."""
+    return plans_as_text([plan])
+
+
+def plans_as_text(plans: Sequence[Plan]) -> str:
+    """The YAML text of a chain's plan, or of several in one file, each server written once."""
+    if len(plans) == 1:
+        return _HEADER + _sections(_yaml_values(plans[0]))
+    text, known = f"{_HEADER}format: 2\nchains:\n", set[str]()
+    for plan in plans:
+        values = _yaml_values(plan)
+        del values["format"]
+        names = [server["name"] for server in values["servers"]]
+        values["servers"] = [
+            name if name in known else server
+            for name, server in zip(names, values["servers"], strict=True)
+        ]
+        known.update(names)
+        text += "- " + indent(_sections(values), "  ")[2:]
+    return text
+
+
+def _yaml_values(plan: Plan) -> dict[str, Any]:
     values = plan.model_dump(mode="json", by_alias=True, exclude_none=True, context=AS_YAML)
     for server in values["servers"]:
         server["threads"] = [_OnOneLine(thread) for thread in server["threads"]]
@@ -622,7 +655,11 @@ def dump_plan(plan: Plan) -> str:
         del values["fallback"]
     if not values["further_shaping_nodes"]:
         del values["further_shaping_nodes"]
-    text = _HEADER
+    return values
+
+
+def _sections(values: dict[str, Any]) -> str:
+    text = ""
     for key, value in values.items():
         if key in _SECTION_COMMENTS:
             text += f"# {_SECTION_COMMENTS[key]}\n"

@@ -3,11 +3,10 @@
 A :class:`Profile` may come from a recording or consist of bare latencies and a period; a policy
 that needs more says so.
 
-Several chains cannot be planned together where one's plan would move another's outputs. A plan is
-made from latencies that were measured while nothing was shaped: shaping a topic that another
-chain's output waits for makes that one later than was measured, and its slot too early. Nor can two
-plans have one thread. Chains that share no more than cores, and sinks that fork off behind the
-first callback, are planned right; the others are refused with what they have in common.
+Further outputs of a chain's graph can be planned with it (``sinks``); several chains, of equal
+standing, are planned by :mod:`chainshaper.planning.several_chains`. A plan is made from latencies
+that were measured while nothing was shaped: shaping a topic that another chain's output waits for
+makes that one later than was measured, and its slot too early. Such chains are refused.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -150,7 +149,7 @@ def plan_chain(
     library that only this request needs is not installed.
     """
     _refuse_contradictions(request, bool(sinks))
-    _refuse_entangled((profile, *sinks), request.policy, sinks=True)
+    refuse_entangled((profile, *sinks), request.policy, sinks=True)
     if any(sink.all_disturbed for sink in sinks) or profile.all_disturbed:
         profile, sinks = _covered(profile, request), [_covered(sink, request) for sink in sinks]
     if (modes := request.modes) is not None and profile.of_modes and request.policy == "shaped":
@@ -196,16 +195,6 @@ def plan_chain(
             " none: leave it out, or plan with synchronous publication"
         )
     return revised(plan, modes=modes)
-
-
-def plan_chains(profiles: Sequence[Profile], request: PlanRequest = _STANDARD) -> tuple[Plan, ...]:
-    """A plan for each of several chains that have nothing in common but cores.
-
-    Raises: as :func:`plan_chain`; InputError also where one chain's plan would move another's
-        outputs.
-    """
-    _refuse_entangled(profiles, request.policy)
-    return tuple(plan_chain(profile, request) for profile in profiles)
 
 
 def band_choice(plan: Plan, profile: Profile, request: PlanRequest) -> BandChoice:
@@ -401,9 +390,14 @@ def _refuse_placement(request: PlanRequest, why: str) -> None:
             raise InputError(f"--{option} places latency bands, {why}")
 
 
-def _refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: bool = False) -> None:
-    """With ``sinks`` all are planned as one: the first chain, and further outputs of its graph."""
+def refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: bool = False) -> None:
+    """Refuse chains of which one waits for what another's plan delays, or with one output.
+
+    With ``sinks`` all are planned as one: the first chain, and further outputs of its graph.
+    """
     for one, two in combinations(profiles, 2):
+        if one.topics and (one.begins, one.topics) == (two.begins, two.topics):
+            raise InputError(f"the chain {two.name} is given twice: name it once")
         outputs = [profile.topics[-1] if profile.topics else None for profile in (one, two)]
         refuse_common((one.name, two.name), (outputs[0], outputs[1]))
     for shaped, waiting in permutations(profiles, 2):
@@ -418,16 +412,13 @@ def _refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: boo
                 f" {shaped.name} alone"
             )
     for one, two in combinations(profiles, 2):
-        if not sinks:
-            shared = one.core_of.keys() & two.core_of.keys()
-            refuse_common((one.name, two.name), (None, None), shared)
-        elif one.begins is not None and two.begins is not None and one.begins != two.begins:
+        if sinks and one.begins is not None and two.begins is not None and one.begins != two.begins:
             raise InputError(
                 f"{two.name} begins at {two.begins[1]}, {one.name} at another callback,"
                 f" {one.begins[1]}: the slots of a sink count from the beginning of the chain. Name"
                 " a sink behind the same first callback, or plan one of the two alone"
             )
-        elif one.period_ns != two.period_ns:
+        if sinks and one.period_ns != two.period_ns:
             raise InputError(
                 f"{two.name} has the period {format_duration(two.period_ns)}, {one.name}"
                 f" {format_duration(one.period_ns)}: a plan has one cycle. Plan one of the two"

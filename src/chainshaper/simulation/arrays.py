@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from chainshaper.analysis.chains import find_chain
-from chainshaper.planning.plan import Plan, Server, Thread, shaping_nodes
+from chainshaper.planning.application_plan import ApplicationPlan
+from chainshaper.planning.plan import Server, Thread
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.layout import NONE, A, C, D, E, G, H, I, Int64s, M, P, R, S, T, X
 from chainshaper.values.application import ApplicationGraph, Callback, Chain, Node
@@ -103,7 +104,7 @@ class System:
 
 
 def build_system(
-    application: Application, plan: Plan | None = None, *, follow_chain: bool
+    application: Application, plan: ApplicationPlan | None = None, *, follow_chain: bool
 ) -> System:
     """Everything that runs in an application; ``follow_chain`` if its chain has to be known.
 
@@ -200,7 +201,7 @@ def _threads(
             )
 
 
-def _servers(plan: Plan, threads: Sequence[ThreadInfo]) -> dict[int, Server]:
+def _servers(plan: ApplicationPlan, threads: Sequence[ThreadInfo]) -> dict[int, Server]:
     """The server of each thread that is in one."""
     numbers = {
         Thread(node=thread.node, role=thread.role): number  # type: ignore[arg-type]
@@ -335,7 +336,7 @@ class Machine:
 
 def build_machine(
     system: System,
-    plan: Plan | None,
+    plan: ApplicationPlan | None,
     timing: Timing,
     *,
     events: bool,
@@ -416,7 +417,11 @@ def build_machine(
 
 
 def _fill_cores(
-    rows: Rows, system: System, areas: tuple[range, range], plan: Plan | None, timing: Timing
+    rows: Rows,
+    system: System,
+    areas: tuple[range, range],
+    plan: ApplicationPlan | None,
+    timing: Timing,
 ) -> None:
     """The cores, and the core, rank and server of each thread."""
     cores, threads = areas
@@ -443,7 +448,8 @@ def _fill_cores(
         first, end = rows.put([number for pair in table for number in pair])
         rows[place + C.TABLE], rows[place + C.TABLE_END] = first, end
         # The run starts anywhere in a cycle.
-        elapsed = (timing.start_ns - timing.anchor_ns - plan.offset_ns) % plan.cycle_ns
+        anchor = timing.start_ns if plan.moves_timers else timing.anchor_ns
+        elapsed = (timing.start_ns - anchor) % plan.cycle_ns
         current = max(number for number, (offset, _) in enumerate(table) if offset <= elapsed)
         following = (current + 1) % len(table)
         rows[place + C.MASK], rows[place + C.NEXT] = table[current][1], first + 2 * following
@@ -451,10 +457,10 @@ def _fill_cores(
         rows[place + C.BOUNDARY] = timing.start_ns - elapsed + until
 
 
-def _slot_table(plan: Plan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
+def _slot_table(plan: ApplicationPlan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
     """Rows (offset in the cycle, mask of the servers that are open from then on)."""
     # A shaping node times its messages itself: its thread needs no slot to run in.
-    shaping = {node.thread for node in shaping_nodes(plan)}
+    shaping = {node.thread for node in plan.shaping_nodes}
     slots = [
         server.slots if shaping.isdisjoint(server.threads) else ((0, plan.cycle_ns),)
         for server in ranked
@@ -563,7 +569,7 @@ def _add_gate(rows: Rows, system: System, described: CallbackDescription, timing
         G.SPIN: gate.spin_ns,
         G.PAUSE: gate.pause_ns,
         G.MESSAGES: WORDS["messages"].index(gate.messages),
-        G.PHASE: timing.anchor_ns,
+        G.PHASE: timing.start_ns + gate.phase_ns if gate.phase_ns is not None else timing.anchor_ns,
         G.CHANGED: 0,
         G.CHANGES: rows.add(at.CHANGES_KEPT, 2).start,
     }.items():

@@ -12,12 +12,17 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper.planning.overruns import open_until_done
+from chainshaper.planning.application_plan import (
+    ApplicationPlan,
+    open_until_done,
+    plan_values,
+    whole,
+)
 from chainshaper.planning.plan import Plan, publisher_servers
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.arrays import Machine, System, build_machine, build_system
 from chainshaper.simulation.layout import Int64s, X
-from chainshaper.splicing.application import splice_application
+from chainshaper.splicing.application import check_periods, splice_application
 from chainshaper.values.compiled import kernel
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError
@@ -45,7 +50,7 @@ Progress = Callable[[float, str], None]
 def simulate(
     application: Application,
     output: str | Path,
-    plan: Plan | None = None,
+    plan: Plan | ApplicationPlan | None = None,
     *,
     cycles: int = 320,
     seed: int | None = None,
@@ -66,8 +71,9 @@ def simulate(
         OperationError: messages pile up without end, or the recording cannot be written.
     """
     output = refuse_existing(output)
-    application, timing = _checked(application, plan, cycles, seed)
-    system, machine = _built(application, plan, timing, events=True, switches=switches)
+    joint = None if plan is None else whole(plan)
+    application, timing = _checked(application, joint, cycles, seed)
+    system, machine = _built(application, joint, timing, events=True, switches=switches)
     info = RecordingInfo(
         source="simulated",
         host="simulation",  # thread ids say nothing about any real machine
@@ -80,15 +86,15 @@ def simulate(
         notes=(f"simulated; the first {live.WARM_UP_CYCLES} cycles were not recorded",),
         chain=application.chain,
         application=application_as_written(application),
-        plan=None if plan is None else plan.model_dump(mode="json"),
-        in_force=None if plan is None else InForceInfo(since_ns=timing.record_from_ns),
+        plan=None if joint is None else plan_values(joint),
+        in_force=None if joint is None else InForceInfo(since_ns=timing.record_from_ns),
     )
     return write_recording(output, _event_tables(system, machine, progress), info)
 
 
 def simulate_latencies(
     application: Application,
-    plan: Plan | None = None,
+    plan: Plan | ApplicationPlan | None = None,
     *,
     cycles: int = 320,
     seed: int | None = None,
@@ -102,15 +108,16 @@ def simulate_latencies(
 
     Raises: as :func:`simulate`.
     """
-    application, timing = _checked(application, plan, cycles, seed)
-    _, machine = _built(application, plan, timing, latencies=cycles)
+    joint = None if plan is None else whole(plan)
+    application, timing = _checked(application, joint, cycles, seed)
+    _, machine = _built(application, joint, timing, latencies=cycles)
     for _ in _runs(machine, progress):
         pass
     return machine.latencies
 
 
 def _checked(
-    application: Application, plan: Plan | None, cycles: int, seed: int | None
+    application: Application, plan: ApplicationPlan | None, cycles: int, seed: int | None
 ) -> tuple[Application, live.Timing]:
     """The application with the seed and the plan's shaping nodes, and the run's instants."""
     if cycles < 1:
@@ -125,15 +132,11 @@ def _checked(
     if seed is not None:
         application = application.model_copy(update={"seed": seed})
     if plan is not None:
-        period = live.origin_timer(application).timer_ns or 0
-        if plan.chain.period_ns != period:
-            raise InputError(
-                f"the plan is for a chain with the period {format_duration(plan.chain.period_ns)},"
-                f" but {application.chain} of {application.name!r} has {format_duration(period)}:"
-                " plan again from a recording of this application"
-            )
-        if plan.shaping_node is not None or any(publisher_servers(plan)):  # not in a baseline
+        shaping = [bool(one.shaping_node) or any(publisher_servers(one)) for one in plan.chains]
+        if all(shaping):
             application = splice_application(application, plan)
+        else:  # a baseline
+            check_periods(application, plan)
     timing = live.timing_of(application, cycles, START_NS)
     slowest = max((cb.timer_ns or 0) + cb.phase_ns for _, cb in application.callbacks())
     if timing.stop_ns + slowest > LONGEST_NS:
@@ -147,7 +150,7 @@ def _checked(
 
 def _built(
     application: Application,
-    plan: Plan | None,
+    plan: ApplicationPlan | None,
     timing: live.Timing,
     *,
     events: bool = False,

@@ -11,9 +11,11 @@ lifespan by which DDS discards what overran.
 
 from typing import Any
 
+from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.overruns import Writer, check_publication, output_lifespan
 from chainshaper.planning.plan import Plan, ShapingNode, publisher_servers
 from chainshaper.splicing.shaping_process import gate_of
+from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError
 from chainshaper.values.yaml_file import wrong_values_refused
 from chainshaper.workload.description import (
@@ -21,18 +23,64 @@ from chainshaper.workload.description import (
     CallbackDescription,
     GateDescription,
     NodeDescription,
+    origin_timer,
 )
 
 
-def splice_application(application: Application, plan: Plan) -> Application:
+def splice_application(application: Application, plan: Plan | ApplicationPlan) -> Application:
     """The application as the plan wants it to run; the given one is left as it is.
 
     It is extended by the plan's shaping nodes or, where the plan gates the publisher's thread,
-    given the lifespan that the plan's treatment of overruns needs.
+    given the lifespan that the plan's treatment of overruns needs. The timers that start chains
+    expire when their cycles start: so much after the common start as the plan's offsets say.
 
     Raises:
         InputError: the plan shapes nothing, or does not fit the application.
     """
+    joint = whole(plan)
+    check_periods(application, joint)
+    for chain in joint.chains:
+        application = _with_chain(_at_offset(application, joint, chain), joint, chain)
+    return application
+
+
+def check_periods(application: Application, joint: ApplicationPlan) -> None:
+    """Refuse a chain that does not have its plan's period in the application.
+
+    Raises InputError: so it is, or the application has no such chain.
+    """
+    for chain in joint.chains:
+        _, timer = _origin(application, joint, chain)
+        if timer.timer_ns != chain.chain.period_ns:
+            raise InputError(
+                "the plan is for a chain with the period"
+                f" {format_duration(chain.chain.period_ns)}, but"
+                f" {chain.chain.spec or application.chain} of {application.name!r} has"
+                f" {format_duration(timer.timer_ns or 0)}: plan again from a recording of this"
+                " application"
+            )
+
+
+def _origin(
+    application: Application, joint: ApplicationPlan, chain: Plan
+) -> tuple[str, CallbackDescription]:
+    """The timer that starts a chain: a plan of one chain is for the application's own."""
+    return origin_timer(application, chain.chain.spec if len(joint.chains) > 1 else None)
+
+
+def _at_offset(application: Application, joint: ApplicationPlan, chain: Plan) -> Application:
+    """The application with the timer that starts a chain expiring at the chain's offset."""
+    if not joint.moves_timers:
+        return application
+    name, timer = _origin(application, joint, chain)
+    node = application.nodes[name]
+    moved = timer.model_copy(update={"phase_ns": chain.offset_ns})
+    callbacks = tuple(moved if one is timer else one for one in node.callbacks)
+    nodes = {**application.nodes, name: node.model_copy(update={"callbacks": callbacks})}
+    return application.model_copy(update={"nodes": nodes})
+
+
+def _with_chain(application: Application, joint: ApplicationPlan, plan: Plan) -> Application:
     shaping = plan.shaping_node
     if shaping is None and any(publisher_servers(plan)):
         check_publication(plan, writers_of(application))
@@ -54,11 +102,13 @@ def splice_application(application: Application, plan: Plan) -> Application:
             "`announces` modes there: describe one, or remove `modes` from the plan"
         )
     for node in (shaping, *plan.further_shaping_nodes):
-        application = _spliced(application, plan, node)
+        application = _spliced(application, joint, plan, node)
     return application
 
 
-def _spliced(application: Application, plan: Plan, shaping: ShapingNode) -> Application:
+def _spliced(
+    application: Application, joint: ApplicationPlan, plan: Plan, shaping: ShapingNode
+) -> Application:
     """The application with one shaping node behind the publisher of its output."""
     if shaping.name in {name.strip("/") for name in application.nodes}:
         raise InputError(
@@ -85,7 +135,8 @@ def _spliced(application: Application, plan: Plan, shaping: ShapingNode) -> Appl
         callbacks.append(callback.model_copy(update={"publishes": tuple(published)}))
     nodes[publishers[0]] = publisher.model_copy(update={"callbacks": tuple(callbacks)})
     depth = shaping.depth or max(10, application.topic(shaping.output).depth)
-    nodes[shaping.name] = _described(plan, shaping, depth)
+    _, timer = _origin(application, joint, plan)
+    nodes[shaping.name] = _described(plan, shaping, depth, timer.phase_ns)
     if shaping.output in topics:
         topics[shaping.input] = topics[shaping.output]  # the same quality of service
     first, *others = application.chain.split("..")
@@ -109,10 +160,11 @@ def writers_of(application: Application) -> list[Writer]:
     ]
 
 
-def _described(plan: Plan, shaping: ShapingNode, depth: int) -> NodeDescription:
+def _described(plan: Plan, shaping: ShapingNode, depth: int, phase_ns: int) -> NodeDescription:
     gate = gate_of(plan, shaping, depth)
     same = ("slots", "cycle_ns", "anchor", "overrun", "due_cycles", "messages", "depth")
     described: dict[str, Any] = {name: getattr(gate, name) for name in same}
+    described["phase_ns"] = phase_ns
     described |= {"spin_ns": shaping.spin_ns, "pause_ns": shaping.pause_ns}
     if gate.modes is not None and plan.modes is not None:
         described["modes"] = {"topic": plan.modes.topic, **vars(gate.modes)}

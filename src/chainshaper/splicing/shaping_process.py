@@ -19,7 +19,7 @@ from typing import Any, Literal, TypeAlias
 import yaml
 
 from chainshaper.analysis.chains import close_names
-from chainshaper.gate import decision, handover
+from chainshaper.gate import decision, handover, throttling
 from chainshaper.gate.decision import DEPTH, Gate, Modes, NodeParameters, gate_parameters
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.plan import Plan, ShapingNode, server_of
@@ -122,6 +122,7 @@ def write_throttler(
     kind: Literal["python", "cpp"],
     folder: Path,
     *,
+    rule: throttling.Rule = "newest",
     name: str = "chainshaper_throttler",
     phase_ns: int = 0,
     core: int | None = None,
@@ -131,21 +132,25 @@ def write_throttler(
 ) -> ShapingProcess:
     """Write a throttler into ``folder`` (paper, section 5.1); what a launch file has to start.
 
-    Each of the ``topics`` is republished on the one it maps to, once every ``period_ns``, at
-    ``phase_ns`` after multiples of it on CLOCK_MONOTONIC. ``depth`` is the history of the
-    publishers where that of the originals is not known; ``into`` as for a shaping process.
+    Each of the ``topics`` is republished on the one it maps to, once every ``period_ns``: by the
+    ``rule`` ``newest`` at ``phase_ns`` after multiples of it on CLOCK_MONOTONIC, by ``first`` as
+    it comes (:mod:`chainshaper.gate.throttling`). ``depth`` is the history of the publishers where
+    that of the originals is not known; ``into`` as for a shaping process.
 
     Raises:
-        InputError: no topics, no period, or a file is there with another content.
+        InputError: no topics or period, ``first`` with a phase, or another file is there.
         OperationError: a file cannot be written.
     """
     if not topics or period_ns <= 0:
         raise InputError("a throttler needs topics and a period longer than nothing")
+    if rule == "first" and phase_ns:
+        raise InputError("the rule `first` has no phase: leave out phase_ns, or choose `newest`")
     parameters = {
         "inputs": list(topics),
         "outputs": list(topics.values()),
         "period_ns": period_ns,
         "phase_ns": phase_ns,
+        "rule": rule,
         "core": -1 if core is None else core,
         "fifo_priority": fifo_priority or 0,
         "output_depth": depth,
@@ -394,7 +399,7 @@ def _schema() -> dict[str, str]:
     }
     numbers = {
         name.lower(): value
-        for room in (decision, handover)
+        for room in (decision, handover, throttling)
         for name, value in vars(room).items()
         if name.isupper() and isinstance(value, int) and not name.startswith("_")
     }

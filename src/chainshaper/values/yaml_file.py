@@ -29,6 +29,7 @@ from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import InputError
 
 Model = TypeVar("Model", bound=BaseModel)
+Other = TypeVar("Other", bound=BaseModel)
 _Path: TypeAlias = tuple[str | int, ...]
 
 _KINDS = {
@@ -111,8 +112,16 @@ def wrong_value(reason: str, *where: str | int) -> PydanticCustomError:
     return PydanticCustomError("wrong_value", "{reason}", {"reason": reason, "where": where})
 
 
-def read_model(path: str | Path, model: type[Model], *, made_by: str) -> Model:
+def read_model(
+    path: str | Path,
+    model: type[Model],
+    *,
+    made_by: str,
+    otherwise: tuple[str, type[Other]] | None = None,
+) -> Model | Other:
     """A YAML file as a Pydantic model; ``made_by`` completes the sentence "such a file is …".
+
+    ``otherwise`` is the model of a file that has a certain key.
 
     Raises:
         InputError: no such file, not YAML, or wrong values; each is named with its line, key,
@@ -125,10 +134,13 @@ def read_model(path: str | Path, model: type[Model], *, made_by: str) -> Model:
     if not isinstance(values, dict):
         found = "the file is empty" if root is None else "expected a YAML mapping (key: value)"
         raise InputError(f"{path}:1: {found}; such a file is {made_by}")
+    meant: type[Model] | type[Other] = model
+    if otherwise is not None and otherwise[0] in values:
+        meant = otherwise[1]
     try:
-        return model.model_validate(values, context=AS_YAML)
+        return meant.model_validate(values, context=AS_YAML)
     except ValidationError as error:
-        raise plain.problems(error, model) from error
+        raise plain.problems(error, meant) from error
 
 
 def read_text(path: Path, made_by: str) -> str:

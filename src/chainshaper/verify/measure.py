@@ -15,7 +15,8 @@ import polars as pl
 
 from chainshaper.analysis import LatencyAnalysis, analyse_latency
 from chainshaper.analysis.latency import summary
-from chainshaper.planning import Plan
+from chainshaper.planning import ApplicationPlan, Plan
+from chainshaper.planning.application_plan import plan_in, plan_of_chain, whole
 from chainshaper.sources import open_source
 from chainshaper.values import events
 from chainshaper.values.durations import format_duration
@@ -93,7 +94,9 @@ def chain_of(recording: Recording, chain: str | None) -> str:
 
 
 def measure_latency(
-    recording: Recording | str | Path, chain: str | None = None, plan: Plan | None = None
+    recording: Recording | str | Path,
+    chain: str | None = None,
+    plan: Plan | ApplicationPlan | None = None,
 ) -> Measurement:
     """Analyse the end-to-end latency of one chain in a recording.
 
@@ -101,27 +104,29 @@ def measure_latency(
     """
     if not isinstance(recording, Recording):
         recording = open_source(recording)
-    if plan is None and recording.info.plan is not None:
-        plan = Plan.model_validate(recording.info.plan, strict=False)
+    joint = None if plan is None else whole(plan)
+    if joint is None and recording.info.plan is not None:
+        joint = plan_in(recording.info.plan)
     spell, left_out = _in_force(recording)
     analysis = analyse_latency(
         recording,
         chain_of(recording, chain),
-        due=() if plan is None else due_of(plan),
+        due=() if joint is None else [due for one in joint.chains for due in due_of(one)],
         between=spell,
     )
+    own = None if joint is None else plan_of_chain(joint, analysis.chain.topics[-1])
     if spell is not None:
         recording = replace(recording, events=events.happened(recording.events, *spell))
-    planned_for = plan is not None and plan.chain.output in (None, analysis.chain.topics[-1])
+    planned_for = own is not None and own.chain.output in (None, analysis.chain.topics[-1])
     return Measurement(
         recording=recording,
         analysis=analysis,
         longest_stall_ns=longest_stall(recording),
-        overruns=overruns_in(recording, plan, analysis),
-        into_open_slots=into_open_slots(recording, plan),
+        overruns=overruns_in(recording, own, analysis),
+        into_open_slots=into_open_slots(recording, own),
         dropped=dropped_in(recording),
-        plan=plan,
-        held=hold_prediction(plan, analysis) if plan and planned_for else None,
+        plan=own,
+        held=hold_prediction(own, analysis) if own and planned_for else None,
         left_out=left_out,
     )
 
@@ -147,7 +152,9 @@ def longest_stall(recording: Recording) -> int | None:
 
 
 def compare_recordings(
-    recordings: Sequence[Recording | str | Path], chain: str | None = None, plan: Plan | None = None
+    recordings: Sequence[Recording | str | Path],
+    chain: str | None = None,
+    plan: Plan | ApplicationPlan | None = None,
 ) -> Comparison:
     """Measure the same chain in several recordings.
 

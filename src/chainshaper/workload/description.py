@@ -26,6 +26,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from chainshaper.gate.decision import Anchor, Gate, Late, Messages, Modes, Overrun
+from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Publication
 from chainshaper.values.yaml_file import (
     AS_YAML,
@@ -126,13 +127,18 @@ class ModesDescription(Part):
 
 
 class GateDescription(Part):
-    """A :class:`~chainshaper.gate.decision.Gate` in a callback: republishing in ``slots`` only."""
+    """A :class:`~chainshaper.gate.decision.Gate` in a callback: republishing in ``slots`` only.
+
+    ``phase_ns`` is where cycles begin without a stamp, behind the common start (None: with the
+    timer that starts the application's chain).
+    """
 
     slots: Annotated[tuple[tuple[Duration, Duration], ...], Field(min_length=1)]
     cycle_ns: PositiveDuration
     anchor: Anchor = "stamp"
     overrun: Overrun = "wait"
     due_cycles: Annotated[int, Field(ge=0)] = 0
+    phase_ns: Duration | None = None
     modes: ModesDescription | None = None
     messages: Messages = "all-in-order"
     depth: Annotated[int, Field(ge=1)] = 10
@@ -350,6 +356,31 @@ class Application(Part):
         """Every core the application uses, with who asks for it."""
         executors = {self.scheduling_of(node).core: f"node {node}" for node in self.nodes}
         return {self.scheduling.dds.core: "scheduling.dds", **executors}
+
+
+def origin_timer(
+    application: Application, chain: str | None = None
+) -> tuple[str, CallbackDescription]:
+    """The timer callback that starts a chain, or leads to its first callback, and its node.
+
+    The application's own chain, unless another is named.
+    """
+    first = (chain or application.chain).split("..")[0].strip()
+    starts = [
+        (name, callback)
+        for name, callback in application.callbacks()
+        if first in callback.publishes or first.strip("/") == name.strip("/")
+    ]
+    # Every topic has a publisher, and topics form no cycle: a timer is found.
+    while starts and all(callback.timer_ns is None for _, callback in starts):
+        inputs = {topic for _, callback in starts for topic in callback.subscriptions}
+        starts = [one for one in application.callbacks() if inputs.intersection(one[1].publishes)]
+    if not starts:
+        raise InputError(
+            f"the application {application.name!r} has no {first}, with which the chain {chain}"
+            " begins: plan again from a recording of this application"
+        )
+    return next(one for one in starts if one[1].timer_ns is not None)
 
 
 def load_application(path: str | Path) -> Application:

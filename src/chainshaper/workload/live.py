@@ -35,8 +35,8 @@ from chainshaper.values.recording import (
 )
 from chainshaper.workload.description import (
     Application,
-    CallbackDescription,
     application_as_written,
+    origin_timer,
 )
 from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS
 from chainshaper.workload.launcher import Child, end_all, first_casualty, start_child
@@ -57,11 +57,13 @@ class StartedNodes:
     """The nodes of a live run while they wait for its start.
 
     ``pids`` has the process of each node's full name; ``anchor_ns`` (CLOCK_MONOTONIC) is the
-    first expiry of the timer that starts the chain, from which its cycles count.
+    first expiry of the timer that starts the chain, from which its cycles count; ``start_ns`` the
+    common start of all timers.
     """
 
     pids: dict[str, int]
     anchor_ns: int
+    start_ns: int
 
 
 Enforcement: TypeAlias = Callable[[StartedNodes], AbstractContextManager[object]]
@@ -133,7 +135,8 @@ def run_application(
         timing = timing_of(application, cycles, time.monotonic_ns() + lead)
         offset = clock_offset()
         processes = {child.pid: node_name(name) for name, child in nodes.items()}
-        started = StartedNodes({node: pid for pid, node in processes.items()}, timing.anchor_ns)
+        pids = {node: pid for pid, node in processes.items()}
+        started = StartedNodes(pids, timing.anchor_ns, timing.start_ns)
         with nullcontext() if enforcement is None else enforcement(started):
             for child in [*nodes.values(), *meters.values()]:
                 child.tell(**asdict(timing))
@@ -173,21 +176,6 @@ def node_name(name: str) -> str:
     return "/" + name.strip("/")
 
 
-def origin_timer(application: Application) -> CallbackDescription:
-    """The timer callback that starts the application's chain, or leads to its first callback."""
-    first = application.chain.split("..")[0].strip()
-    starts = [
-        callback
-        for name, callback in application.callbacks()
-        if first in callback.publishes or first.strip("/") == name.strip("/")
-    ]
-    # Every topic has a publisher, and topics form no cycle: a timer is found.
-    while all(callback.timer_ns is None for callback in starts):
-        inputs = {topic for callback in starts for topic in callback.subscriptions}
-        starts = [cb for _, cb in application.callbacks() if inputs.intersection(cb.publishes)]
-    return next(callback for callback in starts if callback.timer_ns is not None)
-
-
 @dataclass(frozen=True)
 class Timing:
     """The instants of a run (ns), live or simulated: from the timers' common start to the end."""
@@ -205,7 +193,7 @@ def timing_of(application: Application, cycles: int, start: int) -> Timing:
 
     It is recorded from just before the first recorded expiry: instances are not cut in two.
     """
-    timer = origin_timer(application)
+    _, timer = origin_timer(application)
     period = timer.timer_ns or 0
     anchor = start + timer.phase_ns
     first = anchor + WARM_UP_CYCLES * period
@@ -247,7 +235,7 @@ def _start_nodes(application: Application, nodes: dict[str, Child], realtime: bo
             seed=application.seed,
             parent=os.getpid(),
             discovery_ns=DISCOVERY_NS,
-            origin_phase=origin_timer(application).phase_ns,
+            origin_phase=origin_timer(application)[1].phase_ns,
             delivery_core=dds.core if realtime and dds.core != executor.core else None,
             callbacks=[callback.model_dump() for callback in node.callbacks],
             topics={topic: application.topic(topic).model_dump() for topic in writers},

@@ -255,7 +255,9 @@ class NodeProcess:
             if delivery_core is not None:
                 delivery_core.clear_until(release_ns + gate["pause_ns"])
 
+        own_phase = gate["phase_ns"]
         decided = Gate(
+            phase_ns=self.spec["origin_phase"] if own_phase is None else own_phase,
             slots=tuple((begin, finish) for begin, finish in gate["slots"]),
             modes=modes and Modes(modes["bands"], modes["default"], modes["late"]),
             **{name: gate[name] for name in GATE_FIELDS},
@@ -320,7 +322,7 @@ class NodeProcess:
         for times in self.execution_times:
             times.refill(min(1 + (stop_ns - start_ns) // min(periods), 100_000))
         for shaper in self.shapers:
-            shaper.queue.phase_ns = start_ns + self.spec["origin_phase"]
+            shaper.queue.phase_ns = start_ns + shaper.gate.phase_ns
         stop_garbage_collection()
         self.executor.spin_until(stop_ns, last_timer_ns)
 

@@ -1,14 +1,12 @@
-"""The throttler: a strictly periodic start for chains whose input is not quite periodic (paper,
-section 5.1).
+"""The throttler, for chains whose input is not quite periodic (paper, section 5.1).
 
-Each topic of ``inputs`` is republished on the topic of ``outputs`` in the same place, once every
-``period_ns``, at ``phase_ns`` after multiples of it on CLOCK_MONOTONIC: the newest message that
-came since the last time. Where none came nothing is published, and where several came the older
-ones are dropped; both are counted, and said at the end.
+Each topic of ``inputs`` is republished on the topic of ``outputs`` in the same place. By the
+``rule`` ``newest`` that is once every ``period_ns``, at ``phase_ns`` after multiples of it on
+CLOCK_MONOTONIC: the newest message that came since the last time. Where none came nothing is
+published, and where several came the older ones are dropped; both are counted, and said at the end.
 
-The paper's is triggered by its input, and its server, a slot of 2 ms in every cycle, makes the
-output periodic. Here a timer does that, on every kernel; the first message of a period would have
-become old by then.
+By ``first``, the paper's, the first message of a period is published as it comes. That is periodic
+only behind the paper's server, a slot of 2 ms in every cycle; a timer is so on every kernel.
 """
 
 import atexit
@@ -21,6 +19,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from chainshaper.gate.decision import sleep_until
+from chainshaper.gate.throttling import RULES, FirstOfPeriod
 from chainshaper.splicing.nodes.python.node import (
     asked_of,
     create_subscription,
@@ -41,15 +40,19 @@ class Channel:
     output: str
     send: Callable[[bytes], None]
     logger: Any
+    periods: FirstOfPeriod | None  # None: the rule is `newest`
     newest: bytes | None = None
     published: int = 0
     dropped: int = 0
     missing: int = 0
 
     def take(self, payload: bytes) -> None:
-        """Keep a message until the next tick."""
-        self.dropped += self.newest is not None
-        self.newest = payload
+        """Publish a message if it is the first of its period; or keep it until the next tick."""
+        passes = self.periods is None or self.periods.passes(time.monotonic_ns())
+        self.dropped += self.newest is not None or not passes
+        self.newest = payload if passes else None
+        if passes and self.periods is not None:
+            self.publish()
 
     def publish(self) -> None:
         """Publish what is new."""
@@ -67,7 +70,7 @@ class Channel:
     def __str__(self) -> str:
         return (
             f"{self.output}: {self.published} published, {self.missing} times nothing new, "
-            f"{self.dropped} dropped for newer ones"
+            f"{self.dropped} dropped"
         )
 
 
@@ -75,9 +78,9 @@ def set_up(node: Node) -> Callable[[], bool]:
     """Make the node's endpoints and timers; behind their callbacks nothing is left to do."""
     parameters = parameters_of(node)
     inputs, outputs, phase = parameters.inputs, parameters.outputs, parameters.phase_ns
-    period = parameters.period_ns
-    if not inputs or len(inputs) != len(outputs) or period <= 0:
-        raise ValueError("inputs, as many outputs, and a period are needed")
+    period, rule = parameters.period_ns, parameters.rule
+    if not inputs or len(inputs) != len(outputs) or period <= 0 or rule not in RULES:
+        raise ValueError("inputs, as many outputs, a period, and a rule are needed")
     channels: list[Channel] = []
     atexit.register(lambda: print(*channels, sep="\n", flush=True))  # noqa: T201
     for source, target in zip(inputs, outputs, strict=True):
@@ -85,10 +88,13 @@ def set_up(node: Node) -> Callable[[], bool]:
         offered = offered_by(info, node)
         message_type = message_class(info.topic_type)
         publisher = node.create_publisher(message_type, target, offered)
-        channel = Channel(target, publish_function(publisher), node.get_logger())
+        periods = FirstOfPeriod(period) if rule == "first" else None
+        channel = Channel(target, publish_function(publisher), node.get_logger(), periods)
         asked = asked_of(offered)
         create_subscription(node, message_type, source, channel.take, asked, raw=True)
         channels.append(channel)
+    if rule == "first":
+        return lambda: False
     # A timer keeps the phase at which it was made, on the same clock.
     since = time.monotonic_ns() - phase
     sleep_until(phase + (since // period + 1) * period)

@@ -1,8 +1,6 @@
-// The throttler: a strictly periodic start for chains whose input is not quite periodic (Managing
-// End-to-End Timing Jitters in ROS2 Computation Chains, section 5.1).
-//
-// chainshaper's Python throttler does the same; its source says what that is, and why it is not the
-// paper's rule to the letter.
+// The throttler, for chains whose input is not quite periodic (Managing End-to-End Timing Jitters in
+// ROS2 Computation Chains, section 5.1). chainshaper's Python throttler does the same; its source
+// says what that is.
 
 #include <memory>
 #include <string>
@@ -18,16 +16,12 @@ struct Channel {
   rclcpp::GenericPublisher::SharedPtr publisher;
   rclcpp::GenericSubscription::SharedPtr subscription;
   rclcpp::TimerBase::SharedPtr timer;
+  std::optional<chainshaper::FirstOfPeriod> periods;  // none: the rule is `newest`
   std::shared_ptr<const rclcpp::SerializedMessage> newest;
   std::uint64_t published{0};
   std::uint64_t dropped{0};
   std::uint64_t missing{0};
 };
-
-void take(Channel & channel, std::shared_ptr<const rclcpp::SerializedMessage> message) {
-  channel.dropped += channel.newest ? 1 : 0;
-  channel.newest = std::move(message);
-}
 
 void publish(rclcpp::Node & node, Channel & channel) {
   if (channel.newest) {
@@ -42,6 +36,14 @@ void publish(rclcpp::Node & node, Channel & channel) {
                        static_cast<std::size_t>(channel.missing));
 }
 
+void take(rclcpp::Node & node, Channel & channel,
+          std::shared_ptr<const rclcpp::SerializedMessage> message) {
+  const bool passes = !channel.periods || channel.periods->passes(chainshaper::monotonic_ns());
+  channel.dropped += channel.newest || !passes ? 1 : 0;
+  channel.newest = passes ? std::move(message) : nullptr;
+  if (passes && channel.periods) publish(node, channel);
+}
+
 }  // namespace
 
 int main(int argc, char ** argv) {
@@ -51,21 +53,26 @@ int main(int argc, char ** argv) {
         const auto parameters = chainshaper::parameters_of(node);
         const auto & [inputs, outputs] = std::tie(parameters.inputs, parameters.outputs);
         const auto period = parameters.period_ns;
-        if (inputs.empty() || inputs.size() != outputs.size() || period <= 0)
-          throw std::invalid_argument("inputs, as many outputs, and a period are needed");
+        const bool first = parameters.rule == "first", known = first || parameters.rule == "newest";
+        if (inputs.empty() || inputs.size() != outputs.size() || period <= 0 || !known)
+          throw std::invalid_argument("inputs, as many outputs, a period, and a rule are needed");
         for (std::size_t i = 0; i < inputs.size(); ++i) {
           const auto offer = chainshaper::wait_for_publisher(node, inputs[i]);
           if (!offer) return {};
           channels.push_back(std::make_unique<Channel>());
           Channel & channel = *channels.back();
           channel.output = outputs[i];
+          if (first) channel.periods = chainshaper::FirstOfPeriod{period};
           channel.publisher =
               node.create_generic_publisher(outputs[i], offer->type, offer->publisher);
           channel.subscription = chainshaper::subscribe_serialized(
               node, inputs[i], offer->type, offer->subscription,
-              [&channel](std::shared_ptr<rclcpp::SerializedMessage> message,
-                         const rclcpp::MessageInfo &) { take(channel, std::move(message)); });
+              [&node, &channel](std::shared_ptr<rclcpp::SerializedMessage> message,
+                                const rclcpp::MessageInfo &) {
+                take(node, channel, std::move(message));
+              });
         }
+        if (first) return [] { return false; };
         // A timer keeps the phase at which it was made, on the same clock.
         const std::int64_t since = chainshaper::monotonic_ns() - parameters.phase_ns;
         chainshaper::sleep_until(parameters.phase_ns + (since / period + 1) * period);
@@ -76,7 +83,7 @@ int main(int argc, char ** argv) {
         return [] { return false; };
       });
   for (const auto & channel : channels) {
-    std::printf("%s: %zu published, %zu times nothing new, %zu dropped for newer ones\n",
+    std::printf("%s: %zu published, %zu times nothing new, %zu dropped\n",
                 channel->output.c_str(), static_cast<std::size_t>(channel->published),
                 static_cast<std::size_t>(channel->missing),
                 static_cast<std::size_t>(channel->dropped));

@@ -319,6 +319,22 @@ private:
   std::uint64_t number_{0};
 };
 
+// The throttler's rule `first`: the same as chainshaper/gate/throttling.py, which explains it.
+struct FirstOfPeriod {
+  std::int64_t period_ns;
+  std::int64_t early_ns{period_ns / schema::early_divisor};
+  std::int64_t due_ns{-2 * period_ns};
+  std::int64_t passed_ns{due_ns};
+
+  bool passes(std::int64_t now_ns) {
+    if (now_ns < std::max(due_ns, passed_ns + period_ns) - early_ns) return false;
+    const bool none_came = now_ns >= due_ns + period_ns - early_ns;
+    due_ns = (none_came ? now_ns : due_ns) + period_ns;
+    passed_ns = now_ns;
+    return true;
+  }
+};
+
 inline std::int64_t clock_ns(clockid_t clock) {
   timespec now{};
   clock_gettime(clock, &now);

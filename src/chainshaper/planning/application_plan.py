@@ -1,0 +1,343 @@
+"""A plan for a whole application: several chains whose servers and shaping nodes act together.
+
+Each chain has a :class:`~chainshaper.planning.plan.Plan`: its period, evidence, slots and outputs.
+Its cycles start ``offset`` after the instant from which those of all chains count, so all slots
+repeat with the **hyper-period**, the least common multiple of the cycles. Chains that begin at the
+same callback share the servers that run it; chains of different beginnings that pass the same node
+each reserve slots for its thread, which then runs in all of them.
+
+:attr:`ApplicationPlan.servers` is what back ends and the simulator carry out: every server once,
+its slots played out over the hyper-period. A plan for one chain is the same with one chain.
+"""
+
+import contextlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
+from itertools import combinations
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+from pydantic import Field, ValidationError, model_validator
+
+from chainshaper.planning.offsets import chain_name, collisions, timetable
+from chainshaper.planning.overruns import open_until_done as chain_open_until_done
+from chainshaper.planning.plan import (
+    Plan,
+    Server,
+    ShapingNode,
+    Slot,
+    Thread,
+    plans_as_text,
+    shaping_nodes,
+    slot_text,
+)
+from chainshaper.values.durations import format_duration
+from chainshaper.values.files import new_file, write_whole
+from chainshaper.values.yaml_file import Part, read_model, wrong_value, wrong_values_refused
+
+MOST_SLOTS = 10_000
+"""So many slots of all servers fit into a hyper-period at the most."""
+
+
+class ApplicationPlan(Part):
+    """The plans of an application's chains; what they share stands in each of them, and is equal.
+
+    In the file a server stands where it comes first; further chains have its name in its place.
+    """
+
+    format: Literal[2] = 2
+    chains: Annotated[tuple[Plan, ...], Field(min_length=1)]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _named_servers(cls, values: Any) -> Any:
+        """Names of servers that stand in an earlier chain, by these servers."""
+        chains = values.get("chains") if isinstance(values, dict) else None
+        if not isinstance(chains, tuple | list) or not all(isinstance(one, dict) for one in chains):
+            return values
+        known: dict[Any, Any] = {}
+        complete = []
+        for place, chain in enumerate(chains):
+            servers = chain.get("servers")
+            own = list(servers) if isinstance(servers, tuple | list) else []
+            for number, server in enumerate(own):
+                if isinstance(server, dict):
+                    known.setdefault(server.get("name"), server)
+                elif server in known:
+                    own[number] = known[server]
+                else:
+                    reason = f"no chain before this one has a server {server!r}: write it out"
+                    raise wrong_value(reason, "chains", place, "servers", number)
+            complete.append({**chain, "servers": tuple(own)} if own else chain)
+        return {**values, "chains": tuple(complete)}
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "ApplicationPlan":
+        for rule in (_outputs, _shared_servers, _threads, _slot_count, _apart):
+            for reason, *where in rule(self):
+                raise wrong_value(str(reason), "chains", *where)
+        return self
+
+    @property
+    def cycle_ns(self) -> int:
+        """The hyper-period: all slots repeat with it."""
+        return math.lcm(*(chain.cycle_ns for chain in self.chains))
+
+    @cached_property
+    def servers(self) -> tuple[Server, ...]:
+        """Each server once, with all its slots in the hyper-period, ascending.
+
+        A thread that several chains have in servers of their own gets one that is open in the
+        slots of all of these, at the best of their priorities.
+        """
+        named = {server.name: (server, one) for one in self.chains for server in one.servers}
+        homes: dict[Thread, list[str]] = {}
+        for name, (server, _) in named.items():
+            for thread in server.threads:
+                homes.setdefault(thread, []).append(name)
+        members: dict[tuple[str, ...], list[Thread]] = {}
+        for thread, names in homes.items():
+            members.setdefault(tuple(names), []).append(thread)
+        for name, (server, _) in named.items():
+            if not server.threads:
+                members[name,] = []
+        found = []
+        for together, threads in members.items():
+            own = [named[name] for name in together]
+            slots = [slot for one in own for slot in _played_out(*one, self.cycle_ns)]
+            found.append(
+                Server(
+                    name="+".join(together),
+                    core=own[0][0].core,
+                    priority=min(server.priority for server, _ in own),
+                    slots=tuple(_united(slots) if len(self.chains) > 1 else sorted(slots)),
+                    threads=tuple(threads),
+                )
+            )
+        return tuple(found)
+
+    @property
+    def moves_timers(self) -> bool:
+        """Whether chains' cycles start at other instants than their timers would by themselves."""
+        return len(self.chains) > 1 or self.chains[0].offset_ns > 0
+
+    @property
+    def shaping_nodes(self) -> tuple[ShapingNode, ...]:
+        """Those of all chains."""
+        return tuple(node for chain in self.chains for node in shaping_nodes(chain))
+
+
+def whole(plan: "Plan | ApplicationPlan") -> ApplicationPlan:
+    """A plan as that of an application, which one chain is as well."""
+    return plan if isinstance(plan, ApplicationPlan) else combined([plan])
+
+
+def plan_of_chain(plan: "Plan | ApplicationPlan", output: str | None) -> Plan | None:
+    """The plan of the chain with this output; None if there is none, or it is not known which.
+
+    A plan that names no output is about any.
+    """
+    for chain in whole(plan).chains:
+        named = [chain.chain.output, *(node.output for node in shaping_nodes(chain))]
+        if chain.chain.output is None or output in named:
+            return chain
+    return None
+
+
+def open_until_done(plan: ApplicationPlan) -> ApplicationPlan:
+    """The plan as back ends and the simulator carry it out: what overruns may finish.
+
+    See :func:`chainshaper.planning.overruns.open_until_done`; a server whose longer slots would
+    meet those of another chain stays as planned.
+    """
+    opened = [server for chain in plan.chains for server in chain_open_until_done(chain).servers]
+    for server in sorted(opened, key=lambda one: one.slots[-1][1]):  # the longest of several last
+        longer = []
+        for chain in plan.chains:
+            servers = [server if one.name == server.name else one for one in chain.servers]
+            longer.append(chain.model_copy(update={"servers": tuple(servers)}))
+        with contextlib.suppress(ValidationError):
+            plan = ApplicationPlan(chains=tuple(longer))
+    return plan
+
+
+def combined(plans: Sequence[Plan]) -> ApplicationPlan:
+    """The plan of an application from those of its chains.
+
+    Raises InputError: they make none together, with the reason.
+    """
+    with wrong_values_refused(ApplicationPlan):
+        return ApplicationPlan(chains=tuple(plans))
+
+
+def _played_out(server: Server, chain: Plan, hyper_period_ns: int) -> Iterator[Slot]:
+    """A server's slots over the hyper-period; one that reaches beyond its end becomes two."""
+    for start_ns in range(chain.offset_ns, chain.offset_ns + hyper_period_ns, chain.cycle_ns):
+        for slot in server.slots:
+            start = (slot[0] + start_ns) % hyper_period_ns
+            end = start + slot[1] - slot[0]
+            yield start, min(end, hyper_period_ns)
+            if end > hyper_period_ns:
+                yield 0, end - hyper_period_ns
+
+
+def _united(slots: list[Slot]) -> list[Slot]:
+    united: list[Slot] = []
+    for start, end in sorted(slots):
+        if united and start <= united[-1][1]:
+            united[-1] = united[-1][0], max(end, united[-1][1])
+        else:
+            united.append((start, end))
+    return united
+
+
+# The rules: each yields what is wrong, and where below `chains` ----------------------------------
+
+_Wrong: TypeAlias = Iterator[tuple[str | int, ...]]
+
+
+def _pairs(plan: ApplicationPlan) -> Iterator[tuple[Plan, int, Plan]]:
+    """Every two chains, the later one with its place."""
+    for (_, one), (place, two) in combinations(enumerate(plan.chains), 2):
+        yield one, place, two
+
+
+def _outputs(plan: ApplicationPlan) -> _Wrong:
+    for one, place, two in _pairs(plan):
+        if one.chain.output is not None and one.chain.output == two.chain.output:
+            reason = f"{one.chain.output} is the output of an earlier chain too: plan it once"
+            yield reason, place, "chain", "output"
+        ours = {name for node in shaping_nodes(one) for name in (node.name, node.output)}
+        for node in shaping_nodes(two):
+            if ours & {node.name, node.output}:
+                reason = (
+                    f"an earlier chain has the shaping node {node.name} or its output"
+                    f" {node.output} too: both must be its own"
+                )
+                yield reason, place, "shaping_node"
+
+
+def _shared_servers(plan: ApplicationPlan) -> _Wrong:
+    for one, place, two in _pairs(plan):
+        known = {server.name: server for server in one.servers}
+        for number, server in enumerate(two.servers):
+            if server.name not in known:
+                continue
+            if known[server.name] != server:
+                reason = f"an earlier chain has another server {server.name!r}: rename one"
+                yield reason, place, "servers", number, "name"
+            if (one.cycle_ns, one.offset_ns) != (two.cycle_ns, two.offset_ns):
+                reason = (
+                    f"the server {server.name!r} is shared with an earlier chain, whose cycles"
+                    " have another length or offset: write a server of its own"
+                )
+                yield reason, place, "servers", number
+
+
+def _threads(plan: ApplicationPlan) -> _Wrong:
+    homes = {t: s for one in plan.chains for s in one.servers for t in s.threads}
+    for place, chain in enumerate(plan.chains):
+        for number, server in enumerate(chain.servers):
+            for thread in server.threads:
+                if (other := homes[thread]).core != server.core:
+                    reason = (
+                        f"the {thread.role} of {thread.node} would run on core {server.core} here"
+                        f" and on core {other.core} in server {other.name!r}: write one core"
+                    )
+                    yield reason, place, "servers", number, "core"
+
+
+def _slot_count(plan: ApplicationPlan) -> _Wrong:
+    chains = plan.chains
+    slots = [sum(len(server.slots) for server in chain.servers) for chain in chains]
+    counts = [plan.cycle_ns // one.cycle_ns * own for one, own in zip(chains, slots, strict=True)]
+    if len(chains) > 1 and sum(counts) > MOST_SLOTS:
+        cycles = ", ".join(format_duration(chain.cycle_ns) for chain in chains)
+        yield (
+            f"the cycles {cycles} repeat together after {format_duration(plan.cycle_ns)} only, with"
+            f" {sum(counts)} slots; {MOST_SLOTS} is the most that is carried out: use periods with"
+            " a larger common divisor",
+            len(chains) - 1,
+            "cycle",
+        )
+
+
+def _apart(plan: ApplicationPlan) -> _Wrong:
+    """Slots of one core and priority are disjoint in all cycles, across chains as inside one."""
+    for one, place, two in _pairs(plan):
+        shared = {server.name for server in one.servers} & {server.name for server in two.servers}
+        common, forbidden = collisions(timetable([one], shared), timetable([two], shared))
+        distance = (two.offset_ns - one.offset_ns) % common
+        if any(first <= distance <= last for first, last in forbidden):
+            yield (
+                f"{_collision_text(one, two, shared)}: move a slot, change the offset of one chain"
+                " (`chainshaper offsets`), or give their servers other cores or priorities",
+                place,
+                "offset",
+            )
+
+
+def _collision_text(one: Plan, two: Plan, shared: set[str]) -> str:
+    """The first slots that collide in some cycle, in words."""
+    common = math.gcd(one.cycle_ns, two.cycle_ns)
+    for server in one.servers:
+        for other in two.servers:
+            if (server.core, server.priority) != (other.core, other.priority):
+                continue
+            if shared & {server.name, other.name}:
+                continue
+            for start, end in server.slots:
+                for other_start, other_end in other.slots:
+                    later = (other_start + two.offset_ns - start - one.offset_ns) % common
+                    if later < end - start or common - later < other_end - other_start:
+                        return (
+                            f"the slot {slot_text((other_start, other_end))} of server"
+                            f" {other.name!r} meets {slot_text((start, end))} of server"
+                            f" {server.name!r} of {chain_name(one)} in some cycles, on core"
+                            f" {server.core} at the same priority {server.priority}"
+                        )
+    return f"slots of {chain_name(two)} and {chain_name(one)} collide"
+
+
+# The file ---------------------------------------------------------------------------------------
+
+
+def load_application_plan(path: str | Path) -> ApplicationPlan:
+    """Read a plan for an application, or for one chain (format 1), however it is laid out.
+
+    Raises InputError: no such file, not YAML, or wrong values; each is named with its line, key,
+    reason and remedy.
+    """
+    made_by = "written by `chainshaper plan`"
+    return whole(read_model(path, Plan, made_by=made_by, otherwise=("chains", ApplicationPlan)))
+
+
+def plan_in(values: Mapping[str, Any]) -> ApplicationPlan:
+    """A plan from what a recording or a run has of it, of either format."""
+    if "chains" in values:
+        return ApplicationPlan.model_validate(values, strict=False)
+    return whole(Plan.model_validate(values, strict=False))
+
+
+def plan_values(plan: ApplicationPlan) -> dict[str, Any]:
+    """What a recording or a run has of a plan: plain data, as :func:`plan_in` reads it."""
+    return (plan.chains[0] if len(plan.chains) == 1 else plan).model_dump(mode="json")
+
+
+def dump_application_plan(plan: ApplicationPlan) -> str:
+    """The YAML text; reading it gives an equal plan. One chain is written as its own plan."""
+    return plans_as_text(plan.chains)
+
+
+def save_application_plan(
+    plan: ApplicationPlan, path: str | Path, *, overwrite: bool = False
+) -> None:
+    """Write a plan, whole or not at all.
+
+    Raises: as :func:`~chainshaper.planning.plan.save_plan`.
+    """
+    path = Path(path)
+    if not (overwrite and path.is_file()):
+        new_file(path)
+    write_whole(path, [dump_application_plan(plan).encode()])

@@ -1,0 +1,198 @@
+"""From the profiles of several chains to one plan of their application.
+
+Each chain is planned as if it were alone (:func:`~chainshaper.planning.request.plan_chain`), and
+what they share is then made one:
+
+* chains that begin at the same callback, branches of one graph, share the servers that run it,
+  which stay open for the slowest of them; each has its output in slots of its own;
+* chains of different beginnings that pass the same node take turns on its thread;
+* chains that share no more than a core take turns on it, or run at the same time at priorities of
+  their own (:func:`~chainshaper.planning.offsets.place_chains`).
+
+What a chain's output waits for must not be shaped by another: it would come later than was measured
+and is refused.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+from chainshaper.planning.application_plan import ApplicationPlan, combined
+from chainshaper.planning.offsets import TIME_LIMIT_SECONDS, chain_name, place_chains
+from chainshaper.planning.plan import (
+    Plan,
+    Server,
+    Slot,
+    publishing_servers,
+    revised,
+    with_slots,
+)
+from chainshaper.planning.request import PlanRequest, Profile, plan_chain, refuse_entangled
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError, OperationError
+
+_STANDARD = PlanRequest()
+_SHARING = ("shaped", "one-long-slot")
+
+
+def plan_application(
+    profiles: Sequence[Profile],
+    request: PlanRequest = _STANDARD,
+    *,
+    time_limit_s: float = TIME_LIMIT_SECONDS,
+) -> tuple[ApplicationPlan, list[str]]:
+    """One plan for several chains of an application, and what is to be known about it.
+
+    A chain that is added behind others does not move their outputs within their cycles.
+
+    Raises: as :func:`.plan_chain` and :func:`.place_chains`. OperationError names the core, the
+        chains and by how much they do not fit, and what would.
+    """
+    if not profiles:
+        raise InputError("no chain is named: give one at least")
+    refuse_entangled(profiles, request.policy)
+    try:
+        return _planned(profiles, request, time_limit_s)
+    except OperationError as error:
+        fits = list(_fitting(profiles, request, time_limit_s)) if len(profiles) > 1 else []
+        if not fits:
+            raise
+        raise OperationError(f"{error}. It fits with {', or with '.join(fits)}") from error
+
+
+def _planned(
+    profiles: Sequence[Profile], request: PlanRequest, time_limit_s: float
+) -> tuple[ApplicationPlan, list[str]]:
+    plans = [plan_chain(profile, request) for profile in profiles]
+    groups = _beginning_together(profiles)
+    for group in groups:
+        for k, plan in zip(group, _sharing_servers([plans[k] for k in group]), strict=True):
+            plans[k] = plan
+    plans = numbered(plans, groups)
+    placed, remarks = place_chains(plans, together=groups, time_limit_s=time_limit_s)
+    return combined(placed), remarks
+
+
+def _beginning_together(profiles: Sequence[Profile]) -> list[list[int]]:
+    """The places of chains, together where they begin at the same callback."""
+    groups: dict[Any, list[int]] = {}
+    for place, profile in enumerate(profiles):
+        key = place if profile.begins is None else (profile.begins, profile.period_ns)
+        groups.setdefault(key, []).append(place)
+    return list(groups.values())
+
+
+def _sharing_servers(plans: list[Plan]) -> list[Plan]:
+    """Branches of one graph: the same servers run it, and their outputs have slots apart."""
+    if len(plans) == 1:
+        return plans
+    if plans[0].policy not in _SHARING:
+        raise InputError(
+            f"{' and '.join(map(chain_name, plans))} begin at the same callback, and such chains"
+            f" are shaped, not planned as {plans[0].policy}: plan them one by one"
+        )
+    shared: dict[tuple[int, int], Server] = {}  # by core and where the first slot starts
+    for plan in plans:
+        for server in _running(plan):
+            place = (server.core, server.slots[0][0])
+            shared[place] = _joined(shared.get(place, server), server)
+    taken: list[tuple[int, Slot]] = []
+    changed = []
+    for plan in plans:
+        later = _behind(plan, taken)
+        own = publishing_servers(later)
+        taken += [(server.core, slot) for server in own for slot in server.slots]
+        changed.append(revised(later, servers=(*shared.values(), *own)))
+    return changed
+
+
+def _running(plan: Plan) -> list[Server]:
+    publishing = publishing_servers(plan)
+    return [server for server in plan.servers if server not in publishing]
+
+
+def _joined(one: Server, two: Server) -> Server:
+    """A server with the threads of both, open as long as the longer of them."""
+    longest = max(one.slots, two.slots, key=lambda slots: slots[-1][1])
+    threads = tuple(dict.fromkeys((*one.threads, *two.threads)))
+    return one.model_copy(update={"slots": longest, "threads": threads})
+
+
+def _behind(plan: Plan, taken: Sequence[tuple[int, Slot]]) -> Plan:
+    """The plan with its publish slots so much later that none meets those taken on their core."""
+    gates = publishing_servers(plan)
+    own = [(server.core, slot) for server in gates for slot in server.slots]
+
+    def meets(later_ns: int) -> bool:
+        return any(
+            core == other_core and start + later_ns < other_end and other_start < end + later_ns
+            for core, (start, end) in own
+            for other_core, (other_start, other_end) in taken
+        )
+
+    ends = {other_end - start for _, (start, _) in own for _, (_, other_end) in taken}
+    later_ns = next(one for one in sorted({0} | {e for e in ends if e > 0}) if not meets(one))
+    if later_ns == 0:
+        return plan
+    end = later_ns + max(slot[1] for _, slot in own)
+    if end > plan.cycle_ns:
+        raise OperationError(
+            f"{chain_name(plan)} would be published until {format_duration(end)}, behind the other"
+            f" outputs of core {own[0][0]} and {format_duration(end - plan.cycle_ns)} after its"
+            f" cycle of {format_duration(plan.cycle_ns)}: use a shorter publish slot, or another"
+            " core for one of the outputs"
+        )
+    slots = {s.name: [(a + later_ns, b + later_ns) for a, b in s.slots] for s in gates}
+    predicted = plan.predicted.model_copy(
+        update={
+            "mean_ns": plan.predicted.mean_ns + later_ns,
+            "max_ns": plan.predicted.max_ns + later_ns,
+        }
+    )
+    return revised(plan, servers=with_slots(plan.servers, slots), predicted=predicted)
+
+
+def numbered(plans: Sequence[Plan], groups: Sequence[Sequence[int]]) -> list[Plan]:
+    """The plans with the names of their servers numbered, by the first chain of the group that
+    shares them, or by their own: those of the first chain stay.
+    """
+    renamed = list(plans)
+    for group in groups:
+        for place in group:
+            gates = publishing_servers(plans[place])
+            names = {
+                one.name: f"{one.name}_{number}" if number > 1 else one.name
+                for one in plans[place].servers
+                for number in [1 + (place if one in gates else group[0])]
+            }
+            servers = tuple(
+                one.model_copy(update={"name": names[one.name]}) for one in plans[place].servers
+            )
+            renamed[place] = revised(plans[place], servers=servers)
+    return renamed
+
+
+def _fitting(
+    profiles: Sequence[Profile], request: PlanRequest, time_limit_s: float
+) -> Iterator[str]:
+    """What would make the chains fit, in words: tried one after the other."""
+    free = 1 + max(core for one in profiles for core in (*one.core_of.values(), 0))
+    variants: list[tuple[str, Sequence[Profile], PlanRequest]] = []
+    for place, profile in enumerate(profiles):
+        shared = {
+            node for other in profiles if other is not profile for node in other.core_of
+        } & profile.core_of.keys()
+        if profile.core_of and not shared:
+            moved = replace(profile, core_of=dict.fromkeys(profile.core_of, free))
+            others = [*profiles[:place], moved, *profiles[place + 1 :]]
+            variants.append((f"{profile.name} on a core of its own", others, request))
+    if request.epsilon_ns is None and not request.ideal_machine:
+        smaller = replace(request, ideal_machine=True, overrun_probability=None)
+        variants.append(("a margin for a machine that does not stall", profiles, smaller))
+    for text, changed, wished in variants:
+        try:
+            _planned(changed, wished, min(time_limit_s, 5.0))
+        except (OperationError, InputError):
+            continue
+        option = " (--ideal-machine)" if wished is not request else " (its nodes' `core`)"
+        yield text + option
