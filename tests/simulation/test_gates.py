@@ -15,7 +15,7 @@ from schedules import MS, application, begin_of, simulated
 
 from chainshaper import plan_recording, simulate
 from chainshaper.analysis import analyse_latency
-from chainshaper.gate.decision import Gate, Modes, Overrun, missed, release_of
+from chainshaper.gate.decision import INTO_OPEN_SLOT, Gate, Modes, Overrun, missed, release_of
 from chainshaper.planning import PlanRequest
 from chainshaper.simulation import layout as at
 from chainshaper.simulation import simulate_latencies
@@ -49,6 +49,7 @@ def gates(draw: st.DrawFn) -> Gate:
         phase_ns=draw(st.integers(0, 300)),
         overrun=draw(st.sampled_from(("wait", "discard", "publish"))),
         due_cycles=draw(st.integers(0, 2)),
+        into_open_slot=draw(st.sampled_from(INTO_OPEN_SLOT)),
         modes=modes,
     )
 
@@ -120,6 +121,7 @@ def as_application(case: Case) -> Application:
         "cycle": f"{gate.cycle_ns}ns",
         **{name: getattr(gate, name) for name in ("anchor", "overrun", "due_cycles", "messages")},
         "depth": gate.depth,
+        "into_open_slot": gate.into_open_slot,
     }
     if gate.modes is not None:
         changes = [(3_900_000_000, gate.modes.default), *case.changes]  # as it was, for the next
