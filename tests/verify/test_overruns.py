@@ -184,6 +184,14 @@ def test_what_comes_into_an_open_slot_leaves_at_once_and_is_counted(tmp_path: Pa
     shown = called("compare", recording.path, recording.path).out
     assert re.search(rf"came when it was open +│ +{measured.into_open_slots} │", shown)
     assert json_of("latency", recording.path)["into_open_slots"] == measured.into_open_slots
+    # Or it waits for the next slot, which is none of this cycle: only one instant of it is used.
+    strict = revised(plan, into_open_slot="next-slot")
+    waiting = simulate(small_chain(tmp_path), tmp_path / "strict", strict, cycles=24)
+    measured, releases = measure_latency(waiting), waiting.events["gate_release"]
+    in_time = releases.filter(pl.col("overrun").is_null())
+    assert measured.overruns == {"wait": (behind > 0).sum()}
+    assert measured.into_open_slots == 0
+    assert set(in_time["time"] - in_time["origin"]) == {start}
 
 
 def test_the_plan_says_what_is_done_about_overruns_and_the_live_run_reports_it(
@@ -193,6 +201,9 @@ def test_the_plan_says_what_is_done_about_overruns_and_the_live_run_reports_it(
     latencies.write_text("4ms\n6ms\n")
     made = json_of("plan", "--latencies", latencies, "--period", "50ms", "--overrun", "discard")
     assert made["overrun"] == "discard"
+    wishes = ("plan", "--latencies", latencies, "--period", "50ms", "--into-open-slot", "next-slot")
+    made = json_of(*wishes)
+    assert (made["into_open_slot"], made["predicted"]["jitter_ns"]) == ("next-slot", 0)
     save_plan(_too_early("discard"), plan_file)
     small_chain(tmp_path)
     output, described = tmp_path / "rec", tmp_path / "small_chain.yaml"

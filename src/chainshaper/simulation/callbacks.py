@@ -394,7 +394,9 @@ def _sleep(m, thread, until):
 @compiled()
 def _enter_gate(m, thread):
     gate, now = m[m[thread + T.ENTITY] + E.BODY_ROW], m[X.NOW]
-    decide(m, gate, m[thread + T.ARRIVAL], m[thread + T.ORIGIN])
+    # A gate at rest knows of a message when it has taken it.
+    arrival = now if m[thread + T.ARRIVAL] >= m[gate + G.FREE] else m[thread + T.ARRIVAL]
+    decide(m, gate, arrival, m[thread + T.ORIGIN])
     m[thread + T.BEGAN] = now
     if m[gate + G.AT] == NONE:
         return _leave_gate(m, thread)
