@@ -157,6 +157,20 @@ def test_whatever_becomes_of_an_overrun_the_next_output_is_in_its_slot(
     assert not leftovers()
 
 
+@pytest.mark.parametrize("policy", ["publish", "wait"])
+def test_of_a_gated_publisher_too_what_missed_its_slot_is_counted(
+    tmp_path: Path, policy: Overrun
+) -> None:
+    application = _with_long_executions(tmp_path)
+    topic = application.topic("/t3").model_copy(update={"publication": "asynchronous"})
+    application = application.model_copy(update={"topics": {"/t3": topic}})
+    wishes: dict[str, Any] = {"publication": "asynchronous", "publish_slot_ns": 10 * MS}
+    plan = small_chain_plan(6 * MS, 9 * MS, core=EXECUTOR_CORE, overrun=policy, **wishes)
+    measured = measure_latency(simulate(application, tmp_path / "rec", plan, cycles=40))
+    assert measured.outcomes == {policy: Outcome(late=3, discarded=0, followed=3, next_hit=0)}
+    assert measured.overruns == {policy: 3}
+
+
 def test_outputs_published_at_once_wait_for_nothing(tmp_path: Path) -> None:
     plan = _too_early("publish")
     recording = simulate(small_chain(tmp_path), tmp_path / "rec", plan, cycles=24)

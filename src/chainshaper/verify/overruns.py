@@ -21,7 +21,7 @@ from chainshaper.analysis.messages import with_overrun
 from chainshaper.gate.decision import DROPPED
 from chainshaper.planning import Plan
 from chainshaper.planning.overruns import cycles_until_output
-from chainshaper.planning.plan import publisher_servers
+from chainshaper.planning.plan import publish_slots, publisher_servers
 from chainshaper.values import events
 from chainshaper.values.recording import Recording
 
@@ -64,6 +64,9 @@ def overruns_in(
             due_until = (cycles_until_output(plan) + 1) * plan.cycle_ns
             late = analysis.traversals["latency_ns"].drop_nulls() >= due_until
             counts["wait"] += int(late.sum())
+            if plan.overrun == "publish":
+                behind = analysis.traversals["place_ns"] >= _slots_end(plan)
+                counts["publish"] += int((behind & ~analysis.traversals["late"]).sum())
     return {policy: count for policy, count in counts.items() if count}
 
 
@@ -90,6 +93,7 @@ def outcomes_in(analysis: LatencyAnalysis, plan: Plan | None) -> dict[str, Outco
     missed = pl.col("late").fill_null(False) | (pl.col("reason") == "discarded").fill_null(False)
     policy = pl.col("overrun")
     if plan is not None and not decided.height and any(publisher_servers(plan)):
+        missed |= (pl.col("place_ns") >= _slots_end(plan)).fill_null(False)
         policy = pl.when(missed).then(pl.lit(plan.overrun))
     cut = pl.col("reason").is_in(["not taken", "not sent", "still running"]).fill_null(False)
     hit = pl.when(~cut).then(missed | ~pl.col("complete"))
@@ -102,6 +106,11 @@ def outcomes_in(analysis: LatencyAnalysis, plan: Plan | None) -> dict[str, Outco
         next_hit=pl.col("next_hit").sum(),
     )
     return {row.pop("policy"): Outcome(**row) for row in figures.iter_rows(named=True)}
+
+
+def _slots_end(plan: Plan) -> int:
+    """Where the last slot in which an output is in time ends, from the start of its cycle (ns)."""
+    return publish_slots(plan)[-1][1] + cycles_until_output(plan) * plan.cycle_ns
 
 
 def next_cycles(outcomes: Mapping[str, Outcome]) -> str:
