@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from chainshaper.gate.decision import IntoOpenSlot
 from chainshaper.planning.bands import (
     BandProblem,
     Placement,
@@ -23,7 +24,7 @@ from chainshaper.planning.bands import (
     with_bands,
     with_long_slot,
 )
-from chainshaper.planning.plan import Plan, publish_slots
+from chainshaper.planning.plan import Plan, band_predictions, publish_slots, revised
 from chainshaper.planning.shaping import plan_shaping, server_per_chain
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import Goal
@@ -53,7 +54,8 @@ def every_placement(problem: BandProblem, bands: int) -> list[Tried]:
             continue
         if problem.max_gap_ns is not None and any(gap > problem.max_gap_ns for gap in gaps):
             continue
-        published = [min(end for end in ends if latency <= end) for latency in sample]
+        early = slot if problem.into_open_slot == "next-slot" else 0  # in time for a slot's start
+        published = [min(end for end in ends if latency <= end - early) for latency in sample]
         shares = [published.count(end) / len(sample) for end in ends]
         if problem.max_share is not None and max(shares) > problem.max_share + 1e-12:
             continue
@@ -75,6 +77,7 @@ def random_problem(random: random.Random) -> tuple[BandProblem, int]:
     if random.random() < 0.4:
         shares = [0.2, 0.25, 1 / 3, 0.5, 0.6, 0.75, random.uniform(0.1, 1)]
         limits["max_share"] = random.choice(shares)
+    limits["into_open_slot"] = random.choice(["at-once", "next-slot"])
     last, grid = max(sample) + random.randint(0, 3) + slot, random.choice([1, 1, 1, 2, 3])
     return BandProblem(np.array(sample), last, slot, grid, **limits), random.randint(1, 5)
 
@@ -98,7 +101,7 @@ def test_the_optimum_is_that_of_trying_everything(seed: int) -> None:
         least = min(one.total for one in tried)
         assert placement.mean_ns == least / size
         assert broken_constraint(problem, placement.slot_ends_ns) is None
-        assert counts_and_mean(problem.latencies_ns, placement.slot_ends_ns)[1] == placement.mean_ns
+        assert counts_and_mean(problem.ready_ns, placement.slot_ends_ns)[1] == placement.mean_ns
         best_jitter = min(one.jitter for one in tried if one.total == least)
         assert by_ends[placement.slot_ends_ns].jitter == best_jitter
 
@@ -239,6 +242,31 @@ def test_bands_replace_the_publish_slot_and_nothing_else() -> None:
     assert banded.predicted.jitter_ns == slots[-1][1] - slots[0][0]
     unchanged = {"servers", "predicted"}
     assert banded.model_dump(exclude=unchanged) == plan.model_dump(exclude=unchanged)
+
+
+def test_bands_without_jitter_are_for_what_is_ready_when_they_begin() -> None:
+    # Δ is 5 ms: the first slot at once is best from 10 ms and 1 µs on, open at 14 ms still.
+    latencies = np.array([10, 10, 14, 50]) * MS
+    ways: tuple[IntoOpenSlot, ...] = ("at-once", "next-slot")
+    shaped = plan_shaping(latencies, 100 * MS, publish_slot_ns=5 * MS)
+    planned = {way: with_bands(revised(shaped, into_open_slot=way), latencies, 2) for way in ways}
+    assert planned["at-once"].predicted.shares == (0.75, 0.25)
+    assert planned["at-once"].predicted.jitter_ns == 56 * MS - 10_001_000
+    strict = planned["next-slot"]
+    ((start, end), last) = publish_slots(strict)
+    assert (start, last) == (14 * MS, (51 * MS, 56 * MS)), "what comes as it begins is in time"
+    assert strict.predicted.shares == (0.75, 0.25)
+    assert strict.predicted.mean_ns == (3 * end + last[1]) // 4
+    assert strict.predicted.jitter_ns == last[0] - start
+    assert [band.jitter_ns for band in band_predictions(strict)] == [0, 0]
+    edited = with_bands(strict, latencies, 2, max_share=0.5)
+    assert edited.predicted.shares == (0.5, 0.5)
+    ways_out: tuple[dict[str, Any], ...] = ({"publication": "asynchronous", "publisher": "/n"}, {})
+    for how in ways_out:
+        gated = plan_shaping(latencies, 100 * MS, output="/t", **how)
+        policy = "shaped" if how else "let-per-chain"
+        with pytest.raises(InputError, match="into_open_slot: only a shaping node sees when"):
+            revised(gated, policy=policy, into_open_slot="next-slot")
 
 
 def test_goals_and_limits_reach_the_placement() -> None:

@@ -21,6 +21,7 @@ from chainshaper.planning import (
     plan_warnings,
     publish_slots,
     save_plan,
+    server_per_chain,
     with_bands,
     with_long_slot,
     with_sink,
@@ -259,15 +260,29 @@ def test_the_chain_may_finish_until_the_cycle_ends_and_the_plan_itself_stays() -
     further = open_until_done(with_sink(plan, LATENCIES + 10 * MS, "/t9"))
     assert slots(further)["chain"] == ((0, 100),)
     assert slots(further)["output_chainshaper_t9"] == ((69, 70),)
-    # The slot of another server is respected.
-    slot = ((75 * MS, 80 * MS),)
-    other = plan.servers[0].model_copy(update={"name": "other", "slots": slot, "threads": ()})
-    for unchanged in (
-        planned(overrun="wait"),
-        planned(overrun="discard"),
-        revised(plan, servers=(*plan.servers, other)),
-    ):
+    # So they do whatever becomes of the output; an asynchronous publisher sends in slots only.
+    for overrun in ("wait", "discard"):
+        in_slots = open_until_done(planned(overrun=overrun, publication="asynchronous"))
+        assert slots(in_slots) == {"chain": ((0, 100),), "output": ((59, 60),)}
+    # What has no slot behind the chain's stays: LET, one server for the chain.
+    for unchanged in (let_per_chain(plan), server_per_chain(plan)):
         assert open_until_done(unchanged) == unchanged
+
+
+def test_the_slots_of_other_servers_are_left_out_where_a_chain_may_finish() -> None:
+    plan = planned()
+
+    def with_other(begin: int, end: int, **changes: int) -> Plan:
+        slot = ((begin * MS, end * MS),)
+        other = plan.servers[0].model_copy(update={"name": "other", "slots": slot, "threads": ()})
+        return revised(plan, servers=(*plan.servers, other.model_copy(update=changes)))
+
+    split = open_until_done(with_other(75, 80))
+    assert slots(split)["chain"] == ((0, 75), (80, 100))
+    assert open_until_done(split) == split
+    assert slots(open_until_done(with_other(59, 80)))["chain"] == ((0, 59), (80, 100))
+    for elsewhere in (with_other(75, 80, core=1), with_other(75, 80, priority=3)):
+        assert slots(open_until_done(elsewhere))["chain"] == ((0, 100),)
 
 
 def test_a_publishers_thread_may_send_late_outputs_below_its_executor() -> None:

@@ -336,6 +336,7 @@ def plans(draw: st.DrawFn) -> Plan:
         offset_ns=draw(st.integers(0, 3)),
         anchor=draw(st.sampled_from(["stamp", "cycle"])),
         overrun=draw(st.sampled_from(["wait", "discard", "publish"])),
+        into_open_slot=draw(st.sampled_from(["at-once", "next-slot"])),
         fallback=draw(st.sampled_from(["bypass", "silence"])),
         servers=(chain, Server(name=name, core=0, priority=1, slots=slots, threads=(node.thread,))),
         shaping_node=node,

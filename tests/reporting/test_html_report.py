@@ -183,12 +183,14 @@ def test_incomplete_cycles_and_overruns_have_numbers_and_reasons(tmp_path: Path)
     page = _report(measure_latency(known_run(tmp_path / "known", 6, untaken=(2, 3), overran=(4,))))
     rows = page.rows["overruns"]
     assert ["4", "31.000", "publish", "31.000"] in rows
+    assert ["publish", "1", "0", "0 of 1"] in rows
     (lost,) = [row for row in rows if row[0] == "known"]
     assert lost[1].startswith("lost: published, but never taken")
     assert lost[2:] == ["/t1", "2", "2, 3"]
     for title, cell in (
         ("incomplete", "2 (2 lost)"),
         ("too late for their slot", "1 (1 publish)"),
+        ("next cycle hit", "0 of 1"),
         ("came when it was open", "0"),
     ):
         assert [title, cell] in page.rows["figures"]

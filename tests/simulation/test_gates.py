@@ -15,7 +15,7 @@ from schedules import MS, application, begin_of, simulated
 
 from chainshaper import plan_recording, simulate
 from chainshaper.analysis import analyse_latency
-from chainshaper.gate.decision import Gate, Modes, Overrun, missed, release_of
+from chainshaper.gate.decision import INTO_OPEN_SLOT, Gate, Modes, Overrun, missed, release_of
 from chainshaper.planning import PlanRequest
 from chainshaper.simulation import layout as at
 from chainshaper.simulation import simulate_latencies
@@ -49,6 +49,7 @@ def gates(draw: st.DrawFn) -> Gate:
         phase_ns=draw(st.integers(0, 300)),
         overrun=draw(st.sampled_from(("wait", "discard", "publish"))),
         due_cycles=draw(st.integers(0, 2)),
+        into_open_slot=draw(st.sampled_from(INTO_OPEN_SLOT)),
         modes=modes,
     )
 
@@ -120,6 +121,7 @@ def as_application(case: Case) -> Application:
         "cycle": f"{gate.cycle_ns}ns",
         **{name: getattr(gate, name) for name in ("anchor", "overrun", "due_cycles", "messages")},
         "depth": gate.depth,
+        "into_open_slot": gate.into_open_slot,
     }
     if gate.modes is not None:
         changes = [(3_900_000_000, gate.modes.default), *case.changes]  # as it was, for the next
@@ -275,7 +277,7 @@ def test_under_let_per_callback_every_output_waits_for_the_next_cycle(tmp_path: 
     assert simulate_latencies(described, planned, cycles=3).tolist() == [80_000_000] * 3
 
 
-@pytest.mark.parametrize(("overrun", "late"), [(None, 15 * MS), ("wait", -1)])
+@pytest.mark.parametrize(("overrun", "late"), [(None, 15 * MS), ("wait", 46 * MS), ("discard", -1)])
 def test_an_output_that_missed_its_slot_is_late_by_what_it_is_late_not_by_a_cycle(
     tmp_path: Path, overrun: Overrun | None, late: int
 ) -> None:
@@ -289,5 +291,5 @@ def test_an_output_that_missed_its_slot_is_late_by_what_it_is_late_not_by_a_cycl
     profile = simulate(application(usual), tmp_path / "profile", cycles=300)
     plan = plan_recording(profile, request=PlanRequest(overrun=overrun))  # [6, 7) ms
     latencies = simulate_latencies(application(longer), plan, cycles=3)
-    # In slots only, 15 ms of work in 6 ms a cycle are not done before the simulation ends.
+    # Each is done in its own cycle, also where it is sent in slots only.
     assert latencies.tolist() == [late] * 3

@@ -42,6 +42,7 @@ Gate read_gate() {
   gate.messages = static_cast<Messages>(number());
   gate.depth = static_cast<std::size_t>(number());
   gate.cycle_ns = number();
+  gate.into_open_slot = static_cast<Entry>(number());
   for (auto slots = number(); slots > 0; --slots) {
     const auto start = number();
     gate.slots.push_back({start, number()});

@@ -12,6 +12,7 @@ from gate_table import PUBLISHING_NS, Case, Outcome, cases, walk
 from chainshaper.gate.decision import (
     ANCHORS,
     DROPPED,
+    INTO_OPEN_SLOT,
     LATE,
     MESSAGES,
     OVERRUNS,
@@ -36,6 +37,7 @@ def as_text(case: Case) -> str:
     words: list[int | str] = [ANCHORS.index(gate.anchor), gate.phase_ns]
     words += [LATE.index(gate.overrun), gate.due_cycles]
     words += [MESSAGES.index(gate.messages), gate.depth, gate.cycle_ns]
+    words += [INTO_OPEN_SLOT.index(gate.into_open_slot)]
     words += [len(gate.slots), *(bound for slot in gate.slots for bound in slot)]
     words += [len(names)]
     if modes is not None:
@@ -91,6 +93,7 @@ def _any_case(draw: random.Random) -> Case:
         modes=modes,
         messages=draw.choice(MESSAGES),
         depth=draw.randint(1, 4),
+        into_open_slot=draw.choice(INTO_OPEN_SLOT),
     )
     times = sorted(draw.randint(0, 300) * scale for _ in range(draw.choice([1, 1, 2, 5])))
     stamps = [draw.choice([None, draw.randint(0, 300) * scale]) for _ in times]

@@ -81,7 +81,7 @@ def test_the_parameters_say_what_the_plan_says(
 ) -> None:
     longer = plan.predicted.model_copy(update={"max_ns": 3 * plan.cycle_ns})  # edited: no matter
     plan = revised(plan, overrun="discard", messages="newest", anchor="cycle", offset_ns=7 * MS)
-    plan = revised(plan, predicted=longer)
+    plan = revised(plan, predicted=longer, into_open_slot="next-slot")
     process = write_shaping_process(plan, node, "python", tmp_path, log=tmp_path / "gate.csv")
     same = {"handover": parameters_of(process)["handover"], "depth": 0, "output_depth": 10}
     assert parameters_of(process) == {
@@ -92,6 +92,7 @@ def test_the_parameters_say_what_the_plan_says(
         "overrun": "discard",
         "due_cycles": 0,
         "messages": "newest",
+        "into_open_slot": "next-slot",
         "spin_ns": node.spin_ns,
         "pause_ns": node.pause_ns,
         "core": EXECUTOR_CORE,

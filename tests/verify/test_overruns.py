@@ -5,25 +5,31 @@ import re
 import signal
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import polars as pl
 import pytest
+from applied_plans import leftovers, needs_fifo
 from calm_runs import calm_run
 from command_line import called, json_of
-from small_chain import PERIOD_NS, small_chain, small_chain_plan
+from gated import needs_cgroups
+from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain, small_chain_plan
 
 from chainshaper import measure_latency, save_plan, shape_application, simulate
-from chainshaper.gate.decision import sleep_until
+from chainshaper.flow.apply import apply_plan
+from chainshaper.gate.decision import Overrun, sleep_until
 from chainshaper.planning import Plan, let_per_chain, plan_shaping, publish_slots
 from chainshaper.planning.plan import revised
-from chainshaper.reporting.latency import latency_json
+from chainshaper.reporting.latency import doubts_text, latency_json
 from chainshaper.values.recording import Recording
 from chainshaper.verify.overruns import (
+    Outcome,
     dropped_in,
     dropped_text,
     gate_releases,
@@ -31,7 +37,8 @@ from chainshaper.verify.overruns import (
     overruns_in,
     overruns_text,
 )
-from chainshaper.workload.live import StartedNodes
+from chainshaper.workload.description import Application, ExecutionTime
+from chainshaper.workload.live import Enforcement, StartedNodes
 
 MS = 1_000_000
 
@@ -78,10 +85,90 @@ def test_discarded_outputs_are_not_published_and_not_lost(tmp_path: Path) -> Non
     assert said in " ".join(called("latency", recording.path).out.split())
     values = json_of("latency", recording.path)
     assert (values["overruns"], values["overruns_by_policy"]) == (count, {"discard": count})
+    # Where one follows the other, the next cycle was hit.
+    behind = list(pairwise(releases["overrun"].fill_null("-")))
+    hit, followed = behind.count(("discard",) * 2), sum(one == "discard" for one, _ in behind)
+    assert 0 < hit < followed
+    outcome = {"late": 0, "discarded": count, "followed": followed, "next_hit": hit}
+    assert values["overrun_outcomes"] == {"discard": outcome}
+    assert f"the next cycle was hit in {hit} of {followed}" in doubts_text(measured)
     compared = ("compare", recording.path, recording.path)
-    assert f"{count} ({count} discard)" in called(*compared).out
+    assert f"{count} ({count} discard)" in (shown := called(*compared).out)
+    assert re.search(rf"next cycle hit +│ +{hit} of {followed} │", shown)
     both = json_of(*compared)["recordings"]
     assert [one["overruns_by_policy"] for one in both] == [{"discard": count}] * 2
+
+
+def _with_long_executions(folder: Path) -> Application:
+    """The small chain, in which every tenth callback of /second takes 36 ms, the others 2 ms."""
+    application = small_chain(folder)
+    nodes = dict(application.nodes)
+    for name in ("first", "second", "third"):
+        (callback,) = nodes[name].callbacks
+        long = (2 * MS,) * 9 + (36 * MS,)
+        usual = ExecutionTime(samples_ns=long, block=10)
+        execution = usual if name == "second" else ExecutionTime(constant_ns=2 * MS)
+        changed = callback.model_copy(update={"execution": execution})
+        nodes[name] = nodes[name].model_copy(update={"callbacks": (changed,)})
+    return application.model_copy(update={"nodes": nodes})
+
+
+def _frozen_outside_slots(plan: Plan) -> Enforcement:
+    """The chain's executors run in the slots of their server, by the freezer."""
+
+    @contextmanager
+    def in_force(nodes: StartedNodes) -> Iterator[None]:
+        stop, in_force = threading.Event(), threading.Event()
+        how: dict[str, Any] = {"back_end": "freezer", "phase_ns": nodes.anchor_ns, "stop": stop}
+        how |= {"wait_ns": 1000 * MS, "watch": lambda _: in_force.set()}
+        with ThreadPoolExecutor(1) as pool:
+            run = pool.submit(apply_plan, plan, **how)
+            while not in_force.wait(0.05) and not run.done():
+                pass
+            try:
+                yield
+            finally:
+                stop.set()
+                run.result()
+
+    return in_force
+
+
+@needs_fifo
+@needs_cgroups
+@pytest.mark.parametrize("policy", ["publish", "wait", "discard"])
+def test_whatever_becomes_of_an_overrun_the_next_output_is_in_its_slot(
+    tmp_path: Path, policy: Overrun
+) -> None:
+    """Stopped at the end of its slot, the chain would take 24 of the next slot's 18 ms."""
+    application, wishes = _with_long_executions(tmp_path), {"epsilon_ns": 9 * MS, "overrun": policy}
+    plan = small_chain_plan(6 * MS, 9 * MS, core=EXECUTOR_CORE, publish_slot_ns=4 * MS, **wishes)
+    simulated = simulate(application, tmp_path / "simulated", plan, cycles=40)
+    for attempt in range(3):  # unless the machine stands still for long
+        place, enforcement = tmp_path / f"live{attempt}", _frozen_outside_slots(plan)
+        live = shape_application(application, plan, place, cycles=40, enforcement=enforcement)
+        found = measure_latency(live).outcomes
+        if [one.next_hit for one in found.values()] == [0]:
+            break
+    count = 3  # as drawn, live and simulated
+    late = 0 if policy == "discard" else count
+    expected = {policy: Outcome(late, discarded=count - late, followed=count, next_hit=0)}
+    assert measure_latency(simulated).outcomes == found == expected
+    assert not leftovers()
+
+
+@pytest.mark.parametrize("policy", ["publish", "wait"])
+def test_of_a_gated_publisher_too_what_missed_its_slot_is_counted(
+    tmp_path: Path, policy: Overrun
+) -> None:
+    application = _with_long_executions(tmp_path)
+    topic = application.topic("/t3").model_copy(update={"publication": "asynchronous"})
+    application = application.model_copy(update={"topics": {"/t3": topic}})
+    wishes: dict[str, Any] = {"publication": "asynchronous", "publish_slot_ns": 10 * MS}
+    plan = small_chain_plan(6 * MS, 9 * MS, core=EXECUTOR_CORE, overrun=policy, **wishes)
+    measured = measure_latency(simulate(application, tmp_path / "rec", plan, cycles=40))
+    assert measured.outcomes == {policy: Outcome(late=3, discarded=0, followed=3, next_hit=0)}
+    assert measured.overruns == {policy: 3}
 
 
 def test_outputs_published_at_once_wait_for_nothing(tmp_path: Path) -> None:
@@ -111,6 +198,16 @@ def test_what_comes_into_an_open_slot_leaves_at_once_and_is_counted(tmp_path: Pa
     shown = called("compare", recording.path, recording.path).out
     assert re.search(rf"came when it was open +│ +{measured.into_open_slots} │", shown)
     assert json_of("latency", recording.path)["into_open_slots"] == measured.into_open_slots
+    # Or it waits for the next slot, which is none of this cycle: only one instant of it is used.
+    strict = revised(plan, into_open_slot="next-slot")
+    waiting = simulate(small_chain(tmp_path), tmp_path / "strict", strict, cycles=24)
+    measured, releases = measure_latency(waiting), waiting.events["gate_release"]
+    behind = releases["arrival"] - releases["origin"] - start
+    assert 0 < (behind > 0).sum() < releases.height
+    assert releases["overrun"].to_list() == ["wait" if late else None for late in behind > 0]
+    assert measured.into_open_slots == 0
+    waited = releases.filter(pl.col("overrun") == "wait")
+    assert set(waited["time"] - waited["origin"]) == {PERIOD_NS + start}, "as the next one begins"
 
 
 def test_the_plan_says_what_is_done_about_overruns_and_the_live_run_reports_it(
@@ -120,6 +217,9 @@ def test_the_plan_says_what_is_done_about_overruns_and_the_live_run_reports_it(
     latencies.write_text("4ms\n6ms\n")
     made = json_of("plan", "--latencies", latencies, "--period", "50ms", "--overrun", "discard")
     assert made["overrun"] == "discard"
+    wishes = ("plan", "--latencies", latencies, "--period", "50ms", "--into-open-slot", "next-slot")
+    made = json_of(*wishes)
+    assert (made["into_open_slot"], made["predicted"]["jitter_ns"]) == ("next-slot", 0)
     save_plan(_too_early("discard"), plan_file)
     small_chain(tmp_path)
     output, described = tmp_path / "rec", tmp_path / "small_chain.yaml"

@@ -252,7 +252,7 @@ class _Run:
         else:
             anchor_ns = phase_ns + LEAD_NS - self.given.chains[0].offset_ns
             self.anchor_ns = anchor_ns % self.given.cycle_ns
-        self.plan = open_until_done(self.given)
+        self.plan = open_until_done(self.given, self.waits_ns)
         table, keeper = threads.server_table(self.plan), self.choice.name
         if not gates(keeper):
             keeper = "none: priority only"

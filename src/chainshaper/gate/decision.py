@@ -5,10 +5,11 @@ sections 3.2.2 and 3.3): the gate *is* that server. Slots repeat every cycle, co
 **anchor**: the ``stamp`` of the message (its first field is a ``std_msgs/Header``), or ``phase_ns``
 of CLOCK_MONOTONIC and every ``cycle`` thereafter.
 
-An early message waits for its slot; one inside a slot leaves at once. One behind the last slot it
-was due in is an **overrun** (section 6): ``wait`` for a slot of a later cycle, ``discard`` it, or
-``publish`` it at once. Under logical execution time a message is due in a later cycle than its own,
-and leaves in none before.
+An early message waits for its slot. One that comes **into an open slot** leaves ``at-once``, or in
+the ``next-slot``: then only what came before a slot's start leaves in it, and all at that instant.
+One behind the last slot it was due in, or without a next one, is an **overrun** (section 6):
+``wait`` for a slot of a later cycle, ``discard`` it, or ``publish`` it at once. Under logical
+execution time a message is due in a later cycle than its own, and leaves in none before.
 
 Of several **messages** in a cycle leave ``all-in-order`` (the oldest is dropped where more than
 ``depth`` wait), the ``newest`` of those that wait, or the ``first`` that came. With **modes**
@@ -33,10 +34,11 @@ from typing import Any, Literal, TypeAlias, get_args
 Anchor: TypeAlias = Literal["stamp", "cycle"]
 Overrun: TypeAlias = Literal["wait", "discard", "publish"]
 Late: TypeAlias = Literal["wait", "discard", "publish", "next-slot"]
+IntoOpenSlot: TypeAlias = Literal["at-once", "next-slot"]
 Messages: TypeAlias = Literal["all-in-order", "newest", "first"]
 Dropped: TypeAlias = Literal["replaced", "surplus", "overflowed", "discarded"]
 ANCHORS, OVERRUNS, LATE = get_args(Anchor), get_args(Overrun), get_args(Late)
-MESSAGES, DROPPED = get_args(Messages), get_args(Dropped)
+INTO_OPEN_SLOT, MESSAGES, DROPPED = get_args(IntoOpenSlot), get_args(Messages), get_args(Dropped)
 
 LOG_COLUMNS = (
     *("time", "pid", "tid", "cpu", "source_timestamp", "arrival", "origin", "release", "slot"),
@@ -104,9 +106,11 @@ class Gate:
     modes: Modes | None = None
     messages: str = "all-in-order"
     depth: int = DEPTH
+    into_open_slot: str = "at-once"
 
     def __post_init__(self) -> None:
-        for key, known in (("anchor", ANCHORS), ("overrun", OVERRUNS), ("messages", MESSAGES)):
+        words = {"anchor": ANCHORS, "overrun": OVERRUNS, "messages": MESSAGES}
+        for key, known in {**words, "into_open_slot": INTO_OPEN_SLOT}.items():
             if (word := getattr(self, key)) not in known:
                 raise ValueError(f"{key} {word!r}: choose one of {', '.join(known)}")
         if self.depth < 1:
@@ -138,6 +142,16 @@ class Gate:
         if self.modes is None or self.modes.late == "next-slot":
             return self.overrun
         return self.modes.late
+
+    def lets_out(
+        self, slot: tuple[int, int], cycle_start_ns: int, arrival_ns: int, ready_ns: int
+    ) -> bool:
+        """Whether a message that came at one instant, and is ready at another, may leave in a slot
+        of a cycle, or before it begins.
+        """
+        start, end = slot
+        in_time = self.into_open_slot == "at-once" or arrival_ns <= cycle_start_ns + start
+        return in_time and ready_ns < cycle_start_ns + end
 
     def counts_from(self, stamp_ns: int | None, arrival_ns: int) -> bool:
         """Whether a message's slots count from its stamp."""
@@ -205,20 +219,21 @@ def release_of(
     # A stamp slightly from the future puts the arrival before its own cycle: cycle 0 still.
     cycle = max(0, (ready - origin) // cycle_ns)
     due_from = origin + due * cycle_ns
-    overran, policy = ready >= due_from + slots[-1][1], gate.policy
+    known = (due_from, arrival_ns, ready)
+    overran, policy = not gate.lets_out(slots[-1], *known), gate.policy
     if overran and policy != "wait":
         at_once = ready if policy == "publish" else None
         return Release(at_once, origin, None, cycle, anchor, policy, mode)
     treated = "wait" if overran else None
-    if mode is not None and not overran and ready >= due_from + slots[0][1]:
+    if mode is not None and not overran and not gate.lets_out(slots[0], *known):
         treated = "next-slot"
     cycle = max(due, cycle)
     while True:
         cycle_start = origin + cycle * cycle_ns
-        for slot, (start, end) in enumerate(slots, first):
-            if ready < cycle_start + end:
-                at = max(ready, cycle_start + start)
-                return Release(at, origin, slot, cycle, anchor, treated, mode)
+        for number, slot in enumerate(slots, first):
+            if gate.lets_out(slot, cycle_start, arrival_ns, ready):
+                at = max(ready, cycle_start + slot[0])
+                return Release(at, origin, number, cycle, anchor, treated, mode)
         cycle += 1
 
 
@@ -244,6 +259,7 @@ class NodeParameters:
     due_cycles: int = 0
     messages: str = "all-in-order"
     depth: int = 0  # 0: the publisher's history, DEPTH at least
+    into_open_slot: str = "at-once"
     mode_topic: str = ""  # no modes
     mode_names: list[str] = field(default_factory=list)
     mode_slots: list[int] = field(default_factory=list)
@@ -283,7 +299,10 @@ class NodeParameters:
         )
 
 
-_SAME = ("cycle_ns", "anchor", "phase_ns", "overrun", "due_cycles", "messages")
+_SAME = (
+    *("cycle_ns", "anchor", "phase_ns", "overrun", "due_cycles", "messages"),
+    "into_open_slot",
+)
 
 
 def gate_parameters(gate: Gate, mode_topic: str = "") -> dict[str, Any]:
@@ -517,7 +536,7 @@ class Shaper:
         self.overflowed: list[Outcome] = []  # since the owner has emptied it
         self.look = look
         self._on_waking, self._on_decision = on_waking, on_decision
-        self._looked_ns = self._waited_ns = 0
+        self._looked_ns = self._waited_ns = self._turn_ns = 0
         self._offset = clock_offset()
         self._next_phase: tuple[int, int] | None = None  # from when on, and which
         self._thread, self._schedstat = 0, -1
@@ -569,6 +588,7 @@ class Shaper:
         """
         queue = self.queue
         message, now = queue.waiting[0], time.monotonic_ns()
+        self._turn_ns = now  # before, this thread was busy with the message before it
         release, dropped = queue.decide()
         self._on_decision(release, queue.phase_ns)
         if release.at_ns is not None:
@@ -630,7 +650,8 @@ class Shaper:
         """
         if release.at_ns is None:
             return 0
-        return max(0, until_ns - release.at_ns - (self._others_ran_ns() - self._waited_ns))
+        since_ns = max(release.at_ns, self._turn_ns)
+        return max(0, until_ns - since_ns - (self._others_ran_ns() - self._waited_ns))
 
     def _others_ran_ns(self) -> int:
         """For how long this thread has been ready while others ran, by the kernel's account.

@@ -38,6 +38,8 @@ from chainshaper.values.yaml_file import Part, read_model, wrong_value, wrong_va
 
 MOST_SLOTS = 10_000
 """So many slots of all servers fit into a hyper-period at the most."""
+WAITING_NS = 1_000_000
+"""So long before a timer expires its thread's server is closed already."""
 
 
 class ApplicationPlan(Part):
@@ -145,13 +147,19 @@ def plan_of_chain(plan: "Plan | ApplicationPlan", output: str | None) -> Plan | 
     return None
 
 
-def open_until_done(plan: ApplicationPlan) -> ApplicationPlan:
+def open_until_done(plan: ApplicationPlan, waits_ns: Sequence[int] = ()) -> ApplicationPlan:
     """The plan as back ends and the simulator carry it out: what overruns may finish.
 
     See :func:`chainshaper.planning.overruns.open_until_done`; a server whose longer slots would
-    meet those of another chain stays as planned.
+    meet those of another chain stays as planned. Of several chains, ``waits_ns`` is how long before
+    its cycle each one's timer expires: it waits for its slot, so that cycles start at their offsets.
     """
-    opened = [server for chain in plan.chains for server in chain_open_until_done(chain).servers]
+    waits = waits_ns if waits_ns and plan.moves_timers else [-WAITING_NS] * len(plan.chains)
+    opened = [
+        server
+        for chain, wait in zip(plan.chains, waits, strict=True)
+        for server in chain_open_until_done(chain, wait + WAITING_NS).servers
+    ]
     for server in sorted(opened, key=lambda one: one.slots[-1][1]):  # the longest of several last
         longer = []
         for chain in plan.chains:

@@ -5,7 +5,9 @@ of slot α and φ the measured distribution, the average is eq. 5,
 
     Σ_α (φ(x_α) − φ(x_{α−1}))·x_α,
 
-and the last slot stays where single-band shaping has it. The optimum on a grid of instants is found
+and the last slot stays where single-band shaping has it. Where an output that comes into an open
+slot waits for the next one, an execution must be done when a slot begins: φ(x_α − Δ) stands for
+φ(x_α), as if all latencies were Δ longer. The optimum on a grid of instants is found
 by dynamic programming from the last slot backwards. With c_j of n latencies ≤ x_j, the least cost
 of the m bands behind one that ends at x_i is
 
@@ -33,6 +35,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from chainshaper.gate.decision import IntoOpenSlot
 from chainshaper.planning.margins import check_latencies
 from chainshaper.planning.plan import (
     Plan,
@@ -69,33 +72,38 @@ def counts_and_mean(
 
 
 def predict_bands(
-    latencies_ns: NDArray[np.int64], slot_ends_ns: Sequence[int], publish_slot_ns: int
+    latencies_ns: NDArray[np.int64],
+    slot_ends_ns: Sequence[int],
+    publish_slot_ns: int,
+    into_open_slot: IntoOpenSlot = "at-once",
 ) -> Prediction:
     """What publication in slots with these ends, Δ long, makes of measured latencies.
 
     The latest output is at x_ν, the earliest at x_1 − Δ: a jitter of 25 ms for the paper's slots
-    [62, 63], [77, 78], [86, 87] ms.
+    [62, 63], [77, 78], [86, 87] ms. Where none leaves but when a slot begins, it is x_ν − x_1.
 
     Raises InputError: slot ends that do not ascend, or the last is before the longest latency.
     """
     ends = [int(end) for end in slot_ends_ns]
     if not ends or any(after <= before for before, after in pairwise(ends)):
         raise InputError(f"slot ends must ascend, at least one: found {ends}")
-    _refuse_before_longest(ends[-1], int(latencies_ns.max()))
-    counts, mean = counts_and_mean(np.sort(latencies_ns), ends)
+    at_start = publish_slot_ns if into_open_slot == "next-slot" else 0
+    ready = np.sort(latencies_ns) + at_start
+    _refuse_before_longest(ends[-1] - at_start, int(latencies_ns.max()))
+    counts, mean = counts_and_mean(ready, ends)
     return Prediction(
         mean_ns=round(float(mean)),
         max_ns=ends[-1],
-        jitter_ns=ends[-1] - (ends[0] - publish_slot_ns),
+        jitter_ns=ends[-1] - (ends[0] - publish_slot_ns) - at_start,
         shares=tuple((counts / counts.sum()).tolist()),
     )
 
 
-def _refuse_before_longest(last_end_ns: int, longest_ns: int) -> None:
-    if last_end_ns < longest_ns:
+def _refuse_before_longest(latest_ns: int, longest_ns: int) -> None:
+    if latest_ns < longest_ns:
         raise InputError(
-            f"the last slot ends at {format_duration(last_end_ns)}, before the longest latency"
-            f" {format_duration(longest_ns)}: move it behind"
+            f"the last slot takes outputs until {format_duration(latest_ns)}, before the longest"
+            f" latency {format_duration(longest_ns)}: move it behind"
         )
 
 
@@ -105,7 +113,7 @@ class BandProblem:
 
     Slots are ``publish_slot_ns`` long (Δ), the last ends at ``last_end_ns``, the others at
     multiples of ``grid_ns``. Neighbouring slot ends are at most ``max_gap_ns`` apart (LV), a band
-    has at most ``max_share`` of the executions.
+    has at most ``max_share`` of the executions. ``into_open_slot``: as the plan has it.
 
     Raises InputError: values that make no sense for any number of bands.
     """
@@ -116,6 +124,7 @@ class BandProblem:
     grid_ns: int = 1_000
     max_gap_ns: int | None = None
     max_share: float | None = None
+    into_open_slot: IntoOpenSlot = "at-once"
 
     def __post_init__(self) -> None:
         slot, gap, share = self.publish_slot_ns, self.max_gap_ns, self.max_share
@@ -123,7 +132,7 @@ class BandProblem:
         object.__setattr__(self, "latencies_ns", latencies)
         if slot <= 0 or self.grid_ns <= 0:
             raise InputError("the publish slot and the grid must be longer than 0ms")
-        _refuse_before_longest(self.last_end_ns, int(latencies[-1]))
+        _refuse_before_longest(self.last_end_ns - self.at_start_ns, int(latencies[-1]))
         if gap is not None and gap <= slot:
             raise InputError(
                 f"a largest gap of {format_duration(gap)} is not longer than the publish slot"
@@ -136,6 +145,16 @@ class BandProblem:
             raise InputError(
                 "latencies this long and this many overflow the planner: plan with fewer"
             )
+
+    @property
+    def at_start_ns(self) -> int:
+        """How long before a slot's end what leaves in it has to be ready: 0, or Δ."""
+        return self.publish_slot_ns if self.into_open_slot == "next-slot" else 0
+
+    @property
+    def ready_ns(self) -> NDArray[np.int64]:
+        """The earliest slot end, ascending, at which each execution may publish."""
+        return self.latencies_ns + self.at_start_ns
 
     @property
     def most_per_band(self) -> int:
@@ -199,7 +218,8 @@ def with_bands(
         placement = (place_by_swarm if solver == "pso" else place_randomly)(problem, bands, seed)
     length = problem.publish_slot_ns
     slots = tuple((end - length, end) for end in placement.slot_ends_ns)
-    predicted = predict_bands(problem.latencies_ns, placement.slot_ends_ns, length)
+    ends, entry = placement.slot_ends_ns, plan.into_open_slot
+    predicted = predict_bands(problem.latencies_ns, ends, length, entry)
     return with_publish_slots(plan, slots, predicted=predicted)
 
 
@@ -266,6 +286,7 @@ def with_long_slot(plan: Plan, latencies_ns: NDArray[np.int64], slot_start_ns: i
 
 def _problem(plan: Plan, latencies_ns: NDArray[np.int64], limits: dict[str, Any]) -> BandProblem:
     start, end = _last_publish_slot(plan)
+    limits = {**limits, "into_open_slot": plan.into_open_slot}
     return BandProblem(latencies_ns, end, publish_slot_ns=end - start, **limits)
 
 
@@ -400,7 +421,7 @@ def _solve(problem: BandProblem, bands: int) -> _Tables:
             f" {format_duration(grid)}"
         )
     ends = (first + np.arange(size, dtype=np.int64)) * grid
-    counts = np.searchsorted(problem.latencies_ns, ends, side="right").astype(np.int64)
+    counts = np.searchsorted(problem.ready_ns, ends, side="right").astype(np.int64)
     behind = problem.latencies_ns.size - counts
     reachable = behind <= problem.most_per_band
     # x_α − x_{α−1} > Δ, at most LV, and no more latencies in between than a band may hold.
@@ -486,7 +507,7 @@ def _broken(
         words = f"slot ends must be at most {format_duration(problem.max_gap_ns)} apart"
         yield words, np.clip(gaps - problem.max_gap_ns, 0, None).sum(axis=-1)
     if problem.max_share is not None:
-        counts, _ = counts_and_mean(problem.latencies_ns, ends)
+        counts, _ = counts_and_mean(problem.ready_ns, ends)
         too_many = np.clip(counts - problem.most_per_band, 0, None).sum(axis=-1)
         words = f"a band must hold at most {problem.max_share:.1%} of the executions"
         yield words, too_many * problem.last_end_ns / problem.latencies_ns.size
@@ -512,7 +533,7 @@ def place_by_swarm(problem: BandProblem, bands: int, seed: int | None = None) ->
 
     def cost(particles: NDArray[np.float64]) -> NDArray[np.float64]:
         ends = slot_ends(particles)
-        _, means = counts_and_mean(problem.latencies_ns, ends)
+        _, means = counts_and_mean(problem.ready_ns, ends)
         off = sum(off for _, off in _broken(problem, ends))
         return np.where(off > 0, last + off, means)
 
@@ -557,7 +578,7 @@ def _checked(problem: BandProblem, ends: list[int], what: str) -> Placement:
         raise OperationError(
             f"{what} ended at a placement that is not allowed ({broken}); use the exact solver"
         )
-    return Placement(tuple(ends), float(counts_and_mean(problem.latencies_ns, ends)[1]))
+    return Placement(tuple(ends), float(counts_and_mean(problem.ready_ns, ends)[1]))
 
 
 @contextmanager

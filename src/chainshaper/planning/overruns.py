@@ -14,7 +14,9 @@ from chainshaper.planning.margins import OVERRUN_PROBABILITY, cycles_needed
 from chainshaper.planning.plan import (
     PER_CALLBACK,
     Plan,
+    Server,
     ShapingNode,
+    Slot,
     Thread,
     below_executors,
     messages_waiting,
@@ -24,7 +26,6 @@ from chainshaper.planning.plan import (
     publishing_servers,
     revised,
     server_of,
-    until,
     with_slots,
 )
 from chainshaper.values.durations import format_duration, milliseconds
@@ -67,29 +68,51 @@ def output_lifespan(plan: Plan) -> int | None:
     return max([slots[0][1], *(after[1] - before[1] for before, after in pairwise(slots))])
 
 
-def open_until_done(plan: Plan) -> Plan:
+def open_until_done(plan: Plan, closed_ns: int = 0) -> Plan:
     """The plan as back ends and the simulator carry it out: what overruns may finish.
 
-    Where an output that missed its slot is to leave at once, the servers that run the chain to its
-    end stay open until the cycle's end (section 6), and so does the last publish slot of an
-    asynchronous publisher: stopping either would delay the output by a whole cycle. The plan itself
-    states what is reserved (eq. 1); where another server of the same priority has a slot there, it
-    stays as planned.
+    The servers that run the chain to its end stay open until the cycle's end (section 6), whatever
+    becomes of the output: stopped at L̄ + ε, the chain would go on in the next cycle, and delay its
+    output too. Where an output that missed its slot is to leave at once, so does the last publish
+    slot of an asynchronous publisher. The plan itself states what is reserved (eq. 1); the slots of
+    other servers of the same core and priority are left out, and the last ``closed_ns`` of a cycle:
+    a thread whose timer expires in these waits for its slot.
     """
-    shaped = plan.policy in ("shaped", "one-long-slot") and output_server(plan) is not None
-    if plan.overrun != "publish" or not shaped:
+    if plan.policy not in ("shaped", "one-long-slot") or output_server(plan) is None:
         return plan
-    publishers = [server for _, server, _ in publisher_servers(plan)]
-    publishing, (last_start, _) = publishing_servers(plan), publish_slots(plan)[-1]
-    longer = {
-        server.name: until(server, plan.cycle_ns)
+    publishing, (done, _) = publishing_servers(plan), publish_slots(plan)[-1]
+    at_once = [one for _, one, _ in publisher_servers(plan) if plan.overrun == "publish"]
+    running = [
+        server
         for server in plan.servers
-        if server in publishers or (server not in publishing and server.slots[-1][1] >= last_start)
-    }
+        if server in at_once
+        or (server not in publishing and server.slots[-1][0] < done <= server.slots[-1][1])
+    ]
+    longer: dict[str, tuple[Slot, ...]] = {}
+    for server in sorted(running, key=lambda one: one.slots[-1][1], reverse=True):
+        taken = [
+            slot
+            for other in plan.servers
+            if other is not server
+            if (other.core, other.priority) == (server.core, server.priority)
+            for slot in longer.get(other.name, other.slots)
+        ]
+        end_ns = max(server.slots[-1][1], plan.cycle_ns - closed_ns)
+        longer[server.name] = _filled(server, taken, end_ns)
     try:
         return revised(plan, servers=below_executors(with_slots(plan.servers, longer)))
-    except InputError:  # another server has a slot there
+    except InputError:  # below its executor, a publisher would meet another server's slot
         return plan
+
+
+def _filled(server: Server, taken: list[Slot], end_ns: int) -> tuple[Slot, ...]:
+    """A server's slots, the last one until ``end_ns`` but where others have theirs."""
+    filled, (free_from, _) = list(server.slots[:-1]), server.slots[-1]
+    for start, end in sorted([*taken, (end_ns, end_ns)]):
+        if free_from < start:
+            filled.append((free_from, start))
+        free_from = max(free_from, end)
+    return tuple(filled)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeAlias
 import yaml
 from pydantic import AfterValidator, Field, model_validator
 
-from chainshaper.gate.decision import Anchor, Late, Messages, Overrun
+from chainshaper.gate.decision import Anchor, IntoOpenSlot, Late, Messages, Overrun
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 from chainshaper.values.files import new_file, write_whole
@@ -259,7 +259,8 @@ class Plan(Part):
     ``cycle_ns`` is a whole multiple of the chain's period. Its cycles start ``offset_ns`` after the
     instant from which those of all chains count; ``anchor``: by the stamp that each message carries
     from the chain's first callback, or by the servers' own cycle. ``overrun`` says what becomes of
-    an output that missed its last slot, ``messages`` which of several outputs of one cycle leave,
+    an output that missed its last slot, ``into_open_slot`` of one that comes when its slot is open
+    already, ``messages`` which of several outputs of one cycle leave,
     ``fallback`` what becomes of outputs while their shaping node is not there. ``shaping_node``
     serves the chain's output, unless the publisher's own thread is gated; ``further_shaping_nodes``
     serve other sinks, or topics inside a chain (LET per callback).
@@ -274,6 +275,7 @@ class Plan(Part):
     offset_ns: Duration = 0
     anchor: Anchor = "stamp"
     overrun: Overrun = "wait"
+    into_open_slot: IntoOpenSlot = "at-once"
     messages: Messages = "all-in-order"
     fallback: Fallback = "bypass"
     servers: Annotated[tuple[Server, ...], Field(min_length=1)]
@@ -284,7 +286,7 @@ class Plan(Part):
 
     @model_validator(mode="after")
     def _consistent(self) -> "Plan":
-        rules = (_cycle, _servers, _overlaps, _shaping_nodes, _modes, _publisher_threads)
+        rules = (_cycle, _servers, _overlaps, _shaping_nodes, _modes, _publisher_threads, _entry)
         for rule in rules:
             for reason, *where in rule(self):
                 raise wrong_value(str(reason), *where)
@@ -329,7 +331,7 @@ def band_predictions(plan: Plan) -> tuple[BandPrediction, ...]:
     if len(slots) != len(shares):
         return ()
     return tuple(
-        BandPrediction(start, end, share, end - start)
+        BandPrediction(start, end, share, 0 if plan.into_open_slot == "next-slot" else end - start)
         for (start, end), share in zip(slots, shares, strict=True)
     )
 
@@ -530,6 +532,16 @@ def _publisher_threads(plan: Plan) -> _Wrong:
             )
 
 
+def _entry(plan: Plan) -> _Wrong:
+    gated = any(publisher_servers(plan))
+    if plan.into_open_slot == "next-slot" and (gated or plan.policy != "shaped"):
+        yield (
+            "only a shaping node sees when an output comes, and only the policy shaped has slots"
+            f" for it, not {'a gated publisher' if gated else plan.policy}: write at-once",
+            "into_open_slot",
+        )
+
+
 def _out_ranked(plan: Plan, server: Server, node: str, other: Server) -> list[Slot]:
     """Slots in which a node's publisher thread out-ranks its executor, if ``other`` runs that."""
     if other.core != server.core or other.priority <= server.priority:
@@ -592,6 +604,7 @@ _SECTION_COMMENTS = {
     "offset": "this chain's cycles start so much after the instant that all chains count from",
     "anchor": "what starts a cycle: the message's origin stamp (stamp), or the servers (cycle)",
     "overrun": "an output that missed its last slot: wait for the next, discard, publish at once",
+    "into_open_slot": "an output that comes when its slot is open: at once, or in the next slot",
     "messages": "several outputs in one cycle: all leave in order, or the newest, or the first",
     "fallback": "while the shaping node is not there: bypass, outputs go around it; or silence",
     "servers": "a thread runs only in its server's slots; a smaller priority is better",
@@ -651,6 +664,8 @@ def _yaml_values(plan: Plan) -> dict[str, Any]:
         values["modes"]["bands"] = _OnOneLine(values["modes"]["bands"])
     if plan.offset_ns == 0:
         del values["offset"]
+    if plan.into_open_slot == "at-once":
+        del values["into_open_slot"]
     if plan.shaping_node is None and plan.fallback == "bypass":
         del values["fallback"]
     if not values["further_shaping_nodes"]:

@@ -110,11 +110,12 @@ def plan_shaping(
             cycle_ns=period_ns,
             anchor=wishes.anchor,
             overrun=wishes.overrun or "publish",
+            into_open_slot=wishes.into_open_slot,
             messages=wishes.messages,
             fallback=wishes.fallback,
             servers=(running, _publishing("output", output_core, (start, end), gated)),
             shaping_node=node,
-            predicted=predict_bands(latencies, [end], length),
+            predicted=predict_bands(latencies, [end], length, wishes.into_open_slot),
         )
 
 

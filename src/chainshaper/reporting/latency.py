@@ -25,7 +25,7 @@ from chainshaper.reporting.tables import (
 )
 from chainshaper.values.durations import milliseconds
 from chainshaper.verify.measure import PARTS, Comparison, Measurement, hop_breakdown, part_shares
-from chainshaper.verify.overruns import dropped_text, overruns_text
+from chainshaper.verify.overruns import dropped_text, next_cycles, overruns_text
 from chainshaper.verify.predictions import FigureHeld, PredictionHeld
 
 __all__ = [
@@ -99,6 +99,7 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
         "silent": analysis.silent,
         "overruns": None if overruns is None else sum(overruns.values()),
         "overruns_by_policy": overruns,
+        "overrun_outcomes": {name: asdict(one) for name, one in measurement.outcomes.items()},
         "into_open_slots": measurement.into_open_slots,
         "dropped": None if dropped is None else sum(dropped.values()),
         "dropped_by_reason": dropped,
@@ -164,6 +165,8 @@ def doubts_text(measurement: Measurement) -> str:
         parts.append(f"incomplete: {reasons}")
     if measurement.overruns:
         parts.append(overruns_text(measurement.overruns))
+    if measurement.outcomes:
+        parts.append(f"the next cycle was hit in {next_cycles(measurement.outcomes)}")
     if measurement.dropped:
         parts.append(dropped_text(measurement.dropped))
     return "; ".join(parts)
@@ -230,6 +233,7 @@ def _counts(measurements: Sequence[Measurement]) -> dict[str, list[str]]:
             ("disturbed by the machine", str(statistics.disturbed) if watched else "not watched"),
             ("incomplete", counts(one.analysis.incomplete)),
             ("too late for their slot", counts(one.overruns, "not gated")),
+            ("next cycle hit", next_cycles(one.outcomes) if one.outcomes else ABSENT),
             ("came when it was open", count(one.into_open_slots, "not gated")),
             ("messages lost at the gate", counts(one.dropped, "not gated")),
             ("begun without publishing", str(one.analysis.silent)),

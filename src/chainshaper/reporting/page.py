@@ -49,7 +49,7 @@ from chainshaper.values.errors import InputError
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.safe_text import escape, shown
 from chainshaper.verify.measure import PARTS, Comparison, Measurement, hop_breakdown
-from chainshaper.verify.overruns import overruns_text
+from chainshaper.verify.overruns import next_cycles, overruns_text
 
 __all__ = ["ENDINGS", "report_page", "write_report"]
 
@@ -255,6 +255,12 @@ def _overruns(part: _Part) -> str:
     if not measurement.overruns:
         return _paragraph(f"{part.name}: no output was too late for its slot.")
     about = _paragraph(f"{part.name}: {overruns_text(measurement.overruns)}.")
+    columns = [*words("policy"), *figures("late", "discarded", "next cycle hit")]
+    outcomes = ResultTable("", columns)
+    for policy, one in measurement.outcomes.items():
+        hit = next_cycles({policy: one})
+        outcomes.add(policy, str(one.late), str(one.discarded), hit)
+    about += outcomes.html() if outcomes.rows else ""
     latencies = measurement.analysis.traversals.select("traversal", "latency_ns")
     late = part.timeline.holds.filter(pl.col("overrun").is_not_null()).join(
         latencies, on="traversal", how="left", maintain_order="left"

@@ -569,6 +569,7 @@ def _add_gate(rows: Rows, system: System, described: CallbackDescription, timing
         G.SPIN: gate.spin_ns,
         G.PAUSE: gate.pause_ns,
         G.MESSAGES: WORDS["messages"].index(gate.messages),
+        G.AT_ONCE: int(gate.into_open_slot == "at-once"),
         G.PHASE: timing.start_ns + gate.phase_ns if gate.phase_ns is not None else timing.anchor_ns,
         G.CHANGED: 0,
         G.CHANGES: rows.add(at.CHANGES_KEPT, 2).start,

@@ -394,7 +394,9 @@ def _sleep(m, thread, until):
 @compiled()
 def _enter_gate(m, thread):
     gate, now = m[m[thread + T.ENTITY] + E.BODY_ROW], m[X.NOW]
-    decide(m, gate, m[thread + T.ARRIVAL], m[thread + T.ORIGIN])
+    # A gate at rest knows of a message when it has taken it.
+    arrival = now if m[thread + T.ARRIVAL] >= m[gate + G.FREE] else m[thread + T.ARRIVAL]
+    decide(m, gate, arrival, m[thread + T.ORIGIN])
     m[thread + T.BEGAN] = now
     if m[gate + G.AT] == NONE:
         return _leave_gate(m, thread)
@@ -539,7 +541,7 @@ def _release(m, gate, row, arrival, stamp, ready):  # noqa: PLR0917 - as `releas
     ready = max(arrival, ready)
     cycle = max(0, (ready - origin) // cycle_ns)
     due_from = origin + due * cycle_ns
-    overran = ready >= due_from + m[last - 1]
+    overran = not _lets_out(m, gate, last - 2, due_from, arrival, ready)
     m[row + G.ARRIVAL], m[row + G.ORIGIN], m[row + G.MODE] = arrival, origin, mode
     m[row + G.BY_STAMP], m[row + G.TREATED] = stamped, NONE
     m[row + G.SLOT], m[row + G.CYCLES], m[row + G.DROPPED] = NONE, cycle, NONE
@@ -550,17 +552,23 @@ def _release(m, gate, row, arrival, stamp, ready):  # noqa: PLR0917 - as `releas
         return
     if overran:
         m[row + G.TREATED] = at.WAIT
-    elif mode != NONE and ready >= due_from + m[first + 1]:
+    elif mode != NONE and not _lets_out(m, gate, first, due_from, arrival, ready):
         m[row + G.TREATED] = at.NEXT_SLOT
     m[row + G.CYCLES] = max(due, cycle)
     while True:
         start = origin + m[row + G.CYCLES] * cycle_ns
         for slot in range(first, last, 2):
-            if ready < start + m[slot + 1]:
+            if _lets_out(m, gate, slot, start, arrival, ready):
                 m[row + G.AT] = max(ready, start + m[slot])
                 m[row + G.SLOT] = (slot - m[gate + G.SLOTS]) // 2
                 return
         m[row + G.CYCLES] += 1
+
+
+@compiled()
+def _lets_out(m, gate, slot, start, arrival, ready):  # noqa: PLR0917 - as `Gate.lets_out`
+    in_time = m[gate + G.AT_ONCE] == 1 or arrival <= start + m[slot]
+    return in_time and ready < start + m[slot + 1]
 
 
 @compiled()

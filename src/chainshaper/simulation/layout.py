@@ -74,12 +74,14 @@ R = IntEnum("R", "ENTITY LAST COLUMNS", start=0)
 """Readers: an entity, and the time of the last delivery to it from this publisher."""
 
 # Gates. SLOTS are pairs of start and end, BANDS has one per mode, NONE for those that the gate does
-# not know (DEFAULT is NONE where it knows none), CHANGES is a ring of pairs: time, mode. LEAVING
-# and LEFT are starts of cycles, as `Queue` has them. From ARRIVAL on: what was decided about the
-# message in it; from OTHER on, the same about one that waits behind.
+# not know (DEFAULT is NONE where it knows none), CHANGES is a ring of pairs: time, mode. AT_ONCE: a
+# message may leave in a slot that is open when it comes. LEAVING and LEFT are starts of cycles, as
+# `Queue` has them. From ARRIVAL on: what was decided about the message in it; from OTHER on, the
+# same about one that waits behind.
 G = IntEnum(
     "G",
     "SLOTS SLOTS_END CYCLE STAMPED OVERRUN DUE LATE SPIN PAUSE DEFAULT BANDS CHANGES MESSAGES"
+    " AT_ONCE"
     " PHASE CHANGED LEAVING LEFT FREE"
     " ARRIVAL AT ORIGIN SLOT CYCLES BY_STAMP TREATED MODE DROPPED OTHER",
     start=0,

@@ -163,7 +163,7 @@ def writers_of(application: Application) -> list[Writer]:
 def _described(plan: Plan, shaping: ShapingNode, depth: int, phase_ns: int) -> NodeDescription:
     gate = gate_of(plan, shaping, depth)
     same = ("slots", "cycle_ns", "anchor", "overrun", "due_cycles", "messages", "depth")
-    described: dict[str, Any] = {name: getattr(gate, name) for name in same}
+    described: dict[str, Any] = {name: getattr(gate, name) for name in (*same, "into_open_slot")}
     described["phase_ns"] = phase_ns
     described |= {"spin_ns": shaping.spin_ns, "pause_ns": shaping.pause_ns}
     if gate.modes is not None and plan.modes is not None:

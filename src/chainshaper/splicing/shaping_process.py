@@ -177,6 +177,7 @@ def gate_of(plan: Plan, node: ShapingNode, depth: int = DEPTH) -> Gate:
         due_cycles=cycles_until_output(plan, node),
         modes=None if modes is None else Modes(bands, modes.default, modes.late),
         messages=plan.messages,
+        into_open_slot=plan.into_open_slot,
         depth=depth,
     )
 
@@ -394,6 +395,7 @@ def _schema() -> dict[str, str]:
     words = {
         "Anchor": decision.ANCHORS,
         "Policy": decision.LATE,
+        "Entry": decision.INTO_OPEN_SLOT,
         "Messages": decision.MESSAGES,
         "Dropped": decision.DROPPED,
     }

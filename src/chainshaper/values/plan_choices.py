@@ -6,7 +6,7 @@ This module imports nothing slow: the planner takes a while, `chainshaper plan -
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple, TypeAlias
 
-from chainshaper.gate.decision import Anchor, Messages, Overrun
+from chainshaper.gate.decision import Anchor, IntoOpenSlot, Messages, Overrun
 
 Policy: TypeAlias = Literal[
     "shaped",
@@ -96,6 +96,9 @@ class Wishes:
     overrun: Annotated[Overrun | None, Option(
         "An output that missed its slot: at once; or in slots only: wait for the next, or"
         " discard. Default: publish.")] = None
+    into_open_slot: Annotated[IntoOpenSlot, Option(
+        "An output that comes when its slot is open: at once; or in the next slot, so that a band"
+        " has no jitter.", BANDS)] = "at-once"
     messages: Annotated[Messages, Option(
         "Which of several outputs in one cycle leave.")] = "all-in-order"
     depth: Annotated[int | None, Option(

@@ -22,7 +22,13 @@ from chainshaper.values import events
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
-from chainshaper.verify.overruns import dropped_in, into_open_slots, overruns_in
+from chainshaper.verify.overruns import (
+    Outcome,
+    dropped_in,
+    into_open_slots,
+    outcomes_in,
+    overruns_in,
+)
 from chainshaper.verify.predictions import PredictionHeld, due_of, hold_prediction
 
 
@@ -53,6 +59,7 @@ class Measurement:
 
     ``longest_stall_ns`` is the machine's own (None: it was not watched), ``overruns`` counts
     outputs that came too late for their publish slot, per policy (None: nothing was gated),
+    ``outcomes`` says what became of those of the chain, and of the cycles behind them,
     ``into_open_slots`` those that came in time, but too late to wait until their slot's start,
     ``dropped`` messages that were lost at a gate, per reason (None: no gate decided). ``plan`` is
     the plan in force, ``held`` its prediction beside this measurement. All of it is about the time
@@ -63,6 +70,7 @@ class Measurement:
     analysis: LatencyAnalysis
     longest_stall_ns: int | None
     overruns: dict[str, int] | None
+    outcomes: dict[str, Outcome]
     into_open_slots: int | None
     dropped: dict[str, int] | None
     plan: Plan | None
@@ -123,6 +131,7 @@ def measure_latency(
         analysis=analysis,
         longest_stall_ns=longest_stall(recording),
         overruns=overruns_in(recording, own, analysis),
+        outcomes=outcomes_in(analysis, own),
         into_open_slots=into_open_slots(recording, own),
         dropped=dropped_in(recording),
         plan=own,

@@ -6,7 +6,13 @@ slot's start: it leaves at once, and later than all others. Those are counted, t
 A gate records its decision for every message. The thread of an asynchronous publisher decides
 nothing; there the messages that were never sent count as discarded, and those that were sent in a
 later cycle than due as having waited.
+
+Whatever the policy, an overrun is to be late by itself: the **next cycle** was hit where its output
+missed its slot too, or did not come, whatever the cause.
 """
+
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import polars as pl
 
@@ -15,7 +21,7 @@ from chainshaper.analysis.messages import with_overrun
 from chainshaper.gate.decision import DROPPED
 from chainshaper.planning import Plan
 from chainshaper.planning.overruns import cycles_until_output
-from chainshaper.planning.plan import publisher_servers
+from chainshaper.planning.plan import publish_slots, publisher_servers
 from chainshaper.values import events
 from chainshaper.values.recording import Recording
 
@@ -58,7 +64,59 @@ def overruns_in(
             due_until = (cycles_until_output(plan) + 1) * plan.cycle_ns
             late = analysis.traversals["latency_ns"].drop_nulls() >= due_until
             counts["wait"] += int(late.sum())
+            if plan.overrun == "publish":
+                behind = analysis.traversals["place_ns"] >= _slots_end(plan)
+                counts["publish"] += int((behind & ~analysis.traversals["late"]).sum())
     return {policy: count for policy, count in counts.items() if count}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of a chain's outputs that overran under one policy, ``late`` left and ``discarded`` did not.
+
+    Behind ``followed`` of them the recording has the next cycle whole; ``next_hit`` of these were
+    hit.
+    """
+
+    late: int
+    discarded: int
+    followed: int
+    next_hit: int
+
+
+def outcomes_in(analysis: LatencyAnalysis, plan: Plan | None) -> dict[str, Outcome]:
+    """What became of the outputs that overran, per policy that was applied to them."""
+    decided = analysis.releases.filter(pl.col("hop") == len(analysis.chain.callbacks) - 1)
+    cycles = analysis.traversals.join(
+        decided.select("traversal", "overrun"), on="traversal", how="left", maintain_order="left"
+    )
+    missed = pl.col("late").fill_null(False) | (pl.col("reason") == "discarded").fill_null(False)
+    policy = pl.col("overrun")
+    if plan is not None and not decided.height and any(publisher_servers(plan)):
+        missed |= (pl.col("place_ns") >= _slots_end(plan)).fill_null(False)
+        policy = pl.when(missed).then(pl.lit(plan.overrun))
+    cut = pl.col("reason").is_in(["not taken", "not sent", "still running"]).fill_null(False)
+    hit = pl.when(~cut).then(missed | ~pl.col("complete"))
+    cycles = cycles.select("complete", policy=policy, next_hit=hit.shift(-1))
+    rows = cycles.drop_nulls("policy").group_by("policy", maintain_order=True)
+    figures = rows.agg(
+        late=pl.col("complete").sum(),
+        discarded=(~pl.col("complete")).sum(),
+        followed=pl.col("next_hit").count(),
+        next_hit=pl.col("next_hit").sum(),
+    )
+    return {row.pop("policy"): Outcome(**row) for row in figures.iter_rows(named=True)}
+
+
+def _slots_end(plan: Plan) -> int:
+    """Where the last slot in which an output is in time ends, from the start of its cycle (ns)."""
+    return publish_slots(plan)[-1][1] + cycles_until_output(plan) * plan.cycle_ns
+
+
+def next_cycles(outcomes: Mapping[str, Outcome]) -> str:
+    """How many of the cycles behind overruns were hit: ``1 of 3``."""
+    hit = sum(one.next_hit for one in outcomes.values())
+    return f"{hit} of {sum(one.followed for one in outcomes.values())}"
 
 
 def into_open_slots(recording: Recording, plan: Plan | None) -> int | None:

@@ -163,6 +163,7 @@ def _figures(
     """Average, maximum and jitter: with outputs at slot starts and ends, with room, measured."""
     predicted = plan.predicted
     mean, longest, jitter = predicted.mean_ns, predicted.max_ns, predicted.jitter_ns
+    publishing = 0
     lowest_max, lowest_jitter = mean, 0  # of outputs that leave when they are ready
     # Where outputs do not come in bands, their variance is not in the plan; between two limits it
     # is at most (max − mean)·(mean − min).
@@ -179,6 +180,8 @@ def _figures(
             if (1 - share) ** measured.count <= MISSING
         ] or starts[:1]
         lowest_max, lowest_jitter = sure[-1], sure[-1] - sure[0]
+        if plan.into_open_slot == "next-slot":  # all leave when a slot begins, and within it
+            publishing = ends[-1] - starts[-1]
     elif slots:
         longest, jitter = min(longest, slots[-1][0]), 0
         lowest_max = longest
@@ -195,7 +198,7 @@ def _figures(
     return (
         figure(mean, "mean_ns", mean - room, room),
         figure(longest, "max_ns", lowest_max),
-        figure(jitter, "jitter_ns", lowest_jitter),
+        figure(jitter, "jitter_ns", lowest_jitter, publishing),
     )
 
 

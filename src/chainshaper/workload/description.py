@@ -25,7 +25,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from chainshaper.gate.decision import Anchor, Gate, Late, Messages, Modes, Overrun
+from chainshaper.gate.decision import Anchor, Gate, IntoOpenSlot, Late, Messages, Modes, Overrun
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Publication
 from chainshaper.values.yaml_file import (
@@ -142,6 +142,7 @@ class GateDescription(Part):
     modes: ModesDescription | None = None
     messages: Messages = "all-in-order"
     depth: Annotated[int, Field(ge=1)] = 10
+    into_open_slot: IntoOpenSlot = "at-once"
     spin_ns: Duration = 0
     pause_ns: Duration = 0
 

@@ -26,7 +26,10 @@ from chainshaper.workload.event_log import ABSENT, LAYOUT, EventLog, number_of
 from chainshaper.workload.execution import ExecutionTimes
 from chainshaper.workload.launcher import receive, send, send_events, wait_for_leave
 
-GATE_FIELDS = ("cycle_ns", "anchor", "overrun", "due_cycles", "messages", "depth")
+GATE_FIELDS = (
+    *("cycle_ns", "anchor", "overrun", "due_cycles", "messages", "depth"),
+    "into_open_slot",
+)
 
 Body: TypeAlias = Callable[[dds.Message], None]
 

@@ -56,9 +56,17 @@ struct Gate {
   std::optional<Modes> modes{};
   Messages messages{Messages::all_in_order};
   std::size_t depth{schema::depth};
+  Entry into_open_slot{Entry::at_once};
 
   Policy policy() const {
     return modes && modes->late != Policy::next_slot ? modes->late : overrun;
+  }
+
+  bool lets_out(const Slot & slot, std::int64_t cycle_start_ns, std::int64_t arrival_ns,
+                std::int64_t ready_ns) const {
+    const bool in_time =
+        into_open_slot == Entry::at_once || arrival_ns <= cycle_start_ns + slot.start;
+    return in_time && ready_ns < cycle_start_ns + slot.end;
   }
 
   bool counts_from(Maybe stamp_ns, std::int64_t arrival_ns) const {
@@ -126,6 +134,7 @@ inline Gate gate_of(const Parameters & parameters, std::size_t depth) {
   gate.due_cycles = parameters.due_cycles;
   gate.messages = static_cast<Messages>(one_of(messages_names, parameters.messages));
   gate.depth = depth;
+  gate.into_open_slot = static_cast<Entry>(one_of(entry_names, parameters.into_open_slot));
   if (!parameters.mode_topic.empty()) {
     const auto & slots = parameters.mode_slots;
     gate.modes = Modes{parameters.mode_names,
@@ -169,7 +178,7 @@ inline Release release_of(const Gate & gate, std::int64_t arrival_ns, Maybe stam
   // A stamp slightly from the future puts the arrival before its own cycle: cycle 0 still.
   std::int64_t cycle = std::max<std::int64_t>(0, (ready - origin) / cycle_ns);
   const std::int64_t due_from = origin + due * cycle_ns;
-  const bool overran = ready >= due_from + gate.slots[last - 1].end;
+  const bool overran = !gate.lets_out(gate.slots[last - 1], due_from, arrival_ns, ready);
   const Policy policy = gate.policy();
   if (overran && policy != Policy::wait) {
     const Maybe at_once = policy == Policy::publish ? Maybe(ready) : std::nullopt;
@@ -178,12 +187,12 @@ inline Release release_of(const Gate & gate, std::int64_t arrival_ns, Maybe stam
   std::optional<Policy> treated;
   if (overran)
     treated = Policy::wait;
-  else if (mode && ready >= due_from + gate.slots[first].end)
+  else if (mode && !gate.lets_out(gate.slots[first], due_from, arrival_ns, ready))
     treated = Policy::next_slot;
   for (cycle = std::max(due, cycle);; ++cycle) {
     const std::int64_t cycle_start = origin + cycle * cycle_ns;
     for (std::size_t slot = first; slot < last; ++slot) {
-      if (ready < cycle_start + gate.slots[slot].end) {
+      if (gate.lets_out(gate.slots[slot], cycle_start, arrival_ns, ready)) {
         const std::int64_t at = std::max(ready, cycle_start + gate.slots[slot].start);
         return {at, origin, slot, cycle, anchor, treated, mode};
       }
@@ -443,6 +452,7 @@ public:
   std::optional<Outcome<Message>> hold() {
     const std::uint64_t number = queue.waiting.front().number;
     std::int64_t now = monotonic_ns();
+    turn_ns_ = now;  // before, this thread was busy with the message before it
     auto [release, dropped] = queue.decide();
     on_decision_(release, queue.phase_ns);
     bool slept = false;
@@ -497,7 +507,8 @@ public:
   std::int64_t time_lost(const Outcome<Message> & outcome) {
     if (!outcome.release.at_ns) return 0;
     const std::int64_t others = others_ran_ns() - waited_ns_;
-    return std::max<std::int64_t>(0, outcome.awake_ns - *outcome.release.at_ns - others);
+    const std::int64_t since_ns = std::max(*outcome.release.at_ns, turn_ns_);
+    return std::max<std::int64_t>(0, outcome.awake_ns - since_ns - others);
   }
 
   Queue<Message> queue;
@@ -535,6 +546,7 @@ private:
   std::int64_t offset_;
   std::int64_t looked_ns_{0};
   std::int64_t waited_ns_{0};
+  std::int64_t turn_ns_{0};
   int schedstat_{-1};
   pid_t thread_{-1};
   std::optional<std::pair<std::int64_t, std::int64_t>> next_phase_;  // from when on, and which
