@@ -152,7 +152,7 @@ def open_until_done(plan: ApplicationPlan, waits_ns: Sequence[int] = ()) -> Appl
 
     See :func:`chainshaper.planning.overruns.open_until_done`; a server whose longer slots would
     meet those of another chain stays as planned. Of several chains, ``waits_ns`` is how long before
-    its cycle each one's timer expires: it waits for its slot, so that cycles start at their offsets.
+    its cycle each one's timer expires: its thread waits, so that cycles start at their offsets.
     """
     waits = waits_ns if waits_ns and plan.moves_timers else [-WAITING_NS] * len(plan.chains)
     opened = [

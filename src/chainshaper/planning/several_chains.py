@@ -21,6 +21,7 @@ from chainshaper.planning.application_plan import ApplicationPlan, combined
 from chainshaper.planning.offsets import TIME_LIMIT_SECONDS, chain_name, place_chains
 from chainshaper.planning.plan import (
     Plan,
+    Prediction,
     Server,
     Slot,
     publishing_servers,
@@ -143,13 +144,14 @@ def _behind(plan: Plan, taken: Sequence[tuple[int, Slot]]) -> Plan:
             " core for one of the outputs"
         )
     slots = {s.name: [(a + later_ns, b + later_ns) for a, b in s.slots] for s in gates}
-    predicted = plan.predicted.model_copy(
-        update={
-            "mean_ns": plan.predicted.mean_ns + later_ns,
-            "max_ns": plan.predicted.max_ns + later_ns,
-        }
-    )
+    predicted = _later(plan.predicted, later_ns)
     return revised(plan, servers=with_slots(plan.servers, slots), predicted=predicted)
+
+
+def _later(predicted: Prediction, later_ns: int) -> Prediction:
+    times = {"mean_ns": predicted.mean_ns + later_ns, "max_ns": predicted.max_ns + later_ns}
+    modes = {mode: _later(own, later_ns) for mode, own in (predicted.modes or {}).items()}
+    return predicted.model_copy(update={**times, "modes": modes or None})
 
 
 def numbered(plans: Sequence[Plan], groups: Sequence[Sequence[int]]) -> list[Plan]:
