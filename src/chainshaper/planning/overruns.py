@@ -8,7 +8,7 @@ what waited for the slot of a later cycle has expired when the thread may run ag
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations, pairwise, product
 
 from chainshaper.planning.margins import OVERRUN_PROBABILITY, cycles_needed
 from chainshaper.planning.plan import (
@@ -87,8 +87,22 @@ def open_until_done(plan: Plan) -> Plan:
     end stay open until the cycle's end (section 6), and so does the last publish slot of an
     asynchronous publisher: stopping either would delay the output by a whole cycle. The plan itself
     states what is reserved (eq. 1); where another server of the same priority has a slot there, it
-    stays as planned.
+    stays as planned. A stage of a pipeline stays open until the next slot of its core begins.
     """
+    if plan.overrun == "publish" and plan.policy == "pipelined":
+        stages = [server for server in plan.servers if server not in publishing_servers(plan)]
+        return revised(
+            plan,
+            servers=with_slots(
+                plan.servers,
+                {
+                    stage.name: [
+                        (start, _next_start(plan, stage.core, end)) for start, end in stage.slots
+                    ]
+                    for stage in stages
+                },
+            ),
+        )
     shaped = plan.policy in ("shaped", "one-long-slot") and output_server(plan) is not None
     if plan.overrun != "publish" or not shaped:
         return plan
@@ -103,6 +117,13 @@ def open_until_done(plan: Plan) -> Plan:
         return revised(plan, servers=below_executors(with_slots(plan.servers, longer)))
     except InputError:  # another server has a slot there
         return plan
+
+
+def _next_start(plan: Plan, core: int, instant: int) -> int:
+    """When, from that instant of the cycle on, a slot of the core begins, or the cycle ends."""
+    own = (server.slots for server in plan.servers if server.core == core)
+    starts = (start for slots in own for start, _ in slots if start >= instant)
+    return min(starts, default=plan.cycle_ns)
 
 
 @dataclass(frozen=True)
@@ -197,7 +218,44 @@ def publication_warnings(plan: Plan) -> list[str]:
 
 def plan_warnings(plan: Plan) -> list[str]:
     """What a person must know before relying on a plan; one sentence each, none if all is well."""
-    return [*_about_late_outputs(plan), *_about_evidence(plan), *publication_warnings(plan)]
+    about = (_about_stages, _about_late_outputs, _about_evidence, publication_warnings)
+    return [warning for one in about for warning in one(plan)]
+
+
+def _about_stages(plan: Plan) -> Iterator[str]:
+    """Where a pipeline is cut, what it costs, and what has to be right for it."""
+    if plan.policy != "pipelined":
+        return
+    longest, cycle = plan.evidence.max_latency_ns, plan.cycle_ns
+    stages = [server for server in plan.servers if server not in publishing_servers(plan)]
+    where = "; ".join(
+        f"{', '.join(thread.node for thread in stage.threads)} on core {stage.core}"
+        for stage in stages
+    )
+    cost = _leaves_at(plan) - longest - plan.margin.epsilon_ns
+    yield (
+        f"the chain takes up to {milliseconds(longest)} ms, {longest / cycle:.2f} times its cycle,"
+        f" and has {len(stages)} stages: {where}. Outputs leave at"
+        f" {milliseconds(_leaves_at(plan))} ms, once a cycle"
+        + (
+            f"; {milliseconds(cost)} ms of it are for stages that wait for their turn."
+            if cost
+            else "."
+        )
+    )
+    for one, two in combinations(stages, 2):
+        both = product(one.slots, two.slots) if one.core == two.core else ()
+        if any(first[0] < second[1] and second[0] < first[1] for first, second in both):
+            yield (
+                f"{one.name} and {two.name} have core {one.core} at the same time: that is right"
+                " only where their callbacks wait (for a device, a sleep) rather than compute."
+            )
+
+
+def _leaves_at(plan: Plan) -> int:
+    """When outputs leave, from the start of their chain on, if they come in time."""
+    slots, delay = publish_slots(plan), cycles_until_output(plan) * plan.cycle_ns
+    return delay + slots[-1][0] if slots else plan.evidence.max_latency_ns + plan.margin.epsilon_ns
 
 
 def _about_late_outputs(plan: Plan) -> Iterator[str]:
@@ -221,7 +279,7 @@ def _about_late_outputs(plan: Plan) -> Iterator[str]:
     elif evidence.disturbed:
         yield f"the machine disturbed {evidence.disturbed} of {cycles} cycles{what}."
     if margin.stalls_ns:
-        end = evidence.max_latency_ns + margin.epsilon_ns
+        end = _leaves_at(plan)
         yield (
             f"covering the disturbed cycles costs {milliseconds(margin.stalls_ns)} ms: outputs"
             f" leave at {milliseconds(end)} ms; on a machine that does not stall it would be"
@@ -267,7 +325,7 @@ def _about_evidence(plan: Plan) -> Iterator[str]:
             f"the plan fills {last / cycle:.1%} of the cycle {format_duration(cycle)}: an execution"
             " a little longer than any measured delays the next one."
         )
-    if longest >= cycle:
+    if longest >= cycle and plan.policy != "pipelined":
         yield (
             f"the longest latency {format_duration(longest)} is not shorter than the cycle"
             f" {format_duration(cycle)}: executions of the chain overlapped while they were"

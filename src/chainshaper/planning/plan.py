@@ -39,7 +39,7 @@ from chainshaper.values.yaml_file import (
 
 SHORTEST_SLOT_NS = 1_000_000  # of an asynchronous publisher
 SENDS_PER_SLOT = 4
-PER_CALLBACK = ("server-per-callback", "let-per-callback")
+PER_CALLBACK = ("server-per-callback", "let-per-callback", "pipelined")
 """Policies whose slots follow from the callbacks, so that an execution may span cycles."""
 
 
@@ -379,8 +379,15 @@ def _cycle(plan: Plan) -> _Wrong:
     if cycle <= longest and plan.policy not in PER_CALLBACK:
         yield (
             f"the cycle {format_duration(cycle)} is not longer than the longest latency measured,"
-            f" {format_duration(longest)}: plan with a longer period or a shorter chain",
+            f" {format_duration(longest)}: plan with a longer period or a shorter chain, or in"
+            " stages (--policy pipelined)",
             "cycle",
+        )
+    if plan.policy == "pipelined" and plan.anchor == "cycle":
+        yield (
+            "an output of a pipeline is whole cycles old, and only its stamp says how many: write"
+            " stamp (--anchor)",
+            "anchor",
         )
 
 

@@ -53,9 +53,21 @@ def splice_application(application: Application, plan: Plan) -> Application:
             f"the plan's modes are named on {plan.modes.topic}, but no callback of the application "
             "`announces` modes there: describe one, or remove `modes` from the plan"
         )
+    if plan.policy == "pipelined":
+        application = _on_cores_of_stages(application, plan)
     for node in (shaping, *plan.further_shaping_nodes):
         application = _spliced(application, plan, node)
     return application
+
+
+def _on_cores_of_stages(application: Application, plan: Plan) -> Application:
+    """The application with the nodes of each stage on the stage's core."""
+    core_of = {thread.node: server.core for server in plan.servers for thread in server.threads}
+    nodes = {
+        name: node.model_copy(update={"core": core_of.get("/" + name.strip("/"), node.core)})
+        for name, node in application.nodes.items()
+    }
+    return application.model_copy(update={"nodes": nodes})
 
 
 def _spliced(application: Application, plan: Plan, shaping: ShapingNode) -> Application:
