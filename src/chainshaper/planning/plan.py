@@ -379,8 +379,7 @@ def _cycle(plan: Plan) -> _Wrong:
     if cycle <= longest and plan.policy not in PER_CALLBACK:
         yield (
             f"the cycle {format_duration(cycle)} is not longer than the longest latency measured,"
-            f" {format_duration(longest)}: plan with a longer period or a shorter chain, or in"
-            " stages (--policy pipelined)",
+            f" {format_duration(longest)}: plan with a longer period or a shorter chain",
             "cycle",
         )
     if plan.policy == "pipelined" and plan.anchor == "cycle":
