@@ -285,6 +285,7 @@ def _steps(
     free = np.zeros(analysis.traversals.height, dtype=np.int64)  # when the instance before is over
     for hop, number in enumerate(chain.callbacks):
         own = hops.filter((pl.col("hop") == hop) & pl.col("publish").is_not_null())
+        own = own.with_columns(pl.coalesce("end", "publish"))
         row, start, end = (own[name].to_numpy() for name in ("traversal", "start", "end"))
         steps[row, hop] = (own["communication_ns"].fill_null(0) + own["computation_ns"]).to_numpy()
         if hop:
