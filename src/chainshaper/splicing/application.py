@@ -12,7 +12,7 @@ lifespan by which DDS discards what overran.
 from typing import Any
 
 from chainshaper.planning.overruns import Writer, check_publication, output_lifespan
-from chainshaper.planning.plan import Plan, ShapingNode, publisher_servers
+from chainshaper.planning.plan import Plan, ShapingNode, output_server, publisher_servers
 from chainshaper.splicing.shaping_process import gate_of
 from chainshaper.values.errors import InputError
 from chainshaper.values.yaml_file import wrong_values_refused
@@ -54,19 +54,22 @@ def splice_application(application: Application, plan: Plan) -> Application:
             "`announces` modes there: describe one, or remove `modes` from the plan"
         )
     if plan.policy == "pipelined":
-        application = _on_cores_of_stages(application, plan)
+        application = _as_stages(application, plan)
     for node in (shaping, *plan.further_shaping_nodes):
         application = _spliced(application, plan, node)
     return application
 
 
-def _on_cores_of_stages(application: Application, plan: Plan) -> Application:
-    """The application with the nodes of each stage on the stage's core."""
-    core_of = {thread.node: server.core for server in plan.servers for thread in server.threads}
-    nodes = {
-        name: node.model_copy(update={"core": core_of.get("/" + name.strip("/"), node.core)})
-        for name, node in application.nodes.items()
-    }
+def _as_stages(application: Application, plan: Plan) -> Application:
+    """The application with nodes where the stages have them: core, and rank where they share it."""
+    server_of = {thread.node: server for server in plan.servers for thread in server.threads}
+    best = min(server.priority for server in plan.servers if server is not output_server(plan))
+    nodes = dict(application.nodes)
+    for name, node in application.nodes.items():
+        if (server := server_of.get("/" + name.strip("/"))) is not None:
+            rank = application.scheduling_of(name).priority - (server.priority - best)
+            placed = {"core": server.core, "priority": max(1, rank)}
+            nodes[name] = node.model_copy(update=placed)
     return application.model_copy(update={"nodes": nodes})
 
 
