@@ -175,9 +175,9 @@ def test_a_pipeline_by_hand(tmp_path: Path) -> None:
     assert cycles_until_output(plan) == 1
     (tmp_path / "plan.yaml").write_text(dump_plan(plan))
     assert load_plan(tmp_path / "plan.yaml") == plan
-    told = plan_warnings(plan)[0]
-    assert "160.000 ms, 1.60 times its cycle, and has 2 stages: /n1, /n2 on core 1" in told
-    assert "leave at 161.000 ms, once a cycle." in told
+    note = plan_warnings(plan)[0]
+    assert "160.000 ms, 1.60 times its cycle, and has 2 stages: /n1, /n2 on core 1" in note
+    assert "leave at 161.000 ms, once a cycle." in note
     assert slots_ms(open_until_done(plan))["stage1"] == [(0, 100)], "an overrun may finish"
     assert slots_ms(open_until_done(plan))["stage2"] == [(0, 61), (64, 100)]
 
