@@ -291,9 +291,7 @@ def _steps(
         if hop:
             same = [one for one in chain.callbacks if core[one] == core[number]]
             others = ran.filter(pl.col("callback_id").is_in(same)).sort("start")
-            ended = np.maximum.accumulate(
-                others["end"].to_numpy()
-            )  # some may have waited meanwhile
+            ended = np.maximum.accumulate(others["end"].to_numpy())  # some may only have waited
             began = np.maximum(others["start"].to_numpy(), np.append(0, ended)[:-1])
             since = np.minimum(free[row], start)
             steps[row, hop] -= stalled_within(since, start, began, ended, np.zeros_like(began))

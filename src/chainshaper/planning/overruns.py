@@ -15,6 +15,7 @@ from chainshaper.planning.plan import (
     PER_CALLBACK,
     Plan,
     ShapingNode,
+    Slot,
     Thread,
     below_executors,
     messages_waiting,
@@ -90,19 +91,7 @@ def open_until_done(plan: Plan) -> Plan:
     stays as planned. A stage of a pipeline stays open until the next slot of its core begins.
     """
     if plan.overrun == "publish" and plan.policy == "pipelined":
-        stages = [server for server in plan.servers if server not in publishing_servers(plan)]
-        return revised(
-            plan,
-            servers=with_slots(
-                plan.servers,
-                {
-                    stage.name: [
-                        (start, _next_start(plan, stage.core, end)) for start, end in stage.slots
-                    ]
-                    for stage in stages
-                },
-            ),
-        )
+        return revised(plan, servers=with_slots(plan.servers, dict(_longer_stages(plan))))
     shaped = plan.policy in ("shaped", "one-long-slot") and output_server(plan) is not None
     if plan.overrun != "publish" or not shaped:
         return plan
@@ -119,11 +108,14 @@ def open_until_done(plan: Plan) -> Plan:
         return plan
 
 
-def _next_start(plan: Plan, core: int, instant: int) -> int:
-    """When, from that instant of the cycle on, a slot of the core begins, or the cycle ends."""
-    own = (server.slots for server in plan.servers if server.core == core)
-    starts = (start for slots in own for start, _ in slots if start >= instant)
-    return min(starts, default=plan.cycle_ns)
+def _longer_stages(plan: Plan) -> Iterator[tuple[str, list[Slot]]]:
+    """The slots of a pipeline's stages until the next slot of the core, or the cycle's end."""
+    for stage in (server for server in plan.servers if server not in publishing_servers(plan)):
+        own = [
+            slot for server in plan.servers if server.core == stage.core for slot in server.slots
+        ]
+        starts = sorted([*(start for start, _ in own), plan.cycle_ns])
+        yield stage.name, [(a, next(one for one in starts if one >= b)) for a, b in stage.slots]
 
 
 @dataclass(frozen=True)
@@ -228,20 +220,13 @@ def _about_stages(plan: Plan) -> Iterator[str]:
         return
     longest, cycle = plan.evidence.max_latency_ns, plan.cycle_ns
     stages = [server for server in plan.servers if server not in publishing_servers(plan)]
-    where = "; ".join(
-        f"{', '.join(thread.node for thread in stage.threads)} on core {stage.core}"
-        for stage in stages
-    )
+    where = (f"{', '.join(t.node for t in one.threads)} on core {one.core}" for one in stages)
     cost = _leaves_at(plan) - longest - plan.margin.epsilon_ns
+    waits = f"; {milliseconds(cost)} ms of it for stages that wait for their turn" if cost else ""
     yield (
         f"the chain takes up to {milliseconds(longest)} ms, {longest / cycle:.2f} times its cycle,"
-        f" and has {len(stages)} stages: {where}. Outputs leave at"
-        f" {milliseconds(_leaves_at(plan))} ms, once a cycle"
-        + (
-            f"; {milliseconds(cost)} ms of it are for stages that wait for their turn."
-            if cost
-            else "."
-        )
+        f" and has {len(stages)} stages: {'; '.join(where)}. Outputs leave at"
+        f" {milliseconds(_leaves_at(plan))} ms, once a cycle{waits}."
     )
     for one, two in combinations(stages, 2):
         both = product(one.slots, two.slots) if one.core == two.core else ()

@@ -17,17 +17,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.planning.plan import (
-    Plan,
-    Prediction,
-    Server,
-    Slot,
-    Thread,
-    publish_slots,
-    revised,
-)
+from chainshaper.planning.plan import Plan, Prediction, Server, Slot, Thread, publish_slots, revised
 from chainshaper.planning.shaping import CHAIN_PRIORITY, OUTPUT_PRIORITY
-from chainshaper.planning.stages import Longest, Stage, opened_early, shortest_cut
+from chainshaper.planning.stages import Longest, opened_early, shortest_cut
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.yaml_file import wrong_values_refused
@@ -49,7 +41,9 @@ def pipelined(
     Raises InputError: a plan without a shaping node. OperationError: no cut fits; the message names
     what prevents it.
     """
-    cores = tuple(cores or ()) or tuple(sorted({core_of[node] for node in nodes}))
+    before = list(dict.fromkeys(core_of[node] for node in nodes))
+    # In the order of the chain, so that nodes stay where they are, if that can be.
+    cores = sorted(cores or before, key=lambda one: (*before, one).index(one))
     margin, cycle, node = plan.margin.epsilon_ns, plan.cycle_ns, plan.shaping_node
     if node is None:
         raise InputError(
@@ -73,24 +67,20 @@ def pipelined(
     servers = tuple(
         Server(
             name=f"stage{number}",
-            core=core,
-            priority=priority,
+            core=cores[stage.place],
+            priority=CHAIN_PRIORITY + cores[: stage.place].count(cores[stage.place]),
             slots=in_cycle(stage.opens_ns, stage.closes_ns, cycle),
             threads=tuple(Thread(node=n) for n in dict.fromkeys(nodes[stage.first : stage.end])),
         )
-        for number, (stage, (core, priority)) in enumerate(
-            zip(stages, _named_cores(stages, nodes, core_of, cores), strict=True), start=1
-        )
+        for number, stage in enumerate(stages, start=1)
     )
     opens = stages[-1].closes_ns
     if opens % cycle + length > cycle:  # a publish slot does not wrap
         opens = -(-opens // cycle) * cycle
     slot = (opens % cycle, opens % cycle + length)
-    # On the last stage's core, unless another stage is there at that moment and not elsewhere.
-    candidates = dict.fromkeys([servers[-1].core, *cores])
-    core = next((one for one in candidates if _free(servers, one, slot)), servers[-1].core)
+    core, gated = servers[-1].core, (node.thread,)
     output = Server(
-        name="output", core=core, priority=OUTPUT_PRIORITY, slots=(slot,), threads=(node.thread,)
+        name="output", core=core, priority=OUTPUT_PRIORITY, slots=(slot,), threads=gated
     )
     with wrong_values_refused(Plan):
         return revised(
@@ -111,60 +101,33 @@ def in_cycle(opens_ns: int, closes_ns: int, cycle_ns: int) -> tuple[Slot, ...]:
     return ((start, end),) if end <= cycle_ns else ((0, end - cycle_ns), (start, cycle_ns))
 
 
-def _free(servers: Sequence[Server], core: int, slot: Slot) -> bool:
-    taken = (one for server in servers if server.core == core for one in server.slots)
-    return all(slot[1] <= start or end <= slot[0] for start, end in taken)
-
-
-def _named_cores(
-    stages: Sequence[Stage],
-    nodes: Sequence[str],
-    core_of: Mapping[str, int],
-    cores: Sequence[int],
-) -> list[tuple[int, int]]:
-    """Core and priority of each stage: a place has the core that most of its callbacks ran on."""
-    free, chosen = list(range(len(cores))), dict[int, int]()
-    for place in dict.fromkeys(stage.place for stage in stages):
-        own = [one for s in stages if s.place == place for one in nodes[s.first : s.end]]
-        before = [core_of.get(one) for one in own]
-        chosen[place] = max(free, key=lambda number: before.count(cores[number]))
-        free.remove(chosen[place])
-    numbers = [chosen[stage.place] for stage in stages]
-    return [(cores[n], CHAIN_PRIORITY + cores[:n].count(cores[n])) for n in numbers]
-
-
 def _refuse_too_long(
     longest: Longest, cuts: Sequence[int], nodes: Sequence[str], margin_ns: int, cycle_ns: int
 ) -> None:
     """What cannot be cut has to fit into a cycle."""
     for first, end in pairwise(cuts):
-        if (needed := longest[first][end] + margin_ns) > cycle_ns:
-            one = f"the callback of {nodes[first]}"
-            several = f"the callbacks of {', '.join(dict.fromkeys(nodes[first:end]))} together"
-            why = "" if end == first + 1 else ", which one thread has to run,"
+        needed = longest[first][end] + margin_ns
+        if needed > cycle_ns:
+            several = ", ".join(dict.fromkeys(nodes[first:end]))
+            why = "" if end == first + 1 else " together, which one thread has to run,"
             raise OperationError(
-                f"{several if why else one}{why} take up to"
-                f" {format_duration(longest[first][end])}, which with the margin"
-                f" {format_duration(margin_ns)} is {format_duration(needed - cycle_ns)} longer than"
-                f" the cycle of {format_duration(cycle_ns)}: no cut makes that shorter. What helps:"
-                f" a period of {format_duration(needed)} or more, or to divide this work between"
-                " nodes with a topic between them"
+                f"the work of {several}{why} takes up to {format_duration(longest[first][end])},"
+                f" with the margin {format_duration(margin_ns)} that is"
+                f" {format_duration(needed - cycle_ns)} longer than the cycle of"
+                f" {format_duration(cycle_ns)}, and no cut makes it shorter. What helps: a period"
+                f" of {format_duration(needed)} or more, or parts of it in nodes of their own"
             )
 
 
 def _no_room(
     longest: Longest, cuts: Sequence[int], margin_ns: int, cycle_ns: int, cores: Sequence[int]
 ) -> str:
-    named, total = ",".join(map(str, cores)), longest[0][cuts[-1]]
+    named, total = ",".join(map(str, sorted(cores))), longest[0][cuts[-1]]
     most = range(len(cores) + 1, len(cuts))
-    cut = (shortest_cut(longest, cuts, margin_ns, cycle_ns, places) for places in most)
-    stages = next(filter(None, cut), ())
-    further = len({stage.place for stage in stages}) - len(cores)
-    then = "" if not stages else f", {format_duration(stages[-1].closes_ns)} long then"
+    enough = next(n for n in most if shortest_cut(longest, cuts, margin_ns, cycle_ns, n))
     return (
         f"no cut of the chain fits on the cores {named}: it takes {format_duration(total)},"
         f" {total / cycle_ns:.2f} times the cycle of {format_duration(cycle_ns)}, and each stage"
-        f" {format_duration(margin_ns)} more for the margin. What helps: {further} more"
-        f" {'core' if further == 1 else 'cores'} (--cores {named},…{then}), a longer period, or a"
-        " smaller margin (--epsilon)"
+        f" {format_duration(margin_ns)} more for the margin. What helps: {enough} cores"
+        f" (--cores {named},…), a longer period, or a smaller margin (--epsilon)"
     )

@@ -198,12 +198,10 @@ def _apart(profile: Profile) -> Profile:
             "a pipeline needs to know what each callback of the chain took, which latencies do not"
             " tell: plan from a recording"
         )
-    apart = {callback.node for callback in profile.callbacks}.difference(profile.nodes)
-    if apart or len(profile.callbacks) > len(profile.nodes):
+    if len(profile.callbacks) > len(profile.nodes):
         raise InputError(
-            f"{profile.name} waits for branches beside it"
-            f"{f' ({chr(44).join(sorted(apart))})' if apart else ''}, and stages are cut from a"
-            " single path: plan a chain that begins behind them"
+            f"{profile.name} waits for branches beside it, and stages are cut from a single path:"
+            " plan a chain that begins behind them"
         )
     return replace(profile, latencies_ns=steps.sum(axis=1), every_latency_ns=every.sum(axis=1))
 

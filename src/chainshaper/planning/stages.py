@@ -64,7 +64,19 @@ def shortest_cut(
 
     @cache
     def rest(room_ns: int) -> dict[int, tuple[int, int]]:
-        return _shortest_rest(longest, cuts, room_ns - margin_ns)
+        """How long the chain takes from each cut on, in how many stages, with such room for each.
+
+        There is none for a cut from which on no stages are that short.
+        """
+        found = {cuts[-1]: (0, 0)}
+        for first in reversed(cuts[:-1]):
+            ways = [
+                (longest[first][end] + further, stages + 1)
+                for end, (further, stages) in found.items()
+                if longest[first][end] + margin_ns <= room_ns
+            ]
+            found.update({first: min(ways)} if ways else {})
+        return found
 
     def bound(pieces: list[_Piece], starts: list[int]) -> _Key | None:
         """Below which nothing comes of these stages; None: no room on the cores for the others."""
@@ -93,8 +105,7 @@ def shortest_cut(
             for more in _turns(longer, longest, margin_ns, cycle_ns):
                 steps += 1
                 found = _least_starts(longer, [*turns, *more], longest, margin_ns, cycle_ns)
-                least = None if found is None else bound(longer, found)
-                if found and least:
+                if found and (least := bound(longer, found)):
                     ways.append((least, (longer, [*turns, *more], found)))
         for least, way in sorted(ways):
             if steps < MOST_STEPS and (best is None or least < best[0]):
@@ -109,28 +120,9 @@ def shortest_cut(
     )
 
 
-def _shortest_rest(
-    longest: Longest, cuts: Sequence[int], room_ns: int
-) -> dict[int, tuple[int, int]]:
-    """How long the chain takes from each cut on, and in how many stages, each in so much room.
-
-    There is none for a cut from which on no stages are that short.
-    """
-    rest = {cuts[-1]: (0, 0)}
-    for first in reversed(cuts[:-1]):
-        ways = [
-            (longest[first][end] + further, stages + 1)
-            for end, (further, stages) in rest.items()
-            if longest[first][end] <= room_ns
-        ]
-        if ways:
-            rest[first] = min(ways)
-    return rest
-
-
 def _turns(
     pieces: list[_Piece], longest: Longest, margin_ns: int, cycle_ns: int
-) -> Iterator[list[_Turn]]:
+) -> Iterator[tuple[_Turn, ...]]:
     """In which turns the last stage may follow those before it on its core.
 
     With K turns in between, s_a + W_a + ε + K·CT ≤ s_b and s_b + W_b + ε ≤ s_a + (K + 1)·CT. No
@@ -138,15 +130,14 @@ def _turns(
     """
     lengths = [longest[first][end] for first, end, _ in pieces]
     last, place = len(pieces) - 1, pieces[-1][2]
-    choices: list[list[_Turn]] = [[]]
+    choices = []
     for stage in range(last):
         if pieces[stage][2] == place:
             apart = sum(lengths[stage:last])
             least = max(0, -(-(apart + lengths[last] + margin_ns) // cycle_ns) - 1)
             most = apart // cycle_ns + last - stage
-            turns = [(stage, last, number) for number in range(least, most + 1)]
-            choices = [[*chosen, turn] for chosen in choices for turn in turns]
-    yield from choices
+            choices.append([(stage, last, number) for number in range(least, most + 1)])
+    return product(*choices)
 
 
 def _least_starts(
