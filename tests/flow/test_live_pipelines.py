@@ -54,7 +54,7 @@ def test_a_chain_of_several_periods_is_constant(
     analysis = measure_latency(shaped).analysis
     latencies = analysis.traversals.filter(~pl.col("disturbed"))["latency_ns"]
     planned = latencies - cycles_later * PERIOD_NS - start
-    assert planned.min() >= 0  # type: ignore[operator]
+    assert planned.min() >= 0
     assert (planned < MS).sum() >= 0.9 * latencies.len() > 20
     ends = analysis.traversals["end"].drop_nulls().diff().drop_nulls()
     assert ends.min() > 0  # type: ignore[operator]

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from chainshaper.enforcement.slot_dispatcher import boundaries_of
 from chainshaper.planning import CallbackTimes, Plan, PlanRequest, Profile, plan_chain
 from chainshaper.planning.overruns import cycles_until_output, open_until_done, plan_warnings
 from chainshaper.planning.pipeline import in_cycle
@@ -173,6 +174,8 @@ def test_a_pipeline_by_hand(tmp_path: Path) -> None:
     ]
     assert (plan.predicted.mean_ns, plan.predicted.jitter_ns) == (162 * MS, MS)
     assert cycles_until_output(plan) == 1
+    across = boundaries_of(plan.cycle_ns, tuple(server.slots for server in plan.servers[:2]))
+    assert [1 in boundary.open for boundary in across] == [True, False, True, True], "not at 0"
     (tmp_path / "plan.yaml").write_text(dump_plan(plan))
     assert load_plan(tmp_path / "plan.yaml") == plan
     note = plan_warnings(plan)[0]
@@ -208,6 +211,7 @@ def test_a_core_that_is_named_twice_has_two_stages_at_a_time() -> None:
         ([[60, 20, 60]], ["/a", "/b", "/a"], {}, "work of /a, /b together, which one thread"),
         ([[60, 60, 60]], None, {}, r"on the cores 0,1: it takes 180ms, 1.80 .* 3 cores "),
         ([[60, 60, 60]], None, {"cores": None}, "on the cores 1: it takes 180ms.* 3 cores"),
+        ([[80, 80]], None, {"cores": (-1, 0)}, "core: .* greater than or equal to 0"),
         ([[80, 80]], None, {"anchor": "cycle"}, "anchor: an output of a pipeline is whole cycles"),
         ([[80, 80]], None, {"publication": "asynchronous"}, "needs a shaping node"),
         ([[80, 80]], None, {"policy": "let-per-callback"}, "add --policy pipelined"),

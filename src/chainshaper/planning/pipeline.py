@@ -64,33 +64,36 @@ def pipelined(
     ((start, end),) = publish_slots(plan)
     length = end - start
     stages = opened_early(stages, steps_ns, margin, cycle, length + node.pause_ns)
-    servers = tuple(
-        Server(
-            name=f"stage{number}",
-            core=cores[stage.place],
-            priority=CHAIN_PRIORITY + cores[: stage.place].count(cores[stage.place]),
-            slots=in_cycle(stage.opens_ns, stage.closes_ns, cycle),
-            threads=tuple(Thread(node=n) for n in dict.fromkeys(nodes[stage.first : stage.end])),
-        )
-        for number, stage in enumerate(stages, start=1)
-    )
     opens = stages[-1].closes_ns
     if opens % cycle + length > cycle:  # a publish slot does not wrap
         opens = -(-opens // cycle) * cycle
-    slot = (opens % cycle, opens % cycle + length)
-    core, gated = servers[-1].core, (node.thread,)
-    output = Server(
-        name="output", core=core, priority=OUTPUT_PRIORITY, slots=(slot,), threads=gated
-    )
+    done = opens + length
     with wrong_values_refused(Plan):
+        servers = tuple(
+            Server(
+                name=f"stage{number}",
+                core=cores[stage.place],
+                priority=CHAIN_PRIORITY + cores[: stage.place].count(cores[stage.place]),
+                slots=in_cycle(stage.opens_ns, stage.closes_ns, cycle),
+                threads=tuple(
+                    Thread(node=n) for n in dict.fromkeys(nodes[stage.first : stage.end])
+                ),
+            )
+            for number, stage in enumerate(stages, start=1)
+        )
+        output = Server(
+            name="output",
+            core=servers[-1].core,
+            priority=OUTPUT_PRIORITY,
+            slots=in_cycle(opens, done, cycle),
+            threads=(node.thread,),
+        )
         return revised(
             plan,
             policy="pipelined",
             servers=(*servers, output),
-            shaping_node=node.model_copy(update={"core": core}),
-            predicted=Prediction(
-                mean_ns=opens + length, max_ns=opens + length, jitter_ns=length, shares=(1.0,)
-            ),
+            shaping_node=node.model_copy(update={"core": output.core}),
+            predicted=Prediction(mean_ns=done, max_ns=done, jitter_ns=length, shares=(1.0,)),
         )
 
 
