@@ -227,10 +227,10 @@ def test_what_no_cut_can_do_is_refused(
 
 def test_only_a_single_path_that_was_recorded_is_cut() -> None:
     request = PlanRequest(policy="pipelined")
-    with pytest.raises(InputError, match="what each callback of the chain took"):
+    with pytest.raises(InputError, match="plan from a recording"):
         plan_chain(Profile(np.array([80, 90]) * MS, 100 * MS), request)
     beside = [CallbackTimes(node, 1, 1, 1, 1) for node in ("/n1", "/rear", "/n2")]
-    with pytest.raises(InputError, match="waits for branches beside it"):
+    with pytest.raises(InputError, match="a chain without branches"):
         plan_chain(profile([[80, 80]], callbacks=tuple(beside)), request)
 
 

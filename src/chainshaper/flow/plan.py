@@ -277,8 +277,7 @@ def _steps(
     With those that overlapped out of it, a row's sum is the latency of an instance that is alone.
     """
     chain, graph = analysis.chain, analysis.graph
-    ran = flow.instances.filter(pl.col("callback_id").is_in(list(chain.callbacks)))
-    ran = ran.filter(pl.col("end").is_not_null())
+    ran = flow.instances.drop_nulls("end").sort("start")
     core = {one.id: core_of.get(one.node, one.node) for one in graph.callbacks}
     hops = analysis.hops.sort("hop", "traversal")
     steps = np.zeros((analysis.traversals.height, len(chain.callbacks)), dtype=np.int64)
@@ -290,7 +289,7 @@ def _steps(
         steps[row, hop] = (own["communication_ns"].fill_null(0) + own["computation_ns"]).to_numpy()
         if hop:
             same = [one for one in chain.callbacks if core[one] == core[number]]
-            others = ran.filter(pl.col("callback_id").is_in(same)).sort("start")
+            others = ran.filter(pl.col("callback_id").is_in(same))
             ended = np.maximum.accumulate(others["end"].to_numpy())  # some may only have waited
             began = np.maximum(others["start"].to_numpy(), np.append(0, ended)[:-1])
             since = np.minimum(free[row], start)

@@ -193,15 +193,10 @@ def plan_chains(profiles: Sequence[Profile], request: PlanRequest = _STANDARD) -
 def _apart(profile: Profile) -> Profile:
     """The profile of a chain whose instances do not overlap: what its callbacks took, in sum."""
     steps, every = profile.steps_ns, profile.every_step_ns
-    if steps is None or every is None:
+    if steps is None or every is None or len(profile.callbacks) > len(profile.nodes):
         raise InputError(
-            "a pipeline needs to know what each callback of the chain took, which latencies do not"
-            " tell: plan from a recording"
-        )
-    if len(profile.callbacks) > len(profile.nodes):
-        raise InputError(
-            f"{profile.name} waits for branches beside it, and stages are cut from a single path:"
-            " plan a chain that begins behind them"
+            f"{profile.name or 'a chain'}: stages are cut from a single path, by what each of its"
+            " callbacks took: plan from a recording, a chain without branches that it waits for"
         )
     return replace(profile, latencies_ns=steps.sum(axis=1), every_latency_ns=every.sum(axis=1))
 
