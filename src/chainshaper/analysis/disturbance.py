@@ -15,7 +15,8 @@ moment at which its output was due**, and by no other:
 * **In between** stalls add up, on one core, within [start, due]. Without a gate they disturb from
   ``COMPUTING_THRESHOLD_NS`` in all; a gate absorbs what the plan's margin ε has room for.
 * A traversal that began before its disturbed predecessor was computed may have queued behind it,
-  and counts as disturbed with it, unless the plan has them overlap (logical execution time).
+  and counts as disturbed with it, unless the plan has them overlap (logical execution time,
+  pipelines), or they overlap anyhow, in a chain that mostly takes longer than its period.
 """
 
 from collections.abc import Mapping
@@ -177,7 +178,9 @@ def disturbed(
     hit = complete & ((gated & at_instants) | (lost >= most))
     # A predecessor that was to be out later than the next began is not waited for.
     following = np.append(start[1:], np.iinfo(np.int64).max)[: len(start)]
-    busy_until = np.where(gated & (due > following), start, computed)
+    overlapped = (computed[:-1] > start[1:])[~hit[:-1]]
+    anyhow = 2 * np.count_nonzero(overlapped) > len(overlapped)
+    busy_until = np.where((gated & (due > following)) | anyhow, start, computed)
     return complete & (hit | _queued_behind(hit, start, busy_until, complete))
 
 

@@ -59,10 +59,18 @@ def _share(text: str) -> float:
     return value
 
 
+def _cores(text: str) -> tuple[int, ...]:
+    parts = text.split(",")
+    if not all(part.strip().isdecimal() for part in parts):
+        raise typer.BadParameter(f"{text!r} are no cores: write their numbers, such as 0,1")
+    return tuple(map(int, parts))
+
+
 PARSERS: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
     "DURATION": (_duration, format_duration),
     "N|auto": (_bands, str),
     "SHARE": (_share, "{:.0%}".format),
+    "N,N…": (_cores, lambda cores: ",".join(map(str, cores))),
 }
 """What reads and writes the values behind a metavar."""
 
@@ -155,6 +163,7 @@ _OTHERS: dict[str, tuple[Any, Any]] = {
     "modes": (str | None, _MODES),
     "late": (Late | None, _LATE),
     "bands": (str, wish("bands")),  # Typer knows no unions
+    "cores": (str | None, wish("cores")),  # nor tuples of any length
 }
 
 

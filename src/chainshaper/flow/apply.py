@@ -48,7 +48,7 @@ from chainshaper.planning.application_plan import (
 )
 from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.overruns import publication_warnings
-from chainshaper.planning.plan import Plan, shaping_nodes
+from chainshaper.planning.plan import Plan, Server, Thread, shaping_nodes
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 
@@ -521,12 +521,29 @@ class _Run:
             )
 
 
+def gated_threads(plan: ApplicationPlan) -> list[tuple[Server, list[Thread]]]:
+    """The servers without which a plan does not work, and whom they have to gate.
+
+    Those of asynchronous publishers, and the stages of a pipeline: one that begins early would run
+    beside the instance before it. Shaping nodes keep to their slots themselves.
+    """
+    gates = {node.thread for node in plan.shaping_nodes}
+    pipelines = [chain for chain in plan.chains if chain.policy == "pipelined"]
+    staged = {one for chain in pipelines for server in chain.servers for one in server.threads}
+    found = [
+        (server, [one for one in server.threads if one.role == "publisher" or one in staged])
+        for server in open_until_done(plan).servers
+        if gates.isdisjoint(server.threads)
+    ]
+    return [(server, threads) for server, threads in found if threads]
+
+
 @contextlib.contextmanager
-def publishers_gated(plan: ApplicationPlan, nodes: "StartedNodes") -> Iterator[None]:
-    """Inside, the publisher threads that a plan names run in the slots of their servers only.
+def threads_gated(plan: ApplicationPlan, nodes: "StartedNodes") -> Iterator[None]:
+    """Inside, the :func:`gated_threads` of a plan run in the slots of their servers only.
 
     For the live workload (paper, section 3.2.1, design 1): which process each node is, and when
-    cycles start, is known. Executors and DDS threads of the same processes run on.
+    cycles start, is known. All other threads run on.
 
     Raises:
         PlatformError: threads cannot be frozen here.
@@ -534,19 +551,15 @@ def publishers_gated(plan: ApplicationPlan, nodes: "StartedNodes") -> Iterator[N
             or the servers failed meanwhile.
     """
     choice = choose_back_end("freezer")  # the others want threads of the fair class
-    planned = [
-        (server, [thread.node for thread in server.threads if thread.role == "publisher"])
-        for server in open_until_done(plan).servers
-    ]
-    planned = [(server, names) for server, names in planned if names]
+    planned = gated_threads(plan)
     table = threads.table_of(plan.cycle_ns, (server for server, _ in planned))
     cores = {server.core for server, _ in planned}
-    with run_claimed(cores, {name for _, names in planned for name in names}) as journal:
+    with run_claimed(cores, {one.node for _, own in planned for one in own}) as journal:
         servers = make_back_end(choice.name, table, journal)
         try:
-            for server, names in planned:
-                for name in names:
-                    for tid in _publisher_threads(name, nodes):
+            for server, own in planned:
+                for one in own:
+                    for tid in _threads_of(one, nodes):
                         servers.assign(tid, server.name)
             servers.arm(nodes.start_ns if plan.moves_timers else nodes.anchor_ns)
             yield
@@ -557,12 +570,14 @@ def publishers_gated(plan: ApplicationPlan, nodes: "StartedNodes") -> Iterator[N
         raise OperationError(f"the servers failed while the application ran: {failure}")
 
 
-def _publisher_threads(node: str, nodes: "StartedNodes") -> list[int]:
-    pid = nodes.pids.get(node)
-    found = [t.tid for t in list_threads(pid) if t.role == "publisher"] if pid is not None else []
-    if not found:
-        raise OperationError(
-            f"{node} has no thread that publishes for it: let it publish asynchronously "
-            "(`publication: asynchronous` under `topics`), or plan with --publication synchronous"
-        )
-    return found
+def _threads_of(wanted: Thread, nodes: "StartedNodes") -> list[int]:
+    pid = nodes.pids.get(wanted.node)
+    found = [t.tid for t in list_threads(pid) if t.role == wanted.role] if pid is not None else []
+    if found:
+        return found
+    if wanted.role == "executor":
+        raise OperationError(f"{wanted.node} of the plan is no node of the application")
+    raise OperationError(
+        f"{wanted.node} has no thread that publishes for it: let it publish asynchronously "
+        "(`publication: asynchronous` under `topics`), or plan with --publication synchronous"
+    )

@@ -13,15 +13,15 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
+import numpy.typing as npt
 import polars as pl
 
 from chainshaper.analysis import DataFlow, LatencyAnalysis, analyse_latency, data_flow
-from chainshaper.analysis.disturbance import overlapping
+from chainshaper.analysis.disturbance import overlapping, stalled_within
 from chainshaper.analysis.graph import goes_on_elsewhere
 from chainshaper.planning import CallbackTimes, Modes, Plan, PlanRequest, Profile, plan_chain
 from chainshaper.planning.application_plan import ApplicationPlan, plan_values, whole
 from chainshaper.planning.margins import read_latencies
-from chainshaper.planning.plan import publisher_servers
 from chainshaper.planning.request import DEFAULT_CORE
 from chainshaper.sources import open_source
 from chainshaper.splicing.application import splice_application
@@ -111,6 +111,7 @@ def _profile_of(
     core_of = {node: cores.get(node, DEFAULT_CORE) for node in nodes}
     instances = _instances_apart_from(flow, disturbed)
     measured = every if all_disturbed else calm
+    steps = _steps(flow, analysis, cores)
     return Profile(
         latencies_ns=measured["latency_ns"].to_numpy().astype(np.int64),
         every_latency_ns=every["latency_ns"].to_numpy().astype(np.int64),
@@ -123,6 +124,8 @@ def _profile_of(
         core_of=core_of,
         receivers=_receivers(graph, chain, nodes),
         callbacks=tuple(_times(flow, instances, stage, core_of[stage.node]) for stage in stages),
+        steps_ns=steps[measured["traversal"].to_numpy()],
+        every_step_ns=steps[every["traversal"].to_numpy()],
         fifo_priority=min(97, priority.get(stages[-1].node, DEFAULT_PRIORITY) + 5),
         recording=str(recording.path),
         incomplete=analysis.traversals.height - every.height,
@@ -325,6 +328,36 @@ def _times(flow: DataFlow, instances: pl.DataFrame, stage: _Stage, core: int) ->
     )
 
 
+def _steps(
+    flow: DataFlow, analysis: LatencyAnalysis, core_of: dict[str, int]
+) -> npt.NDArray[np.int64]:
+    """What each callback of the chain took, a row per traversal: from the message before it to its
+    own, without the time for which other instances of the chain had its core.
+
+    With those that overlapped out of it, a row's sum is the latency of an instance that is alone.
+    """
+    chain, graph = analysis.chain, analysis.graph
+    ran = flow.instances.drop_nulls("end").sort("start")
+    core = {one.id: core_of.get(one.node, one.node) for one in graph.callbacks}
+    hops = analysis.hops.sort("hop", "traversal")
+    steps = np.zeros((analysis.traversals.height, len(chain.callbacks)), dtype=np.int64)
+    free = np.zeros(analysis.traversals.height, dtype=np.int64)  # when the instance before is over
+    for hop, number in enumerate(chain.callbacks):
+        own = hops.filter((pl.col("hop") == hop) & pl.col("publish").is_not_null())
+        own = own.with_columns(pl.coalesce("end", "publish"))
+        row, start, end = (own[name].to_numpy() for name in ("traversal", "start", "end"))
+        steps[row, hop] = (own["communication_ns"].fill_null(0) + own["computation_ns"]).to_numpy()
+        if hop:
+            same = [one for one in chain.callbacks if core[one] == core[number]]
+            others = ran.filter(pl.col("callback_id").is_in(same))
+            ended = np.maximum.accumulate(others["end"].to_numpy())  # some may only have waited
+            began = np.maximum(others["start"].to_numpy(), np.append(0, ended)[:-1])
+            since = np.minimum(free[row], start)
+            steps[row, hop] -= stalled_within(since, start, began, ended, np.zeros_like(began))
+        free[row] = end
+    return steps
+
+
 def _instances_apart_from(flow: DataFlow, disturbed: pl.DataFrame) -> pl.DataFrame:
     """Finished instances, with their response time, that began in none of these traversals."""
     seen = flow.instances.filter(pl.col("end").is_not_null() & ~pl.col("assumed"))
@@ -460,18 +493,18 @@ def shape_application(
     """Splice the plan's shaping nodes into an application, run it and record it.
 
     ``enforcement`` puts the plan's servers in force while it runs. A shaping node does without; the
-    thread of an asynchronous publisher is gated unless ``enforcement`` does so
-    (:func:`chainshaper.flow.apply.publishers_gated`).
+    thread of an asynchronous publisher, and the stages of a pipeline, are gated unless
+    ``enforcement`` does so (:func:`chainshaper.flow.apply.threads_gated`).
 
     Raises InputError: the plan does not fit the application; and what
-    :func:`~chainshaper.workload.live.run_application` raises. PlatformError: the plan gates a
-    publisher's thread, and threads cannot be frozen here.
+    :func:`~chainshaper.workload.live.run_application` raises. PlatformError: the plan gates
+    threads, and threads cannot be frozen here.
     """
     joint = whole(plan)
-    if any(next(publisher_servers(one), None) for one in joint.chains) and enforcement is None:
-        from chainshaper.flow.apply import publishers_gated
+    if enforcement is None:
+        from chainshaper.flow.apply import gated_threads, threads_gated
 
-        enforcement = partial(publishers_gated, joint)
+        enforcement = partial(threads_gated, joint) if gated_threads(joint) else None
     return run_application(
         splice_application(application, joint),
         output,

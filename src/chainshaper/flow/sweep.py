@@ -78,6 +78,7 @@ PLAN = "plan."
 UNPLANNED = "none"
 """The policy of a point whose application runs as it is described."""
 MOST_POINTS = 1_000_000
+BY_CALLBACK = ("server-per-callback", "pipelined")
 STRUCTURE_CYCLES = 100  # enough of a recording to see who publishes what where
 MOST_RECORDED = 100_000
 URGENT = 90
@@ -446,7 +447,7 @@ def profile_at(grid: Grid, values: Values, progress: Progress | None = None) -> 
     """
     try:
         application = _urgent(application_at(grid, values))
-        per_callback = values.get("policy") == "server-per-callback"
+        per_callback = values.get("policy") in BY_CALLBACK
         recorded = min(grid.cycles, MOST_RECORDED if per_callback else STRUCTURE_CYCLES)
         with tempfile.TemporaryDirectory(prefix="chainshaper-sweep-") as folder:
             place = Path(folder) / "profile"
@@ -584,7 +585,7 @@ def groups_of(grid: Grid, points: Iterable[tuple[int, Values]]) -> list[Group]:
     for number, values in points:
         profiled = request_at(grid, values) is not None
         application = {name: value for name, value in values.items() if _changes_application(name)}
-        per_callback = values.get("policy") == "server-per-callback"
+        per_callback = values.get("policy") in BY_CALLBACK
         key = json.dumps([profiled, profiled and per_callback, application])
         groups.setdefault(key, []).append((number, values))
     return [Group(json.loads(key)[0], tuple(points)) for key, points in groups.items()]

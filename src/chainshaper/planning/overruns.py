@@ -8,7 +8,7 @@ what waited for the slot of a later cycle has expired when the thread may run ag
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations, pairwise, product
 
 from chainshaper.planning.margins import OVERRUN_PROBABILITY, cycles_needed
 from chainshaper.planning.plan import (
@@ -76,8 +76,11 @@ def open_until_done(plan: Plan, closed_ns: int = 0) -> Plan:
     output too. Where an output that missed its slot is to leave at once, so does the last publish
     slot of an asynchronous publisher. The plan itself states what is reserved (eq. 1); the slots of
     other servers of the same core and priority are left out, and the last ``closed_ns`` of a cycle:
-    a thread whose timer expires in these waits for its slot.
+    a thread whose timer expires in these waits for its slot. A stage of a pipeline stays open until
+    the next slot of its core begins.
     """
+    if plan.overrun == "publish" and plan.policy == "pipelined":
+        return revised(plan, servers=with_slots(plan.servers, dict(_longer_stages(plan))))
     if plan.policy not in ("shaped", "one-long-slot") or output_server(plan) is None:
         return plan
     publishing, (done, _) = publishing_servers(plan), publish_slots(plan)[-1]
@@ -113,6 +116,16 @@ def _filled(server: Server, taken: list[Slot], end_ns: int) -> tuple[Slot, ...]:
             filled.append((free_from, start))
         free_from = max(free_from, end)
     return tuple(filled)
+
+
+def _longer_stages(plan: Plan) -> Iterator[tuple[str, list[Slot]]]:
+    """The slots of a pipeline's stages until the next slot of the core, or the cycle's end."""
+    for stage in (server for server in plan.servers if server not in publishing_servers(plan)):
+        own = [
+            slot for server in plan.servers if server.core == stage.core for slot in server.slots
+        ]
+        starts = sorted([*(start for start, _ in own), plan.cycle_ns])
+        yield stage.name, [(a, next(one for one in starts if one >= b)) for a, b in stage.slots]
 
 
 @dataclass(frozen=True)
@@ -207,7 +220,37 @@ def publication_warnings(plan: Plan) -> list[str]:
 
 def plan_warnings(plan: Plan) -> list[str]:
     """What a person must know before relying on a plan; one sentence each, none if all is well."""
-    return [*_about_late_outputs(plan), *_about_evidence(plan), *publication_warnings(plan)]
+    about = (_about_stages, _about_late_outputs, _about_evidence, publication_warnings)
+    return [warning for one in about for warning in one(plan)]
+
+
+def _about_stages(plan: Plan) -> Iterator[str]:
+    """Where a pipeline is cut, what it costs, and what has to be right for it."""
+    if plan.policy != "pipelined":
+        return
+    longest, cycle = plan.evidence.max_latency_ns, plan.cycle_ns
+    stages = [server for server in plan.servers if server not in publishing_servers(plan)]
+    where = (f"{', '.join(t.node for t in one.threads)} on core {one.core}" for one in stages)
+    cost = _leaves_at(plan) - longest - plan.margin.epsilon_ns
+    waits = f"; {milliseconds(cost)} ms of it for stages that wait for their turn" if cost else ""
+    yield (
+        f"the chain takes up to {milliseconds(longest)} ms, {longest / cycle:.2f} times its cycle,"
+        f" and has {len(stages)} stages: {'; '.join(where)}. Outputs leave at"
+        f" {milliseconds(_leaves_at(plan))} ms, once a cycle{waits}."
+    )
+    for one, two in combinations(stages, 2):
+        both = product(one.slots, two.slots) if one.core == two.core else ()
+        if any(first[0] < second[1] and second[0] < first[1] for first, second in both):
+            yield (
+                f"{one.name} and {two.name} have core {one.core} at the same time: that is right"
+                " only where their callbacks wait (for a device, a sleep) rather than compute."
+            )
+
+
+def _leaves_at(plan: Plan) -> int:
+    """When outputs leave, from the start of their chain on, if they come in time."""
+    slots, delay = publish_slots(plan), cycles_until_output(plan) * plan.cycle_ns
+    return delay + slots[-1][0] if slots else plan.evidence.max_latency_ns + plan.margin.epsilon_ns
 
 
 def _about_late_outputs(plan: Plan) -> Iterator[str]:
@@ -234,7 +277,7 @@ def _about_late_outputs(plan: Plan) -> Iterator[str]:
     elif evidence.disturbed:
         yield f"the machine disturbed {evidence.disturbed} of {cycles} cycles{what}."
     if margin.stalls_ns:
-        end = evidence.max_latency_ns + margin.epsilon_ns
+        end = _leaves_at(plan)
         yield (
             f"covering the disturbed cycles costs {milliseconds(margin.stalls_ns)} ms: outputs"
             f" leave at {milliseconds(end)} ms; on a machine that does not stall it would be"
@@ -286,7 +329,7 @@ def _about_evidence(plan: Plan) -> Iterator[str]:
             f"the plan fills {last / cycle:.1%} of the cycle {format_duration(cycle)}: an execution"
             " a little longer than any measured delays the next one."
         )
-    if longest >= cycle:
+    if longest >= cycle and plan.policy != "pipelined":
         yield (
             f"the longest latency {format_duration(longest)} is not shorter than the cycle"
             f" {format_duration(cycle)}: executions of the chain overlapped while they were"

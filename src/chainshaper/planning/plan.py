@@ -40,7 +40,7 @@ from chainshaper.values.yaml_file import (
 
 SHORTEST_SLOT_NS = 1_000_000  # of an asynchronous publisher; of any, unless one is given
 SENDS_PER_SLOT = 4
-PER_CALLBACK = ("server-per-callback", "let-per-callback")
+PER_CALLBACK = ("server-per-callback", "let-per-callback", "pipelined")
 """Policies whose slots follow from the callbacks, so that an execution may span cycles."""
 
 
@@ -390,6 +390,12 @@ def _cycle(plan: Plan) -> _Wrong:
             f"the cycle {format_duration(cycle)} is not longer than the longest latency measured,"
             f" {format_duration(longest)}: plan with a longer period or a shorter chain",
             "cycle",
+        )
+    if plan.policy == "pipelined" and plan.anchor == "cycle":
+        yield (
+            "an output of a pipeline is whole cycles old, and only its stamp says how many: write"
+            " stamp (--anchor)",
+            "anchor",
         )
 
 

@@ -31,6 +31,7 @@ from chainshaper.planning.margins import (
 )
 from chainshaper.planning.modes import place_modes, with_modes
 from chainshaper.planning.offsets import refuse_common
+from chainshaper.planning.pipeline import pipelined
 from chainshaper.planning.plan import (
     PER_CALLBACK,
     SENDS_PER_SLOT,
@@ -76,8 +77,10 @@ class Profile:
     graph, and its name, ``upstream`` the topics that the output waits for: on the chain, on those
     branches, and before the chain begins. ``receivers`` are the nodes that subscribe to the chain's
     output and are none of these. ``callbacks`` are those of the chain and its branches, see
-    :func:`~chainshaper.planning.shaping.server_per_callback`. ``output_depth`` is the history of
-    the output's writer, ``of_modes`` has what was measured in each mode of the system. The rest is
+    :func:`~chainshaper.planning.shaping.server_per_callback`. ``steps_ns`` and ``every_step_ns``
+    are what each callback of the chain took, a row per latency, see
+    :mod:`~chainshaper.planning.pipeline`. ``output_depth`` is the history of the output's writer,
+    ``of_modes`` has what was measured in each mode of the system. The rest is
     :class:`~chainshaper.planning.plan.Evidence`.
     """
 
@@ -92,6 +95,8 @@ class Profile:
     core_of: Mapping[str, int] = field(default_factory=dict)
     receivers: tuple[str, ...] = ()
     callbacks: tuple[CallbackTimes, ...] = ()
+    steps_ns: NDArray[np.int64] | None = None
+    every_step_ns: NDArray[np.int64] | None = None
     fifo_priority: int = 84
     output_depth: int | None = None
     recording: str | None = None
@@ -149,6 +154,8 @@ def plan_chain(
     library that only this request needs is not installed.
     """
     _refuse_contradictions(request, bool(sinks))
+    if request.policy == "pipelined":
+        profile = _apart(profile)
     refuse_entangled((profile, *sinks), request.policy, sinks=True)
     if any(sink.all_disturbed for sink in sinks) or profile.all_disturbed:
         profile, sinks = _covered(profile, request), [_covered(sink, request) for sink in sinks]
@@ -195,6 +202,17 @@ def plan_chain(
             " none: leave it out, or plan with synchronous publication"
         )
     return revised(plan, modes=modes)
+
+
+def _apart(profile: Profile) -> Profile:
+    """The profile of a chain whose instances do not overlap: what its callbacks took, in sum."""
+    steps, every = profile.steps_ns, profile.every_step_ns
+    if steps is None or every is None or len(profile.callbacks) > len(profile.nodes):
+        raise InputError(
+            f"{profile.name or 'a chain'}: stages are cut from a single path, by what each of its"
+            " callbacks took: plan from a recording, a chain without branches that it waits for"
+        )
+    return replace(profile, latencies_ns=steps.sum(axis=1), every_latency_ns=every.sum(axis=1))
 
 
 def band_choice(plan: Plan, profile: Profile, request: PlanRequest) -> BandChoice:
@@ -334,9 +352,10 @@ def _margin(profile: Profile, request: PlanRequest) -> Margin:
             f" measure {cycles_needed(probability)} or more"
         )
     stalls = 0
-    if request.policy not in OWN_SLOTS:  # what a stall adds belongs to no single callback
-        share = probability or OVERRUN_PROBABILITY
-        stalls = max(0, covered_latency(covered, share, _latest(profile, request)) - longest)
+    if request.policy not in OWN_SLOTS or request.policy == "pipelined":
+        share = probability or OVERRUN_PROBABILITY  # a stall belongs to no single callback
+        latest = None if request.policy in OWN_SLOTS else _latest(profile, request)
+        stalls = max(0, covered_latency(covered, share, latest) - longest)
     epsilon = EPSILON_NS + stalls
     return Margin(
         epsilon_ns=epsilon,
@@ -362,6 +381,11 @@ def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
             f"the policy {request.policy} needs the chain's callbacks, which latencies do not tell:"
             " plan from a recording"
         )
+    steps, every = profile.steps_ns, profile.every_step_ns
+    if request.policy == "pipelined" and steps is not None and every is not None:
+        if profile.all_disturbed:
+            steps = every[every.sum(axis=1) <= profile.longest_ns]
+        return pipelined(plan, profile.nodes, steps, profile.core_of, request.cores)
     if request.policy == "server-per-callback":
         return server_per_callback(plan, profile.callbacks, margin_ns=plan.margin.epsilon_ns)
     return let_per_callback(plan, profile.topics, profile.nodes)
@@ -375,6 +399,8 @@ def _refuse_contradictions(request: PlanRequest, sinks: bool) -> None:
         )
     if request.policy != "one-long-slot" and request.slot_start_ns is not None:
         raise InputError("a slot's start goes with the policy one-long-slot: add it")
+    if request.policy != "pipelined" and request.cores is not None:
+        raise InputError("cores are for stages: add --policy pipelined, or leave out --cores")
     if request.policy == "shaped":
         return
     why = f"which the policy {request.policy} has not: leave it out, or plan with the policy shaped"

@@ -184,7 +184,7 @@ def _refuse_too_long(longest: int, epsilon: int, publish_slot: int, period: int)
     if longest + publish_slot <= period:
         remedies.insert(0, f"a margin of {format_duration(period - longest - publish_slot)}")
     if longest >= period:
-        remedies.append("a pipeline over several cores (section 3.1 of the paper)")
+        remedies.append("a pipeline of stages, each shorter than the cycle (--policy pipelined)")
     raise OperationError(
         f"the longest latency {format_duration(longest)}, the margin {format_duration(epsilon)} and"
         f" the publish slot {format_duration(publish_slot)} do not fit into the cycle of"

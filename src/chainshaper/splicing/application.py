@@ -13,7 +13,7 @@ from typing import Any
 
 from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.overruns import Writer, check_publication, output_lifespan
-from chainshaper.planning.plan import Plan, ShapingNode, publisher_servers
+from chainshaper.planning.plan import Plan, ShapingNode, publisher_servers, publishing_servers
 from chainshaper.splicing.shaping_process import gate_of
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError
@@ -39,6 +39,7 @@ def splice_application(application: Application, plan: Plan | ApplicationPlan) -
     """
     joint = whole(plan)
     check_periods(application, joint)
+    application = _placed(application, joint)
     for chain in joint.chains:
         application = _with_chain(_at_offset(application, joint, chain), joint, chain)
     return application
@@ -104,6 +105,21 @@ def _with_chain(application: Application, joint: ApplicationPlan, plan: Plan) ->
     for node in (shaping, *plan.further_shaping_nodes):
         application = _spliced(application, joint, plan, node)
     return application
+
+
+def _placed(application: Application, joint: ApplicationPlan) -> Application:
+    """The application with nodes where the servers have them: core, and rank where they differ."""
+    publishing = {one.name for chain in joint.chains for one in publishing_servers(chain)}
+    running = [server for server in joint.servers if server.name not in publishing]
+    server_of = {thread.node: server for server in running for thread in server.threads}
+    best = min((server.priority for server in running), default=1)
+    nodes = dict(application.nodes)
+    for name, node in application.nodes.items():
+        if (server := server_of.get("/" + name.strip("/"))) is not None:
+            rank = application.scheduling_of(name).priority - (server.priority - best)
+            placed = {"core": server.core, "priority": max(1, rank)}
+            nodes[name] = node.model_copy(update=placed)
+    return application.model_copy(update={"nodes": nodes})
 
 
 def _spliced(

@@ -15,6 +15,7 @@ Policy: TypeAlias = Literal[
     "server-per-chain",
     "let-per-callback",
     "let-per-chain",
+    "pipelined",
 ]
 """How the chain is scheduled: the paper's way, or one of those that it compares (section 2.5)."""
 
@@ -56,7 +57,7 @@ class Wishes:
     longest publication measured, 1 ms at least. ``overrun`` None: an output that missed its slot
     leaves at once, where the policy and the publisher allow it. ``bands`` to ``seed`` go with the
     policy ``shaped``, see :func:`~chainshaper.planning.bands.with_bands`; ``slot_start_ns`` goes
-    with ``one-long-slot``.
+    with ``one-long-slot``, ``cores`` with ``pipelined``.
     """
 
     policy: Annotated[Policy, Option("How it is scheduled.")] = "shaped"
@@ -89,6 +90,9 @@ class Wishes:
     least_gain: Annotated[float, Option(
         "With --bands auto: what another band must take off the average.", BANDS, "SHARE")] = 0.02
     seed: Annotated[int, Option("For pso, random and the derived margin.", least=0)] = 0
+    cores: Annotated[tuple[int, ...] | None, Option(
+        "The cores that stages of a pipeline may have. Default: those on which it was recorded.",
+        "More of the graph", "N,N…")] = None
     first_slot_ns: Annotated[int | None, Option(
         "A server of its own for the chain's first node, this long.", "More of the graph")] = None
     anchor: Annotated[Anchor, Option(

@@ -1,0 +1,241 @@
+"""Chains longer than their period: the shortest cut, against brute force and by hand; plans."""
+
+from collections.abc import Sequence
+from itertools import combinations, pairwise, product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from chainshaper.enforcement.slot_dispatcher import boundaries_of
+from chainshaper.planning import CallbackTimes, Plan, PlanRequest, Profile, plan_chain
+from chainshaper.planning.overruns import cycles_until_output, open_until_done, plan_warnings
+from chainshaper.planning.pipeline import in_cycle
+from chainshaper.planning.plan import dump_plan, load_plan, publish_slots, revised
+from chainshaper.planning.stages import Longest, Stage, opened_early, shortest_cut
+from chainshaper.values.errors import InputError, OperationError
+
+MS = 1_000_000
+
+
+def longest_of(rows: Sequence[Sequence[int]]) -> Longest:
+    count = len(rows[0])
+    return [
+        [max(sum(row[i:j]) for row in rows) for j in range(count + 1)] for i in range(count + 1)
+    ]
+
+
+def apart(slots: Sequence[tuple[int, int]], cycle: int) -> bool:
+    """Whether slots of the latency axis overlap at no instant of the cycle: by counting."""
+    taken = [instant % cycle for start, end in slots for instant in range(start, end)]
+    return len(taken) == len(set(taken))
+
+
+def brute_force(
+    longest: Longest, cuts: Sequence[int], margin: int, cycle: int, places: int
+) -> tuple[int, int, int] | None:
+    """The least (end, stages, cores): every cut, every core of each stage, every start."""
+    best = None
+    inner = cuts[1:-1]
+    for chosen in (c for n in range(len(inner) + 1) for c in combinations(inner, n)):
+        bounds = [cuts[0], *chosen, cuts[-1]]
+        lengths = [longest[i][j] for i, j in pairwise(bounds)]
+        for core_of in product(range(places), repeat=len(lengths)):
+            for waits in product(range(cycle), repeat=len(lengths) - 1):
+                starts = [0]
+                for wait, length in zip(waits, lengths, strict=False):
+                    starts.append(starts[-1] + length + wait)
+                found = starts[-1] + lengths[-1], len(lengths), len(set(core_of))
+                if best is not None and best <= found:
+                    continue
+                slots = [(s, s + w + margin) for s, w in zip(starts, lengths, strict=True)]
+                of_core = [
+                    [slot for slot, own in zip(slots, core_of, strict=True) if own == core]
+                    for core in range(places)
+                ]
+                if all(apart(own, cycle) for own in of_core):
+                    best = found
+    return best
+
+
+def found(stages: tuple[Stage, ...] | None, margin: int) -> tuple[int, int, int] | None:
+    if stages is None:
+        return None
+    return stages[-1].closes_ns - margin, len(stages), len({stage.place for stage in stages})
+
+
+Problem = tuple[list[list[int]], list[int], int, int, int]
+
+
+@st.composite
+def problems(draw: st.DrawFn) -> Problem:
+    count = draw(st.integers(1, 4))
+    step = st.integers(1, 4)
+    rows = draw(st.lists(st.lists(step, min_size=count, max_size=count), min_size=1, max_size=3))
+    cuts = [0, *(cut for cut in range(1, count) if draw(st.integers(0, 4))), count]
+    cycle, places = draw(st.integers(3, 6)), draw(st.integers(1, 3))
+    return rows, cuts, draw(st.integers(0, 1)), cycle, places
+
+
+@settings(max_examples=300, deadline=None)
+@given(problems())
+def test_the_cut_is_the_shortest_there_is(problem: Problem) -> None:
+    rows, cuts, margin, cycle, places = problem
+    longest = longest_of(rows)
+    stages = shortest_cut(longest, cuts, margin, cycle, places)
+    assert found(stages, margin) == brute_force(longest, cuts, margin, cycle, places)
+    if stages is None:
+        return
+    assert (stages[0].first, stages[0].opens_ns, stages[-1].end) == (0, 0, cuts[-1])
+    for before, after in pairwise(stages):
+        assert before.end == after.first in cuts
+        assert before.closes_ns - margin <= after.opens_ns
+
+    opened = opened_early(stages, np.array(rows), margin, cycle)
+    assert sum(rows[0]) + margin <= opened[-1].closes_ns <= stages[-1].closes_ns
+    for row in rows:  # every instance is through each stage before its slot closes, but for ε
+        now = 0
+        for stage in opened:
+            now = max(now, stage.opens_ns) + sum(row[stage.first : stage.end])
+            assert now <= stage.closes_ns - margin
+    for place, some in product(range(places), (stages, opened)):
+        own = [s for s in some if s.place == place]
+        slots = [slot for s in own for slot in in_cycle(s.opens_ns, s.closes_ns, cycle)]
+        assert all(0 <= start < end <= cycle for start, end in slots)
+        assert apart(slots, cycle)
+
+
+def test_a_stage_waits_for_its_turn() -> None:
+    """On the first core 5 of 10 are left, but they begin 3 after the data are there."""
+    longest = longest_of([[5, 7, 5]])
+    stages = shortest_cut(longest, range(4), 0, 10, 2)
+    assert stages == (Stage(0, 1, 0, 0, 5), Stage(1, 2, 1, 5, 12), Stage(2, 3, 0, 15, 20))
+    alone = shortest_cut(longest, range(4), 0, 10, 3)
+    assert alone is not None
+    assert [(s.place, s.opens_ns, s.closes_ns) for s in alone] == [
+        (0, 0, 5),
+        (1, 5, 12),
+        (2, 12, 17),
+    ]
+    assert shortest_cut(longest_of([[5, 7, 9]]), range(4), 0, 10, 2) is None
+
+
+# Plans -----------------------------------------------------------------------------------------
+
+
+def profile(
+    rows: Sequence[Sequence[int]], nodes: Sequence[str] | None = None, **values: object
+) -> Profile:
+    """A chain with these times (ms) of its callbacks, which was recorded on core 1."""
+    steps = np.array([*rows, *rows]) * MS
+    names = [f"/n{number}" for number in range(1, steps.shape[1] + 1)] if nodes is None else nodes
+    given = {
+        "nodes": tuple(names),
+        "topics": tuple(f"/t{number}" for number in range(1, len(names) + 1)),
+        "core_of": dict.fromkeys(names, 1),
+        "callbacks": tuple(CallbackTimes(node, 1, MS, MS, MS) for node in names),
+        "steps_ns": steps,
+        "every_step_ns": steps,
+    }
+    return Profile(steps.sum(axis=1), 100 * MS, **{**given, **values})  # type: ignore[arg-type]
+
+
+def planned(
+    rows: Sequence[Sequence[int]], nodes: Sequence[str] | None = None, **wishes: object
+) -> Plan:
+    request = {"policy": "pipelined", "cores": (0, 1), "epsilon_ns": MS, **wishes}
+    return plan_chain(profile(rows, nodes), PlanRequest(**request))  # type: ignore[arg-type]
+
+
+def slots_ms(plan: Plan) -> dict[str, list[tuple[float, float]]]:
+    return {s.name: [(start / MS, end / MS) for start, end in s.slots] for s in plan.servers}
+
+
+ROWS = [[30, 40, 50, 40], [20, 30, 40, 30], [40, 40, 30, 20]]
+"""The longest instance takes 160 ms; from 50 to 80 ms in its first half, from 50 to 90 behind."""
+
+
+def test_a_pipeline_by_hand(tmp_path: Path) -> None:
+    plan = planned(ROWS)
+    assert (plan.evidence.max_latency_ns, plan.margin.epsilon_ns) == (160 * MS, MS)
+    # L̄ + ε is 161 ms. The second stage may begin at 50 ms, but its slot leaves 3 ms for Δ and the
+    # pause behind the publication: it begins at 64 ms, which is no later than the data of any.
+    assert slots_ms(plan) == {
+        "stage1": [(0, 81)],
+        "stage2": [(0, 61), (64, 100)],
+        "output": [(61, 62)],
+    }
+    assert [s.core for s in plan.servers] == [1, 0, 0], "the first stage stays on its core"
+    assert [[t.node for t in s.threads] for s in plan.servers[:2]] == [
+        ["/n1", "/n2"],
+        ["/n3", "/n4"],
+    ]
+    assert (plan.predicted.mean_ns, plan.predicted.jitter_ns) == (162 * MS, MS)
+    assert cycles_until_output(plan) == 1
+    across = boundaries_of(plan.cycle_ns, tuple(server.slots for server in plan.servers[:2]))
+    assert [1 in boundary.open for boundary in across] == [True, False, True, True], "not at 0"
+    (tmp_path / "plan.yaml").write_text(dump_plan(plan))
+    assert load_plan(tmp_path / "plan.yaml") == plan
+    note = plan_warnings(plan)[0]
+    assert "160.000 ms, 1.60 times its cycle, and has 2 stages: /n1, /n2 on core 1" in note
+    assert "leave at 161.000 ms, once a cycle." in note
+    assert slots_ms(open_until_done(plan))["stage1"] == [(0, 100)], "an overrun may finish"
+    assert slots_ms(open_until_done(plan))["stage2"] == [(0, 61), (64, 100)]
+
+
+def test_waiting_for_a_turn_costs_what_the_plan_says() -> None:
+    plan = planned([[49, 69, 49]])
+    assert slots_ms(plan) == {
+        "stage1": [(0, 50)],
+        "stage2": [(0, 19), (49, 100)],
+        "stage3": [(50, 100)],
+        "output": [(0, 1)],
+    }
+    assert (plan.predicted.max_ns, cycles_until_output(plan)) == (201 * MS, 2)
+    assert "32.000 ms of it for stages that wait for their turn" in plan_warnings(plan)[0]
+
+
+def test_a_core_that_is_named_twice_has_two_stages_at_a_time() -> None:
+    plan = planned([[80, 80, 80]], cores=(0, 1, 1))
+    assert publish_slots(plan) == ((41 * MS, 42 * MS),)
+    assert [(s.core, s.priority) for s in plan.servers[:3]] == [(1, 2), (1, 3), (0, 2)]
+    assert "stage1 and stage2 have core 1 at the same time" in plan_warnings(plan)[1]
+
+
+@pytest.mark.parametrize(
+    ("rows", "nodes", "wishes", "words"),
+    [
+        ([[30, 120, 30]], None, {}, r"work of /n2 takes up to 120ms.*21ms longer.*of 121ms"),
+        ([[60, 20, 60]], ["/a", "/b", "/a"], {}, "work of /a, /b together, which one thread"),
+        ([[60, 60, 60]], None, {}, r"on the cores 0,1: it takes 180ms, 1.80 .* 3 cores "),
+        ([[60, 60, 60]], None, {"cores": None}, "on the cores 1: it takes 180ms.* 3 cores"),
+        ([[80, 80]], None, {"cores": (-1, 0)}, "core: .* greater than or equal to 0"),
+        ([[80, 80]], None, {"anchor": "cycle"}, "anchor: an output of a pipeline is whole cycles"),
+        ([[80, 80]], None, {"publication": "asynchronous"}, "needs a shaping node"),
+        ([[80, 80]], None, {"policy": "let-per-callback"}, "add --policy pipelined"),
+        ([[80, 80]], None, {"policy": "shaped", "cores": None}, "or a pipeline of stages"),
+    ],
+)
+def test_what_no_cut_can_do_is_refused(
+    rows: list[list[int]], nodes: list[str] | None, wishes: dict[str, object], words: str
+) -> None:
+    with pytest.raises((InputError, OperationError), match=words):
+        planned(rows, nodes, **wishes)
+
+
+def test_only_a_single_path_that_was_recorded_is_cut() -> None:
+    request = PlanRequest(policy="pipelined")
+    with pytest.raises(InputError, match="plan from a recording"):
+        plan_chain(Profile(np.array([80, 90]) * MS, 100 * MS), request)
+    beside = [CallbackTimes(node, 1, 1, 1, 1) for node in ("/n1", "/rear", "/n2")]
+    with pytest.raises(InputError, match="a chain without branches"):
+        plan_chain(profile([[80, 80]], callbacks=tuple(beside)), request)
+
+
+def test_a_publish_slot_does_not_wrap() -> None:
+    plan = planned([[80, 80, 38]], cores=(0, 1, 2), publish_slot_ns=2 * MS)
+    assert publish_slots(plan) == ((0, 2 * MS),)
+    with pytest.raises(InputError, match="stamp"):
+        revised(plan, anchor="cycle")
