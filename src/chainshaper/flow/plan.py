@@ -331,7 +331,7 @@ def _times(flow: DataFlow, instances: pl.DataFrame, stage: _Stage, core: int) ->
 def _steps(
     flow: DataFlow, analysis: LatencyAnalysis, core_of: dict[str, int]
 ) -> npt.NDArray[np.int64]:
-    """What each callback of the chain took, a row per traversal: from the message before it to its
+    """What each callback of the chain took, a row per traversal's number: from the message before it to its
     own, without the time for which other instances of the chain had its core.
 
     With those that overlapped out of it, a row's sum is the latency of an instance that is alone.
@@ -340,8 +340,10 @@ def _steps(
     ran = flow.instances.drop_nulls("end").sort("start")
     core = {one.id: core_of.get(one.node, one.node) for one in graph.callbacks}
     hops = analysis.hops.sort("hop", "traversal")
-    steps = np.zeros((analysis.traversals.height, len(chain.callbacks)), dtype=np.int64)
-    free = np.zeros(analysis.traversals.height, dtype=np.int64)  # when the instance before is over
+    numbers = (hops["traversal"], analysis.traversals["traversal"])
+    rows = 1 + max(int(one.max() or 0) for one in numbers)  # type: ignore[arg-type]
+    steps = np.zeros((rows, len(chain.callbacks)), dtype=np.int64)
+    free = np.zeros(rows, dtype=np.int64)  # when the instance before is over
     for hop, number in enumerate(chain.callbacks):
         own = hops.filter((pl.col("hop") == hop) & pl.col("publish").is_not_null())
         own = own.with_columns(pl.coalesce("end", "publish"))

@@ -116,9 +116,11 @@ def _placed(application: Application, joint: ApplicationPlan) -> Application:
     nodes = dict(application.nodes)
     for name, node in application.nodes.items():
         if (server := server_of.get("/" + name.strip("/"))) is not None:
-            rank = application.scheduling_of(name).priority - (server.priority - best)
-            placed = {"core": server.core, "priority": max(1, rank)}
-            nodes[name] = node.model_copy(update=placed)
+            own = application.scheduling_of(name)
+            rank = max(1, own.priority - (server.priority - best))
+            if (own.core, own.priority) != (server.core, rank):
+                placed = {"core": server.core, "priority": rank}
+                nodes[name] = node.model_copy(update=placed)
     return application.model_copy(update={"nodes": nodes})
 
 
