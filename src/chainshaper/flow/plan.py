@@ -331,8 +331,8 @@ def _times(flow: DataFlow, instances: pl.DataFrame, stage: _Stage, core: int) ->
 def _steps(
     flow: DataFlow, analysis: LatencyAnalysis, core_of: dict[str, int]
 ) -> npt.NDArray[np.int64]:
-    """What each callback of the chain took, a row per traversal's number: from the message before it to its
-    own, without the time for which other instances of the chain had its core.
+    """What each callback of the chain took, a row per traversal's number: from the message before
+    it to its own, without the time for which other instances of the chain had its core.
 
     With those that overlapped out of it, a row's sum is the latency of an instance that is alone.
     """
