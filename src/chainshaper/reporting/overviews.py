@@ -281,12 +281,17 @@ def stall_table(meter: StallMeterInfo, stalls: pl.DataFrame) -> ResultTable:
     return table
 
 
-def condition_table(names: Sequence[str], measurements: Sequence[Measurement]) -> ResultTable:
-    """How each recording was taken, a column for each: what makes its figures believable."""
+def condition_table(
+    names: Sequence[str], recordings: Sequence[Sequence[Measurement]]
+) -> ResultTable:
+    """How each recording was taken, a column for each: what makes its figures believable.
+
+    A recording has a measurement for each of its chains.
+    """
     rows: dict[str, list[str]] = {}
-    for one in measurements:
-        info, plan = one.recording.info, one.plan
-        in_force = "none" if plan is None else f"{plan.policy}, for {plan.chain.spec or 'a chain'}"
+    for one, *others in recordings:
+        info, plans = one.recording.info, [m.plan for m in (one, *others) if m.plan is not None]
+        in_force = "\n".join(f"{p.policy}, for {p.chain.spec or 'a chain'}" for p in plans)
         for title, cell in (
             ("folder", str(one.recording.path)),
             ("first cycle", _begun(one)),
@@ -301,7 +306,7 @@ def condition_table(names: Sequence[str], measurements: Sequence[Measurement]) -
             ("machine watched for stalls", _watched(info.stall_meter)),
             ("events", f"{event_counts(one.recording)['count'].sum():,}"),
             ("events lost", lost_text(info.lost).partition(": ")[2]),
-            ("plan in force", in_force),
+            ("plan in force", in_force or "none"),
         ):
             rows.setdefault(title, []).append(cell or UNKNOWN)
     table = ResultTable("", words("", *names))

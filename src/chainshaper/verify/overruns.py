@@ -6,16 +6,23 @@ slot's start: it leaves at once, and later than all others. Those are counted, t
 A gate records its decision for every message. The thread of an asynchronous publisher decides
 nothing; there the messages that were never sent count as discarded, and those that were sent in a
 later cycle than due as having waited.
+
+Where several chains are shaped, a chain's figures are those of its own gates. Each gate is a
+process; what processes of other nodes recorded does not count.
 """
+
+from collections.abc import Collection
 
 import polars as pl
 
 from chainshaper.analysis import LatencyAnalysis
 from chainshaper.analysis.messages import with_overrun
+from chainshaper.analysis.objects import named_nodes
 from chainshaper.gate.decision import DROPPED
 from chainshaper.planning import Plan
 from chainshaper.planning.overruns import cycles_until_output
-from chainshaper.planning.plan import publisher_servers
+from chainshaper.planning.plan import publisher_servers, shaping_nodes
+from chainshaper.splicing.shaping_process import STANDBY
 from chainshaper.values import events
 from chainshaper.values.recording import Recording
 
@@ -31,10 +38,42 @@ _WITHOUT_NODE = {
 }
 
 
-def gate_releases(recording: Recording, plan: Plan | None) -> pl.DataFrame:
-    """The table `gate_release` with ``overrun``, which older recordings lack."""
+def gate_releases(
+    recording: Recording, plan: Plan | None, analysis: LatencyAnalysis | None = None
+) -> pl.DataFrame:
+    """The table `gate_release` with ``overrun``, which older recordings lack.
+
+    Of a plan it has the rows of its shaping nodes and their standbys; with ``analysis`` only those
+    of shaping nodes on that chain, not those of the plan's other sinks.
+    """
     due = 0 if plan is None else cycles_until_output(plan)
-    return with_overrun(events.table(recording.events, "gate_release"), due)
+    table = events.table(recording.events, "gate_release", ["dropped", "lost"])
+    table = with_overrun(table, due)
+    if plan is None:
+        return table
+    gates = _gates(plan, analysis)
+    return _of_nodes(recording, table, [*gates, *(f"{gate}{STANDBY}" for gate in gates)])
+
+
+def _gates(plan: Plan, analysis: LatencyAnalysis | None) -> list[str]:
+    return [
+        node.thread.node
+        for node in shaping_nodes(plan)
+        if analysis is None or node.output in analysis.chain.topics
+    ]
+
+
+def _decided(recording: Recording, plan: Plan | None, analysis: LatencyAnalysis | None) -> bool:
+    """Whether a gate of the plan decided about anything that was recorded."""
+    return "gate_release" in recording.events and (plan is None or bool(_gates(plan, analysis)))
+
+
+def _of_nodes(recording: Recording, table: pl.DataFrame, own: Collection[str]) -> pl.DataFrame:
+    """The rows of a table but those of processes of which it is known that they run other nodes."""
+    nodes = named_nodes(recording.events)
+    ours = nodes.filter(pl.col("node").is_in(own))
+    others = nodes.join(ours, on="pid", how="anti")
+    return table.join(others, on="pid", how="anti", maintain_order="left")
 
 
 def overruns_in(
@@ -47,12 +86,14 @@ def overruns_in(
     waited cannot be counted.
     """
     gated = plan is not None and any(publisher_servers(plan))
-    if "gate_release" not in recording.events and not gated:
+    if not gated and not _decided(recording, plan, analysis):
         return None
-    treated = gate_releases(recording, plan)["overrun"].drop_nulls()
+    treated = gate_releases(recording, plan, analysis)["overrun"].drop_nulls()
     counts = {policy: int((treated == policy).sum()) for policy in (*_DONE, *_WITHOUT_NODE)}
     if gated and plan is not None:
-        outcomes = events.table(recording.events, "asynchronous_send")["outcome"]
+        publishers = [node for *_, nodes in publisher_servers(plan) for node in nodes]
+        sends = events.table(recording.events, "asynchronous_send")
+        outcomes = _of_nodes(recording, sends, publishers)["outcome"]
         counts["discard"] += int((outcomes != "sent").sum())
         if analysis is not None:
             due_until = (cycles_until_output(plan) + 1) * plan.cycle_ns
@@ -61,26 +102,30 @@ def overruns_in(
     return {policy: count for policy, count in counts.items() if count}
 
 
-def into_open_slots(recording: Recording, plan: Plan | None) -> int | None:
+def into_open_slots(
+    recording: Recording, plan: Plan | None, analysis: LatencyAnalysis | None = None
+) -> int | None:
     """How many outputs came into their slot when it was open already; None: no gate decided.
 
     They took longer than the plan's L̄ + ε, and make up the jitter that a wide slot lets through.
     """
-    if "gate_release" not in recording.events:
+    if not _decided(recording, plan, analysis):
         return None
-    table = gate_releases(recording, plan).filter(pl.col("overrun").is_null())
+    table = gate_releases(recording, plan, analysis).filter(pl.col("overrun").is_null())
     return int((table["release"] == table["arrival"]).sum())
 
 
-def dropped_in(recording: Recording) -> dict[str, int] | None:
+def dropped_in(
+    recording: Recording, plan: Plan | None = None, analysis: LatencyAnalysis | None = None
+) -> dict[str, int] | None:
     """How many messages gates received and did not let out, per reason, and how many DDS lost
     before they reached one, where its numbers say so; None: no gate decided.
 
     The reasons are those of ``dropped`` in :mod:`chainshaper.values.events`.
     """
-    if "gate_release" not in recording.events:
+    if not _decided(recording, plan, analysis):
         return None
-    table = events.table(recording.events, "gate_release", ["dropped", "lost", "overrun"])
+    table = gate_releases(recording, plan, analysis)
     discarded = pl.col("release").is_null() & (pl.col("overrun") == "discard")
     reason = pl.coalesce("dropped", pl.when(discarded).then(pl.lit("discarded")))
     reasons = table.select(reason).to_series()
