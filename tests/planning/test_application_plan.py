@@ -25,10 +25,8 @@ from chainshaper.planning.plan import (
     Plan,
     Prediction,
     Server,
-    ShapingNode,
     Slot,
     Thread,
-    revised,
 )
 from chainshaper.values.errors import InputError
 
@@ -57,10 +55,6 @@ def _chain(name: str, cycle: int, offset: int, *servers: Server) -> Plan:
     )
 
 
-def _in_ms(slots: tuple[Slot, ...]) -> list[tuple[float, float]]:
-    return [(start / MS, end / MS) for start, end in slots]
-
-
 # The servers --------------------------------------------------------------------------------------
 
 
@@ -71,8 +65,8 @@ def test_slots_are_played_out_over_the_hyper_period() -> None:
     both = combined([a, b])
     assert both.cycle_ns == 12 * MS
     one, two = both.servers
-    assert _in_ms(one.slots) == [(0, 1), (4, 5), (8, 9)]
-    assert _in_ms(two.slots) == [(0, 1), (5, 7), (11, 12)]
+    assert one.slots == _server("by hand", [(0, 1), (4, 5), (8, 9)]).slots
+    assert two.slots == _server("by hand", [(0, 1), (5, 7), (11, 12)]).slots
     assert whole(a).servers == a.servers
 
 
@@ -82,18 +76,9 @@ def test_a_thread_of_several_chains_runs_in_the_slots_of_all() -> None:
     b = _chain("b", 6, 1, _server("b", [(0, 1)], "x y"))
     shared, own = combined([a, b]).servers
     assert (shared.name, [thread.node for thread in shared.threads]) == ("a+b", ["/x"])
-    assert _in_ms(shared.slots) == [(0, 2), (4, 5), (7, 9)]
+    assert shared.slots == _server("by hand", [(0, 2), (4, 5), (7, 9)]).slots
     assert (own.name, [thread.node for thread in own.threads]) == ("b", ["/y"])
-    assert _in_ms(own.slots) == [(1, 2), (7, 8)]
-
-
-def test_a_shared_server_is_there_once() -> None:
-    running = _server("chain", [(0, 3)], "x y")
-    chains = [
-        _chain(name, 10, 0, running, _server(f"out_{name}", [slot], name, priority=1))
-        for name, slot in (("a", (3, 4)), ("b", (4, 5)))
-    ]
-    assert [server.name for server in combined(chains).servers] == ["chain", "out_a", "out_b"]
+    assert own.slots == _server("by hand", [(1, 2), (7, 8)]).slots
 
 
 _SLOTS = st.lists(st.integers(0, 5), min_size=2, max_size=4, unique=True).map(sorted)
@@ -165,6 +150,7 @@ def test_a_plan_is_written_with_each_server_once_and_read_again(
     assert "servers:\n  - chain\n" in text
     assert load_application_plan(path) == three
     assert plan_in(plan_values(three)) == three
+    assert [one.name for one in three.servers] == ["chain", "out_a", "out_b", "chain_2"]
     assert plan_of_chain(three, "/b") == three.chains[1]
     assert plan_of_chain(three, "/nowhere") is None
 
@@ -236,16 +222,6 @@ def test_what_makes_no_plan_together_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"repeat together after .* 10000 is the most"):
         combined(apart)
     assert len(combined(apart[:2]).servers[0].slots) == 1009
-    common = {"core": 1, "fifo_priority": 85, "spin_ns": 0, "pause_ns": 0}
-    gated = [
-        revised(
-            _chain(name, 10, 0, _server(name, [slot], "gate")),
-            shaping_node=ShapingNode(name="gate", input="/in", output=f"/{name}", **common),
-        )
-        for name, slot in (("b", (0, 1)), ("c", (1, 2)))
-    ]
-    with pytest.raises(InputError, match="an earlier chain has the shaping node gate"):
-        combined(gated)
     path = tmp_path / "plan.yaml"
     save_application_plan(combined(apart[:2]), path)
     with pytest.raises(InputError, match="is of several chains, and only one is wanted"):

@@ -176,6 +176,10 @@ def test_what_else_has_no_plan_together_is_refused(recording: Recording) -> None
     profiles = profile_chains(recording, ("/t1../t3", "behind../end"), period_ns=100 * MS)
     with pytest.raises(InputError, match=r"behind\.\./end waits for /t3, which"):
         plan_application(profiles)
+    # These begin at subscriptions that one timer triggers: no offset moves them apart.
+    for chains in (("second../t3", "fork../forked"), ("/t1../forked", "second../t3")):
+        with pytest.raises(InputError, match=r"begins at .* both need /t1: neither's cycles"):
+            plan_application(profile_chains(recording, chains, period_ns=100 * MS))
     # LET of every callback shapes what lies on the way, too.
     forked = profile_chains(recording, ("/t1../t3", "/t1../forked"))
     with pytest.raises(InputError, match=r"/t1\.\./forked waits for /t1, which the plan for"):
