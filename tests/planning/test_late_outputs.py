@@ -32,7 +32,6 @@ from chainshaper.planning.overruns import (
     open_until_done,
     output_lifespan,
     publication_warnings,
-    refuse_offset,
 )
 from chainshaper.planning.plan import messages_waiting, output_server, publisher_servers, revised
 from chainshaper.values.errors import InputError
@@ -277,9 +276,3 @@ def test_a_publishers_thread_may_send_late_outputs_below_its_executor() -> None:
     assert slots(enforced) == {"chain": ((0, 100),), "output": ((39, 40), (59, 100))}
     chain, output = enforced.servers
     assert output.priority > chain.priority, "it must not out-rank what holds its locks"
-
-
-def test_an_offset_is_refused_where_the_chains_timer_starts_its_cycles() -> None:
-    refuse_offset(planned())
-    with pytest.raises(InputError, match=r"offset: 7ms cannot be carried out here.*so much later"):
-        refuse_offset(revised(planned(), offset_ns=7 * MS))

@@ -67,19 +67,6 @@ def output_lifespan(plan: Plan) -> int | None:
     return max([slots[0][1], *(after[1] - before[1] for before, after in pairwise(slots))])
 
 
-def refuse_offset(plan: Plan) -> None:
-    """Refuse an offset where the phase of the chain's own timer says when its cycles start.
-
-    Raises InputError: the plan has one; the message says how to carry it out.
-    """
-    if plan.offset_ns:
-        raise InputError(
-            f"offset: {format_duration(plan.offset_ns)} cannot be carried out here, where the"
-            " chain's first timer starts its cycles: let this timer start so much later, and"
-            " remove `offset` from the plan"
-        )
-
-
 def open_until_done(plan: Plan) -> Plan:
     """The plan as back ends and the simulator carry it out: what overruns may finish.
 

@@ -60,6 +60,25 @@ def plan_application(
         raise OperationError(f"{error}. It fits with {', or with '.join(fits)}") from error
 
 
+def with_own_names(plans: Sequence[Plan]) -> list[Plan]:
+    """The plans, in which a server that has the name of another one before it has one of its own.
+
+    Plans that were made one by one all have a server ``chain``, and an ``output``.
+    """
+    known: dict[str, Server] = {}
+    renamed = []
+    for place, plan in enumerate(plans, start=1):
+        servers = []
+        for server in plan.servers:
+            name = server.name
+            while known.get(name, server) != server:
+                name += f"_{place}"
+            servers.append(server.model_copy(update={"name": name}))
+            known[name] = server
+        renamed.append(revised(plan, servers=tuple(servers)))
+    return renamed
+
+
 def _planned(
     profiles: Sequence[Profile], request: PlanRequest, time_limit_s: float
 ) -> tuple[ApplicationPlan, list[str]]:
