@@ -54,6 +54,9 @@ nodes:
   beside2:
     callbacks:
       - {subscription: /b1, execution: {uniform: [2ms, 9ms]}, publishes: [/b2]}
+  beside3:
+    callbacks:
+      - {subscription: /b1, execution: {uniform: [1ms, 2ms]}, publishes: [/b3]}
   listener:
     callbacks:
       - {subscription: /o2}
@@ -116,6 +119,7 @@ def test_a_sink_that_forks_off_is_planned_right(
         (["/b1../b2"], True),  # takes turns with the first
         (["/t1../forked", "/t1../twin"], False),  # sinks of one graph, in slots apart
         (["/b1../b2", "/t1../forked", "/o1../o2"], True),
+        (["/b1../b2", "/t1../forked", "/b1../b3"], True),  # two pairs of branches
     ],
 )
 def test_chains_are_planned_together(

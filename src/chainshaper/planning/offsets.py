@@ -106,8 +106,6 @@ def place_chains(
                 return with_offsets(
                     ranked, together=together, time_limit_s=time_limit_s, alone=share
                 ), [remark]
-        remark += " A chain that begins while a better one runs begins late, and may be published"
-        remark += " where another one is."
         return with_offsets(ranked, together=together, time_limit_s=time_limit_s), [remark]
 
 

@@ -70,8 +70,8 @@ def with_own_names(plans: Sequence[Plan]) -> list[Plan]:
     for place, plan in enumerate(plans, start=1):
         servers = []
         for server in plan.servers:
-            name = server.name
-            while known.get(name, server) != server:
+            name = next((n for n, one in known.items() if one == server), server.name)
+            while name in known and (known[name] != server or not server.threads):
                 name += f"_{place}"
             servers.append(server.model_copy(update={"name": name}))
             known[name] = server
@@ -84,10 +84,11 @@ def _planned(
 ) -> tuple[ApplicationPlan, list[str]]:
     plans = [plan_chain(profile, request) for profile in profiles]
     groups = _beginning_together(profiles)
-    for number, group in enumerate(groups):
+    for group in groups:
         for k, plan in zip(group, _sharing_servers([plans[k] for k in group]), strict=True):
-            plans[k] = _with_names(plan, number, k)
-    placed, remarks = place_chains(plans, together=groups, time_limit_s=time_limit_s)
+            plans[k] = plan
+    named = with_own_names(plans)
+    placed, remarks = place_chains(named, together=groups, time_limit_s=time_limit_s)
     return combined(placed), remarks
 
 
@@ -168,21 +169,6 @@ def _behind(plan: Plan, taken: Sequence[tuple[int, Slot]]) -> Plan:
         }
     )
     return revised(plan, servers=with_slots(plan.servers, slots), predicted=predicted)
-
-
-def _with_names(plan: Plan, group: int, place: int) -> Plan:
-    """The plan with the names of its servers numbered by its group, or by its place among chains:
-    those of the first chain stay.
-    """
-    gates = publishing_servers(plan)
-
-    def named(server: Server) -> Server:
-        number = place if server in gates else group
-        return (
-            server.model_copy(update={"name": f"{server.name}_{number + 1}"}) if number else server
-        )
-
-    return revised(plan, servers=tuple(map(named, plan.servers)))
 
 
 def _fitting(

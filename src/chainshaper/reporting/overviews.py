@@ -47,6 +47,7 @@ from chainshaper.verify.measure import Measurement
 UNKNOWN = "unknown"
 COLOURS = {"good": "green", "limited": "yellow", "absent": "red"}
 MOST_ROWS = 50
+MOST_SLOTS = 8
 SWEEP_FIGURES = {
     "mean_ns": "average",
     "max_ns": "maximum",
@@ -429,7 +430,9 @@ def servers_table(state: RunState) -> ResultTable:
             drift = f"{'-' if state.drift_ns < 0 else '+'}{format_duration(abs(state.drift_ns))}"
             table.caption += f"; the chain begins {drift} from where it did"
     for server in state.servers:
-        slots = " ".join(map(slot_text, server.slots))
+        more = len(server.slots) - MOST_SLOTS  # of several chains, over the hyper-period
+        slots = " ".join(map(slot_text, server.slots[:MOST_SLOTS]))
+        slots += f" and {more} more" if more > 0 else ""
         cells = [server.name, str(server.core), str(server.priority), slots]
         cells += [listed(server.threads) or "none", server.kept_by]
         table.add(*cells, *_counted(server).values())

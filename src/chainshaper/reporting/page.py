@@ -112,37 +112,32 @@ def report_page(
             raise InputError(
                 f"there is no cycle {cycle}: the recordings have {most} at most, numbered from 0"
             )
-    names = distinct_names([one.recording.path for one in chains[0].measurements])
+    shared, several = chains[0].measurements, len(chains) > 1
+    names = distinct_names([one.recording.path for one in shared])
     recorded = {id(one.recording): one.recording for one in every}  # once, whatever its chains
     flows = {key: data_flow(one.events, one.info.clock_offset_ns) for key, one in recorded.items()}
+    parts = []
+    for chain in chains:
+        named = zip(names, chain.measurements, strict=True)
+        parts.append([_part(name, one, flows[id(one.recording)]) for name, one in named])
+    drawn = [_drawn(of_one, cycles, number) for number, of_one in enumerate(parts)]
     folder = resources.files("chainshaper.reporting")
     page, of_chain, style, script = (
         (folder / name).read_text("utf-8")
         for name in ("page.html", "chain.html", "page.css", "page.js")
     )
-    blocks, data = [], []
-    for number, chain in enumerate(chains, start=1):
-        parts = []
-        for name, one in zip(names, chain.measurements, strict=True):
-            flow = flows[id(one.recording)]
-            timeline = timeline_of(one.recording, flow, one.analysis, one.plan)
-            parts.append(_Part(name, one, flow, timeline))
-        suffix = f"-{number}" if number > 1 else ""
-        plans = _plans_of(parts)
-        drawn = _drawn(parts, plans, cycles, suffix)
-        places = _tables(parts, plans, suffix) | _beside_charts(parts, drawn["recordings"])
-        places["heading"] = "" if len(chains) == 1 else _heading(chain, names)
-        places["callbacks"] = _callback_section(parts) if number == 1 else ""
-        blocks.append(Template(of_chain).substitute(places, n=suffix))
-        data.append(drawn)
+    blocks = []
+    for of_one, data in zip(parts, drawn, strict=True):
+        places = _tables(of_one, data["n"], several) | _beside_charts(of_one, data["recordings"])
+        blocks.append(Template(of_chain).substitute(places, n=data["n"]))
     digest = base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
-    embedded = json.dumps(_safe(data), ensure_ascii=True, separators=(",", ":"))
-    about = chains[0].chain if len(chains) == 1 else f"{len(chains)} chains"
-    shared = chains[0].measurements
-    first = headline_table(names, shared) if len(chains) == 1 else overview_table(chains, names)
+    embedded = json.dumps(_safe(drawn), ensure_ascii=True, separators=(",", ":"))
+    about = f"{len(chains)} chains" if several else chains[0].chain
+    headline = overview_table(chains, names) if several else headline_table(names, shared)
+    left_out = [(name, one.left_out.text) for name, one in zip(names, shared, strict=True)]
     return Template(page).substitute(
         title=escape(f"End-to-end latency of {about}"),
-        headline=first.html() + _left_out(names, shared),
+        headline=headline.html() + "".join(_paragraph(f"{n}: {t}.") for n, t in left_out if t),
         chains=_lines(blocks),
         conditions=_conditions(names, chains),
         style=style,
@@ -151,6 +146,10 @@ def report_page(
         script=script,
         digest=digest,
     )
+
+
+def _part(name: str, one: Measurement, flow: DataFlow) -> _Part:
+    return _Part(name, one, flow, timeline_of(one.recording, flow, one.analysis, one.plan))
 
 
 def _plans_of(parts: Sequence[_Part]) -> dict[str, Plan]:
@@ -162,22 +161,20 @@ def _plans_of(parts: Sequence[_Part]) -> dict[str, Plan]:
     return {", ".join(users): plan for users, plan in plans.values()}
 
 
-def _drawn(
-    parts: Sequence[_Part], plans: dict[str, Plan], cycles: Sequence[int], suffix: str
-) -> dict[str, Any]:
-    """Everything that is drawn of one chain; the ids of its charts end in ``suffix``."""
+def _drawn(parts: Sequence[_Part], cycles: Sequence[int], number: int) -> dict[str, Any]:
+    """Everything that is drawn of a chain; ``n`` is what ids end in, nothing for the first."""
+    suffix = f"-{number + 1}" if number else ""
     recordings = [_recording_data(part, cycles) for part in parts]
     times = [time for one in recordings for time in one["points"]["time"][-1:]]
-    bars = {f"breakdown{suffix}": _hop_bars(parts)}
-    for number, plan in enumerate(plans.values()):
-        bars[f"slots-{number}{suffix}"] = _slot_bars(plan)
+    slots = enumerate(_plans_of(parts).values())
+    bars = {f"slots-{place}{suffix}": _slot_bars(plan) for place, plan in slots}
     return {
         "n": suffix,
         "recordings": recordings,
         "publishSlots": list(dict.fromkeys(slot for one in recordings for slot in one["slots"])),
         "longest": max([1, *times]),
         "range": latency_range(recordings),
-        "bars": bars,
+        "bars": {f"breakdown{suffix}": _hop_bars(parts), **bars},
     }
 
 
@@ -200,18 +197,25 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
     return [f"{path} ({number})" for number, path in enumerate(paths, start=1)]
 
 
-def _tables(parts: Sequence[_Part], plans: dict[str, Plan], suffix: str) -> dict[str, str]:
-    """What a chain's tables say, by the places that the template has for them."""
+def _tables(parts: Sequence[_Part], suffix: str, several: bool) -> dict[str, str]:
+    """What a chain's tables say, by the places that the template has for them.
+
+    Of ``several`` chains each has a heading, and the first has the callbacks of all.
+    """
     names = [one.name for one in parts]
     measurements = [one.measurement for one in parts]
     compared = Comparison(measurements[0].analysis.chain.spec, tuple(measurements))
     incomplete = incomplete_table(names, measurements)
+    heading = f"<h1>{escape(compared.chain)}</h1>\n{headline_table(names, measurements).html()}"
+    callbacks = f"<h2>Callbacks</h2>\n{_lines(map(_callbacks, parts))}"
     hops = (
         _paragraph(f"{one.name}, all complete cycles [ms]:")
         + breakdown_table(one.measurement.analysis).html()
         for one in parts
     )
     return {
+        "heading": heading if several else "",
+        "callbacks": "" if suffix else f'<section id="callbacks">\n{callbacks}\n</section>',
         "before_and_after": "Before and after" if len(parts) > 1 else "Figures",
         "comparison": comparison_table(compared, names).html(),
         "predictions": _lines(map(_prediction, parts)),
@@ -221,23 +225,10 @@ def _tables(parts: Sequence[_Part], plans: dict[str, Plan], suffix: str) -> dict
         if incomplete.rows
         else _paragraph("Every cycle that began is complete."),
         "stalls": _lines(map(_stalls, parts)),
-        "plans": _lines(_plan(f"{n}{suffix}", *one) for n, one in enumerate(plans.items())),
+        "plans": _lines(
+            _plan(f"{n}{suffix}", *one) for n, one in enumerate(_plans_of(parts).items())
+        ),
     }
-
-
-def _heading(chain: Comparison, names: Sequence[str]) -> str:
-    """What a chain's part begins with, where there are several."""
-    return f"<h1>{escape(chain.chain)}</h1>\n{headline_table(names, chain.measurements).html()}"
-
-
-def _left_out(names: Sequence[str], measurements: Sequence[Measurement]) -> str:
-    left_out = [(name, one.left_out.text) for name, one in zip(names, measurements, strict=True)]
-    return "".join(_paragraph(f"{name}: {text}.") for name, text in left_out if text)
-
-
-def _callback_section(parts: Sequence[_Part]) -> str:
-    tables = _lines(map(_callbacks, parts))
-    return f'<section id="callbacks">\n<h2>Callbacks</h2>\n{tables}\n</section>'
 
 
 def _conditions(names: Sequence[str], chains: Sequence[Comparison]) -> str:

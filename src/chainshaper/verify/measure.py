@@ -174,14 +174,14 @@ def compare_recordings(
     chain: str | None = None,
     plan: Plan | ApplicationPlan | None = None,
 ) -> Comparison:
-    """Measure the same chain in several recordings.
+    """Measure the same chain, the first of several, in several recordings.
 
     ``plan`` was in force in the last of them, should that not say so itself.
 
     Raises:
         InputError: fewer than two recordings, or a chain that one of them does not have.
     """
-    return _compared(recordings, lambda _: [chain], plan)[0]
+    return compare_chains(recordings, chain, plan)[0]
 
 
 def compare_chains(
@@ -194,31 +194,18 @@ def compare_chains(
 ) -> tuple[Comparison, ...]:
     """Measure every chain of an application in ``least`` recordings or more.
 
-    The chains are those of the plan that was in force in the last of them, if it has several;
-    otherwise the one that is measured is ``chain``, or the recording's own.
+    They are the chains of the plan that was in force in the last of them, if it has several;
+    otherwise each recording's own. ``chain`` names one.
 
     Raises: as :func:`compare_recordings`.
     """
-
-    def wanted(last: Recording) -> list[str | None]:
-        joint = _plan_of(last, plan)
-        several = [] if joint is None else [one.chain.spec for one in joint.chains]
-        return [chain] if chain is not None or len(several) < 2 else several
-
-    return _compared(recordings, wanted, plan, least, progress)
-
-
-def _compared(
-    recordings: Sequence[Recording | str | Path],
-    wanted: Callable[[Recording], list[str | None]],
-    plan: Plan | ApplicationPlan | None,
-    least: int = 2,
-    progress: Callable[[float, str], None] = lambda *_: None,
-) -> tuple[Comparison, ...]:
     if len(recordings) < least:
         raise InputError("a comparison needs two recordings, such as `compare before after`")
     opened = [_opened(recording) for recording in recordings]
-    chains, columns = wanted(opened[-1]), []
+    joint = _plan_of(opened[-1], plan)
+    chains = [] if joint is None or chain is not None else [one.chain.spec for one in joint.chains]
+    chains = chains if len(chains) > 1 else [chain]
+    columns = []
     for number, recording in enumerate(opened, start=1):
         progress((number - 1) / len(opened), f"analysing {recording.path}")
         columns.append(_measured(recording, chains, plan if number == len(opened) else None))

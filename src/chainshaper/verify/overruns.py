@@ -40,32 +40,21 @@ _WITHOUT_NODE = {
 
 def gate_releases(
     recording: Recording, plan: Plan | None, analysis: LatencyAnalysis | None = None
-) -> pl.DataFrame:
-    """The table `gate_release` with ``overrun``, which older recordings lack.
+) -> pl.DataFrame | None:
+    """The table `gate_release` with ``overrun``, which older recordings lack; None: there is none.
 
     Of a plan it has the rows of its shaping nodes and their standbys; with ``analysis`` only those
     of shaping nodes on that chain, not those of the plan's other sinks.
     """
-    due = 0 if plan is None else cycles_until_output(plan)
+    if "gate_release" not in recording.events:
+        return None
     table = events.table(recording.events, "gate_release", ["dropped", "lost"])
-    table = with_overrun(table, due)
+    table = with_overrun(table, 0 if plan is None else cycles_until_output(plan))
     if plan is None:
         return table
-    gates = _gates(plan, analysis)
-    return _of_nodes(recording, table, [*gates, *(f"{gate}{STANDBY}" for gate in gates)])
-
-
-def _gates(plan: Plan, analysis: LatencyAnalysis | None) -> list[str]:
-    return [
-        node.thread.node
-        for node in shaping_nodes(plan)
-        if analysis is None or node.output in analysis.chain.topics
-    ]
-
-
-def _decided(recording: Recording, plan: Plan | None, analysis: LatencyAnalysis | None) -> bool:
-    """Whether a gate of the plan decided about anything that was recorded."""
-    return "gate_release" in recording.events and (plan is None or bool(_gates(plan, analysis)))
+    nodes = [n for n in shaping_nodes(plan) if not analysis or n.output in analysis.chain.topics]
+    gates = [f"{one.thread.node}{ending}" for one in nodes for ending in ("", STANDBY)]
+    return _of_nodes(recording, table, gates) if gates else None
 
 
 def _of_nodes(recording: Recording, table: pl.DataFrame, own: Collection[str]) -> pl.DataFrame:
@@ -86,9 +75,10 @@ def overruns_in(
     waited cannot be counted.
     """
     gated = plan is not None and any(publisher_servers(plan))
-    if not gated and not _decided(recording, plan, analysis):
+    decided = gate_releases(recording, plan, analysis)
+    if decided is None and not gated:
         return None
-    treated = gate_releases(recording, plan, analysis)["overrun"].drop_nulls()
+    treated = pl.Series(dtype=pl.String) if decided is None else decided["overrun"].drop_nulls()
     counts = {policy: int((treated == policy).sum()) for policy in (*_DONE, *_WITHOUT_NODE)}
     if gated and plan is not None:
         publishers = [node for *_, nodes in publisher_servers(plan) for node in nodes]
@@ -109,9 +99,10 @@ def into_open_slots(
 
     They took longer than the plan's L̄ + ε, and make up the jitter that a wide slot lets through.
     """
-    if not _decided(recording, plan, analysis):
+    decided = gate_releases(recording, plan, analysis)
+    if decided is None:
         return None
-    table = gate_releases(recording, plan, analysis).filter(pl.col("overrun").is_null())
+    table = decided.filter(pl.col("overrun").is_null())
     return int((table["release"] == table["arrival"]).sum())
 
 
@@ -123,9 +114,9 @@ def dropped_in(
 
     The reasons are those of ``dropped`` in :mod:`chainshaper.values.events`.
     """
-    if not _decided(recording, plan, analysis):
-        return None
     table = gate_releases(recording, plan, analysis)
+    if table is None:
+        return None
     discarded = pl.col("release").is_null() & (pl.col("overrun") == "discard")
     reason = pl.coalesce("dropped", pl.when(discarded).then(pl.lit("discarded")))
     reasons = table.select(reason).to_series()
