@@ -6,17 +6,15 @@ from typing import Any
 import pytest
 from command_line import called, json_of, refused
 
-from chainshaper import (
-    compare_chains,
-    load_application,
-    measure_latency,
-    save_application_plan,
-    simulate,
-)
+from chainshaper import compare_chains, load_application, measure_latency, simulate
 from chainshaper.flow.plan import profile_chains
 from chainshaper.planning import PlanRequest, plan_application, publish_slots
-from chainshaper.planning.application_plan import ApplicationPlan, combined
-from chainshaper.planning.plan import output_server, publishing_servers, revised, with_slots
+from chainshaper.planning.application_plan import (
+    ApplicationPlan,
+    combined,
+    save_application_plan,
+)
+from chainshaper.planning.plan import publishing_servers, revised, with_slots
 from chainshaper.verify.predictions import due_of
 from chainshaper.workload.description import Application
 
@@ -79,8 +77,7 @@ def test_twenty_chains_on_eight_cores(tmp_path: Path) -> None:
     servers = {thread.node: server for server in plan.servers for thread in server.threads}
     gates = {server.name for chain in plan.chains for server in publishing_servers(chain)}
     names = {thread.tid: thread.node for thread in after.info.threads}
-    switches, begun = after.events["sched_switch"].sort("cpu", "time"), 0
-    checked = 0
+    switches, begun, checked = after.events["sched_switch"].sort("cpu", "time"), 0, 0
     for time, before, following in switches.select("time", "prev_tid", "next_tid").iter_rows():
         server = servers.get(names.get(before, ""))
         if server is not None and server.name not in gates:
@@ -97,11 +94,9 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("robot")
     application, plan = _planned(folder, 9, overrun="discard")
     early, other = plan.chains[8], plan.chains[0]
-    server = output_server(early)
-    assert server is not None
+    (server,) = publishing_servers(early)
     slots = {server.name: [(2 * MS, 3 * MS)]}
-    changed = revised(early, servers=with_slots(early.servers, slots))
-    both = combined([other, changed])
+    both = combined([other, revised(early, servers=with_slots(early.servers, slots))])
     save_application_plan(both, folder / "plan.yaml")
     simulate(application, folder / "after", both, cycles=60)
     return folder
@@ -157,9 +152,6 @@ def test_places_count_from_the_chains_own_cycle(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (["plan", "before", "--chain", "/a0../b0", "--chain", "first0../b0"], "is given twice"),
-        (["plan", "before", "--chain", "/a0../b0", "--chain", "second0../b0"], "both publish /b0"),
-        (["plan", "before", "--chain", "/a0../b0", "--sink", "/a1../b1"], "another callback"),
         (["sweep", "application.yaml", "plan.yaml", "--vary", "seed=1"], "only one is wanted"),
         (["compare", "after"], "needs two recordings"),
         (["compare", "before", "after", "--figures", "f"], "--figures draws one chain"),
@@ -169,6 +161,5 @@ def test_what_cannot_be_done_is_refused(
     arguments: list[str], reason: str, robot: Path, tmp_path: Path
 ) -> None:
     words = [str(robot / one) if (robot / one).exists() else one for one in arguments]
-    words += ["--period", "50ms"] if "second0../b0" in words else []
     words += ["-o", str(tmp_path / "o")] if words[0] != "compare" else []
     assert reason in refused(2, *words)

@@ -65,8 +65,7 @@ def with_own_names(plans: Sequence[Plan]) -> list[Plan]:
 
     Plans that were made one by one all have a server ``chain``, and an ``output``.
     """
-    known: dict[str, Server] = {}
-    renamed = []
+    known, renamed = dict[str, Server](), []
     for place, plan in enumerate(plans, start=1):
         servers = []
         for server in plan.servers:
