@@ -83,6 +83,7 @@ if TYPE_CHECKING:
     from chainshaper.values.recording import open_recording as open_recording
     from chainshaper.verify.measure import Comparison as Comparison
     from chainshaper.verify.measure import Measurement as Measurement
+    from chainshaper.verify.measure import compare_chains as compare_chains
     from chainshaper.verify.measure import compare_recordings as compare_recordings
     from chainshaper.verify.measure import hop_breakdown as hop_breakdown
     from chainshaper.verify.measure import measure_latency as measure_latency

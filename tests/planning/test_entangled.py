@@ -54,6 +54,9 @@ nodes:
   beside2:
     callbacks:
       - {subscription: /b1, execution: {uniform: [2ms, 9ms]}, publishes: [/b2]}
+  beside3:
+    callbacks:
+      - {subscription: /b1, execution: {uniform: [1ms, 2ms]}, publishes: [/b3]}
   listener:
     callbacks:
       - {subscription: /o2}
@@ -116,6 +119,7 @@ def test_a_sink_that_forks_off_is_planned_right(
         (["/b1../b2"], True),  # takes turns with the first
         (["/t1../forked", "/t1../twin"], False),  # sinks of one graph, in slots apart
         (["/b1../b2", "/t1../forked", "/o1../o2"], True),
+        (["/b1../b2", "/t1../forked", "/b1../b3"], True),  # two pairs of branches
     ],
 )
 def test_chains_are_planned_together(
@@ -176,6 +180,10 @@ def test_what_else_has_no_plan_together_is_refused(recording: Recording) -> None
     profiles = profile_chains(recording, ("/t1../t3", "behind../end"), period_ns=100 * MS)
     with pytest.raises(InputError, match=r"behind\.\./end waits for /t3, which"):
         plan_application(profiles)
+    # These begin at subscriptions that one timer triggers: no offset moves them apart.
+    for chains in (("second../t3", "fork../forked"), ("/t1../forked", "second../t3")):
+        with pytest.raises(InputError, match=r"begins at .* both need /t1: neither's cycles"):
+            plan_application(profile_chains(recording, chains, period_ns=100 * MS))
     # LET of every callback shapes what lies on the way, too.
     forked = profile_chains(recording, ("/t1../t3", "/t1../forked"))
     with pytest.raises(InputError, match=r"/t1\.\./forked waits for /t1, which the plan for"):

@@ -187,6 +187,8 @@ def test_chains_that_cannot_take_turns_run_at_priorities_of_their_own() -> None:
     assert ["only their publish slots are kept apart" in remark for remark in remarks] == [True]
     slots = [plan.offset_ns + plan.servers[1].slots[0][0] for plan in placed]
     assert (slots[1] - slots[0]) % (50 * MS) in range(MS, 49 * MS + 1)
+    # The worse chain begins while the better one's slot, 30 ms of 50, is closed.
+    assert (placed[0].offset_ns - placed[1].offset_ns) % (50 * MS) >= 30 * MS
     turns, none = place_chains([_shaped("a", 100, 40), _shaped("b", 100, 40)])
     assert none == []
     assert [plan.servers[0].priority for plan in turns] == [2, 2]

@@ -306,7 +306,9 @@ def test_older_recordings_are_read_by_the_cycles_their_outputs_waited(
     shaped: Recording, plan: Plan
 ) -> None:
     old = _without_column(shaped, [0, 1, 2, 0])
-    assert gate_releases(old, plan)["overrun"].to_list() == [None, "wait", "wait", None]
+    decided = gate_releases(old, plan)
+    assert decided is not None
+    assert decided["overrun"].to_list() == [None, "wait", "wait", None]
     assert overruns_in(old, plan) == {"wait": 2}
     assert overruns_in(old, None) == {"wait": 2}
     assert overruns_in(old, let_per_chain(plan)) == {"wait": 1}, "they are due a cycle later"

@@ -33,7 +33,10 @@ def plan(
         "The chain, by topics or nodes: /t1../t5. Default: the one the recording names."
         " Give several to plan them together: what they share, and when each one's cycles start.",
     ),
-    output: Path | None = option("--output -o plan.yaml", "File to write; must not exist."),
+    output: Path | None = option(
+        "--output -o plan.yaml",
+        "File to write; of several chains also a folder, for a plan each. Must not exist.",
+    ),
     latencies: Path | None = option(
         "--latencies FILE", "Instead of a recording: a duration a line, or .npy in ns."
     ),
@@ -90,7 +93,8 @@ def plan(
     if len(planned) > 1:
         if sinks or curve is not None:
             raise InputError("--sink and --curve go with one chain: plan chains one by one")
-        _print_application(*plan_application(planned, request), output, json)
+        joint, remarks = plan_application(planned, request)
+        _print_several(joint.chains, remarks, output, json)
         return
     made = cs.plan_chain(planned[0], request, sinks)
     choice = band_choice(made, planned[0], request) if request.bands == "auto" else None
@@ -145,36 +149,30 @@ def offsets(
     Where chains cannot take turns on a core, they run at the same time at different priorities, and
     only their publish slots are kept apart.
     """
-    from chainshaper.planning import save_plans
-    from chainshaper.planning.application_plan import combined
-    from chainshaper.planning.several_chains import numbered
-
     placed, remarks = cs.place_chains(
         [chain for path in plans for chain in cs.load_application_plan(path).chains],
         time_limit_s=time_limit,
     )
-    if output is not None and output.suffix in DESCRIPTIONS:
-        alone = [[place] for place in range(len(placed))]
-        _print_application(combined(numbered(placed, alone)), remarks, output, json)
-        return
-    written = [] if output is None else save_plans(placed, output)
-    _print_placed(placed, remarks, written, json)
+    _print_several(placed, remarks, output, json)
 
 
-def _print_application(
-    plan: "cs.ApplicationPlan", remarks: Sequence[str], output: Path | None, json: bool
+def _print_several(
+    placed: "Sequence[cs.Plan]", remarks: Sequence[str], output: Path | None, json: bool
 ) -> None:
-    if output is not None:
-        cs.save_application_plan(plan, output)
-    _print_placed(plan.chains, remarks, [] if output is None else [output], json)
-
-
-def _print_placed(
-    placed: "Sequence[cs.Plan]", remarks: Sequence[str], written: Sequence[Path], json: bool
-) -> None:
-    from chainshaper.planning import plan_json, plan_warnings
+    """Plans of several chains, written as one plan of all, or into a folder with a plan each."""
+    from chainshaper.planning import plan_json, plan_warnings, save_plans
+    from chainshaper.planning.application_plan import combined
+    from chainshaper.planning.several_chains import with_own_names
     from chainshaper.reporting.overviews import plan_table
 
+    written = [output] if output is not None else []
+    if output is not None and output.suffix not in DESCRIPTIONS:
+        written = save_plans(placed, output)
+    else:
+        joint = combined(with_own_names(placed))
+        placed = joint.chains
+        if output is not None:
+            cs.save_application_plan(joint, output)
     warnings = [*remarks, *(warning for one in placed for warning in plan_warnings(one))]
     files = [str(path) for path in written]
     values = {"plans": [plan_json(one) for one in placed], "files": files, "warnings": warnings}

@@ -377,8 +377,9 @@ def _shape_described(
             progress=report,
         )
     for chain in planned.chains:
+        about = f"{chain.chain.output}: " if len(planned.chains) > 1 else ""
         if overruns := overruns_in(recording, chain):
-            notes([overruns_text(overruns)])
+            notes([about + overruns_text(overruns)])
     if dropped := dropped_in(recording):
         notes([dropped_text(dropped)])
     notes(recording.info.notes)

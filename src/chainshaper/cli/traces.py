@@ -164,12 +164,18 @@ def convert(trace: list[Path] = TRACE, output: Path = RECORDING_OUTPUT) -> None:
     notes((*written.info.notes, lost_events(written)))
 
 
-def comparison_tables(comparison: "cs.Comparison") -> "list[ResultTable]":
-    """Recordings beside each other; then each prediction beside its measurement."""
-    from chainshaper.reporting.latency import comparison_table, prediction_table
+def comparison_tables(*comparisons: "cs.Comparison") -> "list[ResultTable]":
+    """For each chain recordings beside each other; then each prediction beside its measurement.
 
-    predictions = [one.held for one in comparison.measurements if one.held is not None]
-    return [comparison_table(comparison), *map(prediction_table, predictions)]
+    Several chains have an overview in front, a row for each.
+    """
+    from chainshaper.reporting.latency import comparison_table, overview_table, prediction_table
+
+    tables = [overview_table(comparisons)] if len(comparisons) > 1 else []
+    for comparison in comparisons:
+        predictions = [one.held for one in comparison.measurements if one.held is not None]
+        tables += [comparison_table(comparison), *map(prediction_table, predictions)]
+    return tables
 
 
 def compare(
@@ -183,16 +189,19 @@ def compare(
 ) -> None:
     """Show the same chain in several recordings side by side, usually before and after shaping.
 
-    Where a plan was in force, its prediction stands beside the measurement, band by band.
+    Where a plan was in force, its prediction stands beside the measurement, band by band. Without
+    --chain, all chains of the plan in force in the last recording are shown.
     """
-    from chainshaper.reporting.latency import comparison_json
+    from chainshaper.reporting.latency import comparisons_json
 
-    comparison = cs.compare_recordings(recordings, chain, plan_in_force(plan))
+    comparisons = cs.compare_chains(recordings, chain, plan_in_force(plan))
     if figures is not None:
         from chainshaper.reporting.figures import draw_comparison
 
-        draw_comparison(comparison.measurements, figures)
-    present(json, comparison_json(comparison), *comparison_tables(comparison))
+        if len(comparisons) > 1:
+            raise InputError("--figures draws one chain: name it with --chain")
+        draw_comparison(comparisons[0].measurements, figures)
+    present(json, comparisons_json(comparisons), *comparison_tables(*comparisons))
 
 
 def report(
@@ -212,25 +221,20 @@ def report(
 
     It has the figures, latency over time, histogram and distribution, the hops, the callbacks, a
     timeline of single cycles, overruns, stalls, the plan, and how all of it was recorded. The page
-    needs no network.
+    needs no network. Without --chain, it has all chains of the plan in force in the last recording.
     """
-    from chainshaper.reporting.latency import comparison_json
+    from chainshaper.reporting.latency import comparisons_json
     from chainshaper.reporting.page import ENDINGS
     from chainshaper.values.files import new_file
 
     new_file(output, ENDINGS)
     in_force = plan_in_force(plan)
-    measurements, steps = [], len(recordings) + 1
     with late_progress("report") as progress:
-        for number, path in enumerate(recordings, start=1):
-            progress((number - 1) / steps, f"analysing {path}")
-            used = in_force if number == len(recordings) else None
-            measurements.append(cs.measure_latency(cs.open_source(path), chain, used))
-        progress(len(recordings) / steps, "drawing")
-        written = cs.write_report(measurements, output, cycles or ())
+        comparisons = cs.compare_chains(recordings, chain, in_force, least=1, progress=progress)
+        progress(0.9, "drawing")
+        written = cs.write_report(comparisons, output, cycles or ())
     if json:
-        compared = cs.Comparison(measurements[0].analysis.chain.spec, tuple(measurements))
-        print_json({"report": str(written.absolute()), **comparison_json(compared)})
+        print_json({"report": str(written.absolute()), **comparisons_json(comparisons)})
         return
     show_line(written.absolute())
 

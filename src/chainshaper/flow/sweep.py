@@ -425,7 +425,14 @@ def _interfered(described: dict[str, Any], period_ns: int, longest_ns: int) -> d
 def _validated(model: type[_Model], data: Any, changes: Values) -> _Model:
     said = ", ".join(f"{name}={value}" for name, value in changes.items())
     with wrong_values_refused(model, f"{said}: "):
-        return model.model_validate_json(json.dumps(data), context=AS_YAML)
+        return model.model_validate(_as_read(data), context=AS_YAML)
+
+
+def _as_read(value: Any) -> Any:
+    """Plain data as a file is read: sequences are tuples."""
+    if isinstance(value, dict):
+        return {key: _as_read(one) for key, one in value.items()}
+    return tuple(map(_as_read, value)) if isinstance(value, list | tuple) else value
 
 
 def _nanoseconds(name: str, value: Any) -> Any:

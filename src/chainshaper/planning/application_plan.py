@@ -244,11 +244,11 @@ def _shared_servers(plan: ApplicationPlan) -> _Wrong:
 
 
 def _threads(plan: ApplicationPlan) -> _Wrong:
-    homes = {t: s for one in plan.chains for s in one.servers for t in s.threads}
+    homes: dict[Thread, Server] = {}
     for place, chain in enumerate(plan.chains):
         for number, server in enumerate(chain.servers):
             for thread in server.threads:
-                if (other := homes[thread]).core != server.core:
+                if (other := homes.setdefault(thread, server)).core != server.core:
                     reason = (
                         f"the {thread.role} of {thread.node} would run on core {server.core} here"
                         f" and on core {other.core} in server {other.name!r}: write one core"

@@ -22,6 +22,7 @@ import math
 import random
 import time
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
 from itertools import chain, combinations
 from typing import NamedTuple, TypeAlias
 
@@ -36,6 +37,8 @@ from chainshaper.values.errors import InputError, OperationError, extra_library
 MOST_SEARCHED = 4  # chains; beyond, CP-SAT is faster
 TIME_LIMIT_SECONDS = 60.0
 MOST_CYCLES = 2_000  # of all chains in a hyper-period that is played out for the solver
+SHARES = (0.9, 0.75, 0.5, 0.25, 0.1, 0.0)  # of a slot that begins while no better one is open
+START_NS = 1_000_000  # at the least, so that the first callback begins in time
 MOST_FITTINGS = 10_000  # of one chain, before the solver is asked; some seconds for 30 chains
 
 _Intervals: TypeAlias = list[tuple[int, int]]  # closed; the first end is behind the last: around 0
@@ -51,10 +54,15 @@ class Timetable(NamedTuple):
     slots: dict[tuple[int, int], list[Slot]]
 
 
-def timetable(plans: Sequence[Plan], without: Collection[str] = ()) -> Timetable:
+def timetable(
+    plans: Sequence[Plan],
+    without: Collection[str] = (),
+    alone: Iterable[tuple[tuple[int, int], int]] = (),
+) -> Timetable:
     """The slots of a chain, or of several that share servers, of which each counts once.
 
-    Servers of the names ``without`` do not count.
+    Servers of the names ``without`` do not count. ``alone`` are cores and priorities at which
+    others must not run for so long (ns) after the cycle has begun.
     """
     servers = {server.name: server for plan in plans for server in plan.servers}
     for name in without:
@@ -62,6 +70,8 @@ def timetable(plans: Sequence[Plan], without: Collection[str] = ()) -> Timetable
     slots: dict[tuple[int, int], list[Slot]] = {}
     for server in servers.values():
         slots.setdefault((server.core, server.priority), []).extend(server.slots)
+    for place, length_ns in alone:
+        slots.setdefault(place, []).append((0, length_ns))
     return Timetable(" and ".join(map(chain_name, plans)), plans[0].cycle_ns, slots)
 
 
@@ -75,7 +85,9 @@ def place_chains(
 
     The chains take turns where they can (:func:`with_offsets`). Where they cannot, they run at the
     same time, the chain with the shorter period at the better priority, and only their publish
-    slots stay apart. Raises as :func:`with_offsets`.
+    slots stay apart. None begins while a better one runs, where there are such offsets, and has its
+    core for as long as there can be: slots count from when a chain really begins, so one that began
+    late would have its publish slot where another has its own. Raises as :func:`with_offsets`.
     """
     together = together or [[k] for k in range(len(plans))]
     try:
@@ -89,6 +101,11 @@ def place_chains(
             " only their publish slots are kept apart: their latencies must have been measured"
             " while all of them ran like this."
         )
+        for share in SHARES:
+            with suppress(OperationError):
+                return with_offsets(
+                    ranked, together=together, time_limit_s=time_limit_s, alone=share
+                ), [remark]
         return with_offsets(ranked, together=together, time_limit_s=time_limit_s), [remark]
 
 
@@ -121,13 +138,15 @@ def with_offsets(
     *,
     together: Sequence[Sequence[int]] | None = None,
     time_limit_s: float = TIME_LIMIT_SECONDS,
+    alone: float | None = None,
 ) -> tuple[Plan, ...]:
     """The plans of several chains with offsets that keep their slots apart.
 
     ``together`` are groups of chains (places in ``plans``) that begin at the same callback: they
     share servers and have one offset (default: none do). The first group, and any that shares no
     core with another, has the offset 0. ``time_limit_s`` bounds the search among groups that can
-    collide with each other.
+    collide with each other. For the share ``alone`` of its slot no chain that begins has its core
+    taken by one of a better priority.
 
     Raises InputError: no plans, or plans that govern the same output. OperationError: there are no
     such offsets, with the reason where a single pair of chains or the load of a core already
@@ -141,9 +160,21 @@ def with_offsets(
     together = together or [[k] for k in range(len(plans))]
     for group, other in combinations(together, 2):
         _refuse_same_beginning(plans[group[0]], plans[other[0]])
-    found = _find_offsets([timetable([plans[k] for k in one]) for one in together], time_limit_s)
+    own = [[plans[k] for k in one] for one in together]
+    tables = [timetable(one, alone=_alone(one, plans, alone)) for one in own]
+    found = _find_offsets(tables, time_limit_s)
     offset_of = {k: found[number] for number, one in enumerate(together) for k in one}
     return tuple(revised(plan, offset_ns=offset_of[k]) for k, plan in enumerate(plans))
+
+
+def _alone(
+    own: Sequence[Plan], plans: Sequence[Plan], share: float | None
+) -> Iterator[tuple[tuple[int, int], int]]:
+    """Cores and priorities better than those with which a chain begins, and for how long (ns)."""
+    first = {one.core: one for plan in own for one in plan.servers if one.slots[0][0] == 0}
+    for core, best in sorted({(one.core, one.priority) for p in plans for one in p.servers}):
+        if share is not None and core in first and best < first[core].priority:
+            yield (core, best), max(START_NS, int(share * first[core].slots[0][1]))
 
 
 def _find_offsets(tables: Sequence[Timetable], time_limit_s: float) -> dict[int, int]:

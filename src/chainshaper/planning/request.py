@@ -438,15 +438,31 @@ def refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: bool
                 f" {shaped.name} alone"
             )
     for one, two in combinations(profiles, 2):
-        if sinks and one.begins is not None and two.begins is not None and one.begins != two.begins:
+        if one.begins is None or two.begins is None or one.begins == two.begins:
+            continue
+        begin = (
+            f"{two.name} begins at {two.begins[1]}, {one.name} at another callback, {one.begins[1]}"
+        )
+        if sinks:
             raise InputError(
-                f"{two.name} begins at {two.begins[1]}, {one.name} at another callback,"
-                f" {one.begins[1]}: the slots of a sink count from the beginning of the chain. Name"
+                f"{begin}: the slots of a sink count from the beginning of the chain. Name"
                 " a sink behind the same first callback, or plan one of the two alone"
             )
+        if common := sorted(_waited_for(one, two) | _waited_for(two, one)):
+            raise InputError(
+                f"{begin}, and both need {', '.join(common)}: neither's cycles can start at another"
+                " instant without the other's. Begin both at the callback that all of it comes"
+                " from, or plan one of the two alone"
+            )
+    for one, two in combinations(profiles, 2):
         if sinks and one.period_ns != two.period_ns:
             raise InputError(
                 f"{two.name} has the period {format_duration(two.period_ns)}, {one.name}"
                 f" {format_duration(one.period_ns)}: a plan has one cycle. Plan one of the two"
                 " alone"
             )
+
+
+def _waited_for(one: Profile, two: Profile) -> frozenset[str]:
+    """Topics that a chain waits for and are not on its way, which another has or waits for too."""
+    return (one.upstream - set(one.topics)) & (two.upstream | set(two.topics))

@@ -61,6 +61,24 @@ def plan_application(
         raise OperationError(f"{error}. It fits with {', or with '.join(fits)}") from error
 
 
+def with_own_names(plans: Sequence[Plan]) -> list[Plan]:
+    """The plans, in which a server that has the name of another one before it has one of its own.
+
+    Plans that were made one by one all have a server ``chain``, and an ``output``.
+    """
+    known, renamed = dict[str, Server](), []
+    for place, plan in enumerate(plans, start=1):
+        servers = []
+        for server in plan.servers:
+            name = next((n for n, one in known.items() if one == server), server.name)
+            while name in known and (known[name] != server or not server.threads):
+                name += f"_{place}"
+            servers.append(server.model_copy(update={"name": name}))
+            known[name] = server
+        renamed.append(revised(plan, servers=tuple(servers)))
+    return renamed
+
+
 def _planned(
     profiles: Sequence[Profile], request: PlanRequest, time_limit_s: float
 ) -> tuple[ApplicationPlan, list[str]]:
@@ -69,8 +87,8 @@ def _planned(
     for group in groups:
         for k, plan in zip(group, _sharing_servers([plans[k] for k in group]), strict=True):
             plans[k] = plan
-    plans = numbered(plans, groups)
-    placed, remarks = place_chains(plans, together=groups, time_limit_s=time_limit_s)
+    named = with_own_names(plans)
+    placed, remarks = place_chains(named, together=groups, time_limit_s=time_limit_s)
     return combined(placed), remarks
 
 
@@ -152,26 +170,6 @@ def _later(predicted: Prediction, later_ns: int) -> Prediction:
     times = {"mean_ns": predicted.mean_ns + later_ns, "max_ns": predicted.max_ns + later_ns}
     modes = {mode: _later(own, later_ns) for mode, own in (predicted.modes or {}).items()}
     return predicted.model_copy(update={**times, "modes": modes or None})
-
-
-def numbered(plans: Sequence[Plan], groups: Sequence[Sequence[int]]) -> list[Plan]:
-    """The plans with the names of their servers numbered, by the first chain of the group that
-    shares them, or by their own: those of the first chain stay.
-    """
-    renamed = list(plans)
-    for group in groups:
-        for place in group:
-            gates = publishing_servers(plans[place])
-            names = {
-                one.name: f"{one.name}_{number}" if number > 1 else one.name
-                for one in plans[place].servers
-                for number in [1 + (place if one in gates else group[0])]
-            }
-            servers = tuple(
-                one.model_copy(update={"name": names[one.name]}) for one in plans[place].servers
-            )
-            renamed[place] = revised(plans[place], servers=servers)
-    return renamed
 
 
 def _fitting(

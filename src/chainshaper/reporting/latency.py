@@ -33,12 +33,14 @@ __all__ = [
     "breakdown_table",
     "comparison_json",
     "comparison_table",
+    "comparisons_json",
     "doubts_text",
     "headline_table",
     "incomplete_table",
     "late_text",
     "latency_json",
     "latency_table",
+    "overview_table",
     "prediction_json",
     "prediction_table",
 ]
@@ -131,6 +133,12 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
             entry["prediction"] = prediction_json(measurement.held)
         entries.append(entry)
     return {"chain": comparison.chain, "recordings": entries}
+
+
+def comparisons_json(comparisons: Sequence[Comparison]) -> dict[str, Any]:
+    """A comparison as plain data; of several chains an object whose ``chains`` has them."""
+    several = [comparison_json(one) for one in comparisons]
+    return several[0] if len(several) == 1 else {"chains": several}
 
 
 def latency_table(measurement: Measurement) -> ResultTable:
@@ -253,6 +261,19 @@ def headline_table(names: Sequence[str], measurements: Sequence[Measurement]) ->
         calm, every = measurement.analysis.undisturbed, measurement.analysis.statistics
         times = map(ms, (calm.jitter_ns, calm.mean_ns, calm.max_ns))
         table.add(name, *times, f"{calm.count:,}", ms(every.max_ns), count(every.late))
+    return table
+
+
+def overview_table(comparisons: Sequence[Comparison], names: Sequence[str] = ()) -> ResultTable:
+    """One row per chain of an application, each recording's figures of undisturbed cycles."""
+    names = names or [one.recording.path.name for one in comparisons[0].measurements]
+    fields = {"jitter": "jitter_ns", "average": "mean_ns", "maximum": "max_ns"}
+    titles = [f"{title}\n{name}" for title in (*fields, "late of all") for name in names]
+    table = ResultTable("At publication [ms]", [*words("chain"), *figures(*titles)])
+    for chain in comparisons:
+        found = [one.analysis for one in chain.measurements]
+        times = (getattr(one.undisturbed, field) for field in fields.values() for one in found)
+        table.add(chain.chain, *map(ms, times), *(count(one.statistics.late) for one in found))
     return table
 
 

@@ -47,6 +47,7 @@ from chainshaper.verify.measure import Measurement
 UNKNOWN = "unknown"
 COLOURS = {"good": "green", "limited": "yellow", "absent": "red"}
 MOST_ROWS = 50
+MOST_SLOTS = 8
 SWEEP_FIGURES = {
     "mean_ns": "average",
     "max_ns": "maximum",
@@ -281,12 +282,17 @@ def stall_table(meter: StallMeterInfo, stalls: pl.DataFrame) -> ResultTable:
     return table
 
 
-def condition_table(names: Sequence[str], measurements: Sequence[Measurement]) -> ResultTable:
-    """How each recording was taken, a column for each: what makes its figures believable."""
+def condition_table(
+    names: Sequence[str], recordings: Sequence[Sequence[Measurement]]
+) -> ResultTable:
+    """How each recording was taken, a column for each: what makes its figures believable.
+
+    A recording has a measurement for each of its chains.
+    """
     rows: dict[str, list[str]] = {}
-    for one in measurements:
-        info, plan = one.recording.info, one.plan
-        in_force = "none" if plan is None else f"{plan.policy}, for {plan.chain.spec or 'a chain'}"
+    for one, *others in recordings:
+        info, plans = one.recording.info, [m.plan for m in (one, *others) if m.plan is not None]
+        in_force = "\n".join(f"{p.policy}, for {p.chain.spec or 'a chain'}" for p in plans)
         for title, cell in (
             ("folder", str(one.recording.path)),
             ("first cycle", _begun(one)),
@@ -301,7 +307,7 @@ def condition_table(names: Sequence[str], measurements: Sequence[Measurement]) -
             ("machine watched for stalls", _watched(info.stall_meter)),
             ("events", f"{event_counts(one.recording)['count'].sum():,}"),
             ("events lost", lost_text(info.lost).partition(": ")[2]),
-            ("plan in force", in_force),
+            ("plan in force", in_force or "none"),
         ):
             rows.setdefault(title, []).append(cell or UNKNOWN)
     table = ResultTable("", words("", *names))
@@ -432,7 +438,9 @@ def servers_table(state: RunState) -> ResultTable:
             drift = f"{'-' if state.drift_ns < 0 else '+'}{format_duration(abs(state.drift_ns))}"
             table.caption += f"; the chain begins {drift} from where it did"
     for server in state.servers:
-        slots = " ".join(map(slot_text, server.slots))
+        more = len(server.slots) - MOST_SLOTS  # of several chains, over the hyper-period
+        slots = " ".join(map(slot_text, server.slots[:MOST_SLOTS]))
+        slots += f" and {more} more" if more > 0 else ""
         cells = [server.name, str(server.core), str(server.priority), slots]
         cells += [listed(server.threads) or "none", server.kept_by]
         table.add(*cells, *_counted(server).values())

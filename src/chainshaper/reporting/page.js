@@ -3,7 +3,7 @@
 // never as markup. Times are ns; axes show ms or s.
 
 const SVG = "http://www.w3.org/2000/svg", NEAR = 24, tip = document.getElementById("tip");
-const { recordings, publishSlots, longest, range, bars } = JSON.parse(document.getElementById("data").text);
+const pages = JSON.parse(document.getElementById("data").text);
 
 const set = (node, attributes) => {
   for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
@@ -190,8 +190,8 @@ function chart(id, spec) {
   return { frame, reset, zoomBy };
 }
 
-function plotOverTime(openCycle) {
-  chart("over-time", {
+function plotOverTime({ recordings, publishSlots, longest, range, n }, openCycle) {
+  chart(`over-time${n}`, {
     height: 320, zoom: "xy",
     x: { range: [0, longest], label: "since the first cycle [s]", unit: 1e9 },
     y: { range, label: "latency [ms]", unit: 1e6 },
@@ -242,9 +242,8 @@ function joined({ width, bin, count }, [low, high]) {
 }
 
 /** One histogram per recording, one above the other, on the same axis of latency. */
-function plotHistogram() {
-  const rows = recordings.length;
-  chart("histogram", {
+function plotHistogram({ recordings, publishSlots, range, n }, rows = recordings.length) {
+  chart(`histogram${n}`, {
     height: 70 + 110 * rows, zoom: "x",
     x: { range, label: "latency [ms]", unit: 1e6 },
     y: { range: [0, rows], label: "cycles", bare: true },
@@ -263,8 +262,8 @@ function plotHistogram() {
   });
 }
 
-function plotDistribution() {
-  chart("cdf", {
+function plotDistribution({ recordings, publishSlots, range, n }) {
+  chart(`cdf${n}`, {
     height: 280, zoom: "x",
     x: { range, label: "latency [ms]", unit: 1e6 },
     y: { range: [0, 1.02], label: "share of cycles" },
@@ -308,8 +307,8 @@ const FILLS = [OTHER, OTHER, OTHER, "url(#hatched)", "var(--series-1)", "var(--b
  * What ran on which thread, which slots were open and where the machine stalled, around one cycle;
  * the chain's own way through it is drawn over everything else. What this returns opens a cycle.
  */
-function plotTimeline() {
-  const host = document.getElementById("timeline"), buttons = [...host.querySelectorAll("button")];
+function plotTimeline({ recordings, n: suffix }) {
+  const host = document.getElementById(`timeline${suffix}`), buttons = [...host.querySelectorAll("button")];
   const [select, number, about, body] = ["select", "input", ".about", "tbody"]
     .map((one) => host.querySelector(one));
   let timeline, cycle, drawn;
@@ -366,7 +365,7 @@ function plotTimeline() {
         publish === null ? null : publish - start]) make(row, "td", time === null ? "–" : ms(time));
       return row;
     }));
-    return drawn ? drawn.reset() : (drawn = chart("timeline", spec));
+    return drawn ? drawn.reset() : (drawn = chart(`timeline${suffix}`, spec));
   }
 
   function choose(which) {
@@ -393,8 +392,9 @@ function plotTimeline() {
   };
 }
 
-plotOverTime(plotTimeline());
-plotHistogram();
-plotDistribution();
-Object.entries(bars).forEach(([id, spec]) => plotRows(id, spec));
+for (const page of pages) {
+  plotOverTime(page, plotTimeline(page));
+  for (const plot of [plotHistogram, plotDistribution]) plot(page);
+  Object.entries(page.bars).forEach(([id, spec]) => plotRows(id, spec));
+}
 document.documentElement.dataset.drawn = "yes";

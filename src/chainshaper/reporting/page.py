@@ -33,6 +33,7 @@ from chainshaper.reporting.latency import (
     comparison_table,
     headline_table,
     incomplete_table,
+    overview_table,
     prediction_table,
 )
 from chainshaper.reporting.overviews import (
@@ -77,12 +78,15 @@ class _Part:
 
 
 def write_report(
-    measurements: Sequence[Measurement], path: str | Path, cycles: Sequence[int] = ()
+    measurements: Sequence[Measurement] | Sequence[Comparison],
+    path: str | Path,
+    cycles: Sequence[int] = (),
 ) -> Path:
     """Write the report of one chain in one or several recordings, whole or not at all.
 
-    ``cycles`` are numbers of cycles that the timeline has to show, should there be so many that it
-    cannot show all.
+    Of several chains of an application, give a comparison each, of the same recordings. ``cycles``
+    are numbers of cycles that the timeline has to show, should there be so many that it cannot show
+    all.
 
     Raises:
         InputError: the path exists already or is no HTML file, or there is no such cycle.
@@ -92,52 +96,86 @@ def write_report(
     return write_whole(path, [report_page(measurements, cycles).encode("utf-8")])
 
 
-def report_page(measurements: Sequence[Measurement], cycles: Sequence[int] = ()) -> str:
+def report_page(
+    measurements: Sequence[Measurement] | Sequence[Comparison], cycles: Sequence[int] = ()
+) -> str:
     """The report as the text of an HTML file."""
     if not measurements:
         raise InputError("a report needs a recording at least")
-    most = max(measurement.analysis.traversals.height for measurement in measurements)
+    chains = [one for one in measurements if isinstance(one, Comparison)]
+    if own := tuple(one for one in measurements if isinstance(one, Measurement)):
+        chains = [Comparison(own[0].analysis.chain.spec, own)]
+    every = [one for chain in chains for one in chain.measurements]
+    most = max(measurement.analysis.traversals.height for measurement in every)
     for cycle in cycles:
         if not 0 <= cycle < most:
             raise InputError(
                 f"there is no cycle {cycle}: the recordings have {most} at most, numbered from 0"
             )
+    shared, several = chains[0].measurements, len(chains) > 1
+    names = distinct_names([one.recording.path for one in shared])
+    recorded = {id(one.recording): one.recording for one in every}  # once, whatever its chains
+    flows = {key: data_flow(one.events, one.info.clock_offset_ns) for key, one in recorded.items()}
     parts = []
-    plans: dict[str, tuple[list[str], Plan]] = {}
-    names = distinct_names([measurement.recording.path for measurement in measurements])
-    for name, one in zip(names, measurements, strict=True):
-        flow = data_flow(one.recording.events, one.recording.info.clock_offset_ns)
-        timeline = timeline_of(one.recording, flow, one.analysis, one.plan)
-        parts.append(_Part(name, one, flow, timeline))
-        if one.plan is not None:  # equal plans stand once, under the names of their recordings
-            plans.setdefault(dump_plan(one.plan), ([], one.plan))[0].append(name)
-    of_users = {", ".join(users): plan for users, plan in plans.values()}
-    recordings = [_recording_data(part, cycles) for part in parts]
-    times = [time for one in recordings for time in one["points"]["time"][-1:]]
-    data = {
-        "recordings": recordings,
-        "publishSlots": list(dict.fromkeys(slot for one in recordings for slot in one["slots"])),
-        "longest": max([1, *times]),
-        "range": latency_range(recordings),
-        "bars": {"breakdown": _hop_bars(parts)}
-        | {f"slots-{number}": _slot_bars(plan) for number, plan in enumerate(of_users.values())},
-    }
+    for chain in chains:
+        named = zip(names, chain.measurements, strict=True)
+        parts.append([_part(name, one, flows[id(one.recording)]) for name, one in named])
+    drawn = [_drawn(of_one, cycles, number) for number, of_one in enumerate(parts)]
     folder = resources.files("chainshaper.reporting")
-    page, style, script = (
-        (folder / name).read_text("utf-8") for name in ("page.html", "page.css", "page.js")
+    page, of_chain, style, script = (
+        (folder / name).read_text("utf-8")
+        for name in ("page.html", "chain.html", "page.css", "page.js")
     )
+    blocks = []
+    for of_one, data in zip(parts, drawn, strict=True):
+        places = _tables(of_one, data["n"], several) | _beside_charts(of_one, data["recordings"])
+        blocks.append(Template(of_chain).substitute(places, n=data["n"]))
     digest = base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
-    embedded = json.dumps(_safe(data), ensure_ascii=True, separators=(",", ":"))
+    embedded = json.dumps(_safe(drawn), ensure_ascii=True, separators=(",", ":"))
+    about = f"{len(chains)} chains" if several else chains[0].chain
+    headline = overview_table(chains, names) if several else headline_table(names, shared)
+    left_out = [(name, one.left_out.text) for name, one in zip(names, shared, strict=True)]
     return Template(page).substitute(
-        _tables(parts, of_users),
-        **_beside_charts(parts, recordings),
-        title=escape(f"End-to-end latency of {measurements[0].analysis.chain.spec}"),
+        title=escape(f"End-to-end latency of {about}"),
+        headline=headline.html() + "".join(_paragraph(f"{n}: {t}.") for n, t in left_out if t),
+        chains=_lines(blocks),
+        conditions=_conditions(names, chains),
         style=style,
         # JSON in which nothing can end the block that it stands in.
         data=embedded.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"),
         script=script,
         digest=digest,
     )
+
+
+def _part(name: str, one: Measurement, flow: DataFlow) -> _Part:
+    return _Part(name, one, flow, timeline_of(one.recording, flow, one.analysis, one.plan))
+
+
+def _plans_of(parts: Sequence[_Part]) -> dict[str, Plan]:
+    """The plans that were in force, by the names of their recordings; equal ones stand once."""
+    plans: dict[str, tuple[list[str], Plan]] = {}
+    for name, one in ((part.name, part.measurement) for part in parts):
+        if one.plan is not None:
+            plans.setdefault(dump_plan(one.plan), ([], one.plan))[0].append(name)
+    return {", ".join(users): plan for users, plan in plans.values()}
+
+
+def _drawn(parts: Sequence[_Part], cycles: Sequence[int], number: int) -> dict[str, Any]:
+    """Everything that is drawn of a chain; ``n`` is what ids end in, nothing for the first."""
+    suffix = f"-{number + 1}" if number else ""
+    recordings = [_recording_data(part, cycles) for part in parts]
+    times = [time for one in recordings for time in one["points"]["time"][-1:]]
+    slots = enumerate(_plans_of(parts).values())
+    bars = {f"slots-{place}{suffix}": _slot_bars(plan) for place, plan in slots}
+    return {
+        "n": suffix,
+        "recordings": recordings,
+        "publishSlots": list(dict.fromkeys(slot for one in recordings for slot in one["slots"])),
+        "longest": max([1, *times]),
+        "range": latency_range(recordings),
+        "bars": {f"breakdown{suffix}": _hop_bars(parts), **bars},
+    }
 
 
 def _safe(value: Any) -> Any:
@@ -159,37 +197,52 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
     return [f"{path} ({number})" for number, path in enumerate(paths, start=1)]
 
 
-def _tables(parts: Sequence[_Part], plans: dict[str, Plan]) -> dict[str, str]:
-    """What the page's tables say, by the places that the template has for them."""
+def _tables(parts: Sequence[_Part], suffix: str, several: bool) -> dict[str, str]:
+    """What a chain's tables say, by the places that the template has for them.
+
+    Of ``several`` chains each has a heading, and the first has the callbacks of all.
+    """
     names = [one.name for one in parts]
     measurements = [one.measurement for one in parts]
     compared = Comparison(measurements[0].analysis.chain.spec, tuple(measurements))
-    left_out = [(one.name, one.measurement.left_out.text) for one in parts]
     incomplete = incomplete_table(names, measurements)
-    notes = [(one.name, dict.fromkeys(one.measurement.analysis.notes)) for one in parts]
-    items = "".join(f"<li>{escape(f'{name}: {note}')}</li>" for name, own in notes for note in own)
-    conditions = condition_table(names, measurements).html(), *map(_recorded_threads, parts)
+    heading = f"<h1>{escape(compared.chain)}</h1>\n{headline_table(names, measurements).html()}"
+    callbacks = f"<h2>Callbacks</h2>\n{_lines(map(_callbacks, parts))}"
     hops = (
         _paragraph(f"{one.name}, all complete cycles [ms]:")
         + breakdown_table(one.measurement.analysis).html()
         for one in parts
     )
     return {
-        "headline": headline_table(names, measurements).html()
-        + "".join(_paragraph(f"{name}: {text}.") for name, text in left_out if text),
+        "heading": heading if several else "",
+        "callbacks": "" if suffix else f'<section id="callbacks">\n{callbacks}\n</section>',
         "before_and_after": "Before and after" if len(parts) > 1 else "Figures",
         "comparison": comparison_table(compared, names).html(),
         "predictions": _lines(map(_prediction, parts)),
         "hops": _lines(hops),
-        "callbacks": _lines(map(_callbacks, parts)),
         "overruns": _lines(map(_overruns, parts)),
         "incomplete": incomplete.html()
         if incomplete.rows
         else _paragraph("Every cycle that began is complete."),
         "stalls": _lines(map(_stalls, parts)),
-        "plans": _lines(_plan(number, *one) for number, one in enumerate(plans.items())),
-        "conditions": _lines([*conditions, f'<ul class="notes">{items}</ul>']),
+        "plans": _lines(
+            _plan(f"{n}{suffix}", *one) for n, one in enumerate(_plans_of(parts).items())
+        ),
     }
+
+
+def _conditions(names: Sequence[str], chains: Sequence[Comparison]) -> str:
+    """How each recording was taken, and what is to be known about it and its chains."""
+    recordings = [*zip(*(chain.measurements for chain in chains), strict=True)]
+    notes = [
+        f"{name}: {note}"
+        for name, own in zip(names, recordings, strict=True)
+        for note in dict.fromkeys(note for one in own for note in one.analysis.notes)
+    ]
+    threads = (_recorded_threads(name, own[0]) for name, own in zip(names, recordings, strict=True))
+    items = "".join(f"<li>{escape(note)}</li>" for note in notes)
+    table = condition_table(names, recordings).html()
+    return _lines([table, *threads, f'<ul class="notes">{items}</ul>'])
 
 
 def _beside_charts(parts: Sequence[_Part], data: Sequence[dict[str, Any]]) -> dict[str, str]:
@@ -299,7 +352,7 @@ def _stalls(part: _Part) -> str:
     return _paragraph(about) + stall_table(meter, stalls).html()
 
 
-def _plan(number: int, users: str, plan: Plan) -> str:
+def _plan(number: str, users: str, plan: Plan) -> str:
     title = "The servers' slots over one cycle"
     return (
         f'<section id="plan-{number}">\n<h2>{escape(f"The plan of {users}")}</h2>\n'
@@ -313,10 +366,10 @@ def _plan(number: int, users: str, plan: Plan) -> str:
     )
 
 
-def _recorded_threads(part: _Part) -> str:
-    threads = part.measurement.recording.info.threads
+def _recorded_threads(name: str, measurement: Measurement) -> str:
+    threads = measurement.recording.info.threads
     table = recorded_thread_table(threads).html()
-    return _details(f"Threads of {part.name} ({len(threads)})", table) if threads else ""
+    return _details(f"Threads of {name} ({len(threads)})", table) if threads else ""
 
 
 def _paragraph(text: str) -> str:

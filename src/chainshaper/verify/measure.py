@@ -7,13 +7,13 @@ pre-emption, and waiting for another callback of the node that publishes for it 
 Over a complete traversal the two add up to the latency, so mean shares add up to one.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import polars as pl
 
-from chainshaper.analysis import LatencyAnalysis, analyse_latency
+from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
 from chainshaper.analysis.latency import summary
 from chainshaper.planning import ApplicationPlan, Plan
 from chainshaper.planning.application_plan import plan_in, plan_of_chain, whole
@@ -110,34 +110,52 @@ def measure_latency(
 
     ``plan`` is the plan in force, for recordings that do not know it themselves.
     """
-    if not isinstance(recording, Recording):
-        recording = open_source(recording)
-    joint = None if plan is None else whole(plan)
-    if joint is None and recording.info.plan is not None:
-        joint = plan_in(recording.info.plan)
+    return _measured(_opened(recording), (chain,), plan)[0]
+
+
+def _opened(recording: Recording | str | Path) -> Recording:
+    return recording if isinstance(recording, Recording) else open_source(recording)
+
+
+def _plan_of(recording: Recording, plan: Plan | ApplicationPlan | None) -> ApplicationPlan | None:
+    """The plan in force: the given one, or that of the recording."""
+    if plan is not None:
+        return whole(plan)
+    return None if recording.info.plan is None else plan_in(recording.info.plan)
+
+
+def _measured(
+    recording: Recording, chains: Sequence[str | None], plan: Plan | ApplicationPlan | None
+) -> list[Measurement]:
+    """The measurements of several chains in one recording, whose events are resolved once."""
+    joint, info = _plan_of(recording, plan), recording.info
+    due = [] if joint is None else [due for one in joint.chains for due in due_of(one)]
     spell, left_out = _in_force(recording)
-    analysis = analyse_latency(
-        recording,
-        chain_of(recording, chain),
-        due=() if joint is None else [due for one in joint.chains for due in due_of(one)],
-        between=spell,
-    )
-    own = None if joint is None else plan_of_chain(joint, analysis.chain.topics[-1])
+    flow = data_flow(recording.events, info.clock_offset_ns)
     if spell is not None:
         recording = replace(recording, events=events.happened(recording.events, *spell))
-    planned_for = own is not None and own.chain.output in (None, analysis.chain.topics[-1])
-    return Measurement(
-        recording=recording,
-        analysis=analysis,
-        longest_stall_ns=longest_stall(recording),
-        overruns=overruns_in(recording, own, analysis),
-        outcomes=outcomes_in(analysis, own),
-        into_open_slots=into_open_slots(recording, own),
-        dropped=dropped_in(recording),
-        plan=own,
-        held=hold_prediction(own, analysis) if own and planned_for else None,
-        left_out=left_out,
-    )
+    measurements = []
+    for chain in chains:
+        found = analyse_latency(flow, chain_of(recording, chain), due=due, between=spell)
+        analysis = replace(found, notes=(*info.notes, *found.notes))
+        output = analysis.chain.topics[-1]
+        own = None if joint is None else plan_of_chain(joint, output)
+        planned_for = own is not None and own.chain.output in (None, output)
+        measurements.append(
+            Measurement(
+                recording=recording,
+                analysis=analysis,
+                longest_stall_ns=longest_stall(recording),
+                overruns=overruns_in(recording, own, analysis),
+                outcomes=outcomes_in(analysis, own),
+                into_open_slots=into_open_slots(recording, own, analysis),
+                dropped=dropped_in(recording, own, analysis),
+                plan=own,
+                held=hold_prediction(own, analysis) if own and planned_for else None,
+                left_out=left_out,
+            )
+        )
+    return measurements
 
 
 def _in_force(recording: Recording) -> tuple[tuple[int, int | None] | None, LeftOut]:
@@ -165,21 +183,42 @@ def compare_recordings(
     chain: str | None = None,
     plan: Plan | ApplicationPlan | None = None,
 ) -> Comparison:
-    """Measure the same chain in several recordings.
+    """Measure the same chain, the first of several, in several recordings.
 
     ``plan`` was in force in the last of them, should that not say so itself.
 
     Raises:
         InputError: fewer than two recordings, or a chain that one of them does not have.
     """
-    if len(recordings) < 2:
+    return compare_chains(recordings, chain, plan)[0]
+
+
+def compare_chains(
+    recordings: Sequence[Recording | str | Path],
+    chain: str | None = None,
+    plan: Plan | ApplicationPlan | None = None,
+    *,
+    least: int = 2,
+    progress: Callable[[float, str], None] = lambda *_: None,
+) -> tuple[Comparison, ...]:
+    """Measure every chain of an application in ``least`` recordings or more.
+
+    They are the chains of the plan that was in force in the last of them, if it has several;
+    otherwise each recording's own. ``chain`` names one.
+
+    Raises: as :func:`compare_recordings`.
+    """
+    if len(recordings) < least:
         raise InputError("a comparison needs two recordings, such as `compare before after`")
-    *first, last = recordings
-    measurements = [
-        *(measure_latency(recording, chain) for recording in first),
-        measure_latency(last, chain, plan),
-    ]
-    return Comparison(measurements[0].analysis.chain.spec, tuple(measurements))
+    opened = [_opened(recording) for recording in recordings]
+    joint = _plan_of(opened[-1], plan)
+    chains = [] if joint is None or chain is not None else [one.chain.spec for one in joint.chains]
+    chains = chains if len(chains) > 1 else [chain]
+    columns = []
+    for number, recording in enumerate(opened, start=1):
+        progress((number - 1) / len(opened), f"analysing {recording.path}")
+        columns.append(_measured(recording, chains, plan if number == len(opened) else None))
+    return tuple(Comparison(own[0].analysis.chain.spec, own) for own in zip(*columns, strict=True))
 
 
 PARTS = ("communication", "computation")

@@ -7,21 +7,26 @@ A gate records its decision for every message. The thread of an asynchronous pub
 nothing; there the messages that were never sent count as discarded, and those that were sent in a
 later cycle than due as having waited.
 
+Where several chains are shaped, a chain's figures are those of its own gates. Each gate is a
+process; what processes of other nodes recorded does not count.
+
 Whatever the policy, an overrun is to be late by itself: the **next cycle** was hit where its output
 missed its slot too, or did not come, whatever the cause.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import polars as pl
 
 from chainshaper.analysis import LatencyAnalysis
 from chainshaper.analysis.messages import with_overrun
+from chainshaper.analysis.objects import named_nodes
 from chainshaper.gate.decision import DROPPED
 from chainshaper.planning import Plan
 from chainshaper.planning.overruns import cycles_until_output
-from chainshaper.planning.plan import publish_slots, publisher_servers
+from chainshaper.planning.plan import publish_slots, publisher_servers, shaping_nodes
+from chainshaper.splicing.shaping_process import STANDBY
 from chainshaper.values import events
 from chainshaper.values.recording import Recording
 
@@ -37,10 +42,31 @@ _WITHOUT_NODE = {
 }
 
 
-def gate_releases(recording: Recording, plan: Plan | None) -> pl.DataFrame:
-    """The table `gate_release` with ``overrun``, which older recordings lack."""
-    due = 0 if plan is None else cycles_until_output(plan)
-    return with_overrun(events.table(recording.events, "gate_release"), due)
+def gate_releases(
+    recording: Recording, plan: Plan | None, analysis: LatencyAnalysis | None = None
+) -> pl.DataFrame | None:
+    """The table `gate_release` with ``overrun``, which older recordings lack; None: there is none.
+
+    Of a plan it has the rows of its shaping nodes and their standbys; with ``analysis`` only those
+    of shaping nodes on that chain, not those of the plan's other sinks.
+    """
+    if "gate_release" not in recording.events:
+        return None
+    table = events.table(recording.events, "gate_release", ["dropped", "lost"])
+    table = with_overrun(table, 0 if plan is None else cycles_until_output(plan))
+    if plan is None:
+        return table
+    nodes = [n for n in shaping_nodes(plan) if not analysis or n.output in analysis.chain.topics]
+    gates = [f"{one.thread.node}{ending}" for one in nodes for ending in ("", STANDBY)]
+    return _of_nodes(recording, table, gates) if gates else None
+
+
+def _of_nodes(recording: Recording, table: pl.DataFrame, own: Collection[str]) -> pl.DataFrame:
+    """The rows of a table but those of processes of which it is known that they run other nodes."""
+    nodes = named_nodes(recording.events)
+    ours = nodes.filter(pl.col("node").is_in(own))
+    others = nodes.join(ours, on="pid", how="anti")
+    return table.join(others, on="pid", how="anti", maintain_order="left")
 
 
 def overruns_in(
@@ -53,12 +79,15 @@ def overruns_in(
     waited cannot be counted.
     """
     gated = plan is not None and any(publisher_servers(plan))
-    if "gate_release" not in recording.events and not gated:
+    decided = gate_releases(recording, plan, analysis)
+    if decided is None and not gated:
         return None
-    treated = gate_releases(recording, plan)["overrun"].drop_nulls()
+    treated = pl.Series(dtype=pl.String) if decided is None else decided["overrun"].drop_nulls()
     counts = {policy: int((treated == policy).sum()) for policy in (*_DONE, *_WITHOUT_NODE)}
     if gated and plan is not None:
-        outcomes = events.table(recording.events, "asynchronous_send")["outcome"]
+        publishers = [node for *_, nodes in publisher_servers(plan) for node in nodes]
+        sends = events.table(recording.events, "asynchronous_send")
+        outcomes = _of_nodes(recording, sends, publishers)["outcome"]
         counts["discard"] += int((outcomes != "sent").sum())
         if analysis is not None:
             due_until = (cycles_until_output(plan) + 1) * plan.cycle_ns
@@ -119,26 +148,31 @@ def next_cycles(outcomes: Mapping[str, Outcome]) -> str:
     return f"{hit} of {sum(one.followed for one in outcomes.values())}"
 
 
-def into_open_slots(recording: Recording, plan: Plan | None) -> int | None:
+def into_open_slots(
+    recording: Recording, plan: Plan | None, analysis: LatencyAnalysis | None = None
+) -> int | None:
     """How many outputs came into their slot when it was open already; None: no gate decided.
 
     They took longer than the plan's L̄ + ε, and make up the jitter that a wide slot lets through.
     """
-    if "gate_release" not in recording.events:
+    decided = gate_releases(recording, plan, analysis)
+    if decided is None:
         return None
-    table = gate_releases(recording, plan).filter(pl.col("overrun").is_null())
+    table = decided.filter(pl.col("overrun").is_null())
     return int((table["release"] == table["arrival"]).sum())
 
 
-def dropped_in(recording: Recording) -> dict[str, int] | None:
+def dropped_in(
+    recording: Recording, plan: Plan | None = None, analysis: LatencyAnalysis | None = None
+) -> dict[str, int] | None:
     """How many messages gates received and did not let out, per reason, and how many DDS lost
     before they reached one, where its numbers say so; None: no gate decided.
 
     The reasons are those of ``dropped`` in :mod:`chainshaper.values.events`.
     """
-    if "gate_release" not in recording.events:
+    table = gate_releases(recording, plan, analysis)
+    if table is None:
         return None
-    table = events.table(recording.events, "gate_release", ["dropped", "lost", "overrun"])
     discarded = pl.col("release").is_null() & (pl.col("overrun") == "discard")
     reason = pl.coalesce("dropped", pl.when(discarded).then(pl.lit("discarded")))
     reasons = table.select(reason).to_series()

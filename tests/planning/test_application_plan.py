@@ -1,0 +1,205 @@
+"""Plans of several chains: the file, the rules, and servers played out against brute force."""
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from chainshaper import load_application_plan, save_application_plan, save_plan
+from chainshaper.planning.application_plan import (
+    ApplicationPlan,
+    combined,
+    dump_application_plan,
+    plan_in,
+    plan_of_chain,
+    plan_values,
+    whole,
+)
+from chainshaper.planning.plan import (
+    ChainOfPlan,
+    Evidence,
+    Margin,
+    Plan,
+    Prediction,
+    Server,
+    Slot,
+    Thread,
+)
+from chainshaper.values.errors import InputError
+
+MS = 1_000_000
+
+
+def _server(
+    name: str, slots: list[Slot], threads: str = "", core: int = 1, priority: int = 2
+) -> Server:
+    in_ns = tuple((start * MS, end * MS) for start, end in slots)
+    own = tuple(Thread(node=f"/{thread}") for thread in threads.split())
+    return Server(name=name, core=core, priority=priority, slots=in_ns, threads=own)
+
+
+def _chain(name: str, cycle: int, offset: int, *servers: Server) -> Plan:
+    """A chain's plan; times in ms."""
+    return Plan(
+        chain=ChainOfPlan(spec=f"/{name}..", output=f"/{name}", period_ns=cycle * MS),
+        evidence=Evidence(samples=1, min_latency_ns=0, mean_latency_ns=1, max_latency_ns=1),
+        margin=Margin(epsilon_ns=0),
+        policy="server-per-chain",
+        cycle_ns=cycle * MS,
+        offset_ns=offset * MS,
+        servers=servers,
+        predicted=Prediction(mean_ns=1, max_ns=1, jitter_ns=0),
+    )
+
+
+def test_slots_are_played_out_over_the_hyper_period() -> None:
+    """By hand: cycles of 4 and 6 ms repeat after 12; b begins 5 ms late, so it ends in the next."""
+    a = _chain("a", 4, 0, _server("a", [(0, 1)], "x"))
+    b = _chain("b", 6, 5, _server("b", [(0, 2)], "y", core=2))
+    both = combined([a, b])
+    assert both.cycle_ns == 12 * MS
+    one, two = both.servers
+    assert one.slots == _server("by hand", [(0, 1), (4, 5), (8, 9)]).slots
+    assert two.slots == _server("by hand", [(0, 1), (5, 7), (11, 12)]).slots
+    assert whole(a).servers == a.servers
+
+
+def test_a_thread_of_several_chains_runs_in_the_slots_of_all() -> None:
+    """By hand: x runs at 0–1, 4–5, 8–9 for a, and at 1–2, 7–8 for b; what touches is one slot."""
+    a = _chain("a", 4, 0, _server("a", [(0, 1)], "x"))
+    b = _chain("b", 6, 1, _server("b", [(0, 1)], "x y"))
+    shared, own = combined([a, b]).servers
+    assert (shared.name, [thread.node for thread in shared.threads]) == ("a+b", ["/x"])
+    assert shared.slots == _server("by hand", [(0, 2), (4, 5), (7, 9)]).slots
+    assert (own.name, [thread.node for thread in own.threads]) == ("b", ["/y"])
+    assert own.slots == _server("by hand", [(1, 2), (7, 8)]).slots
+
+
+_SLOTS = st.lists(st.integers(0, 5), min_size=2, max_size=4, unique=True).map(sorted)
+
+
+@st.composite
+def _chains(draw: st.DrawFn) -> list[Plan]:
+    found = []
+    for number in range(draw(st.integers(1, 3))):
+        cycle = draw(st.sampled_from([6, 8, 9, 12]))
+        bounds = draw(_SLOTS)
+        slots = list(zip(bounds[::2], bounds[1::2], strict=False))
+        core, priority = draw(st.sampled_from([(0, 1), (1, 1), (1, 2)]))
+        server = _server(f"s{number}", slots, f"n{number}", core, priority)
+        found.append(_chain(f"c{number}", cycle, draw(st.integers(0, 11)), server))
+    return found
+
+
+def _marked(chain: Plan, hyper_period: int) -> Iterator[int]:
+    """Every millisecond of the hyper-period in which the chain's server is open, by looking."""
+    (server,) = chain.servers
+    for instant in range(hyper_period):
+        place = (instant * MS - chain.offset_ns) % chain.cycle_ns
+        if any(start <= place < end for start, end in server.slots):
+            yield instant
+
+
+@settings(max_examples=300, deadline=None)
+@given(_chains())
+def test_slots_and_collisions_are_those_of_a_timeline(chains: list[Plan]) -> None:
+    hyper_period = math.lcm(*(chain.cycle_ns // MS for chain in chains))
+    open_at = [set(_marked(chain, hyper_period)) for chain in chains]
+    where = [(chain.servers[0].core, chain.servers[0].priority) for chain in chains]
+    collide = any(
+        where[j] == where[k] and open_at[j] & open_at[k]
+        for k in range(len(chains))
+        for j in range(k)
+    )
+    if collide:
+        with pytest.raises(InputError, match=r"meets .* of server '.*' of /c\d\.\. in some cycles"):
+            combined(chains)
+        return
+    for server, expected in zip(combined(chains).servers, open_at, strict=True):
+        found = [n for a, b in server.slots for n in range(a // MS, b // MS)]
+        assert found == sorted(expected)
+
+
+@pytest.fixture
+def three() -> ApplicationPlan:
+    """Two branches of a graph that share a server, and a chain of 50 ms that takes turns."""
+    running = _server("chain", [(0, 20)], "first second")
+    branches = [
+        _chain(name, 100, 0, running, _server(f"out_{name}", [slot], f"gate_{name}", priority=1))
+        for name, slot in (("a", (20, 21)), ("b", (21, 22)))
+    ]
+    return combined([*branches, _chain("c", 50, 20, _server("chain_2", [(0, 10)], "third"))])
+
+
+def test_a_plan_is_written_with_each_server_once_and_read_again(
+    three: ApplicationPlan, tmp_path: Path
+) -> None:
+    path = tmp_path / "plan.yaml"
+    save_application_plan(three, path)
+    text = path.read_text()
+    assert text.count("name: chain\n") == 1
+    assert "servers:\n  - chain\n" in text
+    assert load_application_plan(path) == three
+    assert plan_in(plan_values(three)) == three
+    assert [one.name for one in three.servers] == ["chain", "out_a", "out_b", "chain_2"]
+    assert plan_of_chain(three, "/b") == three.chains[1]
+    assert plan_of_chain(three, "/nowhere") is None
+
+
+def test_plans_of_one_chain_are_read_and_written_as_ever(
+    three: ApplicationPlan, tmp_path: Path
+) -> None:
+    chain, path = three.chains[2], tmp_path / "plan.yaml"
+    save_plan(chain, path)
+    assert "format: 1" in path.read_text()
+    assert load_application_plan(path) == whole(chain)
+    assert dump_application_plan(whole(chain)) == path.read_text()
+    assert plan_in(chain.model_dump(mode="json")) == whole(chain)
+    assert plan_values(whole(chain)) == chain.model_dump(mode="json")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        ("  - chain\n", "  - chian\n", "no chain before this one has a server 'chian'"),
+        ("output: /b", "output: /a", "/a is the output of an earlier chain too"),
+        ("name: out_b", "name: out_a", "an earlier chain has another server 'out_a': rename one"),
+        ("offset: 20ms", "offset: 15ms", "'chain_2' meets [0ms, 20ms) of server 'chain' of /a.."),
+        # 100 and 50 ms meet modulo 50: where c begins 65 ms late it runs 15 ms late as well.
+        ("offset: 20ms", "offset: 65ms", "'chain_2' meets [0ms, 20ms) of server 'chain' of /a.."),
+        ("offset: 20ms", "ofset: 20ms", "offset"),
+        ("  - chain\n", "  - {name: chain}\n", "slots"),
+    ],
+)
+def test_what_was_edited_wrongly_is_named_with_its_line(
+    old: str, new: str, reason: str, three: ApplicationPlan, tmp_path: Path
+) -> None:
+    path, text = tmp_path / "plan.yaml", dump_application_plan(three)
+    assert old in text
+    path.write_text(text.replace(old, new))
+    lines = enumerate(path.read_text().splitlines(), start=1)
+    number = max(number for number, line in lines if new.strip() in line)
+    with pytest.raises(InputError) as refused:
+        load_application_plan(path)
+    assert str(refused.value).startswith(f"{path}:{number}: ")
+    assert reason in str(refused.value)
+
+
+def test_what_makes_no_plan_together_is_refused() -> None:
+    shared = _chain("a", 10, 0, _server("s", [(0, 1)], "x"))
+    with pytest.raises(InputError, match="cycles have another length or offset"):
+        combined([shared, _chain("b", 10, 1, *shared.servers)])
+    elsewhere = _chain("b", 10, 0, _server("t", [(0, 1)], "x", core=2))
+    with pytest.raises(InputError, match="of /x would run on core 2 here and on core 1"):
+        combined([shared, elsewhere])
+    # 997, 1009 and 1013 ms have no common divisor: together they repeat after eleven days.
+    apart = [
+        _chain(name, cycle, 0, _server(name, [(0, 1)], name, core=core))
+        for core, (name, cycle) in enumerate((("a", 997), ("b", 1009), ("c", 1013)))
+    ]
+    with pytest.raises(InputError, match=r"repeat together after .* 10000 is the most"):
+        combined(apart)
+    assert len(combined(apart[:2]).servers[0].slots) == 1009
