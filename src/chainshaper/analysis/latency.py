@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +14,7 @@ from chainshaper.analysis.flow import DataFlow, data_flow
 from chainshaper.analysis.graph import graph_of
 from chainshaper.analysis.traversals import reception, traverse
 from chainshaper.values import events
-from chainshaper.values.application import ApplicationGraph, Chain
+from chainshaper.values.application import ApplicationGraph, Chain, trigger_text
 from chainshaper.values.recording import Recording
 
 PERCENTILES: tuple[float, ...] = (0.5, 1, 5, 25, 50, 75, 95, 99, 99.5)
@@ -97,6 +98,46 @@ def callback_statistics(flow: DataFlow) -> pl.DataFrame:
             *("tids", "count", "unfinished", "response_ns", "execution_ns"),
         )
     )
+
+
+class Executor(NamedTuple):
+    """The threads of a process that run the same callbacks.
+
+    ``callbacks`` are these by id, ``nodes`` theirs, ``names`` the timers and subscriptions among
+    them: node, and :func:`~chainshaper.values.application.trigger_text`.
+    """
+
+    pid: int
+    tids: frozenset[int]
+    callbacks: frozenset[int]
+    nodes: tuple[str, ...]
+    names: tuple[tuple[str, str], ...]
+
+
+def executors(flow: DataFlow) -> list[Executor]:
+    """Which callbacks have an executor of their own (paper, section 6): they share no thread.
+
+    Callbacks that one thread was seen to run are one executor's, and so are those that several
+    threads take turns with.
+    """
+    found: list[Executor] = []
+    columns = ("callback_id", "node", "kind", "topic", "period_ns", "pid", "tids")
+    for row in callback_statistics(flow).drop_nulls("node").select(*columns).iter_rows():
+        number, node, kind, topic, period_ns, pid, tids = row
+        trigger = trigger_text(topic, period_ns) if kind in ("timer", "subscription") else ""
+        names = ((node, trigger),) if trigger else ()
+        own = Executor(pid, frozenset(tids), frozenset((number,)), (node,), names)
+        for one in [one for one in found if one.pid == pid and one.tids & own.tids]:
+            found.remove(one)
+            own = Executor(
+                pid,
+                one.tids | own.tids,
+                one.callbacks | own.callbacks,
+                tuple(dict.fromkeys(one.nodes + own.nodes)),
+                tuple(dict.fromkeys(one.names + own.names)),
+            )
+        found.append(own)
+    return found
 
 
 @dataclass(frozen=True)

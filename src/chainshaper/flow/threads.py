@@ -8,11 +8,11 @@ Which nodes a process has, its creation events say; which threads execute, the c
 
 import platform
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, cast, get_args
 
 from chainshaper.enforcement import threads as allocation
 from chainshaper.enforcement.back_ends import choose_back_end
@@ -41,8 +41,6 @@ if TYPE_CHECKING:
 
 LEAD_NS = 2_000_000
 """The cycle starts so long after the chain's timer expires (DESIGN section 6)."""
-
-_KNOWN_ROLES = ("executor", "publisher", "dds")
 
 
 def find_threads(
@@ -123,7 +121,7 @@ def recorded_processes(
     """The processes of a recording, and why it says nothing about this machine, if that is so."""
     import polars as pl  # only who has a recording pays for this
 
-    from chainshaper.analysis import callback_statistics, data_flow
+    from chainshaper.analysis import data_flow, executors
     from chainshaper.values import events
 
     info, tables = recording.info, recording.events
@@ -145,17 +143,20 @@ def recorded_processes(
     for pid, node in created.unique(maintain_order=True).iter_rows():
         nodes.setdefault(pid, []).append(node)
     threads = defaultdict[int, dict[int, RecordedThread]](dict)
+    comms = {(one.pid, one.tid): one.comm for one in info.threads}
     for one in info.threads:
-        if one.role in _KNOWN_ROLES:
-            own = (one.node,) if one.node else ()
-            role = cast(ThreadRole, one.role)
-            threads[one.pid][one.tid] = RecordedThread(one.tid, role, own)
-            nodes.setdefault(one.pid, list(own))
-    ran = callback_statistics(data_flow(tables, info.clock_offset_ns)).drop_nulls("node")
-    executors = ran.explode("tids").group_by("pid", "tids", maintain_order=True)
-    of_thread = executors.agg(pl.col("node").unique(maintain_order=True))
-    for pid, tid, own in of_thread.iter_rows():
-        threads[pid][tid] = RecordedThread(tid, "executor", tuple(own))
+        own = (one.node,) if one.node else ()
+        role = cast(ThreadRole, one.role if one.role in get_args(ThreadRole) else "unknown")
+        threads[one.pid][one.tid] = RecordedThread(one.tid, role, own, one.comm)
+        nodes.setdefault(one.pid, list(own))
+    ran = executors(data_flow(tables, info.clock_offset_ns))
+    several = Counter(one.pid for one in ran)
+    for executor in ran:
+        apart = executor.names if several[executor.pid] > 1 else ()
+        for tid in executor.tids:
+            comm = comms.get((executor.pid, tid), "")
+            known = RecordedThread(tid, "executor", executor.nodes, comm, apart)
+            threads[executor.pid][tid] = known
     found = (
         RecordedProcess(pid, tuple(own), tuple(threads[pid].values()), last_seen[pid])
         for pid, own in nodes.items()
@@ -239,9 +240,9 @@ def first_threads(plan: ApplicationPlan, found: Allocation) -> list[Thread]:
 
     Raises OperationError: no server of a chain holds an executor, or see :func:`.server_members`.
     """
-    members = allocation.server_members(plan, found)
+    allocation.server_members(plan, found)  # none is in two servers
     of_thread = {
-        planned: [one.thread for one in members[server.name] if planned.node in one.nodes]
+        planned: [one.thread for one in allocation.threads_for(planned, found)]
         for server in plan.servers
         for planned in server.threads
     }

@@ -39,6 +39,7 @@ from chainshaper.planning.shaping import (
     plan_shaping,
     server_per_callback,
     server_per_chain,
+    with_executors,
     with_first_node_apart,
     with_sink,
 )
@@ -61,11 +62,13 @@ class Profile:
     ``every_latency_ns`` those of all (None: all were undisturbed), both in the order of time.
     ``nodes`` are those of the chain's callbacks, one per callback, ``topics`` what each of these
     publishes for the chain. ``core_of`` names the core of every node whose executor takes part,
-    also on branches that the chain waits for. ``begins`` is the first callback's number in the
-    graph, and its name, ``upstream`` the topics that the output waits for: on the chain, on those
-    branches, and before the chain begins. ``receivers`` are the nodes that subscribe to the chain's
-    output and are none of these. ``callbacks`` are those of the chain and its branches, see
-    :func:`~chainshaper.planning.shaping.server_per_callback`. ``output_depth`` is the history of
+    also on branches that the chain waits for; where a node has several that run different
+    callbacks, ``executors`` are those that take part, each by its callbacks. ``begins`` is the
+    first callback's number in the graph, and its name, ``upstream`` the topics that the output
+    waits for: on the chain, on those branches, and before the chain begins. ``receivers`` are the
+    nodes that subscribe to the chain's output and are none of these. ``callbacks`` are those of the
+    chain and its branches, see :func:`~chainshaper.planning.shaping.server_per_callback`.
+    ``output_depth`` is the history of
     the output's writer. The rest is :class:`~chainshaper.planning.plan.Evidence`.
     """
 
@@ -78,6 +81,7 @@ class Profile:
     begins: tuple[int, str] | None = None
     upstream: frozenset[str] = frozenset()
     core_of: Mapping[str, int] = field(default_factory=dict)
+    executors: Mapping[str, tuple[tuple[str, ...], ...]] = field(default_factory=dict)
     receivers: tuple[str, ...] = ()
     callbacks: tuple[CallbackTimes, ...] = ()
     fifo_priority: int = 84
@@ -169,7 +173,11 @@ def plan_chain(
             f"--fallback {request.fallback} is for an output with a shaping node, and the plan has"
             " none: leave it out, or plan with synchronous publication"
         )
-    return revised(plan, modes=request.modes)
+    executors: dict[str, tuple[tuple[str, ...], ...]] = {}
+    for one in (profile, *sinks):
+        for node, own in one.executors.items():
+            executors[node] = tuple(dict.fromkeys((*executors.get(node, ()), *own)))
+    return with_executors(revised(plan, modes=request.modes), executors)
 
 
 def band_choice(plan: Plan, profile: Profile, request: PlanRequest) -> BandChoice:

@@ -248,6 +248,27 @@ def _chain_and_others(plan: Plan) -> tuple[Server, list[Server]]:
     return found, [server for server in plan.servers if server is not found]
 
 
+def with_executors(plan: Plan, executors: Mapping[str, Sequence[tuple[str, ...]]]) -> Plan:
+    """The plan with those executors of nodes in its servers that run the given callbacks.
+
+    Of a node whose callback groups have executors of their own, the others run on (section 6).
+    """
+
+    def of_callbacks(thread: Thread) -> list[Thread]:
+        if thread.role == "publisher" or thread.node not in executors:
+            return [thread]
+        return [Thread(node=thread.node, callbacks=own) for own in executors[thread.node]]
+
+    def of_server(server: Server) -> Server:
+        found = tuple(one for thread in server.threads for one in of_callbacks(thread))
+        return server.model_copy(update={"threads": found})
+
+    if not executors:
+        return plan
+    with wrong_values_refused(Plan):
+        return revised(plan, servers=tuple(map(of_server, plan.servers)))
+
+
 def with_sink(
     plan: Plan,
     latencies_ns: NDArray[np.int64],
