@@ -103,14 +103,14 @@ def callback_statistics(flow: DataFlow) -> pl.DataFrame:
 class Executor(NamedTuple):
     """The threads of a process that run the same callbacks.
 
-    ``callbacks`` are these by id, ``nodes`` theirs, ``names`` the timers and subscriptions among
-    them: node, and :func:`~chainshaper.values.application.trigger_text`.
+    ``threads`` are their ids, each with the nodes it ran callbacks of, ``callbacks`` these by id,
+    ``names`` the timers and subscriptions among them: node, and
+    :func:`~chainshaper.values.application.trigger_text`.
     """
 
     pid: int
-    tids: frozenset[int]
+    threads: dict[int, tuple[str, ...]]
     callbacks: frozenset[int]
-    nodes: tuple[str, ...]
     names: tuple[tuple[str, str], ...]
 
 
@@ -124,19 +124,16 @@ def executors(flow: DataFlow) -> list[Executor]:
     columns = ("callback_id", "node", "kind", "topic", "period_ns", "pid", "tids")
     for row in callback_statistics(flow).drop_nulls("node").select(*columns).iter_rows():
         number, node, kind, topic, period_ns, pid, tids = row
-        trigger = trigger_text(topic, period_ns) if kind in ("timer", "subscription") else ""
-        names = ((node, trigger),) if trigger else ()
-        own = Executor(pid, frozenset(tids), frozenset((number,)), (node,), names)
-        for one in [one for one in found if one.pid == pid and one.tids & own.tids]:
+        threads: dict[int, tuple[str, ...]] = dict.fromkeys(tids, (node,))
+        callbacks, names = frozenset((number,)), tuple[tuple[str, str], ...]()
+        if kind in ("timer", "subscription"):
+            names = ((node, trigger_text(topic, period_ns)),)
+        for one in [one for one in found if one.pid == pid and one.threads.keys() & threads]:
             found.remove(one)
-            own = Executor(
-                pid,
-                one.tids | own.tids,
-                one.callbacks | own.callbacks,
-                tuple(dict.fromkeys(one.nodes + own.nodes)),
-                tuple(dict.fromkeys(one.names + own.names)),
-            )
-        found.append(own)
+            for tid, nodes in one.threads.items():
+                threads[tid] = tuple(dict.fromkeys((*nodes, *threads.get(tid, ()))))
+            callbacks, names = callbacks | one.callbacks, tuple(dict.fromkeys(one.names + names))
+        found.append(Executor(pid, threads, callbacks, names))
     return found
 
 

@@ -361,10 +361,16 @@ def threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThre
             "a recording of it" + (f"; {allocation.strangers}" if allocation.strangers else "")
         )
     if not found:
-        what = "asynchronous publisher" if planned.role == "publisher" else planned.role
+        what, remedy = str(planned.role), ""
+        if planned.role == "publisher":
+            what = "asynchronous publisher"
+            remedy = (
+                "; Fast DDS has one where RMW_FASTRTPS_PUBLICATION_MODE is ASYNCHRONOUS, Cyclone "
+                "DDS has none: plan with --publication synchronous"
+            )
         raise OperationError(
             f"process {pids[0]} of node {planned.node} has no thread that is known to be its "
-            f"{what}: see `chainshaper threads {pids[0]}`"
+            f"{what}: see `chainshaper threads {pids[0]}`{remedy}"
         )
     if not planned.callbacks:
         return found

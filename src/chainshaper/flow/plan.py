@@ -108,6 +108,7 @@ def _profile_of(
         utilisation=_utilisation(flow, graph, core_of, running),
         longest_send_ns=_longest_send(flow),
         lost_events=sum(recording.info.lost.values()) or None,
+        asynchronous=_publishes_asynchronously(recording, stages[-1].node),
         output_depth=_output_depth(flow, stages[-1].node, chain.topics[-1]),
         all_disturbed=all_disturbed or None,
     )
@@ -318,7 +319,7 @@ def _executors(
 
     Of several in a process that which runs the chain is meant.
     """
-    ours = {(one.pid, tid) for one in running for tid in one.tids}
+    ours = {(one.pid, tid) for one in running for tid in one.threads}
     threads = sorted(recording.info.threads, key=lambda one: (one.pid, one.tid) in ours)
     by_pid = {thread.pid: thread for thread in threads if thread.role == "executor"}
     found = {node.name: by_pid[node.pid] for node in graph.nodes if node.pid in by_pid}
@@ -343,6 +344,14 @@ def _longest_send(flow: DataFlow) -> int | None:
     )
     calm = sends.filter(~pl.Series(overlapping(began, ended, stalled, over)))
     return int((calm if calm.height else sends)["duration"].max())  # type: ignore[arg-type]
+
+
+def _publishes_asynchronously(recording: Recording, node: str) -> bool | None:
+    """Whether a node's process has a publisher's thread; None where DDS threads have no names."""
+    threads = recording.info.threads
+    pids = {thread.pid for thread in threads if thread.node == node}
+    roles = {thread.role for thread in threads if thread.pid in pids}
+    return "publisher" in roles if "dds" in roles else None
 
 
 def _output_depth(flow: DataFlow, node: str, topic: str) -> int | None:

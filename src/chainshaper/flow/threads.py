@@ -31,7 +31,8 @@ from chainshaper.linux.scheduling import available_cores
 from chainshaper.linux.threads import Thread, ThreadRole
 from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
 from chainshaper.planning.offsets import chain_name
-from chainshaper.planning.plan import Plan, Server
+from chainshaper.planning.overruns import Writer, check_publication
+from chainshaper.planning.plan import Plan, Server, publisher_servers
 from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.values.errors import InputError, OperationError
 
@@ -153,16 +154,61 @@ def recorded_processes(
     several = Counter(one.pid for one in ran)
     for executor in ran:
         apart = executor.names if several[executor.pid] > 1 else ()
-        for tid in executor.tids:
+        for tid, ran_of in executor.threads.items():
             comm = comms.get((executor.pid, tid), "")
-            known = RecordedThread(tid, "executor", executor.nodes, comm, apart)
-            threads[executor.pid][tid] = known
+            threads[executor.pid][tid] = RecordedThread(tid, "executor", ran_of, comm, apart)
     found = (
         RecordedProcess(pid, tuple(own), tuple(threads[pid].values()), last_seen[pid])
         for pid, own in nodes.items()
         if pid in last_seen
     )
     return tuple(found), ()
+
+
+def check_publishers(
+    plan: ApplicationPlan, found: Allocation, recording: "Recording | None" = None
+) -> list[str]:
+    """Look whether processes publish as a plan that gates publishers' threads asks (design 1).
+
+    What a plan shows by itself was checked when it was read, and that the threads are there by
+    :func:`.server_members`. A recording knows the writers, the environment of a process how Fast
+    DDS is to publish. Returns what a person must know, one sentence each.
+
+    Raises InputError: as :func:`.check_publication`.
+    """
+    gating = [chain for chain in plan.chains if any(publisher_servers(chain))]
+    if not gating or recording is None:
+        return []
+    process = {node: one.thread.pid for one in found.threads for node in one.nodes}
+    writers = [
+        Writer(one.node, one.topic, one.depth, _asynchronous(process[one.node]), process[one.node])
+        for one in recording.info.endpoints
+        if one.kind == "publisher" and one.node in process
+    ]
+    known = {writer.node for writer in writers}
+    return [
+        said
+        for chain in gating
+        if chain.chain.publisher in known
+        for said in check_publication(chain, writers)
+    ]
+
+
+def _asynchronous(pid: int) -> bool | None:
+    """Whether all writers of a process publish asynchronously, as rmw_fastrtps has been asked to.
+
+    None: each as a file of profiles says (`AUTO`), or as it is by default.
+    """
+    from chainshaper.sources.ros import environment_of  # only who gates publishers pays for this
+
+    try:
+        asked = environment_of(pid).variables
+    except OperationError:
+        return None
+    if asked.get("RMW_FASTRTPS_USE_QOS_FROM_XML") == "1":
+        return None
+    modes = {"ASYNCHRONOUS": True, "SYNCHRONOUS": False}
+    return modes.get(asked.get("RMW_FASTRTPS_PUBLICATION_MODE", ""))
 
 
 @dataclass(frozen=True)

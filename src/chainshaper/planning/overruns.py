@@ -108,13 +108,14 @@ def open_until_done(plan: Plan) -> Plan:
 @dataclass(frozen=True)
 class Writer:
     """A writer of an application: node, topic, history (keep last), and whether a publisher thread
-    sends for it. None is: not known.
+    sends for it. None is: not known. Those of one ``process`` have one such thread.
     """
 
     node: str
     topic: str
     depth: int | None = None
     asynchronous: bool | None = None
+    process: int | None = None
 
 
 def check_publication(plan: Plan, writers: Sequence[Writer]) -> list[str]:
@@ -131,12 +132,23 @@ def check_publication(plan: Plan, writers: Sequence[Writer]) -> list[str]:
             own = {writer.topic: writer for writer in writers if writer.node == node}
             if node == plan.chain.publisher and output is not None:
                 _check_output(output, node, own.get(output), messages_waiting(plan, server))
-            delayed = sorted(t for t, writer in own.items() if writer.asynchronous and t != output)
-            if delayed:
+            processes = {writer.process for writer in own.values()} - {None}
+            others = [
+                writer
+                for writer in writers
+                if writer.node == node or writer.process in processes
+                if writer.asynchronous is not False
+                and (writer.node, writer.topic) != (node, output)
+            ]
+            if others:
+                delayed = {
+                    f"{o.topic}{'' if o.asynchronous else ' (if asynchronous)'}" for o in others
+                }
                 warnings.append(
-                    f"{', '.join(delayed)} of {node} will be delayed as well, until the slots of"
-                    f" server {server.name!r}: one thread sends for all asynchronous writers of a"
-                    " process. Publish them synchronously, or from another process."
+                    f"{', '.join(sorted(delayed))} of {', '.join(sorted({o.node for o in others}))}"
+                    f" will be delayed as well, until the slots of server {server.name!r}: one"
+                    " thread sends for all asynchronous writers of a process. Publish them"
+                    " synchronously, or from another process."
                 )
     return warnings
 

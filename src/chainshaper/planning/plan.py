@@ -148,13 +148,6 @@ class Thread(Part):
     role: Literal["executor", "publisher"] = "executor"
     callbacks: tuple[Annotated[str, AfterValidator(_callback)], ...] = ()
 
-    @model_validator(mode="after")
-    def _executor_only(self) -> "Thread":
-        if self.callbacks and self.role == "publisher":
-            reason = "a publisher runs no callbacks: remove them, or write the executor's thread"
-            raise wrong_value(reason, "callbacks")
-        return self
-
     def overlaps(self, other: "Thread") -> bool:
         """Whether a thread may be both."""
         apart = self.callbacks and other.callbacks

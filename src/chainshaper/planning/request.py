@@ -68,8 +68,9 @@ class Profile:
     waits for: on the chain, on those branches, and before the chain begins. ``receivers`` are the
     nodes that subscribe to the chain's output and are none of these. ``callbacks`` are those of the
     chain and its branches, see :func:`~chainshaper.planning.shaping.server_per_callback`.
-    ``output_depth`` is the history of
-    the output's writer. The rest is :class:`~chainshaper.planning.plan.Evidence`.
+    ``output_depth`` is the history of the output's writer, ``asynchronous`` whether its
+    process has a thread that publishes (None: not known). The rest is
+    :class:`~chainshaper.planning.plan.Evidence`.
     """
 
     latencies_ns: NDArray[np.int64]
@@ -93,6 +94,7 @@ class Profile:
     longest_stall_ns: int | None = None
     utilisation: float | None = None
     longest_send_ns: int | None = None
+    asynchronous: bool | None = None
     lost_events: int | None = None
     all_disturbed: bool | None = None
 
@@ -219,6 +221,13 @@ def _shaped(
     last = profile.nodes[-1] if profile.nodes else None
     values = {n: getattr(profile, n) for n in Evidence.model_fields if hasattr(profile, n)}
     if request.publication == "asynchronous":
+        if profile.asynchronous is False:
+            raise InputError(
+                f"{last} has no thread that publishes for it, so {profile.name} cannot be shaped by"
+                " gating one: let it publish asynchronously (rmw_fastrtps_cpp, with"
+                " RMW_FASTRTPS_PUBLICATION_MODE=ASYNCHRONOUS) and record again, or plan with"
+                " --publication synchronous"
+            )
         values["output_depth"] = profile.output_depth
     else:  # how long sends take is no evidence for it
         del values["longest_send_ns"]

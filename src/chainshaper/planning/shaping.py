@@ -253,20 +253,15 @@ def with_executors(plan: Plan, executors: Mapping[str, Sequence[tuple[str, ...]]
 
     Of a node whose callback groups have executors of their own, the others run on (section 6).
     """
-
-    def of_callbacks(thread: Thread) -> list[Thread]:
-        if thread.role == "publisher" or thread.node not in executors:
-            return [thread]
-        return [Thread(node=thread.node, callbacks=own) for own in executors[thread.node]]
-
-    def of_server(server: Server) -> Server:
-        found = tuple(one for thread in server.threads for one in of_callbacks(thread))
-        return server.model_copy(update={"threads": found})
-
-    if not executors:
-        return plan
-    with wrong_values_refused(Plan):
-        return revised(plan, servers=tuple(map(of_server, plan.servers)))
+    servers = []
+    for server in plan.servers:
+        threads = [
+            one.model_copy(update={"callbacks": own})
+            for one in server.threads
+            for own in (executors.get(one.node, ((),)) if one.role == "executor" else ((),))
+        ]
+        servers.append(server.model_copy(update={"threads": tuple(threads)}))
+    return revised(plan, servers=tuple(servers))
 
 
 def with_sink(
