@@ -37,7 +37,16 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     found = [f"-L{one / 'lib'}" for one in prefixes] + [f"-l{name}" for name in LIBRARIES]
     path = tmp_path_factory.mktemp("groups") / "groups"
     allowed = "-Wl,--allow-shlib-undefined"
-    command = [compiler, "-std=c++17", SOURCE, "-o", path, *include, *found, allowed]
+    command: list[str | Path] = [
+        compiler,
+        "-std=c++17",
+        SOURCE,
+        "-o",
+        path,
+        *include,
+        *found,
+        allowed,
+    ]
     subprocess.run(command, check=True, timeout=150)
     return path
 

@@ -4,6 +4,7 @@ import os
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -499,7 +500,7 @@ def test_how_a_process_publishes_is_looked_up_before_its_publisher_is_gated(
     mode: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RMW_FASTRTPS_PUBLICATION_MODE", mode)
-    values = {"output": "/out", "publisher": "/b", "nodes": ["/b"], "publication": "asynchronous"}
+    values: dict[str, Any] = {"output": "/out", "publisher": "/b", "publication": "asynchronous"}
     plan = whole(plan_shaping(np.array([5 * MS, 20 * MS]), 100 * MS, **values))
     names = [("/b", "/out"), ("/b", "/rosout"), ("/beside", "/debug"), ("/other", "/rosout")]
     ends = [EndpointInfo(node=n, topic=t, kind="publisher", depth=5) for n, t in names]

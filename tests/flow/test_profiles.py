@@ -279,7 +279,13 @@ def test_the_executor_of_a_callback_group_is_named_by_its_callbacks(
         story.runs(relays, begin + 2 * MS, begin + 6 * MS, reads=begin + 1, writes=writes, tid=60)
         for timer, tid in zip(timers, (worker, beside), strict=True):
             story.runs(timer, begin + 8 * MS + tid, begin + 9 * MS, tid=tid)
-    executor = {"comm": "relay", "node": "/relay", "pid": 6, "role": "executor", "priority": 0}
+    executor: dict[str, Any] = {
+        "comm": "relay",
+        "node": "/relay",
+        "pid": 6,
+        "role": "executor",
+        "priority": 0,
+    }
     threads = tuple(
         ThreadInfo(**executor, policy="SCHED_OTHER", tid=tid, cores=(core,))
         for tid, core in ((60, 0), (61, 1), (62, 1))

@@ -193,13 +193,14 @@ def strangers_text(
 def _identify(process: Process, recorded: Sequence[RecordedProcess]) -> _Identified:
     named = named_nodes(process.command)
     match = next((seen for seen in recorded if _is_same(process, named, seen)), None)
-    known = {} if match is None else {thread.tid: thread for thread in match.threads}
-    if match is not None and match.nodes:
-        return _Identified(process, match.nodes, "recording", known)
     nodes, known_by = _own_words(process)
-    earlier = next((seen for seen in recorded if nodes and set(nodes) <= set(seen.nodes)), None)
-    if earlier is None or match is not None:
+    if match is not None:
+        known = {thread.tid: thread for thread in match.threads}
+        nodes, known_by = (match.nodes, "recording") if match.nodes else (nodes, known_by)
         return _Identified(process, nodes, known_by, known)
+    earlier = next((seen for seen in recorded if nodes and set(nodes) <= set(seen.nodes)), None)
+    if earlier is None:
+        return _Identified(process, nodes, known_by)
     # A container's command line names the container only; an earlier run tells its components.
     if named and set(named) < set(earlier.nodes):
         nodes, known_by = earlier.nodes, "recording"
@@ -285,12 +286,11 @@ def _with_unique_names(identified: list[_Identified]) -> list[_Identified]:
 def _threads_of(one: _Identified) -> Iterable[NodeThread]:
     seen = one.recorded
     executors_seen = any(thread.role == "executor" for thread in seen.values())
-    callbacks: tuple[tuple[str, str], ...]
     for thread in one.process.threads:
-        nodes, role, known_by, callbacks = one.nodes, thread.role, "", ()
+        nodes, role, known_by = one.nodes, thread.role, ""
         recorded = seen.get(thread.inner_tid)
         if recorded is not None and recorded.role != "unknown":
-            nodes, role, callbacks = recorded.nodes or nodes, recorded.role, recorded.callbacks
+            nodes, role = recorded.nodes or nodes, recorded.role
             known_by = "order of start" if one.in_order else "recording"
         elif thread.role == "executor":
             # Where others execute, the program keeps its main thread out of it.
@@ -300,6 +300,7 @@ def _threads_of(one: _Identified) -> Iterable[NodeThread]:
             known_by = "name"
         kind = thread.kind if role in ("dds", "publisher") else None
         known = replace(thread, role=role, kind=kind)
+        callbacks = () if recorded is None else recorded.callbacks
         yield NodeThread(known, nodes, known_by, one.nodes_known_by, callbacks)
 
 
@@ -361,16 +362,15 @@ def threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThre
             "a recording of it" + (f"; {allocation.strangers}" if allocation.strangers else "")
         )
     if not found:
-        what, remedy = str(planned.role), ""
+        what = "executor: "
         if planned.role == "publisher":
-            what = "asynchronous publisher"
-            remedy = (
-                "; Fast DDS has one where RMW_FASTRTPS_PUBLICATION_MODE is ASYNCHRONOUS, Cyclone "
-                "DDS has none: plan with --publication synchronous"
+            what = (
+                "asynchronous publisher. Fast DDS has one if RMW_FASTRTPS_PUBLICATION_MODE is "
+                "ASYNCHRONOUS, Cyclone DDS has none: plan with --publication synchronous, or "
             )
         raise OperationError(
             f"process {pids[0]} of node {planned.node} has no thread that is known to be its "
-            f"{what}: see `chainshaper threads {pids[0]}`{remedy}"
+            f"{what}see `chainshaper threads {pids[0]}`"
         )
     if not planned.callbacks:
         return found

@@ -12,7 +12,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, cast, get_args
+from typing import TYPE_CHECKING, cast
 
 from chainshaper.enforcement import threads as allocation
 from chainshaper.enforcement.back_ends import choose_back_end
@@ -147,7 +147,7 @@ def recorded_processes(
     comms = {(one.pid, one.tid): one.comm for one in info.threads}
     for one in info.threads:
         own = (one.node,) if one.node else ()
-        role = cast(ThreadRole, one.role if one.role in get_args(ThreadRole) else "unknown")
+        role = cast(ThreadRole, one.role)
         threads[one.pid][one.tid] = RecordedThread(one.tid, role, own, one.comm)
         nodes.setdefault(one.pid, list(own))
     ran = executors(data_flow(tables, info.clock_offset_ns))
@@ -180,24 +180,19 @@ def check_publishers(
     if not gating or recording is None:
         return []
     process = {node: one.thread.pid for one in found.threads for node in one.nodes}
+    modes = {pid: _asynchronous(pid) for pid in set(process.values())}
     writers = [
-        Writer(one.node, one.topic, one.depth, _asynchronous(process[one.node]), process[one.node])
+        Writer(one.node, one.topic, one.depth, modes[pid], pid)
         for one in recording.info.endpoints
-        if one.kind == "publisher" and one.node in process
+        if one.kind == "publisher" and (pid := process.get(one.node)) is not None
     ]
-    known = {writer.node for writer in writers}
-    return [
-        said
-        for chain in gating
-        if chain.chain.publisher in known
-        for said in check_publication(chain, writers)
-    ]
+    known = [c for c in gating if any(one.node == c.chain.publisher for one in writers)]
+    return [said for chain in known for said in check_publication(chain, writers)]
 
 
 def _asynchronous(pid: int) -> bool | None:
-    """Whether all writers of a process publish asynchronously, as rmw_fastrtps has been asked to.
-
-    None: each as a file of profiles says (`AUTO`), or as it is by default.
+    """Whether rmw_fastrtps lets all writers of a process publish asynchronously; None: each as a
+    file of profiles says, or as it is by default.
     """
     from chainshaper.sources.ros import environment_of  # only who gates publishers pays for this
 

@@ -175,11 +175,9 @@ def plan_chain(
             f"--fallback {request.fallback} is for an output with a shaping node, and the plan has"
             " none: leave it out, or plan with synchronous publication"
         )
-    executors: dict[str, tuple[tuple[str, ...], ...]] = {}
-    for one in (profile, *sinks):
-        for node, own in one.executors.items():
-            executors[node] = tuple(dict.fromkeys((*executors.get(node, ()), *own)))
-    return with_executors(revised(plan, modes=request.modes), executors)
+    return revised(
+        with_executors(plan, [one.executors for one in (profile, *sinks)]), modes=request.modes
+    )
 
 
 def band_choice(plan: Plan, profile: Profile, request: PlanRequest) -> BandChoice:

@@ -248,18 +248,20 @@ def _chain_and_others(plan: Plan) -> tuple[Server, list[Server]]:
     return found, [server for server in plan.servers if server is not found]
 
 
-def with_executors(plan: Plan, executors: Mapping[str, Sequence[tuple[str, ...]]]) -> Plan:
+def with_executors(
+    plan: Plan, executors: Sequence[Mapping[str, Sequence[tuple[str, ...]]]]
+) -> Plan:
     """The plan with those executors of nodes in its servers that run the given callbacks.
 
     Of a node whose callback groups have executors of their own, the others run on (section 6).
     """
     servers = []
     for server in plan.servers:
-        threads = [
-            one.model_copy(update={"callbacks": own})
-            for one in server.threads
-            for own in (executors.get(one.node, ((),)) if one.role == "executor" else ((),))
-        ]
+        threads: list[Thread] = []
+        for one in server.threads:
+            own = dict.fromkeys(names for known in executors for names in known.get(one.node, ()))
+            apart = own if own and one.role == "executor" else [()]
+            threads += [one.model_copy(update={"callbacks": names}) for names in apart]
         servers.append(server.model_copy(update={"threads": tuple(threads)}))
     return revised(plan, servers=tuple(servers))
 

@@ -200,14 +200,14 @@ def threads_json(allocation: Allocation) -> dict[str, Any]:
 
 def threads_table(allocation: Allocation) -> ResultTable:
     """A row per thread; what is as in the row above is left out."""
-    names = ("node", "pid", "tid", "name", "role", "class", "cores", "known by")
-    table = ResultTable("Threads", words(*names))
+    columns = words("node", "pid", "tid", "name", "role", "class", "cores", "known by")
+    table = ResultTable("Threads", columns)
     above: NodeThread | None = None
     for found in allocation.threads:
         thread = found.thread
         first = above is None or above.thread.pid != thread.pid
         same_nodes = not first and above is not None and above.nodes == found.nodes
-        known_by = [found.known_by or "-"]
+        known_by, names = [found.known_by or "-"], [name for _, name in found.callbacks]
         if first and found.nodes:
             known_by.append(f"node: {found.nodes_known_by or None}")
         table.add(
@@ -215,21 +215,13 @@ def threads_table(allocation: Allocation) -> ResultTable:
             str(thread.pid) if first else "",
             str(thread.tid),
             thread.comm,
-            _role_text(found),
+            f"DDS {thread.kind}" if thread.role == "dds" else ", ".join((thread.role, *names)),
             scheduling_text(thread.policy, thread.priority),
             core_ranges(thread.cores),
             "; ".join(known_by),
         )
         above = found
     return table
-
-
-def _role_text(found: NodeThread) -> str:
-    """A thread's role; where its process has several executors, with the callbacks of this one."""
-    if found.thread.role == "dds":
-        return f"DDS {found.thread.kind}"
-    names = ", ".join(name for _, name in found.callbacks)
-    return f"{found.thread.role}: {names}" if names else found.thread.role
 
 
 def core_ranges(cores: Sequence[int]) -> str:
