@@ -13,7 +13,7 @@ import numpy as np
 
 from chainshaper.analysis.chains import find_chain
 from chainshaper.planning.application_plan import ApplicationPlan
-from chainshaper.planning.plan import Server
+from chainshaper.planning.plan import Server, Thread
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.layout import NONE, A, C, D, E, G, H, I, Int64s, M, P, R, S, T, X
 from chainshaper.values.application import ApplicationGraph, Callback, Chain, Node
@@ -204,20 +204,19 @@ def _threads(
 def _servers(plan: ApplicationPlan, threads: Sequence[ThreadInfo]) -> dict[int, Server]:
     """The server of each thread that is in one."""
     numbers = {
-        (thread.node, thread.role): number
+        Thread(node=thread.node, role=thread.role): number  # type: ignore[arg-type]
         for number, thread in enumerate(threads)
         if thread.role != "dds"
     }
     found: dict[int, Server] = {}
     for server in plan.servers:
         for thread in server.threads:
-            number = numbers.get((thread.node, thread.role))
-            if number is None or thread.callbacks:
+            if thread not in numbers:
                 raise InputError(
                     f"server {server.name!r} of the plan holds {thread.text}, which the application"
                     " does not have: plan again from a recording of it"
                 )
-            found[number] = server
+            found[numbers[thread]] = server
     return found
 
 
