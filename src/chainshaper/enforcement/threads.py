@@ -150,13 +150,10 @@ def allocate(
         "a name or a namespace of its own, or end those that are not meant"
         for name, claimants in _claims(chosen).items()
     ]
-    in_order = [
-        f"process {one.process.pid} of {', '.join(one.nodes)}: {IN_ORDER}"
-        for one in chosen
-        if one.in_order
-    ]
+    in_order = [one for one in chosen if one.in_order]
+    notes = (f"process {o.process.pid} of {', '.join(o.nodes)}: {IN_ORDER}" for o in in_order)
     threads = tuple(thread for one in chosen for thread in _threads_of(one))
-    return Allocation(threads, (*guesses, *ambiguities, *in_order))
+    return Allocation(threads, (*guesses, *ambiguities, *notes))
 
 
 def new_and_ended(
@@ -219,18 +216,14 @@ def _in_order(process: Process, earlier: RecordedProcess) -> dict[int, RecordedT
         return {}
     found: dict[int, RecordedThread] = {}
     for name in {thread.comm for thread in executing}:
-        # Ids ascend, and begin again at the lowest that is free.
-        before = sorted(
-            (thread for thread in earlier.threads if thread.comm == name),
-            key=lambda one: (one.tid < earlier.pid, one.tid),
-        )
-        now = sorted(
-            (thread.inner_tid for thread in process.threads if thread.comm == name),
-            key=lambda tid: (tid < process.inner_pid, tid),
-        )
+        before = {one.tid: one for one in earlier.threads if one.comm == name}
+        now = [one.inner_tid for one in process.threads if one.comm == name]
         if len(before) != len(now):
             return {}
-        found.update(zip(now, before, strict=True))
+        # Ids ascend, and begin again at the lowest that is free.
+        now.sort(key=lambda tid: (tid < process.inner_pid, tid))
+        tids = sorted(before, key=lambda tid: (tid < earlier.pid, tid))
+        found |= {tid: before[its] for tid, its in zip(now, tids, strict=True)}
     return found
 
 

@@ -141,11 +141,10 @@ def check_publication(plan: Plan, writers: Sequence[Writer]) -> list[str]:
                 and (writer.node, writer.topic) != (node, output)
             ]
             if others:
-                delayed = {
-                    f"{o.topic}{'' if o.asynchronous else ' (if asynchronous)'}" for o in others
-                }
+                doubt = {True: "", None: " (if asynchronous)"}
+                topics = sorted({f"{one.topic}{doubt[one.asynchronous]}" for one in others})
                 warnings.append(
-                    f"{', '.join(sorted(delayed))} of {', '.join(sorted({o.node for o in others}))}"
+                    f"{', '.join(topics)} of {', '.join(sorted({one.node for one in others}))}"
                     f" will be delayed as well, until the slots of server {server.name!r}: one"
                     " thread sends for all asynchronous writers of a process. Publish them"
                     " synchronously, or from another process."
