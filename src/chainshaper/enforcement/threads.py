@@ -106,7 +106,8 @@ class Allocation:
 
 class _Identified(NamedTuple):
     """A process with its nodes, how they are known, and what a recording says of its threads, by
-    their ids in its own pid namespace: of itself, or (``in_order``) of an earlier run.
+    their ids in its own pid namespace: of itself, or (``in_order``) of an earlier run. Where others
+    execute, the program keeps its main thread out of it.
     """
 
     process: Process
@@ -114,6 +115,7 @@ class _Identified(NamedTuple):
     nodes_known_by: str = ""
     recorded: Mapping[int, RecordedThread] = MappingProxyType({})
     in_order: bool = False
+    main_executes: bool = True
 
 
 def allocate(
@@ -194,7 +196,8 @@ def _identify(process: Process, recorded: Sequence[RecordedProcess]) -> _Identif
     if match is not None:
         known = {thread.tid: thread for thread in match.threads}
         nodes, known_by = (match.nodes, "recording") if match.nodes else (nodes, known_by)
-        return _Identified(process, nodes, known_by, known)
+        main = all(thread.role != "executor" for thread in match.threads)
+        return _Identified(process, nodes, known_by, known, main_executes=main)
     earlier = next((seen for seen in recorded if nodes and set(nodes) <= set(seen.nodes)), None)
     if earlier is None:
         return _Identified(process, nodes, known_by)
@@ -202,7 +205,9 @@ def _identify(process: Process, recorded: Sequence[RecordedProcess]) -> _Identif
     if named and set(named) < set(earlier.nodes):
         nodes, known_by = earlier.nodes, "recording"
     like = _in_order(process, earlier)
-    return _Identified(process, nodes, known_by, like, bool(like))
+    executing = [thread.tid for thread in earlier.threads if thread.role == "executor"]
+    main = not executing or earlier.pid in executing
+    return _Identified(process, nodes, known_by, like, bool(like), main)
 
 
 def _in_order(process: Process, earlier: RecordedProcess) -> dict[int, RecordedThread]:
@@ -277,17 +282,14 @@ def _with_unique_names(identified: list[_Identified]) -> list[_Identified]:
 
 
 def _threads_of(one: _Identified) -> Iterable[NodeThread]:
-    seen = one.recorded
-    executors_seen = any(thread.role == "executor" for thread in seen.values())
     for thread in one.process.threads:
         nodes, role, known_by = one.nodes, thread.role, ""
-        recorded = seen.get(thread.inner_tid)
+        recorded = one.recorded.get(thread.inner_tid)
         if recorded is not None and recorded.role != "unknown":
             nodes, role = recorded.nodes or nodes, recorded.role
             known_by = "order of start" if one.in_order else "recording"
         elif thread.role == "executor":
-            # Where others execute, the program keeps its main thread out of it.
-            main = bool(nodes) and not executors_seen
+            main = bool(nodes) and one.main_executes
             role, known_by = ("executor", "main thread") if main else ("unknown", "")
         elif thread.role != "unknown":
             known_by = "name"
@@ -355,7 +357,7 @@ def threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThre
             "a recording of it" + (f"; {allocation.strangers}" if allocation.strangers else "")
         )
     if not found:
-        what = "executor: "
+        what = "executor: name a recording of this very process (--recording), or "
         if planned.role == "publisher":
             what = (
                 "asynchronous publisher. Fast DDS has one if RMW_FASTRTPS_PUBLICATION_MODE is "
