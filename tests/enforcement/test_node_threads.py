@@ -4,6 +4,7 @@ import os
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 
 from chainshaper.enforcement.threads import (
     DDS_PRIORITY,
+    IN_ORDER,
     Allocation,
     NodeThread,
     RecordedProcess,
@@ -25,6 +27,7 @@ from chainshaper.enforcement.threads import (
     server_members,
     server_priorities,
 )
+from chainshaper.flow.threads import check_publishers
 from chainshaper.linux.processes import Process, read_process
 from chainshaper.linux.scheduling import Scheduling
 from chainshaper.linux.threads import Thread, ThreadRole, dds_kind, role_of
@@ -33,7 +36,9 @@ from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.plan import Server, ShapingNode, revised
 from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.recording import EndpointInfo, Recording, RecordingInfo
 
+MS = 1_000_000
 CYCLONE = ("gc", "dq.builtins", "dq.user", "tev", "recv")
 
 
@@ -65,7 +70,8 @@ RAN_A = RecordedThread(101, "executor", ("/a",))
 RAN_BOTH = RecordedThread(102, "executor", ("/a", "/b"))
 SENT = RecordedThread(103, "publisher", ())
 OTHERS = _seen(100, ("/other",), RecordedThread(101, "executor", ("/other",)))
-ENDED_BEFORE = RecordedProcess(100, ("/x",), (RecordedThread(101, "executor", ("/x",)),), 0)
+RAN_X = tuple(RecordedThread(tid, "executor", ("/x",)) for tid in (100, 101))
+ENDED_BEFORE = RecordedProcess(100, ("/x",), RAN_X, 0)
 EARLIER = [_seen(31, ("/d", "/e")), _seen(30, BOX, RecordedThread(30, "executor", ("/a",)))]
 
 
@@ -123,6 +129,48 @@ def test_the_nodes_of_a_process_and_of_its_threads() -> None:
     assert nodes_of(_process(1, "/bin/bash", participates=False)) == [()]
     seen = _seen(100, BOX, RAN_A, RAN_BOTH)
     assert nodes_of(_process(100, "c", "c", "c"), seen) == [BOX, ("/a",), ("/a", "/b")]
+
+
+TICKS, CHAIN = (("/x", "every 10ms"),), (("/x", "/t1"), ("/x", "every 100ms"))
+GROUPS = (
+    *(RecordedThread(100 + n, "unknown", ("/x",), "main") for n in (0, 2)),  # 101 has ended
+    RecordedThread(103, "executor", ("/x",), "main", TICKS),
+    RecordedThread(104, "dds", ("/x",), "recv"),
+    RecordedThread(99, "executor", ("/x",), "main", CHAIN),  # ids began again
+)
+EARLIER_GROUPS = RecordedProcess(100, ("/x",), GROUPS, seen_ns=0)
+"""A run that has ended, of a program with two callback groups on executors of their own."""
+
+
+@pytest.mark.parametrize(
+    ("names", "executors"),
+    [
+        (["main", "recv", "main", "main"], {703: TICKS, 704: CHAIN}),
+        (["gc", "main", "main", "recv", "main"], {703: TICKS, 705: CHAIN}),
+        (["main", "recv", "main"], {}),  # one has not started yet: nothing is sure
+        (["main", "recv", "main", "main", "main"], {}),
+    ],
+)
+def test_executors_are_told_apart_by_the_order_in_which_an_earlier_run_started_them(
+    names: list[str], executors: dict[int, tuple[tuple[str, str], ...]]
+) -> None:
+    found = allocate([_process(700, X, *names)], [EARLIER_GROUPS])
+    shown = {t.thread.tid: t.callbacks for t in found.threads if t.thread.role == "executor"}
+    assert shown == executors
+    sure = len(executors) > 1
+    assert [note.endswith(IN_ORDER) for note in found.notes] == [True] * sure
+    ticks = _plan(_server("ticks", PlannedThread(node="/x", callbacks=("every 10ms",))))
+    if sure:
+        (member,) = server_members(ticks, found)["ticks"]
+        assert (member.thread.tid, member.known_by) == (703, "order of start")
+        everything = _plan(_server("all", PlannedThread(node="/x")))
+        assert len(server_members(everything, found)["all"]) == 2
+        other = _plan(_server("other", PlannedThread(node="/x", callbacks=("/t2",))))
+        with pytest.raises(OperationError, match=r"runs /t2 is not known \(known are .*/t1, every"):
+            server_members(other, found)
+    else:
+        with pytest.raises(OperationError, match="no thread that is known to be its executor"):
+            server_members(ticks, found)
 
 
 RUN = _process(50, f"ros2 run p {X}", participates=False)
@@ -192,9 +240,6 @@ def test_a_process_started_after_the_recording_is_not_in_it(
         recorded = RecordedProcess(process.inner_pid, ("/a",), threads, seen_ns)
         found = allocate([process], [recorded])
     assert (found.threads[0].nodes == ("/a",)) is not started_later
-
-
-MS = 1_000_000
 
 
 def _plan(*servers: Server) -> ApplicationPlan:
@@ -442,3 +487,46 @@ def test_whatever_the_plan_the_order_of_priorities_holds(
                 assert new.priority is not None
                 assert one.wanted.priority is not None
                 assert one.wanted.priority < new.priority
+
+
+@pytest.mark.parametrize(
+    ("mode", "said"),
+    [
+        ("ASYNCHRONOUS", "/debug, /rosout of /b, /beside will be delayed as well"),
+        ("AUTO", "/debug (if asynchronous), /rosout (if asynchronous) of /b, /beside will be"),
+        ("SYNCHRONOUS", "/b publishes /out synchronously"),
+    ],
+)
+def test_how_a_process_publishes_is_looked_up_before_its_publisher_is_gated(
+    mode: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RMW_FASTRTPS_PUBLICATION_MODE", mode)
+    values: dict[str, Any] = {"output": "/out", "publisher": "/b", "publication": "asynchronous"}
+    plan = whole(plan_shaping(np.array([5 * MS, 20 * MS]), 100 * MS, **values))
+    names = [("/b", "/out"), ("/b", "/rosout"), ("/beside", "/debug"), ("/other", "/rosout")]
+    ends = [EndpointInfo(node=n, topic=t, kind="publisher", depth=5) for n, t in names]
+    arguments = ("--ros-args", "-r", "b:__node:=b", "-r", "c:__node:=beside")
+    with acting(tmp_path, *CYCLONE, "dds.asyn.0.0", arguments=arguments) as actor:
+
+        def checked() -> list[str]:
+            info = RecordingInfo(source="lttng", clock_offset_ns=0, endpoints=tuple(ends))
+            process = read_process(actor.pid)
+            assert process is not None
+            found = allocate([process])
+            server_members(plan, found)
+            return check_publishers(plan, found, Recording(tmp_path, info, {}))
+
+        # What sends again for synchronous writers is no asynchronous publisher.
+        with pytest.raises(OperationError, match="RMW_FASTRTPS_PUBLICATION_MODE is ASYNCHRONOUS"):
+            checked()
+        actor.begin("dds.asyn.0.1")
+        if mode == "SYNCHRONOUS":
+            with pytest.raises(InputError, match=said):
+                checked()
+            return
+        (warning,) = checked()
+        assert warning.startswith(said)
+        ends[0] = ends[0].model_copy(update={"depth": 1})
+        plan = whole(revised(plan.chains[0], cycle_ns=300 * MS))
+        with pytest.raises(InputError, match="history of 1, but 3 messages"):
+            checked()

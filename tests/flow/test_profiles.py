@@ -272,3 +272,53 @@ def test_the_fusion_of_a_real_trace_waits_for_both_filters() -> None:
         "/filter_transform_rear",
         "/filter_transform_front",
     }
+
+
+@pytest.mark.parametrize(
+    ("beside", "worker", "period", "expected"),
+    [
+        (61, 60, 10, ("/t1", "every 50ms")),  # two executors
+        (61, 62, 10, ("/t1",)),  # three: nothing else runs in the chain's
+        (60, 60, 10, ()),  # one for all
+        (61, 61, 50, ("/t1",)),
+        (61, 60, 50, ()),  # the timers have one name, so nothing tells them apart
+    ],
+)
+def test_the_executor_of_a_callback_group_is_named_by_its_callbacks(
+    beside: int, worker: int, period: int, expected: tuple[str, ...]
+) -> None:
+    """A relay's subscription runs in thread 60; two timers beside it run where they are told."""
+    story = Story()
+    source, relay = story.node("/source", 5), story.node("/relay", 6)
+    first, t1 = story.timer(source, period=100 * MS), story.publisher(source, "/t1")
+    relays, t2 = story.subscription(relay, "/t1"), story.publisher(relay, "/t2")
+    timers = [story.timer(relay, each * MS, symbol=f"f{n}") for n, each in enumerate((50, period))]
+    for begin in range(1000 * MS, 1300 * MS, 100 * MS):
+        story.runs(first, begin, begin + MS, writes=((t1, begin + 1),))
+        writes = ((t2, begin + 5 * MS),)
+        story.runs(relays, begin + 2 * MS, begin + 6 * MS, reads=begin + 1, writes=writes, tid=60)
+        for timer, tid in zip(timers, (worker, beside), strict=True):
+            story.runs(timer, begin + 8 * MS + tid, begin + 9 * MS, tid=tid)
+    executor: dict[str, Any] = {
+        "comm": "relay",
+        "node": "/relay",
+        "pid": 6,
+        "role": "executor",
+        "priority": 0,
+    }
+    threads = tuple(
+        ThreadInfo(**executor, policy="SCHED_OTHER", tid=tid, cores=(core,))
+        for tid, core in ((60, 0), (61, 1), (62, 1))
+    )
+    info = RecordingInfo(source="simulated", clock_offset_ns=OFFSET, threads=threads)
+    plan = plan_recording(Recording(Path("groups"), info, story.tables()), "/t1../t2")
+    (thread,) = (t for server in plan.servers for t in server.threads if t.node == "/relay")
+    assert thread.callbacks == expected
+    (server,) = (server for server in plan.servers if thread in server.threads)
+    assert server.core == 0, "that of the executor that is meant"
+
+
+def test_a_recorded_node_without_a_publishers_thread_is_not_planned_for_one() -> None:
+    profile = replace(_profile(), asynchronous=False)
+    with pytest.raises(InputError, match=r"/ndt has no thread that publishes.*ASYNCHRONOUS"):
+        plan_chain(profile, PlanRequest(publication="asynchronous"))

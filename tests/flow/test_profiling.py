@@ -132,16 +132,17 @@ def test_a_node_that_does_not_appear_is_named(
 def test_an_executor_that_had_several_threads_has_them_again() -> None:
     program = "import threading; threading.Thread(target=input, daemon=True).start(); input()"
     command = [sys.executable, "-c", program, "--ros-args", "-r", "__node:=box"]
-    threads = tuple(RecordedThread(number, "executor", ("/part",)) for number in (1, 2))
     with subprocess.Popen(command, stdin=subprocess.PIPE) as process:
         wait_for(lambda: len(list_threads(process.pid)) == 2, "the threads")
         running = list_processes([process.pid])
+        comm = running[0].threads[0].comm
+        threads = [RecordedThread(number, "executor", ("/part",), comm) for number in (1, 2)]
         for count in (1, 2):
-            earlier = [RecordedProcess(1, ("/box", "/part"), threads[:count], seen_ns=0)]
+            earlier = [RecordedProcess(1, ("/box", "/part"), (*threads[:count],), seen_ns=0)]
             found = allocate(running, earlier)
             for nodes in (frozenset(["/part"]), frozenset[str]()):
-                assert len(executors_of(found, nodes, running, earlier)) == count
-        assert executors_of(found, frozenset(["/other"]), running, earlier) == []
+                assert len(executors_of(found, nodes, running)) == count
+        assert executors_of(found, frozenset(["/other"]), running) == []
         process.communicate(b"\n\n")
 
 

@@ -33,12 +33,12 @@ from chainshaper.values.errors import OperationError, PlatformError
 KINDS: dict[DdsKind, tuple[str, ...]] = {
     "receive": ("recv", "recvUC", "recvMC", "dds.udp.7410", "dds.shm.7413", "dds.tcp.5100"),
     "delivery": ("dq.user", "dq.camera"),
-    "transmit": ("xmit.user", "sendq"),
+    "transmit": ("xmit.user", "sendq", "dds.asyn.0.0"),
     "event": ("tev", "dds.ev.0"),
     "discovery": ("dq.builtins", "dds.ds_ev.0", "dds.tls.replies"),
     "lease": ("lease",),
     "garbage collection": ("gc",),
-    "asynchronous publisher": ("dds.asyn.0.1", "dds.asyn.0.1234"),
+    "asynchronous publisher": ("dds.asyn.0.1", "dds.asyn.10.12"),
     "connection": ("dds.tcp_accept", "dds.tcp_keep", "fsm"),
     "housekeeping": ("dds.shm.wdog", "dds.log", "dds.fwatch.cb", "dds.something", "debmon"),
 }

@@ -1,6 +1,7 @@
 """Overruns and asynchronous publishers: what would be destructive is refused, the rest is said."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -165,6 +166,11 @@ def test_an_application_that_fits_is_accepted_and_other_writers_are_named() -> N
     others = [Writer("/n5", "/rosout", 10, True), Writer("/n5", "/debug", 10, True)]
     (warning,) = check_publication(asynchronous(), [OUTPUT, *others])
     assert warning.startswith("/debug, /rosout of /n5 will be delayed as well")
+    # One thread sends for all nodes of a process.
+    placed = [replace(one, process=7) for one in (OUTPUT, Writer("/box", "/rosout", 10, True))]
+    placed += [Writer("/n6", "/t6", process=7), Writer("/n7", "/t7", 10, True, process=8)]
+    (warning,) = check_publication(asynchronous(), placed)
+    assert warning.startswith("/rosout, /t6 (if asynchronous) of /box, /n6 will be delayed")
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from chainshaper.planning import (
     save_plan,
     server_of,
 )
+from chainshaper.planning.application_plan import whole
 from chainshaper.planning.plan import ChainOfPlan, Evidence
 from chainshaper.values.errors import InputError, OperationError
 
@@ -106,6 +107,7 @@ WRONG_VALUES = [
     ("{node: /n1, role: executor}", "{node: n1}", 3, "servers[0].threads[0].node", "full ROS"),
     ("role: executor", "role: dds", 3, "servers[0].threads[0].role", "'executor' or 'publisher'"),
     ("{node: /n1", "{node: /chainshaper_t5", 10, "servers[1].threads[0]", "already in"),
+    ("role: executor", "callbacks: [t]", 3, "servers[0].threads[0].callbacks[0]", "no callback"),
     ("{node: /chainshaper_t5}", "{node: /other}", 23, "shaping_node.name", "no server holds"),
     ("input: /t5_tmp", "input: /t5", 23, "shaping_node.input", "feed itself"),
     ("input: /t5_tmp", "input: /t5//tmp", 23, "shaping_node.input", "full ROS"),
@@ -120,6 +122,24 @@ WRONG_VALUES = [
     ("format: 1", "format: 2", 26, "format", "should be 1"),
     ('spec: "/t1../t5"', "spec: 7", 13, "chain.spec", "7 is not a text"),
 ]
+
+
+def test_executors_of_a_node_are_told_apart_by_their_callbacks(tmp_path: Path) -> None:
+    """Callback groups with executors of their own (section 6) may be in servers of their own."""
+    named = GOOD.replace("role: executor", "callbacks: [every 0.1 s, /t1]")
+    plan = _load(tmp_path, named)
+    (chain,) = plan.servers[0].threads
+    assert chain == Thread(node="/n1", callbacks=("every 100ms", "/t1"))
+    assert "{node: /n1, role: executor, callbacks: [every 100ms, /t1]}" in dump_plan(plan)
+    assert "callbacks" not in dump_plan(_load(tmp_path, GOOD))
+    text = "- {name: late, core: 0, priority: 2, slots: [[70ms, 80ms]], threads: [{node: /n1%s}]}"
+    both = named.replace("cycle: 100ms", f"  {text}\ncycle: 100ms", 1)
+    joint = whole(_load(tmp_path, both % ", callbacks: [/t2]"))
+    assert [server.name for server in joint.servers] == ["chain", "output", "late"]
+    for overlapping in ("", ", callbacks: [/t2, /t1]"):
+        with pytest.raises(InputError, match=r"runs every 100ms, /t1 is already in .*'chain'"):
+            _load(tmp_path, both % overlapping)
+
 
 MODES = """\
 modes:

@@ -22,6 +22,7 @@ from chainshaper.analysis.latency import (
     LatencyStatistics,
     analyse_latency,
     callback_statistics,
+    executors,
     latency_statistics,
 )
 from chainshaper.analysis.objects import resolve_objects
@@ -29,5 +30,5 @@ from chainshaper.analysis.traversals import REASONS, traverse
 
 __all__ = ["REASONS", "ChainEnumeration", "DataFlow", "LatencyAnalysis", "LatencyStatistics"]
 __all__ += ["analyse_latency", "application_graph", "callback_instances", "callback_statistics"]
-__all__ += ["data_flow", "disturbed", "enumerate_chains", "find_chain", "graph_of"]
+__all__ += ["data_flow", "disturbed", "enumerate_chains", "executors", "find_chain", "graph_of"]
 __all__ += ["latency_statistics", "load_named_paths", "resolve_objects", "traverse"]

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +14,7 @@ from chainshaper.analysis.flow import DataFlow, data_flow
 from chainshaper.analysis.graph import graph_of
 from chainshaper.analysis.traversals import reception, traverse
 from chainshaper.values import events
-from chainshaper.values.application import ApplicationGraph, Chain
+from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Chain, trigger_text
 from chainshaper.values.recording import Recording
 
 PERCENTILES: tuple[float, ...] = (0.5, 1, 5, 25, 50, 75, 95, 99, 99.5)
@@ -97,6 +98,42 @@ def callback_statistics(flow: DataFlow) -> pl.DataFrame:
             *("tids", "count", "unfinished", "response_ns", "execution_ns"),
         )
     )
+
+
+class Executor(NamedTuple):
+    """The threads of a process that run the same callbacks.
+
+    ``threads`` are their ids, each with the nodes it ran callbacks of, ``callbacks`` these by id,
+    ``names`` the timers and subscriptions among them by node and trigger, without those that every
+    node has for itself (`/clock` may have a thread of its own).
+    """
+
+    pid: int
+    threads: dict[int, tuple[str, ...]]
+    callbacks: frozenset[int]
+    names: tuple[tuple[str, str], ...]
+
+
+def executors(flow: DataFlow) -> list[Executor]:
+    """Which callbacks have an executor of their own (paper, section 6): they share no thread.
+
+    What one thread was seen to run is one executor's, and so is what several take turns with.
+    """
+    found: list[Executor] = []
+    columns = ("callback_id", "node", "kind", "topic", "period_ns", "pid", "tids")
+    for row in callback_statistics(flow).drop_nulls("node").select(*columns).iter_rows():
+        number, node, kind, topic, period_ns, pid, tids = row
+        threads: dict[int, tuple[str, ...]] = dict.fromkeys(tids, (node,))
+        callbacks, names = frozenset((number,)), tuple[tuple[str, str], ...]()
+        if kind in ("timer", "subscription") and topic not in INTERNAL_TOPICS:
+            names = ((node, trigger_text(topic, period_ns)),)
+        for one in [one for one in found if one.pid == pid and one.threads.keys() & threads]:
+            found.remove(one)
+            for tid, nodes in one.threads.items():
+                threads[tid] = tuple(dict.fromkeys((*nodes, *threads.get(tid, ()))))
+            callbacks, names = callbacks | one.callbacks, tuple(dict.fromkeys(one.names + names))
+        found.append(Executor(pid, threads, callbacks, names))
+    return found
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,8 @@ def apply(
         "Where in a cycle the chain's timer expires, on CLOCK_MONOTONIC. Default: measured.",
     ),
     recording: Path | None = option(
-        "--recording REC", "A recording of these very processes: it tells executors for sure."
+        "--recording REC",
+        "Of these very processes, or of an earlier run: it tells which threads execute what.",
     ),
     wait: int | None = option(
         "--wait DURATION",

@@ -21,6 +21,7 @@ import time
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain as joined
+from types import MappingProxyType
 from typing import NamedTuple
 
 from chainshaper.enforcement.servers import ReservationServer
@@ -39,6 +40,10 @@ from chainshaper.planning.plan import Server
 from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.values.errors import InputError, OperationError
 
+IN_ORDER = (
+    "its executors are told apart by the order in which it started its threads, as the program did"
+    " when it was recorded"
+)
 LEFT_ALONE = "left alone, since users run them whom this run does not name: "
 DDS_PRIORITY = 90
 _BEST_SERVER_PRIORITY = 87
@@ -49,11 +54,16 @@ _MOST_NAMED = 5
 
 @dataclass(frozen=True)
 class RecordedThread:
-    """A thread in a recording, by its id in its own pid namespace, and whose callbacks it ran."""
+    """A thread in a recording, by its id in its own pid namespace, and whose callbacks it ran.
+
+    ``callbacks`` are those of its executor, by node and trigger, where the process has several.
+    """
 
     tid: int
     role: ThreadRole
     nodes: tuple[str, ...]
+    comm: str = ""
+    callbacks: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -71,13 +81,15 @@ class NodeThread:
     """A thread of an application, the nodes it works for, and how its role is known.
 
     ``known_by`` is empty when the role is unknown. ``nodes_known_by`` is ``recording``,
-    ``command line``, or ``program's name``: a guess.
+    ``command line``, or ``program's name``: a guess. ``callbacks`` are as in
+    :class:`RecordedThread`.
     """
 
     thread: Thread
     nodes: tuple[str, ...]
     known_by: str
     nodes_known_by: str
+    callbacks: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -93,12 +105,17 @@ class Allocation:
 
 
 class _Identified(NamedTuple):
-    """A process with its nodes, how they are known, and its recorded self if there is one."""
+    """A process with its nodes, how they are known, and what a recording says of its threads, by
+    their ids in its own pid namespace: of itself, or (``in_order``) of an earlier run. Where others
+    execute, the program keeps its main thread out of it.
+    """
 
     process: Process
     nodes: tuple[str, ...] = ()
     nodes_known_by: str = ""
-    recorded: RecordedProcess | None = None
+    recorded: Mapping[int, RecordedThread] = MappingProxyType({})
+    in_order: bool = False
+    main_executes: bool = True
 
 
 def allocate(
@@ -135,8 +152,10 @@ def allocate(
         "a name or a namespace of its own, or end those that are not meant"
         for name, claimants in _claims(chosen).items()
     ]
+    in_order = [one for one in chosen if one.in_order]
+    notes = (f"process {o.process.pid} of {', '.join(o.nodes)}: {IN_ORDER}" for o in in_order)
     threads = tuple(thread for one in chosen for thread in _threads_of(one))
-    return Allocation(threads, (*guesses, *ambiguities))
+    return Allocation(threads, (*guesses, *ambiguities, *notes))
 
 
 def new_and_ended(
@@ -173,13 +192,44 @@ def strangers_text(
 def _identify(process: Process, recorded: Sequence[RecordedProcess]) -> _Identified:
     named = named_nodes(process.command)
     match = next((seen for seen in recorded if _is_same(process, named, seen)), None)
-    if match is not None and match.nodes:
-        return _Identified(process, match.nodes, "recording", match)
+    nodes, known_by = _own_words(process)
+    if match is not None:
+        known = {thread.tid: thread for thread in match.threads}
+        nodes, known_by = (match.nodes, "recording") if match.nodes else (nodes, known_by)
+        main = all(thread.role != "executor" for thread in match.threads)
+        return _Identified(process, nodes, known_by, known, main_executes=main)
+    earlier = next((seen for seen in recorded if nodes and set(nodes) <= set(seen.nodes)), None)
+    if earlier is None:
+        return _Identified(process, nodes, known_by)
     # A container's command line names the container only; an earlier run tells its components.
-    earlier = (seen.nodes for seen in recorded if named and set(named) < set(seen.nodes))
-    if components := next(earlier, None):
-        return _Identified(process, components, "recording", match)
-    return _Identified(process, *_own_words(process), match)
+    if named and set(named) < set(earlier.nodes):
+        nodes, known_by = earlier.nodes, "recording"
+    like = _in_order(process, earlier)
+    executing = [thread.tid for thread in earlier.threads if thread.role == "executor"]
+    main = not executing or earlier.pid in executing
+    return _Identified(process, nodes, known_by, like, bool(like), main)
+
+
+def _in_order(process: Process, earlier: RecordedProcess) -> dict[int, RecordedThread]:
+    """The threads of a process as an earlier run of its program had them; none if it is not sure.
+
+    A program starts its threads in one order, so those of one name are the same by turns, once
+    there are as many. It is asked for executors beside the main thread only.
+    """
+    executing = [thread for thread in earlier.threads if thread.role == "executor"]
+    if all(thread.tid == earlier.pid for thread in executing):
+        return {}
+    found: dict[int, RecordedThread] = {}
+    for name in {thread.comm for thread in executing}:
+        before = {one.tid: one for one in earlier.threads if one.comm == name}
+        now = [one.inner_tid for one in process.threads if one.comm == name]
+        if len(before) != len(now):
+            return {}
+        # Ids ascend, and begin again at the lowest that is free.
+        now.sort(key=lambda tid: (tid < process.inner_pid, tid))
+        tids = sorted(before, key=lambda tid: (tid < earlier.pid, tid))
+        found |= {tid: before[its] for tid, its in zip(now, tids, strict=True)}
+    return found
 
 
 def _own_words(process: Process) -> tuple[tuple[str, ...], str]:
@@ -232,21 +282,21 @@ def _with_unique_names(identified: list[_Identified]) -> list[_Identified]:
 
 
 def _threads_of(one: _Identified) -> Iterable[NodeThread]:
-    seen = {thread.tid: thread for thread in one.recorded.threads} if one.recorded else {}
-    executors_seen = any(thread.role == "executor" for thread in seen.values())
     for thread in one.process.threads:
         nodes, role, known_by = one.nodes, thread.role, ""
-        recorded = seen.get(thread.inner_tid)
+        recorded = one.recorded.get(thread.inner_tid)
         if recorded is not None and recorded.role != "unknown":
-            nodes, role, known_by = recorded.nodes or nodes, recorded.role, "recording"
+            nodes, role = recorded.nodes or nodes, recorded.role
+            known_by = "order of start" if one.in_order else "recording"
         elif thread.role == "executor":
-            # Where others execute, the program keeps its main thread out of it.
-            main = bool(nodes) and not executors_seen
+            main = bool(nodes) and one.main_executes
             role, known_by = ("executor", "main thread") if main else ("unknown", "")
         elif thread.role != "unknown":
             known_by = "name"
         kind = thread.kind if role in ("dds", "publisher") else None
-        yield NodeThread(replace(thread, role=role, kind=kind), nodes, known_by, one.nodes_known_by)
+        known = replace(thread, role=role, kind=kind)
+        callbacks = () if recorded is None else recorded.callbacks
+        yield NodeThread(known, nodes, known_by, one.nodes_known_by, callbacks)
 
 
 @dataclass(frozen=True)
@@ -274,7 +324,7 @@ def server_members(
         found = {
             one.thread.identity: one
             for planned in server.threads
-            for one in _threads_for(planned, allocation)
+            for one in threads_for(planned, allocation)
         }
         for identity, one in found.items():
             if identity in homes:
@@ -289,7 +339,8 @@ def server_members(
     return members
 
 
-def _threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThread]:
+def threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThread]:
+    """The threads that a plan means. Raises OperationError: as :func:`server_members`."""
     owners = [one for one in allocation.threads if planned.node in one.nodes]
     found = [one for one in owners if one.thread.role == planned.role]
     pids = sorted({one.thread.pid for one in owners})
@@ -306,12 +357,29 @@ def _threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThr
             "a recording of it" + (f"; {allocation.strangers}" if allocation.strangers else "")
         )
     if not found:
-        what = "asynchronous publisher" if planned.role == "publisher" else planned.role
+        what = "executor: name a recording of this very process (--recording), or "
+        if planned.role == "publisher":
+            what = (
+                "asynchronous publisher. Fast DDS has one if RMW_FASTRTPS_PUBLICATION_MODE is "
+                "ASYNCHRONOUS, Cyclone DDS has none: plan with --publication synchronous, or "
+            )
         raise OperationError(
             f"process {pids[0]} of node {planned.node} has no thread that is known to be its "
-            f"{what}: see `chainshaper threads {pids[0]}`"
+            f"{what}see `chainshaper threads {pids[0]}`"
         )
-    return found
+    if not planned.callbacks:
+        return found
+    wanted = {(planned.node, name) for name in planned.callbacks}
+    own = [one for one in found if not wanted.isdisjoint(one.callbacks)]
+    if not own:
+        known = sorted({name for one in found for node, name in one.callbacks})
+        raise OperationError(
+            f"process {pids[0]} of node {planned.node}: which of its threads runs "
+            f"{', '.join(planned.callbacks)} is not known"
+            + (f" (known are those that run {', '.join(known)})" if known else "")
+            + ": name a recording of it, or of an earlier run of the same program (--recording)"
+        )
+    return own
 
 
 def server_priorities(priorities: Iterable[int]) -> dict[int, int]:

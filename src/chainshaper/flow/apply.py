@@ -94,14 +94,15 @@ def apply_plan(
     ``command`` is started first (its output goes to ``command_stdout``); without one, the
     application runs already. Its nodes have ``wait_ns`` to appear (default: 30 s with a command,
     else none). ``phase_ns`` is where in a cycle the first chain's timer expires, on CLOCK_MONOTONIC
-    (None: those of all chains are measured). ``recording`` is one of the very processes. Only
+    (None: those of all chains are measured). ``recording`` is one of the very processes, or of an
+    earlier run of their programs. Only
     processes of ``users`` (names or numbers; default: who launched us, and root) are nodes of the
     plan. ``watch`` gets the state every second; ``folder`` is where runs stand (default:
     `/run/chainshaper`).
 
     Raises:
         InputError: the plan names no threads, or has offsets, which priorities alone cannot carry
-            out; or there is no such user.
+            out; or a publisher does not publish as it asks; or there is no such user.
         PlatformError: the machine lacks a core or the back end, or we a privilege.
         OperationError: another run governs a core or node, a node does not appear or is ambiguous,
             the chain has no regular beginning, the kernel refuses something, the servers failed,
@@ -127,8 +128,10 @@ def apply_plan(
             run.command = start_command(command, stdout=command_stdout)
         run.await_nodes((START_NS if command else 0) if wait_ns is None else wait_ns, progress)
         run.guardians.await_ready(run.go_on)
+        said = threads.check_publishers(given, run.found, recording)
         run.schedule()
         run.begin_state(command, plan_path)
+        run.note(*said, *(one for one in run.found.notes if one.endswith(allocation.IN_ORDER)))
         run.find_anchor(phase_ns, progress)
         table = threads.server_table(run.plan)
         run.servers = make_back_end(choice.name, table, journal, run.go_on)

@@ -129,7 +129,7 @@ def shape_launch(
         "after",
         _with_shaping_node(launch, splicing),
         duration_ns,
-        scheduling=_in_force(plan, back_end, first, taken),
+        scheduling=_in_force(plan, back_end, first, taken, applied := list[str]()),
         plan=plan,
         gate_logs=splicing.logs,
         **measured,
@@ -137,7 +137,7 @@ def shape_launch(
     progress(0.0, "comparing")
     comparison = compare_recordings([before, after], chain)
     write_comparison(comparison, folder)
-    found = [*before.info.notes, *splicing.notes, *after.info.notes]
+    found = [*before.info.notes, *splicing.notes, *applied, *after.info.notes]
     if not permitted:
         found.insert(0, "measured under ordinary scheduling: SCHED_FIFO is not permitted.")
     return ShapedLaunch(folder, chain, plan, splicing, comparison, tuple(dict.fromkeys(found)))
@@ -172,11 +172,12 @@ def _with_shaping_node(launch: LaunchCommand, splicing: Splicing) -> list[str]:
 
 @contextmanager
 def _in_force(
-    plan: Plan, back_end: str, recording: Recording, users: frozenset[int]
+    plan: Plan, back_end: str, recording: Recording, users: frozenset[int], notes: list[str]
 ) -> Iterator[Callable[[Sequence[Process]], bool]]:
     """The plan in force on what runs; what it gives says whether all servers have opened.
 
-    A thread of its own does what `chainshaper apply` does, until the context ends.
+    A thread of its own does what `chainshaper apply` does, until the context ends; ``notes`` are
+    what it has to say then.
     """
     stop, states = threading.Event(), list[RunState]()
     with ThreadPoolExecutor(1, "apply") as beside:
@@ -204,4 +205,4 @@ def _in_force(
             yield opened
         finally:
             stop.set()
-    applied.result()
+    notes += applied.result().state.notes

@@ -6,9 +6,11 @@ followed backwards here, from every input of a synchronising callback to what st
 node with which the chain begins: what feeds a subscription there is not planned for.
 """
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain as joined
 from pathlib import Path
 from types import MappingProxyType
 
@@ -16,9 +18,10 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper.analysis import DataFlow, LatencyAnalysis, analyse_latency, data_flow
+from chainshaper.analysis import DataFlow, LatencyAnalysis, analyse_latency, data_flow, executors
 from chainshaper.analysis.disturbance import overlapping, stalled_within
 from chainshaper.analysis.graph import goes_on_elsewhere
+from chainshaper.analysis.latency import Executor
 from chainshaper.planning import CallbackTimes, Modes, Plan, PlanRequest, Profile, plan_chain
 from chainshaper.planning.application_plan import ApplicationPlan, plan_values, whole
 from chainshaper.planning.margins import read_latencies
@@ -106,8 +109,9 @@ def _profile_of(
     disturbed = every.clear() if all_disturbed else every.filter("disturbed")
     period = _period(analysis, period_ns)
     stages = _stages(graph, chain)
-    cores, priority = _executors(recording, graph)
     nodes = dict.fromkeys(stage.node for stage in stages)
+    running, named = _running(flow, stages)
+    cores, priority = _executors(recording, graph, running)
     core_of = {node: cores.get(node, DEFAULT_CORE) for node in nodes}
     instances = _instances_apart_from(flow, disturbed)
     measured = every if all_disturbed else calm
@@ -122,6 +126,7 @@ def _profile_of(
         begins=(chain.callbacks[0], graph.callbacks[chain.callbacks[0]].label),
         upstream=_upstream(graph, chain, stages),
         core_of=core_of,
+        executors=named,
         receivers=_receivers(graph, chain, nodes),
         callbacks=tuple(_times(flow, instances, stage, core_of[stage.node]) for stage in stages),
         steps_ns=steps[measured["traversal"].to_numpy()],
@@ -132,10 +137,11 @@ def _profile_of(
         disturbed=int(every["disturbed"].sum()),
         realtime=recording.info.realtime,
         longest_stall_ns=longest_stall(recording),
-        utilisation=_utilisation(flow, graph, core_of),
+        utilisation=_utilisation(flow, graph, core_of, running),
         longest_send_ns=_longest_send(flow),
         longest_publication_ns=_longest_publication(flow, stages[-1].node, chain.topics[-1]),
         lost_events=sum(recording.info.lost.values()) or None,
+        asynchronous=_publishes_asynchronously(recording, stages[-1].node),
         output_depth=_output_depth(flow, stages[-1].node, chain.topics[-1]),
         all_disturbed=all_disturbed or None,
     )
@@ -382,11 +388,35 @@ def _receivers(graph: ApplicationGraph, chain: Chain, nodes: Collection[str]) ->
     )
 
 
+def _running(
+    flow: DataFlow, stages: Sequence[_Stage]
+) -> tuple[list[Executor], dict[str, tuple[tuple[str, ...], ...]]]:
+    """The executors that run the chain and its branches; of nodes with several, their callbacks.
+
+    Where two executors have callbacks of one name, nothing tells them apart in another run.
+    """
+    every = executors(flow)
+    members = {number for stage in stages for number in stage.members}
+    running = [one for one in every if not members.isdisjoint(one.callbacks)]
+    named = {}
+    for node in {stage.node for stage in stages}:
+        names = [tuple(name for owner, name in one.names if owner == node) for one in every]
+        own = tuple(one for one, by in zip(names, every, strict=True) if one and by in running)
+        if own and sum(map(bool, names)) > 1 and max(Counter(joined(*names)).values()) == 1:
+            named[node] = own
+    return running, named
+
+
 def _executors(
-    recording: Recording, graph: ApplicationGraph
+    recording: Recording, graph: ApplicationGraph, running: Sequence[Executor]
 ) -> tuple[dict[str, int], dict[str, int]]:
-    """Core and SCHED_FIFO priority of every node's executor, where the recording knows them."""
-    by_pid = {thread.pid: thread for thread in recording.info.threads if thread.role == "executor"}
+    """Core and SCHED_FIFO priority of every node's executor, where the recording knows them.
+
+    Of several in a process that which runs the chain is meant.
+    """
+    ours = {(one.pid, tid) for one in running for tid in one.threads}
+    threads = sorted(recording.info.threads, key=lambda one: (one.pid, one.tid) in ours)
+    by_pid = {thread.pid: thread for thread in threads if thread.role == "executor"}
     found = {node.name: by_pid[node.pid] for node in graph.nodes if node.pid in by_pid}
     return (
         {name: thread.cores[0] for name, thread in found.items() if len(thread.cores) == 1},
@@ -437,6 +467,14 @@ def _longest_calm(flow: DataFlow, lasted: pl.DataFrame) -> int:
     return int((calm if calm.height else lasted)["duration"].max())  # type: ignore[arg-type]
 
 
+def _publishes_asynchronously(recording: Recording, node: str) -> bool | None:
+    """Whether a node's process has a publisher's thread; None where DDS threads have no names."""
+    threads = recording.info.threads
+    pids = {thread.pid for thread in threads if thread.node == node}
+    roles = {thread.role for thread in threads if thread.pid in pids}
+    return "publisher" in roles if "dds" in roles else None
+
+
 def _output_depth(flow: DataFlow, node: str, topic: str) -> int | None:
     """The history (keep last) of the writer of the chain's output."""
     writers = flow.objects.publishers.filter((pl.col("node") == node) & (pl.col("topic") == topic))
@@ -448,9 +486,16 @@ def _output_depth(flow: DataFlow, node: str, topic: str) -> int | None:
     return int(depths.min()) if depths.len() else None  # type: ignore[arg-type]
 
 
-def _utilisation(flow: DataFlow, graph: ApplicationGraph, core_of: dict[str, int]) -> float | None:
-    """The largest share of a core that the executors of the chain's nodes take."""
-    core = {one.id: core_of[one.node] for one in graph.callbacks if one.node in core_of}
+def _utilisation(
+    flow: DataFlow,
+    graph: ApplicationGraph,
+    core_of: dict[str, int],
+    running: Sequence[Executor],
+) -> float | None:
+    """The largest share of a core that the executors of the chain take."""
+    theirs = {number for one in running for number in one.callbacks}
+    own = (one for one in graph.callbacks if one.node in core_of and one.id in theirs)
+    core = {one.id: core_of[one.node] for one in own}
     ran = flow.instances.filter(
         pl.col("callback_id").is_in(list(core)) & pl.col("execution_ns").is_not_null()
     )

@@ -18,7 +18,6 @@ from chainshaper.enforcement.servers import ReservationServer
 from chainshaper.enforcement.threads import (
     Allocation,
     NodeThread,
-    RecordedProcess,
     allocate,
     scheduling_around,
 )
@@ -58,7 +57,7 @@ def profiling_condition(
         """Give new threads what they shall have; whether all nodes have it, and nothing was new."""
         found = allocate(processes, recorded)
         there = {node for one in found.threads for node in one.nodes}
-        members = executors_of(found, wanted, processes, recorded)
+        members = executors_of(found, wanted, processes)
         if not members or not wanted <= there:
             if time.monotonic_ns() - begun_ns > START_NS:
                 missing, running = (", ".join(sorted(n)) for n in (wanted - there, there))
@@ -109,31 +108,18 @@ def executors_of(
     found: Allocation,
     nodes: frozenset[str],
     processes: Sequence[Process],
-    recorded: Sequence[RecordedProcess],
 ) -> list[NodeThread]:
     """The threads that execute these nodes, or publish for them; of all nodes if none are named.
 
     What has started other nodes is left out: `ros2 launch` is a node as well, and in no chain.
-    Where several threads of a process executed before, unnamed ones are taken for such: they do not
-    differ from others that do next to nothing, as the one that waits for signals.
     """
     owners = {one.thread.pid for one in found.threads if one.nodes}
     launchers = {one.parent for one in processes if one.pid in owners}
-    names = {one.pid: one.threads[0].comm for one in processes if one.threads}
-    several: set[str] = set()
-    for seen in recorded:
-        if sum(thread.role == "executor" for thread in seen.threads) > 1:
-            several.update(seen.nodes)
-
-    def executes(one: NodeThread) -> bool:
-        if one.thread.role == "unknown":
-            unnamed = one.thread.comm == names[one.thread.pid]
-            return unnamed and not several.isdisjoint(one.nodes)
-        return one.thread.role in ("executor", "publisher")
 
     def is_meant(one: NodeThread) -> bool:
         if nodes:
             return not nodes.isdisjoint(one.nodes)
         return bool(one.nodes) and one.thread.pid not in launchers
 
-    return [one for one in found.threads if executes(one) and is_meant(one)]
+    running = (one for one in found.threads if one.thread.role in ("executor", "publisher"))
+    return [one for one in running if is_meant(one)]

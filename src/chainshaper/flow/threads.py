@@ -8,7 +8,7 @@ Which nodes a process has, its creation events say; which threads execute, the c
 
 import platform
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -31,7 +31,8 @@ from chainshaper.linux.scheduling import available_cores
 from chainshaper.linux.threads import Thread, ThreadRole
 from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
 from chainshaper.planning.offsets import chain_name
-from chainshaper.planning.plan import Plan, Server
+from chainshaper.planning.overruns import Writer, check_publication
+from chainshaper.planning.plan import Plan, Server, publisher_servers
 from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.values.errors import InputError, OperationError
 
@@ -41,8 +42,6 @@ if TYPE_CHECKING:
 
 LEAD_NS = 2_000_000
 """The cycle starts so long after the chain's timer expires (DESIGN section 6)."""
-
-_KNOWN_ROLES = ("executor", "publisher", "dds")
 
 
 def find_threads(
@@ -123,7 +122,7 @@ def recorded_processes(
     """The processes of a recording, and why it says nothing about this machine, if that is so."""
     import polars as pl  # only who has a recording pays for this
 
-    from chainshaper.analysis import callback_statistics, data_flow
+    from chainshaper.analysis import data_flow, executors
     from chainshaper.values import events
 
     info, tables = recording.info, recording.events
@@ -145,23 +144,66 @@ def recorded_processes(
     for pid, node in created.unique(maintain_order=True).iter_rows():
         nodes.setdefault(pid, []).append(node)
     threads = defaultdict[int, dict[int, RecordedThread]](dict)
+    comms = {(one.pid, one.tid): one.comm for one in info.threads}
     for one in info.threads:
-        if one.role in _KNOWN_ROLES:
-            own = (one.node,) if one.node else ()
-            role = cast(ThreadRole, one.role)
-            threads[one.pid][one.tid] = RecordedThread(one.tid, role, own)
-            nodes.setdefault(one.pid, list(own))
-    ran = callback_statistics(data_flow(tables, info.clock_offset_ns)).drop_nulls("node")
-    executors = ran.explode("tids").group_by("pid", "tids", maintain_order=True)
-    of_thread = executors.agg(pl.col("node").unique(maintain_order=True))
-    for pid, tid, own in of_thread.iter_rows():
-        threads[pid][tid] = RecordedThread(tid, "executor", tuple(own))
+        own = (one.node,) if one.node else ()
+        role = cast(ThreadRole, one.role)
+        threads[one.pid][one.tid] = RecordedThread(one.tid, role, own, one.comm)
+        nodes.setdefault(one.pid, list(own))
+    ran = executors(data_flow(tables, info.clock_offset_ns))
+    several = Counter(one.pid for one in ran)
+    for executor in ran:
+        apart = executor.names if several[executor.pid] > 1 else ()
+        for tid, ran_of in executor.threads.items():
+            comm = comms.get((executor.pid, tid), "")
+            threads[executor.pid][tid] = RecordedThread(tid, "executor", ran_of, comm, apart)
     found = (
         RecordedProcess(pid, tuple(own), tuple(threads[pid].values()), last_seen[pid])
         for pid, own in nodes.items()
         if pid in last_seen
     )
     return tuple(found), ()
+
+
+def check_publishers(
+    plan: ApplicationPlan, found: Allocation, recording: "Recording | None" = None
+) -> list[str]:
+    """Look whether processes publish as a plan that gates publishers' threads asks (design 1).
+
+    What a plan shows by itself was checked when it was read, and that the threads are there by
+    :func:`.server_members`. A recording knows the writers, the environment of a process how Fast
+    DDS is to publish. Returns what a person must know, one sentence each.
+
+    Raises InputError: as :func:`.check_publication`.
+    """
+    gating = [chain for chain in plan.chains if any(publisher_servers(chain))]
+    if not gating or recording is None:
+        return []
+    process = {node: one.thread.pid for one in found.threads for node in one.nodes}
+    modes = {pid: _asynchronous(pid) for pid in set(process.values())}
+    writers = [
+        Writer(one.node, one.topic, one.depth, modes[pid], pid)
+        for one in recording.info.endpoints
+        if one.kind == "publisher" and (pid := process.get(one.node)) is not None
+    ]
+    known = [c for c in gating if any(one.node == c.chain.publisher for one in writers)]
+    return [said for chain in known for said in check_publication(chain, writers)]
+
+
+def _asynchronous(pid: int) -> bool | None:
+    """Whether rmw_fastrtps lets all writers of a process publish asynchronously; None: each as a
+    file of profiles says, or as it is by default.
+    """
+    from chainshaper.sources.ros import environment_of  # only who gates publishers pays for this
+
+    try:
+        asked = environment_of(pid).variables
+    except OperationError:
+        return None
+    if asked.get("RMW_FASTRTPS_USE_QOS_FROM_XML") == "1":
+        return None
+    modes = {"ASYNCHRONOUS": True, "SYNCHRONOUS": False}
+    return modes.get(asked.get("RMW_FASTRTPS_PUBLICATION_MODE", ""))
 
 
 @dataclass(frozen=True)
@@ -249,9 +291,9 @@ def first_threads(plan: ApplicationPlan, found: Allocation) -> list[Thread]:
 
     Raises OperationError: no server of a chain holds an executor, or see :func:`.server_members`.
     """
-    members = allocation.server_members(plan, found)
+    allocation.server_members(plan, found)  # none is in two servers
     of_thread = {
-        planned: [one.thread for one in members[server.name] if planned.node in one.nodes]
+        planned: [one.thread for one in allocation.threads_for(planned, found)]
         for server in plan.servers
         for planned in server.threads
     }

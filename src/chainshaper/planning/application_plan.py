@@ -248,9 +248,16 @@ def _threads(plan: ApplicationPlan) -> _Wrong:
     for place, chain in enumerate(plan.chains):
         for number, server in enumerate(chain.servers):
             for thread in server.threads:
+                for other_thread in filter(thread.overlaps, tuple(homes)):
+                    if other_thread != thread:
+                        yield (
+                            f"{thread.text} may be {other_thread.text} in server"
+                            f" {homes[other_thread].name!r}: name the same callbacks in both",
+                            *(place, "servers", number, "threads"),
+                        )
                 if (other := homes.setdefault(thread, server)).core != server.core:
                     reason = (
-                        f"the {thread.role} of {thread.node} would run on core {server.core} here"
+                        f"{thread.text} would run on core {server.core} here"
                         f" and on core {other.core} in server {other.name!r}: write one core"
                     )
                     yield reason, place, "servers", number, "core"

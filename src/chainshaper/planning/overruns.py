@@ -131,13 +131,14 @@ def _longer_stages(plan: Plan) -> Iterator[tuple[str, list[Slot]]]:
 @dataclass(frozen=True)
 class Writer:
     """A writer of an application: node, topic, history (keep last), and whether a publisher thread
-    sends for it. None is: not known.
+    sends for it. None is: not known. Those of one ``process`` have one such thread.
     """
 
     node: str
     topic: str
     depth: int | None = None
     asynchronous: bool | None = None
+    process: int | None = None
 
 
 def check_publication(plan: Plan, writers: Sequence[Writer]) -> list[str]:
@@ -154,12 +155,22 @@ def check_publication(plan: Plan, writers: Sequence[Writer]) -> list[str]:
             own = {writer.topic: writer for writer in writers if writer.node == node}
             if node == plan.chain.publisher and output is not None:
                 _check_output(output, node, own.get(output), messages_waiting(plan, server))
-            delayed = sorted(t for t, writer in own.items() if writer.asynchronous and t != output)
-            if delayed:
+            processes = {writer.process for writer in own.values()} - {None}
+            others = [
+                writer
+                for writer in writers
+                if writer.node == node or writer.process in processes
+                if writer.asynchronous is not False
+                and (writer.node, writer.topic) != (node, output)
+            ]
+            if others:
+                doubt = {True: "", None: " (if asynchronous)"}
+                topics = sorted({f"{one.topic}{doubt[one.asynchronous]}" for one in others})
                 warnings.append(
-                    f"{', '.join(delayed)} of {node} will be delayed as well, until the slots of"
-                    f" server {server.name!r}: one thread sends for all asynchronous writers of a"
-                    " process. Publish them synchronously, or from another process."
+                    f"{', '.join(topics)} of {', '.join(sorted({one.node for one in others}))}"
+                    f" will be delayed as well, until the slots of server {server.name!r}: one"
+                    " thread sends for all asynchronous writers of a process. Publish them"
+                    " synchronously, or from another process."
                 )
     return warnings
 

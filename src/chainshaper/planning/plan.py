@@ -23,7 +23,7 @@ import yaml
 from pydantic import AfterValidator, Field, model_validator
 
 from chainshaper.gate.decision import Anchor, IntoOpenSlot, Late, Messages, Overrun
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import OperationError
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.plan_choices import Fallback, Policy
@@ -128,13 +128,41 @@ class Margin(Part):
     confidence_interval_ns: tuple[Duration, Duration] | None = None
 
 
+def _callback(value: str) -> str:
+    """A callback by what starts it, in one spelling. Raises ValueError: it is neither."""
+    if value.startswith("every "):
+        return f"every {format_duration(parse_duration(value.removeprefix('every ')))}"
+    if re.fullmatch(r"(/[A-Za-z_]\w*)+", value):
+        return value
+    raise ValueError(
+        f"{value!r} is no callback: write the topic that it subscribes to, or a timer's period, as"
+        " in `every 100ms`"
+    )
+
+
 class Thread(Part):
     """A thread of a node that runs inside a server; other DDS threads are never gated (section
     3.1).
+
+    A node may have callback groups with an executor each (section 6): ``callbacks`` are those of
+    the one that is meant, by topic or as ``every 100ms``. Without, all executors of the node are.
     """
 
     node: FullName
     role: Literal["executor", "publisher"] = "executor"
+    callbacks: tuple[Annotated[str, AfterValidator(_callback)], ...] = ()
+
+    def overlaps(self, other: "Thread") -> bool:
+        """Whether a thread may be both."""
+        apart = self.callbacks and other.callbacks
+        same = (self.node, self.role) == (other.node, other.role)
+        return same and not (apart and set(self.callbacks).isdisjoint(other.callbacks))
+
+    @property
+    def text(self) -> str:
+        """A thread as messages name it."""
+        said = f" that runs {', '.join(self.callbacks)}" if self.callbacks else ""
+        return f"the {self.role} of {self.node}{said}"
 
 
 class Server(Part):
@@ -415,10 +443,10 @@ def _servers(plan: Plan) -> _Wrong:
                 )
                 yield reason, "servers", place, "slots", number
         for number, thread in enumerate(server.threads):
-            if thread in homes:
+            for other in filter(thread.overlaps, homes):
                 reason = (
-                    f"the {thread.role} of {thread.node} is already in server {homes[thread]!r}:"
-                    " a thread belongs to one server, remove it from the other"
+                    f"{other.text} is already in server {homes[other]!r}: a thread belongs to one"
+                    " server, remove it from the other"
                 )
                 yield reason, "servers", place, "threads", number
             homes[thread] = server.name
@@ -552,7 +580,7 @@ def _out_ranked(plan: Plan, server: Server, node: str, other: Server) -> list[Sl
     """Slots in which a node's publisher thread out-ranks its executor, if ``other`` runs that."""
     if other.core != server.core or other.priority <= server.priority:
         return []
-    if Thread(node=node) not in other.threads:
+    if not any(map(Thread(node=node).overlaps, other.threads)):
         return []
     earliest = plan.evidence.min_latency_ns
     return [
@@ -665,7 +693,10 @@ def plans_as_text(plans: Sequence[Plan]) -> str:
 def _yaml_values(plan: Plan) -> dict[str, Any]:
     values = plan.model_dump(mode="json", by_alias=True, exclude_none=True, context=AS_YAML)
     for server in values["servers"]:
-        server["threads"] = [_OnOneLine(thread) for thread in server["threads"]]
+        server["threads"] = [
+            _OnOneLine({key: value for key, value in thread.items() if value})
+            for thread in server["threads"]
+        ]
     if "modes" in values:
         values["modes"]["bands"] = _OnOneLine(values["modes"]["bands"])
     if plan.offset_ns == 0:

@@ -51,6 +51,7 @@ from chainshaper.planning.shaping import (
     plan_shaping,
     server_per_callback,
     server_per_chain,
+    with_executors,
     with_first_node_apart,
     with_sink,
 )
@@ -73,13 +74,15 @@ class Profile:
     ``every_latency_ns`` those of all (None: all were undisturbed), both in the order of time.
     ``nodes`` are those of the chain's callbacks, one per callback, ``topics`` what each of these
     publishes for the chain. ``core_of`` names the core of every node whose executor takes part,
-    also on branches that the chain waits for. ``begins`` is the first callback's number in the
-    graph, and its name, ``upstream`` the topics that the output waits for: on the chain, on those
-    branches, and before the chain begins. ``receivers`` are the nodes that subscribe to the chain's
-    output and are none of these. ``callbacks`` are those of the chain and its branches, see
-    :func:`~chainshaper.planning.shaping.server_per_callback`. ``steps_ns`` and ``every_step_ns``
-    are what each callback of the chain took, a row per latency, see
-    :mod:`~chainshaper.planning.pipeline`. ``output_depth`` is the history of the output's writer,
+    also on branches that the chain waits for; where a node has several that run different
+    callbacks, ``executors`` are those that take part, each by its callbacks. ``begins`` is the
+    first callback's number in the graph, and its name, ``upstream`` the topics that the output
+    waits for: on the chain, on those branches, and before the chain begins. ``receivers`` are the
+    nodes that subscribe to the chain's output and are none of these. ``callbacks`` are those of the
+    chain and its branches, see :func:`~chainshaper.planning.shaping.server_per_callback`.
+    ``steps_ns`` and ``every_step_ns`` are what each callback of the chain took, a row per latency,
+    see :mod:`~chainshaper.planning.pipeline`. ``output_depth`` is the history of the output's
+    writer, ``asynchronous`` whether its process has a thread that publishes (None: not known),
     ``of_modes`` has what was measured in each mode of the system. The rest is
     :class:`~chainshaper.planning.plan.Evidence`.
     """
@@ -93,6 +96,7 @@ class Profile:
     begins: tuple[int, str] | None = None
     upstream: frozenset[str] = frozenset()
     core_of: Mapping[str, int] = field(default_factory=dict)
+    executors: Mapping[str, tuple[tuple[str, ...], ...]] = field(default_factory=dict)
     receivers: tuple[str, ...] = ()
     callbacks: tuple[CallbackTimes, ...] = ()
     steps_ns: NDArray[np.int64] | None = None
@@ -107,6 +111,7 @@ class Profile:
     utilisation: float | None = None
     longest_send_ns: int | None = None
     longest_publication_ns: int | None = None
+    asynchronous: bool | None = None
     lost_events: int | None = None
     all_disturbed: bool | None = None
     of_modes: Mapping[str, "Profile"] = field(default_factory=dict)
@@ -201,7 +206,8 @@ def plan_chain(
             f"--fallback {request.fallback} is for an output with a shaping node, and the plan has"
             " none: leave it out, or plan with synchronous publication"
         )
-    return revised(plan, modes=modes)
+    named = with_executors(plan, [one.executors for one in (profile, *sinks)])
+    return revised(named, modes=modes)
 
 
 def _apart(profile: Profile) -> Profile:
@@ -300,6 +306,13 @@ def _shaped(
     last = profile.nodes[-1] if profile.nodes else None
     values = {n: getattr(profile, n) for n in Evidence.model_fields if hasattr(profile, n)}
     if request.publication == "asynchronous":
+        if profile.asynchronous is False:
+            raise InputError(
+                f"{last} has no thread that publishes for it, so {profile.name} cannot be shaped by"
+                " gating one: let it publish asynchronously (rmw_fastrtps_cpp, with"
+                " RMW_FASTRTPS_PUBLICATION_MODE=ASYNCHRONOUS) and record again, or plan with"
+                " --publication synchronous"
+            )
         values["output_depth"] = profile.output_depth
     unused = "publication" if request.publication == "asynchronous" else "send"
     del values[f"longest_{unused}_ns"]  # no evidence for it

@@ -251,6 +251,24 @@ def _chain_and_others(plan: Plan) -> tuple[Server, list[Server]]:
     return found, [server for server in plan.servers if server is not found]
 
 
+def with_executors(
+    plan: Plan, executors: Sequence[Mapping[str, Sequence[tuple[str, ...]]]]
+) -> Plan:
+    """The plan with those executors of nodes in its servers that run the given callbacks.
+
+    Of a node whose callback groups have executors of their own, the others run on (section 6).
+    """
+    servers = []
+    for server in plan.servers:
+        threads: list[Thread] = []
+        for one in server.threads:
+            own = dict.fromkeys(names for known in executors for names in known.get(one.node, ()))
+            apart = own if own and one.role == "executor" else [()]
+            threads += [one.model_copy(update={"callbacks": names}) for names in apart]
+        servers.append(server.model_copy(update={"threads": tuple(threads)}))
+    return revised(plan, servers=tuple(servers))
+
+
 def with_sink(
     plan: Plan,
     latencies_ns: NDArray[np.int64],

@@ -31,7 +31,7 @@ from chainshaper.reporting.tables import (
     slots_ms,
     words,
 )
-from chainshaper.values.application import ApplicationGraph, Chain
+from chainshaper.values.application import ApplicationGraph, Chain, trigger_text
 from chainshaper.values.durations import format_duration, milliseconds
 from chainshaper.values.recording import (
     INFO_FILE,
@@ -121,8 +121,7 @@ def callback_table(statistics: pl.DataFrame) -> ResultTable:
     table = ResultTable("Callbacks [ms]", columns)
     rows = []
     for row in statistics.to_dicts():
-        period = row["period_ns"]
-        trigger = row["topic"] or "" if period is None else f"every {format_duration(period)}"
+        trigger = trigger_text(row["topic"], row["period_ns"])
         rows.append((f"{row['kind']} {trigger}".rstrip(), row))
     alike = Counter((row["pid"], row["node"], trigger) for trigger, row in rows)
     for trigger, row in rows:
@@ -188,6 +187,7 @@ def threads_json(allocation: Allocation) -> dict[str, Any]:
             "tid": found.thread.tid,
             "comm": found.thread.comm,
             "role": found.thread.role,
+            "callbacks": [{"node": node, "callback": name} for node, name in found.callbacks],
             "dds_kind": found.thread.kind,
             "known_by": found.known_by or None,
             "policy": found.thread.policy,
@@ -201,14 +201,14 @@ def threads_json(allocation: Allocation) -> dict[str, Any]:
 
 def threads_table(allocation: Allocation) -> ResultTable:
     """A row per thread; what is as in the row above is left out."""
-    names = ("node", "pid", "tid", "name", "role", "class", "cores", "known by")
-    table = ResultTable("Threads", words(*names))
+    columns = words("node", "pid", "tid", "name", "role", "class", "cores", "known by")
+    table = ResultTable("Threads", columns)
     above: NodeThread | None = None
     for found in allocation.threads:
         thread = found.thread
         first = above is None or above.thread.pid != thread.pid
         same_nodes = not first and above is not None and above.nodes == found.nodes
-        known_by = [found.known_by or "-"]
+        known_by, names = [found.known_by or "-"], [name for _, name in found.callbacks]
         if first and found.nodes:
             known_by.append(f"node: {found.nodes_known_by or None}")
         table.add(
@@ -216,7 +216,7 @@ def threads_table(allocation: Allocation) -> ResultTable:
             str(thread.pid) if first else "",
             str(thread.tid),
             thread.comm,
-            f"DDS {thread.kind}" if thread.role == "dds" else thread.role,
+            f"DDS {thread.kind}" if thread.role == "dds" else ", ".join((thread.role, *names)),
             scheduling_text(thread.policy, thread.priority),
             core_ranges(thread.cores),
             "; ".join(known_by),
@@ -366,8 +366,9 @@ def plan_table(plan: Plan) -> ResultTable:
     table = ResultTable(f"Plan for {plan.chain.spec or 'a chain'} [ms]", columns)
     for server in plan.servers:
         threads = (
-            thread.node + (" (publisher)" if thread.role == "publisher" else "")
+            f"{thread.node} ({what})" if what else thread.node
             for thread in server.threads
+            for what in ["publisher" if thread.role == "publisher" else ", ".join(thread.callbacks)]
         )
         where = str(server.core), str(server.priority)
         table.add(server.name, *where, slots_ms(*server.slots), ", ".join(threads))

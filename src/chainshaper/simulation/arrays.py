@@ -213,8 +213,8 @@ def _servers(plan: ApplicationPlan, threads: Sequence[ThreadInfo]) -> dict[int, 
         for thread in server.threads:
             if thread not in numbers:
                 raise InputError(
-                    f"server {server.name!r} of the plan holds the {thread.role} of {thread.node},"
-                    " which the application does not have: plan again from a recording of it"
+                    f"server {server.name!r} of the plan holds {thread.text}, which the application"
+                    " does not have: plan again from a recording of it"
                 )
             found[numbers[thread]] = server
     return found

@@ -10,6 +10,7 @@ from typing import Literal, TypeAlias
 from chainshaper.values.durations import format_duration
 
 __all__ = ["INTERNAL_TOPICS", "ApplicationGraph", "Callback", "CallbackKind", "Chain", "Node"]
+__all__ += ["trigger_text"]
 
 INTERNAL_TOPICS = frozenset(("/parameter_events", "/rosout", "/clock", "/_chainshaper_rehearsal"))
 """Topics that every node has for itself, or every shaping node: they connect no computation."""
@@ -17,6 +18,13 @@ INTERNAL_TOPICS = frozenset(("/parameter_events", "/rosout", "/clock", "/_chains
 CallbackKind: TypeAlias = Literal["timer", "subscription", "service", "client", "unknown"]
 """``unknown``: it was seen to run, but not to be created (tracing started after it), or only its
 publications were seen (``handle`` 0: a thread of the node's own)."""
+
+
+def trigger_text(topic: str | None, period_ns: int | None) -> str:
+    """What starts a callback: its topic, or ``every 100ms``. It is the same in every run, and what
+    the callbacks of a node are told apart by; empty where neither is known.
+    """
+    return topic or "" if period_ns is None else f"every {format_duration(period_ns)}"
 
 
 @dataclass(frozen=True)
@@ -50,7 +58,7 @@ class Callback:
     def label(self) -> str:
         """A short text that tells callbacks apart: ``/node2 ← /t1`` or ``/node1 every 100ms``."""
         if self.kind == "timer":
-            return f"{self.node} every {format_duration(self.period_ns or 0)}"
+            return f"{self.node} {trigger_text(None, self.period_ns or 0)}"
         if self.kind == "unknown" and not self.handle:
             return f"{self.node} outside callbacks"
         if self.kind == "unknown":
