@@ -446,19 +446,20 @@ def _below(publisher: WantedScheduling, wanted: Iterable[WantedScheduling]) -> W
 
 
 def left_by_back_end(
-    back_end: str, wanted: Iterable[WantedScheduling]
+    back_end: str, wanted: Iterable[WantedScheduling], free: Collection[PlannedThread] = ()
 ) -> tuple[WantedScheduling, ...]:
     """What threads get from us where a back end schedules its servers' threads itself.
 
     Under sched_ext and LITMUS^RT servers are scheduling classes of their own: their threads need
     no priority, and sched_ext's may have none, since the kernel runs real-time threads above it.
+    ``free`` threads, which no back end keeps in their slots, stand above them with what is wanted.
     A receiver would stand above the servers then, instead of below: it is left as it is.
     """
     if back_end not in ("scx", "litmus"):
         return tuple(wanted)
-    left = []
+    left, themselves = [], {thread.node for thread in free}
     for one in wanted:
-        if one.server is not None:
+        if one.server is not None and themselves.isdisjoint(one.thread.nodes):
             priority = 0 if back_end == "scx" and one.thread.thread.priority else None
             left.append(replace(one, wanted=Scheduling(priority, one.wanted.cores)))
         elif one.reason != _RECEIVES:

@@ -195,7 +195,7 @@ def planned_changes(
     if back_end != "litmus":
         choice = choose_back_end(back_end)
         wanted = allocation.plan_scheduling(plan, found, available_cores())
-        threads = allocation.left_by_back_end(choice.name, wanted)
+        threads = allocation.left_by_back_end(choice.name, wanted, plan.free_threads)
         return Changes(choice.name, choice.reason, threads, (), found.notes)
     notes = found.notes
     try:
@@ -218,8 +218,7 @@ def server_table(plan: ApplicationPlan) -> ServerTable:
 
     Raises OperationError: there are none.
     """
-    gated_by_themselves = {node.thread for node in plan.shaping_nodes}
-    servers = [s for s in plan.servers if set(s.threads) - gated_by_themselves]
+    servers = [s for s in plan.servers if set(s.threads) - plan.free_threads]
     if not servers:
         raise OperationError(
             "the plan's servers name no threads of the application, so there is nothing to apply: "

@@ -38,6 +38,9 @@ from chainshaper.values.yaml_file import Part, read_model, wrong_value, wrong_va
 
 MOST_SLOTS = 10_000
 """So many slots of all servers fit into a hyper-period at the most."""
+ROOM_NS = 2_000_000
+"""A shaping node takes messages so long before it watches for its slot, and goes on as long behind
+its pause, to write down what it did: where its server is in force, this is open then."""
 
 
 class ApplicationPlan(Part):
@@ -86,7 +89,7 @@ class ApplicationPlan(Part):
 
     @cached_property
     def servers(self) -> tuple[Server, ...]:
-        """Each server once, with all its slots in the hyper-period, ascending.
+        """Each server once, with all its slots in the hyper-period: ascending and joined.
 
         A thread that several chains have in servers of their own gets one that is open in the
         slots of all of these, at the best of their priorities.
@@ -111,7 +114,7 @@ class ApplicationPlan(Part):
                     name="+".join(together),
                     core=own[0][0].core,
                     priority=min(server.priority for server, _ in own),
-                    slots=tuple(_united(slots)) if len(own) > 1 else tuple(sorted(slots)),
+                    slots=tuple(_united(slots)),
                     threads=tuple(threads),
                 )
             )
@@ -126,6 +129,12 @@ class ApplicationPlan(Part):
     def shaping_nodes(self) -> tuple[ShapingNode, ...]:
         """Those of all chains."""
         return tuple(node for chain in self.chains for node in shaping_nodes(chain))
+
+    @property
+    def free_threads(self) -> set[Thread]:
+        """Threads that stand in servers, and that no back end keeps there: their gates do."""
+        free = (chain for chain in self.chains if chain.shaping_thread == "free")
+        return {node.thread for chain in free for node in shaping_nodes(chain)}
 
 
 def whole(plan: "Plan | ApplicationPlan") -> ApplicationPlan:
@@ -174,12 +183,30 @@ def combined(plans: Sequence[Plan]) -> ApplicationPlan:
 def _played_out(server: Server, chain: Plan, hyper_period_ns: int) -> Iterator[Slot]:
     """A server's slots over the hyper-period; one that reaches beyond its end becomes two."""
     for start_ns in range(chain.offset_ns, chain.offset_ns + hyper_period_ns, chain.cycle_ns):
-        for slot in server.slots:
+        for slot in _in_force(server, chain):
             start = (slot[0] + start_ns) % hyper_period_ns
             end = start + slot[1] - slot[0]
             yield start, min(end, hyper_period_ns)
             if end > hyper_period_ns:
                 yield 0, end - hyper_period_ns
+
+
+def _in_force(server: Server, chain: Plan) -> Sequence[Slot]:
+    """A server's slots as they are carried out, from the start of a cycle of its chain on.
+
+    A shaping node that runs in them publishes where its gate says, in the slots as planned. Around
+    these its thread needs time to take messages, to watch the clock, to pause, and for its notes;
+    and until the cycle's end, where an output that missed its slot leaves at once.
+    """
+    nodes = [node for node in shaping_nodes(chain) if node.thread in server.threads]
+    if not nodes or chain.shaping_thread == "free":
+        return server.slots
+    before = ROOM_NS + max(node.spin_ns for node in nodes)
+    behind = ROOM_NS + max(node.pause_ns for node in nodes)
+    slots = [(start - before, end + behind) for start, end in server.slots]
+    if "publish" in (chain.overrun, chain.modes and chain.modes.late):
+        slots[-1] = slots[-1][0], max(slots[-1][1], chain.cycle_ns)
+    return [(start, min(end, start + chain.cycle_ns)) for start, end in slots]
 
 
 def _united(slots: list[Slot]) -> list[Slot]:

@@ -26,7 +26,7 @@ from chainshaper.gate.decision import Anchor, Late, Messages, Overrun
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 from chainshaper.values.files import new_file, write_whole
-from chainshaper.values.plan_choices import Fallback, Policy
+from chainshaper.values.plan_choices import Fallback, Policy, ShapingThread
 from chainshaper.values.yaml_file import (
     AS_YAML,
     Duration,
@@ -254,7 +254,9 @@ class Plan(Part):
     instant from which those of all chains count; ``anchor``: by the stamp that each message carries
     from the chain's first callback, or by the servers' own cycle. ``overrun`` says what becomes of
     an output that missed its last slot, ``messages`` which of several outputs of one cycle leave,
-    ``fallback`` what becomes of outputs while their shaping node is not there. ``shaping_node``
+    ``fallback`` what becomes of outputs while their shaping node is not there. With
+    ``shaping_thread`` in-slots, back ends keep the threads of shaping nodes in their servers' slots
+    (:attr:`.ApplicationPlan.servers`); free ones are timed by their gates alone. ``shaping_node``
     serves the chain's output, unless the publisher's own thread is gated; ``further_shaping_nodes``
     serve other sinks, or topics inside a chain (LET per callback).
     """
@@ -270,6 +272,7 @@ class Plan(Part):
     overrun: Overrun = "wait"
     messages: Messages = "all-in-order"
     fallback: Fallback = "bypass"
+    shaping_thread: ShapingThread = "free"
     servers: Annotated[tuple[Server, ...], Field(min_length=1)]
     shaping_node: ShapingNode | None = None
     further_shaping_nodes: tuple[ShapingNode, ...] = ()
@@ -462,6 +465,9 @@ def _shaping_nodes(plan: Plan) -> _Wrong:
                 " them the same",
                 *(*where, "core"),
             )
+    if not placed and plan.shaping_thread != "free":
+        reason = f"{plan.shaping_thread}, but the plan has no shaping node: remove it"
+        yield reason, "shaping_thread"
 
 
 def _modes(plan: Plan) -> _Wrong:
@@ -595,6 +601,8 @@ _SECTION_COMMENTS = {
     "overrun": "an output that missed its last slot: wait for the next, discard, publish at once",
     "messages": "several outputs in one cycle: all leave in order, or the newest, or the first",
     "fallback": "while the shaping node is not there: bypass, outputs go around it; or silence",
+    "shaping_thread": "shaping nodes' threads run in their servers' slots only; free: their gates"
+    " alone time them",
     "servers": "a thread runs only in its server's slots; a smaller priority is better",
     "shaping_node": "republishes the output in its slots; receivers get SCHED_FIFO below servers",
     "modes": "each mode's band, 1 is the first slot; the topic (std_msgs/String) names the mode",
@@ -642,6 +650,8 @@ def _yaml_values(plan: Plan) -> dict[str, Any]:
         values["modes"]["bands"] = _OnOneLine(values["modes"]["bands"])
     if plan.offset_ns == 0:
         del values["offset"]
+    if plan.shaping_thread == "free":
+        del values["shaping_thread"]
     if plan.shaping_node is None and plan.fallback == "bypass":
         del values["fallback"]
     if not values["further_shaping_nodes"]:

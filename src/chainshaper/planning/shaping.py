@@ -110,6 +110,7 @@ def plan_shaping(
             overrun=wishes.overrun or "publish",
             messages=wishes.messages,
             fallback=wishes.fallback,
+            shaping_thread=wishes.shaping_thread,
             servers=(running, _publishing("output", output_core, (start, end), gated)),
             shaping_node=node,
             predicted=predict_bands(latencies, [end], length),

@@ -459,10 +459,9 @@ def _fill_cores(
 
 def _slot_table(plan: ApplicationPlan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
     """Rows (offset in the cycle, mask of the servers that are open from then on)."""
-    # A shaping node times its messages itself: its thread needs no slot to run in.
-    shaping = {node.thread for node in plan.shaping_nodes}
+    # A free shaping node times its messages itself: its thread needs no slot to run in.
     slots = [
-        server.slots if shaping.isdisjoint(server.threads) else ((0, plan.cycle_ns),)
+        server.slots if plan.free_threads.isdisjoint(server.threads) else ((0, plan.cycle_ns),)
         for server in ranked
     ]
     offsets = {0} | {instant for own in slots for slot in own for instant in slot}

@@ -24,6 +24,9 @@ Fallback: TypeAlias = Literal["bypass", "silence"]
 Publication: TypeAlias = Literal["synchronous", "asynchronous"]
 """By a shaping node, or by the publisher's own thread (section 3.2)."""
 
+ShapingThread: TypeAlias = Literal["free", "in-slots"]
+"""Whether a shaping node's thread is timed by its gate alone, or runs in its server's slots."""
+
 Solver: TypeAlias = Literal["exact", "pso", "random"]
 """What places latency bands; the paper uses particle swarm optimisation (section 3.3)."""
 
@@ -98,6 +101,9 @@ class Wishes:
     depth: Annotated[int | None, Option(
         "How many outputs may wait in the gate. Default: as many as the history of its"
         " publisher has room for, 10 at least.", least=1)] = None
+    shaping_thread: Annotated[ShapingThread, Option(
+        "The shaping node's thread: its gate alone times it; or back ends keep it in its server's"
+        " slots as well.")] = "free"
     fallback: Annotated[Fallback, Option(
         "While the shaping node is not there: outputs go around it, or none is published."
         " Default: bypass, or what the plan says.")] = "bypass"
