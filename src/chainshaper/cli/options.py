@@ -155,6 +155,7 @@ _OTHERS: dict[str, tuple[Any, Any]] = {
     "modes": (str | None, _MODES),
     "late": (Late | None, _LATE),
     "bands": (str, wish("bands")),  # Typer knows no unions
+    "best_effort": (list[str], wish("best_effort", default=[])),  # and no tuples of any length
 }
 
 
@@ -170,6 +171,8 @@ def takes_wishes(*names: str) -> Callable[[Callable[..., None]], Any]:
         def called(**values: Any) -> None:
             wished = {name: values.pop(name) for name in names}
             modes = modes_of(wished.pop("modes", None), wished.pop("late", None))
+            if "best_effort" in wished:
+                wished["best_effort"] = tuple(wished["best_effort"])
             verb(**values, request=cs.PlanRequest(**wished, modes=modes))
 
         options = []

@@ -111,6 +111,7 @@ def apply_plan(
     table, taken = threads.server_table(opened), run_users(users)
     check_cores({server.core: f"server {server.name}" for server in opened.servers})
     choice = choose_back_end(back_end)
+    threads.refuse_turns(given, choice.name)
     if not gates(choice.name) and any(chain.offset_ns for chain in given.chains):
         raise InputError(
             f"the back end {choice.name} sets priorities only, and chains whose cycles start at"

@@ -92,6 +92,7 @@ def _profile_of(
         begins=(chain.callbacks[0], graph.callbacks[chain.callbacks[0]].label),
         upstream=_upstream(graph, chain, stages),
         core_of=core_of,
+        cores=cores,
         receivers=_receivers(graph, chain, nodes),
         callbacks=tuple(_times(flow, instances, stage, core_of[stage.node]) for stage in stages),
         fifo_priority=min(97, priority.get(stages[-1].node, DEFAULT_PRIORITY) + 5),

@@ -194,6 +194,7 @@ def planned_changes(
     found = find_threads(plan, recording, users=users)
     if back_end != "litmus":
         choice = choose_back_end(back_end)
+        refuse_turns(plan, choice.name)
         wanted = allocation.plan_scheduling(plan, found, available_cores())
         threads = allocation.left_by_back_end(choice.name, wanted, plan.free_threads)
         return Changes(choice.name, choice.reason, threads, (), found.notes)
@@ -211,6 +212,19 @@ def planned_changes(
         notes += ("slots are counted from a beginning that is measured when the chain runs",)
     anchor = 0 if phase_ns is None else phase_ns + LEAD_NS
     return Changes("litmus", "asked for", (), litmus_commands(table, members, anchor), notes)
+
+
+def refuse_turns(plan: ApplicationPlan, back_end: str) -> None:
+    """Refuse servers of one priority that take turns where the back end has no turns for servers.
+
+    Raises InputError: so it is.
+    """
+    if plan.takes_turns and back_end == "scx":
+        raise InputError(
+            "equal_priorities: round-robin, but under the back end scx turns are those of one"
+            " server's threads, and servers of one priority run in the plan's order: choose"
+            " another (--backend freezer)"
+        )
 
 
 def server_table(plan: ApplicationPlan) -> ServerTable:

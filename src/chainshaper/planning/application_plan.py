@@ -116,6 +116,7 @@ class ApplicationPlan(Part):
                     priority=min(server.priority for server, _ in own),
                     slots=tuple(_united(slots)),
                     threads=tuple(threads),
+                    best_effort=all(server.best_effort for server, _ in own),
                 )
             )
         return tuple(found)
@@ -129,6 +130,11 @@ class ApplicationPlan(Part):
     def shaping_nodes(self) -> tuple[ShapingNode, ...]:
         """Those of all chains."""
         return tuple(node for chain in self.chains for node in shaping_nodes(chain))
+
+    @property
+    def takes_turns(self) -> bool:
+        """Whether threads of all servers of one priority take turns."""
+        return any(chain.equal_priorities == "round-robin" for chain in self.chains)
 
     @property
     def free_threads(self) -> set[Thread]:
@@ -293,6 +299,8 @@ def _slot_count(plan: ApplicationPlan) -> _Wrong:
 def _apart(plan: ApplicationPlan) -> _Wrong:
     """Slots of one core and priority are disjoint in all cycles, across chains as inside one."""
     for one, place, two in _pairs(plan):
+        if one.equal_priorities == two.equal_priorities == "round-robin":
+            continue
         shared = {server.name for server in one.servers} & {server.name for server in two.servers}
         common, forbidden = collisions(timetable([one], shared), timetable([two], shared))
         distance = (two.offset_ns - one.offset_ns) % common
@@ -312,7 +320,7 @@ def _collision_text(one: Plan, two: Plan, shared: set[str]) -> str:
         for other in two.servers:
             if (server.core, server.priority) != (other.core, other.priority):
                 continue
-            if shared & {server.name, other.name}:
+            if shared & {server.name, other.name} or server.best_effort or other.best_effort:
                 continue
             for start, end in server.slots:
                 for other_start, other_end in other.slots:

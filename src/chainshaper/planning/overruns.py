@@ -93,11 +93,12 @@ def open_until_done(plan: Plan) -> Plan:
     if plan.overrun != "publish" or not shaped:
         return plan
     publishers = [server for _, server, _ in publisher_servers(plan)]
-    publishing, (last_start, _) = publishing_servers(plan), publish_slots(plan)[-1]
+    beside = [*publishing_servers(plan), *(one for one in plan.servers if one.best_effort)]
+    last_start, _ = publish_slots(plan)[-1]
     longer = {
         server.name: until(server, plan.cycle_ns)
         for server in plan.servers
-        if server in publishers or (server not in publishing and server.slots[-1][1] >= last_start)
+        if server in publishers or (server not in beside and server.slots[-1][1] >= last_start)
     }
     try:
         return revised(plan, servers=below_executors(with_slots(plan.servers, longer)))

@@ -26,7 +26,7 @@ from chainshaper.gate.decision import Anchor, Late, Messages, Overrun
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 from chainshaper.values.files import new_file, write_whole
-from chainshaper.values.plan_choices import Fallback, Policy, ShapingThread
+from chainshaper.values.plan_choices import EqualPriorities, Fallback, Policy, ShapingThread
 from chainshaper.values.yaml_file import (
     AS_YAML,
     Duration,
@@ -135,7 +135,8 @@ class Thread(Part):
 
 class Server(Part):
     """A table-driven reservation server (section 2.2.1): its threads run in its slots only. A
-    smaller ``priority`` is better, as in LITMUS^RT.
+    smaller ``priority`` is better, as in LITMUS^RT. One for ``best_effort`` (R_m' and R_int of the
+    paper, sections 3.1 and 5.1) runs only what is left of its core by all others.
     """
 
     name: Annotated[str, Field(min_length=1)]
@@ -143,6 +144,7 @@ class Server(Part):
     priority: FromOne
     slots: Annotated[tuple[Slot, ...], Field(min_length=1)]
     threads: tuple[Thread, ...] = ()
+    best_effort: bool = False
 
     @model_validator(mode="after")
     def _slots_ascend(self) -> "Server":
@@ -256,7 +258,8 @@ class Plan(Part):
     an output that missed its last slot, ``messages`` which of several outputs of one cycle leave,
     ``fallback`` what becomes of outputs while their shaping node is not there. With
     ``shaping_thread`` in-slots, back ends keep the threads of shaping nodes in their servers' slots
-    (:attr:`.ApplicationPlan.servers`); free ones are timed by their gates alone. ``shaping_node``
+    (:attr:`.ApplicationPlan.servers`); free ones are timed by their gates alone.
+    ``equal_priorities`` says whether servers of one core and priority may overlap. ``shaping_node``
     serves the chain's output, unless the publisher's own thread is gated; ``further_shaping_nodes``
     serve other sinks, or topics inside a chain (LET per callback).
     """
@@ -273,6 +276,7 @@ class Plan(Part):
     messages: Messages = "all-in-order"
     fallback: Fallback = "bypass"
     shaping_thread: ShapingThread = "free"
+    equal_priorities: EqualPriorities = "apart"
     servers: Annotated[tuple[Server, ...], Field(min_length=1)]
     shaping_node: ShapingNode | None = None
     further_shaping_nodes: tuple[ShapingNode, ...] = ()
@@ -418,10 +422,17 @@ def _servers(plan: Plan) -> _Wrong:
                 )
                 yield reason, "servers", place, "threads", number
             homes[thread] = server.name
+        for other in plan.servers:
+            above = server.best_effort and not other.best_effort and server.core == other.core
+            if above and server.priority <= other.priority:
+                reason = f"best effort comes behind all others: write more than {other.priority}"
+                yield reason, "servers", place, "priority"
 
 
 def _overlaps(plan: Plan) -> _Wrong:
-    """Two servers of one core may overlap only when a priority says who runs."""
+    """Two servers of one core may overlap only when a priority says who runs, or by turns."""
+    if plan.equal_priorities == "round-robin":
+        return
     for (_, one), (place, two) in combinations(enumerate(plan.servers), 2):
         if (one.core, one.priority) != (two.core, two.priority):
             continue
@@ -603,6 +614,7 @@ _SECTION_COMMENTS = {
     "fallback": "while the shaping node is not there: bypass, outputs go around it; or silence",
     "shaping_thread": "shaping nodes' threads run in their servers' slots only; free: their gates"
     " alone time them",
+    "equal_priorities": "servers of one core and priority take turns; apart: they never overlap",
     "servers": "a thread runs only in its server's slots; a smaller priority is better",
     "shaping_node": "republishes the output in its slots; receivers get SCHED_FIFO below servers",
     "modes": "each mode's band, 1 is the first slot; the topic (std_msgs/String) names the mode",
@@ -646,12 +658,15 @@ def _yaml_values(plan: Plan) -> dict[str, Any]:
     values = plan.model_dump(mode="json", by_alias=True, exclude_none=True, context=AS_YAML)
     for server in values["servers"]:
         server["threads"] = [_OnOneLine(thread) for thread in server["threads"]]
+        if not server["best_effort"]:
+            del server["best_effort"]
     if "modes" in values:
         values["modes"]["bands"] = _OnOneLine(values["modes"]["bands"])
     if plan.offset_ns == 0:
         del values["offset"]
-    if plan.shaping_thread == "free":
-        del values["shaping_thread"]
+    for name in ("shaping_thread", "equal_priorities"):
+        if values[name] == Plan.model_fields[name].default:
+            del values[name]
     if plan.shaping_node is None and plan.fallback == "bypass":
         del values["fallback"]
     if not values["further_shaping_nodes"]:

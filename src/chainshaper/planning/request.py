@@ -39,8 +39,10 @@ from chainshaper.planning.shaping import (
     plan_shaping,
     server_per_callback,
     server_per_chain,
+    with_best_effort,
     with_first_node_apart,
     with_sink,
+    with_turns,
 )
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError
@@ -61,7 +63,8 @@ class Profile:
     ``every_latency_ns`` those of all (None: all were undisturbed), both in the order of time.
     ``nodes`` are those of the chain's callbacks, one per callback, ``topics`` what each of these
     publishes for the chain. ``core_of`` names the core of every node whose executor takes part,
-    also on branches that the chain waits for. ``begins`` is the first callback's number in the
+    also on branches that the chain waits for, ``cores`` that of any node that has one core to run
+    on. ``begins`` is the first callback's number in the
     graph, and its name, ``upstream`` the topics that the output waits for: on the chain, on those
     branches, and before the chain begins. ``receivers`` are the nodes that subscribe to the chain's
     output and are none of these. ``callbacks`` are those of the chain and its branches, see
@@ -78,6 +81,7 @@ class Profile:
     begins: tuple[int, str] | None = None
     upstream: frozenset[str] = frozenset()
     core_of: Mapping[str, int] = field(default_factory=dict)
+    cores: Mapping[str, int] = field(default_factory=dict)
     receivers: tuple[str, ...] = ()
     callbacks: tuple[CallbackTimes, ...] = ()
     fifo_priority: int = 84
@@ -169,7 +173,20 @@ def plan_chain(
             f"--fallback {request.fallback} is for an output with a shaping node, and the plan has"
             " none: leave it out, or plan with synchronous publication"
         )
-    return revised(plan, modes=request.modes)
+    plan = revised(plan, modes=request.modes)
+    if request.equal_priorities == "round-robin":
+        plan = with_turns(plan)
+    return with_best_effort([plan], best_effort_cores([profile], request))[0]
+
+
+def best_effort_cores(profiles: Sequence[Profile], request: PlanRequest) -> dict[str, int]:
+    """The core of each node that is best effort: its own, if it has one, or the first chain's."""
+    cores = {node: core for one in profiles for node, core in one.cores.items()}
+    chain = profiles[0].core_of.get(
+        profiles[0].nodes[-1] if profiles[0].nodes else "", DEFAULT_CORE
+    )
+    names = ["/" + name.strip("/") for name in request.best_effort]
+    return {name: cores.get(name, chain) for name in names}
 
 
 def band_choice(plan: Plan, profile: Profile, request: PlanRequest) -> BandChoice:

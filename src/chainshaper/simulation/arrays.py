@@ -437,6 +437,11 @@ def _fill_cores(
                 bit = ranked.index(server)
                 rows[threads[number] + T.SERVER] = bit
                 rows[threads[number] + T.RANK] = bit - len(ranked)
+                if plan is not None and plan.takes_turns:
+                    equal = [one.priority for one in ranked].index(server.priority)
+                    rows[threads[number] + T.RANK] = equal - len(ranked)
+                if server.best_effort:  # under the fair class, behind all real-time threads
+                    rows[threads[number] + T.RANK] = BEST_EFFORT
         mine = [thread for thread in threads if rows[thread + T.CORE] == place]
         rows[place + C.FIRST], rows[place + C.END] = rows.put(mine)
         rows[place + C.RUNNING], rows[place + C.LAST] = NONE, NONE

@@ -27,6 +27,9 @@ Publication: TypeAlias = Literal["synchronous", "asynchronous"]
 ShapingThread: TypeAlias = Literal["free", "in-slots"]
 """Whether a shaping node's thread is timed by its gate alone, or runs in its server's slots."""
 
+EqualPriorities: TypeAlias = Literal["apart", "round-robin"]
+"""What servers of one core and one priority do: their slots are apart, or they take turns."""
+
 Solver: TypeAlias = Literal["exact", "pso", "random"]
 """What places latency bands; the paper uses particle swarm optimisation (section 3.3)."""
 
@@ -112,6 +115,12 @@ class Wishes:
     pause_ns: Annotated[int | None, Option(
         "How long the gate rests after publishing. Default: 2ms, a twentieth of the cycle at"
         " most.")] = None
+    equal_priorities: Annotated[EqualPriorities, Option(
+        "Servers of one priority on a core: their slots stay apart; or, with one priority for all"
+        " (eq. 3), they take turns.")] = "apart"
+    best_effort: Annotated[tuple[str, ...], Option(
+        "A node outside the chain that runs when none of its servers does, in a server that is"
+        " open all the time (may be repeated).", "More of the graph", "NODE")] = ()
     with_receivers: Annotated[bool, Option(
         "Give nodes that subscribe to the shaped output SCHED_FIFO below all servers, while"
         " the plan is in force.", flag="--receivers/--no-receivers")] = True

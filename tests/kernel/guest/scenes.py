@@ -77,6 +77,33 @@ class Spinner:
         return read_windows(self.log)
 
 
+class Gate:
+    """A process with a shaping node's gate; messages are given to it."""
+
+    def __init__(self, cycle: int, start: int, spin: int, log: Path) -> None:
+        self.log = log
+        words = [str(one) for one in (HERE / "gate_process.py", cycle, start, spin, log)]
+        environment = {**os.environ, "PYTHONPATH": "/src"}
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(
+            [sys.executable, *words], stdin=pipe, stdout=pipe, env=environment
+        )
+        assert self.process.stdout is not None
+        assert self.process.stdout.readline() == b"ready\n"
+        self.tid = self.process.pid
+
+    def give(self) -> None:
+        assert self.process.stdin is not None
+        os.write(self.process.stdin.fileno(), b".")
+
+    def published(self) -> Intervals:
+        """End it, in its server's next slot; releases and publications."""
+        self.process.terminate()
+        assert self.process.wait() == 0
+        lines = (line.split() for line in self.log.read_text().splitlines())
+        return [(int(release), int(published)) for release, published in lines]
+
+
 class Loader:
     """The process that holds the back end; calls go through :meth:`ask`."""
 
@@ -119,8 +146,13 @@ class Scene:
         self._processes.append(made.process)
         return made
 
+    def gate(self, cycle: int, start: int, spin: int, log: Path) -> Gate:
+        made = Gate(cycle, start, spin, log)
+        self._processes.append(made.process)
+        return made
+
     def loader(
-        self, servers: ServerTable, members: dict[str, list[Spinner]] | None = None
+        self, servers: ServerTable, members: dict[str, list[Spinner | Gate]] | None = None
     ) -> Loader:
         """The back end, with threads assigned."""
         made = Loader(servers)
