@@ -215,7 +215,7 @@ def test_a_shaping_node_in_its_server_publishes_as_a_free_one_and_runs_later(
     recording = simulate(
         small_chain(tmp_path), tmp_path / "rec", governed, cycles=20, switches=True
     )
-    begin = recording.events["callback_start"]["time"].min()
+    begin = begin_of(recording)
     (comm,) = {t.comm for t in recording.info.threads if t.node == "/chainshaper_t3"}
     switches = recording.events["sched_switch"].filter(pl.col("next_comm") == comm)["time"]
     assert first_ms * MS <= ((switches - begin) % PERIOD_NS).min() < (first_ms + 10) * MS
