@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -152,7 +152,7 @@ class Scene:
         return made
 
     def loader(
-        self, servers: ServerTable, members: dict[str, list[Spinner | Gate]] | None = None
+        self, servers: ServerTable, members: Mapping[str, Sequence[Spinner | Gate]] | None = None
     ) -> Loader:
         """The back end, with threads assigned."""
         made = Loader(servers)
