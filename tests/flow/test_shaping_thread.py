@@ -34,7 +34,7 @@ def test_a_shaping_node_kept_in_its_server_publishes_when_its_gate_says(tmp_path
     recording = calm_run(run, tmp_path)
     chain, output = states[-1].servers
     assert (chain.kept_by, output.kept_by) == ("freezer", "freezer")
-    assert output.slots == ((22 * MS, 50 * MS),), "open early enough, and for what is late"
+    assert output.slots == ((20 * MS, 50 * MS),), "open early enough, and for what is late"
     assert (output.counters.slots or 0) > 40
     measured = measure_latency(recording)
     assert measured.analysis.statistics.incomplete <= 1, "a frozen node loses nothing"

@@ -40,23 +40,23 @@ def open_in_ms(plan: Plan | ApplicationPlan, name: str = "output") -> list[tuple
 
 
 def test_a_shaping_nodes_server_opens_early_enough_for_its_gate() -> None:
-    """2 ms to take the message, 1 to watch; behind the slot the pause, and 2 ms for its notes."""
+    """4 ms to take the message, 1 to watch; behind the slot the pause, and 2 ms for its notes."""
     late = in_slots(overrun="wait")
-    assert open_in_ms(late) == [(18, 26)]
-    assert open_in_ms(in_slots(overrun="publish")) == [(18, 50)], "what is late may leave at once"
+    assert open_in_ms(late) == [(16, 26)]
+    assert open_in_ms(in_slots(overrun="publish")) == [(16, 50)], "what is late may leave at once"
     banded = revised(
-        late, servers=with_slots(late.servers, {"output": [(12 * MS, 13 * MS), (21 * MS, 22 * MS)]})
+        late, servers=with_slots(late.servers, {"output": [(10 * MS, 11 * MS), (21 * MS, 22 * MS)]})
     )
-    assert open_in_ms(banded) == [(9, 17), (18, 26)]
+    assert open_in_ms(banded) == [(5, 15), (16, 26)]
     close = revised(
         late, servers=with_slots(late.servers, {"output": [(15 * MS, 16 * MS), (21 * MS, 22 * MS)]})
     )
-    assert open_in_ms(close) == [(12, 26)], "one opening for both"
-    assert open_in_ms(let_per_chain(late)) == [(0, 5), (47, 50)], "around the end of the cycle"
+    assert open_in_ms(close) == [(10, 26)], "one opening for both"
+    assert open_in_ms(let_per_chain(late)) == [(0, 5), (45, 50)], "around the end of the cycle"
     assert open_in_ms(let_per_chain(in_slots(overrun="publish"))) == [(0, 50)]
     assert open_in_ms(combined([late.model_copy(update={"offset_ns": 30 * MS})])) == [
         (0, 6),
-        (48, 50),
+        (46, 50),
     ]
 
 
@@ -70,7 +70,7 @@ def test_every_back_end_has_the_server_when_its_node_runs_in_slots() -> None:
     assert [" ".join(command) for command in commands] == [
         "setsched P-RES",
         "resctl -n 1001 -t table-driven -c 1 -m 50 -q 2 [0,21)",
-        "resctl -n 1002 -t table-driven -c 1 -m 50 -q 1 [18,26)",
+        "resctl -n 1002 -t table-driven -c 1 -m 50 -q 1 [16,26)",
         "resctl -a 7 -r 1001 -c 1",
         "resctl -a 8 -r 1002 -c 1",
     ]

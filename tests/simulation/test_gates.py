@@ -205,11 +205,11 @@ def test_a_gate_watches_the_clock_before_its_slot_and_pauses_behind_it(tmp_path:
     assert (end - release["origin"]) / 1e6 == pytest.approx(30 + 0.1 + 2 + 0.5)
 
 
-@pytest.mark.parametrize(("thread", "first_ms"), [("free", 3), ("in-slots", 18)])
+@pytest.mark.parametrize(("thread", "first_ms"), [("free", 3), ("in-slots", 16)])
 def test_a_shaping_node_in_its_server_publishes_as_a_free_one_and_runs_later(
     tmp_path: Path, thread: str, first_ms: float
 ) -> None:
-    """The output is there after 3 ms at least; the server opens at 18 for a slot at 21."""
+    """The output is there after 3 ms at least; the server opens at 16 for a slot at 21."""
     governed = small_chain_plan(10 * MS, 20 * MS, spin_ns=MS, shaping_thread=thread)
     governed = governed.model_copy(update={"anchor": "cycle"})
     recording = simulate(

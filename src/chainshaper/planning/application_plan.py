@@ -38,9 +38,10 @@ from chainshaper.values.yaml_file import Part, read_model, wrong_value, wrong_va
 
 MOST_SLOTS = 10_000
 """So many slots of all servers fit into a hyper-period at the most."""
-ROOM_NS = 2_000_000
-"""A shaping node takes messages so long before it watches for its slot, and goes on as long behind
-its pause, to write down what it did: where its server is in force, this is open then."""
+BEFORE_NS, BEHIND_NS = 4_000_000, 2_000_000
+"""Where a shaping node's server is in force, it is open for so long before the node watches for its
+slot, which takes 2 ms to take messages, and comes 2 ms earlier in cycles whose beginning no server
+holds back (`LEAD_NS` of :mod:`chainshaper.flow.threads`); and behind its pause, for its notes."""
 
 
 class ApplicationPlan(Part):
@@ -207,8 +208,8 @@ def _in_force(server: Server, chain: Plan) -> Sequence[Slot]:
     nodes = [node for node in shaping_nodes(chain) if node.thread in server.threads]
     if not nodes or chain.shaping_thread == "free":
         return server.slots
-    before = ROOM_NS + max(node.spin_ns for node in nodes)
-    behind = ROOM_NS + max(node.pause_ns for node in nodes)
+    before = BEFORE_NS + max(node.spin_ns for node in nodes)
+    behind = BEHIND_NS + max(node.pause_ns for node in nodes)
     slots = [(start - before, end + behind) for start, end in server.slots]
     if "publish" in (chain.overrun, chain.modes and chain.modes.late):
         slots[-1] = slots[-1][0], max(slots[-1][1], chain.cycle_ns)
