@@ -5,6 +5,7 @@ and R_m° is [21, 22); the gate watches the clock for 1 ms and pauses for 2 ms.
 """
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,58 +14,48 @@ from small_chain import small_chain_plan
 
 from chainshaper.enforcement.litmus import litmus_commands
 from chainshaper.flow.threads import refuse_turns, server_table
-from chainshaper.planning import PlanRequest, Profile, plan_application, plan_chain
-from chainshaper.planning.application_plan import (
-    ApplicationPlan,
-    combined,
-    dump_application_plan,
-    load_application_plan,
-    open_until_done,
-    whole,
+from chainshaper.planning import (
+    PlanRequest,
+    Profile,
+    load_plan,
+    plan_application,
+    plan_chain,
+    save_plan,
 )
+from chainshaper.planning.application_plan import open_until_done, whole
 from chainshaper.planning.plan import Plan, revised, with_slots
 from chainshaper.planning.shaping import let_per_chain
 from chainshaper.values.errors import InputError
 
 MS = 1_000_000
-WISHES: dict[str, Any] = {"spin_ns": MS, "pause_ns": 2 * MS, "shaping_thread": "in-slots"}
 
 
-def in_slots(**wishes: Any) -> Plan:
-    return small_chain_plan(10 * MS, 20 * MS, **{**WISHES, **wishes})
+def in_slots(overrun: str = "wait", **wishes: Any) -> Plan:
+    values = {"spin_ns": MS, "pause_ns": 2 * MS, "shaping_thread": "in-slots", **wishes}
+    return small_chain_plan(10 * MS, 20 * MS, overrun=overrun, **values)
 
 
-def open_in_ms(plan: Plan | ApplicationPlan, name: str = "output") -> list[tuple[float, float]]:
+def open_in_ms(plan: Plan, name: str = "output") -> list[tuple[float, float]]:
     (server,) = [s for s in open_until_done(whole(plan)).servers if s.name == name]
     return [(start / MS, end / MS) for start, end in server.slots]
 
 
 def test_a_shaping_nodes_server_opens_early_enough_for_its_gate() -> None:
     """4 ms to take the message, 1 to watch; behind the slot the pause, and 2 ms for its notes."""
-    late = in_slots(overrun="wait")
+    late = in_slots()
     assert open_in_ms(late) == [(16, 26)]
-    assert open_in_ms(in_slots(overrun="publish")) == [(16, 50)], "what is late may leave at once"
-    banded = revised(
-        late, servers=with_slots(late.servers, {"output": [(10 * MS, 11 * MS), (21 * MS, 22 * MS)]})
-    )
-    assert open_in_ms(banded) == [(5, 15), (16, 26)]
-    close = revised(
-        late, servers=with_slots(late.servers, {"output": [(15 * MS, 16 * MS), (21 * MS, 22 * MS)]})
-    )
-    assert open_in_ms(close) == [(10, 26)], "one opening for both"
+    assert open_in_ms(in_slots("publish")) == [(16, 50)], "what is late may leave at once"
+    for first_ms, opened in ((10, [(5, 15), (16, 26)]), (15, [(10, 26)])):
+        bands = {"output": [(first_ms * MS, first_ms * MS + MS), (21 * MS, 22 * MS)]}
+        assert open_in_ms(revised(late, servers=with_slots(late.servers, bands))) == opened
     assert open_in_ms(let_per_chain(late)) == [(0, 5), (45, 50)], "around the end of the cycle"
-    assert open_in_ms(let_per_chain(in_slots(overrun="publish"))) == [(0, 50)]
-    assert open_in_ms(combined([late.model_copy(update={"offset_ns": 30 * MS})])) == [
-        (0, 6),
-        (46, 50),
-    ]
+    assert open_in_ms(revised(late, offset_ns=30 * MS)) == [(0, 6), (46, 50)]
 
 
 def test_every_back_end_has_the_server_when_its_node_runs_in_slots() -> None:
-    free, bound = (whole(in_slots(shaping_thread=t, overrun="wait")) for t in ("free", "in-slots"))
+    free, bound = whole(in_slots(shaping_thread="free")), whole(in_slots())
     assert [s.name for s in server_table(free).servers] == ["chain"]
-    assert {t.node for t in free.free_threads} == {"/chainshaper_t3"}
-    assert [s.name for s in server_table(bound).servers] == ["chain", "output"]
+    assert [t.node for t in free.free_threads] == ["/chainshaper_t3"]
     assert not bound.free_threads
     commands = litmus_commands(server_table(bound), {"chain": [7], "output": [8]}, anchor_ns=0)
     assert [" ".join(command) for command in commands] == [
@@ -81,7 +72,6 @@ def test_every_back_end_has_the_server_when_its_node_runs_in_slots() -> None:
 PROFILE = Profile(
     latencies_ns=np.array([10 * MS, 20 * MS]),
     period_ns=50 * MS,
-    spec="/t1../t3",
     nodes=("/first", "/second"),
     topics=("/t1", "/t3"),
     core_of={"/first": 1, "/second": 1},
@@ -89,21 +79,18 @@ PROFILE = Profile(
 )
 
 
-def test_best_effort_comes_behind_all_others_in_a_server_that_is_always_open(tmp_path: Any) -> None:
+def test_best_effort_comes_behind_all_others_in_a_server_that_is_always_open(
+    tmp_path: Path,
+) -> None:
     """On its own core, where it has one; else on the chain's (R_m' and R_int)."""
-    plan = plan_chain(PROFILE, PlanRequest(best_effort=("noise", "/logger"), epsilon_ns=MS))
-    assert [(s.name, s.core, s.priority, s.best_effort) for s in plan.servers] == [
-        ("chain", 1, 2, False),
-        ("output", 1, 1, False),
-        ("best_effort_core1", 1, 3, True),
-        ("best_effort_core2", 2, 3, True),
+    plan = plan_chain(PROFILE, PlanRequest(best_effort=("noise", "/logger")))
+    assert [(s.name, s.core, s.priority) for s in plan.servers if s.best_effort] == [
+        ("best_effort_core1", 1, 3),
+        ("best_effort_core2", 2, 3),
     ]
     assert open_in_ms(plan, "best_effort_core1") == [(0, 50)]
-    assert [t.node for t in plan.servers[-1].threads] == ["/noise"]
-    path = tmp_path / "plan.yaml"
-    path.write_text(dump_application_plan(whole(plan)))
-    assert load_application_plan(path).chains[0] == plan
-    assert path.read_text().count("best_effort: true") == 2
+    save_plan(plan, tmp_path / "plan.yaml")
+    assert load_plan(tmp_path / "plan.yaml") == plan
     short = revised(plan, servers=with_slots(plan.servers, {"best_effort_core1": [(0, 45 * MS)]}))
     assert open_in_ms(short, "best_effort_core1") == [(0, 45)], "overruns are the chain's"
     better = [s.model_copy(update={"priority": 2}) if s.best_effort else s for s in plan.servers]
@@ -111,23 +98,11 @@ def test_best_effort_comes_behind_all_others_in_a_server_that_is_always_open(tmp
         revised(plan, servers=tuple(better))
     with pytest.raises(InputError, match="/second is in the server 'chain'"):
         plan_chain(PROFILE, PlanRequest(best_effort=("/second",)))
-
-
-def test_chains_that_share_a_core_have_one_best_effort_server() -> None:
     other = replace(
-        PROFILE,
-        period_ns=100 * MS,
-        spec="/u1../u2",
-        nodes=("/third",),
-        topics=("/u2",),
-        core_of={"/third": 1},
-        begins=(9, "/third"),
+        PROFILE, nodes=("/third",), topics=("/u",), core_of={"/third": 1}, begins=(9, "")
     )
-    request = PlanRequest(best_effort=("/logger",), epsilon_ns=MS)
-    plan, _ = plan_application([PROFILE, other], request)
-    (server,) = [s for s in plan.servers if s.best_effort]
-    assert (server.slots, server.threads[0].node) == (((0, 100 * MS),), "/logger")
-    assert server.priority > max(s.priority for s in plan.servers if s is not server)
+    both, _ = plan_application([PROFILE, other], PlanRequest(best_effort=("/logger",)))
+    assert [len(s.threads) for s in both.servers if s.best_effort] == [1], "one for all chains"
 
 
 def test_servers_of_one_priority_overlap_only_where_they_take_turns() -> None:
@@ -137,10 +112,8 @@ def test_servers_of_one_priority_overlap_only_where_they_take_turns() -> None:
     assert open_in_ms(plan, "chain") == [(0, 50)]
     apart = revised(plan, equal_priorities="apart")
     assert open_in_ms(apart, "chain") == [(0, 21)]
-    assert (whole(plan).takes_turns, whole(apart).takes_turns) == (True, False)
-    longer = with_slots(plan.servers, {"chain": [(0, 40 * MS)]})
     with pytest.raises(InputError, match="overlaps"):
-        revised(apart, servers=longer)
+        revised(apart, servers=with_slots(plan.servers, {"chain": [(0, 40 * MS)]}))
     refuse_turns(whole(plan), "freezer")
     with pytest.raises(InputError, match=r"under the back end scx .* \(--backend freezer\)"):
         refuse_turns(whole(plan), "scx")

@@ -1,9 +1,7 @@
-"""A gate at work, as in a shaping node: takes a message a cycle, and publishes it in its slot.
+"""A gate at work, as in a shaping node: `gate_process.py CYCLE SLOT_START SPIN LOG`.
 
-    python gate_process.py CYCLE SLOT_START SPIN LOG
-
-Messages are bytes on standard input. On SIGTERM the log gets a line each: release and publication,
-ns of CLOCK_MONOTONIC.
+A message is a byte on standard input. On SIGTERM the log gets releases and publications, ns of
+CLOCK_MONOTONIC.
 """
 
 import os
@@ -13,7 +11,6 @@ import time
 from pathlib import Path
 
 from chainshaper.gate.decision import Gate, Shaper
-from chainshaper.linux.scheduling import stop_garbage_collection
 
 cycle, start, spin = map(int, sys.argv[1:4])
 gate = Gate(cycle_ns=cycle, slots=((start, start + 1_000_000),), anchor="cycle")
@@ -26,11 +23,8 @@ def end(*_: object) -> None:
 
 
 signal.signal(signal.SIGTERM, end)
-stop_garbage_collection()
-sys.stdout.write("ready\n")
-sys.stdout.flush()
+os.write(1, b"ready\n")
 while os.read(0, 1):
     shaper.arrive(b"", time.monotonic_ns())
-    outcome = shaper.hold()
-    if outcome is not None:
+    if (outcome := shaper.hold()) is not None:
         seen.append((outcome.release.at_ns, outcome.awake_ns))

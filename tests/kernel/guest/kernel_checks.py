@@ -213,13 +213,12 @@ def a_thread_assigned_while_running_is_governed_at_once() -> str:
 
 def a_gate_publishes_exactly_in_a_server_that_opens_before_its_slot() -> str:
     """R_m and R_m° of a plan (paper, section 3.2.2): the chain computes until 12 ms of its slot
-    [0, 25); the gate's slot starts at 25, its server opens for it at 22.
+    [0, 25); the gate's slot starts at 25, its server opens for it at 20.
     """
-    chain, output = server("chain", 0, 25, priority=2), server("output", 22, 31)
-    log, work = Path("/tmp/gate.log"), (0, CYCLE, 0, 12 * MS)
+    chain, output = server("chain", 0, 25, priority=2), server("output", 20, 30)
     with scene() as s:
-        gate = s.gate(CYCLE, 25 * MS, MS, log)
-        computing, hog = s.spinner("chain", job=work), s.spinner("hog")
+        gate = s.gate(CYCLE, 25 * MS, MS)
+        computing, hog = s.spinner("chain", job=(0, CYCLE, 0, 12 * MS)), s.spinner("hog")
         loader = s.loader(table(chain, output), {"chain": [computing], "output": [gate]})
         start = loader.arm() + CYCLE
         for _ in range(20):

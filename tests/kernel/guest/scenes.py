@@ -80,13 +80,14 @@ class Spinner:
 class Gate:
     """A process with a shaping node's gate; messages are given to it."""
 
-    def __init__(self, cycle: int, start: int, spin: int, log: Path) -> None:
-        self.log = log
-        words = [str(one) for one in (HERE / "gate_process.py", cycle, start, spin, log)]
+    def __init__(self, *words: object) -> None:
+        """With the arguments of `gate_process.py`, but its log."""
+        self.log = Path("/tmp/gate.log")
+        command = [sys.executable, HERE / "gate_process.py", *words, self.log]
         environment = {**os.environ, "PYTHONPATH": "/src"}
         pipe = subprocess.PIPE
         self.process = subprocess.Popen(
-            [sys.executable, *words], stdin=pipe, stdout=pipe, env=environment
+            list(map(str, command)), stdin=pipe, stdout=pipe, env=environment
         )
         assert self.process.stdout is not None
         assert self.process.stdout.readline() == b"ready\n"
@@ -100,8 +101,8 @@ class Gate:
         """End it, in its server's next slot; releases and publications."""
         self.process.terminate()
         assert self.process.wait() == 0
-        lines = (line.split() for line in self.log.read_text().splitlines())
-        return [(int(release), int(published)) for release, published in lines]
+        numbers = list(map(int, self.log.read_text().split()))
+        return list(zip(numbers[::2], numbers[1::2], strict=True))
 
 
 class Loader:
@@ -146,8 +147,8 @@ class Scene:
         self._processes.append(made.process)
         return made
 
-    def gate(self, cycle: int, start: int, spin: int, log: Path) -> Gate:
-        made = Gate(cycle, start, spin, log)
+    def gate(self, *words: object) -> Gate:
+        made = Gate(*words)
         self._processes.append(made.process)
         return made
 
