@@ -308,21 +308,18 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
 
 
 def test_best_effort_runs_under_the_fair_class_and_equal_servers_take_turns() -> None:
-    """The receiver of an output must not wait for best effort: it stays above."""
-    last = _server("last", PlannedThread(node="/noise"), priority=3, start=0)
-    servers = (
+    last = _server("last", PlannedThread(node="/noise"), priority=3)
+    apart = _plan(
         _server("chain", EXECUTOR_A, priority=1),
         _server("other", EXECUTOR_B, priority=1, start=1),
         last.model_copy(update={"best_effort": True}),
     )
-    allocation = _allocation(
-        *(_node(name, tid, "executor") for name, tid in (("/a", 1), ("/b", 2), ("/noise", 3)))
-    )
-    apart = _by_tid(plan_scheduling(_plan(*servers), allocation, (0, 1)))
-    assert apart == {n: Scheduling(p, (1,)) for n, p in ((1, 87), (2, 87), (3, 0))}
-    turns = whole(revised(_plan(*servers).chains[0], equal_priorities="round-robin"))
-    wanted = _by_tid(plan_scheduling(turns, allocation, (0, 1)))
-    assert {n: wanted[n].takes_turns for n in wanted} == {1: True, 2: True, 3: False}
+    turns = whole(revised(apart.chains[0], equal_priorities="round-robin"))
+    nodes = [_node(name, tid, "executor") for name, tid in (("/a", 1), ("/b", 2), ("/noise", 3))]
+    for plan, turn in ((apart, False), (turns, True)):
+        real_time = Scheduling(87, (1,), turn)
+        wanted = _by_tid(plan_scheduling(plan, _allocation(*nodes), (0, 1)))
+        assert wanted == {1: real_time, 2: real_time, 3: Scheduling(0, (1,))}
 
 
 def test_an_asynchronous_publisher_stands_below_its_siblings_on_its_core() -> None:

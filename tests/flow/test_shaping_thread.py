@@ -31,15 +31,12 @@ def test_a_shaping_node_kept_in_its_server_publishes_when_its_gate_says(tmp_path
         states.append(apply_plan(plan, command, back_end="freezer").state)
         return open_recording(place / "rec")
 
-    recording = calm_run(run, tmp_path)
-    chain, output = states[-1].servers
-    assert (chain.kept_by, output.kept_by) == ("freezer", "freezer")
-    assert output.slots == ((20 * MS, 50 * MS),), "open early enough, and for what is late"
-    assert (output.counters.slots or 0) > 40
-    measured = measure_latency(recording)
-    assert measured.analysis.statistics.incomplete <= 1, "a frozen node loses nothing"
-    calm = measured.analysis.traversals.filter(~pl.col("disturbed"))["latency_ns"]
-    assert calm.len() > 30
+    measured = measure_latency(calm_run(run, tmp_path)).analysis
+    assert [one.kept_by for one in states[-1].servers] == ["freezer", "freezer"]
+    # Open early enough, and for what is late.
+    assert states[-1].servers[1].slots == ((20 * MS, 50 * MS),)
+    assert measured.statistics.incomplete <= 1, "a frozen node loses nothing"
+    calm = measured.traversals.filter(~pl.col("disturbed"))["latency_ns"]
     assert calm.quantile(0.9) - calm.quantile(0.1) < MS // 2  # type: ignore[operator]
     assert abs(calm.median() - 25 * MS) < MS // 2  # type: ignore[operator]
     assert not leftovers()

@@ -97,29 +97,23 @@ def test_a_plan_for_another_application_is_refused(
         )
 
 
-THREE = """
-chain: a
-nodes:
-  a: {callbacks: [{timer: 20ms, execution: {constant: 4ms}}]}
-  b: {callbacks: [{timer: 20ms, execution: {constant: 4ms}}]}
-  c: {callbacks: [{timer: 20ms, execution: {constant: 2ms}}]}
-"""
+TURNS = next(case for case in CASES if case["name"] == "threads of one server take turns")
 
 
 def test_servers_of_one_priority_take_turns_where_the_plan_says_so(tmp_path: Path) -> None:
     one, other = (server(1, [node], [[0, 20]]) for node in "ab")
     other = other.model_copy(update={"name": "other"})
-    governed = plan(one, other, equal_priorities="round-robin")
-    found = ran(simulated(tmp_path, application(THREE, quantum="1ms"), governed))
-    assert found[:9] == [*(("ab"[k % 2], k, k + 1) for k in range(8)), ("c", 8, 10)]
+    recording = simulated(
+        tmp_path, described(TURNS), plan(one, other, equal_priorities="round-robin")
+    )
+    assert ran(recording)[: len(TURNS["ran"])] == [tuple(each) for each in TURNS["ran"]]
 
 
 def test_best_effort_servers_come_behind_all_real_time_threads(tmp_path: Path) -> None:
     """In its server b yields to c, which is in none; its slots hold nevertheless."""
     last = server(2, ["b"], [[0, 8]]).model_copy(update={"best_effort": True})
-    governed = plan(server(1, ["a"], [[0, 20]]), last)
-    found = ran(simulated(tmp_path, application(THREE), governed))
-    assert found[:3] == [("a", 0, 4), ("c", 4, 6), ("b", 6, 8)]
+    recording = simulated(tmp_path, described(TURNS), plan(server(1, ["a"], [[0, 20]]), last))
+    assert ran(recording)[:3] == [("a", 0, 4), ("c", 4, 6), ("b", 6, 8)]
 
 
 def test_costs_of_waking_taking_and_publishing_are_the_threads_own(tmp_path: Path) -> None:

@@ -1,30 +1,34 @@
-"""A gate at work, as in a shaping node: `gate_process.py CYCLE SLOT_START SPIN LOG`.
+"""A gate at work, as in a shaping node, with the arguments and the log of `spin`.
 
-A message is a byte on standard input. On SIGTERM the log gets releases and publications, ns of
-CLOCK_MONOTONIC.
+    gate_process.py LOG CORE CYCLE ARRIVAL START SPIN
+
+A message comes ARRIVAL ns into each cycle. LOG gets pairs of instants: release and publication.
 """
 
 import os
 import signal
+import struct
 import sys
 import time
 from pathlib import Path
 
-from chainshaper.gate.decision import Gate, Shaper
+sys.path.insert(0, "/src")
+from chainshaper.gate.decision import Gate, Shaper, sleep_until
 
-cycle, start, spin = map(int, sys.argv[1:4])
-gate = Gate(cycle_ns=cycle, slots=((start, start + 1_000_000),), anchor="cycle")
-shaper, seen = Shaper(gate, spin), []
+cycle, arrival, start, spin = map(int, sys.argv[3:])
+shaper, seen = Shaper(Gate(((start, start + 1_000_000),), cycle, "cycle"), spin), []
 
 
 def end(*_: object) -> None:
-    Path(sys.argv[4]).write_text("".join(f"{at} {awake}\n" for at, awake in seen))
+    Path(sys.argv[1]).write_bytes(b"".join(struct.pack("qq", *each) for each in seen))
     os._exit(0)
 
 
 signal.signal(signal.SIGTERM, end)
 os.write(1, b"ready\n")
-while os.read(0, 1):
+while True:
+    now = time.monotonic_ns()
+    sleep_until(now + (arrival - now) % cycle)
     shaper.arrive(b"", time.monotonic_ns())
     if (outcome := shaper.hold()) is not None:
-        seen.append((outcome.release.at_ns, outcome.awake_ns))
+        seen.append((outcome.release.at_ns or 0, outcome.awake_ns))

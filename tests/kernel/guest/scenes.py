@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -60,11 +60,21 @@ def wait_for_phase(phase_ms: int) -> int:
 
 
 class Spinner:
-    """A process with one thread that wants the core; `job` is (anchor, period, offset, work)."""
+    """A process with one thread that wants the core; `job` is (anchor, period, offset, work).
 
-    def __init__(self, name: str, core: int = 0, job: tuple[int, int, int, int] | None = None):
+    As a ``gate`` it is `gate_process.py`, whose job and log are its own.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        core: int = 0,
+        job: tuple[int, int, int, int] | None = None,
+        gate: bool = False,
+    ):
         self.log = Path(f"/tmp/{name}.log")
-        arguments = [str(HERE / "spin"), str(self.log), str(core), *map(str, job or ())]
+        program = [sys.executable, HERE / "gate_process.py"] if gate else [HERE / "spin"]
+        arguments = [str(one) for one in (*program, self.log, core, *(job or ()))]
         self.process = subprocess.Popen(arguments, stdout=subprocess.PIPE)
         assert self.process.stdout is not None
         assert self.process.stdout.readline() == b"ready\n"
@@ -75,34 +85,6 @@ class Spinner:
         self.process.terminate()
         assert self.process.wait() == 0, "spin has failed, or written down too many windows"
         return read_windows(self.log)
-
-
-class Gate:
-    """A process with a shaping node's gate; messages are given to it."""
-
-    def __init__(self, *words: object) -> None:
-        """With the arguments of `gate_process.py`, but its log."""
-        self.log = Path("/tmp/gate.log")
-        command = [sys.executable, HERE / "gate_process.py", *words, self.log]
-        environment = {**os.environ, "PYTHONPATH": "/src"}
-        pipe = subprocess.PIPE
-        self.process = subprocess.Popen(
-            list(map(str, command)), stdin=pipe, stdout=pipe, env=environment
-        )
-        assert self.process.stdout is not None
-        assert self.process.stdout.readline() == b"ready\n"
-        self.tid = self.process.pid
-
-    def give(self) -> None:
-        assert self.process.stdin is not None
-        os.write(self.process.stdin.fileno(), b".")
-
-    def published(self) -> Intervals:
-        """End it, in its server's next slot; releases and publications."""
-        self.process.terminate()
-        assert self.process.wait() == 0
-        numbers = list(map(int, self.log.read_text().split()))
-        return list(zip(numbers[::2], numbers[1::2], strict=True))
 
 
 class Loader:
@@ -142,18 +124,13 @@ class Scene:
     def __init__(self) -> None:
         self._processes: list[subprocess.Popen[bytes]] = []
 
-    def spinner(self, name: str, core: int = 0, job: Any = None) -> Spinner:
-        made = Spinner(name, core, job)
-        self._processes.append(made.process)
-        return made
-
-    def gate(self, *words: object) -> Gate:
-        made = Gate(*words)
+    def spinner(self, name: str, core: int = 0, job: Any = None, gate: bool = False) -> Spinner:
+        made = Spinner(name, core, job, gate)
         self._processes.append(made.process)
         return made
 
     def loader(
-        self, servers: ServerTable, members: Mapping[str, Sequence[Spinner | Gate]] | None = None
+        self, servers: ServerTable, members: dict[str, list[Spinner]] | None = None
     ) -> Loader:
         """The back end, with threads assigned."""
         made = Loader(servers)
