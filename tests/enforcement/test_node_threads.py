@@ -345,8 +345,26 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
     more_cores = _by_tid(plan_scheduling(plan, allocation, (0, 1, 2, 3)))
     assert more_cores[301] == Scheduling(91, (0,)), "the core that is kept clear for them"
     assert 300 not in _by_tid(left_by_back_end("scx", wanted)), "it would outrank the servers"
+    (gate_thread,) = (one.wanted for one in wanted if one.thread.thread.tid == 100)
+    free = _by_tid(left_by_back_end("scx", wanted, plan.free_threads))
+    assert (free[100], free[200].priority) == (gate_thread, None), "no back end keeps it"
     alone = whole(revised(bare, shaping_node=node.model_copy(update={"receivers": ()})))
     assert set(_by_tid(plan_scheduling(alone, allocation, (0, 1)))) == {100, 200}
+
+
+def test_best_effort_runs_under_the_fair_class_and_equal_servers_take_turns() -> None:
+    last = _server("last", PlannedThread(node="/noise"), priority=3)
+    apart = _plan(
+        _server("chain", EXECUTOR_A, priority=1),
+        _server("other", EXECUTOR_B, priority=1, start=1),
+        last.model_copy(update={"best_effort": True}),
+    )
+    turns = whole(revised(apart.chains[0], equal_priorities="round-robin"))
+    nodes = [_node(name, tid, "executor") for name, tid in (("/a", 1), ("/b", 2), ("/noise", 3))]
+    for plan, turn in ((apart, False), (turns, True)):
+        real_time = Scheduling(87, (1,), turn)
+        wanted = _by_tid(plan_scheduling(plan, _allocation(*nodes), (0, 1)))
+        assert wanted == {1: real_time, 2: real_time, 3: Scheduling(0, (1,))}
 
 
 def test_an_asynchronous_publisher_stands_below_its_siblings_on_its_core() -> None:

@@ -11,7 +11,8 @@ import yaml
 from gate_table import PUBLISHING_NS, Case, cases
 from hypothesis import given
 from hypothesis import strategies as st
-from schedules import MS, application, begin_of, simulated
+from schedules import MS, application, begin_of, ran, simulated
+from small_chain import small_chain, small_chain_plan
 
 from chainshaper import plan_recording, simulate
 from chainshaper.analysis import analyse_latency
@@ -204,6 +205,18 @@ def test_a_gate_watches_the_clock_before_its_slot_and_pauses_behind_it(tmp_path:
     )
     # Published at 30 (after the origin), pause until 32.1, awake again half a millisecond later.
     assert (end - release["origin"]) / 1e6 == pytest.approx(30 + 0.1 + 2 + 0.5)
+
+
+@pytest.mark.parametrize(("thread", "first_ms"), [("free", 3), ("in-slots", 16)])
+def test_a_shaping_node_in_its_server_publishes_as_a_free_one_and_runs_later(
+    tmp_path: Path, thread: str, first_ms: int
+) -> None:
+    """The output is there after 3 ms at least; the server opens at 16 for a slot at 21."""
+    governed = small_chain_plan(10 * MS, 20 * MS, spin_ns=MS, shaping_thread=thread, anchor="cycle")
+    recording = simulated(tmp_path, small_chain(tmp_path), governed, cycles=20)
+    assert {round(at % 50, 1) for at in published(recording, "/chainshaper_t3")} == {21.0}
+    earliest = min(at % 50 for name, at, _ in ran(recording) if name == "chainshaper_t3")
+    assert first_ms <= earliest < first_ms + 10
 
 
 def test_modes_that_are_announced_choose_the_slot(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from chainshaper.values.recording import Recording
 CASES = yaml.safe_load(Path(__file__).with_name("schedules.yaml").read_text())
 
 
-def plan(*servers: Server, cycle_ms: int = 20, offset_ms: int = 0) -> Plan:
+def plan(*servers: Server, cycle_ms: int = 20, offset_ms: int = 0, **more: Any) -> Plan:
     """A plan that consists of servers only."""
     return Plan(
         chain=ChainOfPlan(spec="a", period_ns=cycle_ms * MS),
@@ -29,6 +29,7 @@ def plan(*servers: Server, cycle_ms: int = 20, offset_ms: int = 0) -> Plan:
         offset_ns=offset_ms * MS,
         servers=servers,
         predicted=Prediction(mean_ns=1, max_ns=1, jitter_ns=0),
+        **more,
     )
 
 
@@ -94,6 +95,25 @@ def test_a_plan_for_another_application_is_refused(
         simulated(
             tmp_path, application("{chain: a, nodes: {a: {callbacks: [{timer: 20ms}]}}}"), governed
         )
+
+
+TURNS = next(case for case in CASES if case["name"] == "threads of one server take turns")
+
+
+def test_servers_of_one_priority_take_turns_where_the_plan_says_so(tmp_path: Path) -> None:
+    one, other = (server(1, [node], [[0, 20]]) for node in "ab")
+    other = other.model_copy(update={"name": "other"})
+    recording = simulated(
+        tmp_path, described(TURNS), plan(one, other, equal_priorities="round-robin")
+    )
+    assert ran(recording)[: len(TURNS["ran"])] == [tuple(each) for each in TURNS["ran"]]
+
+
+def test_best_effort_servers_come_behind_all_real_time_threads(tmp_path: Path) -> None:
+    """In its server b yields to c, which is in none; its slots hold nevertheless."""
+    last = server(2, ["b"], [[0, 8]]).model_copy(update={"best_effort": True})
+    recording = simulated(tmp_path, described(TURNS), plan(server(1, ["a"], [[0, 20]]), last))
+    assert ran(recording)[:3] == [("a", 0, 4), ("c", 4, 6), ("b", 6, 8)]
 
 
 def test_costs_of_waking_taking_and_publishing_are_the_threads_own(tmp_path: Path) -> None:

@@ -164,6 +164,7 @@ _OTHERS: dict[str, tuple[Any, Any]] = {
     "late": (Late | None, _LATE),
     "bands": (str, wish("bands")),  # Typer knows no unions
     "cores": (str | None, wish("cores")),  # nor tuples of any length
+    "best_effort": (list[str], wish("best_effort", default=[])),  # and no tuples of any length
 }
 
 
@@ -182,6 +183,8 @@ def takes_wishes(*names: str) -> Callable[[Callable[..., None]], Any]:
             modes = modes_of(text, wished.pop("late", None))
             if modes is not None and "=" not in text:
                 wished["bands_of_modes"] = "found"
+            if "best_effort" in wished:
+                wished["best_effort"] = tuple(wished["best_effort"])
             verb(**values, request=cs.PlanRequest(**wished, modes=modes))
 
         options = []

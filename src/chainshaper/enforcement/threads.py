@@ -14,7 +14,9 @@ On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DES
 * who receives what a shaping node publishes stands below all servers, on the shaping node's core;
 * an asynchronous publisher stands below every other thread of its process on its core: it spins on
   the writer's lock, and above them would never let them release it;
-* all others, best effort, are left alone.
+* what a plan has in a best-effort server comes behind all these, on the server's core, under the
+  fair class (SCHED_OTHER): it would take the core from everything else otherwise;
+* all others, best effort too, are left alone.
 """
 
 import time
@@ -407,7 +409,7 @@ def plan_scheduling(
     """
     members = server_members(plan, allocation)
     planned = {one.thread.identity for group in members.values() for one in group}
-    below = min(server_priorities(server.priority for server in plan.servers).values()) - _STEP
+    below = min(server_priorities(_ranked(plan.servers)).values()) - _STEP
     cores = {receiver: node.core for node in plan.shaping_nodes for receiver in node.receivers}
     receiving = [
         WantedScheduling(one, Scheduling(max(1, below), (core,)), None, _RECEIVES)
@@ -416,8 +418,18 @@ def plan_scheduling(
         for core in [cores[node] for node in one.nodes if node in cores][:1]
     ]
     return scheduling_around(
-        members, plan.servers, allocation, available_cores, receiving=receiving
+        members,
+        plan.servers,
+        allocation,
+        available_cores,
+        receiving=receiving,
+        take_turns=plan.takes_turns,
     )
+
+
+def _ranked(servers: Iterable[Server | ReservationServer]) -> list[int]:
+    """The priorities that stand for real-time ones."""
+    return [one.priority for one in servers if not getattr(one, "best_effort", False)]
 
 
 def scheduling_around(
@@ -427,18 +439,27 @@ def scheduling_around(
     available_cores: Sequence[int],
     *,
     receiving: Sequence[WantedScheduling] = (),
+    take_turns: bool = False,
 ) -> tuple[WantedScheduling, ...]:
     """What the threads of servers, and the others of their processes, shall get.
 
     ``members`` are by server's name. ``receiving`` is what threads that receive an output shall
-    get, whose processes are treated alike. Raises OperationError: a thread cannot leave the core of
-    a publisher that would outrank it. InputError: see :func:`server_priorities`.
+    get, whose processes are treated alike; with ``take_turns``, servers of one priority share it by
+    turns. Raises OperationError: a thread cannot leave the core of a publisher that would outrank
+    it. InputError: see :func:`server_priorities`.
     """
-    ranks = server_priorities(server.priority for server in servers)
+    ranks = server_priorities(_ranked(servers))
+
+    def wanted_in(server: Server | ReservationServer) -> Scheduling:
+        if getattr(server, "best_effort", False):
+            return Scheduling(0, (server.core,))
+        turns = take_turns or len(members[server.name]) > 1
+        return Scheduling(ranks[server.priority], (server.core,), turns)
+
     own = [
         WantedScheduling(
             member,
-            Scheduling(ranks[server.priority], (server.core,), len(members[server.name]) > 1),
+            wanted_in(server),
             server.name,
             f"server priority {server.priority}",
         )
@@ -514,19 +535,20 @@ def _below(publisher: WantedScheduling, wanted: Iterable[WantedScheduling]) -> W
 
 
 def left_by_back_end(
-    back_end: str, wanted: Iterable[WantedScheduling]
+    back_end: str, wanted: Iterable[WantedScheduling], free: Collection[PlannedThread] = ()
 ) -> tuple[WantedScheduling, ...]:
     """What threads get from us where a back end schedules its servers' threads itself.
 
     Under sched_ext and LITMUS^RT servers are scheduling classes of their own: their threads need
     no priority, and sched_ext's may have none, since the kernel runs real-time threads above it.
+    ``free`` threads, which no back end keeps in their slots, stand above them with what is wanted.
     A receiver would stand above the servers then, instead of below: it is left as it is.
     """
     if back_end not in ("scx", "litmus"):
         return tuple(wanted)
-    left = []
+    left, themselves = [], {thread.node for thread in free}
     for one in wanted:
-        if one.server is not None:
+        if one.server is not None and themselves.isdisjoint(one.thread.nodes):
             priority = 0 if back_end == "scx" and one.thread.thread.priority else None
             left.append(replace(one, wanted=Scheduling(priority, one.wanted.cores)))
         elif one.reason != _RECEIVES:

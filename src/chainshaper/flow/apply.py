@@ -6,7 +6,8 @@ Nothing of the application is changed but where and when its threads run, and ev
 a journal first (:mod:`chainshaper.linux.runs`): whatever ends the run, a signal or a crash, puts it
 back. Servers are armed only when all nodes run, and released before a command of ours is to end,
 since a stopped thread cannot. A thread that appears later gets what the plan says at the next look.
-The shaping node is its own server: its thread gets a priority and a core, and no slots.
+A shaping node is its own server, unless the plan says otherwise (`shaping_thread`): its thread gets
+a priority and a core, and no slots.
 """
 
 import contextlib
@@ -112,6 +113,7 @@ def apply_plan(
     threads.server_table(given)
     check_cores({server.core: f"server {server.name}" for server in given.servers})
     choice = choose_back_end(back_end)
+    threads.refuse_turns(given, choice.name)
     threads.refuse_offsets(given, choice.name)
     nodes = {thread.node for server in given.servers for thread in server.threads}
     nodes.update(receiver for node in given.shaping_nodes for receiver in node.receivers)
@@ -219,7 +221,7 @@ class _Run:
     def schedule(self) -> None:
         """Give threads their priorities and cores, as far as the back end leaves that to us."""
         wanted = allocation.plan_scheduling(self.plan, self.found, available_cores())
-        left = allocation.left_by_back_end(self.choice.name, wanted)
+        left = allocation.left_by_back_end(self.choice.name, wanted, self.plan.free_threads)
         change_all(self.journal, ((one.thread.thread, one.wanted) for one in left))
 
     def begin_state(self, command: Sequence[str], plan_path: str) -> None:
@@ -325,7 +327,7 @@ class _Run:
 
     def assign(self, servers: BackEnd) -> None:
         """Put the threads that are not in their servers yet there."""
-        themselves = {node.thread.node for node in self.plan.shaping_nodes}
+        themselves = {thread.node for thread in self.plan.free_threads}
         already = {one.name: one.threads for one in self.state.servers}
         members = allocation.server_members(self.plan, self.found)
         for name, group in members.items():

@@ -127,6 +127,7 @@ def _profile_of(
         upstream=_upstream(graph, chain, stages),
         core_of=core_of,
         executors=named,
+        cores=cores,
         receivers=_receivers(graph, chain, nodes),
         callbacks=tuple(_times(flow, instances, stage, core_of[stage.node]) for stage in stages),
         steps_ns=steps[measured["traversal"].to_numpy()],

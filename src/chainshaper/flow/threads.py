@@ -237,8 +237,9 @@ def planned_changes(
     if back_end != "litmus":
         choice = choose_back_end(back_end)
         refuse_offsets(plan, choice.name)
+        refuse_turns(plan, choice.name)
         wanted = allocation.plan_scheduling(plan, found, available_cores())
-        threads = allocation.left_by_back_end(choice.name, wanted)
+        threads = allocation.left_by_back_end(choice.name, wanted, plan.free_threads)
         return Changes(choice.name, choice.reason, threads, (), found.notes)
     notes = found.notes
     try:
@@ -265,13 +266,25 @@ def refuse_offsets(plan: ApplicationPlan, back_end: str) -> None:
         )
 
 
+def refuse_turns(plan: ApplicationPlan, back_end: str) -> None:
+    """Refuse servers of one priority that take turns where the back end has no turns for servers.
+
+    Raises InputError: so it is.
+    """
+    if plan.takes_turns and back_end == "scx":
+        raise InputError(
+            "equal_priorities: round-robin, but under the back end scx turns are those of one"
+            " server's threads, and servers of one priority run in the plan's order: choose"
+            " another (--backend freezer)"
+        )
+
+
 def server_table(plan: ApplicationPlan) -> ServerTable:
     """The servers of a plan whose threads a back end has to keep inside their slots.
 
     Raises OperationError: there are none.
     """
-    gated_by_themselves = {node.thread for node in plan.shaping_nodes}
-    servers = [s for s in plan.servers if set(s.threads) - gated_by_themselves]
+    servers = [s for s in plan.servers if set(s.threads) - plan.free_threads]
     if not servers:
         raise OperationError(
             "the plan's servers name no threads of the application, so there is nothing to apply: "

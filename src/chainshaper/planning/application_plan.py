@@ -40,6 +40,10 @@ MOST_SLOTS = 10_000
 """So many slots of all servers fit into a hyper-period at the most."""
 WAITING_NS = 1_000_000
 """So long before a timer expires its thread's server is closed already."""
+BEFORE_NS, BEHIND_NS = 4_000_000, 2_000_000
+"""Where a shaping node's server is in force, it is open for so long before the node watches for its
+slot, which takes 2 ms to take messages, and comes 2 ms earlier in cycles whose beginning no server
+holds back (`LEAD_NS` of :mod:`chainshaper.flow.threads`); and behind its pause, for its notes."""
 
 
 class ApplicationPlan(Part):
@@ -88,7 +92,7 @@ class ApplicationPlan(Part):
 
     @cached_property
     def servers(self) -> tuple[Server, ...]:
-        """Each server once, with all its slots in the hyper-period, ascending.
+        """Each server once, with all its slots in the hyper-period: ascending and joined.
 
         A thread that several chains have in servers of their own gets one that is open in the
         slots of all of these, at the best of their priorities.
@@ -113,8 +117,9 @@ class ApplicationPlan(Part):
                     name="+".join(together),
                     core=own[0][0].core,
                     priority=min(server.priority for server, _ in own),
-                    slots=tuple(_united(slots) if len(self.chains) > 1 else sorted(slots)),
+                    slots=tuple(_united(slots)),
                     threads=tuple(threads),
+                    best_effort=all(server.best_effort for server, _ in own),
                 )
             )
         return tuple(found)
@@ -128,6 +133,17 @@ class ApplicationPlan(Part):
     def shaping_nodes(self) -> tuple[ShapingNode, ...]:
         """Those of all chains."""
         return tuple(node for chain in self.chains for node in shaping_nodes(chain))
+
+    @property
+    def takes_turns(self) -> bool:
+        """Whether threads of all servers of one priority take turns."""
+        return any(chain.equal_priorities == "round-robin" for chain in self.chains)
+
+    @property
+    def free_threads(self) -> set[Thread]:
+        """Threads that stand in servers, and that no back end keeps there: their gates do."""
+        free = (chain for chain in self.chains if chain.shaping_thread == "free")
+        return {node.thread for chain in free for node in shaping_nodes(chain)}
 
 
 def whole(plan: "Plan | ApplicationPlan") -> ApplicationPlan:
@@ -182,12 +198,30 @@ def combined(plans: Sequence[Plan]) -> ApplicationPlan:
 def _played_out(server: Server, chain: Plan, hyper_period_ns: int) -> Iterator[Slot]:
     """A server's slots over the hyper-period; one that reaches beyond its end becomes two."""
     for start_ns in range(chain.offset_ns, chain.offset_ns + hyper_period_ns, chain.cycle_ns):
-        for slot in server.slots:
+        for slot in _in_force(server, chain):
             start = (slot[0] + start_ns) % hyper_period_ns
             end = start + slot[1] - slot[0]
             yield start, min(end, hyper_period_ns)
             if end > hyper_period_ns:
                 yield 0, end - hyper_period_ns
+
+
+def _in_force(server: Server, chain: Plan) -> Sequence[Slot]:
+    """A server's slots as they are carried out, from the start of a cycle of its chain on.
+
+    A shaping node that runs in them publishes where its gate says, in the slots as planned. Around
+    these its thread needs time to take messages, to watch the clock, to pause, and for its notes;
+    and until the cycle's end, where an output that missed its slot leaves at once.
+    """
+    nodes = [node for node in shaping_nodes(chain) if node.thread in server.threads]
+    if not nodes or chain.shaping_thread == "free":
+        return server.slots
+    before = BEFORE_NS + max(node.spin_ns for node in nodes)
+    behind = BEHIND_NS + max(node.pause_ns for node in nodes)
+    slots = [(start - before, end + behind) for start, end in server.slots]
+    if "publish" in (chain.overrun, chain.modes and chain.modes.late):
+        slots[-1] = slots[-1][0], max(slots[-1][1], chain.cycle_ns)
+    return [(start, min(end, start + chain.cycle_ns)) for start, end in slots]
 
 
 def _united(slots: list[Slot]) -> list[Slot]:
@@ -281,6 +315,8 @@ def _slot_count(plan: ApplicationPlan) -> _Wrong:
 def _apart(plan: ApplicationPlan) -> _Wrong:
     """Slots of one core and priority are disjoint in all cycles, across chains as inside one."""
     for one, place, two in _pairs(plan):
+        if one.equal_priorities == two.equal_priorities == "round-robin":
+            continue
         shared = {server.name for server in one.servers} & {server.name for server in two.servers}
         common, forbidden = collisions(timetable([one], shared), timetable([two], shared))
         distance = (two.offset_ns - one.offset_ns) % common
@@ -300,7 +336,7 @@ def _collision_text(one: Plan, two: Plan, shared: set[str]) -> str:
         for other in two.servers:
             if (server.core, server.priority) != (other.core, other.priority):
                 continue
-            if shared & {server.name, other.name}:
+            if shared & {server.name, other.name} or server.best_effort or other.best_effort:
                 continue
             for start, end in server.slots:
                 for other_start, other_end in other.slots:

@@ -69,7 +69,8 @@ def timetable(
         servers.pop(name, None)
     slots: dict[tuple[int, int], list[Slot]] = {}
     for server in servers.values():
-        slots.setdefault((server.core, server.priority), []).extend(server.slots)
+        if not server.best_effort:
+            slots.setdefault((server.core, server.priority), []).extend(server.slots)
     for place, length_ns in alone:
         slots.setdefault(place, []).append((0, length_ns))
     return Timetable(" and ".join(map(chain_name, plans)), plans[0].cycle_ns, slots)
@@ -121,12 +122,15 @@ def _ranked(plans: Sequence[Plan], together: Sequence[Sequence[int]]) -> list[Pl
         return list(plans)
     ranked = list(plans)
     shortest_first = sorted(together, key=lambda group: (plans[group[0]].cycle_ns, group[0]))
+    last = {"priority": OUTPUT_PRIORITY + 1 + len(together)}
     for rank, group in enumerate(shortest_first):
         own = {"priority": OUTPUT_PRIORITY + 1 + rank}
         publishing = {server.name for k in group for server in publishing_servers(plans[k])}
         for k in group:
             servers = tuple(
-                one if one.name in publishing else one.model_copy(update=own)
+                one
+                if one.name in publishing
+                else one.model_copy(update=last if one.best_effort else own)
                 for one in plans[k].servers
             )
             ranked[k] = revised(plans[k], servers=servers)

@@ -83,20 +83,21 @@ def open_until_done(plan: Plan, closed_ns: int = 0) -> Plan:
         return revised(plan, servers=with_slots(plan.servers, dict(_longer_stages(plan))))
     if plan.policy not in ("shaped", "one-long-slot") or output_server(plan) is None:
         return plan
-    publishing, (done, _) = publishing_servers(plan), publish_slots(plan)[-1]
+    beside = [*publishing_servers(plan), *(one for one in plan.servers if one.best_effort)]
+    done, _ = publish_slots(plan)[-1]
     at_once = [one for _, one, _ in publisher_servers(plan) if plan.overrun == "publish"]
     running = [
         server
         for server in plan.servers
         if server in at_once
-        or (server not in publishing and server.slots[-1][0] < done <= server.slots[-1][1])
+        or (server not in beside and server.slots[-1][0] < done <= server.slots[-1][1])
     ]
     longer: dict[str, tuple[Slot, ...]] = {}
     for server in sorted(running, key=lambda one: one.slots[-1][1], reverse=True):
         taken = [
             slot
             for other in plan.servers
-            if other is not server
+            if other is not server and not other.best_effort
             if (other.core, other.priority) == (server.core, server.priority)
             for slot in longer.get(other.name, other.slots)
         ]

@@ -26,7 +26,7 @@ from chainshaper.gate.decision import Anchor, IntoOpenSlot, Late, Messages, Over
 from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import OperationError
 from chainshaper.values.files import new_file, write_whole
-from chainshaper.values.plan_choices import Fallback, Policy
+from chainshaper.values.plan_choices import EqualPriorities, Fallback, Policy, ShapingThread
 from chainshaper.values.yaml_file import (
     AS_YAML,
     Duration,
@@ -167,7 +167,8 @@ class Thread(Part):
 
 class Server(Part):
     """A table-driven reservation server (section 2.2.1): its threads run in its slots only. A
-    smaller ``priority`` is better, as in LITMUS^RT.
+    smaller ``priority`` is better, as in LITMUS^RT. One for ``best_effort`` (R_m' and R_int of the
+    paper, sections 3.1 and 5.1) runs only what is left of its core by all others.
     """
 
     name: Annotated[str, Field(min_length=1)]
@@ -175,6 +176,7 @@ class Server(Part):
     priority: FromOne
     slots: Annotated[tuple[Slot, ...], Field(min_length=1)]
     threads: tuple[Thread, ...] = ()
+    best_effort: bool = False
 
     @model_validator(mode="after")
     def _slots_ascend(self) -> "Server":
@@ -288,8 +290,11 @@ class Plan(Part):
     instant from which those of all chains count; ``anchor``: by the stamp that each message carries
     from the chain's first callback, or by the servers' own cycle. ``overrun`` says what becomes of
     an output that missed its last slot, ``into_open_slot`` of one that comes when its slot is open
-    already, ``messages`` which of several outputs of one cycle leave,
-    ``fallback`` what becomes of outputs while their shaping node is not there. ``shaping_node``
+    already, ``messages`` which of several outputs of one cycle leave, ``fallback`` what becomes of
+    outputs while their shaping node is not there. With ``shaping_thread`` in-slots, back ends keep
+    the threads of shaping nodes in their servers' slots (:attr:`.ApplicationPlan.servers`); free
+    ones are timed by their gates alone. ``equal_priorities`` says whether servers of one core and
+    priority may overlap. ``shaping_node``
     serves the chain's output, unless the publisher's own thread is gated; ``further_shaping_nodes``
     serve other sinks, or topics inside a chain (LET per callback).
     """
@@ -306,6 +311,8 @@ class Plan(Part):
     into_open_slot: IntoOpenSlot = "at-once"
     messages: Messages = "all-in-order"
     fallback: Fallback = "bypass"
+    shaping_thread: ShapingThread = "free"
+    equal_priorities: EqualPriorities = "apart"
     servers: Annotated[tuple[Server, ...], Field(min_length=1)]
     shaping_node: ShapingNode | None = None
     further_shaping_nodes: tuple[ShapingNode, ...] = ()
@@ -443,17 +450,24 @@ def _servers(plan: Plan) -> _Wrong:
                 )
                 yield reason, "servers", place, "slots", number
         for number, thread in enumerate(server.threads):
-            for other in filter(thread.overlaps, homes):
+            for taken in filter(thread.overlaps, homes):
                 reason = (
-                    f"{other.text} is already in server {homes[other]!r}: a thread belongs to one"
+                    f"{taken.text} is already in server {homes[taken]!r}: a thread belongs to one"
                     " server, remove it from the other"
                 )
                 yield reason, "servers", place, "threads", number
             homes[thread] = server.name
+        for other in plan.servers:
+            above = server.best_effort and not other.best_effort and server.core == other.core
+            if above and server.priority <= other.priority:
+                reason = f"best effort comes behind all others: write more than {other.priority}"
+                yield reason, "servers", place, "priority"
 
 
 def _overlaps(plan: Plan) -> _Wrong:
-    """Two servers of one core may overlap only when a priority says who runs."""
+    """Two servers of one core may overlap only when a priority says who runs, or by turns."""
+    if plan.equal_priorities == "round-robin":
+        return
     for (_, one), (place, two) in combinations(enumerate(plan.servers), 2):
         if (one.core, one.priority) != (two.core, two.priority):
             continue
@@ -497,6 +511,9 @@ def _shaping_nodes(plan: Plan) -> _Wrong:
                 " them the same",
                 *(*where, "core"),
             )
+    if not placed and plan.shaping_thread != "free":
+        reason = f"{plan.shaping_thread}, but the plan has no shaping node: remove it"
+        yield reason, "shaping_thread"
 
 
 def _modes(plan: Plan) -> _Wrong:
@@ -641,6 +658,9 @@ _SECTION_COMMENTS = {
     "into_open_slot": "an output that comes when its slot is open: at once, or in the next slot",
     "messages": "several outputs in one cycle: all leave in order, or the newest, or the first",
     "fallback": "while the shaping node is not there: bypass, outputs go around it; or silence",
+    "shaping_thread": "shaping nodes' threads run in their servers' slots only; free: their gates"
+    " alone time them",
+    "equal_priorities": "servers of one core and priority take turns; apart: they never overlap",
     "servers": "a thread runs only in its server's slots; a smaller priority is better",
     "shaping_node": "republishes the output in its slots; receivers get SCHED_FIFO below servers",
     "modes": "each mode's band, 1 is the first slot; the topic (std_msgs/String) names the mode",
@@ -697,12 +717,15 @@ def _yaml_values(plan: Plan) -> dict[str, Any]:
             _OnOneLine({key: value for key, value in thread.items() if value})
             for thread in server["threads"]
         ]
+        if not server["best_effort"]:
+            del server["best_effort"]
     if "modes" in values:
         values["modes"]["bands"] = _OnOneLine(values["modes"]["bands"])
     if plan.offset_ns == 0:
         del values["offset"]
-    if plan.into_open_slot == "at-once":
-        del values["into_open_slot"]
+    for name in ("into_open_slot", "shaping_thread", "equal_priorities"):
+        if values[name] == Plan.model_fields[name].default:
+            del values[name]
     if plan.shaping_node is None and plan.fallback == "bypass":
         del values["fallback"]
     if not values["further_shaping_nodes"]:

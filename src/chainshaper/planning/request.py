@@ -51,9 +51,11 @@ from chainshaper.planning.shaping import (
     plan_shaping,
     server_per_callback,
     server_per_chain,
+    with_best_effort,
     with_executors,
     with_first_node_apart,
     with_sink,
+    with_turns,
 )
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError
@@ -74,15 +76,16 @@ class Profile:
     ``every_latency_ns`` those of all (None: all were undisturbed), both in the order of time.
     ``nodes`` are those of the chain's callbacks, one per callback, ``topics`` what each of these
     publishes for the chain. ``core_of`` names the core of every node whose executor takes part,
-    also on branches that the chain waits for; where a node has several that run different
-    callbacks, ``executors`` are those that take part, each by its callbacks. ``begins`` is the
-    first callback's number in the graph, and its name, ``upstream`` the topics that the output
-    waits for: on the chain, on those branches, and before the chain begins. ``receivers`` are the
-    nodes that subscribe to the chain's output and are none of these. ``callbacks`` are those of the
-    chain and its branches, see :func:`~chainshaper.planning.shaping.server_per_callback`.
-    ``steps_ns`` and ``every_step_ns`` are what each callback of the chain took, a row per latency,
-    see :mod:`~chainshaper.planning.pipeline`. ``output_depth`` is the history of the output's
-    writer, ``asynchronous`` whether its process has a thread that publishes (None: not known),
+    also on branches that the chain waits for, ``cores`` that of any node that has one core; where a
+    node has several executors that run different callbacks, ``executors`` are those that take part,
+    each by its callbacks. ``begins`` is the first callback's number in the graph, and its name,
+    ``upstream`` the topics that the output waits for: on the chain, on those branches, and before
+    the chain begins. ``receivers`` are the nodes that subscribe to the chain's output and are none
+    of these. ``callbacks`` are those of the chain and its branches, see
+    :func:`~chainshaper.planning.shaping.server_per_callback`. ``steps_ns`` and ``every_step_ns``
+    are what each callback of the chain took, a row per latency, see
+    :mod:`~chainshaper.planning.pipeline`. ``output_depth`` is the history of the output's writer,
+    ``asynchronous`` whether its process has a thread that publishes (None: not known),
     ``of_modes`` has what was measured in each mode of the system. The rest is
     :class:`~chainshaper.planning.plan.Evidence`.
     """
@@ -97,6 +100,7 @@ class Profile:
     upstream: frozenset[str] = frozenset()
     core_of: Mapping[str, int] = field(default_factory=dict)
     executors: Mapping[str, tuple[tuple[str, ...], ...]] = field(default_factory=dict)
+    cores: Mapping[str, int] = field(default_factory=dict)
     receivers: tuple[str, ...] = ()
     callbacks: tuple[CallbackTimes, ...] = ()
     steps_ns: NDArray[np.int64] | None = None
@@ -206,8 +210,11 @@ def plan_chain(
             f"--fallback {request.fallback} is for an output with a shaping node, and the plan has"
             " none: leave it out, or plan with synchronous publication"
         )
-    named = with_executors(plan, [one.executors for one in (profile, *sinks)])
-    return revised(named, modes=modes)
+    plan = with_executors(plan, [one.executors for one in (profile, *sinks)])
+    plan = revised(plan, modes=modes)
+    if request.equal_priorities == "round-robin":
+        plan = with_turns(plan)
+    return with_best_effort([plan], best_effort_cores([profile], request))[0]
 
 
 def _apart(profile: Profile) -> Profile:
@@ -219,6 +226,16 @@ def _apart(profile: Profile) -> Profile:
             " callbacks took: plan from a recording, a chain without branches that it waits for"
         )
     return replace(profile, latencies_ns=steps.sum(axis=1), every_latency_ns=every.sum(axis=1))
+
+
+def best_effort_cores(profiles: Sequence[Profile], request: PlanRequest) -> dict[str, int]:
+    """The core of each node that is best effort: its own, if it has one, or the first chain's."""
+    cores = {node: core for one in profiles for node, core in one.cores.items()}
+    chain = profiles[0].core_of.get(
+        profiles[0].nodes[-1] if profiles[0].nodes else "", DEFAULT_CORE
+    )
+    names = ["/" + name.strip("/") for name in request.best_effort]
+    return {name: cores.get(name, chain) for name in names}
 
 
 def band_choice(plan: Plan, profile: Profile, request: PlanRequest) -> BandChoice:

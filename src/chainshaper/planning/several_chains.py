@@ -28,7 +28,14 @@ from chainshaper.planning.plan import (
     revised,
     with_slots,
 )
-from chainshaper.planning.request import PlanRequest, Profile, plan_chain, refuse_entangled
+from chainshaper.planning.request import (
+    PlanRequest,
+    Profile,
+    best_effort_cores,
+    plan_chain,
+    refuse_entangled,
+)
+from chainshaper.planning.shaping import with_best_effort
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError
 
@@ -82,14 +89,15 @@ def with_own_names(plans: Sequence[Plan]) -> list[Plan]:
 def _planned(
     profiles: Sequence[Profile], request: PlanRequest, time_limit_s: float
 ) -> tuple[ApplicationPlan, list[str]]:
-    plans = [plan_chain(profile, request) for profile in profiles]
+    alone = replace(request, best_effort=())
+    plans = [plan_chain(profile, alone) for profile in profiles]
     groups = _beginning_together(profiles)
     for group in groups:
         for k, plan in zip(group, _sharing_servers([plans[k] for k in group]), strict=True):
             plans[k] = plan
     named = with_own_names(plans)
     placed, remarks = place_chains(named, together=groups, time_limit_s=time_limit_s)
-    return combined(placed), remarks
+    return combined(with_best_effort(placed, best_effort_cores(profiles, request))), remarks
 
 
 def _beginning_together(profiles: Sequence[Profile]) -> list[list[int]]:

@@ -113,6 +113,7 @@ def plan_shaping(
             into_open_slot=wishes.into_open_slot,
             messages=wishes.messages,
             fallback=wishes.fallback,
+            shaping_thread=wishes.shaping_thread,
             servers=(running, _publishing("output", output_core, (start, end), gated)),
             shaping_node=node,
             predicted=predict_bands(latencies, [end], length, wishes.into_open_slot),
@@ -242,6 +243,41 @@ def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int) -> Plan:
     behind = {"slots": ((slot_end_ns, end),), "threads": rest}
     split = (chain.model_copy(update=alone), chain.model_copy(update=behind))
     return revised(plan, servers=(*split, *others))
+
+
+def with_best_effort(plans: Sequence[Plan], core_of: Mapping[str, int]) -> list[Plan]:
+    """Plans whose first has a server on each core for these nodes, which are in none of the chains.
+
+    It is open all the time, and runs what no other server wants to run: R_m' of section 3.1, R_int
+    of section 5.1. Raises InputError: a node is in a server already.
+    """
+    first, *others = plans
+    known = {one.node: server.name for p in plans for server in p.servers for one in server.threads}
+    if taken := sorted(known.keys() & core_of.keys()):
+        raise InputError(
+            f"{taken[0]} is in the server {known[taken[0]]!r}: best effort are nodes beside chains"
+        )
+    worst = max(server.priority for plan in plans for server in plan.servers)
+    with wrong_values_refused(Plan):
+        added = [
+            Server(
+                name=f"best_effort_core{core}",
+                core=core,
+                priority=worst + 1,
+                slots=((0, first.cycle_ns),),
+                threads=tuple(Thread(node=node) for node, its in core_of.items() if its == core),
+                best_effort=True,
+            )
+            for core in sorted(set(core_of.values()))
+        ]
+    return [revised(first, servers=(*first.servers, *added)), *others]
+
+
+def with_turns(plan: Plan) -> Plan:
+    """A plan whose servers have one priority, as in the paper (eq. 3), and take turns."""
+    best = min(server.priority for server in plan.servers)
+    equal = tuple(one.model_copy(update={"priority": best}) for one in plan.servers)
+    return revised(plan, servers=below_executors(equal), equal_priorities="round-robin")
 
 
 def _chain_and_others(plan: Plan) -> tuple[Server, list[Server]]:

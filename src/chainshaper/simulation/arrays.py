@@ -437,6 +437,11 @@ def _fill_cores(
                 bit = ranked.index(server)
                 rows[threads[number] + T.SERVER] = bit
                 rows[threads[number] + T.RANK] = bit - len(ranked)
+                if plan is not None and plan.takes_turns:
+                    equal = [one.priority for one in ranked].index(server.priority)
+                    rows[threads[number] + T.RANK] = equal - len(ranked)
+                if server.best_effort:  # under the fair class, behind all real-time threads
+                    rows[threads[number] + T.RANK] = BEST_EFFORT
         mine = [thread for thread in threads if rows[thread + T.CORE] == place]
         rows[place + C.FIRST], rows[place + C.END] = rows.put(mine)
         rows[place + C.RUNNING], rows[place + C.LAST] = NONE, NONE
@@ -459,10 +464,9 @@ def _fill_cores(
 
 def _slot_table(plan: ApplicationPlan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
     """Rows (offset in the cycle, mask of the servers that are open from then on)."""
-    # A shaping node times its messages itself: its thread needs no slot to run in.
-    shaping = {node.thread for node in plan.shaping_nodes}
+    # A free shaping node times its messages itself: its thread needs no slot to run in.
     slots = [
-        server.slots if shaping.isdisjoint(server.threads) else ((0, plan.cycle_ns),)
+        server.slots if plan.free_threads.isdisjoint(server.threads) else ((0, plan.cycle_ns),)
         for server in ranked
     ]
     offsets = {0} | {instant for own in slots for slot in own for instant in slot}

@@ -107,7 +107,9 @@ def write_shaping_process(
     of_standby = {name: parameters[name] for name in ("handover", "output_depth", "depth")} | {
         "shaping_node": node.name,
         "fallback": plan.fallback,
-        "patience_ns": max(plan.cycle_ns // 2, SHORTEST_PATIENCE_NS),
+        # A node that is kept in its server's slots may get to a message a cycle later.
+        "patience_ns": max(plan.cycle_ns // 2, SHORTEST_PATIENCE_NS)
+        + (plan.cycle_ns if plan.shaping_thread == "in-slots" else 0),
         "server_cores": _server_cores(plan),
         "log": "" if log is None else str(log.with_stem(standby).absolute()),
     }

@@ -25,6 +25,12 @@ Fallback: TypeAlias = Literal["bypass", "silence"]
 Publication: TypeAlias = Literal["synchronous", "asynchronous"]
 """By a shaping node, or by the publisher's own thread (section 3.2)."""
 
+ShapingThread: TypeAlias = Literal["free", "in-slots"]
+"""Whether a shaping node's thread is timed by its gate alone, or runs in its server's slots."""
+
+EqualPriorities: TypeAlias = Literal["apart", "round-robin"]
+"""What servers of one core and one priority do: their slots are apart, or they take turns."""
+
 Solver: TypeAlias = Literal["exact", "pso", "random"]
 """What places latency bands; the paper uses particle swarm optimisation (section 3.3)."""
 
@@ -108,6 +114,9 @@ class Wishes:
     depth: Annotated[int | None, Option(
         "How many outputs may wait in the gate. Default: as many as the history of its"
         " publisher has room for, 10 at least.", least=1)] = None
+    shaping_thread: Annotated[ShapingThread, Option(
+        "The shaping node's thread: its gate alone times it; or back ends keep it in its server's"
+        " slots as well.")] = "free"
     fallback: Annotated[Fallback, Option(
         "While the shaping node is not there: outputs go around it, or none is published."
         " Default: bypass, or what the plan says.")] = "bypass"
@@ -116,6 +125,12 @@ class Wishes:
     pause_ns: Annotated[int | None, Option(
         "How long the gate rests after publishing. Default: 2ms, a twentieth of the cycle at"
         " most.")] = None
+    equal_priorities: Annotated[EqualPriorities, Option(
+        "Servers of one priority on a core: their slots stay apart; or, with one priority for all"
+        " (eq. 3), they take turns.")] = "apart"
+    best_effort: Annotated[tuple[str, ...], Option(
+        "A node outside the chain that runs when none of its servers does, in a server that is"
+        " open all the time (may be repeated).", "More of the graph", "NODE")] = ()
     with_receivers: Annotated[bool, Option(
         "Give nodes that subscribe to the shaped output SCHED_FIFO below all servers, while"
         " the plan is in force.", flag="--receivers/--no-receivers")] = True

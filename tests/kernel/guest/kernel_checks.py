@@ -211,6 +211,32 @@ def a_thread_assigned_while_running_is_governed_at_once() -> str:
     return f"ran on for {leaks[0] / 1e3:.1f} us; {leaks[1] / 1e3:.1f} us when it was waiting"
 
 
+def a_gate_publishes_exactly_in_a_server_that_opens_before_its_slot() -> str:
+    """R_m and R_m° of a plan (paper, section 3.2.2): the chain computes until 12 ms of its slot
+    [0, 25), a message comes at 15; the gate's slot starts at 25, its server opens at 20.
+    """
+    chain, output = server("chain", 0, 25, priority=2), server("output", 20, 30)
+    with scene() as s:
+        gate = s.spinner("gate", job=(CYCLE, 15 * MS, 25 * MS, MS), gate=True)
+        computing, hog = s.spinner("chain", job=(0, CYCLE, 0, 12 * MS)), s.spinner("hog")
+        loader = s.loader(table(chain, output), {"chain": [computing], "output": [gate]})
+        start = loader.arm() + CYCLE
+        wait(RUN_MS)
+        end = time.monotonic_ns()
+        counted = loader.ask("counters")
+        published = [each for each in gate.windows() if start < each[0] < end]
+        ran, others = cut(computing.windows(), start, end), cut(hog.windows(), start, end)
+    lateness = [at - slot for slot, at in published]
+    assert len(published) >= (end - start) // CYCLE - 1, f"{len(published)} messages left"
+    assert all(slot % CYCLE == 25 * MS for slot, _ in published)
+    assert max(lateness) < MS // 10, f"late by up to {max(lateness)} ns"
+    assert overlap(ran, slots_between(((12 * MS + MS // 2, CYCLE),), CYCLE, 0, start, end)) == 0
+    assert length(others) > 0.5 * (end - start), "best effort was starved"
+    assert counted["chain"]["overruns"] == 0, counted
+    worst = max(lateness) / 1e3
+    return f"{len(published)} messages, {median(lateness) / 1e3:.1f} us late, at most {worst:.1f}"
+
+
 def counters_tell_slots_and_overruns() -> str:
     """A thread that never has enough overruns each slot, one that is ready in time none."""
     with scene() as s:
@@ -325,6 +351,7 @@ VIRTUAL_TIME = (
     moving_the_cycles_lets_nobody_slip_between,
     two_servers_exchange_their_slots_at_one_instant,
     a_thread_assigned_while_running_is_governed_at_once,
+    a_gate_publishes_exactly_in_a_server_that_opens_before_its_slot,
     counters_tell_slots_and_overruns,
     a_real_time_thread_in_the_way_counts_as_a_late_entry,
     a_stopped_loader_changes_nothing,

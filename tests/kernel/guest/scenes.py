@@ -60,11 +60,21 @@ def wait_for_phase(phase_ms: int) -> int:
 
 
 class Spinner:
-    """A process with one thread that wants the core; `job` is (anchor, period, offset, work)."""
+    """A process with one thread that wants the core; `job` is (anchor, period, offset, work).
 
-    def __init__(self, name: str, core: int = 0, job: tuple[int, int, int, int] | None = None):
+    As a ``gate`` it is `gate_process.py`, whose job and log are its own.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        core: int = 0,
+        job: tuple[int, int, int, int] | None = None,
+        gate: bool = False,
+    ):
         self.log = Path(f"/tmp/{name}.log")
-        arguments = [str(HERE / "spin"), str(self.log), str(core), *map(str, job or ())]
+        program = [sys.executable, HERE / "gate_process.py"] if gate else [HERE / "spin"]
+        arguments = [str(one) for one in (*program, self.log, core, *(job or ()))]
         self.process = subprocess.Popen(arguments, stdout=subprocess.PIPE)
         assert self.process.stdout is not None
         assert self.process.stdout.readline() == b"ready\n"
@@ -114,8 +124,8 @@ class Scene:
     def __init__(self) -> None:
         self._processes: list[subprocess.Popen[bytes]] = []
 
-    def spinner(self, name: str, core: int = 0, job: Any = None) -> Spinner:
-        made = Spinner(name, core, job)
+    def spinner(self, name: str, core: int = 0, job: Any = None, gate: bool = False) -> Spinner:
+        made = Spinner(name, core, job, gate)
         self._processes.append(made.process)
         return made
 
