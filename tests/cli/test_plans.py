@@ -264,7 +264,7 @@ def test_modes_get_their_bands(unshaped: Recording, tmp_path: Path) -> None:
     assert load_plan(tmp_path / "plan.yaml").modes == Modes.model_validate(values["modes"])
     assert "from 1 to 1, or add a slot" in refused(2, *plan, *modes)
     asynchronous = ("--publication", "asynchronous", "--publish-slot", "1ms")
-    assert "no `shaping_node`" in refused(2, *two, *asynchronous, "--bands", "1")
+    assert "/third has no thread that publishes" in refused(2, *two, *asynchronous)
     assert "--late publish goes with modes" in refused(2, *plan, "--late", "publish")
     for wrong, reason in {
         "/mode:city,highway=1": "all with a band or none",

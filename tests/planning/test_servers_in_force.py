@@ -109,7 +109,7 @@ def test_servers_of_one_priority_overlap_only_where_they_take_turns() -> None:
     assert [(s.name, s.priority) for s in plan.servers] == [("chain", 1), ("output", 1)]
     assert open_in_ms(plan, "chain") == [(0, 50)]
     apart = revised(plan, equal_priorities="apart")
-    assert open_in_ms(apart, "chain") == [(0, 21)]
+    assert open_in_ms(apart, "chain") == [(0, 21), (22, 50)]
     with pytest.raises(InputError, match="overlaps"):
         revised(apart, servers=with_slots(plan.servers, {"chain": [(0, 40 * MS)]}))
     refuse_turns(whole(plan), "freezer")

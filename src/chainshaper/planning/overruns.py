@@ -97,7 +97,7 @@ def open_until_done(plan: Plan, closed_ns: int = 0) -> Plan:
         taken = [
             slot
             for other in plan.servers
-            if other is not server and not other.best_effort
+            if other is not server and plan.equal_priorities == "apart"
             if (other.core, other.priority) == (server.core, server.priority)
             for slot in longer.get(other.name, other.slots)
         ]
