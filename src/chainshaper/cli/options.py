@@ -49,6 +49,16 @@ def _bands(text: str) -> int | Literal["auto"]:
     return int(text)
 
 
+def _cores(text: str) -> tuple[int, ...]:
+    words = text.split(",")
+    if not all(word.strip().isdecimal() for word in words):
+        raise typer.BadParameter(f"{text!r} are no cores: write their numbers, such as 0,1")
+    cores = tuple(int(word) for word in words)
+    if len(set(cores)) < len(cores):
+        raise typer.BadParameter(f"{text} names a core twice: name each once")
+    return cores
+
+
 def _share(text: str) -> float:
     try:
         value = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
@@ -62,6 +72,7 @@ def _share(text: str) -> float:
 PARSERS: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
     "DURATION": (_duration, format_duration),
     "N|auto": (_bands, str),
+    "CORES": (_cores, str),
     "SHARE": (_share, "{:.0%}".format),
 }
 """What reads and writes the values behind a metavar."""
@@ -86,6 +97,11 @@ def argument(metavar: str, help_text: str, default: Any = None) -> Any:
     return typer.Argument(default, metavar=metavar, help=help_text, show_default=False)
 
 
+SINK: list[str] | None = option(
+    "--sink FIRST..LAST",
+    "A chain to a further output of the same graph, to be shaped too.",
+    rich_help_panel="More of the graph",
+)
 JSON: bool = option("--json", "Print the figures as JSON (integer ns).", False)
 CHAIN: str | None = option(
     "--chain FIRST..LAST",
@@ -155,6 +171,7 @@ _OTHERS: dict[str, tuple[Any, Any]] = {
     "modes": (str | None, _MODES),
     "late": (Late | None, _LATE),
     "bands": (str, wish("bands")),  # Typer knows no unions
+    "cores": (str | None, wish("cores")),
 }
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.planning.bands import BandChoice, choose_bands, with_bands, with_long_slot
+from chainshaper.planning.cores import Work, assign_cores
 from chainshaper.planning.margins import (
     EPSILON_NS,
     MOST_PROBABLE,
@@ -65,8 +66,9 @@ class Profile:
     graph, and its name, ``upstream`` the topics that the output waits for: on the chain, on those
     branches, and before the chain begins. ``receivers`` are the nodes that subscribe to the chain's
     output and are none of these. ``callbacks`` are those of the chain and its branches, see
-    :func:`~chainshaper.planning.shaping.server_per_callback`. ``output_depth`` is the history of
-    the output's writer. The rest is :class:`~chainshaper.planning.plan.Evidence`.
+    :func:`~chainshaper.planning.shaping.server_per_callback`. ``together`` are nodes that share a
+    process. ``output_depth`` is the history of the output's writer. The rest is
+    :class:`~chainshaper.planning.plan.Evidence`.
     """
 
     latencies_ns: NDArray[np.int64]
@@ -78,6 +80,7 @@ class Profile:
     begins: tuple[int, str] | None = None
     upstream: frozenset[str] = frozenset()
     core_of: Mapping[str, int] = field(default_factory=dict)
+    together: tuple[tuple[str, ...], ...] = ()
     receivers: tuple[str, ...] = ()
     callbacks: tuple[CallbackTimes, ...] = ()
     fifo_priority: int = 84
@@ -134,6 +137,7 @@ def plan_chain(
     library that only this request needs is not installed.
     """
     _refuse_contradictions(request, bool(sinks))
+    (profile, *sinks), _ = on_cores((profile, *sinks), request)
     refuse_entangled((profile, *sinks), request.policy, sinks=True)
     if any(sink.all_disturbed for sink in sinks) or profile.all_disturbed:
         profile, sinks = _covered(profile, request), [_covered(sink, request) for sink in sinks]
@@ -170,6 +174,51 @@ def plan_chain(
             " none: leave it out, or plan with synchronous publication"
         )
     return revised(plan, modes=request.modes)
+
+
+def cores_for(
+    profiles: Sequence[Profile],
+    cores: Sequence[int],
+    request: PlanRequest = _STANDARD,
+    worth: float = 0.0,
+) -> dict[str, int]:
+    """The core of each node of these chains, see :func:`~chainshaper.planning.cores.assign_cores`.
+
+    Raises InputError: a profile has no callbacks, being bare latencies.
+    """
+    if bare := [profile.name for profile in profiles if not profile.callbacks]:
+        raise InputError(
+            f"--cores distributes callbacks, and latencies do not tell those of {bare[0]}: plan"
+            " from a recording"
+        )
+    margin = EPSILON_NS if request.epsilon_ns is None else request.epsilon_ns
+    work = [Work((p.begins, p.period_ns), p.period_ns, p.callbacks, margin) for p in profiles]
+    together = [group for profile in profiles for group in profile.together]
+    return assign_cores(work, cores, together=together, worth=worth)
+
+
+def on_cores(
+    profiles: Sequence[Profile], request: PlanRequest
+) -> tuple[tuple[Profile, ...], list[str]]:
+    """The profiles with their executors on the wished cores, and whose latency is another there.
+
+    Raises: as :func:`cores_for`.
+    """
+    if request.cores is None:
+        return tuple(profiles), []
+    core_of, moved, doubts = cores_for(profiles, request.cores, request), [], []
+    for one in profiles:
+        own = {node: core_of[node] for node in one.core_of}
+        homes = {(own[node], core) for node, core in one.core_of.items()}
+        if not len(homes) == len(set(own.values())) == len(set(one.core_of.values())):
+            doubts.append(
+                f"{one.name} was measured with its executors distributed over cores in another way"
+                " than planned, which is another latency: measure it so (`chainshaper profile"
+                f" --cores {','.join(map(str, request.cores))}`)"
+            )
+        callbacks = tuple(replace(each, core=core_of[each.node]) for each in one.callbacks)
+        moved.append(replace(one, core_of=own, callbacks=callbacks))
+    return tuple(moved), doubts
 
 
 def band_choice(plan: Plan, profile: Profile, request: PlanRequest) -> BandChoice:

@@ -27,7 +27,13 @@ from chainshaper.planning.plan import (
     revised,
     with_slots,
 )
-from chainshaper.planning.request import PlanRequest, Profile, plan_chain, refuse_entangled
+from chainshaper.planning.request import (
+    PlanRequest,
+    Profile,
+    on_cores,
+    plan_chain,
+    refuse_entangled,
+)
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError
 
@@ -50,9 +56,12 @@ def plan_application(
     """
     if not profiles:
         raise InputError("no chain is named: give one at least")
+    profiles, doubts = on_cores(profiles, request)
+    request = replace(request, cores=None)
     refuse_entangled(profiles, request.policy)
     try:
-        return _planned(profiles, request, time_limit_s)
+        plan, remarks = _planned(profiles, request, time_limit_s)
+        return plan, [*doubts, *remarks]
     except OperationError as error:
         fits = list(_fitting(profiles, request, time_limit_s)) if len(profiles) > 1 else []
         if not fits:
@@ -64,7 +73,7 @@ def _planned(
     profiles: Sequence[Profile], request: PlanRequest, time_limit_s: float
 ) -> tuple[ApplicationPlan, list[str]]:
     plans = [plan_chain(profile, request) for profile in profiles]
-    groups = _beginning_together(profiles)
+    groups = beginning_together(profiles)
     for number, group in enumerate(groups):
         for k, plan in zip(group, _sharing_servers([plans[k] for k in group]), strict=True):
             plans[k] = _with_names(plan, number, k)
@@ -72,7 +81,7 @@ def _planned(
     return combined(placed), remarks
 
 
-def _beginning_together(profiles: Sequence[Profile]) -> list[list[int]]:
+def beginning_together(profiles: Sequence[Profile]) -> list[list[int]]:
     """The places of chains, together where they begin at the same callback."""
     groups: dict[Any, list[int]] = {}
     for place, profile in enumerate(profiles):

@@ -55,7 +55,7 @@ class Wishes:
     (None: 1 %, or as few as the sample shows). ``overrun`` None: an output that missed its slot
     leaves at once, where the policy and the publisher allow it. ``bands`` to ``seed`` go with the
     policy ``shaped``, see :func:`~chainshaper.planning.bands.with_bands`; ``slot_start_ns`` goes
-    with ``one-long-slot``.
+    with ``one-long-slot``. ``cores`` None: executors are planned for the cores that they ran on.
     """
 
     policy: Annotated[Policy, Option("How it is scheduled.")] = "shaped"
@@ -106,6 +106,10 @@ class Wishes:
     pause_ns: Annotated[int | None, Option(
         "How long the gate rests after publishing. Default: 2ms, a twentieth of the cycle at"
         " most.")] = None
+    cores: Annotated[tuple[int, ...] | None, Option(
+        "Distribute the executors over these cores, such as 0,1: branches that run at the same"
+        " time, and chains whose slots would collide, get a core of their own.",
+        "More of the graph", "CORES")] = None
     with_receivers: Annotated[bool, Option(
         "Give nodes that subscribe to the shaped output SCHED_FIFO below all servers, while"
         " the plan is in force.", flag="--receivers/--no-receivers")] = True
