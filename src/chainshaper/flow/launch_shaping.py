@@ -144,6 +144,7 @@ def shape_launch(
 
     shaped, setup = list(command), list[str]()
     if throttled:
+        request = replace(request, anchor="cycle")  # messages have the stamps of their sensors
         kind: Literal["python", "cpp"] = "python" if node == "python" else "cpp"
         inputs = splice_throttlers(throttled, [launch.file], folder / "throttled", node=kind)
         launch, setup = replace(launch, file=next(iter(inputs.launch.values()))), _sourced(inputs)

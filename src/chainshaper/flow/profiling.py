@@ -58,7 +58,7 @@ def profiling_condition(
     does not appear, or the kernel refuses something.
     """
     wanted, core_of = frozenset(nodes), core if isinstance(core, Mapping) else {}
-    cores = check_profiling(core if isinstance(core, int) else sorted(set(core_of.values())))
+    cores = check_profiling(core if isinstance(core, int) else [*dict.fromkeys(core_of.values())])
     servers = [ReservationServer(f"the executors of core {one}", one, 1, ()) for one in cores]
     recorded = recorded_processes(like)[0] if like is not None else ()
     begun_ns, done = time.monotonic_ns(), set[tuple[int, int]]()
@@ -80,7 +80,8 @@ def profiling_condition(
             server.name: [one for one in members if _core(one, core_of, cores) == server.core]
             for server in servers
         }
-        around = scheduling_around(homes, servers, found, available_cores())
+        clear = cores[:1] if len(cores) > 1 else ()  # the plan's, whose output it has mostly
+        around = scheduling_around(homes, servers, found, available_cores(), clear=clear)
         new = [one for one in around if one.thread.thread.identity not in done]
         # One after the other, as under SCHED_FIFO in the paper: no turns.
         changes = [(one.thread.thread, replace(one.wanted, takes_turns=False)) for one in new]
