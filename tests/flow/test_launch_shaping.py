@@ -27,12 +27,28 @@ def test_what_is_not_launched_by_ros2_cannot_be_shaped_so(tmp_path: Path) -> Non
 def test_a_description_needs_its_plan(tmp_path: Path) -> None:
     said = refused(2, "shape", "robot.yaml", "-o", tmp_path / "out")
     assert "chainshaper shape APP.yaml plan.yaml -o REC" in said
+    words = ("shape", "robot.yaml", "plan.yaml", "--bands", "2", "-o", tmp_path / "out")
+    assert "is shaped as plan.yaml says" in refused(2, *words)
 
 
 def test_a_folder_with_something_in_it_is_left_alone(tmp_path: Path, launch_file: Path) -> None:
     with pytest.raises(InputError, match="exists already and is not overwritten"):
         shape_launch(["ros2", "launch", str(launch_file)], tmp_path)
     assert [entry.name for entry in tmp_path.iterdir()] == [launch_file.name]
+
+
+def test_what_cannot_be_shaped_is_refused_before_anything_is_launched(
+    tmp_path: Path, launch_file: Path
+) -> None:
+    launch = ("-o", tmp_path / "out", "--", "ros2", "launch", launch_file)
+    assert "core 4000, which --cores asks for" in refused(3, "shape", "--cores", "0,4000", *launch)
+    for words, reason in {
+        "--chain /a../b --chain /c../d --sink /a../e": "--sink goes with one chain",
+        "--throttle /in=100ms": "as in --throttle NODE:/in=PERIOD",
+        "--throttle /node:/in": "write a topic and a period",
+    }.items():
+        assert reason in refused(2, "shape", *words.split(), *launch)
+    assert not (tmp_path / "out").exists()
 
 
 def test_missing_build_tools_are_named_before_minutes_are_spent(

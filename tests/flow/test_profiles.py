@@ -13,11 +13,13 @@ from story import OFFSET, Callback, Publisher, Story
 
 from chainshaper.flow.plan import plan_recording, profile_chains
 from chainshaper.planning import Plan, PlanRequest, Profile, band_choice, plan_chain, plan_warnings
+from chainshaper.planning.request import on_cores
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording, RecordingInfo, ThreadInfo
 
 MS = 1_000_000
+FRONT = "/front_filter"
 CHAIN = "/rear_raw../fused../pose"
 
 
@@ -127,6 +129,19 @@ def test_a_publication_takes_until_its_callback_ends_or_publishes_again_or_all_h
     stalled = {**story.tables(), "machine_stall": pl.DataFrame([stall], schema_overrides=types)}
     (profile,) = profile_chains(replace(recording, events=stalled), ["/out"])
     assert profile.longest_publication_ns == 50, "a stall is no part of it"
+
+
+def test_a_front_filter_is_planned_for_a_core_of_its_own() -> None:
+    """As the paper has it in section 5.1; on one core, latencies would be others than measured."""
+    for cores, front, said in (((1, 0), 0, 0), ((3, 2), 2, 0), ((1,), 1, 1)):
+        (profile,), doubts = on_cores([_profile()], PlanRequest(cores=cores))
+        assert profile.core_of == {**dict.fromkeys(_profile().core_of, cores[0]), FRONT: front}
+        assert [doubt.startswith(f"{CHAIN} was measured with") for doubt in doubts] == [True] * said
+        plan = plan_chain(_profile(), PlanRequest(cores=cores, epsilon_ns=2 * MS))
+        homes = {thread.node: server.core for server in plan.servers for thread in server.threads}
+        assert {node: homes[node] for node in profile.core_of} == profile.core_of
+    with pytest.raises(InputError, match="--cores distributes callbacks, and latencies do not"):
+        plan_chain(Profile(np.array([1, 2]), 100 * MS), PlanRequest(cores=(0, 1)))
 
 
 def test_a_chain_that_no_timer_starts_needs_its_period_and_leaves_out_what_feeds_it() -> None:

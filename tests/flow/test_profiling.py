@@ -12,13 +12,14 @@ from command_line import called, json_of, refused
 from lttng_node import chain_command, required_node
 from processes import wait_for
 
-from chainshaper import InputError, OperationError, PlatformError, open_recording
+from chainshaper import InputError, OperationError, PlanRequest, PlatformError, open_recording
 from chainshaper.enforcement.threads import RecordedProcess, RecordedThread, allocate
 from chainshaper.flow import profiling
 from chainshaper.flow.profiling import (
     chain_nodes,
     check_profiling,
     executors_of,
+    profiled_cores,
     profiling_condition,
 )
 from chainshaper.linux.processes import list_processes
@@ -83,6 +84,15 @@ def test_the_chains_threads_are_high_and_apart_and_afterwards_as_before(
         assert (run / "journal.jsonl").is_file()
     assert _states(nodes) == before
     assert list(tmp_path.iterdir()) == []
+
+
+def test_executors_run_on_the_cores_that_are_named(nodes: dict[str, int], tmp_path: Path) -> None:
+    cores = dict(zip(nodes, available_cores(), strict=False))
+    with profiling_condition(cores, cores, folder=tmp_path) as see_to_it:
+        see_to_it(list_processes(nodes.values()))
+        for node, core in cores.items():
+            executor = list_threads(nodes[node])[0]
+            assert (executor.priority, executor.cores) == (87, (core,))
 
 
 def test_all_is_as_before_when_the_run_fails(nodes: dict[str, int], tmp_path: Path) -> None:
@@ -156,6 +166,8 @@ def test_profile_records_the_chain_under_its_condition(node: Path, tmp_path: Pat
     command = chain_command(node, 100_000)
     assert called("record", "-o", first, "--duration", "1s", "--", *command).code == 0
     assert chain_nodes(open_recording(first), "/x../y") == ("/source", "/relay")
+    _, cores = profiled_cores(open_recording(first), ["/x../y"], PlanRequest())
+    assert cores == {"/source": available_cores()[-1], "/relay": available_cores()[-1]}
     with pytest.raises(InputError, match="/nowhere"):
         chain_nodes(open_recording(first), "/x../nowhere")
     chain: tuple[str | Path, ...] = ("--chain", "/x../y", "--like", first)
@@ -179,6 +191,16 @@ def test_profile_says_what_it_needs(tmp_path: Path) -> None:
     assert "no command given" in refused(2, "profile", "-o", path)
     said = refused(2, "profile", "-o", path, "--chain", "/a../b", *command)
     assert "an earlier recording knows: name it with --like" in said
+    twice = called("profile", "-o", path, "--cores", "0,0", *command)
+    assert (twice.code, "names a core twice" in twice.err) == (2, True)
+    for options, reason in {
+        ("--cores", "0,4000"): "core 4000, which the chain asks for, is not available",
+        ("--cores", "0,1", "--core", "1"): "give one of them",
+        ("--cores", ",".join(map(str, available_cores()))): "name these with --chain",
+    }.items():
+        assert reason in refused(
+            3 if "4000" in reason else 2, "profile", "-o", path, *options, *command
+        )
     assert "no such folder" in refused(
         2, "profile", "-o", path, "--chain", "/a../b", "--like", tmp_path / "no", *command
     )

@@ -49,6 +49,13 @@ def _bands(text: str) -> int | Literal["auto"]:
     return int(text)
 
 
+def _cores(text: str) -> tuple[int, ...]:
+    words = text.split(",")
+    if not all(word.strip().isdecimal() for word in words):
+        raise typer.BadParameter(f"{text!r} are no cores: write their numbers, such as 0,1")
+    return tuple(map(int, words))
+
+
 def _share(text: str) -> float:
     try:
         value = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
@@ -59,18 +66,11 @@ def _share(text: str) -> float:
     return value
 
 
-def _cores(text: str) -> tuple[int, ...]:
-    parts = text.split(",")
-    if not all(part.strip().isdecimal() for part in parts):
-        raise typer.BadParameter(f"{text!r} are no cores: write their numbers, such as 0,1")
-    return tuple(map(int, parts))
-
-
 PARSERS: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
     "DURATION": (_duration, format_duration),
     "N|auto": (_bands, str),
+    "CORES": (_cores, lambda cores: ",".join(map(str, cores))),
     "SHARE": (_share, "{:.0%}".format),
-    "N,N…": (_cores, lambda cores: ",".join(map(str, cores))),
 }
 """What reads and writes the values behind a metavar."""
 
@@ -94,6 +94,11 @@ def argument(metavar: str, help_text: str, default: Any = None) -> Any:
     return typer.Argument(default, metavar=metavar, help=help_text, show_default=False)
 
 
+SINK: list[str] | None = option(
+    "--sink FIRST..LAST",
+    "A chain to a further output of the same graph, to be shaped too.",
+    rich_help_panel="More of the graph",
+)
 JSON: bool = option("--json", "Print the figures as JSON (integer ns).", False)
 CHAIN: str | None = option(
     "--chain FIRST..LAST",

@@ -14,6 +14,7 @@ from chainshaper.cli.options import (
     NODE,
     PLAN_WISHES,
     SEED,
+    SINK,
     NodeKind,
     argument,
     option,
@@ -56,11 +57,7 @@ def plan(
         " (may be repeated). Default: the cycles of the recording that began in it.",
         rich_help_panel="Latency bands",
     ),
-    sink: list[str] | None = option(
-        "--sink FIRST..LAST",
-        "A chain to a further output of the same graph, to be shaped too.",
-        rich_help_panel="More of the graph",
-    ),
+    sink: list[str] | None = SINK,
     json: bool = JSON,
 ) -> None:
     """Plan the reservation servers of a chain: by default one publish slot behind its longest
@@ -75,6 +72,7 @@ def plan(
         plan_warnings,
         publish_slots,
     )
+    from chainshaper.planning.request import on_cores
     from chainshaper.reporting.figures import draw_curve
     from chainshaper.reporting.overviews import bands_table, choice_json, choice_table, plan_table
 
@@ -100,7 +98,8 @@ def plan(
     choice = band_choice(made, planned[0], request) if request.bands == "auto" else None
     if output is not None:
         cs.save_plan(made, output)
-    values: dict[str, Any] = {**plan_json(made), "warnings": plan_warnings(made)}
+    warnings = [*on_cores(profiles, request)[1], *plan_warnings(made)]
+    values: dict[str, Any] = {**plan_json(made), "warnings": warnings}
     tables = [plan_table(made)]
     if len(publish_slots(made)) > 1 or made.modes is not None:
         tables.append(bands_table(made))
@@ -336,12 +335,16 @@ def splice(
 
 
 def _throttled(inputs: list[str], recording: Path | None, common: dict[str, Any]) -> "cs.Splicing":
+    if not common["launch_files"]:
+        raise InputError("give the launch files: `splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`")
+    return cs.splice_throttlers(throttled_inputs(inputs), recording=_opened(recording), **common)
+
+
+def throttled_inputs(inputs: Sequence[str]) -> "list[cs.ThrottledInput]":
     """Inputs as they are written: ``/fusion:/points_raw=100ms``, ``/points_raw=100ms,first``."""
     from chainshaper.values.durations import parse_duration
     from chainshaper.values.yaml_file import wrong_values_refused
 
-    if not common["launch_files"]:
-        raise InputError("give the launch files: `splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`")
     parsed = []
     for text in inputs:
         where, equals, how = text.rpartition("=")
@@ -353,7 +356,7 @@ def _throttled(inputs: list[str], recording: Path | None, common: dict[str, Any]
         values |= {"rule": rule} if comma else {}
         with wrong_values_refused(cs.ThrottledInput):
             parsed.append(cs.ThrottledInput.model_validate(values))
-    return cs.splice_throttlers(parsed, recording=_opened(recording), **common)
+    return parsed
 
 
 def _opened(recording: Path | None) -> "cs.Recording | None":

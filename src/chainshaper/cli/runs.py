@@ -10,14 +10,15 @@ import typer
 import chainshaper as cs
 from chainshaper.cli.options import (
     APPLICATION,
-    CHAIN,
     CYCLES,
     DESCRIPTIONS,
     JSON,
     NODE,
+    PLAN_WISHES,
     REALTIME,
     RECORDING_OUTPUT,
     SEED,
+    SINK,
     SOURCE,
     USERS,
     NodeKind,
@@ -40,6 +41,7 @@ from chainshaper.cli.output import (
     stop_on_signals,
     warn,
 )
+from chainshaper.cli.plans import throttled_inputs
 from chainshaper.cli.traces import comparison_tables
 from chainshaper.values.errors import InputError, OperationError
 
@@ -241,12 +243,15 @@ def _record_and_show(
         )
 
 
+@takes_wishes("cores")
 def profile(
     output: Path = RECORDING_OUTPUT,
     command: list[str] | None = COMMAND,
-    chain: str | None = option(
+    *,
+    chain: list[str] | None = option(
         "--chain FIRST..LAST",
-        "The chain whose nodes get the priority; --like tells which those are.",
+        "The chain whose nodes, and those that it waits for, get the priority (may be repeated);"
+        " --like tells which those are.",
     ),
     like: Path | None = option(
         "--like REC",
@@ -259,9 +264,11 @@ def profile(
     ),
     core: int | None = option(
         "--core",
-        "Where executors run. Default: the last core. DDS threads run on the others.",
+        "Where executors run. Default: the last core; with --chain and --like, others as well where"
+        " branches run at the same time. DDS threads run on the others.",
         min=0,
     ),
+    request: "cs.PlanRequest",
     source: Source = SOURCE,
     duration: int | None = DURATION,
     buffer: int | None = BUFFER,
@@ -272,38 +279,49 @@ def profile(
     This is how the latencies are measured that a plan is computed from. Whatever ends it, all
     threads are as before. What happened before the priorities were in force is left out.
     """
-    from chainshaper.flow.profiling import chain_nodes, check_profiling
+    from chainshaper.flow.profiling import check_profiling, profiled_cores, undelayed
     from chainshaper.linux.own_processes import check_command
     from chainshaper.values.recording import refuse_existing
 
     if not command:
         raise InputError("no command given: `chainshaper profile -o REC -- ros2 launch …`")
-    if chain is not None and like is None and not node:
+    chains = chain or []
+    if chains and like is None and not node:
         raise InputError(
-            f"which nodes {chain} has, an earlier recording knows: name it with --like REC "
+            f"which nodes {chains[0]} has, an earlier recording knows: name it with --like REC "
             "(`chainshaper record`), or name the nodes with --node"
         )
     refuse_existing(output)
     check_command(command)
-    core = check_profiling(core)
+    if core is not None and request.cores is not None:
+        raise InputError("--core is for one core, --cores for several: give one of them")
+    if core is not None:
+        request = cs.PlanRequest(cores=(core,))
+    cores = check_profiling(request.cores)
     names = [f"/{name.strip('/')}" for name in node or ()]
     earlier = None if like is None else cs.open_source(like)
-    if earlier is not None and chain is not None:
-        names += chain_nodes(earlier, chain)
+    if len(cores) > 1 and not (earlier and chains):
+        raise InputError(
+            "--cores are distributed by what chains do at the same time: name these with --chain,"
+            " and a recording that has them with --like"
+        )
+    core_of = dict.fromkeys(names, cores[0])
+    if earlier is not None and chains:
+        seen, found = profiled_cores(earlier, chains, request)
+        core_of |= found
+        if len(undelayed(seen, found)) > 1:
+            notes(["chains that share a core delay each other here: profile them one by one"])
     _record_and_show(
         *(output, command, json, buffer),
         source=source,
         duration_ns=duration,
-        chain=chain,
-        scheduling=cs.profiling_condition(names, core, like=earlier),
+        chain=chains[0] if chains else None,
+        scheduling=cs.profiling_condition(core_of, core_of or cores[0], like=earlier),
         watch_stalls=True,
     )
 
 
-@takes_wishes(
-    *("bands", "modes", "epsilon_ns", "ideal_machine", "overrun", "messages", "depth"),
-    *("with_receivers", "fallback"),
-)
+@takes_wishes(*PLAN_WISHES)
 def shape(
     words: list[str] = argument(
         "APP.yaml plan.yaml | -- ros2 launch ...",
@@ -318,7 +336,18 @@ def shape(
     ),
     cycles: int = CYCLES,
     realtime: bool | None = REALTIME,
-    chain: str | None = CHAIN,
+    chain: list[str] | None = option(
+        "--chain FIRST..LAST",
+        "The chain, by topics or nodes: /t1../t5. Several are shaped together. Default: you are"
+        " asked.",
+    ),
+    sink: list[str] | None = SINK,
+    throttle: list[str] | None = option(
+        "--throttle NODE:TOPIC=PERIOD",
+        "A throttler before an input of NODE that is not quite periodic, from the first recording"
+        " on (may be repeated).",
+    ),
+    period: int | None = option("--period DURATION", "Period of a chain that no timer starts."),
     duration: int | None = option(
         "--duration DURATION", "How long to measure, before and after. Default: 60s."
     ),
@@ -334,12 +363,12 @@ def shape(
 
     The publisher's output topic is remapped, and the shaping node republishes it in its slots.
     Behind `--`, `ros2 launch` does the whole flow: record, choose a chain, profile, plan, splice,
-    apply, record again, compare. Every file in between stays; --chain, --duration, --source,
-    --node, --backend, --bands, --modes, --epsilon, --ideal-machine, --overrun, --messages, --depth,
-    --no-receivers, --fallback and --user are for this, and mean what they mean for `chainshaper
-    plan` and `apply`.
+    apply, record again, compare. Every file in between stays. All options but --cycles and
+    --realtime are for this, and mean what they mean for `chainshaper plan` and `apply`.
     """
     if len(words) == 2 and words[0].endswith(DESCRIPTIONS):
+        if chain or sink or throttle or request != cs.PlanRequest():
+            raise InputError("a described application is shaped as plan.yaml says: plan it so")
         _shape_described(Path(words[0]), Path(words[1]), output, cycles, realtime)
         return
     if Path(words[0]).suffix in DESCRIPTIONS:
@@ -350,6 +379,9 @@ def shape(
     _shape_launched(
         *(words, output, json),
         chain=chain,
+        sinks=sink or (),
+        throttled=throttled_inputs(throttle or []),
+        period_ns=period,
         duration_ns=duration or SHAPING_DURATION_NS,
         source=source,
         node=node,
@@ -400,8 +432,13 @@ def _shape_launched(command: list[str], folder: Path, json: bool, **how: Any) ->
             progress=stage_lines("shape"),
             **how,
         )
-    values = comparison_json(shaped.comparison) | {"folder": str(shaped.folder)}
-    if present(json, values, *comparison_tables(shaped.comparison)):
+    values = comparison_json(shaped.comparison) | {
+        "folder": str(shaped.folder),
+        "chains": [comparison_json(one) for one in shaped.comparisons],
+        "cores": dict(shaped.cores),
+    }
+    tables = [table for one in shaped.comparisons for table in comparison_tables(one)]
+    if present(json, values, *tables):
         notes(shaped.notes)
         show_line(shaped.folder)
 

@@ -417,6 +417,7 @@ def plan_scheduling(
         if one.thread.role == "executor" and one.thread.identity not in planned
         for core in [cores[node] for node in one.nodes if node in cores][:1]
     ]
+    clear = {node.core for node in plan.shaping_nodes}
     return scheduling_around(
         members,
         plan.servers,
@@ -424,6 +425,7 @@ def plan_scheduling(
         available_cores,
         receiving=receiving,
         take_turns=plan.takes_turns,
+        clear=clear,
     )
 
 
@@ -440,13 +442,17 @@ def scheduling_around(
     *,
     receiving: Sequence[WantedScheduling] = (),
     take_turns: bool = False,
+    clear: Collection[int] = (),
 ) -> tuple[WantedScheduling, ...]:
     """What the threads of servers, and the others of their processes, shall get.
 
     ``members`` are by server's name. ``receiving`` is what threads that receive an output shall
     get, whose processes are treated alike; with ``take_turns``, servers of one priority share it by
-    turns. Raises OperationError: a thread cannot leave the core of a publisher that would outrank
-    it. InputError: see :func:`server_priorities`.
+    turns. DDS threads leave the cores of all servers or, where these are all that there are, those
+    to be ``clear``.
+
+    Raises OperationError: a thread cannot leave the core of a publisher that would outrank it.
+    InputError: see :func:`server_priorities`.
     """
     ranks = server_priorities(_ranked(servers))
 
@@ -468,6 +474,7 @@ def scheduling_around(
     ]
     planned = {one.thread.thread.identity: one.thread.thread.pid for one in (*own, *receiving)}
     free_cores = tuple(sorted(set(available_cores) - {server.core for server in servers}))
+    free_cores = free_cores or tuple(sorted(set(available_cores) - set(clear or available_cores)))
     receivers = {one.thread.thread.pid for one in receiving}
     beside = (
         _beside(one, own, free_cores, one.thread.pid in receivers)
@@ -487,7 +494,7 @@ def _beside(
 ) -> WantedScheduling | None:
     """What a thread in no server shall get, in a process that has one in a server.
 
-    DDS threads stand above all servers; on machines without a free core they stay where they are.
+    DDS threads stand above all servers; where no core is left to them they stay where they are.
     Others, of no class of their own, leave the core of a publisher, which would outrank them.
     """
     thread = one.thread

@@ -1,20 +1,23 @@
 """Shaping a real application from measuring to the proof: `chainshaper shape -- ros2 launch …`.
 
     first/ ─► which chain ─► before/ ─► plan.yaml ─► launch/ ─► after/ ─► comparison.json, figures
-    record                   profile    plan         splice     apply,
+    record    which cores    profile    plan         splice     apply,
                                                                 recorded
 
 Each step is what the verb of its name does, and leaves its result in the folder. The first, short
-recording tells which chains there are and which nodes a chain has; the second measures it under the
-paper's profiling condition (section 2.4), as far as that is permitted.
+recording tells which chains there are, which nodes a chain has and which of these run at the same
+time; the second measures it under the paper's profiling condition (section 2.4), as far as that is
+permitted. Of several chains each is measured as if it were alone, as it is planned: chains that
+would delay each other, on a core or in a node, have recordings of their own. Throttlers stand in
+front of everything.
 """
 
 import sys
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -22,22 +25,38 @@ from chainshaper.analysis import ChainEnumeration, data_flow, graph_of
 from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow.apply import START_NS, apply_plan
 from chainshaper.flow.exploration import list_chains
-from chainshaper.flow.launch_splicing import Splicing, splice_launch_files
-from chainshaper.flow.plan import plan_recording
-from chainshaper.flow.profiling import chain_nodes, profiling_condition
+from chainshaper.flow.launch_splicing import (
+    Splicing,
+    ThrottledInput,
+    splice_launch_files,
+    splice_throttlers,
+)
+from chainshaper.flow.plan import profile_chains
+from chainshaper.flow.profiling import chain_nodes, profiled_cores, profiling_condition, undelayed
 from chainshaper.flow.record import record_command
 from chainshaper.linux.processes import Process, run_users
-from chainshaper.linux.scheduling import may_use_fifo
-from chainshaper.planning import Plan, PlanRequest, save_plan
+from chainshaper.linux.scheduling import check_cores, may_use_fifo
+from chainshaper.planning import (
+    ApplicationPlan,
+    Plan,
+    PlanRequest,
+    Profile,
+    plan_application,
+    plan_chain,
+    save_application_plan,
+)
+from chainshaper.planning.application_plan import whole
+from chainshaper.planning.request import refuse_entangled
 from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.shaping_process import NodeKind, build_package, check_build_tools
-from chainshaper.splicing.spliced_launch import NODES, LaunchCommand, parse_launch_command
+from chainshaper.splicing.spliced_launch import NODES, parse_launch_command
 from chainshaper.values.application import ApplicationGraph
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording, refuse_existing
 from chainshaper.verify.measure import Comparison, compare_recordings
 
 FIRST_LOOK_NS = 10_000_000_000  # long enough for everything to have started and run
+NOT_PERMITTED = "measured under ordinary scheduling: SCHED_FIFO is not permitted."
 
 Choose: TypeAlias = Callable[[ApplicationGraph, ChainEnumeration], str]
 """Asked which of the chains that were found is meant."""
@@ -48,42 +67,56 @@ class ShapedLaunch:
     """What came of it; everything lies in ``folder`` too."""
 
     folder: Path
-    chain: str
-    plan: Plan
-    splicing: Splicing
-    comparison: Comparison
+    chain: str  # the first
+    plan: Plan  # of the first chain
+    splicing: Splicing | None  # None: no output has a shaping node
+    comparison: Comparison  # of the first chain
     notes: tuple[str, ...]
+    application: ApplicationPlan
+    comparisons: tuple[Comparison, ...]  # of every chain and sink
+    cores: Mapping[str, int]  # where each node's executor ran
 
 
 def shape_launch(
     command: Sequence[str],
     folder: str | Path,
     *,
-    chain: str | None = None,
+    chain: str | Sequence[str] | None = None,
+    sinks: Sequence[str] = (),
+    throttled: Sequence[ThrottledInput] = (),
     choose: Choose | None = None,
     request: PlanRequest | None = None,
+    period_ns: int | None = None,
     duration_ns: int = 60_000_000_000,
     source: Literal["lttng", "ebpf"] = "lttng",
     node: NodeKind = "python",
     back_end: str = "auto",
     users: Collection[str | int] = (),
     stop: threading.Event | None = None,
-    planned: Callable[[Plan], None] = lambda _: None,
+    planned: Callable[[Plan | ApplicationPlan], None] = lambda _: None,
     progress: Callable[[float, str], None] = lambda *_: None,
 ) -> ShapedLaunch:
-    """Measure a chain of a launched application, plan, splice, apply, and measure again.
+    """Measure chains of a launched application, plan, splice, apply, and measure again.
 
-    ``chain`` is the one to shape; without it, ``choose`` is asked. The application is launched
-    three times: briefly, and for ``duration_ns`` before and after. ``planned``
-    gets the plan before it is used, to say what is doubtful about it. ``stop`` ends the step that
-    is under way, and with it everything. ``users`` are for :func:`.apply_plan`.
+    ``chain`` is the one to shape, or several; without it, ``choose`` is asked. ``sinks`` are chains
+    to further outputs of the graph of one chain, ``throttled`` inputs with the nodes that get them
+    by way of a throttler, ``period_ns`` is that of chains that no timer starts. ``request.cores``
+    are where executors run (default: the last core, and others that are worth it). The application
+    is launched three times, briefly, and for ``duration_ns`` before and after; more often, where
+    chains are measured one by one. ``planned`` gets the plan before it is used, to say what is
+    doubtful about it. ``stop`` ends the step that is under way, and with it everything. ``users``
+    are for :func:`.apply_plan`.
 
     Raises:
         InputError: ``folder`` is not empty, the command is not `ros2 launch`, or what it launches
             does not fit: no such chain, a launch file with a mistake …
-        PlatformError, OperationError: a step failed; what the steps before it left is kept.
+        PlatformError: there is no such core. PlatformError, OperationError: a step failed; what the
+            steps before it left is kept.
     """
     launch = parse_launch_command(command)
+    request = request or PlanRequest()
+    chains = [chain] if isinstance(chain, str) else [*(chain or ())]
+    _refuse_early(request, chains, sinks, throttled)
     if node != "python":
         check_build_tools()
     folder, stop = refuse_existing(folder), stop or threading.Event()
@@ -109,44 +142,102 @@ def shape_launch(
             )
         return done.recording
 
-    first = record("first", command, FIRST_LOOK_NS)
-    chain = _chain(first, chain, choose)
+    shaped, setup = list(command), list[str]()
+    if throttled:
+        request = replace(request, anchor="cycle")  # messages have the stamps of their sensors
+        kind: Literal["python", "cpp"] = "python" if node == "python" else "cpp"
+        inputs = splice_throttlers(throttled, [launch.file], folder / "throttled", node=kind)
+        launch, setup = replace(launch, file=next(iter(inputs.launch.values()))), _sourced(inputs)
+        shaped = [*setup, *launch.with_file(launch.file)]
+    first = record("first", shaped, FIRST_LOOK_NS)
+    chains = chains or [_chosen(first, choose)]
+    wanted = (*chains, *sinks)
+    seen, core_of = profiled_cores(first, wanted, request, period_ns)
+    refuse_entangled(seen, request.policy, sinks=bool(sinks))
     permitted = may_use_fifo()  # else it is measured under ordinary scheduling
-    profiled = profiling_condition(chain_nodes(first, chain), like=first) if permitted else None
-    measured: dict[str, Any] = {"chain": chain, "watch_stalls": True}
-    before = record("before", command, duration_ns, scheduling=profiled, **measured)
+    found = [] if permitted else [NOT_PERMITTED]
+    measured: dict[int, tuple[Recording, Profile]] = {}
+    for number, places in enumerate(undelayed(seen, core_of), start=1):
+        own = [wanted[place] for place in places]
+        cores = {node: core_of[node] for node in chain_nodes(first, *own)}
+        before = record(
+            *("before" if number == 1 else f"before_{number}", shaped, duration_ns),
+            scheduling=profiling_condition(cores, cores, like=first) if permitted else None,
+            chain=own[0],
+            watch_stalls=True,
+        )
+        found += before.info.notes
+        profiles = profile_chains(before, own, period_ns=period_ns)
+        measured |= {k: (before, one) for k, one in zip(places, profiles, strict=True)}
     progress(0.0, "planning")
-    plan = plan_recording(before, chain, request or PlanRequest())
-    save_plan(plan, folder / "plan.yaml")
-    planned(plan)
-    splicing = splice_launch_files(
-        *(plan, [launch.file], folder / "launch"),
-        node=node,
-        arguments=launch.arguments,
-        recording=first,
-    )
+    plan, remarks = _planned([measured[k][1] for k in range(len(wanted))], len(chains), request)
+    save_application_plan(plan, folder / "plan.yaml")
+    planned(plan if len(plan.chains) > 1 else plan.chains[0])
+    splicing = None
+    if plan.shaping_nodes:
+        splicing = splice_launch_files(
+            *(plan, [launch.file], folder / "launch"),
+            node=node,
+            arguments=launch.arguments,
+            recording=first,
+        )
+        file = next(iter(splicing.launch.values()))
+        shaped = [*setup, *_sourced(splicing), *launch.with_file(file)]
     after = record(
-        "after",
-        _with_shaping_node(launch, splicing),
-        duration_ns,
+        *("after", shaped, duration_ns),
         scheduling=_in_force(plan, back_end, first, taken, applied := list[str]()),
         plan=plan,
-        gate_logs=splicing.logs,
-        **measured,
+        gate_logs=() if splicing is None else splicing.logs,
+        chain=chains[0],
+        watch_stalls=True,
     )
     progress(0.0, "comparing")
-    comparison = compare_recordings([before, after], chain)
-    write_comparison(comparison, folder)
-    found = [*before.info.notes, *splicing.notes, *applied, *after.info.notes]
-    if not permitted:
-        found.insert(0, "measured under ordinary scheduling: SCHED_FIFO is not permitted.")
-    return ShapedLaunch(folder, chain, plan, splicing, comparison, tuple(dict.fromkeys(found)))
+    comparisons = [compare_recordings([measured[k][0], after], one) for k, one in enumerate(wanted)]
+    for k, comparison in enumerate(comparisons):
+        write_comparison(comparison, folder / f"chain_{k + 1}" if k else folder)
+    found += [*remarks, *(() if splicing is None else splicing.notes), *applied, *after.info.notes]
+    return ShapedLaunch(
+        folder=folder,
+        chain=chains[0],
+        plan=plan.chains[0],
+        splicing=splicing,
+        comparison=comparisons[0],
+        notes=tuple(dict.fromkeys(found)),
+        application=plan,
+        comparisons=tuple(comparisons),
+        cores=core_of,
+    )
 
 
-def _chain(first: Recording, chain: str | None, choose: Choose | None) -> str:
-    """The chain that is meant; names that no recorded chain has are refused where it is used."""
-    if chain is not None:
-        return chain
+def _refuse_early(
+    request: PlanRequest,
+    chains: Sequence[str],
+    sinks: Sequence[str],
+    throttled: Sequence[ThrottledInput],
+) -> None:
+    """What need not be tried: it would be refused minutes later."""
+    check_cores(dict.fromkeys(request.cores or (), "--cores"))
+    if sinks and len(chains) > 1:
+        raise InputError("--sink goes with one chain: name each output with a --chain of its own")
+    if unknown := [one.topic for one in throttled if one.subscriber is None]:
+        raise InputError(
+            f"which node gets {unknown[0]} is not known before the first recording: name it, as in"
+            f" --throttle NODE:{unknown[0]}=PERIOD"
+        )
+
+
+def _planned(
+    profiles: Sequence[Profile], chains: int, request: PlanRequest
+) -> tuple[ApplicationPlan, list[str]]:
+    """The plan for the first of the profiles and its sinks, or for all; cores as measured."""
+    request = replace(request, cores=None)
+    if chains > 1:
+        return plan_application(profiles, request)
+    return whole(plan_chain(profiles[0], request, profiles[1:])), []
+
+
+def _chosen(first: Recording, choose: Choose | None) -> str:
+    """The chain that is meant, of those that were recorded."""
     flow = data_flow(first.events, first.info.clock_offset_ns)
     found = list_chains(flow)
     if not found.chains:
@@ -161,18 +252,21 @@ def _chain(first: Recording, chain: str | None, choose: Choose | None) -> str:
     return choose(graph_of(flow), found)
 
 
-def _with_shaping_node(launch: LaunchCommand, splicing: Splicing) -> list[str]:
-    """The command that launches both, in the environment that the shaping node needs."""
-    words = launch.with_file(next(iter(splicing.launch.values())))
+def _sourced(splicing: Splicing) -> list[str]:
+    """What stands before a command for the environment that our nodes need; they are built."""
     if all(process.package is None for process in splicing.processes):
-        return words
+        return []
     setup = build_package(splicing.folder / NODES)
-    return ["bash", "-c", 'source "$0" && exec "$@"', str(setup), *words]
+    return ["bash", "-c", 'source "$0" && exec "$@"', str(setup)]
 
 
 @contextmanager
 def _in_force(
-    plan: Plan, back_end: str, recording: Recording, users: frozenset[int], notes: list[str]
+    plan: ApplicationPlan,
+    back_end: str,
+    recording: Recording,
+    users: frozenset[int],
+    notes: list[str],
 ) -> Iterator[Callable[[Sequence[Process]], bool]]:
     """The plan in force on what runs; what it gives says whether all servers have opened.
 

@@ -38,6 +38,7 @@ POLL_NS = 250_000
 WATCHER_PRIORITY = 95
 TO_STOP_NS = 20_000  # stopping and continuing a thread takes 5 to 7 us of its time, a timer tens
 SEEN_IN = 0.8  # a place counts when wake-ups come there in this share of the cycles
+MOST_TRIES = 5
 _PATIENCE_S = 20  # ROS 2 has found the nodes by then, however busy the machine is, or never will
 
 
@@ -62,20 +63,20 @@ def measure_phase(
     cycles: int = 12,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Phase:
-    """Watch a thread for some cycles and find its phase.
+    """Watch a thread for some cycles and find its phase; again, where it was disturbed meanwhile.
 
     Raises OperationError: it ended, or does not wake up regularly.
     """
-    found = watch_wake_ups(pid, tid, cycles * cycle_ns, progress)
-    phase = find_phase(found, cycle_ns, cycles)
-    if phase is None:
-        raise OperationError(
-            f"thread {tid} of process {pid} was watched for {format_duration(cycles * cycle_ns)} "
-            f"and does not wake up once in every {format_duration(cycle_ns)} ({len(found)} "
-            "wake-ups): is the chain running, with the period of the plan? Its phase can also be "
-            "given (--phase)"
-        )
-    return phase
+    for _ in range(MOST_TRIES):
+        found = watch_wake_ups(pid, tid, cycles * cycle_ns, progress)
+        if (phase := find_phase(found, cycle_ns, cycles)) is not None:
+            return phase
+    raise OperationError(
+        f"thread {tid} of process {pid} was watched for {format_duration(cycles * cycle_ns)} "
+        f"and does not wake up once in every {format_duration(cycle_ns)} ({len(found)} "
+        "wake-ups): is the chain running, with the period of the plan? Its phase can also be "
+        "given (--phase)"
+    )
 
 
 def watch_wake_ups(

@@ -108,7 +108,7 @@ def _profile_of(
     all_disturbed = calm.height < 2
     disturbed = every.clear() if all_disturbed else every.filter("disturbed")
     period = _period(analysis, period_ns)
-    stages = _stages(graph, chain)
+    stages = graph_stages(graph, chain)
     nodes = dict.fromkeys(stage.node for stage in stages)
     running, named = _running(flow, stages)
     cores, priority = _executors(recording, graph, running)
@@ -128,6 +128,7 @@ def _profile_of(
         core_of=core_of,
         executors=named,
         cores=cores,
+        together=_together(graph, nodes),
         receivers=_receivers(graph, chain, nodes),
         callbacks=tuple(_times(flow, instances, stage, core_of[stage.node]) for stage in stages),
         steps_ns=steps[measured["traversal"].to_numpy()],
@@ -214,7 +215,7 @@ _Key = tuple[tuple[int, ...], str]
 """A stage while it is looked for: its callbacks, and the topic it publishes."""
 
 
-def _stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
+def graph_stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
     """The chain and the branches it waits for, along the graph; the chain's last stands last."""
     outside = _feeding(graph, chain)
     along: list[_Key] = []
@@ -375,6 +376,16 @@ def _instances_apart_from(flow: DataFlow, disturbed: pl.DataFrame) -> pl.DataFra
     hit = overlapping(began, began, disturbed["start"].to_numpy(), disturbed["end"].to_numpy() + 1)
     response = pl.col("end") - pl.col("start")
     return seen.filter(~pl.Series(hit)).select("instance", "callback_id", response=response)
+
+
+def _together(graph: ApplicationGraph, nodes: Collection[str]) -> tuple[tuple[str, ...], ...]:
+    """The processes that host several nodes, these among them: they may share an executor."""
+    hosts: dict[int, list[str]] = {}
+    for one in graph.nodes:
+        hosts.setdefault(one.pid, []).append(one.name)
+    return tuple(
+        tuple(own) for own in hosts.values() if len(own) > 1 and not set(own).isdisjoint(nodes)
+    )
 
 
 def _receivers(graph: ApplicationGraph, chain: Chain, nodes: Collection[str]) -> tuple[str, ...]:

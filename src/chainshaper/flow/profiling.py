@@ -1,12 +1,13 @@
 """The paper's profiling condition: a chain alone with its interference (sections 2.5 and 4.2).
 
-The executors of the chain's nodes run under SCHED_FIFO at a high priority on one core, their DDS
-threads above them on the others, so that nothing else disturbs the chain. Threads are changed as
-`apply` changes them; those that appear later get theirs at the next look.
+The executors of the nodes of the chain, and of the branches that it waits for, run under SCHED_FIFO
+at a high priority, on one core or distributed over several (:mod:`chainshaper.planning.cores`),
+their DDS threads above them on the others, so that nothing else disturbs the chain. Threads are
+changed as `apply` changes them; those that appear later get theirs at the next look.
 """
 
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -21,35 +22,43 @@ from chainshaper.enforcement.threads import (
     allocate,
     scheduling_around,
 )
+from chainshaper.flow.plan import graph_stages, profile_chains
 from chainshaper.flow.threads import recorded_processes
 from chainshaper.linux.processes import Process
 from chainshaper.linux.scheduling import available_cores, check_cores, may_use_fifo
+from chainshaper.planning.request import PlanRequest, Profile, cores_for
+from chainshaper.planning.several_chains import beginning_together
 from chainshaper.values.durations import format_duration
-from chainshaper.values.errors import OperationError, PlatformError
+from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import Recording
 
 START_NS = 30_000_000_000  # so long the nodes have to appear
+WORTH = 0.05
+"""A further core is taken unasked if it takes this share off the latencies."""
 
 
 @contextmanager
 def profiling_condition(
     nodes: Collection[str] = (),
-    core: int | None = None,
+    core: int | Mapping[str, int] | None = None,
     folder: Path | None = None,
     like: Recording | None = None,
 ) -> Iterator[Callable[[Sequence[Process]], bool]]:
     """Have the threads of ``nodes`` (default: of all) run as the paper profiles a chain.
 
     It gives what :func:`chainshaper.flow.record.record_command` wants for its ``scheduling``.
-    ``core`` is where the executors run (default: the last that we may use), ``folder`` where
-    journals are (default: `/run/chainshaper`). An earlier recording of the application that this
-    one is ``like`` says which components a container has, and which executors several threads.
+    ``core`` is where the executors run (default: the last that we may use), or the core of each of
+    ``nodes``, which those that share a process have in common. ``folder`` is where journals are
+    (default: `/run/chainshaper`). An earlier recording of the application that this one is ``like``
+    says which components a container has, and which executors several threads.
 
     Raises PlatformError: no such core, or SCHED_FIFO is not permitted. OperationError: `apply`
     governs one of the nodes, or the core; not all could be put back. And where it is called: a node
     does not appear, or the kernel refuses something.
     """
-    core, wanted = check_profiling(core), frozenset(nodes)
+    wanted, core_of = frozenset(nodes), core if isinstance(core, Mapping) else {}
+    cores = check_profiling(core if isinstance(core, int) else [*dict.fromkeys(core_of.values())])
+    servers = [ReservationServer(f"the executors of core {one}", one, 1, ()) for one in cores]
     recorded = recorded_processes(like)[0] if like is not None else ()
     begun_ns, done = time.monotonic_ns(), set[tuple[int, int]]()
 
@@ -66,8 +75,12 @@ def profiling_condition(
                     f" {format_duration(START_NS)}; running: {running or 'no node'}"
                 )
             return False
-        server = ReservationServer("the chain", core, 1, ())
-        around = scheduling_around({server.name: members}, [server], found, available_cores())
+        homes = {
+            server.name: [one for one in members if _core(one, core_of, cores) == server.core]
+            for server in servers
+        }
+        clear = cores[:1] if len(cores) > 1 else ()  # the plan's, whose output it has mostly
+        around = scheduling_around(homes, servers, found, available_cores(), clear=clear)
         new = [one for one in around if one.thread.thread.identity not in done]
         # One after the other, as under SCHED_FIFO in the paper: no turns.
         changes = [(one.thread.thread, replace(one.wanted, takes_turns=False)) for one in new]
@@ -75,12 +88,16 @@ def profiling_condition(
         done.update(thread.identity for thread, _ in changes)
         return not new
 
-    with run_claimed({core}, nodes, folder) as journal:
+    with run_claimed(cores, nodes, folder) as journal:
         yield see_to_it
 
 
-def check_profiling(core: int | None = None) -> int:
-    """The core on which executors will run, once it is sure that they may.
+def _core(thread: NodeThread, core_of: Mapping[str, int], cores: Sequence[int]) -> int:
+    return next((core_of[node] for node in thread.nodes if node in core_of), cores[0])
+
+
+def check_profiling(core: int | Sequence[int] | None = None) -> Sequence[int]:
+    """The cores on which executors will run, once it is sure that they may.
 
     Raises PlatformError: no such core, or SCHED_FIFO is not permitted.
     """
@@ -89,19 +106,63 @@ def check_profiling(core: int | None = None) -> int:
             "profiling needs SCHED_FIFO: run as root, or give your user an rtprio limit of 98 in "
             "/etc/security/limits.conf; without, `chainshaper record` records as things are"
         )
-    core = available_cores()[-1] if core is None else core
-    check_cores({core: "the chain"})
-    return core
+    cores = (core,) if isinstance(core, int) else core or available_cores()[-1:]
+    check_cores(dict.fromkeys(cores, "the chain"))
+    return cores
 
 
-def chain_nodes(recording: Recording, chain: str) -> tuple[str, ...]:
-    """The nodes of a chain in an earlier recording of the application, in its order.
+def chain_nodes(recording: Recording, *chains: str) -> tuple[str, ...]:
+    """The nodes of chains, and of the branches that they wait for, in an earlier recording.
 
     Raises InputError: no such chain.
     """
     graph = graph_of(data_flow(recording.events, recording.info.clock_offset_ns))
-    found = find_chain(graph, chain)
-    return tuple(dict.fromkeys(graph.callbacks[number].node for number in found.callbacks))
+    stages = (graph_stages(graph, find_chain(graph, chain)) for chain in chains)
+    return tuple(dict.fromkeys(stage.node for one in stages for stage in one))
+
+
+def profiled_cores(
+    recording: Recording,
+    chains: Sequence[str],
+    request: PlanRequest,
+    period_ns: int | None = None,
+) -> tuple[tuple[Profile, ...], dict[str, int]]:
+    """What an earlier recording shows of chains, and on which cores to profile their executors.
+
+    Without ``request.cores`` these are found: the last, and others as far as they are worth it. On
+    machines of three cores and more, the first is left to DDS threads. One chain of which too
+    little is to be seen runs on the last core.
+
+    Raises InputError: no such chain, or several of which too little is to be seen. PlatformError:
+        no such core. OperationError: as :func:`.profile_chains`.
+    """
+    available = available_cores()
+    found = (available[1:] if len(available) > 2 else available)[::-1]
+    cores, worth = (found, WORTH) if request.cores is None else (request.cores, 0.0)
+    check_cores(dict.fromkeys(cores, "the chain"))
+    try:
+        seen = profile_chains(recording, chains, period_ns=period_ns)
+    except (InputError, OperationError):
+        if len(chains) > 1 or len(request.cores or ()) > 1:
+            raise
+        return (), dict.fromkeys(chain_nodes(recording, *chains), cores[0])
+    return seen, cores_for(seen, cores, request, worth)
+
+
+def undelayed(seen: Sequence[Profile], core_of: Mapping[str, int]) -> list[list[int]]:
+    """The places of chains, together where one recording can measure each as if it were alone.
+
+    Chains that begin together are one graph; others delay each other where they share a core.
+    """
+    found: list[tuple[list[int], set[int]]] = []
+    for group in beginning_together(seen):
+        cores = {core_of[node] for place in group for node in seen[place].core_of}
+        apart = next((one for one in found if not one[1] & cores), ([], set()))
+        if not apart[0]:
+            found.append(apart)
+        apart[0].extend(group)
+        apart[1].update(cores)
+    return [places for places, _ in found] or [[0]]
 
 
 def executors_of(

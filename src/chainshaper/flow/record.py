@@ -36,7 +36,8 @@ from chainshaper.linux.processes import (
 from chainshaper.linux.runs import Governed, governing, in_force_throughout
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import parents
-from chainshaper.planning import Plan
+from chainshaper.planning import ApplicationPlan, Plan
+from chainshaper.planning.application_plan import plan_values, whole
 from chainshaper.sources import Tracer
 from chainshaper.sources.gate_log import releases_so_far, with_gate_logs
 from chainshaper.sources.ros import Environment, ask_graph, environment_of
@@ -120,7 +121,7 @@ def record_command(
     buffer: int | None = None,
     chain: str | None = None,
     scheduling: Scheduling | None = None,
-    plan: Plan | None = None,
+    plan: Plan | ApplicationPlan | None = None,
     gate_logs: Sequence[Path] = (),
     watch_stalls: bool = False,
     command_stdout: int | None = None,
@@ -281,7 +282,11 @@ def _look(run: _Run) -> None:
 
 
 def _written(
-    output: Path, run: _Run, command: Sequence[str], chain: str | None, plan: Plan | None
+    output: Path,
+    run: _Run,
+    command: Sequence[str],
+    chain: str | None,
+    plan: Plan | ApplicationPlan | None,
 ) -> Recording:
     tables, info = run.tracer.recording()
     if run.stalls.table is not None:
@@ -319,7 +324,7 @@ def _written(
         "realtime": True if run.schedule is not None else in_real_time,
         "stall_meter": run.stalls.info,
         "chain": chain,
-        "plan": None if plan is None else plan.model_dump(mode="json"),
+        "plan": None if plan is None else plan_values(whole(plan)),
         "in_force": None if plan is None else InForceInfo(since_ns=since_ns),
         "notes": tuple(notes),
     }

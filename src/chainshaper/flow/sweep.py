@@ -90,7 +90,7 @@ _REQUEST = TypeAdapter(PlanRequest)
 _WISHES = {
     field.name.removesuffix("_ns"): field.name
     for field in dataclasses.fields(PlanRequest)
-    if field.name != "seed"  # that of the application is meant
+    if field.name not in ("seed", "cores")  # those of the application are meant
 }
 _RANGE = re.compile(r"(-?\d{1,18})\.\.(-?\d{1,18})")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)e[+-]?\d+", re.IGNORECASE)

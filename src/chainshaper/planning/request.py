@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.planning.bands import BandChoice, choose_bands, with_bands, with_long_slot
+from chainshaper.planning.cores import Work, assign_cores
 from chainshaper.planning.margins import (
     EPSILON_NS,
     MOST_PROBABLE,
@@ -85,7 +86,8 @@ class Profile:
     :func:`~chainshaper.planning.shaping.server_per_callback`. ``steps_ns`` and ``every_step_ns``
     are what each callback of the chain took, a row per latency, see
     :mod:`~chainshaper.planning.pipeline`. ``output_depth`` is the history of the output's writer,
-    ``asynchronous`` whether its process has a thread that publishes (None: not known),
+    ``asynchronous`` whether its process has a thread that publishes (None: not known), ``together``
+    are nodes that share a process,
     ``of_modes`` has what was measured in each mode of the system. The rest is
     :class:`~chainshaper.planning.plan.Evidence`.
     """
@@ -101,6 +103,7 @@ class Profile:
     core_of: Mapping[str, int] = field(default_factory=dict)
     executors: Mapping[str, tuple[tuple[str, ...], ...]] = field(default_factory=dict)
     cores: Mapping[str, int] = field(default_factory=dict)
+    together: tuple[tuple[str, ...], ...] = ()
     receivers: tuple[str, ...] = ()
     callbacks: tuple[CallbackTimes, ...] = ()
     steps_ns: NDArray[np.int64] | None = None
@@ -165,6 +168,8 @@ def plan_chain(
     _refuse_contradictions(request, bool(sinks))
     if request.policy == "pipelined":
         profile = _apart(profile)
+    else:
+        (profile, *sinks), _ = on_cores((profile, *sinks), request)
     refuse_entangled((profile, *sinks), request.policy, sinks=True)
     if any(sink.all_disturbed for sink in sinks) or profile.all_disturbed:
         profile, sinks = _covered(profile, request), [_covered(sink, request) for sink in sinks]
@@ -211,9 +216,7 @@ def plan_chain(
             " none: leave it out, or plan with synchronous publication"
         )
     plan = with_executors(plan, [one.executors for one in (profile, *sinks)])
-    plan = revised(plan, modes=modes)
-    if request.equal_priorities == "round-robin":
-        plan = with_turns(plan)
+    plan = with_turns(revised(plan, modes=modes), request.equal_priorities)
     return with_best_effort([plan], best_effort_cores([profile], request))[0]
 
 
@@ -236,6 +239,51 @@ def best_effort_cores(profiles: Sequence[Profile], request: PlanRequest) -> dict
     )
     names = ["/" + name.strip("/") for name in request.best_effort]
     return {name: cores.get(name, chain) for name in names}
+
+
+def cores_for(
+    profiles: Sequence[Profile],
+    cores: Sequence[int],
+    request: PlanRequest = _STANDARD,
+    worth: float = 0.0,
+) -> dict[str, int]:
+    """The core of each node of these chains, see :func:`~chainshaper.planning.cores.assign_cores`.
+
+    Raises InputError: a profile has no callbacks, being bare latencies.
+    """
+    if bare := [profile.name for profile in profiles if not profile.callbacks]:
+        raise InputError(
+            f"--cores distributes callbacks, and latencies do not tell those of {bare[0]}: plan"
+            " from a recording"
+        )
+    margin = EPSILON_NS if request.epsilon_ns is None else request.epsilon_ns
+    work = [Work((p.begins, p.period_ns), p.period_ns, p.callbacks, margin) for p in profiles]
+    together = [group for profile in profiles for group in profile.together]
+    return assign_cores(work, cores, together=together, worth=worth)
+
+
+def on_cores(
+    profiles: Sequence[Profile], request: PlanRequest
+) -> tuple[tuple[Profile, ...], list[str]]:
+    """The profiles with their executors on the wished cores, and whose latency is another there.
+
+    Raises: as :func:`cores_for`.
+    """
+    if request.cores is None:
+        return tuple(profiles), []
+    core_of, moved, doubts = cores_for(profiles, request.cores, request), [], []
+    for one in profiles:
+        own = {node: core_of[node] for node in one.core_of}
+        homes = {(own[node], core) for node, core in one.core_of.items()}
+        if not len(homes) == len(set(own.values())) == len(set(one.core_of.values())):
+            doubts.append(
+                f"{one.name} was measured with its executors distributed over cores in another way"
+                " than planned, which is another latency: measure it so (`chainshaper profile"
+                f" --cores {','.join(map(str, request.cores))}`)"
+            )
+        callbacks = tuple(replace(each, core=core_of[each.node]) for each in one.callbacks)
+        moved.append(replace(one, core_of=own, callbacks=callbacks))
+    return tuple(moved), doubts
 
 
 def band_choice(plan: Plan, profile: Profile, request: PlanRequest) -> BandChoice:
@@ -429,8 +477,9 @@ def _refuse_contradictions(request: PlanRequest, sinks: bool) -> None:
         )
     if request.policy != "one-long-slot" and request.slot_start_ns is not None:
         raise InputError("a slot's start goes with the policy one-long-slot: add it")
-    if request.policy != "pipelined" and request.cores is not None:
-        raise InputError("cores are for stages: add --policy pipelined, or leave out --cores")
+    cores = request.cores or ()
+    if request.policy != "pipelined" and len(set(cores)) < len(cores):
+        raise InputError("--cores names a core twice, which only stages may have: name each once")
     if request.policy == "shaped":
         return
     why = f"which the policy {request.policy} has not: leave it out, or plan with the policy shaped"

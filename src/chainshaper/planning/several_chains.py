@@ -32,6 +32,7 @@ from chainshaper.planning.request import (
     PlanRequest,
     Profile,
     best_effort_cores,
+    on_cores,
     plan_chain,
     refuse_entangled,
 )
@@ -58,9 +59,12 @@ def plan_application(
     """
     if not profiles:
         raise InputError("no chain is named: give one at least")
+    profiles, doubts = on_cores(profiles, request)
+    request = replace(request, cores=None)
     refuse_entangled(profiles, request.policy)
     try:
-        return _planned(profiles, request, time_limit_s)
+        plan, remarks = _planned(profiles, request, time_limit_s)
+        return plan, [*doubts, *remarks]
     except OperationError as error:
         fits = list(_fitting(profiles, request, time_limit_s)) if len(profiles) > 1 else []
         if not fits:
@@ -91,7 +95,7 @@ def _planned(
 ) -> tuple[ApplicationPlan, list[str]]:
     alone = replace(request, best_effort=())
     plans = [plan_chain(profile, alone) for profile in profiles]
-    groups = _beginning_together(profiles)
+    groups = beginning_together(profiles)
     for group in groups:
         for k, plan in zip(group, _sharing_servers([plans[k] for k in group]), strict=True):
             plans[k] = plan
@@ -100,7 +104,7 @@ def _planned(
     return combined(with_best_effort(placed, best_effort_cores(profiles, request))), remarks
 
 
-def _beginning_together(profiles: Sequence[Profile]) -> list[list[int]]:
+def beginning_together(profiles: Sequence[Profile]) -> list[list[int]]:
     """The places of chains, together where they begin at the same callback."""
     groups: dict[Any, list[int]] = {}
     for place, profile in enumerate(profiles):

@@ -41,7 +41,7 @@ from chainshaper.planning.plan import (
 )
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError
-from chainshaper.values.plan_choices import Wishes
+from chainshaper.values.plan_choices import EqualPriorities, Wishes
 from chainshaper.values.yaml_file import wrong_values_refused
 
 OUTPUT_PRIORITY = 1  # better than the chain's: a publish slot inside its slot has to pre-empt it
@@ -273,8 +273,10 @@ def with_best_effort(plans: Sequence[Plan], core_of: Mapping[str, int]) -> list[
     return [revised(first, servers=(*first.servers, *added)), *others]
 
 
-def with_turns(plan: Plan) -> Plan:
-    """A plan whose servers have one priority, as in the paper (eq. 3), and take turns."""
+def with_turns(plan: Plan, equal_priorities: EqualPriorities) -> Plan:
+    """A plan whose servers take turns at one priority, as in the paper (eq. 3), if that is wished."""
+    if equal_priorities == "apart":
+        return plan
     best = min(server.priority for server in plan.servers)
     equal = tuple(one.model_copy(update={"priority": best}) for one in plan.servers)
     return revised(plan, servers=below_executors(equal), equal_priorities="round-robin")

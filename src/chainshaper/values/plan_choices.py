@@ -63,7 +63,7 @@ class Wishes:
     longest publication measured, 1 ms at least. ``overrun`` None: an output that missed its slot
     leaves at once, where the policy and the publisher allow it. ``bands`` to ``seed`` go with the
     policy ``shaped``, see :func:`~chainshaper.planning.bands.with_bands`; ``slot_start_ns`` goes
-    with ``one-long-slot``, ``cores`` with ``pipelined``.
+    with ``one-long-slot``. ``cores`` None: executors are planned for the cores that they ran on.
     """
 
     policy: Annotated[Policy, Option("How it is scheduled.")] = "shaped"
@@ -97,8 +97,10 @@ class Wishes:
         "With --bands auto: what another band must take off the average.", BANDS, "SHARE")] = 0.02
     seed: Annotated[int, Option("For pso, random and the derived margin.", least=0)] = 0
     cores: Annotated[tuple[int, ...] | None, Option(
-        "The cores that stages of a pipeline may have. Default: those on which it was recorded.",
-        "More of the graph", "N,N…")] = None
+        "Distribute the executors, or the stages of a pipeline, over these cores, such as 0,1:"
+        " branches that run at the same time, and chains whose slots would collide, get a core of"
+        " their own. Default: those on which it was recorded.",
+        "More of the graph", "CORES")] = None
     first_slot_ns: Annotated[int | None, Option(
         "A server of its own for the chain's first node, this long.", "More of the graph")] = None
     anchor: Annotated[Anchor, Option(

@@ -1,0 +1,184 @@
+"""Which core runs which executor: found from what overlaps in time.
+
+The paper takes the assignment as given (the front filter on a core of its own in section 5.1, 18
+callbacks on two cores in 5.4). Here executors gain from a core of their own where branches of a
+graph run at the same time, and where slots of different chains would collide.
+
+An assignment is judged by playing out one cycle of each graph: a callback starts when all that it
+waits for is done and its core is free, and is not pre-empted, as under SCHED_FIFO at one priority.
+What counts, in this order:
+
+1. by how much chains that share a core do not fit: slots as long as the longest execution must
+   both fit into the greatest common divisor of their periods
+   (:mod:`chainshaper.planning.offsets`), and all of the fullest core into its time;
+2. the sum of all outputs' mean latencies, each as a share of its period;
+3. how many messages cross between cores.
+
+For up to ten executors all assignments are tried, which is exact. For more, the best of fewer cores
+is improved by moving one executor, or swapping two, for as long as that is better.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import NamedTuple, TypeAlias
+
+from chainshaper.planning.shaping import CallbackTimes
+
+MOST_TRIED = 10  # executors, whose assignments are all tried
+
+MOST_OF_MEAN = 2
+"""So many times its mean a callback lasts: what took longer had to wait, before it was profiled."""
+
+_Assignment: TypeAlias = tuple[int, ...]  # of each executor, the place of its core
+_Cost: TypeAlias = Callable[[_Assignment], tuple[float, float, int]]
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a chain and its branches have to do in a cycle, the chain's last callback last.
+
+    ``begins`` is equal for chains of one graph, whose callbacks then are the same as far as they
+    wait for the same; ``margin_ns`` is what a slot is longer than the longest execution.
+    """
+
+    begins: Hashable
+    period_ns: int
+    callbacks: tuple[CallbackTimes, ...]
+    margin_ns: int = 0
+
+
+class _Callback(NamedTuple):
+    executor: int
+    mean_ns: int
+    longest_ns: int
+    after: tuple[int, ...]
+
+
+class _Graph(NamedTuple):
+    period_ns: int
+    margin_ns: int
+    callbacks: list[_Callback]
+    outputs: list[int]  # which callbacks publish them
+
+
+def assign_cores(
+    work: Sequence[Work],
+    cores: Sequence[int],
+    *,
+    together: Sequence[Sequence[str]] = (),
+    worth: float = 0.0,
+) -> dict[str, int]:
+    """The core of each node's executor, out of ``cores``: the first has that of the first callback.
+
+    As few cores as do as well are used: a further one must let more chains fit, or take more than
+    the share ``worth`` off the latencies. ``together`` are nodes of one process, which move as one.
+    """
+    nodes = dict.fromkeys(callback.node for one in work for callback in one.callbacks)
+    hosts = {node: min(group) for group in together for node in group}
+    executors = list(dict.fromkeys(hosts.get(node, node) for node in nodes))
+    executor_of = {node: executors.index(hosts.get(node, node)) for node in nodes}
+    graphs = _graphs(work, executor_of)
+
+    def cost(assignment: _Assignment) -> tuple[float, float, int]:
+        return _cost(graphs, assignment)
+
+    best: _Assignment = (0,) * len(executors)
+    for count in range(2, min(len(cores), len(executors)) + 1):
+        if len(executors) <= MOST_TRIED:
+            found = min(_all(len(executors), count), key=cost)
+        else:
+            found = _improved(best, count, cost)
+        (excess, latency, _), (least_excess, least, _) = cost(found), cost(best)
+        if excess >= least_excess and latency >= (1 - worth) * least:
+            break
+        best = found
+    return {node: cores[best[executor_of[node]]] for node in nodes}
+
+
+def _graphs(work: Sequence[Work], executor_of: dict[str, int]) -> list[_Graph]:
+    """The graphs of all chains: those that begin together are one."""
+    graphs: dict[Hashable, _Graph] = {}
+    known: dict[Hashable, int] = {}
+    for one in work:
+        graph = graphs.setdefault(one.begins, _Graph(one.period_ns, one.margin_ns, [], []))
+        own: list[int] = []
+        seen: Counter[Hashable] = Counter()
+        for callback in one.callbacks:
+            after = tuple(sorted({own[place] for place in callback.after}))
+            key = (one.begins, callback.node, after)
+            seen[key] += 1
+            mean = callback.mean_response_ns
+            longest = min(callback.max_response_ns, MOST_OF_MEAN * mean)
+            found = _Callback(executor_of[callback.node], mean, longest, after)
+            place = known.setdefault((key, seen[key]), len(graph.callbacks))
+            graph.callbacks[place : place + 1] = [max([found, *graph.callbacks[place : place + 1]])]
+            own.append(place)
+        graph.outputs.append(own[-1])
+    return list(graphs.values())
+
+
+def _all(executors: int, cores: int, begun: _Assignment = (0,)) -> Iterator[_Assignment]:
+    """Every assignment in which a core is used only if those before it are."""
+    if len(begun) == executors:
+        yield begun
+        return
+    for core in range(min(cores, max(begun) + 2)):
+        yield from _all(executors, cores, (*begun, core))
+
+
+def _improved(best: _Assignment, cores: int, cost: _Cost) -> _Assignment:
+    while True:
+        places = range(len(best))
+        moved = [(*best[:k], core, *best[k + 1 :]) for k in places for core in range(cores)]
+        for j, k in combinations(places, 2):
+            moved.append((*best[:j], best[k], *best[j + 1 : k], best[j], *best[k + 1 :]))
+        found = min(moved, key=cost)
+        if cost(found) >= cost(best):
+            return best
+        best = found
+
+
+def _cost(graphs: Sequence[_Graph], assignment: _Assignment) -> tuple[float, float, int]:
+    cores = [{assignment[one.executor] for one in graph.callbacks} for graph in graphs]
+    excess = latency = 0.0
+    slots, crossing = [], 0
+    load = dict.fromkeys(assignment, 0.0)
+    for graph, own in zip(graphs, cores, strict=True):
+        mean = _played_out(graph, assignment, [one.mean_ns for one in graph.callbacks])
+        longest = _played_out(graph, assignment, [one.longest_ns for one in graph.callbacks])
+        latency += sum(mean[place] for place in graph.outputs) / graph.period_ns
+        slots.append(max(longest) + graph.margin_ns)
+        for core in own:
+            load[core] += slots[-1] / graph.period_ns
+        home = [assignment[one.executor] for one in graph.callbacks]
+        ends = zip(home, graph.callbacks, strict=True)
+        crossing += sum(home[place] != core for core, one in ends for place in one.after)
+    for j, k in combinations(range(len(graphs)), 2):
+        if cores[j] & cores[k]:
+            common = math.gcd(graphs[j].period_ns, graphs[k].period_ns)
+            excess += max(0.0, (slots[j] + slots[k]) / common - 1)
+    excess += max(0.0, max(load.values()) - 1)
+    return round(excess, 9), round(latency, 9), crossing
+
+
+def _played_out(graph: _Graph, assignment: _Assignment, lasting: Sequence[int]) -> list[int]:
+    """When each callback of a cycle is done."""
+    done: dict[int, int] = {}
+    free: dict[int, int] = {}
+
+    def start_of(place: int) -> tuple[int, int, int]:
+        one = graph.callbacks[place]
+        ready = max((done[before] for before in one.after), default=0)
+        return max(ready, free.get(assignment[one.executor], 0)), ready, place
+
+    while len(done) < len(lasting):
+        start, _, place = min(
+            start_of(place)
+            for place, one in enumerate(graph.callbacks)
+            if place not in done and all(before in done for before in one.after)
+        )
+        done[place] = free[assignment[graph.callbacks[place].executor]] = start + lasting[place]
+    return [done[place] for place in range(len(lasting))]

@@ -1,0 +1,67 @@
+// A node with one callback that computes for a random time and publishes what it was started by:
+//
+//   vertex OUTPUT|- LEAST_MS MOST_MS every PERIOD_MS
+//   vertex OUTPUT|- LEAST_MS MOST_MS on INPUT [INPUT]      (two inputs: synchronised)
+#include <chrono>
+#include <ctime>
+#include <memory>
+#include <random>
+#include <string>
+#include <vector>
+
+#include "geometry_msgs/msg/point_stamped.hpp"
+#include "message_filters/subscriber.h"
+#include "message_filters/time_synchronizer.h"
+#include "rclcpp/rclcpp.hpp"
+
+using Message = geometry_msgs::msg::PointStamped;
+using Filter = message_filters::Subscriber<Message>;
+
+class Vertex : public rclcpp::Node {
+ public:
+  explicit Vertex(const std::vector<std::string>& words)
+      : Node("vertex"), time_ms_(std::stod(words[2]), std::stod(words[3])) {
+    if (words[1] != "-") output_ = create_publisher<Message>(words[1], 10);
+    const auto take = [this](const Message::ConstSharedPtr& message) { finish(*message); };
+    if (words[4] == "every") {
+      timer_ = create_wall_timer(std::chrono::milliseconds(std::stoi(words[5])), [this] {
+        Message begun;
+        begun.header.stamp = now();
+        finish(begun);
+      });
+    } else if (words.size() == 6) {
+      input_ = create_subscription<Message>(words[5], 10, take);
+    } else {
+      filters_ = {std::make_shared<Filter>(this, words[5]), std::make_shared<Filter>(this, words[6])};
+      both_ = std::make_shared<message_filters::TimeSynchronizer<Message, Message>>(*filters_[0], *filters_[1], 10);
+      both_->registerCallback(std::bind(take, std::placeholders::_1));
+    }
+  }
+
+ private:
+  void finish(const Message& message) {
+    const double end_ms = ran_ms() + time_ms_(random_);
+    while (ran_ms() < end_ms) {
+    }
+    if (output_) output_->publish(message);
+  }
+
+  static double ran_ms() {
+    timespec ran;
+    clock_gettime(CLOCK_THREAD_CPUTIME_ID, &ran);
+    return ran.tv_sec * 1e3 + ran.tv_nsec / 1e6;
+  }
+
+  std::uniform_real_distribution<double> time_ms_;
+  std::mt19937 random_{std::random_device{}()};
+  rclcpp::Publisher<Message>::SharedPtr output_;
+  rclcpp::TimerBase::SharedPtr timer_;
+  rclcpp::Subscription<Message>::SharedPtr input_;
+  std::vector<std::shared_ptr<Filter>> filters_;
+  std::shared_ptr<message_filters::TimeSynchronizer<Message, Message>> both_;
+};
+
+int main(int argc, char** argv) {
+  rclcpp::spin(std::make_shared<Vertex>(rclcpp::init_and_remove_ros_arguments(argc, argv)));
+  rclcpp::shutdown();
+}
