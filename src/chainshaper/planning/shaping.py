@@ -274,7 +274,7 @@ def with_best_effort(plans: Sequence[Plan], core_of: Mapping[str, int]) -> list[
 
 
 def with_turns(plan: Plan, equal_priorities: EqualPriorities) -> Plan:
-    """A plan whose servers take turns at one priority, as in the paper (eq. 3), if that is wished."""
+    """A plan whose servers take turns at one priority (eq. 3), if that is wished."""
     if equal_priorities == "apart":
         return plan
     best = min(server.priority for server in plan.servers)
