@@ -214,7 +214,6 @@ def test_a_core_that_is_named_twice_has_two_stages_at_a_time() -> None:
         ([[80, 80]], None, {"cores": (-1, 0)}, "core: .* greater than or equal to 0"),
         ([[80, 80]], None, {"anchor": "cycle"}, "anchor: an output of a pipeline is whole cycles"),
         ([[80, 80]], None, {"publication": "asynchronous"}, "needs a shaping node"),
-        ([[80, 80]], None, {"policy": "let-per-callback"}, "add --policy pipelined"),
         ([[80, 80]], None, {"policy": "shaped", "cores": None}, "or a pipeline of stages"),
     ],
 )

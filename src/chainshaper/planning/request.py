@@ -269,7 +269,7 @@ def on_cores(
 
     Raises: as :func:`cores_for`.
     """
-    if request.cores is None:
+    if request.cores is None or request.policy == "pipelined":  # there, stages get them
         return tuple(profiles), []
     core_of, moved, doubts = cores_for(profiles, request.cores, request), [], []
     for one in profiles:

@@ -60,7 +60,8 @@ def plan_application(
     if not profiles:
         raise InputError("no chain is named: give one at least")
     profiles, doubts = on_cores(profiles, request)
-    request = replace(request, cores=None)
+    if request.policy != "pipelined":
+        request = replace(request, cores=None)
     refuse_entangled(profiles, request.policy)
     try:
         plan, remarks = _planned(profiles, request, time_limit_s)
