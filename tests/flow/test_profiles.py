@@ -267,7 +267,7 @@ def test_a_stall_longer_than_the_cycle_is_not_covered_where_all_cycles_are_distu
 
 def test_executions_that_span_cycles_can_be_planned_callback_by_callback() -> None:
     long = replace(_profile(), latencies_ns=np.array([60, 141]) * MS)
-    with pytest.raises(OperationError, match="pipeline over several cores"):
+    with pytest.raises(OperationError, match="a pipeline of stages"):
         plan_chain(long, PlanRequest())
     for policy in ("server-per-callback", "let-per-callback"):
         plan = plan_chain(long, PlanRequest(policy=policy, epsilon_ns=0))

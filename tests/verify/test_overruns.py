@@ -324,7 +324,8 @@ def test_of_a_gated_publisher_what_was_not_sent_was_discarded(unshaped: Recordin
         overrun="discard",
     )
     outcomes = ["sent", "expired", "sent", "overwritten"]
-    sends = pl.DataFrame({"outcome": outcomes})
+    pids = {node: pid for pid, node in unshaped.info.processes.items()}
+    sends = pl.DataFrame({"outcome": outcomes, "pid": [pids["/third"]] * 4})
     gated = replace(unshaped, events={**unshaped.events, "asynchronous_send": sends})
     assert overruns_in(gated, plan) == {"discard": 2}
     analysis = measure_latency(unshaped).analysis

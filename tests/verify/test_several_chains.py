@@ -152,7 +152,7 @@ def test_places_count_from_the_chains_own_cycle(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (["sweep", "application.yaml", "plan.yaml", "--vary", "seed=1"], "only one is wanted"),
+        (["sweep", "application.yaml", "plan.yaml", "--vary", "seed=1"], "that of one is wanted"),
         (["compare", "after"], "needs two recordings"),
         (["compare", "before", "after", "--figures", "f"], "--figures draws one chain"),
     ],

@@ -99,8 +99,11 @@ def _core(thread: NodeThread, core_of: Mapping[str, int], cores: Sequence[int]) 
 def check_profiling(core: int | Sequence[int] | None = None) -> Sequence[int]:
     """The cores on which executors will run, once it is sure that they may.
 
-    Raises PlatformError: no such core, or SCHED_FIFO is not permitted.
+    Raises InputError: a core is named twice. PlatformError: no such core, or SCHED_FIFO is not
+    permitted.
     """
+    if isinstance(core, Sequence) and len(set(core)) < len(core):
+        raise InputError("--cores names a core twice: name each once")
     if not may_use_fifo():
         raise PlatformError(
             "profiling needs SCHED_FIFO: run as root, or give your user an rtprio limit of 98 in "

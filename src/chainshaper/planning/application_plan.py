@@ -171,19 +171,27 @@ def open_until_done(plan: ApplicationPlan, waits_ns: Sequence[int] = ()) -> Appl
     its cycle each one's timer expires: its thread waits, so that cycles start at their offsets.
     """
     waits = waits_ns if waits_ns and plan.moves_timers else [-WAITING_NS] * len(plan.chains)
-    opened = [
+    longer = [
         server
         for chain, wait in zip(plan.chains, waits, strict=True)
         for server in chain_open_until_done(chain, wait + WAITING_NS).servers
     ]
-    for server in sorted(opened, key=lambda one: one.slots[-1][1]):  # the longest of several last
-        longer = []
-        for chain in plan.chains:
-            servers = [server if one.name == server.name else one for one in chain.servers]
-            longer.append(chain.model_copy(update={"servers": tuple(servers)}))
+    # Of a server of several chains, the longest.
+    opened = {one.name: one for one in sorted(longer, key=lambda one: one.slots[-1][1])}
+    with contextlib.suppress(ValidationError):
+        return _with_servers(plan, opened)
+    for name, server in opened.items():
         with contextlib.suppress(ValidationError):
-            plan = ApplicationPlan(chains=tuple(longer))
+            plan = _with_servers(plan, {name: server})
     return plan
+
+
+def _with_servers(plan: ApplicationPlan, servers: Mapping[str, Server]) -> ApplicationPlan:
+    chains = []
+    for chain in plan.chains:
+        own = tuple(servers.get(one.name, one) for one in chain.servers)
+        chains.append(chain.model_copy(update={"servers": own}))
+    return ApplicationPlan(chains=tuple(chains))
 
 
 def combined(plans: Sequence[Plan]) -> ApplicationPlan:
