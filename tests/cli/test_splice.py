@@ -79,6 +79,8 @@ def test_the_fallback_is_the_plan_s_or_the_option_s(files: Files) -> None:
     assert fallbacks == [False, True]
     refusal = refused(2, "splice", "--throttle", "/a:/t=1ms", robot, "-o", folder, *options)
     assert "a throttler has no fallback" in refusal
+    twice = ("--throttle", "/a:/t=1ms", "--throttle", "/b:/t=2ms")
+    assert "/t is throttled twice" in refused(2, "splice", *twice, robot, "-o", folder)
 
 
 def test_a_throttler_needs_no_plan(files: Files) -> None:

@@ -179,7 +179,13 @@ def splice_throttlers(
     subscribers = _endpoints(recording, "subscription")
     alike: dict[tuple[int, Rule], dict[str, tuple[str, ...]]] = {}
     for one in inputs:
-        topics = alike.setdefault((one.period_ns, one.rule), {})
+        how = (one.period_ns, one.rule)
+        if any(one.topic in topics for other, topics in alike.items() if other != how):
+            raise InputError(
+                f"{one.topic} is throttled twice, with another period or rule: two throttlers would"
+                f" publish {one.topic}_throttled; name it with one"
+            )
+        topics = alike.setdefault(how, {})
         nodes = (*topics.get(one.topic, ()), *_subscribers(one, subscribers))
         topics[one.topic] = tuple(dict.fromkeys(nodes))
 
