@@ -14,13 +14,13 @@ import contextlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
-from itertools import combinations
+from itertools import combinations, product
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Field, ValidationError, model_validator
 
-from chainshaper.planning.offsets import chain_name, collisions, timetable
+from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.overruns import open_until_done as chain_open_until_done
 from chainshaper.planning.plan import (
     Plan,
@@ -31,9 +31,9 @@ from chainshaper.planning.plan import (
     plans_as_text,
     shaping_nodes,
     slot_text,
+    write_plans,
 )
 from chainshaper.values.durations import format_duration
-from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.yaml_file import Part, read_model, wrong_value, wrong_values_refused
 
 MOST_SLOTS = 10_000
@@ -325,38 +325,32 @@ def _apart(plan: ApplicationPlan) -> _Wrong:
     for one, place, two in _pairs(plan):
         if one.equal_priorities == two.equal_priorities == "round-robin":
             continue
-        shared = {server.name for server in one.servers} & {server.name for server in two.servers}
-        common, forbidden = collisions(timetable([one], shared), timetable([two], shared))
-        distance = (two.offset_ns - one.offset_ns) % common
-        if any(first <= distance <= last for first, last in forbidden):
+        for text in _collisions(one, two):
             yield (
-                f"{_collision_text(one, two, shared)}: move a slot, change the offset of one chain"
-                " (`chainshaper offsets`), or give their servers other cores or priorities",
+                f"{text}: move a slot, change the offset of one chain (`chainshaper offsets`), or"
+                " give their servers other cores or priorities",
                 place,
                 "offset",
             )
 
 
-def _collision_text(one: Plan, two: Plan, shared: set[str]) -> str:
-    """The first slots that collide in some cycle, in words."""
+def _collisions(one: Plan, two: Plan) -> Iterator[str]:
+    """The slots of two chains that meet in some cycle, in words."""
     common = math.gcd(one.cycle_ns, two.cycle_ns)
-    for server in one.servers:
-        for other in two.servers:
-            if (server.core, server.priority) != (other.core, other.priority):
-                continue
-            if shared & {server.name, other.name} or server.best_effort or other.best_effort:
-                continue
-            for start, end in server.slots:
-                for other_start, other_end in other.slots:
-                    later = (other_start + two.offset_ns - start - one.offset_ns) % common
-                    if later < end - start or common - later < other_end - other_start:
-                        return (
-                            f"the slot {slot_text((other_start, other_end))} of server"
-                            f" {other.name!r} meets {slot_text((start, end))} of server"
-                            f" {server.name!r} of {chain_name(one)} in some cycles, on core"
-                            f" {server.core} at the same priority {server.priority}"
-                        )
-    return f"slots of {chain_name(two)} and {chain_name(one)} collide"
+    shared = {server.name for server in one.servers} & {server.name for server in two.servers}
+    for server, other in product(one.servers, two.servers):
+        if (server.core, server.priority) != (other.core, other.priority):
+            continue
+        if shared & {server.name, other.name} or server.best_effort or other.best_effort:
+            continue
+        for (start, end), (other_start, other_end) in product(server.slots, other.slots):
+            later = (other_start + two.offset_ns - start - one.offset_ns) % common
+            if later < end - start or common - later < other_end - other_start:
+                yield (
+                    f"the slot {slot_text((other_start, other_end))} of server {other.name!r} meets"
+                    f" {slot_text((start, end))} of server {server.name!r} of {chain_name(one)} in"
+                    f" some cycles, on core {server.core} at the same priority {server.priority}"
+                )
 
 
 # The file ---------------------------------------------------------------------------------------
@@ -396,7 +390,4 @@ def save_application_plan(
 
     Raises: as :func:`~chainshaper.planning.plan.save_plan`.
     """
-    path = Path(path)
-    if not (overwrite and path.is_file()):
-        new_file(path)
-    write_whole(path, [dump_application_plan(plan).encode()])
+    write_plans(plan.chains, path, overwrite=overwrite)

@@ -21,7 +21,7 @@ well but may run out of time.
 import math
 import random
 import time
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from itertools import chain, combinations
 from typing import NamedTuple, TypeAlias
@@ -54,19 +54,16 @@ class Timetable(NamedTuple):
     slots: dict[tuple[int, int], list[Slot]]
 
 
-def timetable(
+def _timetable(
     plans: Sequence[Plan],
-    without: Collection[str] = (),
     alone: Iterable[tuple[tuple[int, int], int]] = (),
 ) -> Timetable:
     """The slots of a chain, or of several that share servers, of which each counts once.
 
-    Servers of the names ``without`` do not count. ``alone`` are cores and priorities at which
-    others must not run for so long (ns) after the cycle has begun.
+    ``alone`` are cores and priorities at which others must not run for so long (ns) after the cycle
+    has begun.
     """
     servers = {server.name: server for plan in plans for server in plan.servers}
-    for name in without:
-        servers.pop(name, None)
     slots: dict[tuple[int, int], list[Slot]] = {}
     for server in servers.values():
         if not server.best_effort:
@@ -165,7 +162,7 @@ def with_offsets(
     for group, other in combinations(together, 2):
         _refuse_same_beginning(plans[group[0]], plans[other[0]])
     own = [[plans[k] for k in one] for one in together]
-    tables = [timetable(one, alone=_alone(one, plans, alone)) for one in own]
+    tables = [_timetable(one, _alone(one, plans, alone)) for one in own]
     found = _find_offsets(tables, time_limit_s)
     offset_of = {k: found[number] for number, one in enumerate(together) for k in one}
     return tuple(revised(plan, offset_ns=offset_of[k]) for k, plan in enumerate(plans))
@@ -184,7 +181,7 @@ def _alone(
 def _find_offsets(tables: Sequence[Timetable], time_limit_s: float) -> dict[int, int]:
     allowed: _Allowed = {}
     for j, k in combinations(range(len(tables)), 2):
-        common, forbidden = collisions(tables[j], tables[k])
+        common, forbidden = _collisions(tables[j], tables[k])
         if forbidden:
             intervals = _between(forbidden, common)
             if not intervals:
@@ -223,7 +220,7 @@ def _slots_of(table: Timetable) -> Iterator[Slot]:
     return chain.from_iterable(table.slots.values())
 
 
-def collisions(one: Timetable, two: Timetable) -> tuple[int, _Intervals]:
+def _collisions(one: Timetable, two: Timetable) -> tuple[int, _Intervals]:
     """g, and the differences of offsets modulo g at which slots collide."""
     common = math.gcd(one.cycle_ns, two.cycle_ns)
     forbidden: _Intervals = []

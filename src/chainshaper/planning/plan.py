@@ -765,10 +765,15 @@ def save_plan(plan: Plan, path: str | Path, *, overwrite: bool = False) -> None:
     Raises InputError: ``path`` exists (and ``overwrite`` is not set), or its folder does not.
     OperationError: it cannot be written; nothing is left behind, an existing file stays.
     """
+    write_plans([plan], path, overwrite=overwrite)
+
+
+def write_plans(plans: Sequence[Plan], path: str | Path, *, overwrite: bool) -> None:
+    """Write plans into one file. Raises: as :func:`save_plan`."""
     path = Path(path)
     if not (overwrite and path.is_file()):
         new_file(path)
-    write_whole(path, [dump_plan(plan).encode()])
+    write_whole(path, [plans_as_text(plans).encode()])
 
 
 def save_plans(plans: Sequence[Plan], folder: str | Path) -> list[Path]:
