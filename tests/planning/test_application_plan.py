@@ -12,7 +12,6 @@ from chainshaper import load_application_plan, save_application_plan, save_plan
 from chainshaper.planning.application_plan import (
     ApplicationPlan,
     combined,
-    dump_application_plan,
     plan_in,
     plan_of_chain,
     plan_values,
@@ -27,6 +26,7 @@ from chainshaper.planning.plan import (
     Server,
     Slot,
     Thread,
+    plans_as_text,
 )
 from chainshaper.values.errors import InputError
 
@@ -156,7 +156,7 @@ def test_plans_of_one_chain_are_read_and_written_as_ever(
     save_plan(chain, path)
     assert "format: 1" in path.read_text()
     assert load_application_plan(path) == whole(chain)
-    assert dump_application_plan(whole(chain)) == path.read_text()
+    assert plans_as_text(whole(chain).chains) == path.read_text()
     assert plan_in(chain.model_dump(mode="json")) == whole(chain)
     assert plan_values(whole(chain)) == chain.model_dump(mode="json")
 
@@ -177,7 +177,7 @@ def test_plans_of_one_chain_are_read_and_written_as_ever(
 def test_what_was_edited_wrongly_is_named_with_its_line(
     old: str, new: str, reason: str, three: ApplicationPlan, tmp_path: Path
 ) -> None:
-    path, text = tmp_path / "plan.yaml", dump_application_plan(three)
+    path, text = tmp_path / "plan.yaml", plans_as_text(three.chains)
     assert old in text
     path.write_text(text.replace(old, new))
     lines = enumerate(path.read_text().splitlines(), start=1)

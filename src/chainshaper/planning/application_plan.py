@@ -28,7 +28,6 @@ from chainshaper.planning.plan import (
     ShapingNode,
     Slot,
     Thread,
-    plans_as_text,
     shaping_nodes,
     slot_text,
     write_plans,
@@ -378,15 +377,10 @@ def plan_values(plan: ApplicationPlan) -> dict[str, Any]:
     return (plan.chains[0] if len(plan.chains) == 1 else plan).model_dump(mode="json")
 
 
-def dump_application_plan(plan: ApplicationPlan) -> str:
-    """The YAML text; reading it gives an equal plan. One chain is written as its own plan."""
-    return plans_as_text(plan.chains)
-
-
 def save_application_plan(
     plan: ApplicationPlan, path: str | Path, *, overwrite: bool = False
 ) -> None:
-    """Write a plan, whole or not at all.
+    """Write a plan, whole or not at all; one chain is written as its own plan.
 
     Raises: as :func:`~chainshaper.planning.plan.save_plan`.
     """
