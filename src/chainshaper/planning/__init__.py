@@ -30,8 +30,8 @@ from chainshaper.planning.plan import publish_slots as publish_slots
 from chainshaper.planning.plan import save_plan as save_plan
 from chainshaper.planning.plan import save_plans as save_plans
 from chainshaper.planning.plan import server_of as server_of
+from chainshaper.planning.profile import Profile as Profile
 from chainshaper.planning.request import PlanRequest as PlanRequest
-from chainshaper.planning.request import Profile as Profile
 from chainshaper.planning.request import band_choice as band_choice
 from chainshaper.planning.request import plan_chain as plan_chain
 from chainshaper.planning.several_chains import plan_application as plan_application

@@ -325,6 +325,11 @@ def _about_evidence(plan: Plan) -> Iterator[str]:
             f"{evidence.lost_events} events were lost while recording: cycles are missing, and the"
             " longest latency may be among them. Record again, see the recording's notes."
         )
+    if evidence.interference_ns:
+        yield (
+            f"{milliseconds(evidence.interference_ns)} ms of the slot are for other chains of the"
+            " plan, which may have the core first."
+        )
     if evidence.incomplete:
         yield (
             f"{evidence.incomplete} executions of the chain have no end in the recording; their"

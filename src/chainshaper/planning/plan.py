@@ -83,9 +83,11 @@ class Evidence(Part):
     They are of undisturbed cycles; where the machine disturbed all but one at most
     (``all_disturbed``), of all. ``max_of_all_ns`` is the longest of all, ``incomplete`` counts
     traversals without an end, ``disturbed`` those hit by a stall of the machine; ``utilisation`` is
-    the share of its core that the chain takes, ``longest_send_ns`` is of the output's asynchronous
-    publisher, ``longest_publication_ns`` of its synchronous one, for which Δ was ``given``, is as
-    long as ``measured``, or the ``least``. ``modes`` has each mode's own. ``None`` is: not known.
+    the share of its core that the chain takes. ``interference_ns`` of every latency are for others
+    (:mod:`~chainshaper.planning.profile`). ``longest_send_ns`` is of the output's
+    asynchronous publisher, ``longest_publication_ns`` of its synchronous one, for which Δ was
+    ``given``, is as long as ``measured``, or the ``least``. ``modes`` has each mode's own. ``None``
+    is: not known.
     """
 
     recording: str | None = None
@@ -99,6 +101,7 @@ class Evidence(Part):
     realtime: bool | None = None
     longest_stall_ns: Duration | None = None
     utilisation: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    interference_ns: Duration | None = None
     longest_send_ns: Duration | None = None
     longest_publication_ns: Duration | None = None
     publish_slot: Literal["given", "measured", "least"] | None = None

@@ -1,0 +1,88 @@
+"""How long other chains can have a chain's core: by hand, and played out."""
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from chainshaper import load_application, simulate
+from chainshaper.flow.plan import profile_chains
+from chainshaper.planning import PlanRequest, plan_application
+from chainshaper.planning.profile import Rival, interference
+
+MS = 1_000_000
+
+
+def _response(own: int, rivals: list[Rival], phases: list[int]) -> int:
+    """What a job of the worst priority takes that arrives at 0, in whole steps of time."""
+    left = [0] * len(rivals)
+    now = done = 0
+    while done < own:
+        for place, (one, phase) in enumerate(zip(rivals, phases, strict=True)):
+            left[place] += one.cost_ns * (now >= phase and (now - phase) % one.period_ns == 0)
+        first = next((place for place, rest in enumerate(left) if rest), None)
+        if first is None:
+            done += 1
+        else:
+            left[first] -= 1
+        now += 1
+    return now
+
+
+_RIVAL = st.builds(Rival, st.integers(8, 30), st.integers(1, 3), st.just(0))
+
+
+@given(st.integers(1, 20), st.lists(st.tuples(_RIVAL, st.integers(0, 30)), max_size=2))
+def test_no_phase_delays_more_and_one_delays_as_much(
+    own: int, drawn: list[tuple[Rival, int]]
+) -> None:
+    rivals, phases = [one for one, _ in drawn], [phase for _, phase in drawn]
+    longest = own + interference(own, rivals, 10_000)
+    assert _response(own, rivals, phases) <= longest
+    assert _response(own, rivals, [0] * len(rivals)) == longest  # all arrive at once
+
+
+def test_what_waits_elsewhere_may_come_twice() -> None:
+    # 6 + 2 of 20 while no instance is late; one that comes 15 later meets the next one's window.
+    assert interference(6, [Rival(20, 2)], 100) == 2
+    assert interference(6, [Rival(20, 2, 15)], 100) == 4
+    assert interference(50, [Rival(10, 10)], 100) >= 50  # never ends: the limit does
+
+
+GRAPH = """
+name: a fork
+chain: /in../left
+scheduling: {executors: {core: 1, priority: 80}, dds: {core: 0, priority: 90}}
+nodes:
+  source: {callbacks: [{timer: 100ms, execution: {constant: 2ms}, publishes: [/in]}]}
+  left: {callbacks: [{subscription: /in, execution: {constant: 5ms}, publishes: [/left]}]}
+  right: {callbacks: [{subscription: /in, execution: {constant: 7ms}, publishes: [/right]}]}
+  first: {callbacks: [{timer: PERIOD, execution: {constant: 1ms}, publishes: [/first]}]}
+  other: {callbacks: [{subscription: /first, execution: {constant: 2ms}, publishes: [/other]}]}
+  sink:
+    core: 0
+    callbacks: [{subscription: /left}, {subscription: /right}, {subscription: /other}]
+"""
+
+
+@pytest.mark.parametrize(("period", "before"), [("50ms", 0), ("40ms", 3)])
+def test_branches_and_a_better_chain_by_hand(period: str, before: int, tmp_path: Path) -> None:
+    pytest.importorskip("numba")
+    (tmp_path / "graph.yaml").write_text(GRAPH.replace("PERIOD", period))
+    application = load_application(tmp_path / "graph.yaml")
+    recording = simulate(application, tmp_path / "rec", cycles=40)
+    chains = ("/in../left", "/in../right", "/first../other")
+    profiles = profile_chains(recording, chains)
+    alone = [int(one.every_step_ns.sum(axis=1).max()) / MS for one in profiles]  # type: ignore[union-attr]
+    # Dispatching and messages take some of a millisecond; the branch that came second, 5 ms later,
+    # has not waited here.
+    assert all(own <= found < own + 0.8 for own, found in zip([7, 9, 3], alone, strict=True))
+    plan, remarks = plan_application(profiles, PlanRequest(epsilon_ns=0))
+    sent = [(one.longest_publication_ns or MS) / MS for one in profiles]
+    added = [(one.evidence.interference_ns or 0) / MS for one in plan.chains]
+    # A branch waits for the other one, and for two gates, each 1 ms and a publication; `other` for
+    # two gates. With 40 ms there is no room for turns: `other` runs first, its callbacks 3 ms long.
+    assert len(remarks) == (before > 0)
+    behind = [7 + 2 + sent[1] + sent[2] + before, 5 + 2 + sent[0] + sent[2] + before]
+    assert added == pytest.approx([*behind, 2 + sent[0] + sent[1]], abs=0.1)
