@@ -85,4 +85,4 @@ def test_branches_and_a_better_chain_by_hand(period: str, before: int, tmp_path:
     # two gates. With 40 ms there is no room for turns: `other` runs first, its callbacks 3 ms long.
     assert len(remarks) == (before > 0)
     behind = [7 + 2 + sent[1] + sent[2] + before, 5 + 2 + sent[0] + sent[2] + before]
-    assert added == pytest.approx([*behind, 2 + sent[0] + sent[1]], abs=0.1)
+    assert added == pytest.approx([*behind, 2 + sent[0] + sent[1]], abs=0.5)  # dispatching
