@@ -2,14 +2,16 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from chainshaper import load_application, simulate
 from chainshaper.flow.plan import profile_chains
-from chainshaper.planning import PlanRequest, plan_application
-from chainshaper.planning.profile import Rival, interference
+from chainshaper.planning import CallbackTimes, PlanRequest, plan_application
+from chainshaper.planning.profile import Profile, Rival, interference
+from chainshaper.values.errors import OperationError
 
 MS = 1_000_000
 
@@ -86,3 +88,37 @@ def test_branches_and_a_better_chain_by_hand(period: str, before: int, tmp_path:
     assert len(remarks) == (before > 0)
     behind = [7 + 2 + sent[1] + sent[2] + before, 5 + 2 + sent[0] + sent[2] + before]
     assert added == pytest.approx([*behind, 2 + sent[0] + sent[1]], abs=0.5)  # dispatching
+
+
+def _profile(name: str, latency_ms: int, stalls_ms: int = 0, last: str | None = None) -> Profile:
+    """A chain of two callbacks on core 1; the machine stalled in nine of 300 cycles."""
+    half = np.full(300, latency_ms * MS // 2)
+    second = half.copy()
+    second[:9] += stalls_ms * MS
+    topics = (f"/{name}1", f"/{name}2")
+    nodes = (topics[0], last or topics[1])
+    return Profile(
+        2 * half,
+        100 * MS,
+        every_latency_ns=half + second,
+        spec="..".join(topics),
+        nodes=nodes,
+        topics=topics,
+        begins=(ord(name), name),
+        core_of=dict.fromkeys(nodes, 1),
+        callbacks=tuple(CallbackTimes(n, 1, MS, MS, int(half[0])) for n in nodes),
+        steps_ns=np.stack([half, half], axis=1),
+        every_step_ns=np.stack([half, second], axis=1),
+    )
+
+
+def test_chains_that_do_not_fit_are_named_with_what_fits() -> None:
+    # At once, /a takes 60 ms and, behind /b, 62 more; 24 ms too much with margin and slot.
+    with pytest.raises(OperationError, match=r"24ms too long") as refused:
+        plan_application([_profile("a", 60), _profile("b", 60)])
+    assert "core 1, 62ms behind /a1../a2" in str(refused.value)
+    assert "It fits with /a1../a2 on a core of its own (its nodes' `core`)" in str(refused.value)
+    # What passes one node has to take turns, for which stalls of 20 ms leave no room.
+    both = [_profile(name, 40, 20, last="/filter") for name in "ab"]
+    with pytest.raises(OperationError, match=r"does not stall \(--ideal-machine\)"):
+        plan_application(both)

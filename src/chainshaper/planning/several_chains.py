@@ -71,7 +71,9 @@ def plan_application(
         fits = list(_fitting(profiles, request, time_limit_s)) if len(profiles) > 1 else []
         if not fits:
             raise
-        raise OperationError(f"{error}. It fits with {', or with '.join(fits)}") from error
+        raise OperationError(
+            f"{str(error).rstrip('.')}. It fits with {', or with '.join(fits)}"
+        ) from error
 
 
 def with_own_names(plans: Sequence[Plan]) -> list[Plan]:
@@ -99,7 +101,7 @@ def _planned(
 
     def plans(at_once: bool) -> list[Plan]:
         delayed = with_interference(profiles, groups, request, at_once=at_once)
-        found = [plan_chain(profile, own) for profile in delayed]
+        found = [_beside_others(profile, delayed, own) for profile in delayed]
         for group in groups:
             for k, plan in zip(group, _sharing_servers([found[k] for k in group]), strict=True):
                 found[k] = plan
@@ -112,6 +114,21 @@ def _planned(
         at_once=partial(plans, at_once=True),
     )
     return combined(with_best_effort(placed, best_effort_cores(profiles, request))), remarks
+
+
+def _beside_others(profile: Profile, every: Sequence[Profile], request: PlanRequest) -> Plan:
+    """The plan of one of several chains; who takes the room that it lacks is named."""
+    try:
+        return plan_chain(profile, request)
+    except OperationError as error:
+        core = profile.core_of.get(profile.nodes[-1]) if profile.nodes else None
+        others = [one.name for one in every if one is not profile and core in one.core_of.values()]
+        if core is None or not profile.interference_ns:
+            raise
+        raise OperationError(
+            f"{profile.name} on core {core}, {format_duration(profile.interference_ns)} behind"
+            f" {' and '.join(others)}: {str(error).rstrip('.')}"
+        ) from error
 
 
 def beginning_together(profiles: Sequence[Profile]) -> list[list[int]]:
