@@ -172,11 +172,11 @@ def _print_several(
         placed = joint.chains
         if output is not None:
             cs.save_application_plan(joint, output)
-    warnings = [*remarks, *(warning for one in placed for warning in plan_warnings(one))]
+    warnings = [*remarks, *plan_warnings(*placed)]
     files = [str(path) for path in written]
     values = {"plans": [plan_json(one) for one in placed], "files": files, "warnings": warnings}
     if present(json, values, *map(plan_table, placed)):
-        notes(dict.fromkeys(warnings))
+        notes(warnings)
         for path in written:
             show_line(path)
 
