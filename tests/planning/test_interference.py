@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chainshaper import load_application, simulate
+from chainshaper import load_application, measure_latency, simulate
 from chainshaper.flow.plan import profile_chains
 from chainshaper.planning import CallbackTimes, PlanRequest, plan_application
+from chainshaper.planning.application_plan import combined
 from chainshaper.planning.profile import Profile, Rival, interference
 from chainshaper.values.errors import OperationError
 
@@ -122,3 +123,45 @@ def test_chains_that_do_not_fit_are_named_with_what_fits() -> None:
     both = [_profile(name, 40, 20, last="/filter") for name in "ab"]
     with pytest.raises(OperationError, match=r"does not stall \(--ideal-machine\)"):
         plan_application(both)
+
+
+OVERRUNNING = """
+name: two chains in turns
+chain: /a1../a2
+scheduling: {executors: {core: 1, priority: 80}, dds: {core: 0, priority: 90}}
+nodes:
+  a1: {callbacks: [{timer: 100ms, execution: {constant: 5ms}, publishes: [/a1]}]}
+  a2:
+    callbacks: [{subscription: /a1, execution: {uniform: [5ms, 20ms]}, publishes: [/a2]}]
+  b1: {callbacks: [{timer: 50ms, execution: {constant: 2ms}, publishes: [/b1]}]}
+  b2: {callbacks: [{subscription: /b1, execution: {constant: 6ms}, publishes: [/b2]}]}
+  sink: {core: 0, callbacks: [{subscription: /a2}, {subscription: /b2}]}
+"""
+
+
+def test_an_overrun_goes_on_behind_the_next_chain_and_does_not_hit_it(tmp_path: Path) -> None:
+    """The first chain's slot ends after 20 of up to 26 ms, and the second's follows at once."""
+    pytest.importorskip("numba")
+    (tmp_path / "app.yaml").write_text(OVERRUNNING)
+    application = load_application(tmp_path / "app.yaml")
+    recording = simulate(application, tmp_path / "rec", cycles=100)
+    plan, _ = plan_application(profile_chains(recording, ("/a1../a2", "/b1../b2")))
+    first, second = plan.chains
+    chain, output = first.servers
+    earlier = [
+        chain.model_copy(update={"slots": ((0, 20 * MS),)}),
+        output.model_copy(update={"slots": ((20 * MS, 21 * MS),)}),
+    ]
+    tight = combined(
+        [
+            first.model_copy(update={"servers": tuple(earlier)}),
+            second.model_copy(update={"offset_ns": 20 * MS}),
+        ]
+    )
+    shaped = simulate(application, tmp_path / "shaped", tight, cycles=300)
+    late = measure_latency(shaped, "/a1../a2").analysis.statistics
+    other = measure_latency(shaped, "/b1../b2").analysis.statistics
+    assert (other.late, other.jitter_ns) == (0, 0)
+    # It had 6 ms to go at most, behind a slot of the second chain that lasts for 10 to 13.
+    assert 0.2 < late.late / 300 < 0.6
+    assert 30 * MS < (late.max_ns or 0) < 41 * MS
