@@ -113,8 +113,7 @@ def apply_plan(
     threads.server_table(given)
     check_cores({server.core: f"server {server.name}" for server in given.servers})
     choice = choose_back_end(back_end)
-    threads.refuse_turns(given, choice.name)
-    threads.refuse_offsets(given, choice.name)
+    threads.refuse_unfit(given, choice.name)
     nodes = {thread.node for server in given.servers for thread in server.threads}
     nodes.update(receiver for node in given.shaping_nodes for receiver in node.receivers)
     recorded: tuple[RecordedProcess, ...] = ()
