@@ -41,15 +41,11 @@ from chainshaper.linux.processes import run_users
 from chainshaper.linux.runs import PLAN_FILE, Journal
 from chainshaper.linux.scheduling import available_cores, check_cores
 from chainshaper.linux.threads import list_threads
-from chainshaper.planning.application_plan import (
-    ApplicationPlan,
-    open_until_done,
-    plan_values,
-    whole,
-)
+from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
 from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.overruns import publication_warnings
 from chainshaper.planning.plan import Plan, Server, Thread, shaping_nodes
+from chainshaper.planning.plan_file import plan_values
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 

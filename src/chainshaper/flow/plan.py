@@ -23,8 +23,9 @@ from chainshaper.analysis.disturbance import overlapping, stalled_within
 from chainshaper.analysis.graph import goes_on_elsewhere
 from chainshaper.analysis.latency import Executor
 from chainshaper.planning import CallbackTimes, Modes, Plan, PlanRequest, Profile, plan_chain
-from chainshaper.planning.application_plan import ApplicationPlan, plan_values, whole
+from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.margins import read_latencies
+from chainshaper.planning.plan_file import plan_values
 from chainshaper.planning.request import DEFAULT_CORE
 from chainshaper.sources import open_source
 from chainshaper.splicing.application import splice_application

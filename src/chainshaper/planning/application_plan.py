@@ -11,10 +11,9 @@ its slots played out over the hyper-period. A plan for one chain is the same wit
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import combinations, product
-from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Field, model_validator
@@ -29,10 +28,9 @@ from chainshaper.planning.plan import (
     Thread,
     shaping_nodes,
     slot_text,
-    write_plans,
 )
 from chainshaper.values.durations import format_duration
-from chainshaper.values.yaml_file import Part, read_model, wrong_value, wrong_values_refused
+from chainshaper.values.yaml_file import Part, wrong_value, wrong_values_refused
 
 MOST_SLOTS = 10_000
 """So many slots of all servers fit into a hyper-period at the most."""
@@ -377,38 +375,3 @@ def _collisions(one: Plan, two: Plan) -> Iterator[str]:
                     f" {slot_text((start, end))} of server {server.name!r} of {chain_name(one)} in"
                     f" some cycles, on core {server.core} at the same priority {server.priority}"
                 )
-
-
-# The file ---------------------------------------------------------------------------------------
-
-
-def load_application_plan(path: str | Path) -> ApplicationPlan:
-    """Read a plan for an application, or for one chain (format 1), however it is laid out.
-
-    Raises InputError: no such file, not YAML, or wrong values; each is named with its line, key,
-    reason and remedy.
-    """
-    made_by = "written by `chainshaper plan`"
-    return whole(read_model(path, Plan, made_by=made_by, otherwise=("chains", ApplicationPlan)))
-
-
-def plan_in(values: Mapping[str, Any]) -> ApplicationPlan:
-    """A plan from what a recording or a run has of it, of either format."""
-    if "chains" in values:
-        return ApplicationPlan.model_validate(values, strict=False)
-    return whole(Plan.model_validate(values, strict=False))
-
-
-def plan_values(plan: ApplicationPlan) -> dict[str, Any]:
-    """What a recording or a run has of a plan: plain data, as :func:`plan_in` reads it."""
-    return (plan.chains[0] if len(plan.chains) == 1 else plan).model_dump(mode="json")
-
-
-def save_application_plan(
-    plan: ApplicationPlan, path: str | Path, *, overwrite: bool = False
-) -> None:
-    """Write a plan, whole or not at all; one chain is written as its own plan.
-
-    Raises: as :func:`~chainshaper.planning.plan.save_plan`.
-    """
-    write_plans(plan.chains, path, overwrite=overwrite)

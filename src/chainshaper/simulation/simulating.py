@@ -12,13 +12,9 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper.planning.application_plan import (
-    ApplicationPlan,
-    open_until_done,
-    plan_values,
-    whole,
-)
+from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
 from chainshaper.planning.plan import Plan, publisher_servers
+from chainshaper.planning.plan_file import plan_values
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.arrays import Machine, System, build_machine, build_system
 from chainshaper.simulation.layout import Int64s, X

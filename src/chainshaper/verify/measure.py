@@ -16,7 +16,8 @@ import polars as pl
 from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
 from chainshaper.analysis.latency import summary
 from chainshaper.planning import ApplicationPlan, Plan
-from chainshaper.planning.application_plan import plan_in, plan_of_chain, whole
+from chainshaper.planning.application_plan import plan_of_chain, whole
+from chainshaper.planning.plan_file import plan_in
 from chainshaper.sources import open_source
 from chainshaper.values import events
 from chainshaper.values.durations import format_duration
