@@ -394,13 +394,16 @@ class _Run:
             yield from repeat(0)
         first = min(range(len(drifts)), key=lambda place: waits[place])
         stamped = all(chain.anchor == "stamp" for chain in self.plan.chains)
-        track = TimerTrack(waits[first], time.monotonic_ns(), looks=stamped)
+        track = TimerTrack(
+            waits[first], time.monotonic_ns(), self.plan.chains[first].cycle_ns, looks=stamped
+        )
         seen = 0
         while True:
             before_ns = track.opens_ns
             if drifts[first].looks > seen:
                 seen = drifts[first].looks
                 track.saw(drifts[first].latest_ns or 0, time.monotonic_ns())
+                drifts[first].look_soon = track.is_unsure
             if track.opens_ns != before_ns:
                 moved_ns = (anchor_ns + track.opens_ns) % self.plan.cycle_ns
                 servers.arm(moved_ns)
