@@ -88,9 +88,8 @@ def write_report(
     are numbers of cycles that the timeline has to show, should there be so many that it cannot show
     all.
 
-    Raises:
-        InputError: the path exists already or is no HTML file, or there is no such cycle.
-        OperationError: it cannot be written; nothing is left behind.
+    Raises InputError: the path exists already or is no HTML file, or there is no such cycle.
+    OperationError: it cannot be written; nothing is left behind.
     """
     path = new_file(path, ENDINGS)
     return write_whole(path, [report_page(measurements, cycles).encode("utf-8")])

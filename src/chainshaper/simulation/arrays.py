@@ -108,9 +108,8 @@ def build_system(
 ) -> System:
     """Everything that runs in an application; ``follow_chain`` if its chain has to be known.
 
-    Raises:
-        InputError: the application's chain is not one path through it, or a server of the plan
-            has a thread that the application does not have.
+    Raises InputError: the application's chain is not one path through it, or a server of the plan
+    has a thread that the application does not have.
     """
     processes = tuple(
         Process(node_name(key), key, FIRST_PID + 10 * number)
@@ -176,10 +175,7 @@ def _threads(
     application: Application, processes: Sequence[Process], publishers: Sequence[Publisher]
 ) -> Iterator[ThreadInfo]:
     for number, process in enumerate(processes):
-        own, dds = (
-            application.scheduling_of(process.key),
-            application.dds_scheduling_of(process.key),
-        )
+        own = application.scheduling_of(process.key)
         named = process.node.strip("/").replace("/", ".")[:15]
         wanted = [("executor", named, own.core, own.priority)]
         if any(p.asynchronous for p in publishers if p.process == number):

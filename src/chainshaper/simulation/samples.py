@@ -30,8 +30,8 @@ def with_recorded_times(
 
     Gates keep what they have: they compute nothing.
 
-    Raises:
-        InputError: a callback of the application is not in the recording, or its CPU time is not.
+    Raises InputError: a callback of the application is not in the recording, or its CPU time is
+    not.
     """
     recording = recording if isinstance(recording, Recording) else open_source(recording)
     times = _computing_times(data_flow(recording.events, recording.info.clock_offset_ns))

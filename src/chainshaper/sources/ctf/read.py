@@ -180,11 +180,8 @@ class _File:
         damaged = self.packets[self.packets[:, tb.P_ERROR] < 0]
         for packet in damaged[:_MOST_WARNINGS]:
             place = int(packet[tb.P_BYTE] + (packet[tb.P_ERROR_AT] >> 3))
-            reason, remedy = (
-                _FAILURES[int(packet[tb.P_ERROR])],
-                "the rest of this packet is not read",
-            )
-            yield str(CtfError(self.path, place, reason, remedy))
+            reason = _FAILURES[int(packet[tb.P_ERROR])]
+            yield str(CtfError(self.path, place, reason, "the rest of this packet is not read"))
         if len(damaged) > _MOST_WARNINGS:
             yield f"{self.path}: {len(damaged) - _MOST_WARNINGS} more packets are like that"
 
