@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 import chainshaper as cs
+from chainshaper.cli import output as out
 from chainshaper.cli.options import (
     APPLICATION,
     CYCLES,
@@ -27,19 +28,6 @@ from chainshaper.cli.options import (
     option,
     plan_in_force,
     takes_wishes,
-)
-from chainshaper.cli.output import (
-    late_progress,
-    lost_events,
-    notes,
-    present,
-    print_json,
-    progress,
-    show,
-    show_line,
-    stage_lines,
-    stop_on_signals,
-    warn,
 )
 from chainshaper.cli.plans import throttled_inputs
 from chainshaper.cli.traces import comparison_tables
@@ -91,7 +79,7 @@ def demo(
     from chainshaper.reporting.overviews import callback_table, plan_table
 
     folder = output or Path(f"chainshaper-demo-{datetime.now():%Y%m%d-%H%M%S}")
-    with progress("demo") as report:
+    with out.progress("demo") as report:
         result = run_demo(
             folder,
             application=application,
@@ -99,14 +87,14 @@ def demo(
             request=request,
             realtime=realtime,
             command=sys.argv,
-            planned=warn,
+            planned=out.warn,
             progress=report,
         )
     tables = [callback_table(result.callbacks), plan_table(result.plan)]
     tables.append(comparison_tables(result.comparison)[0])
-    if present(json, comparison_json(result.comparison) | {"folder": str(folder)}, *tables):
-        notes(result.notes)
-        show_line(folder.absolute())
+    if out.present(json, comparison_json(result.comparison) | {"folder": str(folder)}, *tables):
+        out.notes(result.notes)
+        out.show_line(folder.absolute())
 
 
 def run(
@@ -121,12 +109,12 @@ def run(
     permitted). The recording is a folder of Parquet tables.
     """
     described = cs.load_application(application)
-    with progress(f"running {described.name}") as report:
+    with out.progress(f"running {described.name}") as report:
         recording = cs.run_application(
             described, output, cycles=cycles, realtime=realtime, command=sys.argv, progress=report
         )
-    notes(recording.info.notes)
-    show_line(recording.path)
+    out.notes(recording.info.notes)
+    out.show_line(recording.path)
 
 
 def simulate(
@@ -150,7 +138,7 @@ def simulate(
         from chainshaper.simulation.samples import with_recorded_times
 
         described = with_recorded_times(described, execution_times, block=block)
-    with late_progress(f"simulating {described.name}") as report:
+    with out.late_progress(f"simulating {described.name}") as report:
         recording = cs.simulate(
             described,
             output,
@@ -161,7 +149,7 @@ def simulate(
             command=sys.argv,
             progress=report,
         )
-    show_line(recording.path)
+    out.show_line(recording.path)
 
 
 def record(
@@ -211,20 +199,20 @@ def _record_and_show(
     """Record, and say what came of it; ``how`` goes to :func:`chainshaper.record_command`."""
     from chainshaper.linux.own_processes import end_in_words
 
-    with stop_on_signals() as stop:
+    with out.stop_on_signals() as stop:
         recorded = cs.record_command(
             output,
             command,
             command_stdout=STDERR if json else None,  # standard output is ours
             buffer=buffer and buffer * MIB,
             stop=stop,
-            progress=stage_lines("record"),
+            progress=out.stage_lines("record"),
             **how,
         )
     recording = recorded.recording
     count = int(cs.event_counts(recording)["count"].sum())
     if json:
-        print_json(
+        out.print_json(
             {
                 "recording": str(recording.path),
                 "events": count,
@@ -234,8 +222,8 @@ def _record_and_show(
             }
         )
     else:
-        show_line(recording.path)
-    notes((*recording.info.notes, f"{count} events; {lost_events(recording)}"))
+        out.show_line(recording.path)
+    out.notes((*recording.info.notes, f"{count} events; {out.lost_events(recording)}"))
     if recorded.exit_code:
         raise OperationError(
             f"the command {end_in_words(recorded.exit_code)}; what was recorded until then is in "
@@ -310,7 +298,7 @@ def profile(
         seen, found = profiled_cores(earlier, chains, request)
         core_of |= found
         if len(undelayed(seen, found)) > 1:
-            notes(["chains that share a core delay each other here: profile them one by one"])
+            out.notes(["chains that share a core delay each other here: profile them one by one"])
     _record_and_show(
         *(output, command, json, buffer),
         source=source,
@@ -397,8 +385,8 @@ def _shape_described(
     from chainshaper.verify.overruns import dropped_in, dropped_text, overruns_in, overruns_text
 
     described, planned = cs.load_application(application), cs.load_application_plan(plan)
-    warn(planned)
-    with progress(f"shaping {described.name}") as report:
+    out.warn(planned)
+    with out.progress(f"shaping {described.name}") as report:
         recording = cs.shape_application(
             described,
             planned,
@@ -411,25 +399,25 @@ def _shape_described(
     for chain in planned.chains:
         about = f"{chain.chain.output}: " if len(planned.chains) > 1 else ""
         if overruns := overruns_in(recording, chain):
-            notes([about + overruns_text(overruns)])
+            out.notes([about + overruns_text(overruns)])
     if dropped := dropped_in(recording):
-        notes([dropped_text(dropped)])
-    notes(recording.info.notes)
-    show_line(recording.path)
+        out.notes([dropped_text(dropped)])
+    out.notes(recording.info.notes)
+    out.show_line(recording.path)
 
 
 def _shape_launched(command: list[str], folder: Path, json: bool, **how: Any) -> None:
     """The whole flow; ``how`` goes to :func:`chainshaper.shape_launch`."""
     from chainshaper.reporting.latency import comparison_json
 
-    with stop_on_signals() as stop:
+    with out.stop_on_signals() as stop:
         shaped = cs.shape_launch(
             command,
             folder,
             choose=_ask if sys.stdin.isatty() and not json else None,
             stop=stop,
-            planned=warn,
-            progress=stage_lines("shape"),
+            planned=out.warn,
+            progress=out.stage_lines("shape"),
             **how,
         )
     values = comparison_json(shaped.comparison) | {
@@ -438,16 +426,16 @@ def _shape_launched(command: list[str], folder: Path, json: bool, **how: Any) ->
         "cores": dict(shaped.cores),
     }
     tables = [table for one in shaped.comparisons for table in comparison_tables(one)]
-    if present(json, values, *tables):
-        notes(shaped.notes)
-        show_line(shaped.folder)
+    if out.present(json, values, *tables):
+        out.notes(shaped.notes)
+        out.show_line(shaped.folder)
 
 
 def _ask(graph: "ApplicationGraph", found: "ChainEnumeration") -> str:
     from chainshaper.reporting.overviews import chain_table
     from chainshaper.values.safe_text import shown
 
-    show(chain_table(graph, found))
+    out.show(chain_table(graph, found))
     default = (found.heaviest or found.chains[0]).spec
     question = f"Which chain, FIRST..LAST? [{shown(default)}]"
     return str(typer.prompt(question, default=default, show_default=False, err=True))

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import chainshaper as cs
+from chainshaper.cli import output as out
 from chainshaper.cli.options import (
     CHAIN,
     JSON,
@@ -13,16 +14,6 @@ from chainshaper.cli.options import (
     argument,
     option,
     plan_in_force,
-)
-from chainshaper.cli.output import (
-    late_progress,
-    lost_events,
-    notes,
-    opened,
-    present,
-    print_json,
-    show,
-    show_line,
 )
 from chainshaper.values.errors import InputError
 
@@ -34,11 +25,11 @@ def info(trace: list[Path] = TRACE, json: bool = JSON) -> None:
     """Show what is in a trace: events, losses, clock, distribution, RMW, hosts, processes."""
     from chainshaper.reporting.overviews import contents_json, contents_table
 
-    with opened("info", trace, overview=True) as (recording, _):
+    with out.opened("info", trace, overview=True) as (recording, _):
         contents = contents_json(recording)
-    if present(json, contents, *contents_table(recording)):
-        show_line(lost_events(recording))
-        notes(contents["notes"])
+    if out.present(json, contents, *contents_table(recording)):
+        out.show_line(out.lost_events(recording))
+        out.notes(contents["notes"])
 
 
 def graph(
@@ -60,35 +51,35 @@ def graph(
 
     if output is not None:
         new_file(output, graph_drawing.ENDINGS)
-    with opened("graph", trace) as (recording, report):
+    with out.opened("graph", trace) as (recording, report):
         application = cs.describe_application(recording)
         if output is not None:
             report(0.9, "drawing")
             cs.write_picture(application, output, everything=everything)
     if json:
-        print_json(graph_drawing.application_json(application))
+        out.print_json(graph_drawing.application_json(application))
     elif output is None:
         chosen = application if everything else graph_drawing.without_internals(application)
-        show(graph_drawing.application_table(chosen))
-        show_line(lost_events(recording))
-        notes(application.notes)
+        out.show(graph_drawing.application_table(chosen))
+        out.show_line(out.lost_events(recording))
+        out.notes(application.notes)
     else:
-        show_line(output.absolute())
-        notes((*application.notes, lost_events(recording)))
+        out.show_line(output.absolute())
+        out.notes((*application.notes, out.lost_events(recording)))
 
 
 def callbacks(trace: list[Path] = TRACE, json: bool = JSON) -> None:
     """Show every callback of a recording or trace: kind, count, execution and response time."""
     from chainshaper.reporting.overviews import callback_rows, callback_table
 
-    with opened("callbacks", trace) as (recording, _):
+    with out.opened("callbacks", trace) as (recording, _):
         flow = cs.data_flow(recording.events, recording.info.clock_offset_ns)
         statistics = cs.callback_statistics(flow)
-    if present(json, callback_rows(statistics), callback_table(statistics)):
-        show_line(lost_events(recording))
-        notes((*recording.info.notes, *flow.notes))
+    if out.present(json, callback_rows(statistics), callback_table(statistics)):
+        out.show_line(out.lost_events(recording))
+        out.notes((*recording.info.notes, *flow.notes))
     elif any(recording.info.lost.values()):  # the array has no place for it
-        notes([lost_events(recording)])
+        out.notes([out.lost_events(recording)])
 
 
 def chains(
@@ -109,16 +100,16 @@ def chains(
     from chainshaper.analysis import graph_of
     from chainshaper.reporting.overviews import chain_table, chains_json, count_text
 
-    with opened("chains", trace) as (recording, report):
+    with out.opened("chains", trace) as (recording, report):
         flow = cs.data_flow(recording.events, recording.info.clock_offset_ns)
         report(0.9, "searching chains")
         application = graph_of(flow)
         found = cs.list_chains(flow, start, end, limit)
     remarks = [*recording.info.notes, *flow.notes]
     values = chains_json(application, found) | {"lost": recording.info.lost, "notes": remarks}
-    if present(json, values, chain_table(application, found)):
-        show_line(f"{count_text(found)}; {lost_events(recording)}")
-        notes(remarks)
+    if out.present(json, values, chain_table(application, found)):
+        out.show_line(f"{count_text(found)}; {out.lost_events(recording)}")
+        out.notes(remarks)
 
 
 def latency(
@@ -142,15 +133,15 @@ def latency(
         raise InputError("--instances goes with --json: add it")
     if chains is not None:
         chain = named_chain(chains, chain)
-    with opened("latency", trace) as (recording, _):
+    with out.opened("latency", trace) as (recording, _):
         measurement = cs.measure_latency(recording, chain)
     analysis = measurement.analysis
     values = of_chain.latency_json(measurement, instances=instances)
     values |= of_chain.breakdown_json(analysis)
     tables = of_chain.latency_table(measurement), of_chain.breakdown_table(analysis)
-    if present(json, values, *tables):
-        show_line(f"{of_chain.doubts_text(measurement)}; {lost_events(recording)}")
-        notes(analysis.notes)
+    if out.present(json, values, *tables):
+        out.show_line(f"{of_chain.doubts_text(measurement)}; {out.lost_events(recording)}")
+        out.notes(analysis.notes)
 
 
 def convert(trace: list[Path] = TRACE, output: Path = RECORDING_OUTPUT) -> None:
@@ -158,10 +149,10 @@ def convert(trace: list[Path] = TRACE, output: Path = RECORDING_OUTPUT) -> None:
     from chainshaper.values.recording import refuse_existing
 
     refuse_existing(output)
-    with opened("convert", trace) as (recording, _):
+    with out.opened("convert", trace) as (recording, _):
         written = cs.convert_recording(recording, output)
-    show_line(written.path.absolute())
-    notes((*written.info.notes, lost_events(written)))
+    out.show_line(written.path.absolute())
+    out.notes((*written.info.notes, out.lost_events(written)))
 
 
 def comparison_tables(*comparisons: "cs.Comparison") -> "list[ResultTable]":
@@ -201,7 +192,7 @@ def compare(
         if len(comparisons) > 1:
             raise InputError("--figures draws one chain: name it with --chain")
         draw_comparison(comparisons[0].measurements, figures)
-    present(json, comparisons_json(comparisons), *comparison_tables(*comparisons))
+    out.present(json, comparisons_json(comparisons), *comparison_tables(*comparisons))
 
 
 def report(
@@ -229,14 +220,14 @@ def report(
 
     new_file(output, ENDINGS)
     in_force = plan_in_force(plan)
-    with late_progress("report") as progress:
+    with out.late_progress("report") as progress:
         comparisons = cs.compare_chains(recordings, chain, in_force, least=1, progress=progress)
         progress(0.9, "drawing")
         written = cs.write_report(comparisons, output, cycles or ())
     if json:
-        print_json({"report": str(written.absolute()), **comparisons_json(comparisons)})
+        out.print_json({"report": str(written.absolute()), **comparisons_json(comparisons)})
         return
-    show_line(written.absolute())
+    out.show_line(written.absolute())
 
 
 def export(
@@ -259,11 +250,11 @@ def export(
 
     new_file(output, ENDINGS)
     in_force = plan_in_force(plan)
-    with opened("export", trace) as (recording, report):
+    with out.opened("export", trace) as (recording, report):
         report(0.5, "analysing")
         named = chain or recording.info.chain
         measured = None if named is None else cs.measure_latency(recording, named, in_force)
         report(0.7, "writing")
         written = cs.export_perfetto(measured or recording, output)
-    show_line(written.absolute())
-    notes((*recording.info.notes, lost_events(recording)))
+    out.show_line(written.absolute())
+    out.notes((*recording.info.notes, out.lost_events(recording)))
