@@ -190,6 +190,7 @@ def test_a_python_node_in_the_chain() -> None:
     found = traversals(story, "/t1../t2")
     assert spans(found) == [(10, 30), (110, 130)]
     assert found.hops.filter(hop=1)["start"].to_list() == [19, 119]
+    assert "without callback events" in data_flow(story.tables()).notes[0]
 
 
 def test_a_driver_that_publishes_from_a_thread_of_its_own() -> None:
