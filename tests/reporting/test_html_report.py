@@ -294,7 +294,10 @@ def test_a_plan_can_be_named_for_a_recording_that_does_not_know_it(tmp_path: Pat
     ("name", "write"),
     [
         *(("report.html", write_report), ("latency.png", draw_latency)),
-        *(("cdf.png", draw_distribution), ("t.pftrace", lambda one, at: export_perfetto(*one, at))),
+        *(
+            ("cdf.png", draw_distribution),
+            ("t.pftrace", lambda one, at: export_perfetto(one[0], at)),
+        ),
     ],
 )
 def test_a_file_on_a_full_disk_leaves_nothing(

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import chainshaper as cs
+from chainshaper.cli import options as opt
 from chainshaper.cli import output as out
-from chainshaper.cli.options import JSON, USERS, argument, option
 from chainshaper.values.errors import InputError, OperationError
 
 if TYPE_CHECKING:
@@ -25,18 +25,18 @@ def recording_of(plan: "cs.ApplicationPlan") -> Path | None:
 
 
 def threads(
-    where: str | None = argument(
+    where: str | None = opt.argument(
         "[PID|PLAN]",
         "A process, which stands for its descendants too, or a plan.yaml for the nodes "
         "of its servers. Default: all that looks like ROS 2 or DDS.",
     ),
-    recording: Path | None = option(
+    recording: Path | None = opt.option(
         "--recording REC",
         "A recording or trace of the processes while they ran: it tells nodes and "
         "executors for sure. Default: the plan's own, where it exists.",
     ),
-    user: list[str] | None = USERS,
-    json: bool = JSON,
+    user: list[str] | None = opt.USERS,
+    json: bool = opt.JSON,
 ) -> None:
     """Show the threads of running nodes: executors, DDS threads, publishers; class and cores."""
     from chainshaper.reporting.overviews import threads_json, threads_table
@@ -54,33 +54,33 @@ def threads(
 
 
 def apply(
-    plan: Path = argument("plan.yaml", "The plan.", ...),
-    command: list[str] | None = argument(
+    plan: Path = opt.argument("plan.yaml", "The plan.", ...),
+    command: list[str] | None = opt.argument(
         "[-- COMMAND…]",
         "Start this, such as `ros2 launch …`, and end when it ends. Default: attach to what runs.",
     ),
-    backend: str = option(
+    backend: str = opt.option(
         "--backend NAME",
         "auto (the strongest that works here), scx, litmus, freezer or fifo.",
         "auto",
     ),
-    phase: int | None = option(
+    phase: int | None = opt.option(
         "--phase DURATION",
         "Where in a cycle the chain's timer expires, on CLOCK_MONOTONIC. Default: measured.",
     ),
-    recording: Path | None = option(
+    recording: Path | None = opt.option(
         "--recording REC",
         "Of these very processes, or of an earlier run: it tells which threads execute what.",
     ),
-    wait: int | None = option(
+    wait: int | None = opt.option(
         "--wait DURATION",
         "How long the plan's nodes have to appear. Default: 30s with a COMMAND, else no time.",
     ),
-    user: list[str] | None = USERS,
-    dry_run: bool = option(
+    user: list[str] | None = opt.USERS,
+    dry_run: bool = opt.option(
         "--dry-run", "Show what would be done to which thread, and change nothing.", False
     ),
-    json: bool = JSON,
+    json: bool = opt.JSON,
 ) -> None:
     """Keep the threads of an application inside a plan's slots, until Ctrl-C.
 
@@ -168,10 +168,10 @@ def _watching() -> "Iterator[tuple[Callable[[RunState], None], out.Progress]]":
 
 
 def status(
-    outputs: bool = option(
+    outputs: bool = opt.option(
         "--outputs", "Only the outputs that are shaped, bypassed or silent.", False
     ),
-    json: bool = JSON,
+    json: bool = opt.JSON,
 ) -> None:
     """Show the plans in force: back end, servers, counters, and what crashed runs have left.
 
@@ -209,7 +209,7 @@ def status(
 
 
 def release(
-    run: str | None = argument(
+    run: str | None = opt.argument(
         "[RUN]", "The run, as `chainshaper status` names it. Default: all of them."
     ),
 ) -> None:
@@ -247,10 +247,10 @@ def release(
 
 
 def doctor(
-    watch: int = option(
+    watch: int = opt.option(
         "--watch DURATION", "How long to watch for stalls of the machine.", 5_000_000_000
     ),
-    json: bool = JSON,
+    json: bool = opt.JSON,
 ) -> None:
     """Examine this machine: scheduling, privileges, tracing, DDS, and its own stalls."""
     from chainshaper.reporting.overviews import machine_json, machine_tables

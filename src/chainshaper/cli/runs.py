@@ -8,27 +8,8 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 import chainshaper as cs
+from chainshaper.cli import options as opt
 from chainshaper.cli import output as out
-from chainshaper.cli.options import (
-    APPLICATION,
-    CYCLES,
-    DESCRIPTIONS,
-    JSON,
-    NODE,
-    PLAN_WISHES,
-    REALTIME,
-    RECORDING_OUTPUT,
-    SEED,
-    SINK,
-    SOURCE,
-    USERS,
-    NodeKind,
-    Source,
-    argument,
-    option,
-    plan_in_force,
-    takes_wishes,
-)
 from chainshaper.cli.plans import throttled_inputs
 from chainshaper.cli.traces import comparison_tables
 from chainshaper.values.errors import InputError, OperationError
@@ -42,32 +23,32 @@ STDERR = 2
 
 SHAPING_DURATION_NS = 60_000_000_000
 
-COMMAND: list[str] | None = argument(
+COMMAND: list[str] | None = opt.argument(
     "[-- COMMAND…]", "Starts the application, such as `ros2 launch …`; ended with the recording."
 )
-DURATION: int | None = option(
+DURATION: int | None = opt.option(
     "--duration DURATION", "How long to record. Default: until the application ends, or Ctrl-C."
 )
-BUFFER: int | None = option(
+BUFFER: int | None = opt.option(
     "--buffer MIB",
     "LTTng's buffer of each core, in MiB, for when events were lost. Default: 4.",
     min=1,
 )
 
 
-@takes_wishes("ideal_machine")
+@opt.takes_wishes("ideal_machine")
 def demo(
-    output: Path | None = option(
+    output: Path | None = opt.option(
         "--output -o DIR", "Folder for everything. Default: chainshaper-demo-DATE-TIME here."
     ),
-    application: Path | None = option(
+    application: Path | None = opt.option(
         "--application APP.yaml", "Another application than the paper's synthetic chain."
     ),
-    cycles: int = CYCLES,
-    realtime: bool | None = REALTIME,
+    cycles: int = opt.CYCLES,
+    realtime: bool | None = opt.REALTIME,
     *,
     request: "cs.PlanRequest",
-    json: bool = JSON,
+    json: bool = opt.JSON,
 ) -> None:
     """Measure a live chain, plan, splice the shaping node, measure again, show the gain.
 
@@ -98,10 +79,10 @@ def demo(
 
 
 def run(
-    application: Path = APPLICATION,
-    output: Path = RECORDING_OUTPUT,
-    cycles: int = CYCLES,
-    realtime: bool | None = REALTIME,
+    application: Path = opt.APPLICATION,
+    output: Path = opt.RECORDING_OUTPUT,
+    cycles: int = opt.CYCLES,
+    realtime: bool | None = opt.REALTIME,
 ) -> None:
     """Run an application live over DDS and record its events.
 
@@ -118,16 +99,16 @@ def run(
 
 
 def simulate(
-    application: Path = APPLICATION,
-    output: Path = RECORDING_OUTPUT,
-    plan: Path | None = argument("plan.yaml", "The plan in force."),
-    cycles: int = CYCLES,
-    seed: int | None = SEED,
-    switches: bool = option("--switches", "Record what ran on which core, too.", False),
-    execution_times: Path | None = option(
+    application: Path = opt.APPLICATION,
+    output: Path = opt.RECORDING_OUTPUT,
+    plan: Path | None = opt.argument("plan.yaml", "The plan in force."),
+    cycles: int = opt.CYCLES,
+    seed: int | None = opt.SEED,
+    switches: bool = opt.option("--switches", "Record what ran on which core, too.", False),
+    execution_times: Path | None = opt.option(
         "--execution-times REC", "Draw execution times from those recorded there."
     ),
-    block: int = option("--block", "So many consecutive ones at a time.", 1, min=1, max=1024),
+    block: int = opt.option("--block", "So many consecutive ones at a time.", 1, min=1, max=1024),
 ) -> None:
     """Simulate an application, with a plan in force or without, and record its events.
 
@@ -142,7 +123,7 @@ def simulate(
         recording = cs.simulate(
             described,
             output,
-            plan_in_force(plan),
+            opt.plan_in_force(plan),
             cycles=cycles,
             seed=seed,
             switches=switches,
@@ -153,23 +134,23 @@ def simulate(
 
 
 def record(
-    output: Path = RECORDING_OUTPUT,
+    output: Path = opt.RECORDING_OUTPUT,
     command: list[str] | None = COMMAND,
-    source: Source = SOURCE,
+    source: opt.Source = opt.SOURCE,
     duration: int | None = DURATION,
-    pid: list[int] | None = option(
+    pid: list[int] | None = opt.option(
         "--pid",
         "Attach to this process and what it has started (ebpf; may be repeated). "
         "Default, without a COMMAND: everything of the users that looks like ROS 2.",
     ),
-    user: list[str] | None = USERS,
+    user: list[str] | None = opt.USERS,
     buffer: int | None = BUFFER,
-    watch_stalls: bool = option(
+    watch_stalls: bool = opt.option(
         "--watch-stalls",
         "Have a sleeper on every core notice when the machine itself stands still.",
         False,
     ),
-    json: bool = JSON,
+    json: bool = opt.JSON,
 ) -> None:
     """Record a ROS 2 application: its events, nodes, threads and QoS.
 
@@ -231,36 +212,36 @@ def _record_and_show(
         )
 
 
-@takes_wishes("cores")
+@opt.takes_wishes("cores")
 def profile(
-    output: Path = RECORDING_OUTPUT,
+    output: Path = opt.RECORDING_OUTPUT,
     command: list[str] | None = COMMAND,
     *,
-    chain: list[str] | None = option(
+    chain: list[str] | None = opt.option(
         "--chain FIRST..LAST",
         "The chain whose nodes, and those that it waits for, get the priority (may be repeated);"
         " --like tells which those are.",
     ),
-    like: Path | None = option(
+    like: Path | None = opt.option(
         "--like REC",
         "An earlier recording of the application: it knows the chain's nodes, components "
         "of containers, and executors with several threads.",
     ),
-    node: list[str] | None = option(
+    node: list[str] | None = opt.option(
         "--node NAME",
         "A node that gets the priority (may be repeated). Default: the chain's, or all.",
     ),
-    core: int | None = option(
+    core: int | None = opt.option(
         "--core",
         "Where executors run. Default: the last core; with --chain and --like, others as well where"
         " branches run at the same time. DDS threads run on the others.",
         min=0,
     ),
     request: "cs.PlanRequest",
-    source: Source = SOURCE,
+    source: opt.Source = opt.SOURCE,
     duration: int | None = DURATION,
     buffer: int | None = BUFFER,
-    json: bool = JSON,
+    json: bool = opt.JSON,
 ) -> None:
     """Record with the chain's threads under SCHED_FIFO, DDS threads on another core.
 
@@ -309,43 +290,43 @@ def profile(
     )
 
 
-@takes_wishes(*PLAN_WISHES)
+@opt.takes_wishes(*opt.PLAN_WISHES)
 def shape(
-    words: list[str] = argument(
+    words: list[str] = opt.argument(
         "APP.yaml plan.yaml | -- ros2 launch ...",
         "A described application and the plan in force; or what launches a real one, "
         "which is then measured and planned first.",
         ...,
     ),
-    output: Path = option(
+    output: Path = opt.option(
         "--output -o REC",
         "Folder for the recording; of a launched application, for everything.",
         ...,
     ),
-    cycles: int = CYCLES,
-    realtime: bool | None = REALTIME,
-    chain: list[str] | None = option(
+    cycles: int = opt.CYCLES,
+    realtime: bool | None = opt.REALTIME,
+    chain: list[str] | None = opt.option(
         "--chain FIRST..LAST",
         "The chain, by topics or nodes: /t1../t5. Several are shaped together. Default: you are"
         " asked.",
     ),
-    sink: list[str] | None = SINK,
-    throttle: list[str] | None = option(
+    sink: list[str] | None = opt.SINK,
+    throttle: list[str] | None = opt.option(
         "--throttle NODE:TOPIC=PERIOD",
         "A throttler before an input of NODE that is not quite periodic, from the first recording"
         " on (may be repeated).",
     ),
-    period: int | None = option("--period DURATION", "Period of a chain that no timer starts."),
-    duration: int | None = option(
+    period: int | None = opt.option("--period DURATION", "Period of a chain that no timer starts."),
+    duration: int | None = opt.option(
         "--duration DURATION", "How long to measure, before and after. Default: 60s."
     ),
-    source: Source = SOURCE,
-    node: NodeKind = NODE,
-    backend: str = option("--backend NAME", "As for `chainshaper apply`.", "auto"),
+    source: opt.Source = opt.SOURCE,
+    node: opt.NodeKind = opt.NODE,
+    backend: str = opt.option("--backend NAME", "As for `chainshaper apply`.", "auto"),
     *,
     request: "cs.PlanRequest",
-    user: list[str] | None = USERS,
-    json: bool = JSON,
+    user: list[str] | None = opt.USERS,
+    json: bool = opt.JSON,
 ) -> None:
     """Run an application with its output shaped as planned, and record it.
 
@@ -354,12 +335,12 @@ def shape(
     apply, record again, compare. Every file in between stays. All options but --cycles and
     --realtime are for this, and mean what they mean for `chainshaper plan` and `apply`.
     """
-    if len(words) == 2 and words[0].endswith(DESCRIPTIONS):
+    if len(words) == 2 and words[0].endswith(opt.DESCRIPTIONS):
         if chain or sink or throttle or request != cs.PlanRequest():
             raise InputError("a described application is shaped as plan.yaml says: plan it so")
         _shape_described(Path(words[0]), Path(words[1]), output, cycles, realtime)
         return
-    if Path(words[0]).suffix in DESCRIPTIONS:
+    if Path(words[0]).suffix in opt.DESCRIPTIONS:
         raise InputError(
             "a described application is shaped with its plan, and nothing else: `chainshaper shape "
             "APP.yaml plan.yaml -o REC`"

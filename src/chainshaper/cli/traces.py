@@ -4,24 +4,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import chainshaper as cs
+from chainshaper.cli import options as opt
 from chainshaper.cli import output as out
-from chainshaper.cli.options import (
-    CHAIN,
-    JSON,
-    PLAN_IN_FORCE,
-    RECORDING_OUTPUT,
-    TRACE,
-    argument,
-    option,
-    plan_in_force,
-)
 from chainshaper.values.errors import InputError
 
 if TYPE_CHECKING:
     from chainshaper.reporting.tables import ResultTable
 
 
-def info(trace: list[Path] = TRACE, json: bool = JSON) -> None:
+def info(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
     """Show what is in a trace: events, losses, clock, distribution, RMW, hosts, processes."""
     from chainshaper.reporting.overviews import contents_json, contents_table
 
@@ -33,17 +24,17 @@ def info(trace: list[Path] = TRACE, json: bool = JSON) -> None:
 
 
 def graph(
-    trace: list[Path] = TRACE,
-    output: Path | None = option(
+    trace: list[Path] = opt.TRACE,
+    output: Path | None = opt.option(
         "--output -o FILE", "File to write: .svg, .dot or .json; must not exist."
     ),
-    everything: bool = option(
+    everything: bool = opt.option(
         "--all",
         "Also what every node has for itself: parameter services, /rosout, "
         "/parameter_events. In JSON they are always there, marked as internal.",
         False,
     ),
-    json: bool = JSON,
+    json: bool = opt.JSON,
 ) -> None:
     """Show the application: nodes, callbacks with kind, period and function, topics, services."""
     from chainshaper.reporting import graph_drawing
@@ -68,7 +59,7 @@ def graph(
         out.notes((*application.notes, out.lost_events(recording)))
 
 
-def callbacks(trace: list[Path] = TRACE, json: bool = JSON) -> None:
+def callbacks(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
     """Show every callback of a recording or trace: kind, count, execution and response time."""
     from chainshaper.reporting.overviews import callback_rows, callback_table
 
@@ -83,15 +74,15 @@ def callbacks(trace: list[Path] = TRACE, json: bool = JSON) -> None:
 
 
 def chains(
-    trace: list[Path] = TRACE,
-    start: str | None = option(
+    trace: list[Path] = opt.TRACE,
+    start: str | None = opt.option(
         "--from X", "Topic or node where they begin. Default: callbacks that nothing triggers."
     ),
-    end: str | None = option(
+    end: str | None = opt.option(
         "--to Y", "Topic or node where they end. Default: topics from which nothing goes on."
     ),
-    limit: int = option("--limit", "How many to list.", 100, min=1),
-    json: bool = JSON,
+    limit: int = opt.option("--limit", "How many to list.", 100, min=1),
+    json: bool = opt.JSON,
 ) -> None:
     """List the computation chains, count them, and show the heaviest.
 
@@ -113,13 +104,13 @@ def chains(
 
 
 def latency(
-    trace: list[Path] = TRACE,
-    chain: str | None = CHAIN,
-    chains: Path | None = option(
+    trace: list[Path] = opt.TRACE,
+    chain: str | None = opt.CHAIN,
+    chains: Path | None = opt.option(
         "--chains FILE", "A CARET architecture file: --chain then names one of its named_paths."
     ),
-    json: bool = JSON,
-    instances: bool = option("--instances", "With --json: every traversal, one by one.", False),
+    json: bool = opt.JSON,
+    instances: bool = opt.option("--instances", "With --json: every traversal, one by one.", False),
 ) -> None:
     """Show the end-to-end latency of a chain: average, maximum, jitter, percentiles.
 
@@ -144,7 +135,7 @@ def latency(
         out.notes(analysis.notes)
 
 
-def convert(trace: list[Path] = TRACE, output: Path = RECORDING_OUTPUT) -> None:
+def convert(trace: list[Path] = opt.TRACE, output: Path = opt.RECORDING_OUTPUT) -> None:
     """Write a trace as a recording: one Parquet file per event table."""
     from chainshaper.values.recording import refuse_existing
 
@@ -170,13 +161,13 @@ def comparison_tables(*comparisons: "cs.Comparison") -> "list[ResultTable]":
 
 
 def compare(
-    recordings: list[Path] = argument("REC REC...", "Recordings' folders.", ...),
-    chain: str | None = CHAIN,
-    figures: Path | None = option(
+    recordings: list[Path] = opt.argument("REC REC...", "Recordings' folders.", ...),
+    chain: str | None = opt.CHAIN,
+    figures: Path | None = opt.option(
         "--figures DIR", "Draw latency.png and distribution.png into this folder."
     ),
-    plan: Path | None = PLAN_IN_FORCE,
-    json: bool = JSON,
+    plan: Path | None = opt.PLAN_IN_FORCE,
+    json: bool = opt.JSON,
 ) -> None:
     """Show the same chain in several recordings side by side, usually before and after shaping.
 
@@ -185,7 +176,7 @@ def compare(
     """
     from chainshaper.reporting.latency import comparisons_json
 
-    comparisons = cs.compare_chains(recordings, chain, plan_in_force(plan))
+    comparisons = cs.compare_chains(recordings, chain, opt.plan_in_force(plan))
     if figures is not None:
         from chainshaper.reporting.figures import draw_comparison
 
@@ -196,17 +187,17 @@ def compare(
 
 
 def report(
-    recordings: list[Path] = argument("REC...", "Recordings' or LTTng traces' folders.", ...),
-    output: Path = option("--output -o FILE.html", "File to write; must not exist.", ...),
-    chain: str | None = CHAIN,
-    plan: Path | None = PLAN_IN_FORCE,
-    cycles: list[int] | None = option(
+    recordings: list[Path] = opt.argument("REC...", "Recordings' or LTTng traces' folders.", ...),
+    output: Path = opt.option("--output -o FILE.html", "File to write; must not exist.", ...),
+    chain: str | None = opt.CHAIN,
+    plan: Path | None = opt.PLAN_IN_FORCE,
+    cycles: list[int] | None = opt.option(
         "--cycle N",
         "A cycle that the timeline has to show, where there are too many to show all. "
         "May be given several times.",
         min=0,
     ),
-    json: bool = JSON,
+    json: bool = opt.JSON,
 ) -> None:
     """Write one self-contained HTML page about a chain, usually before and after shaping.
 
@@ -219,7 +210,7 @@ def report(
     from chainshaper.values.files import new_file
 
     new_file(output, ENDINGS)
-    in_force = plan_in_force(plan)
+    in_force = opt.plan_in_force(plan)
     with out.late_progress("report") as progress:
         comparisons = cs.compare_chains(recordings, chain, in_force, least=1, progress=progress)
         progress(0.9, "drawing")
@@ -231,13 +222,13 @@ def report(
 
 
 def export(
-    trace: list[Path] = TRACE,
-    output: Path = option(
+    trace: list[Path] = opt.TRACE,
+    output: Path = opt.option(
         "--output -o FILE", "File to write, such as trace.pftrace; must not exist.", ...
     ),
-    perfetto: bool = option("--perfetto", "A trace that ui.perfetto.dev opens.", False),
-    chain: str | None = CHAIN,
-    plan: Path | None = PLAN_IN_FORCE,
+    perfetto: bool = opt.option("--perfetto", "A trace that ui.perfetto.dev opens.", False),
+    chain: str | None = opt.CHAIN,
+    plan: Path | None = opt.PLAN_IN_FORCE,
 ) -> None:
     """Write a recording for another tool: threads, callbacks, messages, slots, stalls.
 
@@ -249,7 +240,7 @@ def export(
     from chainshaper.values.files import new_file
 
     new_file(output, ENDINGS)
-    in_force = plan_in_force(plan)
+    in_force = opt.plan_in_force(plan)
     with out.opened("export", trace) as (recording, report):
         report(0.5, "analysing")
         named = chain or recording.info.chain
