@@ -309,7 +309,12 @@ def splice(
             raise InputError(
                 "a throttler is for all types: choose --node python or cpp, and no --type"
             )
-        splicing = _throttled(throttle, recording, common)
+        if not files:
+            raise InputError(
+                "give the launch files: `splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`"
+            )
+        known = _opened(recording)
+        splicing = cs.splice_throttlers(throttled_inputs(throttle), recording=known, **common)
     elif plan is None or not files:
         raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
     else:
@@ -323,12 +328,6 @@ def splice(
         out.print_json(_splicing_json(splicing, setup))
         return
     _show_splicing(splicing, arguments, setup)
-
-
-def _throttled(inputs: list[str], recording: Path | None, common: dict[str, Any]) -> "cs.Splicing":
-    if not common["launch_files"]:
-        raise InputError("give the launch files: `splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`")
-    return cs.splice_throttlers(throttled_inputs(inputs), recording=_opened(recording), **common)
 
 
 def throttled_inputs(inputs: Sequence[str]) -> "list[cs.ThrottledInput]":

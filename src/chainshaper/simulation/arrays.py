@@ -219,6 +219,7 @@ def _servers(plan: ApplicationPlan, threads: Sequence[ThreadInfo]) -> dict[int, 
 def _graph(
     processes: Sequence[Process], entities: Sequence[Entity], publishers: Sequence[Publisher]
 ) -> ApplicationGraph:
+    """Where the chain is found: callbacks alone publish, so topics need not name their nodes."""
     callbacks = [
         Callback(
             id=number,
@@ -232,17 +233,8 @@ def _graph(
         )
         for number, entity in enumerate(entities)
     ]
-    writers: dict[str, tuple[str, ...]] = {}
-    readers: dict[str, tuple[str, ...]] = {}
-    for publisher in publishers:
-        node = processes[publisher.process].node
-        writers[publisher.topic] = (*writers.get(publisher.topic, ()), node)
-    for entity in entities:
-        if entity.topic is not None:
-            node = processes[entity.process].node
-            readers[entity.topic] = (*readers.get(entity.topic, ()), node)
     nodes = tuple(Node(process.node, process.pid) for process in processes)
-    return ApplicationGraph(nodes, tuple(callbacks), writers, readers)
+    return ApplicationGraph(nodes, tuple(callbacks))
 
 
 class Rows(list[int]):
