@@ -61,10 +61,9 @@ def simulate(
     description's. With ``switches`` the recording has `sched_switch` as well. Memory does not
     grow with ``cycles``. As in a live run, a few cycles before the recorded ones are left out.
 
-    Raises:
-        InputError: ``output`` exists, the plan does not fit the application, or a callback of it
-            computes, so that its execution times are not known.
-        OperationError: messages pile up without end, or the recording cannot be written.
+    Raises InputError: ``output`` exists, the plan does not fit the application, or a callback of it
+    computes, so that its execution times are not known. OperationError: messages pile up without
+    end, or the recording cannot be written.
     """
     output = refuse_existing(output)
     joint = None if plan is None else whole(plan)

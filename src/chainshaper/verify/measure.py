@@ -90,8 +90,7 @@ class Comparison:
 def chain_of(recording: Recording, chain: str | None) -> str:
     """The chain that was asked for, or the one that the recording itself names.
 
-    Raises:
-        InputError: neither names one.
+    Raises InputError: neither names one.
     """
     named = chain or recording.info.chain
     if named is None:
@@ -188,8 +187,7 @@ def compare_recordings(
 
     ``plan`` was in force in the last of them, should that not say so itself.
 
-    Raises:
-        InputError: fewer than two recordings, or a chain that one of them does not have.
+    Raises InputError: fewer than two recordings, or a chain that one of them does not have.
     """
     return compare_chains(recordings, chain, plan)[0]
 
