@@ -4,9 +4,9 @@
 
 As root. The chains take turns, and both timers are off alike, as those of one sensor; each slot of
 the one is followed by one of the other, so a slot that stays behind its timer shows at once.
-Prints for every five minutes how many outputs were late, and how far apart the others left; at the end how
-far the timer and the slots have moved. Nothing is asserted: a machine that stalls makes outputs
-late by itself.
+Prints for every five minutes how many outputs were late, and how far apart the others left; at the
+end how far the timer and the slots have moved. Nothing is asserted: a machine that stalls makes
+outputs late by itself.
 """
 
 import argparse
