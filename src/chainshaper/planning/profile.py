@@ -11,15 +11,16 @@ which the others can have it (Joseph and Pandya, The Computer Journal 29, 1986):
 over all that may run before the chain on its cores, each every T, for C at most, and up to J later
 in one cycle than in another:
 
-* the branches that begin with it, in any order: they share its server and its priority;
+* the branches that begin with it, in any order, behind the fork: they share its server and its
+  priority;
 * chains of a better priority, where they run at the same time (where they take turns, none);
 * the shaping nodes of all other chains, which spin before a slot and publish.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain as joined
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,8 @@ from chainshaper.planning.plan import SHORTEST_SLOT_NS
 from chainshaper.planning.shaping import CallbackTimes
 from chainshaper.values.plan_choices import Wishes
 
+_Stage: TypeAlias = tuple[str, str | None]
+"""A callback of a graph, by its node and what it publishes."""
 _ADDED_UP = ("shaped", "one-long-slot", "server-per-chain")
 
 
@@ -145,18 +148,21 @@ def with_interference(
         return list(profiles)
     alone = [_alone(profile) for profile in profiles]
     delayed = list(alone)
-    better: list[tuple[Sequence[int], list[Profile]]] = []  # groups, and their chains, so far
+    gates = wishes.policy != "server-per-chain" and wishes.publication == "synchronous"
+    better: list[list[Profile]] = []  # the chains of each group so far
     for group in sorted(groups, key=lambda one: (profiles[one[0]].period_ns, one[0])):
         for k in group:
-            rivals = [_branches(alone[k], [alone[j] for j in group if j != k])]
-            rivals += [_group(alone[k], chains) for _, chains in better if at_once]
-            if wishes.policy != "server-per-chain" and wishes.publication == "synchronous":
-                others = [one for j, one in enumerate(alone) if j != k]
-                rivals += _gates(alone[k], others, wishes.spin_ns)
-            longest = int(alone[k].every.max())
-            delay = interference(longest, rivals, alone[k].period_ns)
-            delayed[k] = _later(alone[k], delay)
-        better.append((group, [delayed[k] for k in group]))
+            one, siblings = alone[k], [alone[j] for j in group if j != k]
+            forked = {*_stages([one])} - {*_stages(siblings)}  # none of these before the fork
+            rivals = [Rival(one.period_ns, _demand(one, siblings, forked))]
+            rivals += [_group(one, chains) for chains in better if at_once]
+            for place, other in enumerate(alone):
+                cores = _cores(one, forked if place in group else _stages([one]))
+                if gates and place != k and other.core_of.get(other.nodes[-1]) in cores:
+                    rivals.append(_gate(other, wishes.spin_ns))
+            delay = interference(int(one.every.max()), rivals, one.period_ns)
+            delayed[k] = _later(one, delay)
+        better.append([delayed[k] for k in group])
     return delayed
 
 
@@ -182,34 +188,30 @@ def _later(profile: Profile, delay_ns: int) -> Profile:
     )
 
 
-def _cores(profile: Profile) -> set[int]:
-    return {callback.core for callback in profile.callbacks}
+def _stages(profiles: Sequence[Profile]) -> dict[_Stage, CallbackTimes]:
+    callbacks = joined.from_iterable(profile.callbacks for profile in profiles)
+    return {(one.node, one.publishes): one for one in callbacks}
 
 
-def _demand(profile: Profile, others: Sequence[Profile]) -> int:
-    """For how long callbacks of others, and not its own, have a chain's cores in one cycle."""
-    own = {(one.node, one.publishes) for one in profile.callbacks}
-    stages: dict[tuple[str, str | None], CallbackTimes] = {
-        (one.node, one.publishes): one
-        for one in joined.from_iterable(other.callbacks for other in others)
-        if (one.node, one.publishes) not in own and one.core in _cores(profile)
-    }
-    return sum(one.max_response_ns for one in stages.values())
+def _cores(profile: Profile, stages: Collection[_Stage]) -> set[int]:
+    return {one.core for stage, one in _stages([profile]).items() if stage in stages}
 
 
-def _branches(profile: Profile, siblings: Sequence[Profile]) -> Rival:
-    return Rival(profile.period_ns, _demand(profile, siblings))
+def _demand(profile: Profile, others: Sequence[Profile], stages: Collection[_Stage]) -> int:
+    """For how long callbacks of others have, in one cycle, the cores of these stages of a chain."""
+    own, cores = _stages([profile]), _cores(profile, stages)
+    theirs = (one for stage, one in _stages(others).items() if stage not in own)
+    return sum(one.max_response_ns for one in theirs if one.core in cores)
 
 
 def _group(profile: Profile, chains: Sequence[Profile]) -> Rival:
     """Chains of one beginning that run before a chain: what waits elsewhere comes late."""
-    cost, longest = _demand(profile, chains), max(int(one.every.max()) for one in chains)
+    cost = _demand(profile, chains, _stages([profile]))
+    longest = max(int(one.every.max()) for one in chains)
     return Rival(chains[0].period_ns, cost, max(0, longest - cost))
 
 
-def _gates(profile: Profile, others: Sequence[Profile], spin_ns: int) -> Iterator[Rival]:
-    """The shaping nodes of other chains: each spins before its slot, and publishes."""
-    for other in others:
-        if other.nodes and other.core_of.get(other.nodes[-1]) in _cores(profile):
-            publication = other.longest_publication_ns or SHORTEST_SLOT_NS
-            yield Rival(other.period_ns, spin_ns + publication)
+def _gate(other: Profile, spin_ns: int) -> Rival:
+    """Another chain's shaping node: it spins before its slot, and publishes."""
+    longest = other.longest_publication_ns
+    return Rival(other.period_ns, spin_ns + (SHORTEST_SLOT_NS if longest is None else longest))
