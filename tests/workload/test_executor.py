@@ -91,7 +91,7 @@ class Bench:
 def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
     monkeypatch.setenv("CYCLONEDDS_URI", dds.closed_domain_configuration())
     log = EventLog()
-    participant = dds.join_domain(dds.free_domain())
+    participant = dds.Participant(dds.free_domain())
     return Bench(participant, log, Executor(participant, log))
 
 
