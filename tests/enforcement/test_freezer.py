@@ -174,46 +174,40 @@ def test_another_anchor_moves_the_slots_and_lets_nothing_slip_between(tmp_path: 
         assert inside_its_slots(spinner, since[2], end, (5, 12), anchor=MS) > 0.99
 
 
-def test_nothing_is_gated_before_arming_and_after_the_release(tmp_path: Path) -> None:
-    with stamping(tmp_path, 20) as spinner:
-        home = cgroup_of(spinner.tid)
-        with freezer(tmp_path, server("a", (0, 1)), cycle=HALF) as back_end:
-            back_end.assign(spinner.tid, "a")
-            ran = cpu_ns(spinner.tid)
-            wait_for(lambda: cpu_ns(spinner.tid) > ran + 20 * MS, "it to run unarmed")
-            back_end.arm(time.monotonic_ns() + 400 * MS)
-            begun(back_end)
-            wait_for(lambda: stands_still(spinner.tid), "it to stop behind its slot")
-            ran = cpu_ns(spinner.tid)
-            back_end.release()
-            back_end.release()
-            assert cgroup_of(spinner.tid) == home
-            wait_for(lambda: cpu_ns(spinner.tid) > ran + 20 * MS, "it to run released")
-            with pytest.raises(OperationError, match="no longer in force: they were released"):
-                back_end.assign(spinner.tid, "a")
-
-
 def stands_still(tid: int) -> bool:
     ran = cpu_ns(tid)
     time.sleep(0.1)
     return cpu_ns(tid) == ran
 
 
-def test_threads_join_and_change_servers_while_these_are_in_force(tmp_path: Path) -> None:
+def test_a_thread_joins_and_changes_servers_and_is_gated_while_they_are_in_force_only(
+    tmp_path: Path,
+) -> None:
     servers = (server("open", (0, 10_000)), server("shut", (0, 1)))
     with stamping(tmp_path, 20) as spinner, freezer(tmp_path, *servers, cycle=HALF) as back_end:
+        home = cgroup_of(spinner.tid)
+
+        def wait_until_it_runs(when: str) -> None:
+            ran = cpu_ns(spinner.tid)
+            wait_for(lambda: cpu_ns(spinner.tid) > ran + 20 * MS, f"it to run {when}")
+
+        back_end.assign(spinner.tid, "shut")
+        wait_until_it_runs("unarmed")
         back_end.arm(time.monotonic_ns() + 310 * MS)
         begun(back_end)
-        time.sleep(0.1)
-        back_end.assign(spinner.tid, "shut")
-        wait_for(lambda: stands_still(spinner.tid), "it to stop")
+        wait_for(lambda: stands_still(spinner.tid), "it to stop behind its slot")
         back_end.assign(spinner.tid, "open")
         assert back_end.members() == {"open": (spinner.tid,), "shut": ()}
-        ran = cpu_ns(spinner.tid)
-        wait_for(lambda: cpu_ns(spinner.tid) > ran, "it to go on")
+        wait_until_it_runs("in another server")
         back_end.assign(spinner.tid, "shut")
         wait_for(lambda: stands_still(spinner.tid), "it to stop again")
         assert back_end.failure() is None
+        for _ in range(2):
+            back_end.release()
+        assert cgroup_of(spinner.tid) == home
+        wait_until_it_runs("released")
+        with pytest.raises(OperationError, match="no longer in force: they were released"):
+            back_end.assign(spinner.tid, "shut")
 
 
 def test_where_servers_overlap_the_better_priority_runs(tmp_path: Path) -> None:
@@ -339,26 +333,18 @@ def test_the_last_of_two_runs_at_once_leaves_it_mounted_as_the_first_found_it(
     assert mount_options() == plain
 
 
-def test_a_group_that_somebody_removes_is_told(tmp_path: Path) -> None:
+def test_a_thread_that_is_moved_away_and_a_group_that_is_removed_are_told(tmp_path: Path) -> None:
     with stamping(tmp_path, 20) as spinner, freezer(tmp_path, server("a", (5, 12))) as back_end:
         back_end.assign(spinner.tid, "a")
         back_end.arm(0)
         begun(back_end)
+        assert back_end.failure() is None
         (folder,) = groups_left(os.getpid())
         (folder.parent / "cgroup.threads").write_text(str(spinner.tid))
+        assert f"thread {spinner.tid} was moved out" in str(back_end.failure())
         folder.rmdir()
-        wait_for(lambda: back_end.failure() is not None, "the failure")
         removed = "a cgroup of server a was removed"
         wait_for(lambda: removed in str(back_end.failure()), "the reason")
-
-
-def test_a_thread_that_somebody_moves_away_is_told(tmp_path: Path) -> None:
-    with stamping(tmp_path, 20) as spinner, freezer(tmp_path, server("a", (5, 12))) as back_end:
-        back_end.assign(spinner.tid, "a")
-        assert back_end.failure() is None
-        parent = cgroup_of(spinner.tid).parent
-        (parent / "cgroup.threads").write_text(str(spinner.tid))
-        assert f"thread {spinner.tid} was moved out" in str(back_end.failure())
 
 
 def test_one_run_at_a_time_has_a_thread(tmp_path: Path) -> None:

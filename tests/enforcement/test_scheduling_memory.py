@@ -196,7 +196,7 @@ def test_killed_at_any_moment_it_leaves_nothing_that_cannot_be_put_back(tmp_path
     names = [f"thread{number}" for number in range(8)]
     with acting(tmp_path, *names) as actor:
         before = _states(actor)
-        for attempt in range(12):
+        for attempt in range(6):
             folder = tmp_path / f"journals{attempt}"
             applier = subprocess.Popen(
                 [sys.executable, "-c", _APPLIER, str(actor.pid), str(folder)],
