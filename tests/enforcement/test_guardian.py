@@ -21,7 +21,7 @@ from typing import TypeAlias
 import pytest
 from applied_plans import Governed, needs_fifo, node_to_govern
 from gated import CORE, ahead_of_others, cpu_ns, groups_left, kill, needs_cgroups
-from processes import wait_for
+from processes import is_alive, wait_for
 
 from chainshaper.enforcement.freezer import CounterPage, run_of
 from chainshaper.enforcement.guardian import GROUP, let_go
@@ -83,19 +83,11 @@ class Run:
         for pid in ours:
             kill(pid)
         self.owner.wait()
-        wait_for(lambda: not any(map(alive, ours)), "our processes to end")
+        wait_for(lambda: not any(map(is_alive, ours)), "our processes to end")
         for journal in find_journals(self.runs):
             assert undo_run(journal) == ()
         assert list(self.runs.iterdir()) == []
         assert groups_left(self.owner.pid) == []
-
-
-def alive(pid: int) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
-    return state not in {"Z", "X"}
 
 
 @contextmanager
@@ -260,7 +252,7 @@ def test_guardians_are_out_of_reach_of_what_befalls_the_owner(node: Governed) ->
             for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
                 kill(pid, number)
         time.sleep(0.2)
-        assert all(map(alive, run.guardians))
+        assert all(map(is_alive, run.guardians))
         assert run.ask("failure") == "None"
 
 
