@@ -172,8 +172,7 @@ def restore_plugin(journal: Journal) -> None:
 def _leave_reservation(tid: int) -> None:
     try:
         ordinary = SchedulingClass(os.SCHED_OTHER, 0, reset_on_fork=False)
-        left = replace(state_of(tid), scheduling_class=ordinary)
-        set_state(tid, left, ["scheduling_class"])
+        set_state(tid, replace(state_of(tid), scheduling_class=ordinary))
     except ProcessLookupError:
         return
     except OSError as error:
