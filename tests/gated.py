@@ -69,11 +69,14 @@ class Stamping:
 
 
 @contextlib.contextmanager
-def stamping(folder: Path, seconds: float, core: int = CORE) -> Iterator[Stamping]:
+def stamping(
+    folder: Path, seconds: float, core: int = CORE, *, with_another: bool = False
+) -> Iterator[Stamping]:
     output = folder / f"windows-{time.monotonic_ns()}.json"
     script = Path(__file__).with_name("stamping_process.py")
+    other = [str(OTHER_CORE)] * with_another
     process = subprocess.Popen(
-        [sys.executable, str(script), str(seconds), str(output), str(core), str(OTHER_CORE)],
+        [sys.executable, str(script), str(seconds), str(output), str(core), *other],
         stdout=subprocess.PIPE,
     )
     try:

@@ -102,7 +102,7 @@ def test_gated_threads_run_inside_their_slots_only_and_their_siblings_run_on(
     tmp_path: Path,
 ) -> None:
     with (
-        stamping(tmp_path, 30) as first,
+        stamping(tmp_path, 30, with_another=True) as first,
         stamping(tmp_path, 30) as second,
         freezer(tmp_path, server("a", (0, 7)), server("b", (7, 13))) as back_end,
     ):
@@ -112,7 +112,7 @@ def test_gated_threads_run_inside_their_slots_only_and_their_siblings_run_on(
         begin = begun(back_end)
         gated, free = cpu_ns(first.tid), cpu_ns(first.other_tid)
         with ahead_of_others(first.tid, second.tid):
-            time.sleep(1)
+            time.sleep(0.6)
             end = time.monotonic_ns()
         gated, free = cpu_ns(first.tid) - gated, cpu_ns(first.other_tid) - free
         slots = back_end.counters()["a"].slots
@@ -144,7 +144,7 @@ def test_processes_of_one_server_are_opened_and_closed_together(tmp_path: Path) 
             back_end.arm(0)
             begin = begun(back_end)
             with ahead_of_others(inside.tid, outside.tid):
-                time.sleep(1)
+                time.sleep(0.6)
                 end = time.monotonic_ns()
         assert cgroup_of(inside.tid) == home
         assert (home / "cgroup.type").read_text() == "domain\n"
@@ -163,7 +163,7 @@ def test_another_anchor_moves_the_slots_and_lets_nothing_slip_between(tmp_path: 
             since.append(begun(back_end))
             assert (since[-1] - anchor) % CYCLE == 0
             with ahead_of_others(spinner.tid):
-                time.sleep(0.7)
+                time.sleep(0.5)
         end = time.monotonic_ns()
         back_end.release()
         closed = since[1] - 7 * MS
@@ -436,7 +436,7 @@ def test_without_the_class_it_gates_as_well_as_it_can(tmp_path: Path) -> None:
             *_, dispatcher = owner.stdout.readline().split()
             assert list_threads(int(dispatcher))[0].policy == "SCHED_OTHER"
             begin = time.monotonic_ns()
-            time.sleep(1)
+            time.sleep(0.6)
             end = time.monotonic_ns()
         windows = spinner.windows(begin, end)
         ran = sum(b - a for a, b in windows)
@@ -455,7 +455,7 @@ def test_after_a_stall_what_should_be_open_by_then_counts(tmp_path: Path) -> Non
         kill(dispatcher, signal.SIGCONT)
         resumed = time.monotonic_ns()
         with ahead_of_others(spinner.tid):
-            time.sleep(1)
+            time.sleep(0.6)
             end = time.monotonic_ns()
         after = back_end.counters()["a"]
         assert back_end.failure() is None

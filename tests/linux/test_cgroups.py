@@ -41,7 +41,7 @@ def freeze(child: Path) -> None:
 
 
 def test_one_thread_stops_while_the_others_of_its_process_run_on(tmp_path: Path) -> None:
-    with own_cgroup("one-thread") as home, stamping(tmp_path, 20) as spinner:
+    with own_cgroup("one-thread") as home, stamping(tmp_path, 20, with_another=True) as spinner:
         (home / "cgroup.procs").write_text(str(spinner.tid))
         child = cgroups.make_threaded_child(home, "gated")
         assert cgroups.move_thread(spinner.tid, child)
