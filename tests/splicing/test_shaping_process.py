@@ -386,7 +386,7 @@ RAW = {"/rear/raw": PUBLISHERS["/t3_tmp"], "/front/raw": PUBLISHERS["/t3_tmp"]}
 
 def test_the_throttler_publishes_what_is_newest_and_counts_the_rest(tmp_path: Path) -> None:
     topics = {"/rear/raw": "/rear", "/front/raw": "/front"}
-    period, phase = 2_000 * MS, 700 * MS
+    period, phase = 1_000 * MS, 350 * MS
     process = write_throttler(topics, period, "python", tmp_path, phase_ns=phase)
     with running_node(process, tmp_path, RAW) as run:
         for payload in ("aa", "bb"):
@@ -419,13 +419,13 @@ def test_by_the_papers_rule_the_first_message_of_a_period_is_published_as_it_com
     tmp_path: Path,
 ) -> None:
     topics = {"/rear/raw": "/rear", "/front/raw": "/front"}
-    process = write_throttler(topics, 2_000 * MS, "python", tmp_path, rule="first")
+    process = write_throttler(topics, 1_000 * MS, "python", tmp_path, rule="first")
     with running_node(process, tmp_path, RAW) as run:
         for payload in ("aa", "bb"):
             run.tell(topic="/rear/raw", payload=payload, source=1)
         run.tell(topic="/front/raw", payload="cc", source=1)
         run.hear(lambda words: words.get("payload") == "cc")
-        time.sleep(1.7)  # four fifths of a period
+        time.sleep(0.9)  # four fifths of a period
         run.tell(topic="/rear/raw", payload="dd", source=1)
         assert run.end() == 0
     published = [words["payload"] for words in run.said if "published" in words]
