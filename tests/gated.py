@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from known import known
 from processes import wait_for
 
 from chainshaper.linux.cgroups import cgroup_of, mount_point
@@ -80,8 +81,7 @@ def stamping(
         stdout=subprocess.PIPE,
     )
     try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == b"ready\n"
+        assert known(process.stdout).readline() == b"ready\n"
         yield Stamping(process, output)
     finally:
         process.kill()

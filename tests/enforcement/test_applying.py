@@ -45,6 +45,7 @@ from applied_plans import (
 )
 from command_line import called, chainshaper
 from gated import kill, needs_cgroups
+from known import known
 from processes import wait_for
 
 from chainshaper import __file__ as package_file
@@ -198,9 +199,8 @@ def test_ctrl_c_ends_it_in_every_phase(tmp_path: Path, phase: str) -> None:
         if phase == "measuring":
             plan, line = slow_plan(), "measuring where in a cycle"
         run = stack.enter_context(started(plan, tmp_path, *options))
-        assert run.stderr is not None
         if line:
-            while line not in (said := run.stderr.readline()):
+            while line not in (said := known(run.stderr).readline()):
                 assert said, "it ended"
         else:
             wait_for(lambda: journals_folder() in open_files(run.pid), "it to wait for the others")

@@ -26,6 +26,7 @@ from gated import (
     sleeping,
     stamping,
 )
+from known import known
 from processes import children_of, wait_for
 
 from chainshaper.enforcement.freezer import Freezer
@@ -83,8 +84,7 @@ def freezer(folder: Path, *servers: ReservationServer, cycle: int = CYCLE) -> It
 
 def begun(back_end: Freezer) -> int:
     """Wait until the servers are in force, and give the start of their first cycle."""
-    begin = back_end.in_force_from()
-    assert begin is not None
+    begin = known(back_end.in_force_from())
     time.sleep(max(0, begin - time.monotonic_ns()) / 1e9)
     return begin
 
@@ -123,8 +123,7 @@ def test_gated_threads_run_inside_their_slots_only_and_their_siblings_run_on(
         assert inside_its_slots(second, begin, end, (7, 13), anchor=3 * MS) > 0.99
         assert gated < 0.5 * (end - begin), "7 ms of 20 ms are its own"
         assert free > 0, "its sibling was to run on"
-        assert slots is not None
-        assert 0.8 <= slots / ((end - begin) // CYCLE) <= 1.1
+        assert 0.8 <= known(slots) / ((end - begin) // CYCLE) <= 1.1
 
 
 def test_processes_of_one_server_are_opened_and_closed_together(tmp_path: Path) -> None:
@@ -254,14 +253,10 @@ def test_a_slot_that_ends_while_a_thread_computes_is_an_overrun(tmp_path: Path) 
         with ahead_of_others(spinner.tid):
             wait_for(lambda: (back_end.counters()["idle"].slots or 0) >= 30, "30 slots")
         busy, idle = back_end.counters()["busy"], back_end.counters()["idle"]
-        assert busy.slots is not None
-        assert busy.overruns is not None
         # A slot in which others kept the core from it altogether may find it elsewhere.
-        assert busy.overruns > 0.5 * busy.slots
+        assert known(busy.overruns) > 0.5 * known(busy.slots)
         assert idle.overruns == 0
-        assert idle.late_entries is not None
-        assert idle.longest_lateness_ns is not None
-        assert (idle.late_entries > 0) == (idle.longest_lateness_ns > 100_000)
+        assert (known(idle.late_entries) > 0) == (known(idle.longest_lateness_ns) > 100_000)
 
 
 def test_threads_that_end_inside_and_outside_their_slots_are_no_failure(tmp_path: Path) -> None:
@@ -430,10 +425,8 @@ def test_without_the_class_it_gates_as_well_as_it_can(tmp_path: Path) -> None:
             text=True,
             preexec_fn=drop,  # noqa: PLW1509 - the child execs at once
         )
-        assert owner.stdin is not None
-        assert owner.stdout is not None
-        with owner, owner.stdin:
-            *_, dispatcher = owner.stdout.readline().split()
+        with owner, known(owner.stdin):
+            *_, dispatcher = known(owner.stdout).readline().split()
             assert list_threads(int(dispatcher))[0].policy == "SCHED_OTHER"
             begin = time.monotonic_ns()
             time.sleep(0.6)
@@ -461,10 +454,8 @@ def test_after_a_stall_what_should_be_open_by_then_counts(tmp_path: Path) -> Non
         assert back_end.failure() is None
         back_end.release()
 
-        assert before.slots is not None
-        assert after.slots is not None
         # Slots that passed meanwhile are not opened belatedly, one after the other.
-        assert after.slots - before.slots <= (end - resumed) // CYCLE + 3
+        assert known(after.slots) - known(before.slots) <= (end - resumed) // CYCLE + 3
         assert inside_its_slots(spinner, resumed + CYCLE, end, (5, 12)) > 0.99
 
 
@@ -481,11 +472,8 @@ def test_an_entry_that_comes_late_is_counted_with_its_lateness(tmp_path: Path) -
             time.sleep(0.2)
         after = back_end.counters()["a"]
         assert back_end.failure() is None
-        assert before.late_entries is not None
-        assert after.late_entries is not None
-        assert after.longest_lateness_ns is not None
-        assert after.late_entries > before.late_entries
-        assert after.longest_lateness_ns > MS
+        assert known(after.late_entries) > known(before.late_entries)
+        assert known(after.longest_lateness_ns) > MS
 
 
 def test_thirty_two_servers_share_a_core(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from typing import TypeAlias
 import pytest
 from applied_plans import Governed, needs_fifo, node_to_govern
 from gated import CORE, ahead_of_others, cpu_ns, groups_left, kill, needs_cgroups
+from known import known
 from processes import is_alive, wait_for
 
 from chainshaper.enforcement.freezer import CounterPage, run_of
@@ -50,10 +51,9 @@ class Run:
 
     def ask(self, line: str) -> str:
         assert self.owner.stdin is not None
-        assert self.owner.stdout is not None
         self.owner.stdin.write(line + "\n")
         self.owner.stdin.flush()
-        return self.owner.stdout.readline().strip()
+        return known(self.owner.stdout).readline().strip()
 
     def is_frozen(self) -> bool:
         groups = groups_left(self.owner.pid)
@@ -112,8 +112,7 @@ def run_on(
     runs = node.folder / f"runs-{time.monotonic_ns()}"
     arguments = (back_end, runs, CORE, cycle_ms, slot_ms, node.pid)
     with owner_of(node.folder, *arguments) as owner:
-        assert owner.stdout is not None
-        said = owner.stdout.readline()
+        said = known(owner.stdout).readline()
         assert said.startswith("in force"), (node.folder / "said").read_text()
         first, second, *dispatchers = map(int, said.split()[3:])
         run = Run(owner, [first, second], dispatchers, runs, node)
@@ -233,8 +232,7 @@ def test_threads_that_a_guardian_lets_go_when_the_dispatcher_is_back_are_closed_
 ) -> None:
     with run_on(node) as run:
         (journal,) = find_journals(run.runs)
-        freezer = run_of(journal)
-        assert freezer is not None
+        freezer = known(run_of(journal))
         let_go(journal, CounterPage(freezer.page, freezer.table), CORE)  # as the slower of two may
         wait_for(run.is_frozen, "it to be closed again")
         assert run.ask("failure") == "None"

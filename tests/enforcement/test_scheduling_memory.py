@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from actors import Actor, acting
+from known import known
 from processes import wait_for
 
 from chainshaper.enforcement.scheduling_memory import (
@@ -202,8 +203,7 @@ def test_killed_at_any_moment_it_leaves_nothing_that_cannot_be_put_back(tmp_path
                 [sys.executable, "-c", _APPLIER, str(actor.pid), str(folder)],
                 stdout=subprocess.PIPE,
             )
-            assert applier.stdout is not None
-            applier.stdout.readline()
+            known(applier.stdout).readline()
             time.sleep(random.uniform(0, 0.1))
             applier.kill()
             applier.communicate()

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from gated import cpu_ns, needs_cgroups, own_cgroup, sleeping, stamping
+from known import known
 from processes import children_of, wait_for
 
 from chainshaper.linux import cgroups
@@ -106,8 +107,7 @@ def test_a_process_that_is_killed_while_frozen_ends_and_its_group_goes() -> None
 
 def test_a_zombie_does_not_hold_its_group() -> None:
     with frozen("zombie") as (_, process):
-        born = start_of(process.pid, process.pid)
-        assert born is not None
+        born = known(start_of(process.pid, process.pid))
         assert not has_ended(process.pid, born)
         process.kill()
         wait_for(lambda: has_ended(process.pid, born), "its end")

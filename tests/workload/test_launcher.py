@@ -10,6 +10,7 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
+from known import known
 from processes import children_of, is_alive, wait_for
 
 from chainshaper.values.errors import OperationError
@@ -165,8 +166,7 @@ def test_children_die_when_their_launcher_is_killed(tmp_path: Path) -> None:
     )
     launcher = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
     try:
-        assert launcher.stdout is not None
-        pids = [int(pid) for pid in launcher.stdout.readline().split()]
+        pids = [int(pid) for pid in known(launcher.stdout).readline().split()]
         assert len(pids) == 2
         assert all(Path(f"/proc/{pid}").exists() for pid in pids)
     finally:
