@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from gated import cpu_ns, groups_left, own_cgroup
+from known import known
 from processes import children_of, wait_for
 
 from chainshaper.linux import cgroups
@@ -111,10 +112,9 @@ def applied(plan: Plan, folder: Path, *options: str) -> Iterator[subprocess.Pope
 
 
 def wait_until_in_force(process: subprocess.Popen[str]) -> None:
-    assert process.stderr is not None
     said: list[str] = []
     while not said or not said[-1].startswith("in force"):
-        said.append(process.stderr.readline())
+        said.append(known(process.stderr).readline())
         assert said[-1], f"it ended: {''.join(said)}"
 
 

@@ -29,6 +29,7 @@ settings.load_profile("chainshaper")
 TIMED = {"enforcement", "flow", "gate", "linux", "verify", "workload"}
 TIMELESS = {"linux/test_own_processes", "workload/test_computing", "workload/test_launcher"}
 TIMELESS |= {"gate/test_decision", "workload/test_description", "workload/test_execution_times"}
+TIMELESS |= {"enforcement/test_dispatcher", "workload/test_event_log"}
 TIMELESS |= {"flow/test_drift", "gate/test_throttling", "verify/test_several_chains"}
 LIVE_RUNS = {"unshaped", "shaped"}
 

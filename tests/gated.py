@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from known import known
 from processes import wait_for
 
 from chainshaper.linux.cgroups import cgroup_of, mount_point
@@ -69,16 +70,18 @@ class Stamping:
 
 
 @contextlib.contextmanager
-def stamping(folder: Path, seconds: float, core: int = CORE) -> Iterator[Stamping]:
+def stamping(
+    folder: Path, seconds: float, core: int = CORE, *, with_another: bool = False
+) -> Iterator[Stamping]:
     output = folder / f"windows-{time.monotonic_ns()}.json"
     script = Path(__file__).with_name("stamping_process.py")
+    other = [str(OTHER_CORE)] * with_another
     process = subprocess.Popen(
-        [sys.executable, str(script), str(seconds), str(output), str(core), str(OTHER_CORE)],
+        [sys.executable, str(script), str(seconds), str(output), str(core), *other],
         stdout=subprocess.PIPE,
     )
     try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == b"ready\n"
+        assert known(process.stdout).readline() == b"ready\n"
         yield Stamping(process, output)
     finally:
         process.kill()

@@ -6,12 +6,21 @@ from pathlib import Path
 
 from chainshaper.linux.threads import list_threads, parents
 
-__all__ = ["children_of", "marked_processes", "real_time_threads", "wait_for"]
+__all__ = ["children_of", "is_alive", "marked_processes", "real_time_threads", "wait_for"]
 
 
 def children_of(pid: int) -> list[int]:
     """Processes whose parent is ``pid``, zombies included."""
     return [child for child, parent in parents().items() if parent == pid]
+
+
+def is_alive(pid: int) -> bool:
+    """Whether a process runs; one that is dead but not yet waited for does not."""
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state not in {"Z", "X"}
 
 
 def marked_processes(marker: str) -> dict[int, str]:

@@ -1,6 +1,6 @@
-"""A process to be gated: one thread notes when it runs, another computes on without a lock.
+"""A process to be gated: one thread notes when it runs, another may compute on without a lock.
 
-    python stamping_process.py SECONDS OUTPUT CORE OTHER_CORE
+    python stamping_process.py SECONDS OUTPUT CORE [OTHER_CORE]
 
 The main thread reads the clock without pause and keeps the windows in which it did: a gap of more
 than 0.2 ms ends one. The other thread is inside one long call that needs no interpreter lock, so
@@ -19,6 +19,8 @@ GAP_NS = 200_000
 
 
 def compute_on(core: int, seconds: float) -> None:
+    # Python would not tell the main thread of a signal that came here.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
     os.sched_setaffinity(threading.get_native_id(), {core})
     hashlib.pbkdf2_hmac("sha256", b"password", b"salt", int(20_000_000 * seconds))
 
@@ -29,13 +31,12 @@ def cpu_ns(tid: int | None) -> int:
 
 
 def main() -> None:
-    seconds, output, core, other_core = float(sys.argv[1]), *sys.argv[2:]
-    other = threading.Thread(target=compute_on, args=(int(other_core), seconds), daemon=True)
-    other.start()
-    while (
-        cpu_ns(other.native_id) < 10_000_000
-    ):  # it has been given the lock, and is inside its call
-        time.sleep(0.005)
+    seconds, output, core = float(sys.argv[1]), *sys.argv[2:4]
+    for other_core in sys.argv[4:]:
+        other = threading.Thread(target=compute_on, args=(int(other_core), seconds), daemon=True)
+        other.start()
+        while cpu_ns(other.native_id) < 10_000_000:  # it has the lock, and is inside its call
+            time.sleep(0.005)
     os.sched_setaffinity(0, {int(core)})
     told = []
     signal.signal(signal.SIGTERM, lambda *_: told.append(True))

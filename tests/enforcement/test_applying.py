@@ -44,13 +44,14 @@ from applied_plans import (
     started,
 )
 from command_line import called, chainshaper
-from gated import cpu_ns, kill, needs_cgroups
+from gated import kill, needs_cgroups
+from known import known
 from processes import wait_for
 
 from chainshaper import __file__ as package_file
 from chainshaper.linux import cgroups
 from chainshaper.linux.runs import journals_folder
-from chainshaper.linux.threads import list_threads
+from chainshaper.linux.threads import list_threads, parents
 from chainshaper.planning import Plan, save_plan
 
 pytestmark = [needs_fifo, needs_cgroups]
@@ -123,16 +124,8 @@ def test_a_command_that_fails_is_reported_and_so_is_one_without_the_nodes(tmp_pa
 
 
 def _processes_of(text: str) -> list[int]:
-    found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit() and int(entry.name) != os.getpid():
-            try:
-                command = (entry / "cmdline").read_bytes().decode(errors="replace")
-            except OSError:
-                continue
-            if text in command and "\0apply\0" not in command:
-                found.append(int(entry.name))
-    return found
+    lines = {pid: command_line(pid) for pid in parents()}
+    return [pid for pid, line in lines.items() if text in line and "\0apply\0" not in line]
 
 
 LONG_S = 100
@@ -206,9 +199,8 @@ def test_ctrl_c_ends_it_in_every_phase(tmp_path: Path, phase: str) -> None:
         if phase == "measuring":
             plan, line = slow_plan(), "measuring where in a cycle"
         run = stack.enter_context(started(plan, tmp_path, *options))
-        assert run.stderr is not None
         if line:
-            while line not in (said := run.stderr.readline()):
+            while line not in (said := known(run.stderr).readline()):
                 assert said, "it ended"
         else:
             wait_for(lambda: journals_folder() in open_files(run.pid), "it to wait for the others")
@@ -290,28 +282,17 @@ def test_when_a_dispatcher_is_lost_the_run_ends_and_says_so(
 def test_what_is_killed_while_a_run_starts_leaves_nothing(tmp_path: Path, victim: str) -> None:
     chance = random.Random(f"{victim} at start")
     with node_to_govern(tmp_path) as governed:
-        for _ in range(2):
-            with started(one_server_plan(), tmp_path, *FREEZER) as run:
-                wait_for(lambda: bool(processes_of(run, victim)), victim)
-                time.sleep(chance.uniform(0, 0.8 if victim == "apply" else 0.2))
-                for pid in processes_of(run, victim):
-                    kill(pid)
-                time.sleep(0.3)
-                run.send_signal(signal.SIGINT)  # where that is no reason to end
-                said = ended(run)
-            assert "Traceback" not in said
-            if run.returncode == 1:
-                assert said.count("error:") == 1
-            governed.check_as_before()
-
-
-def test_a_stopped_run_goes_on_being_served_and_can_be_released(tmp_path: Path) -> None:
-    with in_force(tmp_path) as (governed, run):
-        run.send_signal(signal.SIGSTOP)
-        ran = cpu_ns(governed.pid)
-        wait_for(lambda: cpu_ns(governed.pid) > ran + 10 * MS, "some slots")
-        assert called("release").code == 0
-        assert run.wait(timeout=20) == 0
+        with started(one_server_plan(), tmp_path, *FREEZER) as run:
+            wait_for(lambda: bool(processes_of(run, victim)), victim)
+            time.sleep(chance.uniform(0, 0.8 if victim == "apply" else 0.2))
+            for pid in processes_of(run, victim):
+                kill(pid)
+            time.sleep(0.3)
+            run.send_signal(signal.SIGINT)  # where that is no reason to end
+            said = ended(run)
+        assert "Traceback" not in said
+        if run.returncode == 1:
+            assert said.count("error:") == 1
         governed.check_as_before()
 
 
@@ -399,39 +380,36 @@ def test_what_a_governed_node_has_forked_is_as_the_node_was_before(tmp_path: Pat
                 kill(pid)
 
 
-@pytest.mark.parametrize(
-    ("granted", "missing"),
-    [
-        ("", "CAP_DAC_OVERRIDE"),
-        ("+sys_nice", "CAP_DAC_OVERRIDE"),
-        ("+dac_override", "CAP_SYS_NICE"),
-    ],
-)
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give privileges away")
 def test_without_the_privileges_nothing_is_changed_and_the_missing_one_is_named(
-    tmp_path: Path, granted: str, missing: str
+    tmp_path: Path,
 ) -> None:
     with node_to_govern(tmp_path) as governed, tempfile.TemporaryDirectory() as readable:
         folder = Path(readable)
         folder.chmod(0o777)
         save_plan(one_server_plan(), folder / "plan.yaml")
         (folder / "plan.yaml").chmod(0o644)
-        ambient = [f"--inh-caps=-all,{granted}", f"--ambient-caps=-all,{granted}"]
-        dropped = [
-            *("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"),
-            *(ambient if granted else ["--inh-caps=-all"]),
-        ]
-        said = subprocess.run(
-            [*dropped, *CLI, "apply", str(folder / "plan.yaml"), *FREEZER],
-            env={**os.environ, "XDG_RUNTIME_DIR": readable, "HOME": readable},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert said.returncode == 3, said.stderr
-        assert missing in said.stderr
-        assert "run as root" in said.stderr
-        assert not (folder / "chainshaper").exists()
+        for granted, missing in (
+            ("", "CAP_DAC_OVERRIDE"),
+            ("+sys_nice", "CAP_DAC_OVERRIDE"),
+            ("+dac_override", "CAP_SYS_NICE"),
+        ):
+            ambient = [f"--inh-caps=-all,{granted}", f"--ambient-caps=-all,{granted}"]
+            dropped = [
+                *("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"),
+                *(ambient if granted else ["--inh-caps=-all"]),
+            ]
+            said = subprocess.run(
+                [*dropped, *CLI, "apply", str(folder / "plan.yaml"), *FREEZER],
+                env={**os.environ, "XDG_RUNTIME_DIR": readable, "HOME": readable},
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+            assert said.returncode == 3, said.stderr
+            assert missing in said.stderr
+            assert "run as root" in said.stderr
+            assert not (folder / "chainshaper").exists()
         governed.check_as_before()
 
 

@@ -26,6 +26,7 @@ from gated import (
     sleeping,
     stamping,
 )
+from known import known
 from processes import children_of, wait_for
 
 from chainshaper.enforcement.freezer import Freezer
@@ -83,8 +84,7 @@ def freezer(folder: Path, *servers: ReservationServer, cycle: int = CYCLE) -> It
 
 def begun(back_end: Freezer) -> int:
     """Wait until the servers are in force, and give the start of their first cycle."""
-    begin = back_end.in_force_from()
-    assert begin is not None
+    begin = known(back_end.in_force_from())
     time.sleep(max(0, begin - time.monotonic_ns()) / 1e9)
     return begin
 
@@ -102,7 +102,7 @@ def test_gated_threads_run_inside_their_slots_only_and_their_siblings_run_on(
     tmp_path: Path,
 ) -> None:
     with (
-        stamping(tmp_path, 30) as first,
+        stamping(tmp_path, 30, with_another=True) as first,
         stamping(tmp_path, 30) as second,
         freezer(tmp_path, server("a", (0, 7)), server("b", (7, 13))) as back_end,
     ):
@@ -112,7 +112,7 @@ def test_gated_threads_run_inside_their_slots_only_and_their_siblings_run_on(
         begin = begun(back_end)
         gated, free = cpu_ns(first.tid), cpu_ns(first.other_tid)
         with ahead_of_others(first.tid, second.tid):
-            time.sleep(1)
+            time.sleep(0.6)
             end = time.monotonic_ns()
         gated, free = cpu_ns(first.tid) - gated, cpu_ns(first.other_tid) - free
         slots = back_end.counters()["a"].slots
@@ -123,8 +123,7 @@ def test_gated_threads_run_inside_their_slots_only_and_their_siblings_run_on(
         assert inside_its_slots(second, begin, end, (7, 13), anchor=3 * MS) > 0.99
         assert gated < 0.5 * (end - begin), "7 ms of 20 ms are its own"
         assert free > 0, "its sibling was to run on"
-        assert slots is not None
-        assert 0.8 <= slots / ((end - begin) // CYCLE) <= 1.1
+        assert 0.8 <= known(slots) / ((end - begin) // CYCLE) <= 1.1
 
 
 def test_processes_of_one_server_are_opened_and_closed_together(tmp_path: Path) -> None:
@@ -144,7 +143,7 @@ def test_processes_of_one_server_are_opened_and_closed_together(tmp_path: Path) 
             back_end.arm(0)
             begin = begun(back_end)
             with ahead_of_others(inside.tid, outside.tid):
-                time.sleep(1)
+                time.sleep(0.6)
                 end = time.monotonic_ns()
         assert cgroup_of(inside.tid) == home
         assert (home / "cgroup.type").read_text() == "domain\n"
@@ -163,7 +162,7 @@ def test_another_anchor_moves_the_slots_and_lets_nothing_slip_between(tmp_path: 
             since.append(begun(back_end))
             assert (since[-1] - anchor) % CYCLE == 0
             with ahead_of_others(spinner.tid):
-                time.sleep(0.7)
+                time.sleep(0.5)
         end = time.monotonic_ns()
         back_end.release()
         closed = since[1] - 7 * MS
@@ -174,46 +173,40 @@ def test_another_anchor_moves_the_slots_and_lets_nothing_slip_between(tmp_path: 
         assert inside_its_slots(spinner, since[2], end, (5, 12), anchor=MS) > 0.99
 
 
-def test_nothing_is_gated_before_arming_and_after_the_release(tmp_path: Path) -> None:
-    with stamping(tmp_path, 20) as spinner:
-        home = cgroup_of(spinner.tid)
-        with freezer(tmp_path, server("a", (0, 1)), cycle=HALF) as back_end:
-            back_end.assign(spinner.tid, "a")
-            ran = cpu_ns(spinner.tid)
-            wait_for(lambda: cpu_ns(spinner.tid) > ran + 20 * MS, "it to run unarmed")
-            back_end.arm(time.monotonic_ns() + 400 * MS)
-            begun(back_end)
-            wait_for(lambda: stands_still(spinner.tid), "it to stop behind its slot")
-            ran = cpu_ns(spinner.tid)
-            back_end.release()
-            back_end.release()
-            assert cgroup_of(spinner.tid) == home
-            wait_for(lambda: cpu_ns(spinner.tid) > ran + 20 * MS, "it to run released")
-            with pytest.raises(OperationError, match="no longer in force: they were released"):
-                back_end.assign(spinner.tid, "a")
-
-
 def stands_still(tid: int) -> bool:
     ran = cpu_ns(tid)
     time.sleep(0.1)
     return cpu_ns(tid) == ran
 
 
-def test_threads_join_and_change_servers_while_these_are_in_force(tmp_path: Path) -> None:
+def test_a_thread_joins_and_changes_servers_and_is_gated_while_they_are_in_force_only(
+    tmp_path: Path,
+) -> None:
     servers = (server("open", (0, 10_000)), server("shut", (0, 1)))
     with stamping(tmp_path, 20) as spinner, freezer(tmp_path, *servers, cycle=HALF) as back_end:
+        home = cgroup_of(spinner.tid)
+
+        def wait_until_it_runs(when: str) -> None:
+            ran = cpu_ns(spinner.tid)
+            wait_for(lambda: cpu_ns(spinner.tid) > ran + 20 * MS, f"it to run {when}")
+
+        back_end.assign(spinner.tid, "shut")
+        wait_until_it_runs("unarmed")
         back_end.arm(time.monotonic_ns() + 310 * MS)
         begun(back_end)
-        time.sleep(0.1)
-        back_end.assign(spinner.tid, "shut")
-        wait_for(lambda: stands_still(spinner.tid), "it to stop")
+        wait_for(lambda: stands_still(spinner.tid), "it to stop behind its slot")
         back_end.assign(spinner.tid, "open")
         assert back_end.members() == {"open": (spinner.tid,), "shut": ()}
-        ran = cpu_ns(spinner.tid)
-        wait_for(lambda: cpu_ns(spinner.tid) > ran, "it to go on")
+        wait_until_it_runs("in another server")
         back_end.assign(spinner.tid, "shut")
         wait_for(lambda: stands_still(spinner.tid), "it to stop again")
         assert back_end.failure() is None
+        for _ in range(2):
+            back_end.release()
+        assert cgroup_of(spinner.tid) == home
+        wait_until_it_runs("released")
+        with pytest.raises(OperationError, match="no longer in force: they were released"):
+            back_end.assign(spinner.tid, "shut")
 
 
 def test_where_servers_overlap_the_better_priority_runs(tmp_path: Path) -> None:
@@ -260,14 +253,10 @@ def test_a_slot_that_ends_while_a_thread_computes_is_an_overrun(tmp_path: Path) 
         with ahead_of_others(spinner.tid):
             wait_for(lambda: (back_end.counters()["idle"].slots or 0) >= 30, "30 slots")
         busy, idle = back_end.counters()["busy"], back_end.counters()["idle"]
-        assert busy.slots is not None
-        assert busy.overruns is not None
         # A slot in which others kept the core from it altogether may find it elsewhere.
-        assert busy.overruns > 0.5 * busy.slots
+        assert known(busy.overruns) > 0.5 * known(busy.slots)
         assert idle.overruns == 0
-        assert idle.late_entries is not None
-        assert idle.longest_lateness_ns is not None
-        assert (idle.late_entries > 0) == (idle.longest_lateness_ns > 100_000)
+        assert (known(idle.late_entries) > 0) == (known(idle.longest_lateness_ns) > 100_000)
 
 
 def test_threads_that_end_inside_and_outside_their_slots_are_no_failure(tmp_path: Path) -> None:
@@ -339,26 +328,18 @@ def test_the_last_of_two_runs_at_once_leaves_it_mounted_as_the_first_found_it(
     assert mount_options() == plain
 
 
-def test_a_group_that_somebody_removes_is_told(tmp_path: Path) -> None:
+def test_a_thread_that_is_moved_away_and_a_group_that_is_removed_are_told(tmp_path: Path) -> None:
     with stamping(tmp_path, 20) as spinner, freezer(tmp_path, server("a", (5, 12))) as back_end:
         back_end.assign(spinner.tid, "a")
         back_end.arm(0)
         begun(back_end)
+        assert back_end.failure() is None
         (folder,) = groups_left(os.getpid())
         (folder.parent / "cgroup.threads").write_text(str(spinner.tid))
+        assert f"thread {spinner.tid} was moved out" in str(back_end.failure())
         folder.rmdir()
-        wait_for(lambda: back_end.failure() is not None, "the failure")
         removed = "a cgroup of server a was removed"
         wait_for(lambda: removed in str(back_end.failure()), "the reason")
-
-
-def test_a_thread_that_somebody_moves_away_is_told(tmp_path: Path) -> None:
-    with stamping(tmp_path, 20) as spinner, freezer(tmp_path, server("a", (5, 12))) as back_end:
-        back_end.assign(spinner.tid, "a")
-        assert back_end.failure() is None
-        parent = cgroup_of(spinner.tid).parent
-        (parent / "cgroup.threads").write_text(str(spinner.tid))
-        assert f"thread {spinner.tid} was moved out" in str(back_end.failure())
 
 
 def test_one_run_at_a_time_has_a_thread(tmp_path: Path) -> None:
@@ -444,13 +425,11 @@ def test_without_the_class_it_gates_as_well_as_it_can(tmp_path: Path) -> None:
             text=True,
             preexec_fn=drop,  # noqa: PLW1509 - the child execs at once
         )
-        assert owner.stdin is not None
-        assert owner.stdout is not None
-        with owner, owner.stdin:
-            *_, dispatcher = owner.stdout.readline().split()
+        with owner, known(owner.stdin):
+            *_, dispatcher = known(owner.stdout).readline().split()
             assert list_threads(int(dispatcher))[0].policy == "SCHED_OTHER"
             begin = time.monotonic_ns()
-            time.sleep(1)
+            time.sleep(0.6)
             end = time.monotonic_ns()
         windows = spinner.windows(begin, end)
         ran = sum(b - a for a, b in windows)
@@ -469,16 +448,14 @@ def test_after_a_stall_what_should_be_open_by_then_counts(tmp_path: Path) -> Non
         kill(dispatcher, signal.SIGCONT)
         resumed = time.monotonic_ns()
         with ahead_of_others(spinner.tid):
-            time.sleep(1)
+            time.sleep(0.6)
             end = time.monotonic_ns()
         after = back_end.counters()["a"]
         assert back_end.failure() is None
         back_end.release()
 
-        assert before.slots is not None
-        assert after.slots is not None
         # Slots that passed meanwhile are not opened belatedly, one after the other.
-        assert after.slots - before.slots <= (end - resumed) // CYCLE + 3
+        assert known(after.slots) - known(before.slots) <= (end - resumed) // CYCLE + 3
         assert inside_its_slots(spinner, resumed + CYCLE, end, (5, 12)) > 0.99
 
 
@@ -495,11 +472,8 @@ def test_an_entry_that_comes_late_is_counted_with_its_lateness(tmp_path: Path) -
             time.sleep(0.2)
         after = back_end.counters()["a"]
         assert back_end.failure() is None
-        assert before.late_entries is not None
-        assert after.late_entries is not None
-        assert after.longest_lateness_ns is not None
-        assert after.late_entries > before.late_entries
-        assert after.longest_lateness_ns > MS
+        assert known(after.late_entries) > known(before.late_entries)
+        assert known(after.longest_lateness_ns) > MS
 
 
 def test_thirty_two_servers_share_a_core(tmp_path: Path) -> None:

@@ -12,14 +12,17 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import pytest
 from applied_plans import Governed, needs_fifo, node_to_govern
 from gated import CORE, ahead_of_others, cpu_ns, groups_left, kill, needs_cgroups
-from processes import wait_for
+from known import known
+from processes import is_alive, wait_for
 
 from chainshaper.enforcement.freezer import CounterPage, run_of
 from chainshaper.enforcement.guardian import GROUP, let_go
@@ -45,14 +48,12 @@ class Run:
     dispatchers: list[int]
     runs: Path
     node: Governed
-    mounted: str  # how the hierarchy was
 
     def ask(self, line: str) -> str:
         assert self.owner.stdin is not None
-        assert self.owner.stdout is not None
         self.owner.stdin.write(line + "\n")
         self.owner.stdin.flush()
-        return self.owner.stdout.readline().strip()
+        return known(self.owner.stdout).readline().strip()
 
     def is_frozen(self) -> bool:
         groups = groups_left(self.owner.pid)
@@ -68,14 +69,13 @@ class Run:
         }[name]
 
     def wait_until_restored(self) -> None:
-        """The node runs, where it was, as it was, and no group is left; mounted as before."""
+        """The node runs, where it was, as it was, and no group is left."""
         wait_for(lambda: groups_left(self.owner.pid) == [], "its group to be removed")
         ran = cpu_ns(self.node.pid)
         wait_for(lambda: cpu_ns(self.node.pid) > ran, "the node to run again")
         wait_for(lambda: state_of(self.node.pid).scheduling_class.priority == 0, "its class")
         assert list(map(str, list_threads(self.node.pid)))
         assert cgroup_of(self.node.pid) == self.node.cgroup
-        wait_for(lambda: mount_options() == self.mounted, "the former mount options")
 
     def end(self) -> None:
         """End all that is left, and see that nothing is."""
@@ -83,19 +83,11 @@ class Run:
         for pid in ours:
             kill(pid)
         self.owner.wait()
-        wait_for(lambda: not any(map(alive, ours)), "our processes to end")
+        wait_for(lambda: not any(map(is_alive, ours)), "our processes to end")
         for journal in find_journals(self.runs):
             assert undo_run(journal) == ()
         assert list(self.runs.iterdir()) == []
         assert groups_left(self.owner.pid) == []
-
-
-def alive(pid: int) -> bool:
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
-    return state not in {"Z", "X"}
 
 
 @contextmanager
@@ -117,14 +109,13 @@ def owner_of(folder: Path, *arguments: object) -> Iterator[subprocess.Popen[str]
 def run_on(
     node: Governed, back_end: str = "freezer", cycle_ms: int = MINUTE, slot_ms: int = 2
 ) -> Iterator[Run]:
-    runs, mounted = node.folder / f"runs-{time.monotonic_ns()}", mount_options()
+    runs = node.folder / f"runs-{time.monotonic_ns()}"
     arguments = (back_end, runs, CORE, cycle_ms, slot_ms, node.pid)
     with owner_of(node.folder, *arguments) as owner:
-        assert owner.stdout is not None
-        said = owner.stdout.readline()
+        said = known(owner.stdout).readline()
         assert said.startswith("in force"), (node.folder / "said").read_text()
         first, second, *dispatchers = map(int, said.split()[3:])
-        run = Run(owner, [first, second], dispatchers, runs, node, mounted)
+        run = Run(owner, [first, second], dispatchers, runs, node)
         try:
             if cycle_ms == MINUTE and back_end == "freezer":
                 wait_for(run.is_frozen, "the node to be frozen")
@@ -133,16 +124,22 @@ def run_on(
             run.end()
 
 
+@pytest.fixture(autouse=True)
+def mounted_as_before() -> Iterator[None]:
+    before = mount_options()
+    yield
+    wait_for(lambda: mount_options() == before, "the former mount options")
+
+
 @pytest.fixture
 def node(tmp_path: Path) -> Iterator[Governed]:
     with node_to_govern(tmp_path) as governed:
         yield governed
 
 
-FAULTS: tuple[tuple[tuple[str, signal.Signals], ...], ...] = (
-    (("owner", KILL),),
+Faults: TypeAlias = tuple[tuple[str, signal.Signals], ...]
+FAULTS: tuple[Faults, ...] = (
     (("owner", signal.SIGTERM),),
-    (("dispatcher", KILL),),
     (("dispatcher", STOP),),
     (("owner", KILL), ("guardian", KILL)),
     (("owner", KILL), ("guardian", STOP)),
@@ -157,23 +154,31 @@ FAULTS: tuple[tuple[tuple[str, signal.Signals], ...], ...] = (
     (("dispatcher", STOP), ("guardian", KILL)),
     (("dispatcher", STOP), ("guardian", STOP)),
 )
-"""All that take the servers away. With ``fifo``, which has no dispatcher, those without one do, and
-an owner that is lost together with both guardians leaves the class to `release`."""
+"""All pairs that take the servers away, and what is more than killing one. With ``fifo``, which has
+no dispatcher, those without one do, and an owner that is lost together with both guardians leaves
+the class to `release`."""
 
 
 @pytest.mark.parametrize("back_end", ["freezer", "fifo"])
 def test_whichever_two_are_killed_or_stopped_all_is_as_before(
-    node: Governed, back_end: str
+    tmp_path: Path, back_end: str
 ) -> None:
-    for faults in FAULTS:
-        if back_end == "fifo" and {"dispatcher", "guardians"} & {name for name, _ in faults}:
-            continue
-        with run_on(node, back_end) as run:
+    """Several runs at a time, each with a node of its own."""
+
+    def lose(faults: Faults) -> None:
+        name = f"node{FAULTS.index(faults)}"
+        (tmp_path / name).mkdir()
+        with node_to_govern(tmp_path / name, name) as node, run_on(node, back_end) as run:
             assert state_of(node.pid).scheduling_class.priority > 0
-            for name, number in faults:
-                for pid in run.pids(name):
+            for whose, number in faults:
+                for pid in run.pids(whose):
                     kill(pid, number)
             run.wait_until_restored()
+
+    without = {"dispatcher", "guardians"} if back_end == "fifo" else set()
+    with ThreadPoolExecutor(max_workers=4) as several:
+        wanted = [one for one in FAULTS if without.isdisjoint(name for name, _ in one)]
+        list(several.map(lose, wanted))
 
 
 @pytest.mark.parametrize(("name", "number"), [("guardian", KILL), ("guardians", STOP)])
@@ -227,8 +232,7 @@ def test_threads_that_a_guardian_lets_go_when_the_dispatcher_is_back_are_closed_
 ) -> None:
     with run_on(node) as run:
         (journal,) = find_journals(run.runs)
-        freezer = run_of(journal)
-        assert freezer is not None
+        freezer = known(run_of(journal))
         let_go(journal, CounterPage(freezer.page, freezer.table), CORE)  # as the slower of two may
         wait_for(run.is_frozen, "it to be closed again")
         assert run.ask("failure") == "None"
@@ -246,7 +250,7 @@ def test_guardians_are_out_of_reach_of_what_befalls_the_owner(node: Governed) ->
             for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
                 kill(pid, number)
         time.sleep(0.2)
-        assert all(map(alive, run.guardians))
+        assert all(map(is_alive, run.guardians))
         assert run.ask("failure") == "None"
 
 

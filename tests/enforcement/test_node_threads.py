@@ -11,6 +11,7 @@ import pytest
 from actors import acting
 from hypothesis import given
 from hypothesis import strategies as st
+from known import known
 
 from chainshaper.enforcement.threads import (
     DDS_PRIORITY,
@@ -202,8 +203,7 @@ def test_threads_that_appear_and_end_are_found_by_looking_again(tmp_path: Path) 
     with acting(tmp_path, *CYCLONE, "worker", arguments=arguments) as actor:
 
         def look() -> Allocation:
-            process = read_process(actor.pid)
-            assert process is not None
+            process = known(read_process(actor.pid))
             return allocate([process])
 
         before = look()
@@ -233,8 +233,7 @@ def test_a_process_started_after_the_recording_is_not_in_it(
     early = time.monotonic_ns()
     time.sleep(0.05)  # more than the tick in which the kernel tells a start
     with acting(tmp_path, "recv", "worker") as actor:
-        process = read_process(actor.pid)
-        assert process is not None
+        process = known(read_process(actor.pid))
         seen_ns = early if started_later else time.monotonic_ns()
         threads = (RecordedThread(process.threads[1].inner_tid, "executor", ("/a",)),)
         recorded = RecordedProcess(process.inner_pid, ("/a",), threads, seen_ns)
@@ -502,9 +501,7 @@ def test_whatever_the_plan_the_order_of_priorities_holds(
                 continue
             new = after.get(sibling.thread.tid, Scheduling(None, None))
             if set(new.cores or sibling.thread.cores) & set(one.wanted.cores or ()):
-                assert new.priority is not None
-                assert one.wanted.priority is not None
-                assert one.wanted.priority < new.priority
+                assert known(one.wanted.priority) < known(new.priority)
 
 
 @pytest.mark.parametrize(
@@ -528,8 +525,7 @@ def test_how_a_process_publishes_is_looked_up_before_its_publisher_is_gated(
 
         def checked() -> list[str]:
             info = RecordingInfo(source="lttng", clock_offset_ns=0, endpoints=tuple(ends))
-            process = read_process(actor.pid)
-            assert process is not None
+            process = known(read_process(actor.pid))
             found = allocate([process])
             server_members(plan, found)
             return check_publishers(plan, found, Recording(tmp_path, info, {}))

@@ -70,12 +70,17 @@ def test_what_a_killed_run_and_its_stopped_processes_left_is_undone(tmp_path: Pa
         assert not [pid for pid in left if Path(f"/proc/{pid}/exe").exists()]
 
 
-def test_a_run_whose_folder_is_removed_has_it_again_and_can_be_released(tmp_path: Path) -> None:
+def test_a_run_whose_folder_is_removed_has_it_again_and_can_be_released_though_it_is_stopped(
+    tmp_path: Path,
+) -> None:
     with in_force(tmp_path) as (governed, run):
         (journal,) = find_journals()
         shutil.rmtree(journal.path.parent)
         wait_for(journal.path.exists, "the journal to be written again")
         assert str(run.pid) in called("status").out
+        run.send_signal(signal.SIGSTOP)
+        ran = cpu_ns(governed.pid)
+        wait_for(lambda: cpu_ns(governed.pid) > ran + 10_000_000, "some slots")
         assert called("release").code == 0
         assert run.wait(timeout=20) == 0
         governed.check_as_before()
@@ -258,22 +263,21 @@ def test_runs_for_different_cores_and_nodes_do_not_mind_each_other(tmp_path: Pat
 
 def test_of_runs_that_start_at_the_same_instant_exactly_one_is_in_force(tmp_path: Path) -> None:
     with node_to_govern(tmp_path) as governed:
-        for _ in range(2):
-            with (
-                started(one_server_plan(), tmp_path, *FREEZER) as one,
-                started(one_server_plan(), tmp_path, *FREEZER) as other,
-            ):
-                wait_for(
-                    lambda: one.poll() is not None or other.poll() is not None,
-                    "one of them to be refused",
-                )
-                winner, loser = (one, other) if other.poll() is not None else (other, one)
-                assert loser.returncode == 1
-                assert f"of process {winner.pid} governs" in ended(loser)
-                wait_until_in_force(winner)
-                winner.send_signal(signal.SIGINT)
-                assert winner.wait(timeout=20) == 0
-            governed.check_as_before()
+        with (
+            started(one_server_plan(), tmp_path, *FREEZER) as one,
+            started(one_server_plan(), tmp_path, *FREEZER) as other,
+        ):
+            wait_for(
+                lambda: one.poll() is not None or other.poll() is not None,
+                "one of them to be refused",
+            )
+            winner, loser = (one, other) if other.poll() is not None else (other, one)
+            assert loser.returncode == 1
+            assert f"of process {winner.pid} governs" in ended(loser)
+            wait_until_in_force(winner)
+            winner.send_signal(signal.SIGINT)
+            assert winner.wait(timeout=20) == 0
+        governed.check_as_before()
 
 
 def test_a_run_takes_over_from_one_that_was_killed_with_all_its_processes(tmp_path: Path) -> None:

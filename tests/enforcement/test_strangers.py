@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from applied_plans import needs_fifo, plan_for, running_node, server
 from command_line import called, json_of, refused
+from known import known
 from processes import wait_for
 from strangers import NOBODY, named, needs_root, open_folder, strange
 
@@ -98,9 +99,8 @@ def test_nothing_of_a_strangers_environment_runs_unless_its_user_is_named_and_th
     plan: Plan, tmp_path: Path, open_folder: Path
 ) -> None:
     environment, ran = trap(open_folder)
-    assert plan.shaping_node is not None
     nodes = [thread.node[1:] for one in plan.servers for thread in one.threads]
-    shaping = plan.shaping_node.name
+    shaping = known(plan.shaping_node).name
     with (
         strange(named(*(node for node in nodes if node != shaping)), environment) as others,
         strange(named(shaping), environment) as gate,
@@ -216,8 +216,7 @@ def test_a_program_that_runs_as_another_than_who_started_it_is_no_users(
         if not is_root():
             pytest.skip("set-user-ID programs do not work in this folder")
         assert user_of(process.pid) is None
-        found = read_process(process.pid)
-        assert found is not None
+        found = known(read_process(process.pid))
         assert found.user is None
         assert all("/carried" not in thread.nodes for thread in find_threads().threads)
         with pytest.raises(OperationError, match="started by another user than runs it"):
@@ -234,8 +233,7 @@ def test_an_environment_from_a_namespace_of_its_own_is_not_used(options: list[st
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, user=user, group=user, cwd="/"
     )
     try:
-        assert process.stdout is not None
-        if process.stdout.readline() != b"ready\n":
+        if known(process.stdout).readline() != b"ready\n":
             pytest.skip("no such namespace can be made here")
         assert user_of(process.pid) == user
         with pytest.raises(OperationError, match="in a container or a namespace of its own"):
@@ -266,8 +264,7 @@ def test_what_a_stranger_has_run_is_bounded_in_time_and_in_what_it_prints(
         pid_file = open_folder / "evil.pid"
         wait_for(lambda: pid_file.read_text().endswith("\n"), "a child of it")
         child = int(pid_file.read_text())
-        started = start_of(child, child)
-        assert started is not None
+        started = known(start_of(child, child))
         _, problem = script.end()
         assert problem == "ROS 2 did not answer within 0 s"
         wait_for(lambda: has_ended(child, started), "the child to be killed")

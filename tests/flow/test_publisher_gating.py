@@ -40,6 +40,7 @@ def test_the_publisher_waits_for_its_slot_and_its_executor_does_not(tmp_path: Pa
     )
 
     measured = measure_latency(recording)
+    assert measured.analysis.incomplete == {}, "nothing is lost"
     undisturbed = measured.analysis.traversals.filter(~pl.col("disturbed"))
     # Latency counts from the first callback, which starts a little after its cycle does.
     start, end = server.slots[0]

@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from known import known
 from passing import decided, held, serialized
 
 from chainshaper.gate import decision
@@ -140,12 +141,11 @@ def test_a_message_leaves_at_the_first_instant_inside_a_slot(
     gate = replace(gate, due_cycles=0)
     release = release_of(gate, arrival, stamp)
     assert release.at_ns is not None
-    assert release.slot is not None
     instant = max(arrival, release.origin_ns)  # no cycle exists before the first one
     while not _inside_a_slot(gate, instant - release.origin_ns):
         instant += 1
     assert release.at_ns == instant
-    start, end = gate.slots[release.slot]
+    start, end = gate.slots[known(release.slot)]
     assert start <= release.at_ns - release.start_ns(gate.cycle_ns) < end
     if release.anchor == "stamp":
         assert (gate.anchor, release.origin_ns) == ("stamp", stamp)
@@ -352,8 +352,7 @@ def test_a_cycle_has_one_mode_and_messages_leave_in_its_slot_unless_late(
     late: str, overrun: str, arrival: int, other: int, changes: list[tuple[int, str]]
 ) -> None:
     release = release_of(with_late(late, overrun), arrival, 0, changes)
-    assert release.mode is not None
-    band = MODES.bands[release.mode]
+    band = MODES.bands[known(release.mode)]
     start, end = MODAL.slots[band]
     assert (release.overrun is None) == (arrival < end)
     if release.overrun is None:

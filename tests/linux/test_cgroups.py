@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from gated import cpu_ns, needs_cgroups, own_cgroup, sleeping, stamping
+from known import known
 from processes import children_of, wait_for
 
 from chainshaper.linux import cgroups
@@ -41,7 +42,7 @@ def freeze(child: Path) -> None:
 
 
 def test_one_thread_stops_while_the_others_of_its_process_run_on(tmp_path: Path) -> None:
-    with own_cgroup("one-thread") as home, stamping(tmp_path, 20) as spinner:
+    with own_cgroup("one-thread") as home, stamping(tmp_path, 20, with_another=True) as spinner:
         (home / "cgroup.procs").write_text(str(spinner.tid))
         child = cgroups.make_threaded_child(home, "gated")
         assert cgroups.move_thread(spinner.tid, child)
@@ -106,8 +107,7 @@ def test_a_process_that_is_killed_while_frozen_ends_and_its_group_goes() -> None
 
 def test_a_zombie_does_not_hold_its_group() -> None:
     with frozen("zombie") as (_, process):
-        born = start_of(process.pid, process.pid)
-        assert born is not None
+        born = known(start_of(process.pid, process.pid))
         assert not has_ended(process.pid, born)
         process.kill()
         wait_for(lambda: has_ended(process.pid, born), "its end")

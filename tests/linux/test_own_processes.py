@@ -12,6 +12,7 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
+from known import known
 from processes import wait_for
 from small_chain import small_chain_text
 
@@ -269,8 +270,7 @@ def test_a_command_gets_a_sigint_when_we_are_killed(tmp_path: Path) -> None:
         "time.sleep(60)"
     )
     owner = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE)
-    assert owner.stdout is not None
-    assert owner.stdout.readline() == b"ready\n"
+    assert known(owner.stdout).readline() == b"ready\n"
     owner.kill()
     owner.wait()
     wait_for(said.exists, "the command's reaction")

@@ -8,6 +8,7 @@ import pytest
 from actors import acting
 from hypothesis import given
 from hypothesis import strategies as st
+from known import known
 
 from chainshaper.linux.processes import (
     descendants,
@@ -128,8 +129,7 @@ CYCLONE = ("gc", "dq.builtins", "dq.user", "tev", "recv")
 def test_a_process_shows_its_command_line_and_threads(tmp_path: Path) -> None:
     arguments = ("--ros-args", "-p", "text:=two words")
     with acting(tmp_path, *CYCLONE, arguments=arguments) as actor:
-        process = read_process(actor.pid)
-    assert process is not None
+        process = known(read_process(actor.pid))
     assert process.command[-3:] == arguments
     assert process.parent == os.getpid()
     assert process.inner_pid == actor.pid or process.inner_pid < actor.pid
@@ -140,8 +140,7 @@ def test_a_process_shows_its_command_line_and_threads(tmp_path: Path) -> None:
 def test_threads_that_only_dds_has_tell_a_participant(tmp_path: Path) -> None:
     for names, participates in ((CYCLONE, True), (("gc", "lease"), False), ((), False)):
         with acting(tmp_path, *names) as actor:
-            process = read_process(actor.pid)
-            assert process is not None
+            process = known(read_process(actor.pid))
             assert process.participates is participates
             assert bool(find_applications([process])) is participates
 

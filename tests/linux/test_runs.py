@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from applied_plans import needs_fifo
 from gated import needs_cgroups
+from known import known
 from small_chain import EXECUTOR_CORE, small_chain_plan, small_chain_text
 
 from chainshaper import measure_latency, open_recording, save_plan
@@ -211,8 +212,7 @@ def test_who_governs_a_process_is_seen_and_when_it_ended(tmp_path: Path) -> None
     assert len(governing(mine, 160, seen, tmp_path)) == 1
     # It says that it ends; or is gone without a word.
     ((_, state),) = [one for one in find_runs(tmp_path) if one[0].path == journal.path]
-    assert state is not None
-    save_run_state(journal.path.parent, replace(state, ended_ns=190))
+    save_run_state(journal.path.parent, replace(known(state), ended_ns=190))
     assert governing(mine, 200, seen, tmp_path)[0].until_ns == 190
     remove_run(journal)
     (gone,) = governing(mine, 300, seen, tmp_path)
@@ -230,8 +230,7 @@ def test_of_several_plans_the_time_counts_in_which_all_were_in_force() -> None:
         ((early, later), (300, 450, {"plan": "c"})),  # one after the other
         ((whole, later), (300, 450, None)),
     ):
-        found = in_force_throughout(runs)
-        assert found is not None
+        found = known(in_force_throughout(runs))
         assert (found.since_ns, found.until_ns, found.plan) == expected
 
 
@@ -250,10 +249,9 @@ def test_applied_and_released_in_the_midst_of_a_recording(tmp_path: Path) -> Non
     words = [*command, "apply", str(file), "--backend", "freezer", "--wait", "20s"]
     governor = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     try:
-        assert governor.stderr is not None
         said: list[str] = []
         while not said or (said[-1] and not said[-1].startswith("in force with freezer")):
-            said.append(governor.stderr.readline())
+            said.append(known(governor.stderr).readline())
         assert said[-1], said
         time.sleep(2)
         governor.send_signal(signal.SIGINT)
@@ -265,20 +263,16 @@ def test_applied_and_released_in_the_midst_of_a_recording(tmp_path: Path) -> Non
             process.kill()
             process.wait()
     recording = open_recording(output)
-    spell = recording.info.in_force
-    assert spell is not None
-    assert spell.until_ns is not None
-    assert recording.info.plan is not None
-    assert recording.info.plan["chain"] == plan.model_dump(mode="json")["chain"]
+    spell = known(recording.info.in_force)
+    assert known(recording.info.plan)["chain"] == plan.model_dump(mode="json")["chain"]
     measured = measure_latency(recording)
     starts = measured.analysis.traversals["start"]
     assert 0 < len(starts) < 160
     assert (starts >= spell.since_ns).all()
-    assert (starts < spell.until_ns).all()
+    assert (starts < known(spell.until_ns)).all()
     assert min(measured.left_out.before_ns, measured.left_out.after_ns) > 0
     # In force, no output leaves before the slot: that is 2 ms behind the timer at the earliest.
-    shortest = measured.analysis.statistics.min_ns
-    assert shortest is not None
+    shortest = known(measured.analysis.statistics.min_ns)
     assert shortest > 25 * MS - 3 * MS
     unknown = recording.info.model_copy(update={"in_force": None})
     whole = measure_latency(replace(recording, info=unknown))

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from actors import acting
+from known import known
 from processes import wait_for
 
 from chainshaper.linux.scheduling import (
@@ -125,8 +126,7 @@ def test_scheduling_a_thread_that_has_ended_is_no_error_and_what_is_refused_is_n
     ended = threading.Thread(target=lambda: None)
     ended.start()
     ended.join()
-    assert ended.native_id is not None
-    apply_scheduling(_thread(ended.native_id), Scheduling(None, (available_cores()[0],)))
+    apply_scheduling(_thread(known(ended.native_id)), Scheduling(None, (available_cores()[0],)))
     thread = _thread(threading.get_native_id())
     with pytest.raises(OperationError, match=rf"thread {thread.tid} \(recv\).*priority 500"):
         apply_scheduling(thread, Scheduling(500, None))

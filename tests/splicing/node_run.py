@@ -14,6 +14,7 @@ from pathlib import Path
 from queue import Empty, Queue
 from typing import Any
 
+from known import known
 from passing import serialized
 
 from chainshaper.planning import Modes, Plan
@@ -65,8 +66,7 @@ class NodeRun:
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:
-        assert self.process.stdout is not None
-        for line in self.process.stdout:
+        for line in known(self.process.stdout):
             self._lines.put(line)
         self._lines.put(None)
 
@@ -123,9 +123,8 @@ class NodeRun:
 
     def end(self, how: signal.Signals | None = None) -> int:
         """End it, by the end of its input or by a signal; its exit code, all said being read."""
-        assert self.process.stdin is not None
         if how is None:
-            self.process.stdin.close()
+            known(self.process.stdin).close()
         else:
             self.process.send_signal(how)
         while (line := self._lines.get(timeout=30)) is not None:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from known import known
 from small_chain import EXECUTOR_CORE, small_chain
 
 from chainshaper import shape_application
@@ -92,12 +93,10 @@ def _asynchronous(**changes: Any) -> Plan:
 def test_how_overruns_are_treated_goes_with_the_gate(application: Application, plan: Plan) -> None:
     for overrun in ("wait", "discard", "publish"):
         spliced = splice_application(application, revised(plan, overrun=overrun))
-        gate = spliced.nodes["chainshaper_t3"].callbacks[0].gate
-        assert gate is not None
+        gate = known(spliced.nodes["chainshaper_t3"].callbacks[0].gate)
         assert (gate.overrun, gate.due_cycles) == (overrun, 0)
     let = splice_application(application, let_per_chain(plan))
-    gate = let.nodes["chainshaper_t3"].callbacks[0].gate
-    assert gate is not None
+    gate = known(let.nodes["chainshaper_t3"].callbacks[0].gate)
     assert gate.due_cycles == 1
 
 

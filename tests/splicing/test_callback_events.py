@@ -7,6 +7,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from known import known
 from node_run import RELIABLE, running_node, stamped
 
 from chainshaper.planning import Plan
@@ -85,9 +86,8 @@ def throttled_once(folder: Path, environment: dict[str, str]) -> None:
 
 def shaped_once(folder: Path, plan: Plan, environment: dict[str, str]) -> str:
     """The source timestamp in its log, of a message that has 77."""
-    assert plan.shaping_node is not None
     log = folder / "gate.csv"
-    process = write_shaping_process(plan, plan.shaping_node, "python", folder, log=log)
+    process = write_shaping_process(plan, known(plan.shaping_node), "python", folder, log=log)
     with running_node(process, folder, environment=environment) as run:
         run.send(stamped(), 77)
         run.hear_published()

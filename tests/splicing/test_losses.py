@@ -12,6 +12,7 @@ from typing import Any
 
 import polars as pl
 import pytest
+from known import known
 from node_run import NodeRun, outputs, running_node, stamped, with_slots
 from processes import wait_for
 
@@ -32,8 +33,7 @@ def at_work(
     """The node of a plan with one slot; ``log_bytes`` is no part of a plan."""
     log_bytes = changes.pop("log_bytes", 100_000_000)
     plan = revised(with_slots(plan, slot), anchor="cycle", **changes)
-    assert plan.shaping_node is not None
-    process = write_shaping_process(plan, plan.shaping_node, "python", folder, log=log)
+    process = write_shaping_process(plan, known(plan.shaping_node), "python", folder, log=log)
     with process.parameters_file.open("a") as file:
         file.write(f"    log_bytes: {log_bytes}\n")
     with running_node(process, folder) as run:

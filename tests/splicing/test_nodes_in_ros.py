@@ -13,6 +13,7 @@ from typing import Any
 
 import polars as pl
 import pytest
+from known import known
 from node_run import SLOTS, banded
 from ros2 import ros2_environment
 
@@ -200,8 +201,7 @@ def test_it_stops_while_it_waits_for_its_input(
 ) -> None:
     process = written(plan, kind, tmp_path)
     with started(process, place) as child:
-        assert child.stdout is not None
-        for line in child.stdout:
+        for line in known(child.stdout):
             if "waiting for a publisher of /t3_tmp" in line:
                 break
 

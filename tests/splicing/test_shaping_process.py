@@ -16,6 +16,7 @@ from unittest.mock import MagicMock
 
 import pytest
 import yaml
+from known import known
 from node_run import PUBLISHERS, RELIABLE, SLOTS, NodeRun, banded, running_node, stamped
 from processes import wait_for
 from small_chain import EXECUTOR_CORE
@@ -39,8 +40,7 @@ LATENCY = Path("/dev/cpu_dma_latency")
 
 @pytest.fixture
 def node(plan: Plan) -> ShapingNode:
-    assert plan.shaping_node is not None
-    return plan.shaping_node
+    return known(plan.shaping_node)
 
 
 def parameters_of(process: ShapingProcess) -> dict[str, Any]:
@@ -100,8 +100,7 @@ def test_the_parameters_say_what_the_plan_says(
         "log": str(tmp_path / "gate.csv"),
         **same,
     }
-    assert process.standby is not None
-    assert parameters_of(process.standby) == {
+    assert parameters_of(known(process.standby)) == {
         "shaping_node": "chainshaper_t3",
         "fallback": "bypass",
         "patience_ns": 25 * MS,
@@ -137,8 +136,7 @@ def test_a_gate_with_modes_is_the_same_behind_its_parameters(
 
 def test_under_let_each_topic_is_due_a_cycle_after_the_one_before_it(plan: Plan) -> None:
     plan = let_per_callback(plan, ("/t1", "/t2", "/t3"))
-    assert plan.shaping_node is not None
-    nodes = (*plan.further_shaping_nodes, plan.shaping_node)
+    nodes = (*plan.further_shaping_nodes, known(plan.shaping_node))
     due = {node.output: gate_of(plan, node).due_cycles for node in nodes}
     assert due == {"/t1": 1, "/t2": 2, "/t3": 3}
 
@@ -192,9 +190,8 @@ def at_work(
     **more: Any,
 ) -> Iterator[NodeRun]:
     """The plan's node in Python, with its log in the folder; a text of its parameters changed."""
-    assert plan.shaping_node is not None
     log = more.pop("log", folder / "gate.csv")
-    process = write_shaping_process(plan, plan.shaping_node, "python", folder, log=log)
+    process = write_shaping_process(plan, known(plan.shaping_node), "python", folder, log=log)
     text = process.parameters_file.read_text()
     assert change[0] in text
     process.parameters_file.write_text(text.replace(*change) if change[0] else text)
@@ -386,7 +383,7 @@ RAW = {"/rear/raw": PUBLISHERS["/t3_tmp"], "/front/raw": PUBLISHERS["/t3_tmp"]}
 
 def test_the_throttler_publishes_what_is_newest_and_counts_the_rest(tmp_path: Path) -> None:
     topics = {"/rear/raw": "/rear", "/front/raw": "/front"}
-    period, phase = 2_000 * MS, 700 * MS
+    period, phase = 1_000 * MS, 350 * MS
     process = write_throttler(topics, period, "python", tmp_path, phase_ns=phase)
     with running_node(process, tmp_path, RAW) as run:
         for payload in ("aa", "bb"):
@@ -419,13 +416,13 @@ def test_by_the_papers_rule_the_first_message_of_a_period_is_published_as_it_com
     tmp_path: Path,
 ) -> None:
     topics = {"/rear/raw": "/rear", "/front/raw": "/front"}
-    process = write_throttler(topics, 2_000 * MS, "python", tmp_path, rule="first")
+    process = write_throttler(topics, 1_000 * MS, "python", tmp_path, rule="first")
     with running_node(process, tmp_path, RAW) as run:
         for payload in ("aa", "bb"):
             run.tell(topic="/rear/raw", payload=payload, source=1)
         run.tell(topic="/front/raw", payload="cc", source=1)
         run.hear(lambda words: words.get("payload") == "cc")
-        time.sleep(1.7)  # four fifths of a period
+        time.sleep(0.9)  # four fifths of a period
         run.tell(topic="/rear/raw", payload="dd", source=1)
         assert run.end() == 0
     published = [words["payload"] for words in run.said if "published" in words]

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import yaml
+from known import known
 from node_run import NodeRun, banded, outputs, running_node, stamped
 from processes import wait_for
 
@@ -29,9 +30,8 @@ def written(
     plan: Plan, folder: Path, patience_ns: int = 20_000 * MS
 ) -> tuple[ShapingProcess, ShapingProcess]:
     """A shaping node and its standby, for which a node on a busy machine is late only then."""
-    assert plan.shaping_node is not None
     process = write_shaping_process(
-        plan, plan.shaping_node, "python", folder, log=folder / "gate.csv"
+        plan, known(plan.shaping_node), "python", folder, log=folder / "gate.csv"
     )
     assert process.standby is not None
     before = change(process.standby, patience_ns=patience_ns)
@@ -248,8 +248,7 @@ def test_without_a_folder_the_node_works_alone_and_the_standby_says_that_it_cann
 ) -> None:
     process, beside = written(plan, tmp_path)
     for one in (process, beside):
-        assert one.command is not None
-        script = Path(one.command[1])
+        script = Path(known(one.command)[1])
         text = script.read_text().replace("/dev/shm/chainshaper-", f"{tmp_path}/no/such/folder-")
         script.write_text(text)
     for name in ("outputs", "chainshaper", "no"):

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from known import known
 
 from chainshaper.workload import dds
 from chainshaper.workload.event_log import LAYOUT, WIDTH, EventLog
@@ -91,7 +92,7 @@ class Bench:
 def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
     monkeypatch.setenv("CYCLONEDDS_URI", dds.closed_domain_configuration())
     log = EventLog()
-    participant = dds.join_domain(dds.free_domain())
+    participant = dds.Participant(dds.free_domain())
     return Bench(participant, log, Executor(participant, log))
 
 
@@ -177,8 +178,7 @@ def test_a_slow_reader_has_the_last_messages_of_its_depth_byte_for_byte(bench: B
     for number, payload in enumerate(payloads):
         publisher.write(payload, source_timestamp=1000 + number)
     for number in (4, 5):
-        message = subscription.take()
-        assert message is not None
+        message = known(subscription.take())
         assert message.source_timestamp == 1000 + number
         assert message.payload[4:] == payloads[number][4:], "behind the encapsulation header"
     assert subscription.take() is None

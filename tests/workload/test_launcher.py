@@ -10,7 +10,8 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
-from processes import children_of, wait_for
+from known import known
+from processes import children_of, is_alive, wait_for
 
 from chainshaper.values.errors import OperationError
 from chainshaper.workload.launcher import Child, end_all, first_casualty, start_child
@@ -165,23 +166,13 @@ def test_children_die_when_their_launcher_is_killed(tmp_path: Path) -> None:
     )
     launcher = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
     try:
-        assert launcher.stdout is not None
-        pids = [int(pid) for pid in launcher.stdout.readline().split()]
+        pids = [int(pid) for pid in known(launcher.stdout).readline().split()]
         assert len(pids) == 2
         assert all(Path(f"/proc/{pid}").exists() for pid in pids)
     finally:
         launcher.kill()
         launcher.communicate()
-    wait_for(lambda: not any(_alive(pid) for pid in pids), "the kernel to end the children")
-
-
-def _alive(pid: int) -> bool:
-    """Whether a process runs; one that is dead but not yet waited for does not."""
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
-    return state not in ("Z", "X")
+    wait_for(lambda: not any(is_alive(pid) for pid in pids), "the kernel to end the children")
 
 
 def test_waiting_ends_with_a_signal_whoever_else_handles_it(nursery: Nursery) -> None:

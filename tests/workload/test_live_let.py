@@ -87,5 +87,10 @@ def test_what_comes_in_comes_out_or_is_counted(
         assert sum(dropped.values()) <= 0.1 * rows.height
     else:
         assert dropped.keys() >= lost
-    order = rows.filter(pl.col("release").is_not_null())["source_timestamp"]
-    assert order.is_sorted(), "in the order they came"
+    left = rows.filter(pl.col("release").is_not_null())
+    assert left["source_timestamp"].is_sorted(), "in the order they came"
+    assert set(left["anchor"]) == {"cycle"}
+    if messages == "first":
+        held = left.filter(pl.col("release") > pl.col("arrival"))["release"]
+        assert held.len() > 0
+        assert set((held - held[0]) % PERIOD_NS) == {0}, "strictly periodic"

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from known import known
 from processes import children_of, real_time_threads
-from small_chain import DDS_CORE, EXECUTOR_CORE, NODES, PERIOD_NS, small_chain, small_chain_text
+from small_chain import DDS_CORE, EXECUTOR_CORE, NODES, small_chain, small_chain_text
 
-from chainshaper import measure_latency, run_application, shape_application
+from chainshaper import measure_latency, run_application
 from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.planning import Plan, publish_slots
-from chainshaper.planning.plan import revised
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import Recording, ThreadInfo
 from chainshaper.workload import live
@@ -89,8 +89,7 @@ def test_every_traversal_is_complete(run: str, request: pytest.FixtureRequest) -
     statistics = measure_latency(recording).analysis.statistics
     assert statistics.incomplete == 0
     assert statistics.count == _count_of(recording, "callback_start")["/first"]
-    assert statistics.min_ns is not None
-    assert statistics.min_ns >= 3_000_000, "three callbacks of 1 ms and more"
+    assert known(statistics.min_ns) >= 3_000_000, "three callbacks of 1 ms and more"
     for pid in {thread.pid for thread in recording.info.threads}:
         assert not Path(f"/proc/{pid}").exists(), "a process is left"
 
@@ -136,8 +135,7 @@ def test_the_recording_says_what_ran(ordinary: Recording) -> None:
     info = ordinary.info
     assert (info.source, info.rmw, info.chain) == ("live", "cyclonedds", "/t1../t3")
     assert set(info.processes.values()) == {f"/{name}" for name in NODES}
-    assert info.application is not None
-    assert info.application["nodes"]["first"]["callbacks"][0]["timer"] == "50ms"
+    assert known(info.application)["nodes"]["first"]["callbacks"][0]["timer"] == "50ms"
     topics = ordinary.events["rcl_publisher_init"]["topic_name"]
     assert set(topics) == {"/t1", "/t2", "/t3"}
 
@@ -159,10 +157,11 @@ def test_the_seed_determines_the_execution_times(privileged: Recording, shaped: 
             assert np.median(excess) < 500_000, "that is not the drawn sequence"
 
 
-def _check_releases(recording: Recording, plan: Plan) -> pl.DataFrame:
+def test_shaped_outputs_leave_in_their_slot_or_are_counted(shaped: Recording, plan: Plan) -> None:
     """Every message left inside a slot, or overran it and left at once, as the plan has it."""
-    releases = recording.events["gate_release"]
-    assert releases.height >= 1
+    releases = shaped.events["gate_release"]
+    assert set(releases["anchor"]) == {"stamp"}
+    assert releases.height == _count_of(shaped, "callback_start")["/first"]
     ((start, end),) = publish_slots(plan)
     at_once = (pl.col("overrun") == "publish").fill_null(False)
     overran, in_time = releases.filter(at_once), releases.filter(~at_once)
@@ -174,46 +173,15 @@ def _check_releases(recording: Recording, plan: Plan) -> pl.DataFrame:
     assert (releases["time"] >= releases["release"]).all(), "it left before its release"
     waited = (releases["release"] - releases["origin"]) // plan.cycle_ns
     assert releases["cycles_waited"].to_list() == waited.to_list()
-    overruns = measure_latency(recording).overruns or {}
-    assert overruns.get("wait", 0) == (releases["cycles_waited"] > 0).sum()
-    return releases
-
-
-def test_shaped_outputs_leave_in_their_slot_or_are_counted(shaped: Recording, plan: Plan) -> None:
-    releases = _check_releases(shaped, plan)
-    assert set(releases["anchor"]) == {"stamp"}
-    assert releases.height == _count_of(shaped, "callback_start")["/first"]
     measured = measure_latency(shaped)
+    overruns = measured.overruns or {}
+    assert overruns.get("wait", 0) == (releases["cycles_waited"] > 0).sum()
     assert measured.plan == plan
     assert measured.analysis.statistics.incomplete == 0
     assert measured.analysis.chain.topics == ("/t1", "/t2", "/t3_tmp", "/t3")
-    if not measured.overruns:
-        assert measured.analysis.statistics.min_ns is not None
+    if not overruns:
         # The stamp is read a moment before the callback's start is; 0.1 ms is far above that.
-        assert measured.analysis.statistics.min_ns >= publish_slots(plan)[0][0] - 100_000
-
-
-def test_anchored_to_the_cycle_the_output_is_strictly_periodic(tmp_path: Path, plan: Plan) -> None:
-    plan = revised(plan, anchor="cycle")
-    recording = shape_application(small_chain(tmp_path), plan, tmp_path / "rec", cycles=CYCLES)
-    releases = _check_releases(recording, plan)
-    assert set(releases["anchor"]) == {"cycle"}
-    held = releases.filter(pl.col("release") > pl.col("arrival"))["release"]
-    assert held.len() > 0
-    assert set((held - held[0]) % PERIOD_NS) == {0}
-
-
-def test_asynchronous_publication_has_a_thread_of_its_own(tmp_path: Path) -> None:
-    application = small_chain(tmp_path, publication="asynchronous")
-    recording = run_application(application, tmp_path / "rec", cycles=CYCLES)
-    (publisher,) = _threads(recording, "publisher")
-    assert (publisher.node, publisher.comm) == ("/third", "dds.asyn.0.1")
-    assert publisher.cores == (EXECUTOR_CORE,)
-    if recording.info.realtime:
-        assert (publisher.policy, publisher.priority) == ("SCHED_FIFO", 79), "below its executor"
-    statistics = measure_latency(recording).analysis.statistics
-    assert statistics.incomplete == 0
-    assert statistics.count == _count_of(recording, "callback_start")["/first"]
+        assert known(measured.analysis.statistics.min_ns) >= start - 100_000
 
 
 def test_what_cannot_run_is_refused_before_anything_starts(tmp_path: Path) -> None:

@@ -172,8 +172,7 @@ def restore_plugin(journal: Journal) -> None:
 def _leave_reservation(tid: int) -> None:
     try:
         ordinary = SchedulingClass(os.SCHED_OTHER, 0, reset_on_fork=False)
-        left = replace(state_of(tid), scheduling_class=ordinary)
-        set_state(tid, left, ["scheduling_class"])
+        set_state(tid, replace(state_of(tid), scheduling_class=ordinary))
     except ProcessLookupError:
         return
     except OSError as error:
@@ -264,17 +263,12 @@ def create_command(
     return (
         *("resctl", "-n", str(number), "-t", "table-driven", "-c", str(server.core)),
         *("-m", milliseconds_text(cycle_ns), "-q", str(server.priority)),
-        *(interval_text(start, end) for start, end in slots),
+        *(f"[{milliseconds_text(start)},{milliseconds_text(end)})" for start, end in slots),
     )
 
 
 def _attach_command(tid: int | str, number: int, core: int) -> Command:
     return ("resctl", "-a", str(tid), "-r", str(number), "-c", str(core))
-
-
-def interval_text(start_ns: int, end_ns: int) -> str:
-    """A half-open interval: ``[2,86.5)``."""
-    return f"[{milliseconds_text(start_ns)},{milliseconds_text(end_ns)})"
 
 
 def milliseconds_text(duration_ns: int) -> str:

@@ -87,7 +87,7 @@ def change_all(journal: Journal, changes: Iterable[tuple[Thread, Scheduling]]) -
     for thread, target in note_scheduling(journal, targets):
         whose = f"thread {thread.tid} ({thread.comm}) of process {thread.pid}"
         try:
-            set_state(thread.tid, target, different_aspects(state_of(thread.tid), target))
+            set_state(thread.tid, target)
         except ProcessLookupError:
             continue
         except PermissionError as error:
@@ -200,7 +200,7 @@ def release_threads(journal: Journal, groups: Iterable[Path] = ()) -> None:
         try:
             now = target = state_of(thread.tid)
             target = _given_back(now, family)
-            set_state(thread.tid, target, different_aspects(now, target))
+            set_state(thread.tid, target)
         except ProcessLookupError:
             return False
         except OSError as error:

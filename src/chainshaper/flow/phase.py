@@ -253,7 +253,7 @@ def _undisturbed() -> Iterator[None]:
     try:
         yield
     finally:
-        set_state(0, before, ["scheduling_class"])
+        set_state(0, before)
 
 
 @dataclass(frozen=True)

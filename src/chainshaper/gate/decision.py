@@ -91,10 +91,8 @@ class Gate:
 
     A message is due in the cycle that it belongs to, or ``due_cycles`` later. With the ``cycle``
     anchor it belongs to the cycle it arrives in, and is due in the next one at the latest: the data
-    of each callback came a cycle before its output is due.
-
-    Raises:
-        ValueError: such a gate makes no sense.
+    of each callback came a cycle before its output is due. Raises ValueError: such a gate makes no
+    sense.
     """
 
     slots: tuple[tuple[int, int], ...]
@@ -287,28 +285,28 @@ class NodeParameters:
     def gate(self, depth: int = DEPTH) -> Gate:
         """The gate that they describe, with room for so many messages.
 
-        Raises:
-            ValueError: they describe none.
+        Raises ValueError: they describe none.
         """
         bands = dict(zip(self.mode_names, self.mode_slots, strict=True))
         return Gate(
             slots=tuple(zip(self.slots_ns[::2], self.slots_ns[1::2], strict=False)),
             modes=Modes(bands, self.mode_default, self.mode_late) if self.mode_topic else None,
             depth=depth,
-            **{name: getattr(self, name) for name in _SAME},
+            **{name: getattr(self, name) for name in SAME},
         )
 
 
-_SAME = (
+SAME = (
     *("cycle_ns", "anchor", "phase_ns", "overrun", "due_cycles", "messages"),
     "into_open_slot",
 )
+"""What a gate, its parameters and its description have alike, under these names."""
 
 
 def gate_parameters(gate: Gate, mode_topic: str = "") -> dict[str, Any]:
     """The parameters that describe a gate, whose modes are announced on that topic."""
     known: dict[str, Any] = {"slots_ns": [bound for slot in gate.slots for bound in slot]}
-    known |= {name: getattr(gate, name) for name in _SAME}
+    known |= {name: getattr(gate, name) for name in SAME}
     if gate.modes is not None:
         known |= {
             "mode_topic": mode_topic,

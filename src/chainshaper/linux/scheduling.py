@@ -9,7 +9,6 @@ import gc
 import os
 import signal
 import threading
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -73,13 +72,13 @@ def state_of(tid: int) -> SchedulingState:
     )
 
 
-def set_state(tid: int, target: SchedulingState, aspects: Iterable[Aspect] = ASPECTS) -> None:
-    """Give a thread these aspects of a state.
+def set_state(tid: int, target: SchedulingState) -> None:
+    """Give a thread the aspects of a state in which it differs.
 
     The class goes first: on a core where a FIFO thread spins, a thread moved there as SCHED_OTHER
     would not run again. Raises ProcessLookupError: it has ended. OSError: the kernel refuses.
     """
-    for aspect in sorted(aspects, key=ASPECTS.index):
+    for aspect in different_aspects(state_of(tid), target):
         if aspect == "scheduling_class":
             wanted = target.scheduling_class
             flag = RESET_ON_FORK if wanted.reset_on_fork else 0
@@ -99,7 +98,7 @@ def after_wish(now: SchedulingState, wanted: Scheduling) -> SchedulingState:
 
 
 def different_aspects(one: SchedulingState, other: SchedulingState) -> list[Aspect]:
-    """In what two states differ."""
+    """In what two states differ, the class first."""
     return [aspect for aspect in ASPECTS if getattr(one, aspect) != getattr(other, aspect)]
 
 
@@ -129,9 +128,7 @@ def apply_scheduling(thread: Thread, wanted: Scheduling) -> None:
     Raises OperationError: the kernel refuses.
     """
     try:
-        before = state_of(thread.tid)
-        target = after_wish(before, wanted)
-        set_state(thread.tid, target, different_aspects(before, target))
+        set_state(thread.tid, after_wish(state_of(thread.tid), wanted))
     except ProcessLookupError:
         return
     except OSError as error:

@@ -9,8 +9,7 @@ added: the application is compared with what the plan takes it for, and its outp
 lifespan by which DDS discards what overran.
 """
 
-from typing import Any
-
+from chainshaper.gate.decision import SAME
 from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.overruns import Writer, check_publication, output_lifespan
 from chainshaper.planning.plan import Plan, ShapingNode, publisher_servers, publishing_servers
@@ -32,10 +31,8 @@ def splice_application(application: Application, plan: Plan | ApplicationPlan) -
 
     It is extended by the plan's shaping nodes or, where the plan gates the publisher's thread,
     given the lifespan that the plan's treatment of overruns needs. The timers that start chains
-    expire when their cycles start: so much after the common start as the plan's offsets say.
-
-    Raises:
-        InputError: the plan shapes nothing, or does not fit the application.
+    expire when their cycles start: so much after the common start as the plan's offsets say. Raises
+    InputError: the plan shapes nothing, or does not fit the application.
     """
     joint = whole(plan)
     check_periods(application, joint)
@@ -180,10 +177,8 @@ def writers_of(application: Application) -> list[Writer]:
 
 def _described(plan: Plan, shaping: ShapingNode, depth: int, phase_ns: int) -> NodeDescription:
     gate = gate_of(plan, shaping, depth)
-    same = ("slots", "cycle_ns", "anchor", "overrun", "due_cycles", "messages", "depth")
-    described: dict[str, Any] = {name: getattr(gate, name) for name in (*same, "into_open_slot")}
-    described["phase_ns"] = phase_ns
-    described |= {"spin_ns": shaping.spin_ns, "pause_ns": shaping.pause_ns}
+    described = {name: getattr(gate, name) for name in (*SAME, "slots", "depth")}
+    described |= {"phase_ns": phase_ns, "spin_ns": shaping.spin_ns, "pause_ns": shaping.pause_ns}
     if gate.modes is not None and plan.modes is not None:
         described["modes"] = {"topic": plan.modes.topic, **vars(gate.modes)}
     with wrong_values_refused(NodeDescription, "the plan's shaping node cannot be run: "):

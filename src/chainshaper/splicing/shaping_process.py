@@ -80,12 +80,9 @@ def write_shaping_process(
     ``message_type`` is the type of the chain's output, such as ``sensor_msgs/msg/Image``: the
     ``typed`` kind is generated for it, the others find it out when they run. ``log`` is where the
     node notes what it did with each message. Files that are there and equal are left alone. Those
-    that are to be moved to ``folder`` later are written ``into`` another one.
-
-    Raises:
-        InputError: a file is there with another content; no type for the typed kind, or none that
-            there is.
-        OperationError: a file cannot be written.
+    that are to be moved to ``folder`` later are written ``into`` another one. Raises InputError: a
+    file is there with another content; no type for the typed kind, or none that there is.
+    OperationError: a file cannot be written.
     """
     if kind == "typed" and message_type is None:
         raise InputError(
@@ -135,13 +132,11 @@ def write_throttler(
     """Write a throttler into ``folder`` (paper, section 5.1); what a launch file has to start.
 
     Each of the ``topics`` is republished on the one it maps to, once every ``period_ns``: by the
-    ``rule`` ``newest`` at ``phase_ns`` after multiples of it on CLOCK_MONOTONIC, by ``first`` as
-    it comes (:mod:`chainshaper.gate.throttling`). ``depth`` is the history of the publishers where
-    that of the originals is not known; ``into`` as for a shaping process.
-
-    Raises:
-        InputError: no topics or period, ``first`` with a phase, or another file is there.
-        OperationError: a file cannot be written.
+    ``rule`` ``newest`` at ``phase_ns`` after multiples of it on CLOCK_MONOTONIC, by ``first`` as it
+    comes (:mod:`chainshaper.gate.throttling`). ``depth`` is the history of the publishers where
+    that of the originals is not known; ``into`` as for a shaping process. Raises InputError: no
+    topics or period, ``first`` with a phase, or another file is there. OperationError: a file
+    cannot be written.
     """
     if not topics or period_ns <= 0:
         raise InputError("a throttler needs topics and a period longer than nothing")
@@ -324,8 +319,7 @@ class MessageType:
 def message_type_named(text: str) -> MessageType:
     """The message type of this name.
 
-    Raises:
-        InputError: it is no type's name, or not installed where there is a ROS 2 environment.
+    Raises InputError: it is no type's name, or not installed where there is a ROS 2 environment.
     """
     match = _TYPE.fullmatch(text)
     if match is None:
@@ -451,9 +445,8 @@ def check_build_tools() -> None:
 def build_package(folder: Path) -> Path:
     """Build the packages in a folder with colcon; the file to source, ``install/setup.bash``.
 
-    Raises:
-        PlatformError: see :func:`check_build_tools`.
-        OperationError: the build failed; the end of what it said is in the message.
+    Raises PlatformError: see :func:`check_build_tools`. OperationError: the build failed; the end
+    of what it said is in the message.
     """
     check_build_tools()
     build = subprocess.run(

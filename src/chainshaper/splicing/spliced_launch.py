@@ -78,10 +78,8 @@ class LaunchCommand:
 def parse_launch_command(command: Sequence[str]) -> LaunchCommand:
     """Find the launch file of a command: named by its path, or by a package and its name there.
 
-    Upstream: ros2launch, `command/launch.py` and `api/api.py`.
-
-    Raises:
-        InputError: it is not `ros2 launch`, or there is no such package or launch file.
+    Upstream: ros2launch, `command/launch.py` and `api/api.py`. Raises InputError: it is not `ros2
+    launch`, or there is no such package or launch file.
     """
     words = list(command)
     if len(words) < 3 or Path(words[0]).name != "ros2" or words[1] != "launch":
@@ -176,10 +174,8 @@ def _keywords(process: ShapingProcess) -> dict[str, Any]:
 def original_words(words: Sequence[str], *, throttled: bool = False) -> list[str]:
     """Launch files as they were before splicing, each once, or `ros2 run …` as it is.
 
-    With ``throttled`` a launch file that has a throttler is an original too.
-
-    Raises:
-        InputError: one of them is not there, or is no launch file.
+    With ``throttled`` a launch file that has a throttler is an original too. Raises InputError: one
+    of them is not there, or is no launch file.
     """
     if is_run(words):
         return list(words)
@@ -211,8 +207,7 @@ def _check_launch_file(path: Path) -> None:
 def usable(folder: Path) -> Path:
     """The absolute path of the folder to write, once it is sure that nothing would be lost.
 
-    Raises:
-        InputError: it has something in it that is not ours, or was changed.
+    Raises InputError: it has something in it that is not ours, or was changed.
     """
     folder = folder.absolute()
     if not folder.parent.is_dir():
@@ -272,10 +267,8 @@ def new_folder(
 ) -> Iterator[Path]:
     """A folder to fill, which takes the place of ``folder`` when all went well.
 
-    ``copies`` are the launch files in it, with the words that they stand for.
-
-    Raises:
-        OperationError: it cannot be written; nothing is left behind, an older one stays.
+    ``copies`` are the launch files in it, with the words that they stand for. Raises
+    OperationError: it cannot be written; nothing is left behind, an older one stays.
     """
     partial: Path | None = None
     try:
@@ -317,9 +310,8 @@ def _moved_aside(folder: Path) -> Path:
 def remove_folder(folder: Path) -> None:
     """Remove a folder of ours, all of it or nothing.
 
-    Raises:
-        InputError: it is not ours, or something in it was changed or added since.
-        OperationError: it cannot be removed.
+    Raises InputError: it is not ours, or something in it was changed or added since.
+    OperationError: it cannot be removed.
     """
     folder = folder.absolute()
     if not folder.is_dir():

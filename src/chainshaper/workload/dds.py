@@ -33,6 +33,7 @@ except ImportError as error:  # no wheel for this Python or processor
     ) from error
 
 GuardCondition, WaitSet = core.GuardCondition, core.WaitSet
+Participant = DomainParticipant  # of a domain, configured by CYCLONEDDS_URI
 
 _DATA_HEAD = struct.Struct("<4siII4xQI")  # encapsulation, stamp, an empty frame id, number, length
 _LITTLE_ENDIAN = b"\0\1\0\0"
@@ -107,11 +108,6 @@ def free_domain() -> int:
     raise OperationError(
         "no DDS domain between 20 and 100 is free: end an application that uses one"
     )
-
-
-def join_domain(domain: int) -> Any:
-    """Take part in a domain; its configuration comes from CYCLONEDDS_URI."""
-    return DomainParticipant(domain)
 
 
 def data_message(data: bytes | memoryview, stamp_ns: int, number: int = 0) -> bytes:

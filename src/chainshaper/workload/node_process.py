@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeAlias
 
+from chainshaper.gate import decision
 from chainshaper.gate.clear_core import ClearCore
 from chainshaper.gate.decision import READER_DEPTH, STALL_NS, Gate, Modes, Outcome, Shaper, text_of
 from chainshaper.linux.scheduling import (
@@ -25,11 +26,6 @@ from chainshaper.workload import dds, executor
 from chainshaper.workload.event_log import ABSENT, LAYOUT, EventLog, number_of
 from chainshaper.workload.execution import ExecutionTimes
 from chainshaper.workload.launcher import receive, send, send_events, wait_for_leave
-
-GATE_FIELDS = (
-    *("cycle_ns", "anchor", "overrun", "due_cycles", "messages", "depth"),
-    "into_open_slot",
-)
 
 Body: TypeAlias = Callable[[dds.Message], None]
 
@@ -68,7 +64,7 @@ class NodeProcess:
     def __init__(self, spec: dict[str, Any]) -> None:
         self.spec = spec
         self.log = EventLog()
-        self.participant = dds.join_domain(spec["domain"])
+        self.participant = dds.Participant(spec["domain"])
         self.executor = executor.Executor(self.participant, self.log)
         self.publishers: dict[str, dds.Publisher] = {}
         self.subscriptions: list[tuple[str, dds.Subscription]] = []
@@ -258,14 +254,14 @@ class NodeProcess:
             if delivery_core is not None:
                 delivery_core.clear_until(release_ns + gate["pause_ns"])
 
-        own_phase = gate["phase_ns"]
-        decided = Gate(
-            phase_ns=self.spec["origin_phase"] if own_phase is None else own_phase,
+        if gate["phase_ns"] is None:
+            gate["phase_ns"] = self.spec["origin_phase"]
+        own = Gate(
             slots=tuple((begin, finish) for begin, finish in gate["slots"]),
             modes=modes and Modes(modes["bands"], modes["default"], modes["late"]),
-            **{name: gate[name] for name in GATE_FIELDS},
+            **{name: gate[name] for name in (*decision.SAME, "depth")},
         )
-        self.shapers.append(Shaper(decided, gate["spin_ns"], get_ready))
+        self.shapers.append(Shaper(own, gate["spin_ns"], get_ready))
         return self.shapers[-1]
 
     def _listen(self, topic: str, shaper: Shaper) -> None:

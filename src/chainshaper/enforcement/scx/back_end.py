@@ -3,8 +3,7 @@
 The policy (`policy/table.bpf.c`, which explains how it works) is compiled ahead. While it is
 in force, *every* thread of the machine's fair class is scheduled by it. Real-time threads stand
 above it, so a thread that shall be governed must not be one. It begins with an empty table, under
-which everything is best effort. Each table after that is written into the generation that is not in
-force, and comes into force on all cores at one instant that lies a little ahead.
+which everything is best effort.
 
 Nothing has to be put back by hand. The policy hangs on a file descriptor of this process, and
 however it ends, the kernel returns to its fair class. (A fork without exec inherits the
@@ -14,9 +13,8 @@ PREEMPT_RT kernels refuse BPF timers. There each core has a **kicker**, a proces
 
     python -m chainshaper.enforcement.scx.back_end CORE DESCRIPTOR
 
-Under SCHED_FIFO, of the lowest priority, it sleeps on the core until the next boundary. Waking up,
-it pushes whatever ran there back to its queue; asleep again, it leaves a core that has to look at
-the table. (A thread of the loader would wait for the interpreter's lock.)
+Under SCHED_FIFO, of the lowest priority, it sleeps on the core until the next boundary. (A thread
+of the loader would wait for the interpreter's lock.)
 """
 
 import ctypes

@@ -1,12 +1,10 @@
 """The throttler, for chains whose input is not quite periodic (paper, section 5.1).
 
-Each topic of ``inputs`` is republished on the topic of ``outputs`` in the same place. By the
-``rule`` ``newest`` that is once every ``period_ns``, at ``phase_ns`` after multiples of it on
-CLOCK_MONOTONIC: the newest message that came since the last time. Where none came nothing is
-published, and where several came the older ones are dropped; both are counted, and said at the end.
-
-By ``first``, the paper's, the first message of a period is published as it comes. That is periodic
-only behind the paper's server, a slot of 2 ms in every cycle; a timer is so on every kernel.
+Each topic of ``inputs`` is republished on the topic of ``outputs`` in the same place, by a ``rule``
+of :mod:`chainshaper.gate.throttling`. Times of ``newest`` are ``phase_ns`` after multiples of
+``period_ns`` on CLOCK_MONOTONIC. Where none came nothing is published, and where several came the
+older ones are dropped; both are counted, and said at the end. ``first`` is periodic only behind the
+paper's server, a slot of 2 ms in every cycle; a timer is so on every kernel.
 """
 
 import atexit

@@ -1,7 +1,7 @@
 // The latency-shaping node: what it receives on `input` it republishes on `output` in the slots of
-// its server (Managing End-to-End Timing Jitters in ROS2 Computation Chains, section 3.2.2). One
-// source for two packages: with `message.hpp` it is for that type of message, without it for any,
-// byte for byte.
+// its server (Managing End-to-End Timing Jitters in ROS2 Computation Chains, section 3.2.2), as
+// chainshaper's Python node, which explains it. One source for two packages: with `message.hpp` it
+// is for that type of message, without it for any, byte for byte.
 
 #include <dlfcn.h>
 
@@ -108,8 +108,7 @@ namespace {
 
 using namespace chainshaper;  // NOLINT
 
-// Where DDS threads deliver the output: the first core that is ours to use and has no server. None
-// where the plan does not name its servers' cores, because it leaves receivers alone.
+// Where DDS threads deliver the output: the first core that is ours to use and has no server.
 std::optional<std::size_t> delivery_core(const std::vector<std::int64_t> & taken) {
   cpu_set_t ours;
   if (taken.empty() || sched_getaffinity(0, sizeof(ours), &ours) != 0) return std::nullopt;
@@ -121,8 +120,7 @@ std::optional<std::size_t> delivery_core(const std::vector<std::int64_t> & taken
   return std::nullopt;
 }
 
-// What is agreed with the standby; none: the node is alone, since nothing names a page. It waits
-// where nodes before it failed at once, so this comes before anything that may fail.
+// What is agreed with the standby; none: the node is alone, since nothing names a page.
 std::optional<Turn> turn_of(rclcpp::Node & node) {
   const auto page = parameters_of(node).handover;
   if (page.empty()) return std::nullopt;
@@ -142,8 +140,7 @@ std::optional<Turn> turn_of(rclcpp::Node & node) {
   return turn;
 }
 
-// Emits the event of a take once more, when a callback is executed for its message: others were
-// taken meanwhile, and a callback is for the message that was taken last.
+// Emits the event of a take once more, when a callback is executed for its message.
 void take_again(const rclcpp::SubscriptionBase & subscription, const void * message,
                 Maybe source_timestamp) {
   using Emit = void (*)(const void *, const void *, std::int64_t, bool);
@@ -198,8 +195,6 @@ public:
           result.successful = true;
           return result;
         });
-    // What leaves in one slot must find room in the writer, too. What the gate has no room for it
-    // drops, and so counts it: its reader has more room.
     const auto depth = depth_of(parameters_, offer);
     const bool latched =
         offer.publisher.durability() == rclcpp::DurabilityPolicy::TransientLocal;
@@ -214,9 +209,7 @@ public:
                        });
   }
 
-  // Leave the output to the standby, if there is one, until the receivers know this node too: what
-  // is published before is lost to them. How far discovery has come at the other side cannot be
-  // seen: it is given a little longer. Whether the node is to run.
+  // Leave the output to the standby until the receivers know this node too. Whether it is to run.
   bool await_receivers() {
     const auto topic = node_.get_node_topics_interface()->resolve_topic_name("output");
     const auto give_up = monotonic_ns() + 2'000'000'000;
@@ -227,8 +220,7 @@ public:
     return rclcpp::ok();
   }
 
-  // Deal with what waits at the gate, each by the subscription's callback, until there is time for
-  // the node's other callbacks; whether some are left.
+  // Deal with what waits at the gate; whether some are left.
   bool work_off() {
     for (bool served = false; rclcpp::ok(); served = true) {
       for (const auto & gone : shaper_.overflowed) note(gone);
@@ -244,8 +236,7 @@ public:
   }
 
 private:
-  // To be called when discovery has had its time. A mode that was announced before is only
-  // delivered when it is asked for, and only if its publisher keeps it.
+  // To be called when discovery has had its time.
   void listen_to_modes() {
     const auto & topic = parameters_.mode_topic;
     if (topic.empty()) return;
@@ -262,8 +253,7 @@ private:
         });
   }
 
-  // The subscription's callback: hold the oldest message until its slot, publish it, rest so that
-  // it is delivered, and note what was done.
+  // The subscription's callback.
   void shape(Pointer message, const rclcpp::MessageInfo & info) {
     if (!its_turn_) {  // the executor took it
       const bool alone = shaper_.queue.waiting.empty();

@@ -211,8 +211,7 @@ inline bool missed(const Gate & gate, const Release & release, std::int64_t now_
          now_ns >= release.start_ns(gate.cycle_ns) + gate.slots[*release.slot].end;
 }
 
-// The header stamp of a serialized message in ns of its clock; none if it is zero or short. It
-// stands right behind the 4-byte CDR encapsulation header, whose second byte gives the byte order.
+// The header stamp of a serialized message in ns of its clock; none if it is zero or short.
 inline Maybe origin_of(const std::uint8_t * payload, std::size_t size) {
   if (size < 12) return std::nullopt;
   const bool little = payload[1] & 1;
@@ -228,8 +227,7 @@ inline Maybe origin_of(const std::uint8_t * payload, std::size_t size) {
   return seconds * 1'000'000'000 + nanoseconds;
 }
 
-// A message that has come and not left. `number` tells it from the others; `lost` counts those
-// that were lost on the way between the one before it and this one (none: not known).
+// A message that has come and not left; `number` tells it from the others.
 template <typename Message>
 struct Waiting {
   Message message;
@@ -321,8 +319,6 @@ private:
     return start_ns && 2 * std::abs(release.start_ns(gate.cycle_ns) - *start_ns) < gate.cycle_ns;
   }
 
-  // The starts of the cycle that the oldest message, or another for it, leaves in, and of that in
-  // which one has left.
   Maybe leaving_;
   Maybe left_;
   std::uint64_t number_{0};
@@ -381,11 +377,7 @@ inline std::int64_t clock_offset() {
   return best;
 }
 
-// A gate at work: holds each message until its release, and minds the clocks. `Message` is what
-// the queue holds. `look` takes what has come and has it arrive: it is called while others wait,
-// before each release and behind it. `on_waking` is called with the time of a release when it wakes
-// `spin_ns` before that, to watch the clock from there; `on_decision` with each decision, before it
-// is waited for, and where cycles begin.
+// A gate at work; `Message` is what the queue holds.
 template <typename Message>
 class Shaper {
 public:
@@ -413,7 +405,7 @@ public:
     next_phase_ = {now_ns + modulo(phase_ns - now_ns, queue.gate.cycle_ns), phase_ns};
   }
 
-  // A mode is announced, in force from the next cycle on; false: there is none like it.
+  // False: there is no mode like it.
   bool announce(const std::string & name, std::int64_t now_ns) {
     const auto & modes = queue.gate.modes;
     const auto mode = modes ? place_of(modes->names, name) : std::nullopt;
@@ -446,9 +438,7 @@ public:
     if (full) overflowed.push_back(std::move(*full));
   }
 
-  // Wait until the oldest message leaves, or is dropped; none: it was overflowed meanwhile. One
-  // that is to be discarded is not waited for; where overruns are discarded, so is a message whose
-  // slot is over when this thread wakes.
+  // Wait until the oldest message leaves, or is dropped; none: it was overflowed meanwhile.
   std::optional<Outcome<Message>> hold() {
     const std::uint64_t number = queue.waiting.front().number;
     std::int64_t now = monotonic_ns();
@@ -522,8 +512,6 @@ private:
     looked_ns_ = now;
   }
 
-  // For how long this thread has been ready while others ran: the second number of
-  // /proc/thread-self/schedstat. Without one, all delay is taken to be other threads'.
   std::int64_t others_ran_ns() {
     const auto thread = static_cast<pid_t>(syscall(SYS_gettid));
     if (thread != thread_) {  // the file is bound to who opened it

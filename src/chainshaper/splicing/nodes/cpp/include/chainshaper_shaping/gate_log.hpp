@@ -1,8 +1,5 @@
-// What a gate did, one line of comma-separated values per message. No ROS 2 here.
-//
-// A thread of its own writes them to the file, so that neither a slow disk nor a full one can delay
-// the gate: that puts a line into a pipe, and goes on without it where the pipe is full. Lines are
-// numbered, so that those that are missing can be counted.
+// What a gate did, one line of comma-separated values per message, written by a thread of its own:
+// as GateLog of chainshaper's Python node, which says why. No ROS 2 here.
 
 #pragma once
 

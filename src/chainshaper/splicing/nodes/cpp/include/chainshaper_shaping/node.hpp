@@ -39,10 +39,7 @@ struct Offer {
   rclcpp::QoS publisher;
 };
 
-// Discovery does not always tell everything: unknown reliability is taken to be reliable, unknown
-// durability volatile, unknown liveliness automatic, and an unknown history keeps the last
-// `depth`. A subscription asks for reliability and durability only: that fits every publisher
-// that offers them.
+// What discovery does not tell is taken to be as in `offered_by` of chainshaper's Python node.
 inline Offer offer_of(const rclcpp::TopicEndpointInfo & info, std::size_t depth) {
   rmw_qos_profile_t offered = info.qos_profile().get_rmw_qos_profile();
   if (offered.history != RMW_QOS_POLICY_HISTORY_KEEP_ALL) {
@@ -92,9 +89,8 @@ inline std::optional<Offer> wait_for_publisher(rclcpp::Node & node, const std::s
   return std::nullopt;
 }
 
-// Lock the memory and give the calling thread its core and SCHED_FIFO priority, as the parameters
-// `core` and `fifo_priority` say. To be called when all endpoints exist: threads inherit, and those
-// of DDS must not; later ones do not get the class. What is not permitted is warned of.
+// Lock the memory and give the calling thread its core and SCHED_FIFO priority. To be called when
+// all endpoints exist: threads inherit, and those of DDS must not; later ones do not get the class.
 inline void become_realtime(rclcpp::Node & node) {
   const auto parameters = parameters_of(node);
   const auto warn = [&](const char * what, const char * remedy) {
