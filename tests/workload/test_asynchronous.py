@@ -169,5 +169,5 @@ def test_a_run_that_is_given_up_while_a_thread_is_frozen_leaves_nothing(tmp_path
             _asynchronous(tmp_path), tmp_path / "rec", enforcement=gating, progress=give_up
         )
     assert children_of(os.getpid()) == children
-    assert list(group.glob("chainshaper-test-*")) == []
+    assert list(group.glob("frozen-test-*")) == []
     assert not (tmp_path / "rec").exists()
