@@ -77,7 +77,8 @@ def apply(
     ),
     phase: int | None = option(
         "--phase DURATION",
-        "Where in a cycle the chain's timer expires, on CLOCK_MONOTONIC. Default: measured.",
+        "Where in a cycle the chain's timer expires, on CLOCK_MONOTONIC: slots then stay there."
+        " Default: measured, and followed where it drifts.",
     ),
     recording: Path | None = option(
         "--recording REC",
